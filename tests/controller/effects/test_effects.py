@@ -37,7 +37,7 @@ def wanted(
     return {target.key.id: target.level_db_sl for target in intent.targets}
 
 
-def test_click_is_over_after_its_duration() -> None:
+def test_click_ends_after_its_duration() -> None:
     """A click of 40 ms is felt until then; the intent says when to look again, and ends."""
     player = EffectPlayer(Layout(effects={"click": Click(level=18.0)}, elsewhere="click"))
     here = [finger(1)]
@@ -49,7 +49,7 @@ def test_click_is_over_after_its_duration() -> None:
     assert player.intent(here, 10.05).until is None
 
 
-def test_buzz_lasts_as_long_as_the_finger() -> None:
+def test_buzz_lasts_while_the_finger_stays() -> None:
     """Without a duration it asks for nothing but its finger; a new finger begins anew."""
     player = EffectPlayer(Layout())
     assert wanted(player, [finger(1)], 0.0) == {1: 20.0}
@@ -73,7 +73,7 @@ def test_ramp_rises_in_steps() -> None:
     assert levels == [(round(0.1 * step, 6), 6.0 + 2 * step) for step in range(8)]
 
 
-def test_ramp_takes_no_steps_that_the_plate_cannot_follow() -> None:
+def test_ramp_steps_are_no_shorter_than_the_plate_response() -> None:
     """40 dB in 0.1 s would be twenty steps: five levels of 20 ms, the least that is felt."""
     course = Ramp(start_level=6.0, duration=0.1).start(finger(1), 0.0, level_db_sl=46.0)
     felt = [course.feel(finger(1), 0.02 * step + 1e-9) for step in range(6)]
@@ -87,7 +87,7 @@ def test_ramp_takes_no_steps_that_the_plate_cannot_follow() -> None:
     ]
 
 
-def test_ramp_that_holds() -> None:
+def test_ramp_holds_its_last_level() -> None:
     """It stays at its last level; one as strong as the neighbours allow ends with that."""
     ramp = Ramp(start_level=6.0, duration=0.8, hold=True)
     for level in (20.0, None):
@@ -95,7 +95,7 @@ def test_ramp_that_holds() -> None:
         assert felt == Sensation(level, or_less=True)
 
 
-def test_ramp_that_holds_rises_first() -> None:
+def test_ramp_with_hold_rises_first() -> None:
     """8, 10, 12 dB for a tenth of a second each, then 12 for good."""
     course = Ramp(start_level=8.0, duration=0.3, hold=True, level=12.0).start(
         finger(1), 0.0, level_db_sl=12.0
@@ -115,7 +115,7 @@ def test_ramp_that_holds_rises_first() -> None:
     ]
 
 
-def test_texture_by_speed() -> None:
+def test_texture_level_follows_speed() -> None:
     """At `fast` the level, at the geometric mean of slow and fast half of the range less.
 
     At rest nothing, 80 ms after the last report from another place.
@@ -136,7 +136,7 @@ def test_texture_by_speed() -> None:
     assert isinstance(felt, NoSensation)
 
 
-def test_texture_begins_with_the_stroke() -> None:
+def test_texture_starts_with_the_movement() -> None:
     """After a rest of seconds the first report elsewhere counts against the last 60 ms.
 
     3 mm within them are 5 cm/s, which is halfway between slow and fast along the logarithm.
@@ -149,7 +149,7 @@ def test_texture_begins_with_the_stroke() -> None:
     assert felt.level_db_sl == 12.0
 
 
-def test_texture_does_not_flutter() -> None:
+def test_texture_level_has_hysteresis() -> None:
     """Speeds around the border of two levels, 1 dB from each, keep the one that was first."""
     course = Texture(slow=0.01, fast=0.1, range=20.0).start(finger(1, 0), 0, level_db_sl=20)
     levels, way = set(), 0.0
@@ -162,7 +162,7 @@ def test_texture_does_not_flutter() -> None:
     assert len(levels) == 1
 
 
-def test_a_finger_on_an_edge() -> None:
+def test_player_keeps_the_region_of_a_finger_on_an_edge() -> None:
     """Noise of half a millimetre across an edge is no crossing; a millimetre of way is."""
     regions = (Region("left", LEFT, on_press="tick"), Region("right", RIGHT, on_press="tock"))
     effects: dict[str, Effect] = {"tick": Click(level=10.0), "tock": Click(level=15.0)}
@@ -175,7 +175,7 @@ def test_a_finger_on_an_edge() -> None:
         assert wanted(player, [finger(1, 0.1009 - 0.0009 * (step % 2))], 2 + 0.1 * step) == {}
 
 
-def test_times_that_run_backwards() -> None:
+def test_effects_accept_decreasing_times() -> None:
     """A ramp that is asked about a moment before it began is at its first level, not at its last.
 
     No other effect asks for more than its level then, either.
@@ -190,7 +190,7 @@ def test_times_that_run_backwards() -> None:
             assert not isinstance(felt, Sensation) or (felt.level_db_sl or 0) <= 20.0
 
 
-def test_strongest_level_of_a_layout() -> None:
+def test_layout_max_level() -> None:
     """What may be felt at all: a ramp's first level too, also where a region lowers its last."""
     falling = Ramp(start_level=40.0, level=12.0)
     assert Layout(effects={"fall": falling}).max_db_sl == 40.0
@@ -200,7 +200,7 @@ def test_strongest_level_of_a_layout() -> None:
     assert Layout((free,), {"soft": Click(level=10.0)}).max_db_sl == float("inf")
 
 
-def test_detents_click_once_each() -> None:
+def test_detents_click_once_per_detent() -> None:
     """Detents lie at 5, 15, 25 mm from where the finger came down, 10 mm apart.
 
     Noise around one is no second click, and the way back clicks again.
@@ -215,7 +215,7 @@ def test_detents_click_once_each() -> None:
     assert clicks == [5.6, 15.6, 30.6, 24]
 
 
-def test_regions_of_a_sliding_finger() -> None:
+def test_player_follows_a_sliding_finger_through_regions() -> None:
     """It presses where it comes in, is released where it goes out, and lifts without a feeling."""
     regions = (
         Region("left", LEFT, on_press="soft", on_release="hard"),
@@ -235,7 +235,7 @@ def test_regions_of_a_sliding_finger() -> None:
     assert wanted(player, [], 0.5) == {}
 
 
-def test_priority_and_the_newest() -> None:
+def test_player_prefers_priority_then_the_newest() -> None:
     """The highest priority is felt; among equals the play that began last; then the one before."""
     regions = (
         Region("left", LEFT, on_press="buzz"),
@@ -250,7 +250,7 @@ def test_priority_and_the_newest() -> None:
     assert wanted(player, [first, urgent], 0.3) == {1: 20.0}
 
 
-def test_the_first_end_is_when_to_look_again() -> None:
+def test_intent_expires_at_the_first_end() -> None:
     """Of a click of 40 ms and a detent of 30 ms at two fingers it is after the detent."""
     slider = Region("slider", LEFT, on_move="dots")
     effects: dict[str, Effect] = {"dots": Detents(duration=0.03), "click": Click(duration=0.04)}
@@ -262,7 +262,7 @@ def test_the_first_end_is_when_to_look_again() -> None:
     assert player.intent(fingers, 1.04).until is None
 
 
-def test_several_at_once() -> None:
+def test_player_plays_several_fingers_at_once() -> None:
     """Where the layout allows two, the two newest of the highest priority feel their own levels."""
     region = Region("left", LEFT, on_press="soft", on_move=None)
     player = EffectPlayer(
@@ -272,7 +272,7 @@ def test_several_at_once() -> None:
     assert wanted(player, fingers, 0.0) == {2: 9.0, 3: 20.0}
 
 
-def test_quiet_sliders_stand_in_nobodys_way() -> None:
+def test_player_ignores_plays_without_sensation() -> None:
     """A finger between detents of a region of high priority leaves the others what they feel."""
     slider = Region("slider", LEFT, on_move="detents", priority=9)
     player = EffectPlayer(Layout((slider,), {"detents": Detents(), "buzz": Buzz()}))
@@ -282,7 +282,7 @@ def test_quiet_sliders_stand_in_nobodys_way() -> None:
     assert wanted(player, [other, finger(2, 0.056)], 0.2) == {1: 20.0}
 
 
-def test_effects_by_name() -> None:
+def test_player_plays_an_effect_by_name() -> None:
     """What was asked for by name goes before all regions, at its level, and then is over."""
     player = EffectPlayer(Layout(effects={"buzz": Buzz(), "alert": Click(duration=0.1)}))
     here, other = finger(1), finger(2)
@@ -295,7 +295,7 @@ def test_effects_by_name() -> None:
         player.play("nothing", here, 0.2, level_db_sl=None)
 
 
-def test_what_was_asked_for_goes_with_its_finger() -> None:
+def test_requested_effect_ends_with_its_finger() -> None:
     """Through other regions too, unlike what a region has for it."""
     regions = (Region("left", LEFT, on_press="hum"), Region("right", RIGHT))
     effects: dict[str, Effect] = {"hum": Buzz(level=9.0), "alert": Buzz(level=18.0)}
@@ -306,7 +306,7 @@ def test_what_was_asked_for_goes_with_its_finger() -> None:
     assert player.effect_of(finger(1).key) == "alert"
 
 
-def test_asking_again_begins_anew() -> None:
+def test_requested_effect_restarts_when_requested_again() -> None:
     """An effect that never ends, asked for a thousand times, is one; it goes with its finger."""
     felt = 0
 
@@ -333,7 +333,7 @@ def test_asking_again_begins_anew() -> None:
     assert wanted(player, [finger(1)], 4.0) == {}
 
 
-def test_asking_at_a_finger_that_was_not_looked_at_yet() -> None:
+def test_requested_effect_plays_for_an_unknown_finger() -> None:
     """What its place has for it begins all the same, and goes on when the other is over."""
     player = EffectPlayer(Layout(effects={"buzz": Buzz(), "alert": Click(duration=0.1)}))
     player.play("alert", finger(1), 0.0, level_db_sl=12.0)
@@ -341,7 +341,7 @@ def test_asking_at_a_finger_that_was_not_looked_at_yet() -> None:
     assert wanted(player, [finger(1)], 0.2) == {1: 20.0}
 
 
-def test_another_layout_is_no_other_press() -> None:
+def test_new_layout_repeats_no_press() -> None:
     """A finger that is down feels what lasts and what moves by the new one, but no second click.
 
     One that comes later feels all, also under the name of one that has lifted.
@@ -373,7 +373,9 @@ def test_another_layout_is_no_other_press() -> None:
         max_size=25,
     )
 )
-def test_any_way_of_fingers(steps: list[tuple[float, dict[int, tuple[float, float]]]]) -> None:
+def test_player_invariants_for_any_movement(
+    steps: list[tuple[float, dict[int, tuple[float, float]]]],
+) -> None:
     """Only fingers that are there are targets, no more than allowed, and no intent ran out before.
 
     The same sequence gives the same intents.
@@ -435,7 +437,7 @@ def test_shapes(
     assert [shape.contains(*point) for point in outside] == [False] * len(outside)
 
 
-def test_effects_of_plug_ins_are_listed() -> None:
+def test_effect_kinds_include_plug_ins() -> None:
     """Whatever parameters they have, as JSON; they disturb the list of the others in nothing."""
 
     class Rhythm(Buzz):
@@ -450,7 +452,7 @@ def test_effects_of_plug_ins_are_listed() -> None:
     assert (rhythm["parameters"]["beats"], rhythm["parameters"]["count"]) == ([0.1, 0.2], 3)
 
 
-def test_kinds() -> None:
+def test_effect_kind_finds_builtin_kinds() -> None:
     """All five are installed, each under its own name."""
     assert {"buzz", "click", "detents", "ramp", "texture"} <= set(effect_kinds())
     for name in effect_kinds():

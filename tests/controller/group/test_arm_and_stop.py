@@ -32,7 +32,7 @@ from virtual_loop import in_virtual_time
 
 
 @in_virtual_time
-async def test_disarmed_at_first() -> None:
+async def test_controller_starts_disarmed() -> None:
     """Until armed, contacts are followed and nothing is sent; then fingers already there feel."""
     bench = make_bench()
     with pytest.raises(CommandError):
@@ -55,7 +55,7 @@ async def test_disarmed_at_first() -> None:
 
 
 @in_virtual_time
-async def test_link_lost() -> None:
+async def test_lost_link_stops_the_others_and_ends_the_loop() -> None:
     """A link that breaks stops the other amplifier, is told, and ends the loop with the error."""
     bench = make_bench("a", "b")
     await bench.controller.open()
@@ -81,7 +81,7 @@ async def test_link_lost() -> None:
 
 
 @in_virtual_time
-async def test_together_or_not_at_all() -> None:
+async def test_amplifiers_stage_before_any_commits() -> None:
     """Several amplifiers stage under one token, all before any commits, and are read back."""
     async with running("a", "b") as bench:
         bench.far_ends[0].delay = 0.004
@@ -115,7 +115,7 @@ async def test_together_or_not_at_all() -> None:
     ],
 )
 @in_virtual_time
-async def test_one_of_several_fails(kind: type[Request], reply: Reply) -> None:
+async def test_failure_of_one_stops_all(kind: type[Request], reply: Reply) -> None:
     """Whatever one amplifier does not do, all are stopped, disarmed and stay so; it is told."""
     async with running("a", "b") as bench:
         bench.far_ends[1].answer = lambda request: reply if isinstance(request, kind) else None
@@ -130,7 +130,7 @@ async def test_one_of_several_fails(kind: type[Request], reply: Reply) -> None:
 
 
 @in_virtual_time
-async def test_one_guard_refuses() -> None:
+async def test_refusal_of_one_guard_silences_all() -> None:
     """What one amplifier's guard refuses, none plays: both are told to be silent."""
     async with running("a", "b") as bench:
         await bench.hold(FINGER, seconds=0.1)
@@ -144,7 +144,7 @@ async def test_one_guard_refuses() -> None:
 
 
 @in_virtual_time
-async def test_stop_is_latched() -> None:
+async def test_stop_is_latched_until_clear() -> None:
     """After a stop nothing arms before it was acknowledged, and touches are not felt."""
     async with running() as bench:
         await bench.controller.stop()
@@ -159,7 +159,7 @@ async def test_stop_is_latched() -> None:
 
 
 @in_virtual_time
-async def test_stop_between_stage_and_commit() -> None:
+async def test_stop_prevents_the_commit_of_a_staged_set() -> None:
     """A set that was staged when the stop came is never committed, and no error is made of it."""
     async with running("a", "b") as bench:
         bench.far_ends[0].delay = 0.01
@@ -174,7 +174,7 @@ async def test_stop_between_stage_and_commit() -> None:
 
 @pytest.mark.parametrize("silencing", ["disarm", "stop", "close"])
 @in_virtual_time
-async def test_silence_asked_for_while_arming(silencing: str) -> None:
+async def test_silencing_wins_over_arming(silencing: str) -> None:
     """Whoever silences while another arms is the one who wins, and the other is told."""
     bench = make_bench("a", "b")
     await bench.controller.open()
@@ -192,7 +192,7 @@ async def test_silence_asked_for_while_arming(silencing: str) -> None:
 
 
 @in_virtual_time
-async def test_arming_again_that_is_refused() -> None:
+async def test_arm_disarms_all_when_one_refuses() -> None:
     """Amplifiers that were armed and cannot be armed anew are disarmed, and nothing is played."""
     async with running("a", "b") as bench:
         bench.far_ends[0].state = AmplifierState.SWITCH_ON_DISABLED  # the other one refuses
@@ -203,7 +203,7 @@ async def test_arming_again_that_is_refused() -> None:
 
 
 @in_virtual_time
-async def test_a_disarm_that_fails() -> None:
+async def test_failed_disarm_stops_all() -> None:
     """If one amplifier does not disarm, all are stopped, and the error is raised."""
     async with running("a", "b") as bench:
         bench.far_ends[1].answer = lambda request: (
@@ -215,7 +215,7 @@ async def test_a_disarm_that_fails() -> None:
 
 
 @in_virtual_time
-async def test_a_stop_is_seen_through() -> None:
+async def test_stop_completes_when_the_loop_is_cancelled() -> None:
     """A loop that is cancelled while it stops the amplifiers ends when they are stopped."""
     bench = make_bench("a", "b")
     await bench.controller.open()
@@ -238,7 +238,7 @@ async def test_a_stop_is_seen_through() -> None:
 
 
 @in_virtual_time
-async def test_a_finger_lifted_while_all_are_stopped() -> None:
+async def test_contacts_are_followed_while_amplifiers_are_stopped() -> None:
     """A stop that is under way takes its time, and the touches that come meanwhile are followed."""
     bench = make_bench()
     await bench.controller.open()
@@ -264,7 +264,7 @@ async def test_a_finger_lifted_while_all_are_stopped() -> None:
 
 @pytest.mark.parametrize("kind", [Stage, Commit, GetStatus, Ping])
 @in_virtual_time
-async def test_a_bug_stops_all(kind: type[Request]) -> None:
+async def test_unexpected_exception_stops_all(kind: type[Request]) -> None:
     """An exception that nobody foresaw, between stage and commit too, leaves nothing vibrating."""
     bench = make_bench("a", "b")
     await bench.controller.open()
@@ -287,7 +287,7 @@ async def test_a_bug_stops_all(kind: type[Request]) -> None:
 
 
 @in_virtual_time
-async def test_close() -> None:
+async def test_close_ramps_reads_back_and_disarms() -> None:
     """Closing ramps to zero in 50 ms, reads zero back, disarms, closes and ends the loop."""
     bench = make_bench()
     await bench.controller.open()
@@ -315,7 +315,7 @@ async def test_close() -> None:
 
 
 @in_virtual_time
-async def test_closing_again_hangs_up_on_nobody(caplog: pytest.LogCaptureFixture) -> None:
+async def test_second_close_waits_for_the_first(caplog: pytest.LogCaptureFixture) -> None:
     """Who closes while another still reads zero back waits for that, and all ends in order."""
     async with running() as bench:
         bench.touch(FINGER)
@@ -329,7 +329,7 @@ async def test_closing_again_hangs_up_on_nobody(caplog: pytest.LogCaptureFixture
 
 
 @in_virtual_time
-async def test_close_without_proof_of_silence(caplog: pytest.LogCaptureFixture) -> None:
+async def test_close_stops_when_a_level_remains(caplog: pytest.LogCaptureFixture) -> None:
     """An amplifier that goes on reporting a level is stopped, and that is logged."""
     async with running() as bench:
         bench.far_end.answer = lambda request: (
@@ -343,7 +343,7 @@ async def test_close_without_proof_of_silence(caplog: pytest.LogCaptureFixture) 
 
 
 @in_virtual_time
-async def test_close_gives_an_amplifier_time_to_report_zero(
+async def test_close_waits_for_a_delayed_zero(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """One whose levels are two looks old is looked at a third time, and all ends in order."""
@@ -364,7 +364,7 @@ async def test_close_gives_an_amplifier_time_to_report_zero(
 
 
 @in_virtual_time
-async def test_a_rig_that_does_not_fit() -> None:
+async def test_controller_refuses_amplifiers_that_do_not_fit_the_rig() -> None:
     """Amplifiers the rig does not name, and channels an amplifier has not, are refused at once."""
     bench = make_bench(channels=1)
     other = {"other": Amplifier(bench.far_end)}
@@ -377,7 +377,7 @@ async def test_a_rig_that_does_not_fit() -> None:
 
 @pytest.mark.parametrize("order", ["stop", "disarm"])
 @in_virtual_time
-async def test_nobody_arms_what_is_just_being_silenced(order: str) -> None:
+async def test_arm_is_refused_while_silencing(order: str) -> None:
     """An Arm at the same moment is refused, not sent: which came first would be a matter of luck.
 
     Once the amplifiers are silenced and cleared they can be armed.
@@ -400,7 +400,7 @@ async def test_nobody_arms_what_is_just_being_silenced(order: str) -> None:
 
 
 @in_virtual_time
-async def test_a_half_committed_set_is_silenced_before_another() -> None:
+async def test_incomplete_set_is_silenced_before_the_next() -> None:
     """A lift ends the wait for commits, and a finger comes before zero goes out: zero goes first.
 
     Some amplifiers may play the set that was given up and others not, which is no pattern at all.
@@ -429,7 +429,7 @@ async def test_a_half_committed_set_is_silenced_before_another() -> None:
 
 
 @in_virtual_time
-async def test_a_stop_is_seen_through_however_often_its_caller_is_cancelled() -> None:
+async def test_stop_completes_when_its_caller_is_cancelled_twice() -> None:
     """Cancelled twice while the amplifiers take 20 ms: they are stopped all the same."""
     async with running("a", "b") as bench:
         for far_end in bench.far_ends:
@@ -444,7 +444,7 @@ async def test_a_stop_is_seen_through_however_often_its_caller_is_cancelled() ->
 
 
 @in_virtual_time
-async def test_all_who_stop_what_is_being_stopped_have_one_stop_together() -> None:
+async def test_concurrent_stops_share_one_stop() -> None:
     """A thousand stops within 5 ms are two to amplifiers that take 10 ms each: one after the last
     of them, and after a clear in between; the amplifiers stay stopped."""
     async with running("a", "b") as bench:
@@ -469,7 +469,7 @@ async def test_all_who_stop_what_is_being_stopped_have_one_stop_together() -> No
 
 @pytest.mark.parametrize("silencing", ["stop", "disarm"])
 @in_virtual_time
-async def test_nothing_is_committed_after_silence_on_wires_of_different_speed(
+async def test_silencing_prevents_commits_on_slower_wires(
     silencing: str,
 ) -> None:
     """Where the commit of a fast wire waits for that of a slow one, a stop or disarm that comes

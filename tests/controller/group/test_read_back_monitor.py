@@ -29,7 +29,7 @@ def expecting(safe: SafeCommandSet) -> ReadBackMonitor:
     return read_backs
 
 
-def test_another_level_for_100_ms_is_refused() -> None:
+def test_check_refuses_a_level_that_differs_for_100_ms() -> None:
     """Two heartbeats later, with both levels in the message; the right one is no matter."""
     read_backs = expecting(tone(ramp=0.02))
     read_backs.check("main", reported(0.1, 0.0), now=10.01)  # it fades
@@ -41,7 +41,7 @@ def test_another_level_for_100_ms_is_refused() -> None:
         expecting(tone()).check("main", reported(0.5, 0.0), now=moment)
 
 
-def test_nothing_is_expected_of_what_ends_by_itself_or_is_forgotten() -> None:
+def test_check_expects_nothing_of_ending_or_forgotten_sets() -> None:
     """valid_for may be over at any heartbeat; after a stop nobody knows."""
     ends, forgotten = expecting(tone(valid_for=1.0)), expecting(tone())
     forgotten.forget()

@@ -67,7 +67,7 @@ def on_a_bus(
 
 
 @pytest.mark.parametrize("bus", BUSES)
-def test_one_that_does_not_answer_holds_up_no_other_stop(bus: str, coarse_rig: Rig) -> None:
+def test_stop_on_a_bus_is_not_delayed_by_a_hung_amplifier(bus: str, coarse_rig: Rig) -> None:
     """The first is asked for its status 30 ms and more; the others are silent a frame after the
     stop was wished all the same, and latched."""
 
@@ -83,7 +83,7 @@ def test_one_that_does_not_answer_holds_up_no_other_stop(bus: str, coarse_rig: R
 
 
 @pytest.mark.parametrize("bus", BUSES)
-def test_each_is_asked_as_well(bus: str, coarse_rig: Rig) -> None:
+def test_stop_on_a_bus_is_followed_by_a_stop_of_each(bus: str, coarse_rig: Rig) -> None:
     """One frame tells all at a moment, and then each is asked for its answer."""
 
     async def use(far: FarSide, group: AmplifierGroup, heard: list[tuple[str, float]]) -> None:
@@ -96,7 +96,7 @@ def test_each_is_asked_as_well(bus: str, coarse_rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("bus", BUSES)
-def test_one_that_is_lost_keeps_the_frame_from_no_other(bus: str, coarse_rig: Rig) -> None:
+def test_stop_on_a_bus_reaches_others_when_one_is_lost(bus: str, coarse_rig: Rig) -> None:
     """One that is there sends it: the others hear it at one moment, and are asked as well."""
 
     async def use(far: FarSide, group: AmplifierGroup, heard: list[tuple[str, float]]) -> None:

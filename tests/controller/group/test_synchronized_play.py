@@ -14,7 +14,9 @@ NAMES = ("a", "b")
 
 
 @pytest.mark.parametrize(("steps", "asked"), [(0, []), (1, [Stage])])
-async def test_what_is_silenced_goes_no_further(steps: int, asked: list[type[Request]]) -> None:
+async def test_play_ends_when_silenced_between_steps(
+    steps: int, asked: list[type[Request]]
+) -> None:
     """Before it nothing is asked; once all have it staged nobody commits, and none is torn."""
     far_ends = {name: FarEnd() for name in NAMES}
     amplifiers = {name: Amplifier(far_end) for name, far_end in far_ends.items()}
@@ -36,7 +38,7 @@ async def test_what_is_silenced_goes_no_further(steps: int, asked: list[type[Req
 
 
 @in_virtual_time
-async def test_a_set_is_sent_when_the_last_has_what_it_needs() -> None:
+async def test_play_reports_when_the_last_commit_was_sent() -> None:
     """The wire of one takes 10 ms longer, so the other is told 10 ms later; both are asked then."""
     far_ends = {name: FarEnd() for name in NAMES}
     far_ends["a"].commit_takes = 0.010

@@ -92,7 +92,9 @@ async def step_at_random(
 @pytest.mark.parametrize("loss", [0.0, 0.1])
 @pytest.mark.parametrize("seed", range(40))
 @in_virtual_time
-async def test_nothing_stays_vibrating(seed: int, loss: float) -> None:
+async def test_controller_never_stays_vibrating_for_any_order_of_events(
+    seed: int, loss: float
+) -> None:
     """While answers come, zero is reached 20 ms after the last finger; in the end in any case.
 
     The end is a close, or a loop that is no more: then the watchdogs do it. No task is left.

@@ -33,7 +33,7 @@ from virtual_loop import in_virtual_time
 
 
 @in_virtual_time
-async def test_touch_to_wire() -> None:
+async def test_controller_plays_a_touch_within_one_turn() -> None:
     """A touch is on the wire in the same moment, as worked out by hand, and is told as confirmed.
 
     20 of 100 µm is level 0.2; the pattern's own ramp goes with it; latency counts from the frame.
@@ -60,7 +60,7 @@ async def test_touch_to_wire() -> None:
 
 
 @in_virtual_time
-async def test_with_several_amplifiers_latency_counts_to_the_commit() -> None:
+async def test_latency_counts_to_the_commit_with_several_amplifiers() -> None:
     """To its last byte, 10 ms after the stage whose answer takes as long; not to the read-back."""
     async with running("west", "east") as bench:
         for far_end in bench.far_ends:
@@ -72,7 +72,7 @@ async def test_with_several_amplifiers_latency_counts_to_the_commit() -> None:
 
 
 @in_virtual_time
-async def test_a_moved_finger_does_not_restart_the_vibration() -> None:
+async def test_controller_keeps_phase_when_a_finger_moves() -> None:
     """The same ERA at the same frequency runs on, another level or not; after silence it starts."""
     async with running() as bench:
         await bench.hold(FINGER, seconds=0.1)
@@ -93,7 +93,7 @@ async def test_a_moved_finger_does_not_restart_the_vibration() -> None:
 
 
 @in_virtual_time
-async def test_phase_is_not_kept_of_what_was_never_confirmed() -> None:
+async def test_controller_restarts_phase_after_an_unconfirmed_set() -> None:
     """After a disarm nobody knows what plays: the next pattern counts from its commit."""
     bench = make_bench()
     await bench.controller.open()
@@ -108,7 +108,7 @@ async def test_phase_is_not_kept_of_what_was_never_confirmed() -> None:
 
 
 @in_virtual_time
-async def test_last_finger_up() -> None:
+async def test_controller_silences_after_the_last_lift() -> None:
     """When the last finger lifts, every channel is at zero within 20 ms, ramp included."""
     async with running() as bench:
         bench.touch(FINGER, OTHER)
@@ -126,7 +126,7 @@ async def test_last_finger_up() -> None:
 
 @pytest.mark.parametrize("kind", [Apply, Ping])
 @in_virtual_time
-async def test_last_finger_up_while_an_answer_is_awaited(kind: type[Request]) -> None:
+async def test_controller_silences_a_lift_while_a_reply_is_awaited(kind: type[Request]) -> None:
     """Zero is reached within 20 ms also where the answer to something else does not come."""
     async with running() as bench:
         due = asyncio.get_running_loop().time()
@@ -151,7 +151,7 @@ async def test_last_finger_up_while_an_answer_is_awaited(kind: type[Request]) ->
 
 
 @in_virtual_time
-async def test_what_a_lift_has_hurried_is_not_asked_again() -> None:
+async def test_controller_repeats_no_aborted_request() -> None:
     """A Ping that nobody has answered in time gives way to what is due since, and is no fault.
 
     The last finger lifts 25 ms after it, and another comes at once, so that a pattern is due.
@@ -184,7 +184,7 @@ async def test_what_a_lift_has_hurried_is_not_asked_again() -> None:
 
 
 @in_virtual_time
-async def test_a_set_whose_finger_has_lifted_is_not_committed() -> None:
+async def test_controller_commits_no_set_after_its_finger_lifted() -> None:
     """Two amplifiers, one of which takes 5 ms to stage: the finger lifts meanwhile."""
     async with running("a", "b") as bench:
         bench.far_ends[0].delay = 0.005
@@ -200,7 +200,7 @@ async def test_a_set_whose_finger_has_lifted_is_not_committed() -> None:
 
 
 @in_virtual_time
-async def test_last_finger_up_before_a_heartbeat() -> None:
+async def test_controller_silences_before_a_due_heartbeat() -> None:
     """Silence goes before a heartbeat that is due, and several amplifiers fall silent at once."""
     async with running("a", "b") as bench:
         await asyncio.sleep(0.045)
@@ -219,7 +219,7 @@ async def test_last_finger_up_before_a_heartbeat() -> None:
 
 
 @in_virtual_time
-async def test_silence_that_was_cancelled_is_sent_again() -> None:
+async def test_controller_resends_cancelled_silence() -> None:
     """A loop that takes over from one that was cancelled does not count on its last command."""
     bench = make_bench()
     await bench.controller.open()
@@ -240,7 +240,7 @@ async def test_silence_that_was_cancelled_is_sent_again() -> None:
 
 
 @in_virtual_time
-async def test_a_source_that_falls_silent() -> None:
+async def test_controller_silences_when_a_source_times_out() -> None:
     """150 ms after the last news the contact counts as lifted, and zero is on the wire."""
     async with running() as bench:
         bench.touch(FINGER)
@@ -251,7 +251,7 @@ async def test_a_source_that_falls_silent() -> None:
 
 
 @in_virtual_time
-async def test_nothing_is_sent_twice() -> None:
+async def test_controller_sends_no_set_twice() -> None:
     """A finger at rest, repeated by its source, costs the wire heartbeats only."""
     async with running() as bench:
         await bench.hold(FINGER, seconds=1.0)
@@ -259,7 +259,7 @@ async def test_nothing_is_sent_twice() -> None:
 
 
 @in_virtual_time
-async def test_heartbeat_pace() -> None:
+async def test_heartbeat_keeps_its_interval() -> None:
     """While armed a heartbeat goes out every 50 ms, whether or not anybody touches."""
     async with running() as bench:
         await asyncio.sleep(0.5)
@@ -271,7 +271,7 @@ async def test_heartbeat_pace() -> None:
 
 
 @in_virtual_time
-async def test_heartbeat_only_after_the_loop_has_run() -> None:
+async def test_heartbeat_is_sent_only_after_the_loop_has_run() -> None:
     """Nothing but a turn of the loop beats, once per turn, and after what the turn had to send."""
     bench = make_bench()
     await bench.controller.open()
@@ -288,7 +288,7 @@ async def test_heartbeat_only_after_the_loop_has_run() -> None:
 
 
 @in_virtual_time
-async def test_a_hung_loop_does_not_beat() -> None:
+async def test_heartbeat_stops_when_the_loop_hangs() -> None:
     """While the loop waits for an amplifier that does not answer, the other gets no heartbeat."""
     async with running("a", "b") as bench:
         slow, other = bench.far_ends
@@ -303,7 +303,7 @@ async def test_a_hung_loop_does_not_beat() -> None:
 
 
 @in_virtual_time
-async def test_the_latest_frame_wins() -> None:
+async def test_controller_uses_the_latest_frame() -> None:
     """Frames that come while a command is on the wire are not sent one by one."""
     async with running() as bench:
         bench.far_end.delay = 0.02
@@ -324,7 +324,7 @@ async def test_the_latest_frame_wins() -> None:
     ],
 )
 @in_virtual_time
-async def test_a_table_that_fails(
+async def test_controller_silences_when_the_table_fails(
     caplog: pytest.LogCaptureFixture, error: Exception, reason: str, logged: int
 ) -> None:
     """No answer is silence with its reason; a bug is logged once; the next touch is felt again."""
@@ -351,7 +351,9 @@ async def test_a_table_that_fails(
     ],
 )
 @in_virtual_time
-async def test_guard_refuses(excitation: Excitation, complaint: str) -> None:
+async def test_controller_silences_when_the_guard_refuses(
+    excitation: Excitation, complaint: str
+) -> None:
     """A pattern that the guard does not let through becomes a zero command, and is told."""
     async with running() as bench:
         await bench.hold(FINGER, seconds=0.1)
@@ -366,7 +368,9 @@ async def test_guard_refuses(excitation: Excitation, complaint: str) -> None:
 
 @pytest.mark.parametrize("amplifiers", [["main"], ["left", "right"]])
 @in_virtual_time
-async def test_what_came_too_fast_is_felt_as_soon_as_it_may(amplifiers: list[str]) -> None:
+async def test_controller_retries_a_pattern_when_the_rate_limit_permits(
+    amplifiers: list[str],
+) -> None:
     """Two sets a second: the third touch is refused, and half a second after it is felt, resting.
 
     Nothing is asked in vain before; and a finger that has left meanwhile is not felt any more.
@@ -403,7 +407,7 @@ async def test_what_came_too_fast_is_felt_as_soon_as_it_may(amplifiers: list[str
 
 
 @in_virtual_time
-async def test_an_era_that_the_rig_has_not() -> None:
+async def test_controller_silences_for_an_unknown_era() -> None:
     """A table that drives an unknown ERA makes silence, not half a pattern."""
     async with running() as bench:
         bench.table.excitation = {"SW": Tone(110.0, 1e-6), "XX": Tone(110.0, 1e-6)}
@@ -413,7 +417,7 @@ async def test_an_era_that_the_rig_has_not() -> None:
 
 
 @in_virtual_time
-async def test_silence_is_not_sent_twice() -> None:
+async def test_controller_sends_no_silence_twice() -> None:
     """From one silence to another, for another reason, costs nothing but the telling."""
     async with running() as bench:
         bench.table.excitation = InputError("nothing is felt there")
@@ -424,7 +428,7 @@ async def test_silence_is_not_sent_twice() -> None:
 
 
 @in_virtual_time
-async def test_nan_touch() -> None:
+async def test_controller_rejects_a_touch_at_nan() -> None:
     """A touch that is nowhere sends nothing and is counted."""
     async with running() as bench:
         before = len(bench.far_end.sets())
@@ -435,7 +439,7 @@ async def test_nan_touch() -> None:
 
 
 @in_virtual_time
-async def test_an_observer_that_fails(caplog: pytest.LogCaptureFixture) -> None:
+async def test_controller_survives_a_failing_observer(caplog: pytest.LogCaptureFixture) -> None:
     """Whatever an observer raises is logged, and the finger feels what it should."""
 
     def fail(*_: object) -> None:
@@ -463,7 +467,7 @@ class FailingSource(TouchSource):
 
 
 @in_virtual_time
-async def test_a_source_that_fails(caplog: pytest.LogCaptureFixture) -> None:
+async def test_controller_survives_a_failing_source(caplog: pytest.LogCaptureFixture) -> None:
     """A source that breaks is told; its finger expires; other sources go on."""
     async with running(sources=[FailingSource()]) as bench:
         await asyncio.sleep(0.2)
@@ -478,7 +482,7 @@ async def test_a_source_that_fails(caplog: pytest.LogCaptureFixture) -> None:
 
 @pytest.mark.parametrize("ago", [5.0, 0.146])
 @in_virtual_time
-async def test_a_finger_that_is_overdue_amid_a_slow_answer_is_silenced_as_one_that_lifts(
+async def test_controller_silences_a_timeout_while_a_reply_is_awaited(
     ago: float,
 ) -> None:
     """Nobody waits for an answer to what is stale: 8 ms after the lease has ended, zero goes out.
@@ -502,7 +506,7 @@ async def test_a_finger_that_is_overdue_amid_a_slow_answer_is_silenced_as_one_th
 
 
 @in_virtual_time
-async def test_arming_again_gives_no_heartbeat_up() -> None:
+async def test_arm_aborts_no_heartbeat() -> None:
     """Arm has silenced all: a heartbeat that waited behind it gets its answer, as slow as that is.
 
     Each answer takes 20 ms, and nothing is asked before it has come.
@@ -524,7 +528,7 @@ async def test_arming_again_gives_no_heartbeat_up() -> None:
 
 
 @in_virtual_time
-async def test_a_finger_from_before_the_arming_that_gets_overdue_amid_a_slow_answer() -> None:
+async def test_controller_times_out_a_finger_from_before_arming() -> None:
     """Its lease is watched from the arming on: 8 ms after it has ended, zero goes out."""
     loop = asyncio.get_running_loop()
     async with running() as bench:

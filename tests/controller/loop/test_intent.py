@@ -28,7 +28,7 @@ def wanted(source: NewestBuzzes, *ids: int) -> list[int]:
         ([(1, 2), (2,), ()], [[2], [2], []]),  # another one's lift changes nothing
     ],
 )
-def test_the_newest_contact_is_the_target(
+def test_newest_buzzes_targets_the_newest_contact(
     steps: list[tuple[int, ...]], targets: list[list[int]]
 ) -> None:
     """From contacts to target, step by step."""
@@ -36,7 +36,7 @@ def test_the_newest_contact_is_the_target(
     assert [wanted(source, *ids) for ids in steps] == targets
 
 
-def test_it_is_wanted_at_the_given_level_for_as_long_as_it_is_down() -> None:
+def test_newest_buzzes_keeps_its_level() -> None:
     """None is for as strongly as the neighbours allow; nothing is to be asked again for."""
     for level in (17.0, None):
         intent = NewestBuzzes(level).intent((at(1),), 0.0)
@@ -44,7 +44,7 @@ def test_it_is_wanted_at_the_given_level_for_as_long_as_it_is_down() -> None:
         assert intent.until is None
 
 
-def test_it_says_why_nobody_is_to_feel_anything() -> None:
+def test_newest_buzzes_gives_a_reason_for_no_target() -> None:
     """After a lift another reason than on an empty plate."""
     source = NewestBuzzes()
     assert source.intent((), 0.0).reason == NO_CONTACTS
@@ -56,6 +56,6 @@ def test_it_says_why_nobody_is_to_feel_anything() -> None:
 @pytest.mark.parametrize(
     ("until", "due"), [(None, None), (7.0, 7.0), (3.0, 5.001), (math.nan, 5.001)]
 )
-def test_a_wish_runs_out(until: float | None, due: float | None) -> None:
+def test_due_of_an_expired_intent_is_later(until: float | None, due: float | None) -> None:
     """The loop comes back when it does; one that has run out does not keep it busy."""
     assert HapticIntent((), until=until).due(5.0) == due

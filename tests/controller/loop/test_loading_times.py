@@ -10,7 +10,7 @@ def pause_after(times: LoadingTimes, now: float) -> float:
     return next(half / 2 for half in range(10_000) if times.problem(now + half / 2) is None)
 
 
-def test_three_slow_ones_in_a_row_are_too_many() -> None:
+def test_three_slow_loadings_in_a_row_pause_loading() -> None:
     """One in time between them, and it is counted anew; just as long as allowed is in time."""
     times = LoadingTimes(FAST)
     for duration in (SLOW, SLOW, FAST, SLOW, SLOW):
@@ -22,7 +22,7 @@ def test_three_slow_ones_in_a_row_are_too_many() -> None:
     assert pause_after(times, 5.0) == FIRST_PAUSE
 
 
-def test_pauses_grow_to_a_bound_while_it_stays_slow() -> None:
+def test_pauses_double_up_to_the_maximum() -> None:
     """Each attempt costs one slow loading only: 30, 60, 120, 240, 480, 480 s."""
     times, now, pauses = LoadingTimes(FAST), 0.0, []
     times.note(SLOW, now=now)
@@ -34,7 +34,7 @@ def test_pauses_grow_to_a_bound_while_it_stays_slow() -> None:
     assert pauses == [30.0, 60.0, 120.0, 240.0, MAX_PAUSE, MAX_PAUSE]
 
 
-def test_a_wire_that_is_fast_again_is_as_it_was() -> None:
+def test_three_loadings_in_time_reset_the_pause() -> None:
     """After three in time a slow one is a hiccup again, and the pause is the first one."""
     times = LoadingTimes(FAST)
     for _ in range(3):
@@ -46,7 +46,7 @@ def test_a_wire_that_is_fast_again_is_as_it_was() -> None:
     assert pause_after(times, FIRST_PAUSE) == FIRST_PAUSE
 
 
-def test_two_in_time_are_not_yet_trusted() -> None:
+def test_two_loadings_in_time_keep_the_pause() -> None:
     """A wire that is fast for a moment is left at its first slow loading, for twice as long."""
     times = LoadingTimes(FAST)
     for _ in range(3):

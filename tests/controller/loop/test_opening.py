@@ -15,7 +15,7 @@ from virtual_loop import in_virtual_time
 
 
 @in_virtual_time
-async def test_a_table_without_a_frequency_that_the_amplifiers_play_is_refused() -> None:
+async def test_open_refuses_a_table_without_playable_frequencies() -> None:
     """Before anything is armed, with what both of them have; nothing stays open."""
     link = Link(channels=4)
     link.amplifier.capabilities = replace(link.amplifier.capabilities, frequency_min=400.0)

@@ -45,7 +45,7 @@ def loaded(link: Link) -> list[Any]:
 
 
 @in_virtual_time
-async def test_a_touch_brings_its_onset(link: Link, shapes: Shapes) -> None:
+async def test_touch_starts_along_its_onset(link: Link, shapes: Shapes) -> None:
     """Knots of the driven ERA as the table found them, in strokes; the last is the command's own.
 
     By hand: lines from 0 to level 0.2 at 90 degrees, 105 ms long.
@@ -73,7 +73,7 @@ async def test_a_touch_brings_its_onset(link: Link, shapes: Shapes) -> None:
 
 
 @in_virtual_time
-async def test_brakes_follow_once_it_has_settled(link: Link, shapes: Shapes) -> None:
+async def test_endings_are_loaded_once_the_onset_is_over(link: Link, shapes: Shapes) -> None:
     """The same tone goes on undisturbed, now with an ending; nobody is told of another pattern."""
     async with running(far_ends=[link], timing=shapes) as bench:
         await bench.hold(FINGER, OTHER, seconds=0.1)
@@ -99,7 +99,7 @@ async def test_brakes_follow_once_it_has_settled(link: Link, shapes: Shapes) -> 
 
 
 @in_virtual_time
-async def test_a_brake_that_there_is_not_is_looked_for_once(link: Link, shapes: Shapes) -> None:
+async def test_ending_is_computed_once_when_there_is_none(link: Link, shapes: Shapes) -> None:
     """Where no ending is found for what plays: the loop does not come back to it at each turn."""
     looked = 0
 
@@ -116,7 +116,7 @@ async def test_a_brake_that_there_is_not_is_looked_for_once(link: Link, shapes: 
 
 
 @in_virtual_time
-async def test_a_lifted_target_ends_by_its_brake(link: Link, shapes: Shapes) -> None:
+async def test_lifted_target_fades_along_its_ending(link: Link, shapes: Shapes) -> None:
     """Along the knots while another finger stays; it is silence for whoever watches."""
     async with running(far_ends=[link], timing=shapes) as bench:
         await bench.hold(OTHER, FINGER, seconds=0.3)
@@ -133,7 +133,7 @@ async def test_a_lifted_target_ends_by_its_brake(link: Link, shapes: Shapes) -> 
 
 @pytest.mark.parametrize("held", [0.05, 0.3])
 @in_virtual_time
-async def test_the_last_finger_up_needs_no_brake(link: Link, shapes: Shapes, held: float) -> None:
+async def test_last_lift_skips_the_ending(link: Link, shapes: Shapes, held: float) -> None:
     """Zero at once and within 20 ms, whether the onset is over or not."""
     async with running(far_ends=[link], timing=shapes) as bench:
         await bench.hold(FINGER, seconds=held)
@@ -144,7 +144,7 @@ async def test_the_last_finger_up_needs_no_brake(link: Link, shapes: Shapes, hel
 
 
 @in_virtual_time
-async def test_the_last_finger_up_ends_a_brake_too(link: Link, shapes: Shapes) -> None:
+async def test_last_lift_interrupts_an_ending(link: Link, shapes: Shapes) -> None:
     """The target lifts, 5 ms later the other finger: silent 20 ms after that, not 35."""
     async with running(far_ends=[link], timing=shapes) as bench:
         await bench.hold(OTHER, FINGER, seconds=0.3)
@@ -157,7 +157,7 @@ async def test_the_last_finger_up_ends_a_brake_too(link: Link, shapes: Shapes) -
 
 
 @in_virtual_time
-async def test_no_brake_before_it_has_settled(link: Link, shapes: Shapes) -> None:
+async def test_lift_before_the_onset_is_over_skips_the_ending(link: Link, shapes: Shapes) -> None:
     """A brake leads from the full level; lifted half way up the target fades along 20 ms."""
     async with running(far_ends=[link], timing=shapes) as bench:
         await bench.hold(OTHER, FINGER, seconds=0.05)
@@ -189,7 +189,7 @@ async def test_silence_does_not_wait_for_envelopes(link: Link, shapes: Shapes) -
 
 
 @in_virtual_time
-async def test_what_runs_on_has_no_new_onset(link: Link, shapes: Shapes) -> None:
+async def test_continued_tone_has_no_onset(link: Link, shapes: Shapes) -> None:
     """A finger that slides on feels the same frequency without a gap, and gets its brake anew."""
     async with running(far_ends=[link], timing=shapes) as bench:
         await bench.hold(FINGER, OTHER, seconds=0.2)
@@ -206,7 +206,7 @@ async def test_what_runs_on_has_no_new_onset(link: Link, shapes: Shapes) -> None
 
 
 @in_virtual_time
-async def test_a_brake_is_not_another_patterns(link: Link, shapes: Shapes) -> None:
+async def test_ending_belongs_to_its_own_pattern(link: Link, shapes: Shapes) -> None:
     """Lifted right after it slid on: what plays now has no brake yet, and fades."""
     async with running(far_ends=[link], timing=shapes) as bench:
         await bench.hold(OTHER, FINGER, seconds=0.2)
@@ -219,7 +219,7 @@ async def test_a_brake_is_not_another_patterns(link: Link, shapes: Shapes) -> No
 
 
 @in_virtual_time
-async def test_a_fault_knows_no_brake(
+async def test_failure_skips_the_ending(
     link: Link, shapes: Shapes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever goes wrong in a decision, all fall silent along the ramp."""
@@ -242,7 +242,7 @@ class Always:
 
 
 @in_virtual_time
-async def test_nothing_is_loaded_or_played_after_a_disarm(link: Link, shapes: Shapes) -> None:
+async def test_disarm_ends_loading_and_playing(link: Link, shapes: Shapes) -> None:
     """Disarmed while the first of two onsets is loaded: it is the last that the amplifier hears."""
     link.delay = lambda request: 0.005 if isinstance(request, LoadEnvelope) else 0.0
     async with running(far_ends=[link], timing=shapes) as bench:
@@ -273,7 +273,7 @@ def on_a_slow_wire(link: Link) -> None:
 
 @pytest.mark.parametrize("poorer", [without_envelopes, with_few_knots, on_a_slow_wire])
 @in_virtual_time
-async def test_where_envelopes_are_not_possible_ramps_serve(
+async def test_ramps_replace_envelopes_when_amplifiers_cannot_play_them(
     link: Link, shapes: Shapes, poorer: Callable[[Link], None]
 ) -> None:
     """None is loaded, and who watches is told of the ramp and its contrast."""
@@ -289,7 +289,7 @@ async def test_where_envelopes_are_not_possible_ramps_serve(
 
 
 @in_virtual_time
-async def test_a_wire_that_turns_out_slow_gets_ramps(
+async def test_ramps_replace_envelopes_when_loading_is_slow(
     link: Link, shapes: Shapes, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Three slow loadings in a row; a single one is a hiccup. After 30 s it is tried again."""
@@ -320,7 +320,7 @@ async def test_a_wire_that_turns_out_slow_gets_ramps(
 
 
 @in_virtual_time
-async def test_an_onset_that_the_guard_refuses_is_a_ramp(link: Link, shapes: Shapes) -> None:
+async def test_ramp_replaces_an_onset_that_the_guard_refuses(link: Link, shapes: Shapes) -> None:
     """A knot beyond full stroke is never on the wire; the pattern itself is played."""
     shapes.largest = 6.0
     async with running(far_ends=[link], timing=shapes) as bench:
@@ -333,7 +333,7 @@ async def test_an_onset_that_the_guard_refuses_is_a_ramp(link: Link, shapes: Sha
 
 
 @in_virtual_time
-async def test_everything_is_prepared_before_the_first_touch(link: Link, shapes: Shapes) -> None:
+async def test_open_prepares_table_and_shaping(link: Link, shapes: Shapes) -> None:
     """Mode and frequencies, when the controller is opened."""
     bench = make_bench(far_ends=[link], timing=shapes)
     await bench.controller.open()
@@ -343,7 +343,7 @@ async def test_everything_is_prepared_before_the_first_touch(link: Link, shapes:
 
 
 @in_virtual_time
-async def test_several_amplifiers_start_together(shapes: Shapes) -> None:
+async def test_amplifiers_start_onsets_together(shapes: Shapes) -> None:
     """Each has its ERA's envelope before any is committed."""
     links = [Link(), Link()]
     for link in links:
@@ -369,7 +369,7 @@ class Click:
 
 
 @in_virtual_time
-async def test_a_wish_that_runs_out_ends_by_itself(link: Link) -> None:
+async def test_expired_intent_ends_its_pattern(link: Link) -> None:
     """The loop wakes at its time, though nobody moves and no heartbeat is due then."""
     async with running(far_ends=[link], intent_source=Click()) as bench:
         begin = asyncio.get_running_loop().time()
@@ -382,7 +382,7 @@ async def test_a_wish_that_runs_out_ends_by_itself(link: Link) -> None:
 
 
 @in_virtual_time
-async def test_several_targets_are_told_with_what_each_feels(link: Link) -> None:
+async def test_applied_has_a_prediction_per_target(link: Link) -> None:
     """Two fingers at once ask, both get it."""
     async with running(far_ends=[link], intent_source=Click()) as bench:
         bench.touch(FINGER, OTHER)
@@ -394,7 +394,7 @@ async def test_several_targets_are_told_with_what_each_feels(link: Link) -> None
 
 
 @in_virtual_time
-async def test_wishes_that_fail_silence_all_and_recover(
+async def test_failing_intent_source_silences_until_it_recovers(
     link: Link, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What plays ends along the ramp at once, heartbeats go on; then it is as if nothing was."""
@@ -415,7 +415,7 @@ async def test_wishes_that_fail_silence_all_and_recover(
 
 
 @in_virtual_time
-async def test_a_contact_is_new_only_once_whatever_the_table_does(link: Link) -> None:
+async def test_contact_is_new_only_once_when_the_table_fails(link: Link) -> None:
     """The table fails for a second finger; when that one lifts nobody is the newest any more."""
     async with running(far_ends=[link]) as bench:
         bench.touch(FINGER)

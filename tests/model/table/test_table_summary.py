@@ -136,7 +136,7 @@ def test_the_numbers_of_a_table(table, monkeypatch):
     weak = WeakCells(table.grid, np.zeros((12, 2)), median_db=values, tenth_db=values - 0.1)
     summary = summarize(quieter, weak)
     assert asked == [1, 2, 3]
-    assert summary["drive_frequencies_hz"] == [60.0, 250.0]
+    assert summary["frequency_range_hz"] == [60.0, 250.0]
     expected = {
         "dead_zone_share": 0.5,
         "least_level_at_full_stroke_db_sl": levels[0] + 20 * np.log10(lower),

@@ -35,7 +35,7 @@ class Deaf(Sensors):
 
 
 @in_virtual_time
-async def test_a_level_that_is_not_played_ends_the_check() -> None:
+async def test_channel_sweep_ends_when_a_level_is_not_played() -> None:
     """By half too quiet it would pass for a dead channel: told with both levels, and disarmed."""
     bench = make_bench()
     far_end = bench.far_end

@@ -66,7 +66,9 @@ def rig() -> Rig:
         ([(1e-4, 0.01), (1.0, 0.01)], "switched"),
     ],
 )
-def test_the_richest_mode_that_all_can_play(steps: list[tuple[float, float]], mode: str) -> None:
+def test_capabilities_choose_the_best_common_drive_mode(
+    steps: list[tuple[float, float]], mode: str
+) -> None:
     """By the steps of level and phase [degrees] of each amplifier."""
     left, right = (
         Opened(replace(FINE, level_step=level, phase_step=phase)) for level, phase in steps
@@ -76,7 +78,7 @@ def test_the_richest_mode_that_all_can_play(steps: list[tuple[float, float]], mo
     assert capabilities.playable[-1] == mode
 
 
-def test_a_poorer_mode_may_be_asked_for_but_no_richer_one() -> None:
+def test_capabilities_refuse_an_unplayable_drive_mode() -> None:
     """The choice holds, or is refused with what there is."""
     plain = {name: Opened(replace(FINE, phase_step=360.0)) for name in ("left", "right")}
     assert playback_capabilities(rig(), plain, drive_mode="switched").drive_mode == "switched"
@@ -84,7 +86,7 @@ def test_a_poorer_mode_may_be_asked_for_but_no_richer_one() -> None:
         playback_capabilities(rig(), plain, drive_mode="phased")
 
 
-def test_frequencies_and_amplitudes_are_the_least_of_all() -> None:
+def test_capabilities_are_the_tightest_limits() -> None:
     """Of the rig's limits and every amplifier."""
     left = Opened(replace(FINE, frequency_min=50.0, level_max=0.5))
     right = Opened(replace(FINE, frequency_max=300.0))
@@ -111,19 +113,19 @@ def test_frequencies_and_amplitudes_are_the_least_of_all() -> None:
         (Opened(replace(FINE, envelope_step_min=0.01)), Opened(), Shaping(False, False)),
     ],
 )
-def test_envelopes_that_all_play_and_that_are_loaded_in_time(
+def test_shaping_needs_capability_and_loading_time(
     left: Opened, right: Opened, shaping: Shaping
 ) -> None:
     """Knots, slots and steps of every amplifier, and 20 ms for every wire."""
     assert shaping_of(rig(), {"left": left, "right": right}, within=0.020) == shaping
 
 
-def test_no_time_is_no_envelopes() -> None:
+def test_shaping_is_plain_without_loading_time() -> None:
     """Where a touch may not wait at all, ramps serve, however fast the wire is."""
     assert not shaping_of(rig(), {"left": Opened(), "right": Opened()}, within=0.0)
 
 
-def test_envelopes_on_the_wire_by_hand() -> None:
+def test_wire_envelopes_by_hand() -> None:
     """Levels in strokes, phases in degrees, without the last knot; a slot each, onsets first."""
     pattern = Pattern(
         {"A": Tone(110.0, 5e-5)},
@@ -149,7 +151,7 @@ def test_envelopes_on_the_wire_by_hand() -> None:
     )
 
 
-def test_a_knot_at_full_stroke_is_not_beyond_it() -> None:
+def test_wire_envelopes_round_full_stroke_to_one() -> None:
     """What rounding adds in the search for knots would be refused by every guard."""
     full = complex(1e-4 * math.cos(1.0), 1e-4 * math.sin(1.0)) * (1 + 1e-12)
     pattern = Pattern({}, 0.02, 20.0, None, None, onset={"A": Envelope(110.0, 0, (full, 0))})

@@ -32,7 +32,7 @@ RIG = Rig(
 )
 
 
-def test_by_hand() -> None:
+def test_route_by_hand() -> None:
     """20 of 100 µm is level 0.2, 20 of 50 is 0.4; pi/2 is 90°; what is not driven is silent."""
     sets = route(
         {"SW": Tone(110.0, 20e-6, math.pi / 2), "SE": Tone(250.0, 20e-6)}, RIG, token=7, ramp=0.02
@@ -73,14 +73,14 @@ def test_by_hand() -> None:
         (20 * math.pi + 0.1, math.degrees(0.1)),
     ],
 )
-def test_phase_is_wrapped(radians: float, degrees: float) -> None:
+def test_route_wraps_phases(radians: float, degrees: float) -> None:
     """Phases lie above -180° and up to 180°."""
     command = route({"SE": Tone(100.0, 1e-6, radians)}, RIG, token=1, ramp=0)["right"].commands[0]
     assert command.phase == pytest.approx(degrees)
     assert -180 < command.phase <= 180
 
 
-def test_nothing_is_limited_here() -> None:
+def test_route_applies_no_limits() -> None:
     """More than full stroke and numbers that are none go on to the guard as they are."""
     over = route({"SE": Tone(1e9, 1e-4, math.nan)}, RIG, token=1, ramp=0)["right"].commands[0]
     assert over.frequency == 1e9
@@ -88,7 +88,7 @@ def test_nothing_is_limited_here() -> None:
     assert math.isnan(over.phase)
 
 
-def test_an_era_that_the_rig_has_not() -> None:
+def test_route_refuses_an_unknown_era() -> None:
     """A pattern of another rig is refused as a whole."""
     with pytest.raises(InputError, match="got NW"):
         route({"SW": Tone(100.0, 1e-6), "NW": Tone(100.0, 1e-6)}, RIG, token=1, ramp=0)
@@ -106,7 +106,7 @@ def test_an_era_that_the_rig_has_not() -> None:
         ({"SW": Tone(250.0, 5e-6), "SE": Tone(250.0, 9e-6)}, set()),
     ],
 )
-def test_what_may_run_on_in_time(wanted: Excitation, kept: set[str]) -> None:
+def test_route_keeps_phase_only_if_all_eras_continue(wanted: Excitation, kept: set[str]) -> None:
     """A frequency runs on if only ERAs play it that do already; one that joins in restarts all."""
     playing = {name: DriveCommand(0, 110.0, 0.5) for name in ("SW", "SE")}
     sets = route(wanted, RIG, token=1, ramp=0, playing=playing)
@@ -116,7 +116,7 @@ def test_what_may_run_on_in_time(wanted: Excitation, kept: set[str]) -> None:
     assert not any(command.keep_phase for each in first.values() for command in each.commands)
 
 
-def test_back_to_eras() -> None:
+def test_drive_of_eras_by_hand() -> None:
     """What the amplifiers play is told by ERA, without the silent ones."""
     achieved = {
         "left": Achieved(7, (DriveCommand(0, 40.0, 0.0), DriveCommand(1, 110.01, 0.1999))),

@@ -25,7 +25,7 @@ from virtual_sockets import in_virtual_time_on_sockets
         st.tuples(st.integers(0, 10**8), st.binary(min_size=1, max_size=40)), min_size=1, max_size=9
     )
 )
-def test_round_trip(
+def test_capture_round_trip(
     tmp_path_factory: pytest.TempPathFactory, sent: list[tuple[int, bytes]]
 ) -> None:
     """What was written to a microsecond comes back, malformed datagrams too."""
@@ -35,7 +35,7 @@ def test_round_trip(
     assert read_capture(path) == datagrams
 
 
-def test_golden_file(tmp_path: Path) -> None:
+def test_read_capture_reads_the_documented_format(tmp_path: Path) -> None:
     """The format as documented, comments included, is read."""
     path = tmp_path / "golden.tuio"
     path.write_text(f"{HEADER}\n# two fingers\n0 2f00ff\n1.5 0a\n", encoding="ascii")
@@ -61,7 +61,7 @@ def test_golden_file(tmp_path: Path) -> None:
         (f"{HEADER}\n0 é\n", "bad.tuio"),
     ],
 )
-def test_bad_captures(tmp_path: Path, text: str, place: str) -> None:
+def test_read_capture_names_file_and_line(tmp_path: Path, text: str, place: str) -> None:
     """Each error names the file and the line."""
     path = tmp_path / "bad.tuio"
     path.write_text(text, encoding="utf-8")
@@ -70,7 +70,7 @@ def test_bad_captures(tmp_path: Path, text: str, place: str) -> None:
     assert str(caught.value).startswith(str(path))
 
 
-def test_missing_capture(tmp_path: Path) -> None:
+def test_read_capture_refuses_a_missing_file(tmp_path: Path) -> None:
     """A missing file is an input error."""
     with pytest.raises(InputError, match=r"No such file.*path"):
         read_capture(tmp_path / "missing.tuio")
@@ -85,7 +85,9 @@ def test_missing_capture(tmp_path: Path) -> None:
         [Datagram(0.0, b"")],
     ],
 )
-def test_only_readable_captures_are_written(tmp_path: Path, datagrams: list[Datagram]) -> None:
+def test_write_capture_refuses_unreadable_captures(
+    tmp_path: Path, datagrams: list[Datagram]
+) -> None:
     """What the reader would refuse is refused when it is written, and no file is left."""
     path = tmp_path / "bad.tuio"
     with pytest.raises(InputError, match="datagram"):
@@ -94,7 +96,7 @@ def test_only_readable_captures_are_written(tmp_path: Path, datagrams: list[Data
 
 
 @in_virtual_time_on_sockets
-async def test_replay_over_udp() -> None:
+async def test_replay_capture_keeps_times_over_udp() -> None:
     """Datagrams arrive unchanged, each at its own time."""
     loop = asyncio.get_running_loop()
     start = loop.time()

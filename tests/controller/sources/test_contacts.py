@@ -33,14 +33,16 @@ def ids(tracker: ContactTracker) -> list[int]:
         ((0.25, 0.75), (0.075, 0.05)),
     ],
 )
-def test_places(touch: tuple[float, float], place: tuple[float, float]) -> None:
+def test_tracker_maps_touches_to_the_plate(
+    touch: tuple[float, float], place: tuple[float, float]
+) -> None:
     """Touch y runs down from the top left corner, plate y up from the south-west one."""
     tracker = ContactTracker(PLATE)
     (contact,) = tracker.update(frame(0.0, (1, *touch))).down
     assert (contact.x, contact.y) == pytest.approx(place)
 
 
-def test_down_moved_up() -> None:
+def test_tracker_reports_down_moved_up() -> None:
     """A contact comes, moves and goes, each told once, and remembers when it came."""
     tracker = ContactTracker(PLATE)
     change = tracker.update(frame(1.0, (7, 0.5, 0.5)))
@@ -53,7 +55,7 @@ def test_down_moved_up() -> None:
     assert tracker.contacts == ()
 
 
-def test_order_of_arrival() -> None:
+def test_tracker_keeps_the_order_of_arrival() -> None:
     """The newest contact is the last, whatever order frames name them in and however they move."""
     tracker = ContactTracker(PLATE)
     tracker.update(frame(0.0, (5, 0.1, 0.1)))
@@ -74,7 +76,7 @@ def test_order_of_arrival() -> None:
         (0.5, 1.001, "off_plate"),
     ],
 )
-def test_rejected_touches(x: float, y: float, reason: str) -> None:
+def test_tracker_rejects_invalid_touches(x: float, y: float, reason: str) -> None:
     """A place that is none makes no contact, ends the one it was of, and is counted."""
     tracker = ContactTracker(PLATE)
     tracker.update(frame(0.0, (1, 0.5, 0.5), (2, 0.5, 0.5)))
@@ -85,7 +87,7 @@ def test_rejected_touches(x: float, y: float, reason: str) -> None:
     assert tracker.rejected == {reason: 2}
 
 
-def test_duplicates() -> None:
+def test_tracker_rejects_duplicates() -> None:
     """Of two touches with one id in a frame the last holds, and it is counted."""
     tracker = ContactTracker(PLATE)
     change = tracker.update(frame(0.0, (1, 0.1, 0.5), (1, 0.9, 0.5)))
@@ -93,7 +95,7 @@ def test_duplicates() -> None:
     assert change.rejected == ("twice",)
 
 
-def test_no_more_than_ten() -> None:
+def test_tracker_accepts_ten_contacts() -> None:
     """The eleventh contact is refused, the ten that came first stay, and it gets a place later."""
     tracker = ContactTracker(PLATE)
     many = [(id, 0.5, 0.5) for id in range(11)]
@@ -105,7 +107,7 @@ def test_no_more_than_ten() -> None:
     assert ids(tracker) == list(range(1, 11))
 
 
-def test_lease() -> None:
+def test_tracker_lifts_contacts_after_the_timeout() -> None:
     """A source without news for 150 ms has all its contacts lifted, others keep theirs."""
     tracker = ContactTracker(PLATE)
     tracker.update(frame(10.0, (1, 0.5, 0.5), (2, 0.5, 0.5)))
@@ -121,7 +123,7 @@ def test_lease() -> None:
 
 
 @pytest.mark.parametrize("time", [math.nan, math.inf])
-def test_a_frame_without_a_time(time: float) -> None:
+def test_tracker_rejects_frames_without_a_time(time: float) -> None:
     """Touches that no lease could end make no contact."""
     tracker = ContactTracker(PLATE)
     tracker.update(frame(0.0, (1, 0.5, 0.5)))
@@ -130,7 +132,7 @@ def test_a_frame_without_a_time(time: float) -> None:
     assert tracker.contacts == ()
 
 
-def test_news_from_the_future() -> None:
+def test_tracker_times_out_frames_from_the_future() -> None:
     """A frame that claims to be of the future is leased from when it was first looked at."""
     tracker = ContactTracker(PLATE)
     tracker.update(frame(1e6, (1, 0.5, 0.5)))
@@ -148,7 +150,7 @@ FRAMES = st.builds(
 
 
 @given(st.lists(FRAMES | st.floats(0, 2)))
-def test_any_sequence(events: list[TouchFrame | float]) -> None:
+def test_tracker_invariants_for_any_sequence(events: list[TouchFrame | float]) -> None:
     """Whatever comes, contacts are on the plate, bounded and each once; changes add up to them."""
     tracker = ContactTracker(PLATE)
     told: dict[ContactKey, tuple[float, float]] = {}

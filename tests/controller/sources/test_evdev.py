@@ -111,7 +111,7 @@ async def follow(
     return seen
 
 
-def test_fingers_come_move_and_go() -> None:
+def test_evdev_source_follows_fingers() -> None:
     """Each report is a frame, in shares of the panel's axes, y downwards as the kernel counts."""
     panel = PipePanel()
 
@@ -130,7 +130,7 @@ def test_fingers_come_move_and_go() -> None:
     ]
 
 
-def test_fingers_that_were_there_before() -> None:
+def test_evdev_source_starts_from_the_state_of_the_kernel() -> None:
     """What rests on the panel when it is opened is there at once, by the kernel's own state."""
     panel = PipePanel()
     panel.state = {0: EMPTY, 1: SlotState(5, 500, 250)}
@@ -144,7 +144,7 @@ def test_fingers_that_were_there_before() -> None:
     assert [touches for _, touches in seen] == [{5: (0.5, 0.5)}, {5: (0.6, 0.5)}]
 
 
-def test_a_resting_finger_is_told_again() -> None:
+def test_evdev_source_repeats_resting_fingers() -> None:
     """Every 50 ms the kernel is asked, well within the 150 ms after which a contact counts as gone.
 
     If it knows of a lift that no event told, the finger is lifted then.
@@ -168,7 +168,7 @@ def test_a_resting_finger_is_told_again() -> None:
     ]
 
 
-def test_lost_events() -> None:
+def test_evdev_source_resyncs_after_lost_events() -> None:
     """After SYN_DROPPED the kernel's state counts, as its documentation asks for."""
     panel = PipePanel()
 
@@ -184,7 +184,7 @@ def test_lost_events() -> None:
 
 
 @pytest.mark.parametrize("notices", ["by reading", "by asking"])
-def test_a_panel_that_is_pulled_out(notices: str) -> None:
+def test_evdev_source_reopens_an_unplugged_panel(notices: str) -> None:
     """Its fingers are lifted when it goes; it is waited for, and followed when it is back."""
     first, second = PipePanel(), PipePanel()
     first.state = {0: SlotState(7, 0, 0), 1: EMPTY}
@@ -206,14 +206,14 @@ def test_a_panel_that_is_pulled_out(notices: str) -> None:
     assert seen[1][0] <= 0.06
 
 
-def test_request_numbers() -> None:
+def test_ioctl_request_numbers() -> None:
     """The numbers that the kernel's header gives on x86-64 and Arm, as strace shows them."""
     assert get_axis(0x35) == 0x80184575  # EVIOCGABS(ABS_MT_POSITION_X)
     assert get_slots(44) == 0x802C450A  # EVIOCGMTSLOTS(44)
     assert GRAB == 0x40044590  # EVIOCGRAB
 
 
-def test_events_are_whole() -> None:
+def test_parse_events_skips_incomplete_events() -> None:
     """Type, code and value of each event; what is no whole event at the end is left out."""
     assert list(parse_events(raw("x -5") + b"\0" * 10)) == [
         InputEvent(3, 0x35, -5),
@@ -225,7 +225,7 @@ def test_events_are_whole() -> None:
     ("path", "words"),
     [("/dev/null", "evtest"), ("/dev/input/event987", "by-id")],
 )
-def test_what_is_no_panel(path: str, words: str) -> None:
+def test_input_device_refuses_what_is_no_panel(path: str, words: str) -> None:
     """A file that is no panel, and none at all: an error that says so, and no open descriptor."""
     before = sorted(Path("/proc/self/fd").iterdir())
     with pytest.raises(InputError, match=words):
@@ -247,7 +247,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch, *, width: int, grab: OSError | None 
     monkeypatch.setattr("controller.sources.input_device.fcntl.ioctl", ioctl)
 
 
-def test_a_panel_that_another_program_keeps_to_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_input_device_reports_a_grabbed_panel(monkeypatch: pytest.MonkeyPatch) -> None:
     """EVIOCGRAB is refused with EBUSY then: told with how to find that one; nothing stays open."""
     kernel(monkeypatch, width=1000, grab=OSError(errno.EBUSY, "Device or resource busy"))
     InputDevice("/dev/null").close()
@@ -257,7 +257,7 @@ def test_a_panel_that_another_program_keeps_to_itself(monkeypatch: pytest.Monkey
     assert sorted(Path("/proc/self/fd").iterdir()) == before
 
 
-def test_an_axis_without_a_range_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_input_device_refuses_an_empty_axis(monkeypatch: pytest.MonkeyPatch) -> None:
     """As of devices that name the axis and do not fill it in; nobody divides by its width."""
     kernel(monkeypatch, width=0)
     with pytest.raises(InputError, match=r"/dev/null: .*0x35.*0 and 0"):
@@ -267,7 +267,7 @@ def test_an_axis_without_a_range_is_none(monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.mark.parametrize(
     "url", ["evdev:", "evdev:?grab=yes", "evdev:/dev/x?grab=no", "evdev:/dev/x?grab=yes&a=b"]
 )
-def test_urls_that_say_something_else(url: str) -> None:
+def test_evdev_source_refuses_bad_urls(url: str) -> None:
     """They are refused with what is expected."""
     with pytest.raises(InputError, match=r"evdev:PATH.grab=yes"):
         open_source(url)

@@ -72,7 +72,7 @@ def shown(frames: list[TouchFrame]) -> list[tuple[float, dict[int, tuple[float, 
     ]
 
 
-def test_two_fingers(tmp_path: Path) -> None:
+def test_read_evemu_follows_two_fingers(tmp_path: Path) -> None:
     """Slots are followed from down to up; values left out have not changed; times start at 0 s."""
     path = write(
         tmp_path,
@@ -91,13 +91,13 @@ def test_two_fingers(tmp_path: Path) -> None:
     ]
 
 
-def test_a_second_tap_at_the_same_place(tmp_path: Path) -> None:
+def test_read_evemu_keeps_coordinates_of_the_slot(tmp_path: Path) -> None:
     """The kernel leaves out a coordinate that did not change since the slot's last contact."""
     path = write(tmp_path, (0, "id 1 x 100 y 0"), (1, "id -1"), (2, "id 2 y 50"))
     assert shown(read_evemu(path))[-1] == (2.0, {2: (0.1, 0.75)})
 
 
-def test_the_slot_at_the_start_is_in_the_header(tmp_path: Path) -> None:
+def test_read_evemu_starts_with_the_slot_of_the_header(tmp_path: Path) -> None:
     """Events before the first slot event belong to the slot that the header says is current."""
     path = write(
         tmp_path,
@@ -112,7 +112,7 @@ def test_the_slot_at_the_start_is_in_the_header(tmp_path: Path) -> None:
     ]
 
 
-def test_a_contact_that_was_already_down(tmp_path: Path) -> None:
+def test_read_evemu_follows_a_contact_that_was_already_down(tmp_path: Path) -> None:
     """A slot that moves without having begun is followed once its place is known, and lifted."""
     path = write(
         tmp_path, (0, "x 100"), (1, "y 0"), (2, "slot 1 id 4 x 500 y 0"), (3, "slot 0 id -1")
@@ -126,13 +126,13 @@ def test_a_contact_that_was_already_down(tmp_path: Path) -> None:
     assert frames[3][1] == {4: (0.5, 0.5)}
 
 
-def test_position_after_the_lift_is_no_contact(tmp_path: Path) -> None:
+def test_read_evemu_ignores_positions_after_the_lift(tmp_path: Path) -> None:
     """A slot that says where its lifted finger was stays empty."""
     path = write(tmp_path, (0, "id 1 x 100 y 0"), (1, "id -1"), (2, "x 200"))
     assert shown(read_evemu(path))[-1] == (2.0, {})
 
 
-def test_a_tap_within_one_report(tmp_path: Path) -> None:
+def test_read_evemu_sees_a_tap_within_one_report(tmp_path: Path) -> None:
     """A contact that came and went within one report is seen down and up."""
     path = write(tmp_path, (0, "id 1 x 100 y 0 id -1"), (1, "id 2 x 300 y 0 id -1 id 3 x 400"))
     assert shown(read_evemu(path)) == [
@@ -144,7 +144,7 @@ def test_a_tap_within_one_report(tmp_path: Path) -> None:
     ]
 
 
-def test_lifted_and_back_under_the_same_id(tmp_path: Path) -> None:
+def test_read_evemu_sees_a_lift_within_one_report(tmp_path: Path) -> None:
     """A lift within one report is seen even if the same id comes back in it."""
     path = write(tmp_path, (0, "id 1 x 100 y 0"), (1, "id -1 id 1"))
     assert shown(read_evemu(path)) == [
@@ -154,13 +154,13 @@ def test_lifted_and_back_under_the_same_id(tmp_path: Path) -> None:
     ]
 
 
-def test_replaced_without_a_lift(tmp_path: Path) -> None:
+def test_read_evemu_sees_a_replaced_contact(tmp_path: Path) -> None:
     """A tracking id that follows another without -1 is another contact."""
     path = write(tmp_path, (0, "id 1 x 100 y 0"), (1, "id 2 x 200"))
     assert shown(read_evemu(path))[-1] == (1.0, {2: (0.2, 0.5)})
 
 
-def test_lost_events(tmp_path: Path) -> None:
+def test_read_evemu_lifts_all_after_lost_events(tmp_path: Path) -> None:
     """After SYN_DROPPED nothing is believed to be down until it moves, then under a new id."""
     path = write(
         tmp_path,
@@ -193,7 +193,7 @@ def test_lost_events(tmp_path: Path) -> None:
         max_size=8,
     )
 )
-def test_any_sequence_of_events(
+def test_read_evemu_invariants_for_any_events(
     tmp_path_factory: pytest.TempPathFactory, reports: list[list[tuple[str, int]]]
 ) -> None:
     """Whatever a panel reports, a frame holds no slot without its place and time never runs back.
@@ -210,7 +210,7 @@ def test_any_sequence_of_events(
     assert len(frames) >= len(reports)
 
 
-def test_ranges_from_the_desc_beside_it(tmp_path: Path) -> None:
+def test_read_evemu_takes_ranges_from_the_desc_file(tmp_path: Path) -> None:
     """A recording without ranges takes them from DEVICE.desc; the slot's value there is stale."""
     header = "# EVEMU 1.0\n"
     path = write(tmp_path, (0, "id 1 x 100 y 30"), (1, "slot 0 x 200"), header=header)
@@ -242,7 +242,7 @@ GOOD = RANGES.format(slot=0)
         ("", "ABS_MT_POSITION_X"),
     ],
 )
-def test_bad_recordings(tmp_path: Path, text: str, place: str) -> None:
+def test_read_evemu_names_file_and_line(tmp_path: Path, text: str, place: str) -> None:
     """Each error names the file and, where there is one, the line."""
     path = tmp_path / "bad.events"
     path.write_text(text, encoding="utf-8")
@@ -251,7 +251,7 @@ def test_bad_recordings(tmp_path: Path, text: str, place: str) -> None:
     assert str(caught.value).startswith(str(path))
 
 
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+def test_read_evemu_refuses_missing_and_binary_files(tmp_path: Path) -> None:
     """A missing file and one that is no text are input errors."""
     with pytest.raises(InputError, match=r"No such file.*path"):
         read_evemu(tmp_path / "missing.events")
@@ -262,7 +262,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
 
 
 @in_virtual_time
-async def test_replay_at_its_own_pace(tmp_path: Path) -> None:
+async def test_evemu_source_keeps_times(tmp_path: Path) -> None:
     """Frames come at their times; a touched panel at rest repeats itself at most 50 ms apart."""
     path = write(tmp_path, (0, "id 1 x 100 y 0"), (0.12, "x 200"), (0.14, "id -1"), (0.5, "id 2"))
     start = asyncio.get_running_loop().time()
@@ -282,7 +282,7 @@ async def test_replay_at_its_own_pace(tmp_path: Path) -> None:
     assert {frame.source for frame in delivered} == {"evemu:panel.taps.events"}
 
 
-def test_url(tmp_path: Path) -> None:
+def test_evemu_source_refuses_bad_urls(tmp_path: Path) -> None:
     """A source needs a path, and refuses a bad recording before anything is replayed."""
     with pytest.raises(InputError, match="evemu:PATH"):
         EvemuSource("evemu:")

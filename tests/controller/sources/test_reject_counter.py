@@ -7,7 +7,7 @@ import pytest
 from controller.sources.reject_counter import RejectCounter
 
 
-def test_counts_all_but_logs_once_a_second(caplog: pytest.LogCaptureFixture) -> None:
+def test_reject_counter_logs_once_per_interval(caplog: pytest.LogCaptureFixture) -> None:
     """A thousand bad datagrams within a second are all counted and make one line, as do later."""
     now = 0.0
     rejects = RejectCounter(logging.getLogger("bad input"), clock=lambda: now)

@@ -37,7 +37,7 @@ async def delivered(url: str) -> list[tuple[float, str, dict[int, tuple[float, f
     return seen
 
 
-def test_own_pace(tmp_path: Path) -> None:
+def test_replay_source_keeps_times(tmp_path: Path) -> None:
     """Frames come at their times, again every 50 ms while a finger is down, lifted in the end."""
     path = tmp_path / "taps.tuio"
     write(path, (0.0, ()), (0.2, (Touch(3, 0.5, 0.25),)), (0.32, (Touch(3, 0.75, 0.25),)))
@@ -53,7 +53,7 @@ def test_own_pace(tmp_path: Path) -> None:
     assert {source for _, source, _ in seen} == {"tuio:taps.tuio/table"}
 
 
-def test_another_pace(tmp_path: Path) -> None:
+def test_replay_source_scales_times(tmp_path: Path) -> None:
     """At twice the speed a finger is down for half the time."""
     path = tmp_path / "taps.tuio"
     write(path, (0.0, (Touch(3, 0.5, 0.25),)), (0.08, ()))
@@ -62,14 +62,14 @@ def test_another_pace(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("options", ["speed=0", "speed=fast", "speed=nan", "loop=yes", "speed"])
-def test_options_that_say_nothing(tmp_path: Path, options: str) -> None:
+def test_replay_source_refuses_bad_options(tmp_path: Path, options: str) -> None:
     """They are refused with what is expected."""
     write(tmp_path / "taps.tuio", (0.0, ()))
     with pytest.raises(InputError, match=r"\?speed=N"):
         open_source(f"replay:{tmp_path}/taps.tuio?{options}")
 
 
-def test_capture_without_touches(tmp_path: Path) -> None:
+def test_replay_source_refuses_a_capture_without_touches(tmp_path: Path) -> None:
     """Datagrams that are no TUIO leave nothing to replay, which is said."""
     write_capture(tmp_path / "noise.tuio", [Datagram(0.0, b"noise")])
     with pytest.raises(InputError, match=r"noise.tuio"):

@@ -29,7 +29,7 @@ PLATE = Plate(length=0.4, width=0.2, thickness=1e-3, material=ALUMINIUM)
         (90, "y", (1, 1), (1, 0)),
     ],
 )
-def test_turned_and_mirrored(
+def test_turned_maps_corners(
     degrees: int, mirror: str | None, top_left: tuple[int, int], top_right: tuple[int, int]
 ) -> None:
     """Where the sensor's upper corners come to lie on the plate, by turning a sheet of paper."""
@@ -39,7 +39,7 @@ def test_turned_and_mirrored(
         assert (placed.x, placed.y) == pytest.approx(place)
 
 
-def test_fit_of_a_panel_larger_than_the_plate() -> None:
+def test_fitted_by_hand() -> None:
     """A sensor 5 cm wider than the plate on each side, touched at three corners of the plate.
 
     The plate's middle is the sensor's middle, and its north-west corner is where it was touched.
@@ -57,7 +57,7 @@ def test_fit_of_a_panel_larger_than_the_plate() -> None:
         lambda m: abs(m[0] * m[4] - m[1] * m[3]) > 0.1
     )
 )
-def test_fit_finds_the_matrix(matrix: tuple[float, ...]) -> None:
+def test_fitted_recovers_any_matrix(matrix: tuple[float, ...]) -> None:
     """Four points placed by any matrix give that matrix back."""
     a, b, c, d, e, f = matrix
     truth = TouchCalibration(((a, b, c), (d, e, f)))
@@ -68,7 +68,7 @@ def test_fit_finds_the_matrix(matrix: tuple[float, ...]) -> None:
     assert [*found.matrix[0], *found.matrix[1]] == pytest.approx(matrix, abs=1e-9)
 
 
-def test_point_touched_elsewhere() -> None:
+def test_fitted_refuses_a_large_residual() -> None:
     """Of four corners one was touched 4 cm off: no fit, and the distance is told."""
     touched = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)]
     with pytest.raises(InputError, match=r"point \d .*10\.0 mm"):
@@ -86,7 +86,7 @@ def test_point_touched_elsewhere() -> None:
         ([(0, 0), (1, 0), (0, 1)], [(0, 0), (0, 0), (0, 0)], "matrix"),
     ],
 )
-def test_points_that_say_too_little(
+def test_fitted_refuses_insufficient_points(
     touched: list[tuple[float, float]], places: list[tuple[float, float]], words: str
 ) -> None:
     """They are refused, each with its reason."""
@@ -94,7 +94,7 @@ def test_points_that_say_too_little(
         fitted(touched, places, PLATE)
 
 
-def test_matrices_that_fold() -> None:
+def test_calibration_refuses_singular_matrices() -> None:
     """A sensor folded onto a line would put every finger in the same place."""
     for matrix in (((1, 0, 0), (1, 0, 0)), ((math.inf, 0, 0), (0, 1, 0))):
         with pytest.raises(InputError, match="matrix"):
@@ -103,7 +103,7 @@ def test_matrices_that_fold() -> None:
         turned(45)
 
 
-async def test_calibrated_source() -> None:
+async def test_calibrated_source_maps_touches() -> None:
     """Frames keep their source, time and ids; not finite stays so, for contacts to refuse."""
 
     class Once(TouchSource):

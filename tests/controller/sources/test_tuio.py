@@ -70,7 +70,7 @@ def counts(reader: TuioReader) -> dict[str, int]:
     return dict(reader.rejects.counts)
 
 
-def test_golden_bundle(reader: TuioReader) -> None:
+def test_reader_reads_a_golden_bundle(reader: TuioReader) -> None:
     """The bytes of a bundle, written out from the OSC 1.0 and TUIO 1.1 specifications, are read."""
 
     def element(raw: bytes) -> bytes:
@@ -90,7 +90,7 @@ def test_golden_bundle(reader: TuioReader) -> None:
     assert result == TouchFrame("tuio:192.0.2.7:50000", 5.0, (Touch(42, 0.5, 0.25),))
 
 
-def test_only_changes_are_set(reader: TuioReader) -> None:
+def test_reader_keeps_unchanged_cursors(reader: TuioReader) -> None:
     """A cursor that is alive but not set again stays where it was; one not alive is gone."""
     reader.read(frame((1, 0.25, 0.5), (2, 0.75, 0.5), fseq=1), PEER, now=0)
     source = message("source", "table@a")
@@ -102,7 +102,7 @@ def test_only_changes_are_set(reader: TuioReader) -> None:
     assert touches(reader.read(none, PEER, now=0.03)) == []
 
 
-def test_alive_without_a_position_is_left_out(reader: TuioReader) -> None:
+def test_reader_omits_cursors_without_a_position(reader: TuioReader) -> None:
     """A cursor whose set message was lost appears once its place is known, not at the origin."""
     assert touches(reader.read(bundle(message("alive", 5)), PEER, now=0)) == []
     late = bundle(message("alive", 5), cursor(5, 0.5, 0.5))
@@ -116,7 +116,7 @@ def test_frame_at_the_end_of_a_bundle_without_fseq(reader: TuioReader) -> None:
     ]
 
 
-def test_late_frames_are_dropped(reader: TuioReader) -> None:
+def test_reader_drops_late_frames(reader: TuioReader) -> None:
     """A reordered frame changes nothing, neither positions nor what is alive."""
     reader.read(frame((1, 0.25, 0.5), fseq=10), PEER, now=0)
     assert reader.read(frame((1, 0.75, 0.5), (2, 0.5, 0.5), fseq=9), PEER, now=0.01) is None
@@ -125,7 +125,7 @@ def test_late_frames_are_dropped(reader: TuioReader) -> None:
     assert counts(reader) == {"late": 1}
 
 
-def test_redundant_frames_are_accepted(reader: TuioReader) -> None:
+def test_reader_accepts_redundant_frames(reader: TuioReader) -> None:
     """A frame numbered -1 is news whatever came before, and does not make the next one late."""
     reader.read(frame((1, 0.25, 0.5), fseq=10), PEER, now=0)
     assert touches(reader.read(frame((1, 0.5, 0.5), fseq=-1), PEER, now=0.01)) == [(1, 0.5, 0.5)]
@@ -133,7 +133,7 @@ def test_redundant_frames_are_accepted(reader: TuioReader) -> None:
 
 
 @pytest.mark.parametrize(("before", "pause"), [(5000, 0.001), (50, 0.6)])
-def test_a_sender_that_began_anew(reader: TuioReader, before: int, pause: float) -> None:
+def test_reader_detects_a_restarted_sender(reader: TuioReader, before: int, pause: float) -> None:
     """Counting from 1 again is a restart after a fall by over 100 or after a pause; all is new."""
     reader.read(frame((1, 0.25, 0.5), fseq=before), PEER, now=0)
     first = bundle(message("source", "table@a"), message("alive", 1), message("fseq", 1))
@@ -171,7 +171,7 @@ def test_number_of_senders_is_bounded(reader: TuioReader) -> None:
     assert reader.read(frame(source="s16"), PEER, now=0.51) is not None
 
 
-def test_positions_are_passed_on_unchecked(reader: TuioReader) -> None:
+def test_reader_passes_positions_unchecked(reader: TuioReader) -> None:
     """Not a number and off the sensor are the tracker's to judge; the former is counted."""
     result = touches(reader.read(frame((1, math.nan, 0.5), (2, 1.5, -3.0)), PEER, now=0))
     assert math.isnan(result[0][1])
@@ -179,7 +179,7 @@ def test_positions_are_passed_on_unchecked(reader: TuioReader) -> None:
     assert counts(reader) == {"not_finite": 1}
 
 
-def test_other_profiles_are_passed_over(reader: TuioReader) -> None:
+def test_reader_ignores_other_profiles(reader: TuioReader) -> None:
     """Objects and blobs on the same port are neither frames nor errors."""
     objects = bundle(
         message("alive", 3, address="/tuio/2Dobj"), message("fseq", 7, address="/tuio/2Dobj")
@@ -217,7 +217,7 @@ MALFORMED = {
 
 
 @pytest.mark.parametrize("datagram", MALFORMED.values(), ids=MALFORMED.keys())
-def test_malformed_datagrams(
+def test_reader_counts_malformed_datagrams(
     reader: TuioReader, datagram: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Each is counted and logged, none raises or makes a touch, and python-osc stays silent."""
@@ -227,7 +227,7 @@ def test_malformed_datagrams(
     assert [record.name for record in caplog.records] == ["test"]
 
 
-def test_a_bad_message_spoils_its_whole_bundle(reader: TuioReader) -> None:
+def test_reader_ignores_a_bundle_with_a_malformed_message(reader: TuioReader) -> None:
     """A bundle with one malformed message changes nothing at all."""
     reader.read(frame((1, 0.25, 0.5), fseq=1), PEER, now=0)
     source = message("source", "table@a")
@@ -237,7 +237,7 @@ def test_a_bad_message_spoils_its_whole_bundle(reader: TuioReader) -> None:
     assert touches(reader.read(fine, PEER, now=0)) == [(1, 0.25, 0.5)]
 
 
-def test_huge_bundles_are_not_read(reader: TuioReader) -> None:
+def test_reader_refuses_oversized_bundles(reader: TuioReader) -> None:
     """More than eight kilobytes are no touch frame; a hundred cursors are."""
     many = [(id, 0.5, 0.5) for id in range(200)]
     assert reader.read(frame(*many[:100]), PEER, now=0) is not None
@@ -246,7 +246,7 @@ def test_huge_bundles_are_not_read(reader: TuioReader) -> None:
 
 
 @given(st.binary(max_size=200), st.integers(0, 300))
-def test_any_bytes(noise: bytes, cut: int) -> None:
+def test_reader_never_raises(noise: bytes, cut: int) -> None:
     """Whatever bytes come, alone or in the middle of a good bundle, nothing is raised."""
     reader = TuioReader(RejectCounter(logging.getLogger("test")))
     good = frame((1, 0.25, 0.5), fseq=1)
@@ -261,7 +261,7 @@ def test_any_bytes(noise: bytes, cut: int) -> None:
         max_size=10,
     )
 )
-def test_tuio_datagram_is_the_inverse(places: dict[int, tuple[float, float]]) -> None:
+def test_tuio_datagram_round_trip(places: dict[int, tuple[float, float]]) -> None:
     """What tuio_datagram writes, the reader reads: ids and positions of single precision."""
     wanted = tuple(Touch(id, x, y) for id, (x, y) in places.items())
     datagram = tuio_datagram(TouchFrame("table@a", 0.0, wanted), 7)
@@ -270,7 +270,7 @@ def test_tuio_datagram_is_the_inverse(places: dict[int, tuple[float, float]]) ->
 
 
 @in_virtual_time_on_sockets
-async def test_over_udp() -> None:
+async def test_tuio_source_delivers_over_udp() -> None:
     """A datagram to the bound port becomes a frame at the loop's time; port 0 takes a free one."""
     source = TuioSource("tuio:127.0.0.1:0")
     await source.open()
@@ -290,7 +290,7 @@ async def test_over_udp() -> None:
 
 
 @in_virtual_time_on_sockets
-async def test_a_port_that_is_taken() -> None:
+async def test_tuio_source_reports_a_taken_port() -> None:
     """The error names the port and what to do."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
@@ -308,14 +308,14 @@ async def test_a_port_that_is_taken() -> None:
         ("tuio:[::1]:4000", "::1", 4000),
     ],
 )
-def test_urls(url: str, host: str, port: int) -> None:
+def test_tuio_source_defaults_of_urls(url: str, host: str, port: int) -> None:
     """What is left out of a URL is loopback and the registered port."""
     source = TuioSource(url)
     assert (source.host, source.port) == (host, port)
 
 
 @pytest.mark.parametrize("url", ["tuio:host", "tuio:host:65536", "tuio:host:-1", "udp:1:2"])
-def test_bad_urls(url: str) -> None:
+def test_tuio_source_refuses_bad_urls(url: str) -> None:
     """A URL that names no port is refused with an example."""
     with pytest.raises(InputError, match=r"tuio:127\.0\.0\.1:3333"):
         TuioSource(url)

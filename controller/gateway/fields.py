@@ -1,9 +1,10 @@
 """The plate's vibration field for drawing: complex amplitude per frequency on a grid."""
 
+import cmath
 import math
-from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -55,7 +56,7 @@ class FieldSolver:
             np.linspace(0, rig.plate.length, self.columns),
             np.linspace(0, rig.plate.width, self.rows),
         )
-        self._responses: OrderedDict[float, ComplexArray] = OrderedDict()
+        self._response = lru_cache(_MAX_FREQUENCIES)(self._solve)
 
     def field(self, drive: Mapping[str, PlayedTone]) -> Field:
         """The steady-state vibration under a drive by ERA; raises InputError."""
@@ -63,19 +64,14 @@ class FieldSolver:
         names = [era.name for era in self._rig.eras]
         amplitude = np.zeros((len(frequencies), self.rows * self.columns), dtype=complex)
         for name, tone in drive.items():
-            weight = tone.level * np.exp(1j * math.radians(tone.phase_deg))
+            weight = cmath.rect(tone.level, math.radians(tone.phase_deg))
             response = self._response(tone.frequency_hz)
             amplitude[frequencies.index(tone.frequency_hz)] += weight * response[names.index(name)]
         return Field(frequencies, amplitude.reshape(-1, self.rows, self.columns))
 
-    def _response(self, frequency: float) -> ComplexArray:
+    def _solve(self, frequency: float) -> ComplexArray:
         """Acceleration [m/s²] (eras, points) per ERA at full stroke."""
-        if frequency not in self._responses:
-            (response,) = self._free.acceleration(
-                self._rig.eras, np.array([frequency]), self._points, loads=self._rig.loads
-            )
-            self._responses[frequency] = response
-            if len(self._responses) > _MAX_FREQUENCIES:
-                self._responses.popitem(last=False)
-        self._responses.move_to_end(frequency)
-        return self._responses[frequency]
+        responses: ComplexArray = self._free.acceleration(
+            self._rig.eras, np.array([frequency]), self._points, loads=self._rig.loads
+        )
+        return responses[0]

@@ -71,7 +71,7 @@ class FieldSolver:
 
     def _solve(self, frequency: float) -> ComplexArray:
         """Acceleration [m/s²] (eras, points) per ERA at full stroke."""
-        responses: ComplexArray = self._free.acceleration(
+        response: ComplexArray = self._free.acceleration(
             self._rig.eras, np.array([frequency]), self._points, loads=self._rig.loads
-        )
-        return responses[0]
+        )[0]
+        return response

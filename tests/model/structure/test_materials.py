@@ -103,16 +103,16 @@ def test_rig_refuses_eras_and_masses_off_the_plate():
     """Not only a rig file is checked: a rig put together by a program is, too."""
     rig = make_paper_rig(12, 9)
     outside = Era("out", 0.31, 0.1, 17000.0, 0.0, 0.0, 1e-4)
-    with pytest.raises(InputError, match=r"ERA out at \(0.31, 0.1\) m is off the plate"):
+    with pytest.raises(InputError, match=r"ERA out .*\(0.31, 0.1\)"):
         replace(rig, eras=(*rig.eras, outside))
-    with pytest.raises(InputError, match=r"point mass at \(0.1, -0.01\) m is off the plate"):
+    with pytest.raises(InputError, match=r"mass.*\(0.1, -0.01\)"):
         replace(rig, masses=(PointMass(0.1, -0.01, 0.005),))
 
 
 def test_rig_refuses_eras_of_one_position_or_name():
     """Two bolts cannot share a hole, and a name means one ERA."""
     rig = make_paper_rig(12, 9)
-    with pytest.raises(InputError, match="ERAs SW and again are both at"):
+    with pytest.raises(InputError, match="SW and again"):
         replace(rig, eras=(*rig.eras, replace(rig.era("SW"), name="again")))
-    with pytest.raises(InputError, match="two ERAs have the name SW"):
+    with pytest.raises(InputError, match=r"name.*SW|SW.*name"):
         replace(rig, eras=(*rig.eras, replace(rig.era("SW"), x=0.1)))

@@ -1,7 +1,7 @@
-"""Making a localization table: a plate solved on its mesh, in parts that do not depend on another.
+"""Building a localization table from independent parts.
 
-The parts are the same whoever solves them and how many at once, so the table is, to the bit; and
-what is done of them can be kept (`model.table.kept_parts`), so that an interrupted build goes on.
+The result is the same to the bit for any number of processes. Finished parts can be kept
+(`model.table.kept_parts`), so that an interrupted build can be resumed.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -26,7 +26,7 @@ from model.version import code_version
 
 @dataclass(frozen=True, eq=False)
 class Build:
-    """A table, and how many of its parts had been kept from a build that was interrupted."""
+    """A table, with the number of its parts that were reused from an interrupted build."""
 
     table: LocalizationTable
     part_count: int
@@ -40,7 +40,7 @@ def build_table(
     grid: Grid = PAPER_GRID,
     drive_mode: str = "switched",
 ) -> LocalizationTable:
-    """Solve the rig's plate on its mesh and keep what localization needs.
+    """Build the localization table of a rig.
 
     frequencies (f,) [Hz], ascending, within the rig's limits; drive_mode: one of DRIVE_MODES.
     Raises InputError.
@@ -54,15 +54,15 @@ def build_in_parts(
     drive_mode: str,
     workers: int = 1,
     kept: KeptParts | None = None,
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Build:
-    """The same, by so many processes; parts that are kept are taken from there, others put there.
+    """Solve the parts of a table by several processes, and join them.
 
-    progress: called with how many parts are done, of how many. An exception, Ctrl-C among them,
-    leaves what is done where it is kept.
+    kept: where finished parts are read from and stored, an exception or Ctrl-C included. progress:
+    called with the number of finished parts and the total. Raises InputError.
     """
     if drive_mode not in DRIVE_MODES:
-        raise InputError(f"unknown drive mode {drive_mode!r}; known: {', '.join(DRIVE_MODES)}")
+        raise InputError(f"drive mode must be one of {', '.join(DRIVE_MODES)}, got {drive_mode!r}")
     parts = dict(enumerate(problem.parts()))
     done: dict[int, Arrays] = {}
     for number, part in parts.items():
@@ -77,25 +77,25 @@ def build_in_parts(
             kept.store(parts[number], arrays)
         done[number] = arrays
         progress(len(done), len(parts))
-    table = _put_together(problem, drive_mode, {parts[number]: done[number] for number in parts})
+    table = _joined(problem, drive_mode, {parts[number]: done[number] for number in parts})
     return Build(table, len(parts), reused_count)
 
 
 def _solve(
     problem: TableProblem, missing: Mapping[int, Part], *, workers: int
 ) -> Iterator[tuple[int, Arrays]]:
-    """Every part that is missing, in any order."""
+    """Solve the missing parts, in any order."""
     if not missing:
         return
     if workers > 1 and len(missing) > 1:
-        # A copy, without what has been worked out here: not all of that can be sent.
+        # A copy without cached properties, which cannot all be sent to a process.
         yield from on_processes(workers, solve_part, replace(problem), missing)
         return
     for number, part in missing.items():
         yield number, solve_part(problem, part)
 
 
-def _put_together(
+def _joined(
     problem: TableProblem, drive_mode: str, solved: Mapping[Part, Arrays]
 ) -> LocalizationTable:
     def joined(name: str, *, axis: int) -> NDArray[Any]:
@@ -103,7 +103,7 @@ def _put_together(
         return np.concatenate(pieces, axis=axis)
 
     rig = problem.rig
-    (modes,) = (arrays for part, arrays in solved.items() if part.what == "modes")
+    (modes,) = (arrays for part, arrays in solved.items() if part.kind == "modes")
     return LocalizationTable(
         plate=rig.plate,
         eras=rig.eras,

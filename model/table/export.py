@@ -1,4 +1,4 @@
-"""A table for other programs: a .mat file that holds all of it, or .csv files for a part each.
+"""Export of tables: a .mat file of everything, or .csv files of patterns or fields.
 
 `docs/reference/table-file.md` lists every name with its shape and unit.
 """
@@ -19,8 +19,8 @@ from model.files.array_file import whole_or_nothing
 from model.table.file import FORMAT_VERSION
 from model.table.table import LocalizationTable
 
-MOST_BYTES = (1 << 31) - 1
-"""Of one variable in a .mat file of version 5, its header included."""
+MAX_MAT_BYTES = (1 << 31) - 1
+"""Size of one variable in a .mat file of version 5, its header included."""
 
 
 def export_mat(table: LocalizationTable, path: Path) -> None:
@@ -34,10 +34,10 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
         table.pattern_count * (4 * table.grid.cell_count + 8 * len(table.eras))
         + table.acceleration.nbytes
     )
-    if size > MOST_BYTES:
+    if size > MAX_MAT_BYTES:
         raise InputError(
-            f"the table has {size / 1e9:.1f} GB with all its patterns, more than a .mat file of "
-            "version 5 holds; the table itself is a .npz file, which numpy.load opens"
+            f"a .mat file of version 5 must have up to {MAX_MAT_BYTES / 1e9:.1f} GB, got "
+            f"{size / 1e9:.1f} GB; open the table itself, a .npz file, with numpy.load"
         )
     pattern_hz = _pattern_frequencies(table)
     content = {
@@ -109,7 +109,7 @@ def _field_rows(table: LocalizationTable) -> Iterator[list[object]]:
 
 
 def _short(values: np.ndarray[Any, np.dtype[np.float32]]) -> list[str]:
-    """The fewest digits that tell single-precision numbers apart."""
+    """Shortest decimals that identify single-precision numbers."""
     return [str(value) for value in values]
 
 

@@ -1,12 +1,8 @@
-"""The table as a file: an uncompressed .npz that any researcher opens with numpy.
+"""Table files: uncompressed .npz with a JSON header.
 
 Members: `header` (JSON as bytes) and the arrays of `LocalizationTable` under their own names. The
-header carries the format version, the plate's fingerprint, everything that made the table, and a
-SHA-256 over the content, so that a damaged or foreign file is refused before any of it is used.
-
-Version 1 held the fields at the nodes of the mesh; 2 holds them on a raster, with the plate's modes
-and point masses, and what `switched` patterns are made of at the cells in place of every one of
-them: of fine frequency steps there are millions. 3 says how wrong the mesh is.
+header has the format version, the plate's fingerprint, the inputs of the table, and a SHA-256 over
+the content, so that a damaged or foreign file is refused before any of it is used.
 """
 
 import json
@@ -33,12 +29,11 @@ from model.table.table import LocalizationTable
 
 FORMAT = "era-haptics localization table"
 ZIP = b"PK\x03\x04"
-"""How every table, as every .npz file, begins."""
+"""Magic number of .npz files."""
 
 FORMAT_VERSION = 3
 
-# A table of the paper's plate has 1.4 MB, one of eight ERAs and a fine grid some hundred; what is
-# larger than this is not a table.
+# A table of the paper's plate has 1.4 MB, one of eight ERAs and a fine grid about 100 MB.
 MAX_BYTES = 2 << 30
 
 _DTYPES = {
@@ -52,13 +47,13 @@ _DTYPES = {
 }
 
 
-# Of accelerations [m/s²], frequencies [rad/s] and shapes [1/sqrt(kg)]; what is larger is of no
-# plate, and cannot be squared in single precision.
-MOST = 1e9
+# Bound of accelerations [m/s²], frequencies [rad/s] and shapes [1/sqrt(kg)], whose squares fit into
+# single precision.
+MAX_VALUE = 1e9
 
 
 class _Raster(BaseModel):
-    """What it must hold about the raster."""
+    """Header entry of the raster."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
@@ -69,14 +64,14 @@ class _Raster(BaseModel):
 
 
 class _Mesh(_Raster):
-    """And about a mesh."""
+    """Header entry of a mesh."""
 
     element: str
     strip: float
 
 
 class _Header(BaseModel):
-    """What the JSON header must hold."""
+    """JSON header."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
@@ -98,10 +93,7 @@ class _Header(BaseModel):
 
 
 def save_table(table: LocalizationTable, path: Path | str) -> None:
-    """Write a table so that the file is either the old one or the whole new one, never between.
-
-    Raises OSError where the folder cannot be written.
-    """
+    """Write a table; the file is replaced as a whole or stays as it was. Raises OSError."""
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     place = expect_path(path, what="path")
     arrays = _arrays(table)
@@ -127,26 +119,28 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
 
 
 def load_table(path: Path | str, *, fingerprint: str | None = None) -> LocalizationTable:
-    """Read a table, whole or not at all.
+    """Read a table.
 
-    fingerprint: of the rig that the table shall serve; a table of another plate is refused. Raises
-    InputError for a missing, damaged or foreign file.
+    fingerprint: of the rig, if the table must be of its plate. Raises InputError for a missing,
+    damaged or foreign file.
     """
     path = expect_path(path, what="path")
     if fingerprint is not None and not isinstance(fingerprint, str):
-        raise InputError(f"fingerprint is {shown(fingerprint)}, not text; give rig.fingerprint")
+        raise InputError(
+            f"fingerprint must be text, got {shown(fingerprint)}; give rig.fingerprint"
+        )
     rebuild = f"build it again: era table build RIG -o {path}"
     try:
         content = read_arrays(path, _DTYPES, max_bytes=MAX_BYTES)
     except FileNotFoundError:
         raise InputError(
-            f"there is no table {path}; build one: era table build RIG -o {path}"
+            f"{path}: no such table; build one: era table build RIG -o {path}"
         ) from None
     except UNREADABLE as error:
-        why = "it is no .npz file" if isinstance(error, BadZipFile) else error
+        why = "not a .npz file" if isinstance(error, BadZipFile) else error
         raise InputError(
-            f"{path} is not a readable localization table ({why}); give a file that era table "
-            "build has written, or, if this was one, build it again"
+            f"{path}: not a readable localization table ({why}); give a file of era table build, "
+            "or build it again"
         ) from error
     try:
         header = _Header.model_validate_json(content.pop("header").tobytes())
@@ -155,21 +149,21 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
         raise InputError(f"{path}: bad header ({where or 'header'}: {said}); {rebuild}") from error
     if header.format != FORMAT or header.format_version != FORMAT_VERSION:
         raise InputError(
-            f"{path} has format {header.format!r} version {header.format_version}; this program "
-            f"reads version {FORMAT_VERSION}; {rebuild}"
+            f"{path}: format must be {FORMAT!r} version {FORMAT_VERSION}, got {header.format!r} "
+            f"version {header.format_version}; {rebuild}"
         )
     if _digest(header.model_dump(exclude={"sha256"}), content) != header.sha256:
-        raise InputError(f"{path} is damaged: its content does not match its checksum; {rebuild}")
+        raise InputError(f"{path}: content does not match its checksum; {rebuild}")
     try:
         table = _assemble(header, content, path)
     except InputError as error:
         raise InputError(f"{error}; {rebuild}") from error
     if table.fingerprint != header.fingerprint:
-        raise InputError(f"{path}: the fingerprint is not that of the plate in it; {rebuild}")
+        raise InputError(f"{path}: fingerprint does not match the plate of the file; {rebuild}")
     if fingerprint is not None and fingerprint != table.fingerprint:
         raise InputError(
-            f"{path} was built for another plate (fingerprint {table.fingerprint[:12]}, the rig's "
-            f"is {fingerprint[:12]}); {rebuild}"
+            f"{path}: fingerprint must be the rig's, {fingerprint[:12]}, got "
+            f"{table.fingerprint[:12]}, of another plate; {rebuild}"
         )
     return table
 
@@ -188,7 +182,7 @@ def _digest(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
 
 
 def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> LocalizationTable:
-    """A table from checked parts; sizes must fit each other and every number must be one."""
+    """Build a table from checked entries; sizes must match and all numbers be finite."""
     try:
         material = header.plate.pop("material")
         table = LocalizationTable(
@@ -205,7 +199,7 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
             **arrays,
         )
     except (TypeError, KeyError, ValueError) as error:
-        raise InputError(f"{path}: the header does not describe a plate ({error})") from error
+        raise InputError(f"{path}: header does not describe a plate ({error})") from error
     if table.drive_mode not in DRIVE_MODES:
         raise InputError(f"{path}: unknown drive mode {table.drive_mode!r}")
     count, era_count, coordinates = len(table.frequencies), len(table.eras), len(table.omega)
@@ -222,22 +216,22 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
     for name, shape in expected.items():
         values = getattr(table, name)
         if values.shape != shape:
-            raise InputError(f"{path}: {name} has shape {values.shape}, expected {shape}")
+            raise InputError(f"{path}: shape of {name} must be {shape}, got {values.shape}")
         if not np.isfinite(values).all():
-            raise InputError(f"{path}: {name} holds values that are not numbers")
-        if values.size and np.abs(values).max() > MOST:
+            raise InputError(f"{path}: {name} must be finite")
+        if values.size and np.abs(values).max() > MAX_VALUE:
             raise InputError(
-                f"{path}: {name} holds values up to {np.abs(values).max():.3g}, which no plate has"
+                f"{path}: {name} must be up to {MAX_VALUE:g}, got {np.abs(values).max():.3g}"
             )
     for name in ("acceleration", "shapes", "cell_sources"):
         if count > 0 and not getattr(table, name).any():
-            raise InputError(f"{path}: {name} is zero everywhere, and no plate rests so")
-    # Rows are found by frequency: in another order it would be the wrong ones.
+            raise InputError(f"{path}: {name} must not be zero everywhere")
+    # Rows are found by frequency with a binary search.
     if not (count > 0 and table.frequencies[0] > 0 and (np.diff(table.frequencies) > 0).all()):
-        raise InputError(f"{path}: the frequencies are none, not above zero, or do not ascend")
+        raise InputError(f"{path}: frequencies must be positive and ascend, at least one")
     if table.frequencies.tolist() != header.frequencies_hz:
-        raise InputError(f"{path}: the header's frequencies are not those of the table")
+        raise InputError(f"{path}: frequencies of header and table must be equal")
     size = (table.raster.length, table.raster.width)
     if size != (table.plate.length, table.plate.width):
-        raise InputError(f"{path}: the raster is not of the plate's size")
+        raise InputError(f"{path}: raster and plate must have the same size")
     return table

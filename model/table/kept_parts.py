@@ -1,4 +1,4 @@
-"""Parts of a table kept beside it while it is built, so that an interrupted build goes on."""
+"""Finished parts of a table, kept beside it so that an interrupted build can be resumed."""
 
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ _SUFFIX = ".part.npz"
 
 @dataclass(frozen=True)
 class KeptParts:
-    """A folder of solved parts; each file's name is a digest of all that made it.
+    """A folder of solved parts; the name of each file is a digest of its inputs.
 
     problem_digest: see `TableProblem.digest`.
     """
@@ -24,28 +24,28 @@ class KeptParts:
 
     @classmethod
     def beside(cls, table: Path, problem_digest: str) -> "KeptParts":
-        """Where the parts of a table file are kept."""
+        """Parts of a table file."""
         return cls(table.with_name(f"{table.name}.parts"), problem_digest)
 
     def load(self, part: Part) -> Arrays | None:
-        """A part's arrays, or None; a damaged file is told of and taken for none."""
-        return kept_arrays(self._path(part), self._text(part), PART_TYPES[part.what])
+        """Load a part's arrays; None if there are none, or, with a warning, if they are damaged."""
+        return kept_arrays(self._path(part), self._text(part), PART_TYPES[part.kind])
 
     def store(self, part: Part, arrays: Arrays) -> None:
-        """Keep a part; its file is whole or not there. Raises OSError if it cannot be written."""
+        """Keep a part in a file that is complete or absent; raises OSError."""
         keep_arrays(self._path(part), self._text(part), arrays)
 
     def clear(self) -> None:
-        """Take away all parts, those of other problems and half-written ones too."""
+        """Remove all parts, incomplete ones and those of other problems included."""
         for path in self.folder.glob(f"*{_SUFFIX}*"):
             path.unlink(missing_ok=True)
-        with suppress(OSError):  # not there, or something of someone else's is in it
+        with suppress(OSError):  # missing, or other files are in it
             self.folder.rmdir()
 
     def _path(self, part: Part) -> Path:
         name = sha256(self._text(part).encode()).hexdigest()[:32]
-        return self.folder / f"{part.what}-{name}{_SUFFIX}"
+        return self.folder / f"{part.kind}-{name}{_SUFFIX}"
 
     def _text(self, part: Part) -> str:
-        """All that made a part."""
+        """Inputs of a part."""
         return f"{self.problem_digest} {part}"

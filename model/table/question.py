@@ -1,4 +1,4 @@
-"""What is asked of a localization table: who shall feel it, who must not, how strongly, and how."""
+"""Questions to a localization table: contacts, level and drive mode."""
 
 import math
 from dataclasses import dataclass
@@ -20,23 +20,22 @@ Point: TypeAlias = tuple[float, float]
 MAX_CONTACTS = 10
 
 MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 200.0
-"""Below lies nothing that a channel can play, above nothing that a plate survives."""
+"""Below the smallest amplitude of a channel, and above what a plate survives."""
 
 
 @dataclass(frozen=True)
 class Question:
-    """Contacts and a wanted level in; `LocalizationTable.ask` gives a pattern out.
+    """Contacts and a level for `LocalizationTable.query`.
 
-    targets: where fingers shall feel it, one or more; quiet: where fingers must not; level_db_sl:
-    wanted at every target; softer_db: by how much less each of them wants than that, empty for
-    nothing; drive_mode: a name in DRIVE_MODES, None for the table's own; playable: the modes that
-    the amplifiers can play; frequencies: the lowest and highest they can [Hz]; eras_at_most: how
-    many ERAs `switched` may drive, beyond two by exact search, which is not for live use and ends
-    after search_time [s] at the latest, with a bound in place of a proof; envelopes: whether the
-    amplifiers play any (`model.table.timing`).
+    targets: fingers that feel it, one or more; quiet: fingers that must not; level_db_sl: at every
+    target; softer_db: reduction of that level for each target, empty for none; drive_mode: a name
+    in DRIVE_MODES, None for the table's own; playable: drive modes of the amplifiers; frequencies:
+    their lowest and highest [Hz]; eras_at_most: maximum number of ERAs in `switched`. More than two
+    are searched exactly, up to search_time [s], with an upper bound where the search is cut short;
+    this is too slow for live use. envelopes: whether amplifiers play any (`model.table.timing`).
 
-    Where targets are not wanted alike, contrast and level of the answer are those of the target
-    that has least of what it wants, as if it wanted the full level.
+    With softer_db, level and contrast of the answer are those of the target that is least served,
+    relative to its own level.
     """
 
     targets: tuple[Point, ...]
@@ -51,94 +50,83 @@ class Question:
     envelopes: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what has no answer on any plate."""
+        """Check everything that does not depend on the table."""
+        count = len(self.targets) + len(self.quiet)
         if not self.targets:
-            raise InputError("nobody is to feel anything: name at least one target")
-        if len(self.targets) + len(self.quiet) > MAX_CONTACTS:
-            raise InputError(
-                f"{len(self.targets) + len(self.quiet)} contacts are more than ten fingers; "
-                f"leave out all but {MAX_CONTACTS}"
-            )
+            raise InputError("a question must have at least one target, got none")
+        if count > MAX_CONTACTS:
+            raise InputError(f"a question must have up to {MAX_CONTACTS} contacts, got {count}")
         low, high = MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL
-        if not low <= self.level_db_sl <= high:  # not true of NaN either
+        if not low <= self.level_db_sl <= high:  # False for NaN
             raise InputError(
-                f"a level of {self.level_db_sl:g} dB SL is none that can be asked for; 20 is "
-                f"strong, 12 is felt, 0 is just detected: give one from {low:g} to {high:g}"
+                f"level must be between {low:g} and {high:g} dB SL, got {self.level_db_sl:g}; 20 "
+                "is strong, 12 is felt, 0 is the threshold"
             )
         if self.softer_db and len(self.softer_db) != len(self.targets):
             raise InputError(
-                f"{counted(len(self.softer_db), 'level')} for "
-                f"{counted(len(self.targets), 'target')}; give each its own, or none"
+                f"softer_db must have a value for each of {counted(len(self.targets), 'target')}, "
+                f"got {len(self.softer_db)}"
             )
         for softer in self.softer_db:
-            if not 0 <= softer <= MAX_LEVEL_DB_SL:  # not true of NaN either
+            if not 0 <= softer <= MAX_LEVEL_DB_SL:  # False for NaN
                 raise InputError(
-                    f"a target cannot be softer than the level asked for by {softer} dB; take the "
-                    "highest for the level, and say by how much the others are below it"
+                    f"softer_db must be between 0 and {MAX_LEVEL_DB_SL:g} dB, got {softer}"
                 )
         if not self.search_time >= 0:
-            raise InputError(f"a search cannot end after {self.search_time} s; give it 0 or more")
+            raise InputError(f"search time must be at least 0 s, got {self.search_time}")
         if self.eras_at_most < 1:
-            raise InputError(f"{self.eras_at_most} ERAs cannot move anything; allow at least one")
+            raise InputError(f"number of ERAs must be at least 1, got {self.eras_at_most}")
         for what, contacts in (("target", self.targets), ("quiet finger", self.quiet)):
-            for number, contact in enumerate(contacts):
-                if contact in contacts[:number]:
-                    raise InputError(
-                        f"the {what} ({contact[0]:g}, {contact[1]:g}) m is given twice; two "
-                        "fingers are at two places, so give each once"
-                    )
+            for x, y in {contact for contact in contacts if contacts.count(contact) > 1}:
+                raise InputError(f"{what} ({x:g}, {y:g}) m must be given once, got two")
         if self.drive_mode is not None and self.drive_mode not in DRIVE_MODES:
             raise InputError(
-                f"unknown drive mode {self.drive_mode!r}; known: {', '.join(DRIVE_MODES)}"
+                f"drive mode must be one of {', '.join(DRIVE_MODES)}, got {self.drive_mode!r}"
             )
         for target in self.targets:
             for position in self.quiet:
                 if math.dist(position, target) < FINGERTIP_RADIUS:
                     raise InputError(
-                        f"target ({target[0]:g}, {target[1]:g}) m lies within the quiet fingertip "
-                        f"at ({position[0]:g}, {position[1]:g}) m; keep them "
-                        f"{1000 * FINGERTIP_RADIUS:g} mm apart at least"
+                        f"target ({target[0]:g}, {target[1]:g}) m must be at least "
+                        f"{1000 * FINGERTIP_RADIUS:g} mm from the quiet finger at "
+                        f"({position[0]:g}, {position[1]:g}) m"
                     )
 
     @property
     def gains(self) -> tuple[np.float32, ...]:
-        """What each target's field is multiplied with: a softer one counts as that much louder.
-
-        Then all want the same.
-        """
+        """Factors on the fields of the targets that make all levels the same."""
         softer = self.softer_db or (0.0,) * len(self.targets)
         return tuple(np.float32(10 ** (each / 20)) for each in softer)
 
     def check_on(self, plate: Plate) -> None:
-        """Raise InputError for a contact off the plate, or one that is no place."""
-        for what, contacts in (("target", self.targets), ("quiet", self.quiet)):
+        """Raise InputError for a contact off the plate."""
+        for what, contacts in (("target", self.targets), ("quiet finger", self.quiet)):
             for x, y in contacts:
-                if not plate.contains(x, y):  # not true of NaN either
+                if not plate.contains(x, y):  # False for NaN
                     raise InputError(
-                        f"{what} ({x:g}, {y:g}) m is not on the plate, which reaches from (0, 0) "
-                        f"to ({plate.length:g}, {plate.width:g}) m"
+                        f"{what} ({x:g}, {y:g}) m must be on the plate, from (0, 0) to "
+                        f"({plate.length:g}, {plate.width:g}) m"
                         f"{in_metres(x, y, length=plate.length, width=plate.width)}"
                     )
 
     def drive_mode_on(self, own: str, *, era_count: int) -> str:
-        """The mode to answer in on a table of so many ERAs, whose own mode is given.
+        """Return the drive mode on a table of so many ERAs with its own default mode.
 
-        Raises InputError if it is not playable, and for a number of ERAs that it cannot keep to.
+        Raises InputError if it is not playable, or the number of ERAs cannot be met.
         """
         drive_mode = self.drive_mode or own
         if self.eras_at_most > max(2, era_count):
             raise InputError(
-                f"the table has {counted(era_count, 'ERA')}, of which up to {self.eras_at_most} "
-                f"cannot be driven; allow {era_count} at the most"
+                f"number of ERAs must be up to {era_count} for this table, got {self.eras_at_most}"
             )
         if self.eras_at_most != 2 and drive_mode != "switched":
             raise InputError(
-                f"how many ERAs are driven is a matter of mode switched; mode {drive_mode} drives "
-                "all of them: ask for mode switched, or leave the number of ERAs out"
+                f"number of ERAs can be set in mode switched only, not in {drive_mode}, which "
+                "drives all; leave it out"
             )
         if drive_mode not in self.playable:
             raise InputError(
-                f"these amplifiers cannot play mode {drive_mode}, only {', '.join(self.playable)}; "
-                f"ask for one of these, or build a table for them: era table build --mode"
+                f"drive mode must be one that these amplifiers play, {', '.join(self.playable)}, "
+                f"got {drive_mode}; build a table for them: era table build --mode"
             )
         return drive_mode

@@ -1,8 +1,8 @@
-"""A regular raster over the plate, from which fields are read between its points.
+"""A regular raster over the plate, with interpolation of fields between its points.
 
-Fields of a plate are smooth: over six raster points a quintic follows them, so that a spacing of a
-twentieth of the shortest bending wavelength leaves an error of less than 1e-4 of the field. That
-makes the points of a fingertip one small matrix product, whatever mesh the plate was solved on.
+Lagrange polynomials over six points (quintic) at a spacing of a twentieth of the shortest bending
+wavelength interpolate a field within 1e-4. The points of a fingertip are then one small matrix
+product, whatever the mesh.
 """
 
 import math
@@ -18,8 +18,8 @@ from model.finger.fingertip import FINGERTIP_RADIUS, UNIT_DISC
 from model.structure.plate import Plate
 
 POINTS_PER_WAVELENGTH = 20
-COARSEST, FINEST = 0.008, 0.003  # m
-PATCH = 6  # points along a side that an interpolation takes in, at the least
+MAX_SPACING, MIN_SPACING = 0.008, 0.003  # m
+PATCH = 6  # points along a side of an interpolation, at least
 
 _DISC = FINGERTIP_RADIUS * UNIT_DISC
 
@@ -34,15 +34,17 @@ class Raster:
     width: float
 
     def __post_init__(self) -> None:
-        """Refuse a raster too small to interpolate in, or too large to keep."""
+        """Check the number of points."""
         if not (PATCH <= self.nx <= 5000 and PATCH <= self.ny <= 5000):
-            raise InputError(f"raster {self.nx}x{self.ny}: {PATCH} to 5000 points a side")
+            raise InputError(
+                f"raster must have {PATCH} to 5000 points a side, got {self.nx}x{self.ny}"
+            )
 
     @classmethod
     def for_plate(cls, plate: Plate, *, frequency_max: float) -> "Raster":
-        """Fine enough for bending waves up to a frequency [Hz]."""
+        """Raster for bending waves up to a frequency [Hz]."""
         wanted = plate.bending_wavelength(frequency_max) / POINTS_PER_WAVELENGTH
-        spacing = min(max(wanted, FINEST), COARSEST)
+        spacing = min(max(wanted, MIN_SPACING), MAX_SPACING)
         nx, ny = (max(PATCH, math.ceil(side / spacing) + 1) for side in (plate.length, plate.width))
         return cls(nx, ny, plate.length, plate.width)
 
@@ -67,7 +69,7 @@ class Raster:
         return lattice(self.x, self.y)
 
     def fingertips(self, centres: FloatArray) -> "Fingertips":
-        """Where the discs of fingertips centred at (k, 2) [m] lie; centres must be on the plate."""
+        """Interpolation at the discs of fingertips centred at (k, 2) [m] on the plate."""
         discs = centres[:, None, :] + _DISC
         within = np.minimum(np.maximum(discs, 0.0), (self.length, self.width))
         index, weights = self._patches(centres, within)
@@ -124,7 +126,7 @@ class Raster:
 
 @dataclass(frozen=True, eq=False)
 class Fingertips:
-    """Points under fingertips, finger after finger, and how values there follow from a raster's.
+    """Points under fingertips, finger after finger, with their interpolation weights.
 
     The points are those of `fingertip_points`: all of the disc (k, p) that is on_plate. index
     (k, patch): raster points around each finger; weights (k, p, patch).
@@ -136,7 +138,7 @@ class Fingertips:
 
     @cached_property
     def ends(self) -> list[int]:
-        """Where the points of each finger end among those of all."""
+        """End of the points of each finger among all points."""
         return [int(end) for end in self.on_plate.sum(axis=1).cumsum()]
 
     def read(self, values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""The reduced plate as a table holds it: its shapes on a raster in place of a mesh."""
+"""The reduced plate with its shapes on a raster instead of a mesh."""
 
 from dataclasses import dataclass
 

@@ -1,16 +1,15 @@
-"""How much of a contrast is left on a real plate, which is never the one that was modelled.
+"""Robust contrast: the tenth percentile over an ensemble of plates within tolerance.
 
-An ensemble of plates that could be the real one, each of them an exact solve in the reduced
-coordinates that the table holds, at the pattern's own frequencies only:
+Each plate is solved exactly in the reduced coordinates of the table, at the pattern's frequencies:
 
 - gains of the ERAs differ by 5 %, phases by 5 degrees (normal, standard deviation);
 - stiffness k_b of each ERA by up to 10 %, thickness by up to 2 % (uniform);
-- all damping, the plate's and the ERAs', is up to twice or half as much (uniform in its logarithm);
-- every finger presses on the plate (`model.finger.load`).
+- all damping, the plate's and the ERAs', by up to a factor of 2 (uniform in its logarithm);
+- every finger loads the plate (`model.finger.load`).
 
-A plate that is thicker by a factor s has the same mode shapes: natural frequencies go with s, modal
-masses too. That is exact for thin plates; the shear and rotary inertia of the paper's plate change
-its answer by less than 1e-3 of it over 2 %.
+A plate that is thicker by a factor s has the same mode shapes; natural frequencies and modal masses
+scale with s. That is exact for thin plates; shear and rotary inertia of the paper's plate change
+the response by less than 1e-3 over 2 %.
 """
 
 from collections.abc import Sequence
@@ -41,7 +40,7 @@ PERCENTILE = 10
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """Plates that could be the real one, relative to the modelled one.
+    """Plates within tolerance, relative to the modelled one.
 
     thickness, damping (m,); stiffness, drive (m, eras), drive complex: gain and phase.
     """
@@ -53,7 +52,7 @@ class Ensemble:
 
 
 def draw_ensemble(era_count: int) -> Ensemble:
-    """MEMBERS plates on so many ERAs, the same ones every time."""
+    """Draw MEMBERS plates on so many ERAs, always the same."""
     rng = np.random.default_rng(0)
     each = (MEMBERS, era_count)
     drive = random_gains(rng, draws=MEMBERS, eras=era_count)
@@ -66,10 +65,10 @@ def draw_ensemble(era_count: int) -> Ensemble:
 
 
 def with_robust_contrast(table: LocalizationTable, question: Question, pattern: Pattern) -> Pattern:
-    """The pattern with its robust contrast, the tenth percentile [dB]; not where a finger is alone.
+    """Add the robust contrast [dB] to a pattern with quiet fingers.
 
-    Some milliseconds, for reports; while fingers wait, patterns are chosen by what stands against
-    gain and phase errors alone (`model.drive_modes.fields`).
+    Takes some milliseconds; in live use patterns are chosen by their robustness against gain and
+    phase errors only (`model.drive_modes.fields`).
     """
     if not question.quiet:
         return pattern

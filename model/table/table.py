@@ -1,9 +1,9 @@
-"""The localization table: which pattern makes one finger feel it and the others not.
+"""The localization table: patterns that one finger feels and others do not.
 
-It holds the field of every ERA at every frequency on a raster over the plate, so that any set of
-fingertips can be asked for at run time in any drive mode; the modes of the plate there, from which
-follows what another stiffness, thickness or finger would change; and the response of every
-`switched` pattern at every cell of a grid.
+It holds the fields of the ERAs at all drive frequencies on a raster over the plate, so that any
+fingertips can be queried in any drive mode; the modes of the plate there, from which the effect of
+other stiffnesses, thicknesses and fingers follows; and the sources of the `switched` patterns at
+the cells of a grid.
 """
 
 import math
@@ -61,15 +61,15 @@ def default_drive_frequencies(limits: Limits) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class LocalizationTable:
-    """Fields of one plate on its ERAs, with all that is needed to choose among patterns.
+    """Fields of one plate on its ERAs, and what choosing among patterns needs.
 
-    drive_mode: what questions are answered in unless they say; frequencies (f,) [Hz]; acceleration
-    (points, f, eras) complex [m/s²] on the raster, each ERA alone at full stroke; omega (r,)
-    [rad/s], held (eras + masses, r) and shapes (points, r) [1/sqrt(kg)]: the reduced free plate, at
-    what holds it and on the raster (`model.reduction.reduced_plate`); cell_sources (sources, cells)
-    [m/s²]: mean peak acceleration over each cell of what `switched` patterns are made of
-    (`model.drive_modes.sources`); discretisation_error (f,): of the fields of any ERA alone,
-    relative L2 over the raster, against the same plate on the reference mesh.
+    drive_mode: default of a question; frequencies (f,) [Hz]; acceleration (points, f, eras) complex
+    [m/s²] on the raster, each ERA alone at full stroke; omega (r,) [rad/s], held (eras + masses, r)
+    and shapes (points, r) [1/sqrt(kg)]: the reduced free plate at ERAs and masses and on the raster
+    (`model.reduction.reduced_plate`); cell_sources (sources, cells) [m/s²]: mean peak acceleration
+    over each cell of the sources of `switched` patterns (`model.drive_modes.sources`);
+    discretisation_error (f,): relative L2 error of the fields over the raster against the reference
+    mesh, maximum over the ERAs.
     """
 
     plate: Plate
@@ -104,7 +104,7 @@ class LocalizationTable:
 
     @property
     def pattern_count(self) -> int:
-        """How many `switched` patterns of one or two ERAs there are."""
+        """Number of `switched` patterns of one or two ERAs."""
         return pattern_count(len(self.eras), len(self.frequencies), eras_at_most=2)
 
     @property
@@ -139,14 +139,14 @@ class LocalizationTable:
         return choose_pattern(question, drive_mode, candidates)
 
     def prepare(self, drive_mode: str | None = None) -> None:
-        """Work out what the first question in a mode would have to wait for."""
+        """Compute ahead what the first query in a drive mode needs."""
         centre = (self.plate.length / 2, self.plate.width / 2)
         for quiet in ((), ((0.0, 0.0),)):
             self.query(
                 Question((centre,), quiet, level_db_sl=MIN_LEVEL_DB_SL, drive_mode=drive_mode)
             )
         if (drive_mode or self.drive_mode) != "switched":
-            _ = self.onsets  # not every question has patterns to choose among
+            _ = self.onsets  # used only where several patterns are near the best
 
     def fields(self, question: Question) -> Fields:
         """Fields of the ERAs at the fingertips of a question, at all frequencies of the table."""
@@ -194,7 +194,7 @@ class LocalizationTable:
         return fingertips.read(self.shapes).astype(float), fingertips.ends
 
     def drive_of(self, excitation: Excitation) -> dict[str, dict[str, float]]:
-        """An excitation as people read it: frequency, level 0..1 of the stroke, phase, by ERA."""
+        """Frequency, level 0..1 of the stroke and phase of an excitation, by ERA."""
         strokes = {era.name: era.stroke for era in self.eras}
         return {
             name: {
@@ -210,7 +210,7 @@ class LocalizationTable:
         """Highest level [dB SL] of any `switched` pattern at the centre of each cell, (cells,)."""
         sources = magnitudes_of_sources(self._cell_fields)
         powers = (sources / per_source(self._threshold, len(self.eras))) ** 2
-        # One cell after the other: of fine frequency steps there are millions of patterns.
+        # Cell by cell, since fine frequency steps make millions of patterns.
         most = [sums_of_sources(cell[None], len(self.eras)).max() for cell in powers.T]
         return decibels(np.sqrt(np.array(most, dtype=float)))
 
@@ -228,10 +228,10 @@ class LocalizationTable:
 
     @cached_property
     def onsets(self) -> RampedOnsets | None:
-        """What plain ramps do at the table's frequencies."""
+        """Plain ramps at the table's frequencies; None where too few ERAs support the plate."""
         try:
             return RampedOnsets(self.in_time, self.frequencies, ramp=ONSET_RAMP)
-        except InputError:  # too few ERAs to rest on: it has answers, but no motion in time
+        except InputError:
             return None
 
     @cached_property

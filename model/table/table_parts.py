@@ -1,4 +1,4 @@
-"""The parts of a table: what can be solved apart from the rest, and how."""
+"""Parts of a table that are solved independently."""
 
 import hashlib
 from collections.abc import Callable
@@ -24,16 +24,16 @@ from model.table.raster import Raster
 from model.version import NUMERICS_VERSION
 from model.vibration.convergence import reference_mesh
 
-# Some ten milliseconds of work on the paper's plate, and some megabytes.
-FREQUENCIES_AT_ONCE = 16
-CELLS_AT_ONCE = 36
+# About ten milliseconds of work on the paper's plate, and some megabytes.
+FREQUENCIES_PER_PART = 16
+CELLS_PER_PART = 36
 
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a table; what: a name in PARTS; start, stop: of its frequencies or cells."""
+    """A part of a table; kind: a name in PARTS; start, stop: range of frequencies or cells."""
 
-    what: str
+    kind: str
     start: int
     stop: int
 
@@ -59,30 +59,30 @@ class TableProblem:
         size = 8 * self.raster.point_count * eras * f + 4 * sources * self.grid.cell_count
         if size > MAX_BYTES:
             raise InputError(
-                f"this table would have {size / 1e9:.1f} GB, more than the {MAX_BYTES / 1e9:.1f} "
-                "GB that are read; take fewer frequencies or a coarser grid"
+                f"a table must have up to {MAX_BYTES / 1e9:.1f} GB, got {size / 1e9:.1f} GB; take "
+                "fewer frequencies or a coarser grid"
             )
 
     @cached_property
     def raster(self) -> Raster:
-        """Where the fields are held."""
+        """Points of the fields."""
         return Raster.for_plate(self.rig.plate, frequency_max=float(self.frequencies[-1]))
 
     @cached_property
     def free_plate(self) -> FreePlate:
-        """The rig's plate, solved up to the highest frequency."""
+        """Free plate, solved up to the highest frequency."""
         highest = float(self.frequencies[-1])
         return solve_free_plate(self.rig.plate, self.rig.mesh, frequency_max=highest)
 
     @property
     def reference_mesh(self) -> Mesh:
-        """The finer mesh that the rig's is compared with."""
+        """Finer mesh for the discretisation error."""
         limit = self.rig.limits.frequency_max
         return reference_mesh(self.rig.plate, frequency_max=limit)
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 over all that decides the numbers of the table, and over their format."""
+        """SHA-256 over everything that decides the numbers of the table, and their format."""
         decisive = {
             "format": FORMAT_VERSION,
             "numerics": NUMERICS_VERSION,
@@ -95,23 +95,23 @@ class TableProblem:
         return hashlib.sha256(canonical_json(decisive).encode()).hexdigest()
 
     def parts(self) -> tuple[Part, ...]:
-        """What there is to solve; the longest first."""
+        """All parts, the longest first."""
         f, cells = len(self.frequencies), self.grid.cell_count
         return (
             Part("discretisation", 0, f),
             Part("modes", 0, f),
-            *_shares("fields", f, FREQUENCIES_AT_ONCE),
-            *_shares("cells", cells, CELLS_AT_ONCE),
+            *_shares("fields", f, FREQUENCIES_PER_PART),
+            *_shares("cells", cells, CELLS_PER_PART),
         )
 
 
 def solve_part(problem: TableProblem, part: Part) -> Arrays:
-    """The arrays of one part."""
-    return PARTS[part.what](problem, part)
+    """Solve the arrays of one part."""
+    return PARTS[part.kind](problem, part)
 
 
 def _fields(problem: TableProblem, part: Part) -> Arrays:
-    """Fields on the raster at some of the frequencies."""
+    """Fields on the raster at a range of frequencies."""
     frequencies = problem.frequencies[part.start : part.stop]
     rig = problem.rig
     fields = problem.free_plate.acceleration(
@@ -122,7 +122,7 @@ def _fields(problem: TableProblem, part: Part) -> Arrays:
 
 
 def _cells(problem: TableProblem, part: Part) -> Arrays:
-    """What patterns are made of, mean over some of the cells."""
+    """Mean magnitudes of pattern sources over a range of cells."""
     rig = problem.rig
     each = CELL_SAMPLES**2
     points = problem.grid.samples(rig.plate)[each * part.start : each * part.stop]
@@ -132,7 +132,7 @@ def _cells(problem: TableProblem, part: Part) -> Arrays:
 
 
 def _modes(problem: TableProblem, part: Part) -> Arrays:
-    """The reduced plate, at what holds it and on the raster."""
+    """Reduced plate at ERAs and loads, and on the raster."""
     rig, highest = problem.rig, float(problem.frequencies[-1])
     attached = np.vstack([era_positions(rig.eras), load_positions(rig.loads)])
     reduced = reduce_plate(rig.plate, rig.mesh, attached, frequency_max=highest)
@@ -144,7 +144,7 @@ def _modes(problem: TableProblem, part: Part) -> Arrays:
 
 
 def _discretisation(problem: TableProblem, part: Part) -> Arrays:
-    """How far the rig's mesh is from a finer one, at every frequency; of all ERAs the worst."""
+    """Relative L2 error of the fields against the reference mesh, maximum over the ERAs (f,)."""
     rig, highest = problem.rig, float(problem.frequencies[-1])
     finer = solve_free_plate(rig.plate, problem.reference_mesh, frequency_max=highest)
     own, exact = (
@@ -161,7 +161,7 @@ PARTS: dict[str, Callable[[TableProblem, Part], Arrays]] = {
     "fields": _fields,
     "cells": _cells,
 }
-"""How each kind of part is solved, by its name."""
+"""Solver of each kind of part."""
 
 PART_TYPES: dict[str, dict[str, str]] = {
     "discretisation": {"discretisation_error": "<f8"},
@@ -169,21 +169,21 @@ PART_TYPES: dict[str, dict[str, str]] = {
     "fields": {"acceleration": "<c8"},
     "cells": {"cell_sources": "<f4"},
 }
-"""The arrays of each kind of part and their types."""
+"""Arrays of each kind of part, with their types."""
 
 
-def _shares(what: str, count: int, size: int) -> list[Part]:
-    return [Part(what, start, min(start + size, count)) for start in range(0, count, size)]
+def _shares(kind: str, count: int, size: int) -> list[Part]:
+    return [Part(kind, start, min(start + size, count)) for start in range(0, count, size)]
 
 
 def _check_frequencies(frequencies: FloatArray, rig: Rig) -> None:
     if len(frequencies) == 0 or not (np.isfinite(frequencies).all()):
-        raise InputError("a table needs at least one frequency, all of them numbers")
+        raise InputError("frequencies of a table must be finite numbers, at least one")
     if not (np.diff(frequencies) > 0).all():
-        raise InputError("the frequencies of a table must ascend, each given once")
+        raise InputError("frequencies of a table must ascend without repetition")
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
     if frequencies[0] < low or frequencies[-1] > high:
         raise InputError(
-            f"frequencies from {frequencies[0]:g} to {frequencies[-1]:g} Hz leave the rig's limits "
-            f"of {low:g} to {high:g} Hz; choose others or change limits.frequency in the rig"
+            f"frequencies must be within the rig's limits.frequency of {low:g} to {high:g} Hz, got "
+            f"{frequencies[0]:g} to {frequencies[-1]:g} Hz; choose others or change the limits"
         )

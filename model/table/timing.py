@@ -1,4 +1,4 @@
-"""Onset, ending and transient measures of the patterns that a table answers."""
+"""Onset, ending and transient measures of patterns."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -12,9 +12,9 @@ from model.transients.shaping import Shaper
 
 
 class Timing:
-    """Knows the plate of a table in time; made once, it serves any number of patterns.
+    """Shapes and rates patterns on the plate of a table in time.
 
-    Some ten milliseconds to make, one more for each frequency when it is first needed.
+    Takes about ten milliseconds to make, and one more at the first use of each frequency.
     """
 
     def __init__(self, table: LocalizationTable) -> None:
@@ -22,17 +22,16 @@ class Timing:
         self._shaper, self._transients = Shaper(table.in_time), Transients(table.in_time)
 
     def prepare(self, frequencies: Iterable[float]) -> None:
-        """Work out ahead what shaping needs to know about frequencies [Hz]."""
+        """Compute ahead what shaping needs at frequencies [Hz]."""
         for frequency in frequencies:
             self._shaper.prepare(frequency)
 
     def with_envelopes(
         self, question: Question, pattern: Pattern, *, onset: bool = True, ending: bool = True
     ) -> Pattern:
-        """The pattern with a shaped onset and ending, or one, for amplifiers with envelopes.
+        """Add a shaped onset and ending, or one of them; takes some milliseconds.
 
-        A few milliseconds for both. Where nobody is to be kept quiet the plate around the targets
-        is, at the onset.
+        Without quiet fingers the onset keeps the plate around the targets quiet.
         """
         targets, quiet, tones = question.targets, question.quiet, pattern.excitation
         if onset:
@@ -44,9 +43,9 @@ class Timing:
         return pattern
 
     def with_transient_measures(self, question: Question, pattern: Pattern) -> Pattern:
-        """The pattern with its contrast over the first 100 ms and what it leaves when it ends.
+        """Add contrast over the first 100 ms and residual vibration after the end.
 
-        With its own onset and ending: its envelopes, or its ramp where it has none.
+        Onset and ending are the pattern's envelopes, or its ramp without any.
         """
         contrast = None
         if question.quiet:

@@ -83,7 +83,7 @@ def test_an_interrupted_build_goes_on(problem, whole, tmp_path):
 
 def test_whichever_part_is_missing_comes_where_it_belongs(problem, tmp_path, monkeypatch):
     """Twelve cells in shares of five: one share lost, the table is that of a build in one go."""
-    monkeypatch.setattr(table_parts, "CELLS_AT_ONCE", 5)
+    monkeypatch.setattr(table_parts, "CELLS_PER_PART", 5)
     whole = file_of(build_in_parts(problem, drive_mode="switched"), tmp_path)
     kept = KeptParts.beside(tmp_path / "t.npz", problem.digest)
     build_in_parts(problem, drive_mode="switched", kept=kept)

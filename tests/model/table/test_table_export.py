@@ -86,7 +86,7 @@ def test_what_the_plate_carries_is_in_a_mat_file(table, tmp_path):
 
 def test_a_table_that_a_mat_file_cannot_hold_is_refused(table, tmp_path, monkeypatch):
     """Before anything is written; the error says what can be read instead."""
-    monkeypatch.setattr(export, "MOST_BYTES", 1000)
+    monkeypatch.setattr(export, "MAX_MAT_BYTES", 1000)
     with pytest.raises(InputError, match="numpy"):
         export_mat(table, tmp_path / "t.mat")
     assert list(tmp_path.iterdir()) == []

@@ -67,7 +67,7 @@ def test_a_bad_line_does_not_end_the_run():
     first, bad, off = query_batch(smooth_table(), lines)
     assert first["level_db_sl"] == 20.0
     assert (bad["line"], off["line"]) == (3, 4)
-    assert "not on the plate" in off["error"]
+    assert "(9, 9)" in off["error"]
 
 
 def test_a_batch_answers_line_by_line_and_exits_with_one_if_a_line_failed(table_file, tmp_path):

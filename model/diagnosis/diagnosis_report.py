@@ -1,4 +1,4 @@
-"""A verdict as people read it, and as programs do."""
+"""Report of a diagnosis, as text and as JSON."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,10 +6,10 @@ from typing import Any
 from model.diagnosis.causes import Explanation
 from model.diagnosis.plate_match import FITS
 from model.diagnosis.polarity import EVEN
-from model.diagnosis.verdict import UNLIKELY, ChannelVerdict, State, Verdict
+from model.diagnosis.verdict import UNLIKELY, ChannelState, ChannelVerdict, Verdict
 from model.quantities import in_display_unit, percent
 
-_TO_DO: dict[State, str] = {
+_TO_DO: dict[ChannelState, str] = {
     "dead": "check its supply, its cable and the amplifier's channel",
     "weak": "check its voltage and its fastening; `era calibrate` writes what it really does",
     "strong": "lower its voltage, or give its true stroke in the rig",
@@ -20,7 +20,7 @@ _LIKELY = 0.05  # what is less likely is not worth a line
 
 
 def verdict_rows(verdict: Verdict) -> list[str]:
-    """What was found and what to do about it, a line each; one line where nothing is wrong."""
+    """Lines of findings with their remedies; one line if there are none."""
     rows = []
     for cycle in verdict.swapped:
         if len(cycle) == 2:
@@ -34,9 +34,11 @@ def verdict_rows(verdict: Verdict) -> list[str]:
                 f"SWAPPED in a circle: the channels of {', '.join(cycle)} each drive the next "
                 f"one's ERA ({_sure(verdict, cycle)}): put the plugs right"
             )
-    told = {era for cycle in verdict.swapped for era in cycle}
+    swapped = {era for cycle in verdict.swapped for era in cycle}
     for channel in verdict.channels:
-        rows += [_row(channel, state) for state in channel.states if _is_news(state, channel, told)]
+        rows += [
+            _row(channel, state) for state in channel.states if _is_news(state, channel, swapped)
+        ]
     inverted = [c for c in verdict.channels if "inverted" in c.states]
     if len(inverted) > 1 and len(inverted) == sum(c.drives is not None for c in verdict.channels):
         rows.append(
@@ -49,7 +51,7 @@ def verdict_rows(verdict: Verdict) -> list[str]:
 
 
 def plate_rows(verdict: Verdict) -> list[str]:
-    """Why the plate is not the rig's, and what would explain it."""
+    """Lines on how the plate differs from the rig, and on what would explain it."""
     match = verdict.match
     if match is None:
         return []
@@ -81,12 +83,12 @@ def plate_rows(verdict: Verdict) -> list[str]:
 
 
 def explains(explanation: Explanation) -> bool:
-    """Whether with it the rest of the rig is what its author can have meant."""
+    """Whether the rest of the rig is then within its priors."""
     return explanation.match.error <= FITS and explanation.match.worst <= UNLIKELY
 
 
 def channel_table(verdict: Verdict) -> list[str]:
-    """A line a channel, below a line of names."""
+    """Table of the channels with a header line."""
     rows = [f"{'ERA':8} {'channel':12} {'drives':8} {'gain':>6} {'phase':>7} {'alike':>6}  verdict"]
     for channel in verdict.channels:
         gain = "-" if channel.gain is None else f"{channel.gain:.2f}"
@@ -157,13 +159,13 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
     }
 
 
-def _is_news(state: State, channel: ChannelVerdict, told: set[str]) -> bool:
+def _is_news(state: ChannelState, channel: ChannelVerdict, swapped: set[str]) -> bool:
     return state not in ("well", "not driven") and not (
-        state == "other ERA" and channel.era in told
+        state == "other ERA" and channel.era in swapped
     )
 
 
-def _row(channel: ChannelVerdict, state: State) -> str:
+def _row(channel: ChannelVerdict, state: ChannelState) -> str:
     at = _at(channel)
     match state:
         case "dead":
@@ -176,7 +178,7 @@ def _row(channel: ChannelVerdict, state: State) -> str:
             )
         case "weak" | "strong":
             return (
-                f"{state.upper()}: {at} does {channel.gain:.2f} of what it is told: "
+                f"{state.upper()}: {at} plays {channel.gain:.2f} of the commanded amplitude: "
                 + (_TO_DO[state])
             )
         case "inverted":

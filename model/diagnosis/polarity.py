@@ -1,4 +1,4 @@
-"""Which channels push where the others pull.
+"""Polarity of channels.
 
 With phases of the drive the sign of a channel shows at once. Without them channels are driven in
 pairs: the shape over the sensors is that of the sum or that of the difference. Then only the signs
@@ -23,7 +23,7 @@ _SURE = 2.0  # logarithm of misfits, summed over a pair's frequencies
 
 
 @dataclass(frozen=True)
-class Phase:
+class ChannelPhase:
     """How a channel's phase differs from what was asked [degrees]; None where it is not known.
 
     sign: 1 or -1 among the channels of its amplifier, 0 where it is not known; confidence 0..1.
@@ -34,7 +34,7 @@ class Phase:
     confidence: float
 
 
-def phases_of_drive(observation: Observation, predicted: ComplexArray) -> list[Phase]:
+def phases_of_drive(observation: Observation, predicted: ComplexArray) -> list[ChannelPhase]:
     """From phases of the drive; predicted (f, e, s), NaN where a channel is not to be judged."""
     found = []
     for channel in range(predicted.shape[1]):
@@ -43,20 +43,20 @@ def phases_of_drive(observation: Observation, predicted: ComplexArray) -> list[P
         inner = (np.where(there, np.conj(model), 0) * np.where(there, measured, 0)).sum(axis=1)
         inner = inner[np.abs(inner) > 0]
         if len(inner) == 0:
-            found.append(Phase(None, 0, 0.0))
+            found.append(ChannelPhase(None, 0, 0.0))
             continue
         mean = complex(np.mean(inner / np.abs(inner)))
         angle = math.degrees(np.angle(mean))
         if abs(mean) < _STEADY:
-            found.append(Phase(None, 0, abs(mean)))
+            found.append(ChannelPhase(None, 0, abs(mean)))
         else:
-            found.append(Phase(angle, 1 if abs(angle) < 90 else -1, abs(mean)))
+            found.append(ChannelPhase(angle, 1 if abs(angle) < 90 else -1, abs(mean)))
     return found
 
 
 def signs_of_pairs(
     observation: Observation, predicted: ComplexArray, groups: Sequence[Sequence[int]]
-) -> list[Phase]:
+) -> list[ChannelPhase]:
     """From pairs, by responses predicted (f, e, s).
 
     groups: the channels of one amplifier each, whose phases begin together.
@@ -75,7 +75,7 @@ def signs_of_pairs(
     for group in groups:
         signs.update(_signs(group, evidence))
     return [
-        Phase(None, *signs[channel]) if channel in signs else Phase(None, 0, 0.0)
+        ChannelPhase(None, *signs[channel]) if channel in signs else ChannelPhase(None, 0, 0.0)
         for channel in range(predicted.shape[1])
     ]
 
@@ -113,6 +113,6 @@ def _signs(group: Sequence[int], evidence: FloatArray) -> dict[int, tuple[int, f
     balance = sum(sign for sign, _ in best.values())
     if balance < 0:
         best = {channel: (-sign, sure) for channel, (sign, sure) in best.items()}
-    elif balance == 0:  # half of them against the other half: nobody can tell which
+    elif balance == 0:  # half against half: undecidable
         best = {channel: (sign, EVEN) for channel, (sign, _) in best.items()}
     return best

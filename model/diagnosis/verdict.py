@@ -21,7 +21,7 @@ from model.diagnosis.diagnosis_screening import (
 )
 from model.diagnosis.observation import Observation
 from model.diagnosis.plate_match import FITS, MODEL_ERROR, Match, match_plate
-from model.diagnosis.polarity import Phase, phases_of_drive, signs_of_pairs
+from model.diagnosis.polarity import ChannelPhase, phases_of_drive, signs_of_pairs
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
 
@@ -31,7 +31,7 @@ _CLEARLY = 0.99  # confidence in another ERA than the rig's
 _BETTER = 20.0  # of cost; what another wiring must explain beyond the rig's own
 _OFF_PHASE = 45.0  # degrees
 
-State: TypeAlias = Literal[
+ChannelState: TypeAlias = Literal[
     "well", "dead", "weak", "strong", "other ERA", "inverted", "out of phase", "not driven"
 ]
 
@@ -48,7 +48,7 @@ class ChannelVerdict:
 
     era: str
     channel: Channel
-    states: tuple[State, ...]
+    states: tuple[ChannelState, ...]
     drives: str | None
     gain: float | None
     phase: float | None
@@ -181,7 +181,7 @@ def _best_match(
 
 def _phases(
     rig: Rig, observation: Observation, match: Match, dead: NDArray[np.bool_]
-) -> list[Phase]:
+) -> list[ChannelPhase]:
     predicted = np.where(dead[None, :, None], np.nan, match.predicted)
     if observation.has_phases:
         return phases_of_drive(observation, predicted)
@@ -198,7 +198,7 @@ def _channel(
     shapes: Likeness,
     drives: Sequence[int],
     match: Match,
-    phase: Phase,
+    phase: ChannelPhase,
     is_dead: bool,
 ) -> ChannelVerdict:
     era = rig.eras[number]
@@ -210,7 +210,7 @@ def _channel(
     driven = drives[number]
     # What was asked for was a share of the own ERA's stroke.
     gain = float(match.gains[number]) * era.stroke / rig.eras[driven].stroke
-    states: list[State] = []
+    states: list[ChannelState] = []
     confidence = min(
         shapes.confidence(number, driven, other)
         for other in range(len(rig.eras))

@@ -95,7 +95,7 @@ def calibration(rig: Rig) -> Calibration:
 
 
 @pytest.mark.parametrize("text", [FLOW, BLOCK], ids=["flow", "block"])
-def test_new_values_in_old_text(tmp_path: Path, text: str) -> None:
+def test_calibrated_text_keeps_comments_and_reads_back(tmp_path: Path, text: str) -> None:
     """Every value is read back, and every comment and line of the author's stands."""
     path = tmp_path / "rig.yaml"
     path.write_text(text, encoding="utf-8")
@@ -120,7 +120,7 @@ def test_new_values_in_old_text(tmp_path: Path, text: str) -> None:
     assert back.plate.material.rho == rig.plate.material.rho
 
 
-def test_what_does_not_read_back_is_refused(tmp_path: Path) -> None:
+def test_check_reads_back_refuses_other_values(tmp_path: Path) -> None:
     """A file with other values than the fitted ones is not taken for the new rig."""
     path = tmp_path / "rig.yaml"
     path.write_text(FLOW)

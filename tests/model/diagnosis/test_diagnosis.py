@@ -92,7 +92,7 @@ def built(coarse_rig: Rig) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_a_plate_within_tolerance_is_well_and_a_swap_on_it_is_seen(
+def test_diagnose_passes_a_plate_within_tolerance_and_finds_a_swap(
     coarse_rig: Rig, seed: int
 ) -> None:
     """No false alarm, and none overslept, whichever two channels are exchanged."""
@@ -112,7 +112,7 @@ def test_a_plate_within_tolerance_is_well_and_a_swap_on_it_is_seen(
     assert min(c.confidence for c in swapped.channels) > 0.95
 
 
-def test_gain_is_told_of_the_stroke_that_a_channel_drives(
+def test_diagnose_relates_gain_to_the_stroke_that_is_driven(
     coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
 ) -> None:
     """SW and SE exchanged, SE with twice the stroke: a share of it is twice what was asked of SW.
@@ -130,7 +130,9 @@ def test_gain_is_told_of_the_stroke_that_a_channel_drives(
         assert channel.gain == pytest.approx(1.0, rel=0.25)
 
 
-def test_three_in_a_circle(coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]) -> None:
+def test_diagnose_finds_a_cycle_of_three_channels(
+    coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
+) -> None:
     """SW's channel drives SE, SE's NE, NE's SW: which permutation it is, is found."""
     places, values = built
     verdict = diagnose(coarse_rig, observe(places, values[:, [1, 2, 0, 3]]))
@@ -138,7 +140,7 @@ def test_three_in_a_circle(coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
     assert [c.drives for c in verdict.channels] == ["SE", "NE", "SW", "NW"]
 
 
-def test_dead_weak_and_inverted_channels(
+def test_diagnose_finds_dead_weak_and_inverted_channels(
     coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
 ) -> None:
     """Each is named with its gain; a dead one whether sensors read nothing or noise."""
@@ -158,7 +160,9 @@ def test_dead_weak_and_inverted_channels(
     assert states(diagnose(coarse_rig, observe(places, broken))) == {"NE": ("dead",)}
 
 
-def test_a_channel_on_anothers_era(coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]) -> None:
+def test_diagnose_finds_a_channel_on_another_era(
+    coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
+) -> None:
     """SW's plug is in NW's socket, and NW's hangs free: another ERA, and a dead channel."""
     places, values = built
     broken = values.copy()
@@ -170,7 +174,7 @@ def test_a_channel_on_anothers_era(coarse_rig: Rig, built: tuple[np.ndarray, np.
     assert any(row.startswith("WRONG ERA: channel 0") for row in verdict_rows(verdict))
 
 
-def test_bad_sensors_are_not_blamed_on_the_rig(
+def test_diagnose_leaves_bad_sensors_out(
     coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
 ) -> None:
     """A dead one and one that is upside down and half are named and left out; the rig is well."""
@@ -183,7 +187,7 @@ def test_bad_sensors_are_not_blamed_on_the_rig(
     assert [name for name, _ in verdict.bad_sensors] == ["P6", "P3"]
 
 
-def test_polarity_without_phases_of_the_drive(
+def test_diagnose_finds_polarity_from_pairs_without_phases(
     coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
 ) -> None:
     """Pairs tell it; the fewer are the wrong ones; of two, nobody knows."""
@@ -236,7 +240,7 @@ def changed(rig: Rig, what: str) -> Rig:
         ("eras.NE.stiffness", 200.0, 0.12),
     ],
 )
-def test_what_would_explain_another_plate_is_named(
+def test_diagnose_names_what_explains_another_plate(
     coarse_rig: Rig, what: str, value: float, within: float
 ) -> None:
     """The first of the explanations is the truth, its value within what is uncertain otherwise."""
@@ -257,7 +261,7 @@ def test_what_would_explain_another_plate_is_named(
     assert told["all_well"] is False
 
 
-def test_a_swap_on_another_plate_is_both(coarse_rig: Rig) -> None:
+def test_diagnose_finds_a_swap_on_another_plate(coarse_rig: Rig) -> None:
     """Exchanged channels on a plate with other springs: both are told, neither hides the other."""
     rng = np.random.default_rng(13)
     places = points(coarse_rig)
@@ -267,7 +271,9 @@ def test_a_swap_on_another_plate_is_both(coarse_rig: Rig) -> None:
     assert verdict.explanations[0].cause.key == "eras.stiffness"
 
 
-def test_nothing_at_all_moves(coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]) -> None:
+def test_diagnose_finds_all_channels_dead_when_nothing_moves(
+    coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
+) -> None:
     """All dead is said of each, and nothing of a plate that nobody has seen."""
     places, values = built
     verdict = diagnose(coarse_rig, observe(places, 1e-5 * values))
@@ -277,7 +283,7 @@ def test_nothing_at_all_moves(coarse_rig: Rig, built: tuple[np.ndarray, np.ndarr
     assert as_json(verdict)["plate"]["unexplained"] is None
 
 
-def test_too_little_to_tell_is_refused(
+def test_diagnose_refuses_too_few_sensors_or_frequencies(
     coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
 ) -> None:
     """Two sensors, three frequencies, no channel: what is needed is said."""
@@ -291,7 +297,7 @@ def test_too_little_to_tell_is_refused(
         diagnose(coarse_rig, observe(places, np.full_like(values, np.nan)))
 
 
-def test_channels_that_were_not_driven_are_not_judged(
+def test_diagnose_skips_channels_that_were_not_driven(
     coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
 ) -> None:
     """Half a measurement is judged as far as it goes."""

@@ -1,13 +1,13 @@
 """Localized vibration from a notebook: `import era_haptics as era`.
 
-A rig, its plate solved, maps of it, its localization table, patterns for fingers, what these feel
-in time, pictures of all that; amplifiers and the daemon of a running panel. Places are metres from
-the corner SW, x along the plate's length, y along its width; everything else is SI, or says its
-unit in its name. What cannot be used raises InputError, a ValueError, in words for its reader.
+Rigs, solved plates, maps, localization tables, patterns for fingers, playback in time, pictures,
+amplifiers and clients of the daemon. Positions are in metres from the corner SW, x along the
+plate's length, y along its width; other values are in SI units or have the unit in their name.
+Invalid input raises InputError, a ValueError.
 
-These names are the stable ones; the packages behind them (`model`, `sim`, `drivers`, `controller`)
-change without notice. A name is loaded when it is first used, so that a client of the daemon does
-not wait for the plate's linear algebra.
+These names are stable; the packages behind them (`model`, `sim`, `drivers`, `controller`) change
+without notice. A name is loaded at its first use, so that a client of the daemon does not wait for
+linear algebra.
 """
 
 from importlib import import_module
@@ -116,14 +116,14 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """The thing behind a name, loaded when it is first used."""
+    """Load a name at its first use."""
     if name not in _HOMES:
-        raise AttributeError(f"era_haptics has no {name!r}; it has {', '.join(__all__)}")
+        raise AttributeError(f"unknown name era_haptics.{name}; known are {', '.join(__all__)}")
     found = getattr(import_module(_HOMES[name]), name)
     globals()[name] = found
     return found
 
 
 def __dir__() -> list[str]:
-    """All names, loaded or not, for completion."""
+    """All names, for completion."""
     return list(__all__)

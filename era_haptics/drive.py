@@ -1,4 +1,4 @@
-"""A drive as people write it, in hertz, shares of full stroke and degrees, as physics."""
+"""Drives in hertz, shares of full stroke and degrees, and their conversion to excitations."""
 
 import math
 from collections.abc import Mapping
@@ -15,9 +15,9 @@ from model.vibration.excitation import Excitation, Tone
 
 @dataclass(frozen=True)
 class Drive:
-    """What one ERA plays: frequency [Hz], level (0..1 of its full stroke) and phase [degrees].
+    """The drive of one ERA: frequency [Hz], level (0..1 of its full stroke), phase [degrees].
 
-    Raises InputError for a frequency that is not above zero and a level outside 0..1.
+    Raises InputError for a frequency of zero or less and a level outside 0..1.
     """
 
     frequency: float
@@ -25,48 +25,50 @@ class Drive:
     phase_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what nothing can play."""
+        """Check types and ranges."""
         for key in ("frequency", "level", "phase_deg"):
             if not isinstance(getattr(self, key), Real):
                 raise InputError(
-                    f"{key}={getattr(self, key)!r} of a drive is no number; hertz, a share of the "
-                    "full stroke and degrees are plain numbers here"
+                    f"{key} of a drive must be a number, in hertz, share of the full stroke or "
+                    f"degrees, got {getattr(self, key)!r}"
                 )
         if not (0 < self.frequency < math.inf):
-            raise InputError(f"a drive of {self.frequency} Hz is none; give one above zero")
+            raise InputError(
+                f"frequency of a drive must be positive and finite, got {self.frequency} Hz"
+            )
         if not 0 <= self.level <= 1:
             raise InputError(
-                f"a level of {self.level} is none; 1 is the ERA's full stroke, 0 is silence"
+                f"level of a drive must be 0 (silence) to 1 (full stroke), got {self.level}"
             )
         if not math.isfinite(self.phase_deg):
-            raise InputError(f"a phase of {self.phase_deg} degrees is none; give a finite number")
+            raise InputError(f"phase of a drive must be finite, got {self.phase_deg} degrees")
 
 
 _UNITS_OF_A_TONE = {"frequency": "hertz", "amplitude": "metres", "phase": "radians"}
 
 Drives: TypeAlias = Mapping[str, "float | Drive | Tone"]
-"""By the ERA's name: a frequency [Hz] at full stroke, a `Drive`, or a `Tone` [Hz, m, rad]."""
+"""By name of the ERA: a frequency [Hz] at full stroke, a `Drive`, or a `Tone` [Hz, m, rad]."""
 
 
 def excitation_of(drive: Pattern | Drives, rig: Rig) -> Excitation:
-    """The same as a tone for each ERA; raises InputError for an ERA that the rig has not."""
+    """A tone for each ERA; raises InputError for an unknown ERA."""
     if isinstance(drive, Pattern):
         return drive.excitation
     if not isinstance(drive, Mapping):
         raise InputError(
-            f"drive is {shown(drive)}; give a pattern, or what each ERA plays by its name, such as "
-            '{"SW": 110}'
+            'drive must be a pattern or a mapping of names of ERAs, such as {"SW": 110}, got '
+            f"{shown(drive)}"
         )
     tones = {}
-    for name, told in drive.items():
+    for name, given in drive.items():
         if name not in rig.wiring:
-            raise InputError(f"the rig has no ERA {name!r}, only {', '.join(rig.wiring)}")
-        if isinstance(told, Tone):
+            raise InputError(f"unknown ERA {name!r}; known are {', '.join(rig.wiring)}")
+        if isinstance(given, Tone):
             for key, unit in _UNITS_OF_A_TONE.items():
-                expect_number(getattr(told, key), what=f"{key} of the tone of {name}", unit=unit)
-            tones[name] = told
+                expect_number(getattr(given, key), what=f"{key} of the tone of {name}", unit=unit)
+            tones[name] = given
             continue
-        asked = told if isinstance(told, Drive) else Drive(told)
-        amplitude = float(asked.level) * rig.era(name).stroke
-        tones[name] = Tone(float(asked.frequency), amplitude, math.radians(asked.phase_deg))
+        one = given if isinstance(given, Drive) else Drive(given)
+        amplitude = float(one.level) * rig.era(name).stroke
+        tones[name] = Tone(float(one.frequency), amplitude, math.radians(one.phase_deg))
     return tones

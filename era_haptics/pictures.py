@@ -1,4 +1,4 @@
-"""Pictures, each a matplotlib Figure of its own, without pyplot: shown by a notebook, or saved."""
+"""Pictures as matplotlib figures, without pyplot."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,9 +19,9 @@ from sim.plant.playback import Playback
 
 
 def draw_map(plate: SolvedPlate, drive: Pattern | Drives, *, title: str = "") -> Figure:
-    """Peak acceleration over the plate in g (1 g = 9.8 m/s²), ERAs, and nulls as red crosses.
+    """Draw the peak acceleration over the plate in g (1 g = 9.8 m/s²), ERAs, nulls as red crosses.
 
-    As `era plate map` draws it. Raises InputError for a drive that the rig cannot play.
+    The picture of `era plate map`. Raises InputError for a drive that the rig cannot play.
     """
     expect(plate, SolvedPlate, what="plate", made_by="era.SolvedPlate(rig)")
     active = excitation_of(drive, plate.rig).keys()
@@ -31,9 +31,9 @@ def draw_map(plate: SolvedPlate, drive: Pattern | Drives, *, title: str = "") ->
 def draw_pattern(
     table: LocalizationTable, pattern: Pattern, target: Places, *, quiet: Places = ()
 ) -> Figure:
-    """How strongly a table's pattern is felt all over the plate [dB SL], and the fingers on it.
+    """Draw the level of a pattern over the plate [dB SL], and the fingers.
 
-    target, quiet: places [m], as they were asked for. Raises InputError for what are no places.
+    target, quiet: positions [m] as in the query. Raises InputError for invalid ones.
     """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect(pattern, Pattern, what="pattern", made_by="era.query(table, target)")
@@ -52,10 +52,10 @@ def draw_pattern(
 
 
 def draw_playback(playback: Playback) -> Figure:
-    """How strongly each finger was shaken over time [m/s²], on a logarithmic scale.
+    """Draw the acceleration at each finger over time [m/s²], on a logarithmic scale.
 
-    The largest acceleration within a period of the lowest frequency: of a target the mean over its
-    fingertip, of a quiet finger its loudest point, as contrast is counted.
+    The peak within a period of the lowest frequency: the mean over the fingertip of a target, the
+    loudest point of a quiet finger, as in contrast.
     """
     expect(playback, Playback, what="playback", made_by="plate.play(pattern, target)")
     figure = Figure(figsize=(6.4, 3.8), layout="constrained")

@@ -1,4 +1,4 @@
-"""Where fingers are, as people write it: one place, or several."""
+"""Positions of fingers: one, or several."""
 
 from collections.abc import Sequence
 from typing import TypeAlias
@@ -9,11 +9,11 @@ from model.errors import InputError
 from model.table.question import Point
 
 Places: TypeAlias = Sequence[float] | Sequence[Sequence[float]]
-"""One place x, y [m], or several; also as an array of shape (2,) or (n, 2)."""
+"""One position x, y [m], or several; also an array of shape (2,) or (n, 2)."""
 
 
 def as_points(places: Places, *, what: str) -> tuple[Point, ...]:
-    """All of them, for a question; what: names them in the InputError for what are no places."""
+    """Positions for a question; what: the argument, for the InputError."""
     try:
         found = np.asarray(places, dtype=float)
     except (TypeError, ValueError):
@@ -22,7 +22,7 @@ def as_points(places: Places, *, what: str) -> tuple[Point, ...]:
         return ()
     if found.ndim > 2 or found.shape[-1:] != (2,):
         raise InputError(
-            f"{what}={places!r} is no place; a finger is at x, y in metres from the corner SW, "
-            "such as (0.08, 0.06), and several are a list of such"
+            f"{what} must be x, y in metres from the corner SW, such as (0.08, 0.06), or a list of "
+            f"these, got {places!r}"
         )
     return tuple((float(x), float(y)) for x, y in found.reshape(-1, 2))

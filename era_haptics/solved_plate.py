@@ -1,4 +1,4 @@
-"""The plate of a rig, solved once and asked many times: modes, maps, and in time."""
+"""The plate of a rig, solved once: modes, maps, and playback in time."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -27,7 +27,7 @@ from sim.plant.playback import Playback, play
 class SolvedPlate:
     """A rig's plate on its ERAs, up to the highest frequency of the rig's limits.
 
-    It is solved when it is first asked something, in some tenths of a second, and never again.
+    Solved once, at the first use, in some tenths of a second.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -43,7 +43,8 @@ class SolvedPlate:
     def modes(self) -> SupportedModes:
         """Natural frequencies (n,) [Hz], damping ratios (n,), and shapes anywhere by `at`.
 
-        All up to the highest frequency of the rig's limits; those of `era plate modes`.
+        Up to the highest frequency of the rig's limits, as `era plate modes`. Raises InputError
+        for a plate that is not supported.
         """
         rig = self.rig
         return supported_modes(
@@ -51,12 +52,12 @@ class SolvedPlate:
         )
 
     def map(self, drive: Pattern | Drives, *, raster: tuple[int, int] | None = None) -> PlateMap:
-        """Peak acceleration [m/s²] all over the plate, steadily driven, and where its nulls are.
+        """Compute the steady peak acceleration [m/s²] over the plate, and its nulls.
 
-        raster: how many points along x and y, by default what shows all that the mesh can carry.
+        raster: number of points along x and y, by default enough for all that the mesh resolves.
         ERAs at one frequency add as complex amplitudes, magnitudes of several frequencies add
-        (paper Eq. 28). Raises InputError for a drive that the rig cannot play. The map of
-        `era plate map`, which is solved directly, within some 1e-5 of it.
+        (paper Eq. 28). Raises InputError for a drive that the rig cannot play. Within 1e-5 of
+        `era plate map`, which is solved directly.
         """
         points = None if raster is None else _as_raster(raster)
         return plate_map(self.rig, self._excitation(drive), raster=points, free=self._free)
@@ -70,12 +71,12 @@ class SolvedPlate:
         duration: float = 1.0,
         finger_load: FingerLoad | None = None,
     ) -> Playback:
-        """What fingers at these places [m] feel while it plays for a duration [s], from rest on.
+        """Compute what fingers at positions [m] feel during a duration [s], from rest.
 
-        A pattern starts along its envelopes or its ramp, anything else along a ramp of 40 ms.
-        finger_load: what each finger does to the plate, None for fingers that only feel. The plate
-        in time is solved exactly, without steps (`docs/concepts/plant.md`). Raises InputError for
-        fingers off the plate, and a duration in which nothing becomes steady.
+        A pattern starts with its envelopes or its ramp, other drives with a ramp of 40 ms.
+        finger_load: load of each finger on the plate, None for weightless ones. The plate in time
+        is solved exactly, without steps (`docs/concepts/plant.md`). Raises InputError for fingers
+        off the plate, and a duration too short for a steady state.
         """
         expect_number(duration, what="duration", unit="seconds")
         if finger_load is not None:
@@ -93,14 +94,13 @@ class SolvedPlate:
         )
 
     def _excitation(self, drive: Pattern | Drives) -> Excitation:
-        """The drive as physics; refuses what is beyond that for which the plate is solved."""
+        """The excitation; raises InputError beyond the frequencies that the plate is solved for."""
         excitation, highest = excitation_of(drive, self.rig), self.rig.limits.frequency_max
         for name, tone in excitation.items():
             if tone.frequency > highest:
                 raise InputError(
-                    f"{name} is driven at {tone.frequency:g} Hz, but the rig's limits end at "
-                    f"{highest:g} Hz, and the plate is solved no further; raise limits.frequency "
-                    "in the rig"
+                    f"frequency of {name} must be at most {highest:g} Hz, got {tone.frequency:g}; "
+                    "raise limits.frequency of the rig"
                 )
         return excitation
 
@@ -116,11 +116,11 @@ class SolvedPlate:
 
 
 def _as_raster(given: object) -> tuple[int, int]:
-    """Two whole numbers, as an array too; InputError for what are none."""
+    """Two whole numbers, also of an array; raises InputError for anything else."""
     pair = tuple(given) if isinstance(given, Sequence | np.ndarray) else ()
     if len(pair) != 2 or not all(is_whole(count) for count in pair):
         raise InputError(
-            f"raster is {shown(given)}, not two whole numbers; give how many points along x and "
-            "y, such as raster=(61, 46)"
+            f"raster must be two whole numbers, points along x and y such as (61, 46), got "
+            f"{shown(given)}"
         )
     return int(pair[0]), int(pair[1])

@@ -1,4 +1,4 @@
-"""The localization table, and what it answers."""
+"""The localization table, and queries of it."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -28,12 +28,12 @@ def table(
     frequencies: Sequence[float] | FloatArray | None = None,
     grid: Grid = PAPER_GRID,
 ) -> LocalizationTable:
-    """The rig's localization table, from the user's cache, or built in a second or two and kept.
+    """Load the rig's localization table from the user's cache, or build it in a second or two.
 
-    drive_mode: its default, `switched`, `graded`, `signed` or `phased`;
-    frequencies (f,) [Hz], ascending, within the rig's limits, unless given
-    60 to 320 in steps of 10 as far as these allow; grid: target cells. It is what
-    `era table build` writes; `load_table` and `save_table` are for such files. Raises InputError.
+    drive_mode: its default, `switched`, `graded`, `signed` or `phased`; frequencies (f,) [Hz]:
+    ascending, within the rig's limits, by default 60 to 320 in steps of 10 within these; grid:
+    target cells. The table of `era table build`; `load_table` and `save_table` are for files.
+    Raises InputError.
     """
     expect_rig(rig)
     expect(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
@@ -78,7 +78,7 @@ def query(
 
 
 def _expect_mode(given: object) -> None:
-    """Raise InputError for what is no name."""
+    """Raise InputError for anything but text."""
     if not isinstance(given, str):
         raise InputError(f"drive_mode must be a name such as 'phased', got {shown(given)}")
 
@@ -91,8 +91,8 @@ def _as_frequencies(given: object) -> FloatArray:
         found = np.empty(())
     if found.ndim != 1:
         raise InputError(
-            f"frequencies is {shown(given)}, which is no row of hertz; give plain numbers, such as "
-            "range(60, 321, 10)"
+            f"frequencies must be a sequence of numbers in hertz, such as range(60, 321, 10), got "
+            f"{shown(given)}"
         )
     return found
 

@@ -48,5 +48,5 @@ def test_one_of_several_must_be_named() -> None:
     """None named, or one that the rig has not: the names that it has are told."""
     rig = replace(RIG, amplifiers={"a": "sim://", "b": "sim://"})
     for name in (None, "c"):
-        with pytest.raises(era.InputError, match="the rig has the amplifiers a, b; name one"):
+        with pytest.raises(era.InputError, match="a, b"):
             era.open_amplifier(rig, name)

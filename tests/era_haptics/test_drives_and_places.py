@@ -24,7 +24,7 @@ def test_a_drive_in_three_ways() -> None:
     }
 
 
-def test_numbers_of_numpy_come_out_as_plain_ones() -> None:
+def test_excitation_of_converts_numbers_of_numpy() -> None:
     """Of single precision too, which would go on into every command; 110.5 and 0.25 are exact."""
     drive = era.Drive(np.float32(110.5), level=np.float32(0.25), phase_deg=np.float32(0))  # type: ignore[arg-type]
     tone = excitation_of({"SW": drive}, RIG)["SW"]
@@ -33,28 +33,32 @@ def test_numbers_of_numpy_come_out_as_plain_ones() -> None:
 
 
 @pytest.mark.parametrize(
-    ("drives", "says"),
+    ("drives", "message"),
     [
-        ({"XX": 110}, "no ERA 'XX', only SW, SE, NE, NW"),
-        ({"XX": era.Tone(110, 1e-4)}, "no ERA 'XX', only SW, SE, NE, NW"),
-        ({"SW": 0}, "a drive of 0 Hz is none"),
-        ({"SW": math.inf}, "a drive of inf Hz is none"),
-        ({"SW": "110 Hz"}, "frequency='110 Hz' of a drive is no number"),
+        ({"XX": 110}, "XX'; known are SW, SE, NE, NW"),
+        ({"XX": era.Tone(110, 1e-4)}, "XX'; known are SW, SE, NE, NW"),
+        ({"SW": 0}, "frequency.* got 0 Hz"),
+        ({"SW": math.inf}, "frequency.* got inf Hz"),
+        ({"SW": "110 Hz"}, "frequency.* got '110 Hz'"),
     ],
 )
-def test_a_drive_that_is_none(drives: dict[str, float], says: str) -> None:
-    """The ERA and what is wrong with what it shall play."""
-    with pytest.raises(era.InputError, match=says):
+def test_excitation_of_refuses_an_invalid_drive(drives: dict[str, float], message: str) -> None:
+    """Unknown ERAs and frequencies that are not positive numbers."""
+    with pytest.raises(era.InputError, match=message):
         excitation_of(drives, RIG)
 
 
 @pytest.mark.parametrize(
-    ("level", "phase", "says"),
-    [(1.1, 0, "level of 1.1"), (math.nan, 0, "level of nan"), (1, math.inf, "phase of inf")],
+    ("level", "phase", "message"),
+    [
+        (1.1, 0, "level.* got 1.1"),
+        (math.nan, 0, "level.* got nan"),
+        (1, math.inf, "phase.* got inf"),
+    ],
 )
-def test_a_level_that_is_none(level: float, phase: float, says: str) -> None:
-    """Beyond full stroke, and what is no number."""
-    with pytest.raises(era.InputError, match=says):
+def test_drive_refuses_an_invalid_level_or_phase(level: float, phase: float, message: str) -> None:
+    """Beyond full stroke, and not finite."""
+    with pytest.raises(era.InputError, match=message):
         era.Drive(110, level=level, phase_deg=phase)
 
 
@@ -62,12 +66,12 @@ def test_a_level_that_is_none(level: float, phase: float, says: str) -> None:
     "places",
     [(0.1, 0.2), [0.1, 0.2], [(0.1, 0.2)], np.array([0.1, 0.2]), np.array([[0.1, 0.2]])],
 )
-def test_a_place_in_every_way(places: object) -> None:
+def test_as_points_reads_one_place(places: object) -> None:
     """One alone or in a list, as an array or not."""
     assert as_points(places, what="target") == ((0.1, 0.2),)
 
 
-def test_several_places_and_none() -> None:
+def test_as_points_reads_several_places_or_none() -> None:
     """A list of places keeps their order, and any empty one, an array too, is no place."""
     assert as_points([(0.1, 0.2), (0.3, 0.1)], what="quiet") == ((0.1, 0.2), (0.3, 0.1))
     for nothing in ((), [], np.empty((0, 2))):
@@ -75,7 +79,7 @@ def test_several_places_and_none() -> None:
 
 
 @pytest.mark.parametrize("places", [(0.1,), (0.1, 0.2, 0.3), "SW", [(0.1, 0.2), (0.3,)], 0.1, None])
-def test_a_place_that_is_none(places: object) -> None:
-    """It says which argument, and what a place looks like."""
-    with pytest.raises(era.InputError, match=r"target=.* is no place; .*\(0.08, 0.06\)"):
+def test_as_points_refuses_other_values(places: object) -> None:
+    """The error names the argument."""
+    with pytest.raises(era.InputError, match="target"):
         as_points(places, what="target")

@@ -33,7 +33,7 @@ def test_every_name_is_there_once() -> None:
 
 def test_a_name_that_is_none_is_told_the_others() -> None:
     """As a spelling mistake in a notebook would find it."""
-    with pytest.raises(AttributeError, match=r"no 'laod_rig'; it has .*load_rig"):
+    with pytest.raises(AttributeError, match=r"laod_rig; .*load_rig"):
         _ = era.laod_rig
 
 

@@ -152,7 +152,10 @@ def convergence(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare natural frequencies and responses of meshes with a finer one."""
+    """Compare meshes with a finer one.
+
+    Print errors of natural frequencies and of responses.
+    """
     from model.commands.progress import progress_bar
     from model.config.points import parse_frequencies
     from model.rig.file import load_rig

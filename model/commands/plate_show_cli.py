@@ -9,7 +9,7 @@ from model.commands.options import JsonOption, RigArgument
 
 
 def materials(as_json: JsonOption = False) -> None:
-    """List the materials known by name, with their numbers and sources."""
+    """List known materials with their sources."""
     from model.errors import InputError
     from model.structure.materials import known_material, material_names
 
@@ -46,7 +46,7 @@ def materials(as_json: JsonOption = False) -> None:
 
 
 def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
-    """Show the plate's material and rigidity, for a laminate with bounds."""
+    """Show material and rigidity of a rig's plate."""
     from model.quantities import in_display_unit
     from model.rig.file import load_rig
     from model.rig.plate_summary import plate_summary

@@ -1,4 +1,4 @@
-"""What the tests of the drivers share: a scripted far end, a guard, guarded sets."""
+"""Fixtures of the driver tests: a scripted far end, a guard, guarded sets."""
 
 from collections.abc import AsyncIterator, Callable
 
@@ -6,27 +6,21 @@ import pytest
 
 from drivers.command import CommandSet, DriveCommand
 from drivers.guard import Guard, GuardLimits, SafeCommandSet
-from drivers.protocol.messages import Capabilities
-from scripted_amplifier import CAPABILITIES, FarEnd
+from scripted_amplifier import FarEnd
+from vendor_pages import CAPABILITIES
 
 
 @pytest.fixture
 async def far_end() -> AsyncIterator[FarEnd]:
-    """A scripted amplifier on a pty, well-behaved until a test says otherwise."""
+    """A scripted amplifier on a pty, well-behaved by default."""
     end = FarEnd()
     yield end
     end.close()
 
 
 @pytest.fixture
-def capabilities() -> Capabilities:
-    """Four channels, 20 to 600 Hz."""
-    return CAPABILITIES
-
-
-@pytest.fixture
 def guard() -> Guard:
-    """Limits of 40 to 500 Hz and level 0.8 over those capabilities."""
+    """Limits of 40 to 500 Hz and level 0.8 for four channels."""
     return Guard(GuardLimits(40.0, 500.0, 0.8), CAPABILITIES)
 
 

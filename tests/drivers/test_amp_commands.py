@@ -34,7 +34,8 @@ from drivers.protocol.messages import (
     Stop,
 )
 from drivers.registry import known_schemes
-from scripted_amplifier import STATUS, FarEnd
+from scripted_amplifier import FarEnd
+from vendor_pages import ARMED
 
 T = TypeVar("T")
 
@@ -134,7 +135,7 @@ def test_a_refused_drive_is_disarmed(background: BackgroundFarEnd) -> None:
 def test_a_drive_that_the_amplifier_ends_is_no_success(background: BackgroundFarEnd) -> None:
     """A fault during a drive is reported, and the amplifier is disarmed."""
     usual = background.end.answer
-    arc = replace(STATUS, state=AmplifierState.FAULT, fault=Fault.ARC)
+    arc = replace(ARMED, state=AmplifierState.FAULT, fault=Fault.ARC)
     background.end.answer = lambda request, frame: (
         arc if isinstance(request, Ping) else usual(request, frame)
     )
@@ -288,7 +289,7 @@ def test_a_drive_over_too_slow_a_line_never_arms(background: BackgroundFarEnd) -
 def test_a_drive_after_a_stop_says_how_to_clear(background: BackgroundFarEnd) -> None:
     """The state, the fault and the command that acknowledges it, as a shell takes the URL."""
     usual = background.end.answer
-    stopped = replace(STATUS, state=AmplifierState.QUICK_STOP_ACTIVE)
+    stopped = replace(ARMED, state=AmplifierState.QUICK_STOP_ACTIVE)
     background.end.answer = lambda request, frame: (
         Nak(NakCode.WRONG_STATE)
         if isinstance(request, Arm)

@@ -8,25 +8,20 @@ import pytest
 
 from drivers.amplifier import Amplifier
 from drivers.backend import Backend
-from drivers.command import CommandSet, Envelope, Knot
+from drivers.command import CommandSet
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
-from drivers.guard import Guard, GuardLimits, SafeCommandSet
+from drivers.guard import SafeCommandSet
 from drivers.link import turns
 from drivers.operation.watchdog import check_watchdog
 from drivers.protocol.messages import (
     Achieved,
-    AmplifierState,
     Apply,
     Arm,
-    Capabilities,
     Clear,
-    Commit,
     Disarm,
-    Fault,
     GetCaps,
     GetStatus,
     Hello,
-    Identity,
     Loaded,
     Nak,
     NakCode,
@@ -36,12 +31,9 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
-from drivers.registry import open_backend
-from scripted_amplifier import CAPABILITIES
+from vendor_pages import ARMED as STATUS
+from vendor_pages import CAPABILITIES, IDENTITY, SHAPE, usual_reply
 
-IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", 1)
-STATUS = Status(AmplifierState.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4)
-WITH_ENVELOPES = replace(CAPABILITIES, envelope_knots=8, envelope_slots=4, envelope_step_max=0.1)
 MakeSafe = Callable[..., SafeCommandSet]
 T = TypeVar("T")
 
@@ -52,8 +44,7 @@ class ScriptedBackend(Backend):
     An exception is raised, a reply returned, a future awaited.
     """
 
-    def __init__(self, capabilities: Capabilities) -> None:
-        self.capabilities = capabilities
+    def __init__(self) -> None:
         self.identity = IDENTITY
         self.script: deque[Exception | Reply | asyncio.Future[Reply]] = deque()
         self.requests: list[Request] = []
@@ -75,26 +66,13 @@ class ScriptedBackend(Backend):
         try:
             await asyncio.sleep(0)
             if not self.script:
-                return self._usual(request)
+                return self.identity if isinstance(request, Hello) else usual_reply(request)
             step = self.script.popleft()
             if isinstance(step, Exception):
                 raise step
             return await step if isinstance(step, asyncio.Future) else step
         finally:
             self.at_once -= 1
-
-    def _usual(self, request: Request) -> Reply:
-        match request:
-            case Hello():
-                return self.identity
-            case GetCaps():
-                return self.capabilities
-            case Apply(command_set=wanted):
-                return Achieved(wanted.token, wanted.commands)
-            case Commit(token=token):
-                return Achieved(token, ())
-            case _:
-                return STATUS
 
     @property
     def last_sent(self) -> float:
@@ -103,9 +81,9 @@ class ScriptedBackend(Backend):
 
 
 @pytest.fixture
-def backend(capabilities: Capabilities) -> ScriptedBackend:
+def backend() -> ScriptedBackend:
     """A scripted backend."""
-    return ScriptedBackend(capabilities)
+    return ScriptedBackend()
 
 
 @pytest.fixture
@@ -164,7 +142,7 @@ async def test_open_identifies_and_does_not_arm(backend: ScriptedBackend) -> Non
     await amplifier.open()
     assert backend.requests == [Hello(), GetCaps()]
     assert amplifier.identity == IDENTITY
-    assert amplifier.capabilities == backend.capabilities
+    assert amplifier.capabilities == CAPABILITIES
 
 
 async def test_open_refuses_another_protocol_version(backend: ScriptedBackend) -> None:
@@ -262,15 +240,12 @@ async def test_wrong_reply_is_a_frame_error(
     amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
 ) -> None:
     """Another type, token, slot or an invalid reply; the error names request, fault and remedy."""
-    shape = Guard(GuardLimits(40.0, 500.0, 0.8), WITH_ENVELOPES).check_envelope(
-        Envelope(2, 0.005, (Knot(0.1, 0.0), Knot(0.2, 0.0)))
-    )
-    backend.script += [STATUS, Achieved(6, ()), FrameError("state 9"), Loaded(slot=2, knots=1)]
+    backend.script += [STATUS, Achieved(6, ()), FrameError("state 9"), Loaded(slot=5, knots=1)]
     for call, fault in (
         (amplifier.apply(safe(5)), "Apply .*Achieved, got Status"),
         (amplifier.apply(safe(5)), "token 5.*token 6"),
         (amplifier.status(), "GetStatus.*state 9"),
-        (amplifier.load_envelope(shape), "2 knots into slot 2, got 1"),
+        (amplifier.load_envelope(SHAPE), "2 knots into slot 5, got 1"),
     ):
         with pytest.raises(FrameError, match=rf"{fault}.*update .*era amp conformance"):
             await call
@@ -538,17 +513,3 @@ def test_check_watchdog_requires_three_heartbeats_and_a_round_trip(
         return
     with pytest.raises(CommandError, match=r"at least \d+ ms"):
         check_watchdog(watchdog, round_trip)
-
-
-@pytest.mark.parametrize(
-    ("url", "milliseconds"),
-    [
-        ("serial:///dev/ttyUSB0?baud=115200", 8.33),  # 50 + 46 bytes of ten bits
-        ("serial:///dev/ttyUSB0?baud=9600", 100.0),
-        ("serial://box:4001", 0.0),
-        ("sim://rig.yaml", 0.0),
-    ],
-)
-def test_round_trip_follows_from_the_url(url: str, milliseconds: float) -> None:
-    """Four channels at the speed in the URL; zero where that is unknown."""
-    assert open_backend(url).wire_times.round_trip(4) * 1e3 == pytest.approx(milliseconds, abs=0.01)

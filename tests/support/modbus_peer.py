@@ -6,9 +6,9 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from typing import TypeAlias, cast
 
-from modbus_session import ScriptedDevice
 from sim.far_ends.modbus.frames import RequestAdu, RtuReader, TcpReader, rtu_frame, tcp_frame
 from sim.far_ends.modbus.unit import ModbusUnit
+from vendor_pages import ScriptedDevice
 
 Answer: TypeAlias = bytes | None
 """A PDU, or nothing."""

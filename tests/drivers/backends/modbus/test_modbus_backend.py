@@ -45,7 +45,10 @@ from drivers.protocol.messages import (
     Stop,
 )
 from modbus_peer import Peer, peer
-from modbus_session import (
+from sim.far_ends.modbus.frames import RequestAdu as Telegram
+from sim.far_ends.modbus.unit import ModbusUnit
+from sim.transport.pseudo_terminal import PseudoTerminal
+from vendor_pages import (
     ARMED,
     CAPABILITIES,
     COMMANDS,
@@ -54,10 +57,8 @@ from modbus_session import (
     SHAPE,
     TRIPPED,
     ScriptedDevice,
+    usual_reply,
 )
-from sim.far_ends.modbus.frames import RequestAdu as Telegram
-from sim.far_ends.modbus.unit import ModbusUnit
-from sim.transport.pseudo_terminal import PseudoTerminal
 
 PATIENCE = 5.0  # s; for what is expected to come
 SHORT = 0.02  # s; for what is expected not to come
@@ -232,7 +233,7 @@ async def test_late_exception_is_not_credited_to_the_next_request(
     far.device.answer = lambda _: Nak(NakCode.WRONG_STATE)
     with pytest.raises(LinkTimeout):
         await backend.exchange(Apply(SET), timeout=SHORT)
-    far.device.answer = far.device.usual_answer
+    far.device.answer = usual_reply
     if far.is_rtu:
         with pytest.raises(LinkTimeout, match="without a reason"):
             await backend.exchange(Arm(0.25), timeout=PATIENCE)
@@ -524,7 +525,7 @@ async def test_open_refuses_two_amplifiers_of_one_unit() -> None:
         second.answer = lambda request: (
             replace(IDENTITY, serial_number="B-18")
             if isinstance(request, Hello)
-            else second.usual_answer(request)
+            else usual_reply(request)
         )
         other = ModbusUnit(second)
 

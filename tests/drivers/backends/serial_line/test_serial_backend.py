@@ -18,7 +18,8 @@ from drivers.codec.serial_line.exchanges import decode_request, encode_reply
 from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
 from drivers.errors import FrameError, LinkError, LinkTimeout
 from drivers.protocol.messages import GetStatus, Hello, Nak, NakCode, Ping
-from scripted_amplifier import IDENTITY, STATUS, FarEnd, usual_answer
+from scripted_amplifier import FarEnd
+from vendor_pages import ARMED, IDENTITY, usual_reply
 
 PATIENCE = 5.0  # s; for what is expected to come
 SHORT = 0.02  # s; for what is expected not to come
@@ -75,8 +76,8 @@ async def test_timeout_includes_the_time_on_a_slow_line(far_end: FarEnd) -> None
     asking = asyncio.create_task(backend.exchange(Ping(), timeout=0.001))
     await far_end.count(1)
     await asyncio.sleep(SHORT)
-    far_end.send(STATUS, far_end.frames[0])
-    assert await asking == STATUS
+    far_end.send(ARMED, far_end.frames[0])
+    assert await asking == ARMED
     await backend.close()
 
 
@@ -92,7 +93,7 @@ async def test_unexpected_replies_are_discarded(backend: SerialBackend, far_end:
         return b"".join(
             encode_frame(one)
             for one in (
-                encode_reply(STATUS, late),
+                encode_reply(ARMED, late),
                 encode_reply(replace(IDENTITY, serial_number="B-1"), other),
                 frame,
                 encode_reply(IDENTITY, frame),
@@ -102,8 +103,8 @@ async def test_unexpected_replies_are_discarded(backend: SerialBackend, far_end:
 
     far_end.answer = answer
     assert await backend.exchange(Hello(), timeout=PATIENCE) == IDENTITY
-    far_end.answer = lambda request, frame: usual_answer(request)
-    assert await backend.exchange(Ping(), timeout=PATIENCE) == STATUS
+    far_end.answer = lambda request, frame: usual_reply(request)
+    assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
     assert backend.counters.unexpected_frames == 4
 
 
@@ -111,13 +112,13 @@ async def test_noise_before_a_reply_is_skipped(backend: SerialBackend, far_end: 
     """Garbage and a damaged copy are only counted."""
 
     def answer(request: object, frame: Frame) -> bytes:
-        good = encode_frame(encode_reply(STATUS, frame))
+        good = encode_frame(encode_reply(ARMED, frame))
         damaged = bytearray(good)
         damaged[6] ^= 0x10
         return b"\x55\xff" + bytes(damaged) + good
 
     far_end.answer = answer
-    assert await backend.exchange(Ping(), timeout=PATIENCE) == STATUS
+    assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
     assert backend.counters.crc_errors == 2
 
 
@@ -221,7 +222,7 @@ async def test_serial_server_replies_and_its_end_is_a_loss() -> None:
         reader = FrameReader()
         while not (frames := reader.feed(await loop.sock_recv(connection, 4096))):
             pass
-        reply = encode_reply(usual_answer(decode_request(frames[0])), frames[0])
+        reply = encode_reply(usual_reply(decode_request(frames[0])), frames[0])
         await loop.sock_sendall(connection, encode_frame(reply))
 
     answering = asyncio.create_task(answer_once())
@@ -248,11 +249,11 @@ async def test_open_refuses_two_amplifiers_at_one_address(far_end: FarEnd) -> No
     other = replace(IDENTITY, serial_number="B-18")
 
     def both(request: object, frame: Frame) -> bytes:
-        replies = [IDENTITY, other if isinstance(request, Hello) else usual_answer(request)]
+        replies = [IDENTITY, other if isinstance(request, Hello) else usual_reply(request)]
         return b"".join(encode_frame(encode_reply(reply, frame)) for reply in replies)
 
     def twice(request: object, frame: Frame) -> bytes:
-        return 2 * encode_frame(encode_reply(usual_answer(request), frame))
+        return 2 * encode_frame(encode_reply(usual_reply(request), frame))
 
     far_end.answer = both
     amplifier = Amplifier(SerialBackend(far_end.url), reply_timeout=PATIENCE)

@@ -14,7 +14,8 @@ from serial.rfc2217 import PortManager
 from drivers.amplifier import Amplifier
 from drivers.backends.serial_line.backend import SerialBackend
 from drivers.errors import LinkError
-from scripted_amplifier import IDENTITY, STATUS, FarEnd
+from scripted_amplifier import FarEnd
+from vendor_pages import ARMED, IDENTITY
 
 # pyserial 3.5 itself calls what Python deprecates.
 pytestmark = pytest.mark.filterwarnings("ignore:set:DeprecationWarning")
@@ -109,7 +110,7 @@ async def test_amplifier_behind_rfc2217(far_end: FarEnd, redirector: Redirector)
     amplifier = Amplifier(backend, reply_timeout=5.0)
     await amplifier.open()
     assert amplifier.identity == IDENTITY
-    assert await amplifier.heartbeat() == STATUS
+    assert await amplifier.heartbeat() == ARMED
     assert redirector.port.baudrate == 115200
     await amplifier.close()
     assert not [one for one in threading.enumerate() if one.name.startswith("era-serial")]

@@ -26,15 +26,12 @@ from drivers.protocol.messages import (
     AmplifierEvent,
     AmplifierState,
     Apply,
-    Arm,
     Capabilities,
     Commit,
-    Disarm,
     Fault,
     FaultRecord,
     Nak,
     NakCode,
-    Ping,
     Stage,
     Status,
     Stop,
@@ -52,28 +49,6 @@ def make(channels: int) -> SafeCommandSet:
     )
     guard = Guard(GuardLimits(20.0, 600.0, 1.0), WIDE)
     return guard.check(CommandSet(token=258, commands=commands, ramp=0.001, valid_for=0.0))
-
-
-def test_order_is_these_bytes() -> None:
-    """Token, ramp, time, action and count, sequence."""
-    frames = {
-        "arm": encode_request(Arm(0.25), node=3, sequence=1),
-        "disarm": encode_request(Disarm(0.05), node=3, sequence=2),
-        "stop": encode_request(Stop(0.005), node=3, sequence=255),
-        "commit": encode_request(Commit(0x1234), node=3, sequence=4),
-        "ping": encode_request(Ping(), node=3, sequence=5),
-    }
-    order = 0x483
-    assert frames == {
-        "arm": (CanFrame(order, bytes.fromhex("7D00 0000 FA00 04 01")),),
-        "disarm": (CanFrame(order, bytes.fromhex("0000 3200 0000 05 02")),),
-        "stop": (CanFrame(order, bytes.fromhex("0000 0500 0000 06 FF")),),
-        "commit": (CanFrame(order, bytes.fromhex("3412 0000 0000 03 04")), SYNC),
-        "ping": (
-            CanFrame(0x77D, b"\x05"),
-            CanFrame(order, bytes.fromhex("0000 0000 0000 00 05")),
-        ),
-    }
 
 
 def test_set_is_a_frame_per_channel_an_order_and_a_sync() -> None:

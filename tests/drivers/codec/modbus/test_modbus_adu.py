@@ -11,7 +11,6 @@ from drivers.codec.modbus.adu import ModbusResponse, RequestAdu, ResponseReader,
 from drivers.errors import FrameError
 from drivers.protocol.messages import Apply, Ping, Status
 from drivers.statistics import WireCounters
-from modbus_session import ARMED, SET, ScriptedDevice
 from sim.far_ends.modbus.frames import (
     FRAME_TIMEOUT,
     RtuReader,
@@ -21,6 +20,7 @@ from sim.far_ends.modbus.frames import (
 )
 from sim.far_ends.modbus.frames import RequestAdu as FarEndRequest
 from sim.far_ends.modbus.unit import ModbusUnit
+from vendor_pages import ARMED, SET, ScriptedDevice
 
 
 def asked_and_answered(is_rtu: bool) -> tuple[RequestAdu, bytes]:

@@ -8,15 +8,14 @@ import drivers
 from drivers.codec.modbus import exchanges
 from drivers.codec.modbus.adu import RequestAdu, ResponseReader, build_adu
 from drivers.codec.modbus.exchanges import Exchange, Read, Write
-from drivers.command import CommandSet, Envelope
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import Apply, Commit, LoadEnvelope, Nak, Ping, Request, Stage, Stop
+from drivers.protocol.messages import Commit, Nak, Ping, Request, Stop
 from drivers.statistics import WireCounters
-from modbus_session import EXAMPLES, ScriptedDevice
 from sim.far_ends.modbus.frames import RequestAdu as Asked
 from sim.far_ends.modbus.frames import rtu_frame, tcp_frame
 from sim.far_ends.modbus.registers import checksum
 from sim.far_ends.modbus.unit import ModbusUnit
+from vendor_pages import EXAMPLES, ScriptedDevice, plain
 
 PAGE = (Path(drivers.__file__).parent.parent / "docs" / "reference" / "wire-modbus.md").read_text(
     "utf-8"
@@ -65,17 +64,6 @@ def answered(device: ScriptedDevice, name: str, wire: str) -> bytes:
     return tcp_frame(Asked(1, b"", int.from_bytes(request[:2], "big")), pdu)
 
 
-def plain(request: Request) -> Request:
-    """The request as who reads it from a wire has it: no guard has seen it."""
-    match request:
-        case Stage(command_set=safe) | Apply(command_set=safe):
-            return type(request)(CommandSet(safe.token, safe.commands, safe.ramp, safe.valid_for))
-        case LoadEnvelope(envelope=safe):
-            return LoadEnvelope(Envelope(safe.slot, safe.step, safe.knots))
-        case _:
-            return request
-
-
 def test_the_page_shows_every_message() -> None:
     """A request and a reply of every message over both wires, and nothing that is not checked."""
     pairs = [f"{name} {part}" for name in (*EXAMPLES, *BESIDE) for part in ("request", "reply")]
@@ -117,7 +105,7 @@ def test_the_host_understands_the_reply(name: str, number: int, wire: str) -> No
 def test_the_far_end_understands_and_answers(name: str, number: int, wire: str) -> None:
     """The far end, which shares no code with the host, reads the message and says the reply."""
     device = ScriptedDevice()
-    device.tell(EXAMPLES[name])
+    device.follow(EXAMPLES[name])
     assert answered(device, name, wire) == FRAMES[f"{name} reply, {wire}"]
     assert device.asked[0] == plain(EXAMPLES[name].request)
 
@@ -127,7 +115,7 @@ def test_the_reason_of_a_refusal_can_be_read(wire: str) -> None:
     """The far end names it with the tag of the refused write, and the host takes it for its own."""
     device, name = ScriptedDevice(), "Refused Apply"
     number = dict(NUMBERED)[name]
-    device.tell(EXAMPLES[name])
+    device.follow(EXAMPLES[name])
     unit = ModbusUnit(device)
     unit.reply(pdu_of(FRAMES[f"{name} request, {wire}"], wire))
     sent = adu(exchanges.refusal_read(), None, number, wire)
@@ -145,7 +133,7 @@ def test_without_function_23_it_takes_two(wire: str) -> None:
     """The same block by function 16, whose echo is checked, and its outcome by function 4."""
     exchange, example = exchange_of("Apply", 20), EXAMPLES["Apply"]
     device = ScriptedDevice()
-    device.tell(example)
+    device.follow(example)
     unit = ModbusUnit(device)
     steps = {"FC16 Apply": (None, exchange.write), "FC4 Apply": (exchange.read, None)}
     for number, (name, (read, write)) in enumerate(steps.items(), start=20):
@@ -178,7 +166,7 @@ def test_other_masters_are_served(wire: str) -> None:
     The objects are those of the standard: 0, 1 and 2, and 128 as the first of the vendor's own.
     """
     device = ScriptedDevice()
-    device.tell(EXAMPLES["Hello"])
+    device.follow(EXAMPLES["Hello"])
     reply = FRAMES[f"FC43 Identification reply, {wire}"]
     assert answered(device, "FC43 Identification", wire) == reply
     for number, text in ((0, b"Acme"), (1, b"Quad"), (2, b"1.2"), (0x80, b"A-17")):

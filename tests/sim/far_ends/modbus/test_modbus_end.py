@@ -17,7 +17,7 @@ from pymodbus.client import AsyncModbusTcpClient
 from drivers.errors import LinkError
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import AmplifierState, Commit, Fault, NakCode, Ping, Stop
-from modbus_session import EXAMPLES, ScriptedDevice
+from vendor_pages import EXAMPLES, ScriptedDevice
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
 from sim.far_ends.modbus.end import ModbusRtuEnd, ModbusTcpEnd
@@ -135,14 +135,14 @@ every_wire = pytest.mark.parametrize("wire", ["RTU", "TCP"])
 
 
 @every_wire
-async def test_modbus_session_of_the_page(wire: str) -> None:
+async def test_vendor_pages_of_the_page(wire: str) -> None:
     """Its request bytes, sent over a real wire, bring its reply bytes, one after the other."""
     device = ScriptedDevice()
     async with scripted(wire, device) as master:
         for name, example in EXAMPLES.items():
             if name == "GetCaps":  # its tag is the one before it, and before it there is none
                 assert master.received == b""
-            device.tell(example)
+            device.follow(example)
             master.send(FRAMES[f"{name} request, {wire}"])
             reply = FRAMES[f"{name} reply, {wire}"]
             assert await master.receive(len(reply)) == reply, name
@@ -159,7 +159,7 @@ async def test_modbus_requests_in_any_pieces(wire: str) -> None:
     expected = FRAMES[f"Arm reply, {wire}"]
     device = ScriptedDevice()
     async with scripted(wire, device) as master:
-        device.tell(EXAMPLES["Arm"])
+        device.follow(EXAMPLES["Arm"])
         master.send(ping + arm)
         replies = await master.receive(2 * len(expected))
         assert replies[len(expected) :] == expected
@@ -185,7 +185,7 @@ async def test_modbus_recovers_after_a_damaged_frame(wire: str, damage: str) -> 
     async with scripted(wire, device) as master:
         master.send(damaged)
         await asyncio.sleep(FRAME_TIMEOUT + 0.02)
-        device.tell(EXAMPLES["Ping"])
+        device.follow(EXAMPLES["Ping"])
         master.received.clear()
         master.send(ping)
         reply = FRAMES[f"Ping reply, {wire}"]
@@ -204,7 +204,7 @@ async def test_modbus_ignores_other_units(wire: str) -> None:
         if wire == "RTU":
             other[-2:] = struct.pack("<H", crc(bytes(other[:-2])))
         master.send(bytes(other))
-        device.tell(EXAMPLES["Ping"])
+        device.follow(EXAMPLES["Ping"])
         master.send(ping)
         reply = FRAMES[f"Ping reply, {wire}"]
         assert await master.receive(len(reply)) == reply
@@ -216,7 +216,7 @@ async def test_modbus_tcp_unit_255_is_the_only_unit() -> None:
     ping = bytearray(FRAMES["Ping request, TCP"])
     ping[6] = 255
     device = ScriptedDevice()
-    device.tell(EXAMPLES["Ping"])
+    device.follow(EXAMPLES["Ping"])
     async with scripted("TCP", device) as master:
         master.send(bytes(ping))
         reply = FRAMES["Ping reply, TCP"]
@@ -224,7 +224,7 @@ async def test_modbus_tcp_unit_255_is_the_only_unit() -> None:
     pair = ScriptedDevice(), ScriptedDevice(number=2)
     async with scripted("TCP", *pair) as master:
         master.send(bytes(ping))
-        pair[0].tell(EXAMPLES["Ping"])
+        pair[0].follow(EXAMPLES["Ping"])
         master.send(FRAMES["Ping request, TCP"])
         assert await master.receive(len(reply)) == reply
         assert pair[0].asked.count(Ping()) == 1

@@ -1,4 +1,4 @@
-"""The session of the Modbus vendor page: what is asked, what is answered, and by whom."""
+"""The exchanges that the pages for vendors show, and an amplifier that replies by script."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -63,14 +63,14 @@ TRIPPED = Status(S.FAULT, Fault.WATCHDOG, 513, False, -5.3, 0.0, (0.0,) * 4)
 
 @dataclass(frozen=True)
 class Example:
-    """One exchange of the session. status: how the amplifier is then."""
+    """One exchange of a page; status: of the amplifier afterwards."""
 
     request: Request
     reply: Reply
     status: Status = PLAYING
 
 
-# In the order of the page; their tags, and over TCP their transactions, count from 1.
+# In the order of the Modbus page, whose tags and transactions count from 1.
 EXAMPLES: dict[str, Example] = {
     "Hello": Example(Hello(), IDENTITY, OFF),
     "GetCaps": Example(GetCaps(), CAPABILITIES, OFF),
@@ -94,6 +94,36 @@ EXAMPLES: dict[str, Example] = {
 }
 
 
+def plain(request: Request) -> Request:
+    """Return a request with plain contents, as decoders make them."""
+    match request:
+        case Stage(command_set=safe) | Apply(command_set=safe):
+            return type(request)(CommandSet(safe.token, safe.commands, safe.ramp, safe.valid_for))
+        case LoadEnvelope(envelope=safe):
+            return LoadEnvelope(Envelope(safe.slot, safe.step, safe.knots))
+        case _:
+            return request
+
+
+def usual_reply(request: Request) -> Reply:
+    """Reply as a well-behaved, armed amplifier."""
+    match request:
+        case Hello():
+            return IDENTITY
+        case GetCaps():
+            return CAPABILITIES
+        case GetFaults():
+            return FaultList(())
+        case Stage(command_set=wanted) | Apply(command_set=wanted):
+            return Achieved(wanted.token, wanted.commands)
+        case Commit(token=token):
+            return Achieved(token, COMMANDS)
+        case LoadEnvelope(envelope=envelope):
+            return Loaded(envelope.slot, len(envelope.knots))
+        case _:
+            return ARMED
+
+
 class ScriptedDevice:
     """An amplifier with scripted replies that records its requests."""
 
@@ -105,49 +135,27 @@ class ScriptedDevice:
         self.is_answering = True
         self.asked: list[Request] = []
         self.heard: list[Broadcast] = []
-        self.answer: Callable[[Request], Reply | None] = self.usual_answer
+        self.answer: Callable[[Request], Reply | None] = usual_reply
 
-    def tell(self, example: Example) -> None:
-        """Say from now on what the page says."""
-
-        def answer(request: Request) -> Reply:
-            match request:
-                case GetStatus() if not isinstance(example.request, GetStatus):
-                    return example.status
-                case _:
-                    return example.reply
-
-        self.answer = answer
-
-    def usual_answer(self, request: Request) -> Reply | None:
-        """What a well-behaved amplifier says."""
-        match request:
-            case Hello():
-                return IDENTITY
-            case GetCaps():
-                return CAPABILITIES
-            case GetFaults():
-                return FaultList(())
-            case Stage(command_set=wanted) | Apply(command_set=wanted):
-                return Achieved(wanted.token, wanted.commands)
-            case Commit(token=token):
-                return Achieved(token, COMMANDS)
-            case LoadEnvelope(envelope=envelope):
-                return Loaded(envelope.slot, len(envelope.knots))
-            case _:
-                return ARMED
+    def follow(self, example: Example) -> None:
+        """Reply as the page from now on."""
+        self.answer = lambda request: (
+            example.status
+            if isinstance(request, GetStatus) and not isinstance(example.request, GetStatus)
+            else example.reply
+        )
 
     def exchange(self, request: Request) -> Reply | None:
-        """Its answer."""
+        """Record a request and reply."""
         self.asked.append(request)
         return self.answer(request)
 
     def broadcast(self, request: Broadcast) -> None:
-        """What was said to all."""
+        """Record a broadcast."""
         self.heard.append(request)
 
     def on_plug(self, on_plug: Callable[[bool], None]) -> None:
-        """Its wire stays where it is."""
+        """Stay plugged in."""
 
     def listen(self, on_event: Callable[[AmplifierEvent], None]) -> None:
-        """It never speaks unasked."""
+        """Send no events."""

@@ -17,12 +17,12 @@ from pymodbus.client import AsyncModbusTcpClient
 from drivers.errors import LinkError
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import AmplifierState, Commit, Fault, NakCode, Ping, Stop
-from vendor_pages import EXAMPLES, ScriptedDevice
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
 from sim.far_ends.modbus.end import ModbusRtuEnd, ModbusTcpEnd
 from sim.far_ends.modbus.frames import FRAME_TIMEOUT, crc
 from sim.far_ends.wires import Wire
+from vendor_pages import EXAMPLES, ScriptedDevice
 from wires import FarSide, far_side
 
 PAGE = (example_rig_path().parent.parent / "docs" / "reference" / "wire-modbus.md").read_text(

@@ -8,13 +8,11 @@ from typing import NamedTuple
 
 from controller.sources.touch import Touch, TouchFrame
 from model.structure.plate import Plate
+from model.table.question import MAX_CONTACTS
 
 # s; sources repeat their frames at least every 100 ms, and a contact that is not confirmed must not
 # be driven.
 CONTACT_TIMEOUT = 0.150
-
-# Ten fingers; more are a forearm, a spill or a broken panel.
-MAX_CONTACTS = 10
 
 
 class ContactKey(NamedTuple):

@@ -3,8 +3,7 @@
 The event loop's own endpoint reads one datagram per turn and knows only when it did so: decisions
 would use outdated touches, and waiting times would stay invisible. Here one turn reads all that has
 arrived and hands on a few at once, of many as much as a quarter of a millisecond allows. On Linux
-the kernel timestamps each. In a flood the newest are kept; the kernel would keep the oldest. Where
-the loop cannot watch sockets (Windows), its own endpoint is used.
+the kernel timestamps each. In a flood the newest are kept; the kernel would keep the oldest.
 """
 
 import asyncio
@@ -44,7 +43,7 @@ _MAX_AGE = 1.0  # s; a step of the system clock must not make touches old
 
 
 class Datagrams:
-    """Listens on a UDP port until it is closed; see `listen`."""
+    """Listens on a bound UDP socket until it is closed; see `listen`."""
 
     def __init__(
         self, line: socket.socket, received: Received, *, max_size: int, thin: Thin
@@ -57,30 +56,18 @@ class Datagrams:
         self._buffer_size = max_size + 1  # so that a larger one shows by its size
         self._loop = asyncio.get_running_loop()
         self._latest = self._loop.time()
-        self._transport: asyncio.DatagramTransport | None = None
+        if sys.platform == "linux":
+            with contextlib.suppress(OSError):
+                line.setsockopt(socket.SOL_SOCKET, _TIMESTAMPS, 1)
+        self._loop.add_reader(line, self._readable)
 
     @property
     def port(self) -> int:
         """The port that is bound."""
         return int(self._line.getsockname()[1])
 
-    async def begin(self) -> None:
-        """Start to listen."""
-        if sys.platform == "linux":
-            with contextlib.suppress(OSError):
-                self._line.setsockopt(socket.SOL_SOCKET, _TIMESTAMPS, 1)
-        try:
-            self._loop.add_reader(self._line, self._readable)
-        except NotImplementedError:
-            self._transport, _ = await self._loop.create_datagram_endpoint(
-                lambda: _Endpoint(self._received, self._loop), sock=self._line
-            )
-
     def close(self) -> None:
-        """Stop to listen."""
-        if self._transport is not None:
-            self._transport.close()
-            return
+        """Stop listening."""
         self._loop.remove_reader(self._line)
         self._line.close()
 
@@ -156,21 +143,7 @@ async def listen(
     try:
         line.setblocking(False)
         line.bind(address)
-        made = Datagrams(line, received, max_size=max_size, thin=thin)
-        await made.begin()
+        return Datagrams(line, received, max_size=max_size, thin=thin)
     except BaseException:
         line.close()
         raise
-    return made
-
-
-class _Endpoint(asyncio.DatagramProtocol):
-    """Endpoint for loops that cannot watch sockets."""
-
-    def __init__(self, received: Received, loop: asyncio.AbstractEventLoop) -> None:
-        self._received = received
-        self._loop = loop
-
-    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        """Hand a datagram on."""
-        self._received(data, (addr[0], addr[1]), self._loop.time())

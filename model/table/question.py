@@ -18,6 +18,7 @@ Point: TypeAlias = tuple[float, float]
 """x, y [m]."""
 
 MAX_CONTACTS = 10
+"""Ten fingers; more are a forearm, a spill or a broken panel."""
 
 MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 200.0
 """Below the smallest amplitude of a channel, and above what a plate survives."""

@@ -7,9 +7,6 @@ from typing import Any
 
 import pytest
 
-from drivers.backends.can_bus.backend import CanBackend
-from drivers.backends.modbus.backend import ModbusBackend
-from drivers.backends.serial_line.backend import SerialBackend
 from drivers.operation.simultaneous import at_one_moment
 from virtual_loop import VirtualLoop
 
@@ -64,18 +61,6 @@ def test_equal_wires_commit_at_once() -> None:
         await asyncio.gather(*tasks)
 
     in_virtual_time(work)
-
-
-def test_commit_time_of_each_wire() -> None:
-    """Frames of the vendor pages: 13 bytes; 19 bytes and the silence; an order and a SYNC."""
-    serial = SerialBackend("serial:///dev/ttyUSB0?baud=115200")
-    assert serial.wire_times.commit() == pytest.approx(13 * 10 / 115_200)
-    assert SerialBackend("socket://h:1").wire_times.commit() == 0
-    modbus = ModbusBackend("modbus+rtu:///dev/ttyS1?baud=19200#1")
-    assert modbus.wire_times.commit() == pytest.approx((19 + 3.5) * 11 / 19_200)
-    assert ModbusBackend("modbus+tcp://h/1").wire_times.commit() == 0
-    can = CanBackend("can+socketcan://can0#1")
-    assert can.wire_times.commit() == pytest.approx((135 + 55) / 500_000)
 
 
 def test_remainder_below_clock_resolution_ends() -> None:

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.codec.serial_line.frame import REPLY, Frame, FrameReader, encode_frame, frame_length
-from drivers.codec.serial_line.timing import SerialTimes
 from drivers.protocol.definition import PROTOCOL
 
 FRAMES = st.builds(
@@ -120,12 +119,3 @@ def test_a_payload_that_does_not_fit_is_refused() -> None:
     """A frame stays within one COBS block."""
     with pytest.raises(ValueError, match="at most 240 bytes, got 241"):
         encode_frame(Frame(kind=7, address=1, sequence=1, payload=bytes(241)))
-
-
-def test_wire_times_are_those_of_the_arithmetic() -> None:
-    """Four channels take 50 bytes of ten bits: 4.3 ms at 115 200 baud, 0.5 ms at 921 600."""
-    assert SerialTimes(115_200).apply(4) == pytest.approx(50 * 10 / 115_200)
-    assert SerialTimes(921_600).apply(4) == pytest.approx(0.5e-3, rel=0.1)
-    assert SerialTimes(115_200).round_trip(4) == pytest.approx((50 + 46) * 10 / 115_200)
-    # The frames of the vendor's page, of two knots.
-    assert SerialTimes(115_200).loading(2) == pytest.approx((23 + 13) * 10 / 115_200)

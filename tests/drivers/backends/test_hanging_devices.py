@@ -1,0 +1,120 @@
+"""A device that hangs while it is opened, read or closed delays nothing else."""
+
+import asyncio
+import logging
+import os
+import threading
+from collections.abc import Callable, Coroutine, Iterator
+from functools import partial
+from typing import Any
+
+import can
+import pytest
+
+from drivers import threads
+from drivers.backends.can_bus import adapter
+from drivers.backends.hardware import Adapter, Port
+from drivers.backends.ports import opening
+from drivers.backends.urls.can_bus import CanUrl
+from drivers.codec.can_bus.frame import CanFrame
+
+
+class _Hanging:
+    """A port or adapter whose opening, reading and closing block until allowed."""
+
+    def __init__(self) -> None:
+        self.port = "/dev/ttyUSB9"
+        self.may_open, self.may_read, self.may_close = (threading.Event() for _ in range(3))
+        self.is_opening, self.is_closed = threading.Event(), threading.Event()
+        self._pipe = os.pipe()
+
+    def open(self, *_: object) -> "_Hanging":
+        self.is_opening.set()
+        self.may_open.wait(20)
+        return self
+
+    def fileno(self) -> int:
+        return self._pipe[0]
+
+    def recv(self, timeout: float) -> can.Message | None:
+        if not self.may_read.wait(timeout):
+            return None
+        return can.Message(arbitration_id=0x701, is_extended_id=False, data=[5])
+
+    def close(self) -> None:
+        self.may_close.wait(20)
+        for descriptor in self._pipe:
+            os.close(descriptor)
+        self.is_closed.set()
+
+    shutdown = close
+
+
+class _HangingRead(_Hanging):
+    def recv(self, timeout: float) -> can.Message | None:
+        return super().recv(20)
+
+
+HEARD: list[CanFrame] = []
+OPENINGS: dict[str, Callable[[], Coroutine[Any, Any, Port | Adapter]]] = {
+    "port": partial(
+        opening.open_port,
+        "/dev/ttyUSB9",
+        baud=9600,
+        on_data=lambda data: None,
+        on_loss=lambda what: None,
+    ),
+    "adapter": partial(
+        adapter.open_adapter,
+        CanUrl.parse("can+socketcan://can0#1").bus,
+        on_frame=HEARD.append,
+        on_loss=lambda what: None,
+    ),
+}
+
+
+@pytest.fixture(params=[_Hanging, _HangingRead])
+def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[_Hanging]:
+    """The device that is opened; released after the test."""
+    device: _Hanging = request.param()
+    monkeypatch.setattr(opening, "_open_port", device.open)
+    monkeypatch.setattr(adapter, "open_bus", device.open)
+    monkeypatch.setattr(threads, "CLOSE_TIMEOUT", 0.05)
+    HEARD.clear()
+    yield device
+    for event in (device.may_open, device.may_read, device.may_close):
+        event.set()
+    assert device.is_closed.wait(20)
+
+
+@pytest.mark.parametrize("device", [_Hanging], indirect=True)
+@pytest.mark.parametrize("kind", OPENINGS)
+async def test_device_opened_after_a_cancellation_is_closed(device: _Hanging, kind: str) -> None:
+    """The cancelled task does not wait for it."""
+    task = asyncio.create_task(OPENINGS[kind]())
+    assert await asyncio.to_thread(device.is_opening.wait, 20)
+    task.cancel()
+    await asyncio.wait({task})
+    assert task.cancelled()
+    assert not device.is_closed.is_set()
+    device.may_close.set()
+    device.may_open.set()
+    assert await asyncio.to_thread(device.is_closed.wait, 20)
+
+
+@pytest.mark.parametrize("kind", OPENINGS)
+async def test_close_does_not_wait_for_a_device_that_hangs(
+    device: _Hanging, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It continues in its thread, with a log line; frames read then are discarded."""
+    device.may_open.set()
+    opened = await OPENINGS[kind]()
+    opened.close()
+    with caplog.at_level(logging.WARNING, "drivers"):
+        await asyncio.wait_for(opened.wait_closed(), 10)
+    assert not device.is_closed.is_set()
+    assert "era-close" in caplog.text
+    device.may_read.set()
+    device.may_close.set()
+    assert await asyncio.to_thread(device.is_closed.wait, 20)
+    assert HEARD == []

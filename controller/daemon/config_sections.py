@@ -13,10 +13,10 @@ from model.drive_modes import DRIVE_MODES
 from model.finger.perception import STRONG_DB_SL
 from model.rig.sections import Identifier
 
-_NUMBER = Annotated[float, Quantity(RATIO, least=-10, most=10)]
+_NUMBER = Annotated[float, Quantity(RATIO, at_least=-10, at_most=10)]
 _ROW = Annotated[tuple[_NUMBER, _NUMBER, _NUMBER], Strict(strict=False)]  # a list in the file
 
-_LENGTH = Annotated[float, Quantity(LENGTH, least=-10, most=10)]
+_LENGTH = Annotated[float, Quantity(LENGTH, at_least=-10, at_most=10)]
 _POINT = Annotated[tuple[_LENGTH, _LENGTH], Strict(strict=False)]
 
 
@@ -48,7 +48,7 @@ MAX_TOUCH_WAIT = 0.1
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 File = Annotated[str, Field(min_length=1, max_length=4096), AfterValidator(_file)]
-LevelDbSl = Annotated[float, Quantity(RATIO, least=-20, most=60)]
+LevelDbSl = Annotated[float, Quantity(RATIO, at_least=-20, at_most=60)]
 
 
 class CalibrationPoint(Section):
@@ -96,11 +96,13 @@ class DaemonSection(Section):
     table: File | None = None
     mode: Annotated[str, AfterValidator(_mode)] | None = None
     level_db_sl: LevelDbSl = STRONG_DB_SL
-    touch_wait: Annotated[float, Quantity(TIME, least=0, most=MAX_TOUCH_WAIT)] = ENVELOPE_TIME
+    touch_wait: Annotated[float, Quantity(TIME, at_least=0, at_most=MAX_TOUCH_WAIT)] = ENVELOPE_TIME
     layout: File | None = None
     touch: Annotated[list[TouchSection], Field(max_length=16, default_factory=list)]
     serial_numbers: Annotated[dict[Identifier, str], Field(max_length=64, default_factory=dict)]
-    longest_lease: Annotated[float, Quantity(TIME, least=MIN_LEASE, most=MAX_LEASE)] = MAX_LEASE
+    longest_lease: Annotated[float, Quantity(TIME, at_least=MIN_LEASE, at_most=MAX_LEASE)] = (
+        MAX_LEASE
+    )
     socket: File | None = None
     log: LogSection = LogSection()
     dumps: DumpSection | None = None

@@ -169,12 +169,12 @@ class TouchRecorder:
 
     async def _add_row(self, touch: _Touch) -> None:
         """Make the row of a lifted touch from the pattern that played longest for it."""
-        longest = max(touch.patterns, key=lambda playing: playing.duration, default=None)
+        dominant = max(touch.patterns, key=lambda playing: playing.duration, default=None)
         contact, quiet, targets = touch.contact, touch.quiet, []
-        if longest is not None:
-            contact = _prediction(touch, longest).contact
-            targets = [each.contact for each in longest.applied.targets]
-            quiet = {_id(other): (other.x, other.y) for other in longest.applied.quiet}
+        if dominant is not None:
+            contact = _prediction(touch, dominant).contact
+            targets = [each.contact for each in dominant.applied.targets]
+            quiet = {_id(other): (other.x, other.y) for other in dominant.applied.quiet}
         row = TouchRow(
             target_id=_id(contact),
             time=contact.since - self._start,
@@ -182,8 +182,8 @@ class TouchRecorder:
             target=(contact.x, contact.y),
             other_targets=tuple((each.x, each.y) for each in targets if each.key != contact.key),
             quiet=quiet,
-            played=await _played(touch, longest) if longest else None,
-            reason=None if longest else touch.reason,
+            played=await _played(touch, dominant) if dominant else None,
+            reason=None if dominant else touch.reason,
         )
         self.rows.append(row)
         self._on_row(row)
@@ -200,11 +200,11 @@ class TouchRecorder:
             self._errors.append(str(error))
 
 
-async def _played(touch: _Touch, longest: _Playing) -> PlayedPattern:
+async def _played(touch: _Touch, dominant: _Playing) -> PlayedPattern:
     """The longest pattern of a touch as measured; latency and onset are of its first pattern."""
     first = touch.patterns[0]
-    applied, predicted = longest.applied, _prediction(touch, longest)
-    vibration = await longest.steady if longest.steady else {}
+    applied, predicted = dominant.applied, _prediction(touch, dominant)
+    vibration = await dominant.steady if dominant.steady else {}
     target, quiet = _fingers(vibration, predicted.contact, applied)
     onset = await first.onset if first.onset else {}
     onset_target, onset_quiet = _fingers(onset, touch.contact, first.applied)
@@ -215,7 +215,7 @@ async def _played(touch: _Touch, longest: _Playing) -> PlayedPattern:
             for era, each in applied.drive.items()
         },
         latency=first.applied.latency,
-        duration=longest.duration,
+        duration=dominant.duration,
         is_onset_shaped=bool(first.applied.pattern.onset),
         predicted_level_db_sl=predicted.level_db_sl,
         measured_level_db_sl=target.level_db_sl if target else None,

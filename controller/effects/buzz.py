@@ -15,7 +15,9 @@ class Buzz(Effect):
     kind: ClassVar[str] = "buzz"
     is_for_motion: ClassVar[bool] = False
 
-    duration: Annotated[float, Quantity(TIME, least=MIN_DURATION, most=MAX_DURATION)] | None = None
+    duration: (
+        Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=MAX_DURATION)] | None
+    ) = None
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start a steady vibration."""

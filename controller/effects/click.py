@@ -15,7 +15,7 @@ class Click(Effect):
     kind: ClassVar[str] = "click"
     is_for_motion: ClassVar[bool] = False
 
-    duration: Annotated[float, Quantity(TIME, least=MIN_DURATION, most=0.5)] = 0.040
+    duration: Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=0.5)] = 0.040
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start a vibration of its duration."""

@@ -22,9 +22,9 @@ class Detents(Effect):
     kind: ClassVar[str] = "detents"
     is_for_motion: ClassVar[bool] = True
 
-    spacing: Annotated[float, Quantity(LENGTH, least=0.002, most=0.2)] = 0.010
+    spacing: Annotated[float, Quantity(LENGTH, at_least=0.002, at_most=0.2)] = 0.010
     along: Literal["x", "y"] = "x"
-    duration: Annotated[float, Quantity(TIME, least=MIN_DURATION, most=0.2)] = 0.030
+    duration: Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=0.2)] = 0.030
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start halfway between two detents."""

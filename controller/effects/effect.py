@@ -16,7 +16,7 @@ NEIGHBOURS: Literal["neighbours"] = "neighbours"
 """The level `as strong as the neighbours allow`."""
 
 MIN_DB_SL, MAX_DB_SL = -20.0, 60.0
-_DB_SL = Quantity(RATIO, least=MIN_DB_SL, most=MAX_DB_SL)
+_DB_SL = Quantity(RATIO, at_least=MIN_DB_SL, at_most=MAX_DB_SL)
 
 
 def _level(value: object) -> object:

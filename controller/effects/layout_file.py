@@ -19,9 +19,9 @@ from model.structure.plate import Plate
 from registry.suggestions import did_you_mean
 
 _MAX_REGIONS = 256
-_LENGTH = Annotated[float, Quantity(LENGTH, least=-10, most=10)]
+_LENGTH = Annotated[float, Quantity(LENGTH, at_least=-10, at_most=10)]
 _POINT = Annotated[tuple[_LENGTH, _LENGTH], Strict(strict=False)]  # a list in the file
-_SIZE = Annotated[float, Quantity(LENGTH, above=0, most=10)]
+_SIZE = Annotated[float, Quantity(LENGTH, above=0, at_most=10)]
 _SHAPES = ("rectangle", "circle", "polygon")
 
 _TOLERANCE = 1e-9  # m; rounding errors at the edge of the plate

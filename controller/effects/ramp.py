@@ -27,8 +27,8 @@ class Ramp(Effect):
     kind: ClassVar[str] = "ramp"
     is_for_motion: ClassVar[bool] = False
 
-    start_level: Annotated[float, Quantity(RATIO, least=MIN_DB_SL, most=MAX_DB_SL)] = 6.0
-    duration: Annotated[float, Quantity(TIME, least=0.1, most=MAX_DURATION)] = 1.0
+    start_level: Annotated[float, Quantity(RATIO, at_least=MIN_DB_SL, at_most=MAX_DB_SL)] = 6.0
+    duration: Annotated[float, Quantity(TIME, at_least=0.1, at_most=MAX_DURATION)] = 1.0
     hold: bool = False
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:

@@ -35,9 +35,9 @@ class Texture(Effect):
     kind: ClassVar[str] = "texture"
     is_for_motion: ClassVar[bool] = True
 
-    slow: Annotated[float, Quantity(SPEED, above=0, most=1)] = 0.01
-    fast: Annotated[float, Quantity(SPEED, above=0, most=5)] = 0.20
-    range: Annotated[float, Quantity(RATIO, least=0, most=40)] = 14.0
+    slow: Annotated[float, Quantity(SPEED, above=0, at_most=1)] = 0.01
+    fast: Annotated[float, Quantity(SPEED, above=0, at_most=5)] = 0.20
+    range: Annotated[float, Quantity(RATIO, at_least=0, at_most=40)] = 14.0
 
     @model_validator(mode="after")
     def _check_speeds(self) -> Self:

@@ -20,10 +20,10 @@ def silent_eras(responses: Responses) -> NDArray[np.bool_]:
 
     Raises InputError where no ERA moves anything.
     """
-    usual = np.array([_median(responses.values[:, e]) for e in range(responses.values.shape[1])])
-    if not np.nanmax(usual) > 0:
+    typical = np.array([_median(responses.values[:, e]) for e in range(responses.values.shape[1])])
+    if not np.nanmax(typical) > 0:
         raise InputError("every measured response is zero; check that the ERAs were driven")
-    return np.asarray(usual < _SILENT_ERA * np.nanmedian(usual))
+    return np.asarray(typical < _SILENT_ERA * np.nanmedian(typical))
 
 
 def silent_sensors(responses: Responses) -> NDArray[np.bool_]:
@@ -31,8 +31,8 @@ def silent_sensors(responses: Responses) -> NDArray[np.bool_]:
     size = np.abs(responses.values)
     loudest = np.where(np.isfinite(size), size, 0).max(axis=2, keepdims=True)
     share = size / np.where(loudest > 0, loudest, np.nan)
-    usual = [_median(share[:, :, s]) for s in range(size.shape[2])]
-    return ~(np.array(usual) >= _SILENT_SENSOR)
+    typical = [_median(share[:, :, s]) for s in range(size.shape[2])]
+    return ~(np.array(typical) >= _SILENT_SENSOR)
 
 
 def _median(values: NDArray[np.inexact]) -> float:

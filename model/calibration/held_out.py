@@ -24,9 +24,9 @@ def hold_out(problem: Problem, fit: Fit, names: tuple[str, ...]) -> HeldOut | No
     wanted = max(round(_HELD_OUT_SHARE * count), 1)
     if count < _LEAST_TO_HOLD_OUT or len(candidates) <= wanted:
         return None
-    spread = np.linspace(0, len(candidates) - 1, wanted + 2)[1:-1].round().astype(int)
+    evenly_spaced = np.linspace(0, len(candidates) - 1, wanted + 2)[1:-1].round().astype(int)
     unseen = np.zeros(count, dtype=bool)
-    unseen[candidates[spread]] = True
+    unseen[candidates[evenly_spaced]] = True
     part = replace(
         problem,
         plate=replace(problem.plate, shapes=problem.plate.shapes[~unseen]),

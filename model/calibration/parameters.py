@@ -69,7 +69,7 @@ def parameters_of(rig: Rig) -> tuple[Parameter, ...]:
             "",
             step=0.01,
             std=max(_LOSS_STD * plate.loss_factor, _MIN_LOSS_STD),
-            most=0.5,
+            at_most=0.5,
         ),
     ]
     for era in rig.eras:
@@ -86,7 +86,7 @@ def parameters_of(rig: Rig) -> tuple[Parameter, ...]:
                 "N s/m",
                 step=0.05 * unit_damping,
                 std=max(_DAMPING_STD * era.damping, _MIN_DAMPING_RATIO_STD * unit_damping),
-                most=2 * unit_damping,
+                at_most=2 * unit_damping,
             ),
             _offset(
                 "bolt_mass",
@@ -95,7 +95,7 @@ def parameters_of(rig: Rig) -> tuple[Parameter, ...]:
                 "kg",
                 step=0.05 * share,
                 std=_BOLT_STD * share,
-                most=5 * share,
+                at_most=5 * share,
             ),
         ]
     return tuple(found)
@@ -139,7 +139,7 @@ def _factor(kind: str, era: str, prior: float, unit: str, *, std: float, reach: 
 
 
 def _offset(
-    kind: str, era: str, prior: float, unit: str, *, step: float, std: float, most: float
+    kind: str, era: str, prior: float, unit: str, *, step: float, std: float, at_most: float
 ) -> Parameter:
-    upper = max(most, 2 * prior) / step
+    upper = max(at_most, 2 * prior) / step
     return Parameter(kind, era, prior, unit, False, step, std / step, 0.0, upper)

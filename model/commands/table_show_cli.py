@@ -75,7 +75,7 @@ def verify(
         print(json.dumps(found.as_json() | {"seed": seed, "verify_time_s": elapsed}))
     else:
         _show_verification(found)
-        count = len(found.content) + len(found.answers)
+        count = len(found.content) + len(found.answer_checks)
         print(f"{count - found.misses} of {count} passed (seed {seed}) in {elapsed:.1f} s")
         if found.misses:
             print(next_line("era", "table", "build", rig_file, "-o", table_file))
@@ -166,7 +166,7 @@ def _show_verification(found: "Verification") -> None:
     print()
     print("                       level, dB SL         contrast, dB")
     print("target, m        quiet  predicted  direct  predicted  direct  in time   tolerances")
-    for answer in found.answers:
+    for answer in found.answer_checks:
         x, y = answer.question.targets[0]
         print(
             f"({x:.3f}, {y:.3f})  {len(answer.question.quiet):5d}  "

@@ -31,26 +31,26 @@ PartT = TypeVar("PartT", bound=Section)
 class Quantity:
     """Annotation of a float field written with a unit or in SI; bounds in SI.
 
-    above and below exclude the bound, least and most include it.
+    above and below exclude the bound, at_least and at_most include it.
     """
 
     dimension: Dimension
     above: float = -float("inf")
-    least: float = -float("inf")
-    most: float = float("inf")
+    at_least: float = -float("inf")
+    at_most: float = float("inf")
     below: float = float("inf")
 
     def read(self, value: object) -> float:
         """Convert to SI units; raises ValueError for another dimension or a value out of bounds."""
         result = quantity(value, self.dimension)
-        if self.above < result < self.below and self.least <= result <= self.most:
+        if self.above < result < self.below and self.at_least <= result <= self.at_most:
             return result
         limits = [
             f"{words} {limit:g} {self.dimension.unit}".strip()
             for words, limit in (
                 ("above", self.above),
-                ("at least", self.least),
-                ("at most", self.most),
+                ("at least", self.at_least),
+                ("at most", self.at_most),
                 ("below", self.below),
             )
             if abs(limit) != float("inf")

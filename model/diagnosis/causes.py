@@ -26,7 +26,7 @@ _SIZES = (0.6, 0.67, 0.75, 0.82, 0.88, 0.94, 1.06, 1.13, 1.21, 1.33, 1.5, 1.67)
 _STIFFNESSES = (0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
 _LOSSES = (0.1, 0.3, 3.0, 10.0, 30.0)
 _MASSES = (0.01, 0.02, 0.04, 0.08, 0.16)  # of the plate's mass, at every ERA
-_LIKELY = 5  # causes for which the rest of the rig is let move
+_FITTED_CAUSES = 5  # causes for which the rest of the rig is let move
 _FOLLOWED = 2  # of these, whose value is searched for finely
 _FINELY = 7  # values
 _TOGETHER = 4.0  # errors of a model go together over sensors and frequencies, and count less
@@ -125,7 +125,7 @@ def explain(
             scores.append((*min(tried), cause))
     scores.sort(key=lambda each: each[0])
     found = []
-    for _, factor, cause in scores[:_LIKELY]:
+    for _, factor, cause in scores[:_FITTED_CAUSES]:
         match = matched(cause, factor)
         if match is not None:
             found.append((cause, factor, match))

@@ -16,7 +16,7 @@ _TO_DO: dict[ChannelState, str] = {
     "inverted": "turn its two wires round",
     "out of phase": "measure it with `era calibrate`, which writes its gains into the rig",
 }
-_LIKELY = 0.05  # what is less likely is not worth a line
+_MIN_SHARE = 0.05  # what is less likely is not worth a line
 
 
 def verdict_rows(verdict: Verdict) -> list[str]:
@@ -64,7 +64,7 @@ def plate_rows(verdict: Verdict) -> list[str]:
             "deviations off"
         )
     rows = [f"PLATE: the rig does not match the plate: {why}"]
-    good = [each for each in verdict.explanations if explains(each) and each.share >= _LIKELY]
+    good = [each for each in verdict.explanations if explains(each) and each.share >= _MIN_SHARE]
     for number, each in enumerate(good):
         unit = each.cause.unit
         rows.append(

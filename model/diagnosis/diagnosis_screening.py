@@ -81,13 +81,13 @@ def off_scale(
     observation: Observation, values: ComplexArray, match: Match
 ) -> list[tuple[str, str]]:
     """Sensors that do not read what the rest of them say, and how much of it; if the rest agree."""
-    if match.usual_error > FITS:
+    if match.median_error > FITS:
         return []
     there = np.isfinite(values) & np.isfinite(match.predicted)
     model = np.where(there, match.predicted, 0)
     measured = np.where(there, values, 0)
-    turn = np.exp(-1j * np.angle((model.conj() * measured).sum(axis=2, keepdims=True)))
-    inner = (model.conj() * measured * turn).real.sum(axis=(0, 1))
+    phase_factor = np.exp(-1j * np.angle((model.conj() * measured).sum(axis=2, keepdims=True)))
+    inner = (model.conj() * measured * phase_factor).real.sum(axis=(0, 1))
     scale = inner / np.maximum((np.abs(model) ** 2).sum(axis=(0, 1)), 1e-300)
     scale = scale / np.median(scale)
     low, high = _SENSOR_SCALE

@@ -42,7 +42,7 @@ class Match:
     known (n,), how much that is of its x;
     gains (e,): magnitude of each channel, NaN where it was not used; cost: half the sum of squares
     of residuals, robustly, and of the priors; error: rms of what is left, relative to each row's,
-    usual_error: its median; responses (f, e, s): of its ERAs;
+    median_error: its median; responses (f, e, s): of its ERAs;
     predicted (f, e, s): of those that the channels drive, with gains.
     """
 
@@ -52,7 +52,7 @@ class Match:
     gains: FloatArray
     cost: float
     error: float
-    usual_error: float
+    median_error: float
     responses: ComplexArray
     predicted: ComplexArray
 

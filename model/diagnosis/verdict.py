@@ -173,7 +173,7 @@ def _best_match(
         if other.cost < match.cost - _BETTER:
             drives, match = nearest, other
     # Noise that is larger than the usual makes numbers of the rig less sure.
-    error = float(np.clip(1.2 * match.usual_error, MODEL_ERROR, 0.3))
+    error = float(np.clip(1.2 * match.median_error, MODEL_ERROR, 0.3))
     if error > MODEL_ERROR:
         match = matched(drives, error)
     return match, drives, error

@@ -92,19 +92,19 @@ def _gains(rows: list[tuple[float, float, float]]) -> list[tuple[float, float, f
 
 GainRow = Annotated[tuple[float, float, float], Strict(strict=False)]  # a list in the file
 Identifier = Annotated[str, AfterValidator(_identifier)]
-Side = Annotated[float, Quantity(LENGTH, above=0, most=100)]
-Coordinate = Annotated[float, Quantity(LENGTH, least=-100, most=100)]
+Side = Annotated[float, Quantity(LENGTH, above=0, at_most=100)]
+Coordinate = Annotated[float, Quantity(LENGTH, at_least=-100, at_most=100)]
 Place = Annotated[tuple[Coordinate, Coordinate], Strict(strict=False)]  # a list in the file
-Thickness = Annotated[float, Quantity(LENGTH, least=1e-6, most=1)]
-Frequency = Annotated[float, Quantity(FREQUENCY, least=1, most=2000)]
+Thickness = Annotated[float, Quantity(LENGTH, at_least=1e-6, at_most=1)]
+Frequency = Annotated[float, Quantity(FREQUENCY, at_least=1, at_most=2000)]
 
 
 class MaterialSection(Section):
     """A material by its numbers."""
 
     name: Identifier = "custom"
-    E: Annotated[float, Quantity(MODULUS, least=1e3, most=1e13)]
-    rho: Annotated[float, Quantity(DENSITY, least=1, most=1e5)]
+    E: Annotated[float, Quantity(MODULUS, at_least=1e3, at_most=1e13)]
+    rho: Annotated[float, Quantity(DENSITY, at_least=1, at_most=1e5)]
     nu: Annotated[float, Quantity(RATIO, above=-1, below=0.5)]
 
 
@@ -137,18 +137,18 @@ class PlateSection(Section):
     layers: Annotated[list[LayerSection], Field(min_length=1, max_length=20)] | None = None
     bond: Annotated[Bond, Strict(strict=False)] = Bond.FULL
     bond_frequency: Frequency | None = None
-    loss_factor: Annotated[float, Quantity(RATIO, least=0, below=1)] = 0.01
+    loss_factor: Annotated[float, Quantity(RATIO, at_least=0, below=1)] = 0.01
 
 
 class EraSection(Section):
     """One ERA. Defaults of damping and stroke are assumed, the paper prints neither."""
 
     at: Place
-    stiffness: Annotated[float, Quantity(STIFFNESS, above=0, most=1e12)]
-    damping_ratio: Annotated[float, Quantity(RATIO, least=0, most=2)] = 0.05
-    damping: Annotated[float, Quantity(DAMPING, least=0, most=1e6)] | None = None
-    bolt_mass: Annotated[float, Quantity(MASS, least=0, most=10)] = 0.0
-    stroke: Annotated[float, Quantity(LENGTH, above=0, most=0.01)] = 100e-6
+    stiffness: Annotated[float, Quantity(STIFFNESS, above=0, at_most=1e12)]
+    damping_ratio: Annotated[float, Quantity(RATIO, at_least=0, at_most=2)] = 0.05
+    damping: Annotated[float, Quantity(DAMPING, at_least=0, at_most=1e6)] | None = None
+    bolt_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=10)] = 0.0
+    stroke: Annotated[float, Quantity(LENGTH, above=0, at_most=0.01)] = 100e-6
     gains: Annotated[list[GainRow], Field(max_length=2000), AfterValidator(_gains)] | None = None
     amplifier: Identifier
     channel: Annotated[int, Field(ge=0, le=255)]
@@ -158,7 +158,7 @@ class MassSection(Section):
     """A point mass on the plate."""
 
     at: Place
-    mass: Annotated[float, Quantity(MASS, least=0, most=10)]
+    mass: Annotated[float, Quantity(MASS, at_least=0, at_most=10)]
 
 
 class AmplifierSection(Section):
@@ -176,12 +176,12 @@ class LimitsSection(Section):
     frequency: Annotated[
         tuple[Frequency, Frequency], Strict(strict=False), AfterValidator(_ascending)
     ] = (40.0, 500.0)
-    level: Annotated[float, Quantity(RATIO, least=0, most=1)] = 1.0
-    slew: Annotated[float, Quantity(SLEW, above=0, most=1e6)] | None = None
-    power: Annotated[float, Quantity(RATIO, above=0, most=256)] | None = None
-    on_time: Annotated[float, Quantity(TIME, above=0, most=86_400)] | None = None
-    duty: Annotated[float, Quantity(RATIO, above=0, most=1)] | None = None
-    rate: Annotated[float, Quantity(RATE, least=1, most=2000)] | None = None
+    level: Annotated[float, Quantity(RATIO, at_least=0, at_most=1)] = 1.0
+    slew: Annotated[float, Quantity(SLEW, above=0, at_most=1e6)] | None = None
+    power: Annotated[float, Quantity(RATIO, above=0, at_most=256)] | None = None
+    on_time: Annotated[float, Quantity(TIME, above=0, at_most=86_400)] | None = None
+    duty: Annotated[float, Quantity(RATIO, above=0, at_most=1)] | None = None
+    rate: Annotated[float, Quantity(RATE, at_least=1, at_most=2000)] | None = None
 
 
 class RigSection(Section):

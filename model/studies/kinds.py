@@ -32,15 +32,16 @@ def count_cases(rig: Rig, *, layouts: int, seed: int, raster: tuple[int, int]) -
             "ERAs must be alike for a study of their count; give all of them the same stiffness, "
             "damping, bolt_mass and stroke"
         )
-    most = max(MAX_ERAS, len(rig.eras))
-    if layouts < most:
+    max_count = max(MAX_ERAS, len(rig.eras))
+    if layouts < max_count:
         raise InputError(
-            f"number of layouts must be at least {most} to compare 1 to {most} ERAs, got {layouts}"
+            f"number of layouts must be at least {max_count} to compare 1 to {max_count} ERAs, "
+            f"got {layouts}"
         )
     pool = LayoutPool(rig, raster)
     rng = np.random.default_rng(seed)
-    for count in range(1, most + 1):
-        share = layouts // most + (count <= layouts % most)
+    for count in range(1, max_count + 1):
+        share = layouts // max_count + (count <= layouts % max_count)
         pool.add(count, share, rng, own=count == len(rig.eras))
     return pool.cases()
 

@@ -50,8 +50,8 @@ class LayoutPool:
 
     def cases(self) -> Cases:
         """All layouts that were added, with the stiffness that the rig's ERAs have."""
-        most = max(len(row) for row in self._places)
-        places = np.full((len(self._places), most), VACANT, dtype=np.int32)
+        count = max(len(row) for row in self._places)
+        places = np.full((len(self._places), count), VACANT, dtype=np.int32)
         for row, numbers in zip(places, self._places, strict=True):
             row[: len(numbers)] = numbers
         return Cases(np.array(self._positions), places, np.ones(len(places)), tuple(self._names))

@@ -17,7 +17,7 @@ from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 
 # More than this [bytes] and the machine is likely to run out of memory.
-_MOST_BYTES = 2 << 30
+_MAX_BYTES = 2 << 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ def solve_receptances(
     """
     count = len(positions)
     size = 16 * len(frequencies) * count * (count + len(points))
-    if size > _MOST_BYTES:
+    if size > _MAX_BYTES:
         raise InputError(
             f"{count} places, {len(points)} points and {len(frequencies)} frequencies take "
             f"{size / 1e9:.1f} GB; take fewer --candidates or fewer --frequencies"

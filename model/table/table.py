@@ -211,8 +211,8 @@ class LocalizationTable:
         sources = magnitudes_of_sources(self._cell_fields)
         powers = (sources / per_source(self._threshold, len(self.eras))) ** 2
         # Cell by cell, since fine frequency steps make millions of patterns.
-        most = [sums_of_sources(cell[None], len(self.eras)).max() for cell in powers.T]
-        return decibels(np.sqrt(np.array(most, dtype=float)))
+        maxima = [sums_of_sources(cell[None], len(self.eras)).max() for cell in powers.T]
+        return decibels(np.sqrt(np.array(maxima, dtype=float)))
 
     @cached_property
     def cell_centres(self) -> FloatArray:

@@ -59,7 +59,7 @@ _ALL_OVER = Grid(8, 6)  # where the root mean square is taken
 
 _WINDOW = 0.25  # s, in which steady amplitudes are read
 _LEFT = 1e-4  # of what the start excited, before they are
-_LONGEST = 20.0  # s
+_MAX_DURATION = 20.0  # s
 
 
 @dataclass(frozen=True)
@@ -117,14 +117,14 @@ class Verification:
     """All recomputed content and answers."""
 
     content: tuple[ContentCheck, ...]
-    answers: tuple[AnswerCheck, ...]
+    answer_checks: tuple[AnswerCheck, ...]
 
     @property
     def misses(self) -> int:
         """Number of failed checks."""
         return [
             *(check.is_passed for check in self.content),
-            *(answer.is_passed for answer in self.answers),
+            *(answer.is_passed for answer in self.answer_checks),
         ].count(False)
 
     def as_json(self) -> dict[str, Any]:
@@ -148,7 +148,7 @@ class Verification:
                     "time_tolerance_db": answer.time_tolerance_db,
                     "holds": answer.is_passed,
                 }
-                for answer in self.answers
+                for answer in self.answer_checks
             ],
             "misses": self.misses,
         }
@@ -184,11 +184,11 @@ def verify_table(
     matrices = assemble(rig.plate, table.mesh)
     content = tuple(_check_content(table, rig, matrices, rng))
     check = _AnswerChecker(table, rig, matrices)
-    answers = []
+    answer_checks = []
     for number in range(samples):
-        answers.append(check(*_random_answer(table, rng, others=1 + number % 3)))
+        answer_checks.append(check(*_random_answer(table, rng, others=1 + number % 3)))
         progress(number + 1, samples)
-    return Verification(content, tuple(answers))
+    return Verification(content, tuple(answer_checks))
 
 
 def _check_content(
@@ -285,8 +285,8 @@ def steady_in_time(
 ) -> FloatArray:
     """Amplitudes (f, p) [m/s²] at points [m] long after an excitation started from rest."""
     slowest = -float(plate.eigenvalues.real.max())
-    settled = -math.log(_LEFT) / slowest if slowest > 0 else _LONGEST
-    duration = min(settled, _LONGEST) + _WINDOW
+    settled = -math.log(_LEFT) / slowest if slowest > 0 else _MAX_DURATION
+    duration = min(settled, _MAX_DURATION) + _WINDOW
     bases = ramped_onset(excitation, plate.eras, ramp=0.02)
     felt = transients.acceleration(bases, points, duration=duration)
     last = round(_WINDOW * SAMPLE_RATE)

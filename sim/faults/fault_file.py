@@ -23,12 +23,12 @@ from sim.faults.fault_window import FaultKind, Faults, FaultWindow, Toward
 
 class _FaultSection(Section):
     fault: FaultKind
-    at: Annotated[float, Quantity(TIME, least=0)] = 0.0
+    at: Annotated[float, Quantity(TIME, at_least=0)] = 0.0
     lasts: Annotated[float, Quantity(TIME, above=0)] = math.inf
     amplifier: str | None = None
-    share: Annotated[float, Quantity(RATIO, above=0, most=1)] = 1.0
+    share: Annotated[float, Quantity(RATIO, above=0, at_most=1)] = 1.0
     toward: Toward | None = None
-    delay: Annotated[float, Quantity(TIME, above=0, most=10)] = 0.1
+    delay: Annotated[float, Quantity(TIME, above=0, at_most=10)] = 0.1
 
 
 class _FaultFileSection(Section):

@@ -36,8 +36,8 @@ def bounds_in_words(asked: Quantity) -> str:
     """Every finite bound of a quantity, in the words of the error."""
     bounds = {
         "above": asked.above,
-        "at least": asked.least,
-        "at most": asked.most,
+        "at least": asked.at_least,
+        "at most": asked.at_most,
         "below": asked.below,
     }
     return ", ".join(f"{word} {b:g}" for word, b in bounds.items() if abs(b) != float("inf"))

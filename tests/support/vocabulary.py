@@ -64,8 +64,13 @@ ALLOWED_FILES = (
 )
 """Their names follow the next version of the protocol."""
 
-ALLOWED = {"most_at_once", "longest_lease"}
-"""Keys of files."""
+ALLOWED = {
+    "most_at_once": "a key of the configuration file",
+    "longest_lease": "a key of the configuration file",
+    "hold": "a parameter of the effect `ramp`: the last level is held",
+    "CLOSE": "an event and an action of the daemon: it closes its amplifiers",
+}
+"""Identifiers in which the word has its ordinary meaning, and which."""
 
 
 def retired_identifiers() -> Iterator[str]:

@@ -47,7 +47,7 @@ class Heartbeat(Effect):
     kind: ClassVar[str] = "heartbeat"
     is_for_motion: ClassVar[bool] = False  # it goes by itself: for on_press
 
-    period: Annotated[float, Quantity(TIME, least=0.4, most=5.0)] = 0.9
+    period: Annotated[float, Quantity(TIME, at_least=0.4, at_most=5.0)] = 0.9
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Begin at a finger."""

@@ -11,7 +11,7 @@ from model.config.units import FREQUENCY, LENGTH
 class Inner(Section):
     """A section in a mapping by name."""
 
-    size: Annotated[float, Quantity(LENGTH, above=0, most=1)]
+    size: Annotated[float, Quantity(LENGTH, above=0, at_most=1)]
     word: str = "none"
 
 
@@ -19,7 +19,7 @@ class Outer(Section):
     """A section that is made up for these tests, as a daemon's would be."""
 
     parts: dict[str, Inner]
-    rate: Annotated[float, Quantity(FREQUENCY, least=10, below=20)] = 15.0
+    rate: Annotated[float, Quantity(FREQUENCY, at_least=10, below=20)] = 15.0
     armed: bool = False
 
 

@@ -47,7 +47,7 @@ def test_a_true_table_holds(confirmed):
     assert confirmed.misses == 0
     assert len(confirmed.content) == 3
     assert max(check.error for check in confirmed.content) < 5e-5
-    assert [len(check.question.quiet) for check in confirmed.answers] == [1, 2, 3, 1]
+    assert [len(check.question.quiet) for check in confirmed.answer_checks] == [1, 2, 3, 1]
 
 
 def test_a_rig_whose_eras_were_measured_holds(rig, tmp_path):
@@ -71,7 +71,7 @@ def test_tolerances_are_what_an_error_of_the_field_makes_of_an_answer(confirmed,
     rigidity = 70e9 * 0.0015**3 / (12 * (1 - 0.33**2))
     x, y = np.meshgrid((np.arange(8) + 0.5) / 8 * 0.3048, (np.arange(6) + 0.5) / 6 * 0.2286)
     matrices = assemble(rig.plate, rig.mesh)
-    for check in confirmed.answers:
+    for check in confirmed.answer_checks:
         contacts = (*check.question.targets, *check.question.quiet)
         discs = [fingertip_points(*place, rig.plate) for place in contacts]
         points = np.vstack([*discs, np.column_stack([x.ravel(), y.ravel()])])
@@ -93,9 +93,9 @@ def test_tolerances_are_what_an_error_of_the_field_makes_of_an_answer(confirmed,
 
 def test_in_time_the_contrast_is_that_of_the_direct_solve(confirmed):
     """Two ways that share nothing but the mesh agree within 0.3 dB up to 25 dB."""
-    contrasts = [check.direct_contrast_db for check in confirmed.answers]
+    contrasts = [check.direct_contrast_db for check in confirmed.answer_checks]
     assert max(contrasts) > 15
-    for check in confirmed.answers:
+    for check in confirmed.answer_checks:
         if check.direct_contrast_db < 25:
             assert check.contrast_in_time_db == pytest.approx(check.direct_contrast_db, abs=0.3)
 
@@ -106,7 +106,7 @@ def test_an_era_that_was_made_stronger_is_found_out(table, rig, tmp_path):
     stronger[:, :, 1] *= 1.1
     found = verify_table(tampered(table, tmp_path, acceleration=stronger), rig, samples=4)
     assert [check.is_passed for check in found.content] == [False, True, True]
-    assert not all(check.is_passed for check in found.answers)
+    assert not all(check.is_passed for check in found.answer_checks)
     assert found.misses >= 2
 
 
@@ -161,8 +161,8 @@ def test_an_answer_holds_within_its_tolerances(confirmed, changed, holds):
     """0.1 dB of level and contrast, 1 dB more in time, where contrast beyond 25 dB counts as 25."""
     check = AnswerCheck(
         **{
-            "question": confirmed.answers[0].question,
-            "pattern": replace(confirmed.answers[0].pattern, level_db_sl=20.0),
+            "question": confirmed.answer_checks[0].question,
+            "pattern": replace(confirmed.answer_checks[0].pattern, level_db_sl=20.0),
             "predicted_contrast_db": 18.0,
             "direct_level_db_sl": 20.0,
             "direct_contrast_db": 18.05,

@@ -57,7 +57,6 @@ class BackgroundFarEnd:
         return asyncio.run_coroutine_threadsafe(coroutine, self.loop).result(10)
 
     def close(self) -> None:
-        """Close the far end and end the loop."""
 
         async def close() -> None:
             self.end.close()

@@ -55,7 +55,6 @@ class ScriptedBackend(Backend):
         """Nothing to open."""
 
     async def close(self) -> None:
-        """Count."""
         self.closed += 1
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
@@ -76,7 +75,6 @@ class ScriptedBackend(Backend):
 
     @property
     def last_sent(self) -> float:
-        """Not of interest here."""
         return 0.0
 
 

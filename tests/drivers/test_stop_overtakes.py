@@ -56,32 +56,26 @@ class Chain:
         self.sent_at: list[float] = []
 
     def begin(self, amplifiers: dict[str, Amplifier], far: FarSide) -> None:
-        """They are ready."""
         self.far = far
         self.east, self.west = amplifiers["east"], amplifiers["west"]
         self.forget()
 
     def forget(self) -> None:
-        """Count anew."""
         self.asked.clear()
         self.sent_at.clear()
 
     @property
     def frames(self) -> int:
-        """How many the host has put on the line since."""
         return len(self.sent_at)
 
     def seen(self, link: str, toward: str, data: bytes) -> None:
-        """Bytes go out."""
         if toward == "amplifier":
             self.sent_at.append(asyncio.get_running_loop().time())
 
     def kinds(self) -> list[tuple[str, str]]:
-        """Whom, and what, by its name."""
         return [(name, type(request).__name__) for name, request in self.asked]
 
     def tone(self, amplifier: Amplifier, token: int, level: float = 0.3) -> SafeCommandSet:
-        """A set on channel 0."""
         guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifier.capabilities)
         commands = (DriveCommand(0, 110.0, level),)
         return guard.check(CommandSet(token, commands, ramp=0.0, valid_for=0.0))

@@ -1,8 +1,7 @@
-"""Both ends of CAN as something that takes any frames and any text; see `mutation`.
+"""Both ends of CAN for damaged frames and text; see `mutation`.
 
-A telegram is the frames of a request in a row: identifier (bit 15: CAN FD), length, data. Damage
-hits all three. What is left is given to the far end, to the host's readers, and as text to both
-kinds of adapters.
+A telegram is the frames of a request: identifier (bit 15: CAN FD), length, data, any of which may
+be damaged. The far end and the host's readers take the frames, and both kinds of adapters the text.
 """
 
 import asyncio
@@ -23,85 +22,33 @@ from drivers.codec.can_bus.requests import encode_request
 from drivers.errors import DriverError
 from drivers.protocol.messages import (
     AmplifierEvent,
-    AmplifierState,
     Arm,
     Clear,
     GetCaps,
     GetFaults,
     Hello,
-    Identity,
     LoadEnvelope,
-    Reply,
     Request,
-    Status,
 )
-from sim.amplifier.amplifier import SimulatedAmplifier
+from fake_device import FakeDevice
 from sim.far_ends.can_bus.bus import CanBus
 from sim.far_ends.can_bus.node import CanNode
 from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter
 from sim.far_ends.can_bus.socketcand_server import SocketcandEnd, _Client
-from sim.faults.fault_window import Faults
 
 _FD = 0x8000
 _FD_LENGTHS = (8, 12, 16, 20, 24, 32, 48, 64)
-_REVIVAL = 10  # telegrams, after which it is operational and armed again
+_REVIVAL = 10  # telegrams until it is operational and armed again
 _ENVELOPE_SLOT = 5
 
 
 class _Never:
-    """A timer that does not come."""
+    """A timer that never expires."""
 
-    def cancel(self) -> None:
-        """Nothing."""
+    def cancel(self) -> None: ...
 
 
 _NEVER = cast(asyncio.TimerHandle, _Never())
-
-
-class FakeDevice:
-    """A simulated amplifier whose clock stands where it is put; `asked` is what came lately."""
-
-    is_answering = True
-
-    def __init__(self) -> None:
-        self.amplifier = SimulatedAmplifier("main", channels=4)
-        self.capabilities = self.amplifier.capabilities
-        self.faults = Faults()
-        self.now = 100.0  # s; any
-        self.asked: list[Request] = []
-
-    @property
-    def identity(self) -> Identity:
-        """Who it is."""
-        return self.amplifier.identity
-
-    def listen(self, on_event: object) -> None:
-        """Pass events on."""
-        assert callable(on_event)
-        self.amplifier.listeners.append(lambda event, _: on_event(event))
-
-    def exchange(self, request: Request) -> Reply:
-        """Its answer."""
-        self.asked.append(request)
-        return self.amplifier.handle(request, self.now)
-
-    broadcast = exchange
-
-    def status(self) -> Status:
-        """How it is."""
-        return self.amplifier.status(self.now)
-
-    def restart(self) -> None:
-        """Anew."""
-        self.amplifier.restart(self.now)
-
-    def pass_time(self, duration: float) -> None:
-        """Let time [s] pass; AssertionError where something plays that must not."""
-        self.now += duration
-        self.amplifier.tick(self.now)
-        assert all(0 <= level <= 1 + 1e-9 for level in self.status().levels)
-        playing = any(tone.lasts for output in self.amplifier.outputs for tone in output)
-        assert not playing or self.amplifier.state is AmplifierState.OPERATION_ENABLED
 
 
 class CanEnds:
@@ -154,9 +101,7 @@ class CanEnds:
                 continue
 
     def _revive(self) -> None:
-        """Have it in operation and armed."""
-        for data in (b"\x01\x01",):
-            self._node.receive(CanFrame(0x000, data))
+        self._node.receive(CanFrame(0x000, b"\x01\x01"))
         for order in (Clear(), Arm(2.0)):
             for frame in encode_request(order, node=1, sequence=9):
                 self._node.receive(frame)
@@ -222,20 +167,16 @@ class CanTexts:
 
 
 class _Deaf:
-    """A connection that takes everything."""
+    """A connection that discards everything."""
 
-    def write(self, data: bytes) -> None:
-        """Nothing."""
+    def write(self, data: bytes) -> None: ...
 
     def get_write_buffer_size(self) -> int:
-        """Nothing waits."""
         return 0
 
-    def close(self) -> None:
-        """Nothing."""
+    def close(self) -> None: ...
 
-    def abort(self) -> None:
-        """Nothing."""
+    def abort(self) -> None: ...
 
 
 def _pack(frames: Sequence[CanFrame]) -> bytes:

@@ -1,7 +1,7 @@
-"""A session between a host and one amplifier, by frames, as docs/reference/wire-can.md shows it.
+"""The session between a host and one amplifier on docs/reference/wire-can.md, in frames.
 
-The host's frames are those of its encoder, or written here by hand where a library of others makes
-them; the amplifier's are those of the far end, which knows nothing of the encoder.
+The host's frames are made by its encoder, or written here where a library makes them; the
+amplifier's by the far end, which shares no code with the encoder.
 """
 
 import asyncio
@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
-from can_fuzz import FakeDevice
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.codec.can_bus.objects import pack_envelope
 from drivers.codec.can_bus.requests import PdoRequest, encode_broadcast, encode_request
@@ -27,6 +26,7 @@ from drivers.protocol.messages import (
     Stage,
     Stop,
 )
+from fake_device import FakeDevice
 from sim.far_ends.can_bus.node import CanNode
 
 NODE = 1
@@ -34,13 +34,13 @@ NODE = 1
 
 @dataclass(frozen=True)
 class Step:
-    """What is done, and the frames that go over the bus, those of the host marked."""
+    """A step: its title and its frames, each with whether the host sends it."""
 
     title: str
     frames: tuple[tuple[bool, CanFrame], ...]
 
     def lines(self) -> Iterator[str]:
-        """As on the page: identifier and data in hexadecimal; `>` from the host, `<` to it."""
+        """Yield lines as on the page, in hexadecimal; `>` from the host, `<` to it."""
         for is_host, frame in self.frames:
             mark = ">" if is_host else "<"
             fd = " FD" if frame.fd else ""
@@ -54,7 +54,6 @@ class Timers:
         self._due: list[object] = []
 
     def call_later(self, delay: float, callback: object) -> asyncio.TimerHandle:
-        """Note who wants to be called."""
         if delay > 0.02:
             self._due = [callback]
         return cast(asyncio.TimerHandle, self)
@@ -63,14 +62,13 @@ class Timers:
         """As a timer."""
 
     def ring(self) -> None:
-        """Call them."""
         (callback,) = self._due
         assert callable(callback)
         callback()
 
 
 class Session:
-    """Plays it; `device` and `node` are there for a test to look into."""
+    """Plays the session."""
 
     def __init__(self) -> None:
         self.device = FakeDevice()
@@ -87,7 +85,6 @@ class Session:
         self.guard = Guard(GuardLimits(20.0, 600.0, 1.0), self.device.capabilities)
 
     def steps(self) -> Iterator[Step]:
-        """All of them, in order."""
         self.node.start(self.timers.call_later)
         yield self._heard("The supply comes: boot-up")
         self.timers.ring()

@@ -46,7 +46,6 @@ class MemoryMachine(HardwareProvider):
     def make_terminal(
         self, on_data: Callable[[bytes], None], *, unpluggable: bool
     ) -> "MemoryTerminal":
-        """The far end's side of a new line."""
         terminal = MemoryTerminal(self, f"/dev/memory{len(self._terminals)}", on_data)
         self._terminals[terminal.port] = terminal
         return terminal
@@ -88,11 +87,9 @@ class MemoryMachine(HardwareProvider):
         return cast(Adapter, client)
 
     def make_worker(self) -> "GreenletWorker":
-        """An executor for jobs that block."""
         return GreenletWorker()
 
     def below(self, limit: int) -> int:
-        """By the loop's chance."""
         return self._loop.dice.randrange(limit)
 
     def kill_host(self) -> None:
@@ -101,7 +98,6 @@ class MemoryMachine(HardwareProvider):
             port.close()
 
     def closed(self, name: str) -> None:
-        """A host's side is closed."""
         self._open.pop(name, None)
 
     def deliver(self, link: str, toward: str, data: bytes, to: "_Direction") -> None:
@@ -118,11 +114,9 @@ class MemoryMachine(HardwareProvider):
             loop.call_at(to.arrives, to.take, piece)
 
     def later(self, delay: float, callback: Callable[..., None], *args: Any) -> None:
-        """Call back on the loop."""
         self._loop.call_later(delay, callback, *args)
 
     def opened(self, name: str) -> "MemoryPort | None":
-        """The host's side, where it is open."""
         return self._open.get(name)
 
 
@@ -163,11 +157,9 @@ class MemoryTerminal(Terminal):
 
     @property
     def port(self) -> str:
-        """The path of the host's side."""
         return self._name
 
     def plug_in(self) -> None:
-        """The line is there again."""
         if not self.is_plugged:
             self.is_plugged = True
             self.inward = _Direction(self._on_data)
@@ -176,7 +168,6 @@ class MemoryTerminal(Terminal):
         """Bytes come by themselves."""
 
     def unplug(self) -> None:
-        """The line is gone, and what was on it."""
         if not self.is_plugged:
             return
         self.is_plugged = False
@@ -186,7 +177,6 @@ class MemoryTerminal(Terminal):
             port.hang_up()
 
     def close(self) -> None:
-        """As unplug."""
         self.unplug()
 
     def write(self, data: bytes) -> None:
@@ -213,7 +203,6 @@ class MemoryPort:
         self.outward = _Direction(on_data)
 
     def write(self, data: bytes) -> None:
-        """Send; LinkError where the line is gone."""
         if self._is_closed or self._is_hung_up:
             raise LinkError(f"serial line {self._terminal.port} was lost")
         self._machine.deliver(self._terminal.port, "amplifier", data, self._terminal.inward)
@@ -225,7 +214,6 @@ class MemoryPort:
         self._machine.later(_NOTICED, self._notice)
 
     def close(self) -> None:
-        """Stop reporting."""
         if not self._is_closed:
             self._is_closed = self.outward.is_cut = True
             if not self._is_hung_up:
@@ -248,16 +236,13 @@ class _Slcan:
         self._reader = SlcanReader()
 
     def heard(self, data: bytes) -> None:
-        """Bytes of the adapter."""
         for frame in self._reader.feed(data):
             self._on_frame(frame)
 
     def send(self, frames: Sequence[CanFrame]) -> None:
-        """All at once."""
         self.port.write(b"".join(map(slcan_line, frames)))
 
     def close(self) -> None:
-        """Close channel and port."""
         with contextlib.suppress(LinkError):  # it is gone already
             self.port.write(b"C\r")
         self.port.close()
@@ -284,11 +269,9 @@ class _Socketcand(asyncio.Protocol):
         self._is_closed = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Wait for the greeting."""
         self._transport = cast(asyncio.Transport, transport)
 
     def data_received(self, data: bytes) -> None:
-        """The greeting, two answers, then frames."""
         if not self.is_raw.is_set():
             for _ in range(data.count(b"< hi >") + data.count(b"< ok >")):
                 self._shake_hands()
@@ -297,19 +280,16 @@ class _Socketcand(asyncio.Protocol):
                 self._on_frame(frame)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The server has hung up, or we have."""
         self._transport = None
         if not self._is_closed:
             self._on_loss(f"the CAN bus {self._url} was lost (the socketcand server hung up)")
 
     def send(self, frames: Sequence[CanFrame]) -> None:
-        """All at once."""
         if self._transport is None:
             raise LinkError(f"the CAN bus {self._url} was lost")
         self._transport.write(b"".join(map(socketcand_element, frames)))
 
     def close(self) -> None:
-        """Hang up."""
         self._is_closed = True
         if self._transport is not None:
             self._transport.close()
@@ -334,21 +314,17 @@ class GreenletWorker(Worker):
         self._tasks: list[asyncio.Task[Any]] = []
 
     def submit(self, job: Callable[[], T]) -> "asyncio.Future[T]":
-        """Do a job when those before it are done."""
         task = asyncio.get_running_loop().create_task(self._run(job))
         self._tasks = [known for known in self._tasks if not known.done()] + [task]
         return task
 
     async def close(self) -> None:
-        """Wait for what is under way."""
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     def make_queue(self) -> "queue.Queue[bytes]":
-        """A queue that a greenlet can wait at."""
         return cast("queue.Queue[bytes]", _GreenletQueue())
 
     def sleep(self, seconds: float) -> None:
-        """Let others run for so long [s]."""
         _wait_for(asyncio.sleep(seconds))
 
     async def _run(self, job: Callable[[], T]) -> T:
@@ -364,7 +340,6 @@ class _GreenletQueue:
         self._came = asyncio.Event()
 
     def put(self, item: bytes) -> None:
-        """Add one; from anywhere."""
         self._items.append(item)
         self._came.set()
 
@@ -375,17 +350,14 @@ class _GreenletQueue:
         return self.get_nowait()
 
     def get_nowait(self) -> bytes:
-        """The next; queue.Empty where there is none."""
         if not self._items:
             raise queue.Empty
         return self._items.popleft()
 
     def qsize(self) -> int:
-        """How many there are."""
         return len(self._items)
 
     def empty(self) -> bool:
-        """Whether there is none."""
         return not self._items
 
     async def _arrival(self, timeout: float | None) -> None:

@@ -1,4 +1,4 @@
-"""Both ends of Modbus as something that takes any bytes; see `mutation`."""
+"""Both ends of Modbus for damaged bytes; see `mutation`."""
 
 import random
 from collections.abc import Iterator, Sequence
@@ -6,51 +6,17 @@ from collections.abc import Iterator, Sequence
 from drivers.codec.modbus import exchanges
 from drivers.codec.modbus.adu import ResponseReader, build_adu
 from drivers.errors import FrameError
-from drivers.protocol.messages import AmplifierState, Arm, Clear, Reply, Request
+from drivers.protocol.messages import Arm, Clear, Request
 from drivers.statistics import WireCounters
-from sim.amplifier.amplifier import SimulatedAmplifier
+from fake_device import FakeDevice
 from sim.far_ends.modbus.frames import FRAME_TIMEOUT, RtuReader, TcpReader, rtu_frame, tcp_frame
 from sim.far_ends.modbus.frames import RequestAdu as Asked
 from sim.far_ends.modbus.unit import ModbusUnit
-from sim.waveform.shaped_tone import ShapedTone
 
-_REVIVAL = (
-    10  # telegrams, after which it is armed again, for most of what comes stops or disarms it
-)
+_REVIVAL = 10  # telegrams until it is armed again: most damaged ones stop or disarm it
 _TAG = 7
 _READ_WRITE = 23
 _BLOCK = 10  # where the block begins that a request of function 23 writes; its check is second
-
-
-class FakeDevice:
-    """A simulated amplifier whose clock stands where it is put; `asked` is what came lately."""
-
-    is_answering = True
-
-    def __init__(self) -> None:
-        self.amplifier = SimulatedAmplifier("main", channels=4)
-        self.now = 100.0  # s; any
-        self.asked: list[object] = []
-
-    def exchange(self, request: Request) -> Reply:
-        """Its answer."""
-        self.asked.append(request)
-        return self.amplifier.handle(request, self.now)
-
-    broadcast = exchange
-
-    def pass_time(self, duration: float) -> None:
-        """Let time [s] pass; AssertionError where something plays that must not."""
-        self.now += duration
-        self.amplifier.tick(self.now)
-        can = self.amplifier.capabilities
-        levels = self.amplifier.status(self.now).levels
-        assert all(0 <= level <= can.level_max + 1e-9 for level in levels)
-        for tone in (tone for output in self.amplifier.outputs for tone in output):
-            assert can.frequency_min <= tone.frequency <= can.frequency_max
-            assert isinstance(tone, ShapedTone) or abs(tone.full) <= can.level_max + 1e-9
-            is_armed = self.amplifier.state is AmplifierState.OPERATION_ENABLED
-            assert is_armed or tone.silent_from <= self.now + can.ramp_max
 
 
 class ModbusEnds:
@@ -109,7 +75,6 @@ class ModbusEnds:
         return understood
 
     def _pieces(self, data: bytes) -> Iterator[bytes]:
-        """In one piece, or in some."""
         while data:
             size = self._chance.choice((len(data), len(data), self._chance.randint(1, len(data))))
             yield data[:size]

@@ -34,13 +34,11 @@ class Peer(asyncio.Protocol):
         self._arrived = asyncio.Event()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """A client has connected."""
         self._transport = cast(asyncio.Transport, transport)
         self._reader = RtuReader() if self.is_rtu else TcpReader()
         self.connections += 1
 
     def data_received(self, data: bytes) -> None:
-        """Answer what is asked."""
         for request in self._reader.feed(data, time.monotonic()):
             self.requests.append(request)
             self._arrived.set()
@@ -49,25 +47,20 @@ class Peer(asyncio.Protocol):
                 self.send(request, pdu)
 
     def send(self, request: RequestAdu, pdu: bytes) -> None:
-        """Answer a request."""
         self.send_raw(self.frame(request, pdu))
 
     def frame(self, request: RequestAdu, pdu: bytes) -> bytes:
-        """The frame of an answer."""
         return rtu_frame(request.unit, pdu) if self.is_rtu else tcp_frame(request, pdu)
 
     def send_raw(self, data: bytes) -> None:
-        """Any bytes."""
         assert self._transport is not None
         self._transport.write(data)
 
     def hang_up(self) -> None:
-        """End the connection."""
         assert self._transport is not None
         self._transport.abort()
 
     async def count(self, number: int) -> None:
-        """Wait until so many requests have come."""
         async with asyncio.timeout(5):
             while len(self.requests) < number:
                 self._arrived.clear()
@@ -75,7 +68,6 @@ class Peer(asyncio.Protocol):
 
     @property
     def functions(self) -> Sequence[int]:
-        """Of the requests so far."""
         return [request.pdu[0] for request in self.requests]
 
 

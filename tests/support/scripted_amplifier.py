@@ -42,26 +42,22 @@ class FarEnd:
                 self.send(answer, frame)
 
     def send(self, answer: Reply | bytes, frame: Frame) -> None:
-        """Send bytes, or a reply to this request frame."""
         if not isinstance(answer, bytes):
             answer = encode_frame(encode_reply(answer, frame))
         os.write(self.master, answer)
 
     async def count(self, number: int) -> None:
-        """Wait for a number of requests in total."""
         async with asyncio.timeout(5):
             while len(self.requests) < number:
                 self._arrived.clear()
                 await self._arrived.wait()
 
     def unplug(self) -> None:
-        """Close the far side: the host loses the port."""
         asyncio.get_running_loop().remove_reader(self.master)
         os.close(self.master)
         self.master = -1
 
     def close(self) -> None:
-        """Close both descriptors."""
         if self.master >= 0:
             self.unplug()
         with contextlib.suppress(OSError):

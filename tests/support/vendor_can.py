@@ -53,13 +53,11 @@ class Channel:
         self.now, self.goal, self.begin, self.ramp = 0, 0, 0.0, 0.0
 
     def level(self, time: float) -> int:
-        """0 to 10000."""
         s = min((time - self.begin) / self.ramp, 1.0) if self.ramp > 0 else 1.0
         gain = (1 - math.cos(math.pi * s)) / 2
         return round(self.now + (self.goal - self.now) * gain)
 
     def go(self, goal: int, ramp: float, time: float) -> None:
-        """Fade to another level."""
         self.now, self.goal, self.begin, self.ramp = self.level(time), goal, time, ramp
 
 
@@ -95,7 +93,6 @@ class VendorAmplifier:
         self._bus.shutdown()
 
     def _run(self) -> None:
-        """Be an amplifier until told to end."""
         self._send(0x700 + NODE, bytes([BOOT_UP]))
         while not self._ending.is_set():
             message = self._bus.recv(timeout=0.001)

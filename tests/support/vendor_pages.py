@@ -138,7 +138,6 @@ class ScriptedDevice:
         self.answer: Callable[[Request], Reply | None] = usual_reply
 
     def follow(self, example: Example) -> None:
-        """Reply as the page from now on."""
         self.answer = lambda request: (
             example.status
             if isinstance(request, GetStatus) and not isinstance(example.request, GetStatus)
@@ -146,12 +145,10 @@ class ScriptedDevice:
         )
 
     def exchange(self, request: Request) -> Reply | None:
-        """Record a request and reply."""
         self.asked.append(request)
         return self.answer(request)
 
     def broadcast(self, request: Broadcast) -> None:
-        """Record a broadcast."""
         self.heard.append(request)
 
     def on_plug(self, on_plug: Callable[[bool], None]) -> None:

@@ -46,7 +46,6 @@ class Line(SharedLine[Port]):
         """Takes its time; see `wait_closed`."""
 
     async def wait_closed(self) -> None:
-        """As long as `blocks` says."""
         await self._note("closed")
 
     async def _note(self, what: str) -> None:
@@ -58,11 +57,9 @@ class Line(SharedLine[Port]):
         self.happened.append(f"gave up: {what}")
 
     def lose(self, what: str) -> None:
-        """As when its cable is pulled out."""
         self._lose(what)
 
     def send(self) -> None:
-        """Put something on it."""
         self._ready().write(b"")
 
 
@@ -233,7 +230,6 @@ class _Open:
         self._sent = sent
 
     def write(self, data: bytes) -> None:
-        """Nobody is there."""
         self._sent.append(data)
 
     send = write  # type: ignore[assignment]

@@ -1,8 +1,10 @@
 """Conformance checks against amplifiers with one mistake each."""
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -28,13 +30,10 @@ from drivers.protocol.messages import (
     Stop,
 )
 from sim.amplifier.amplifier import SimulatedAmplifier
+from vendor_pages import plain
 
 Answer = Callable[[SimulatedAmplifier, Request, float], Reply]
-
-
-def honest(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Reply as specified."""
-    return amplifier.handle(request, now)
+Deed = Callable[[SimulatedAmplifier, float], None]
 
 
 class Flawed(Backend):
@@ -52,33 +51,69 @@ class Flawed(Backend):
 
     @property
     def last_sent(self) -> float:
-        """Not of interest here."""
         return 0.0
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
-        """Answered at once."""
         return self._answer(self._amplifier, request, time.monotonic())
 
 
-def forgets_tokens(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Plays a repeated token once more."""
-    if isinstance(request, Apply):
-        amplifier._sets.tokens.clear()
-        amplifier._sets.active = None
-    return amplifier.handle(request, now)
+def altered_reply(kind: type[Any], **changes: object) -> Answer:
+    """Alter every reply of a kind."""
+
+    def answer(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
+        reply = amplifier.handle(request, now)
+        return replace(reply, **changes) if isinstance(reply, kind) else reply
+
+    return answer
 
 
-def drops_bad_channels(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Plays what it can of a set instead of refusing it."""
-    if isinstance(request, Apply):
-        asked = request.command_set
-        good = tuple(one for one in asked.commands if one.channel < 4)
-        request = Apply(CommandSet(asked.token, good, asked.ramp, asked.valid_for))
-    return amplifier.handle(request, now)
+def altered_request(kind: type[Any], alter: Callable[[Any], Request]) -> Answer:
+    """Carry out another request instead of one of a kind."""
+
+    def answer(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
+        return amplifier.handle(alter(request) if isinstance(request, kind) else request, now)
+
+    return answer
+
+
+def altered_set(alter: Callable[[CommandSet], dict[str, Any]]) -> Answer:
+    """Apply another set."""
+    return altered_request(
+        Apply,
+        lambda asked: Apply(replace(plain(asked).command_set, **alter(asked.command_set))),
+    )
+
+
+def void(amplifier: SimulatedAmplifier, now: float) -> None:
+    """Do nothing."""
+
+
+def clear(amplifier: SimulatedAmplifier, now: float) -> None:
+    """Acknowledge a stop or fault."""
+    amplifier.handle(Clear(), now)
+
+
+def beside(kind: type[Any], *, before: Deed = void, after: Deed = void) -> Answer:
+    """Do something before or after a request of a kind."""
+
+    def answer(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
+        is_wanted = isinstance(request, kind)
+        (before if is_wanted else void)(amplifier, now)
+        reply = amplifier.handle(request, now)
+        (after if is_wanted else void)(amplifier, now)
+        return reply
+
+    return answer
+
+
+def forget_tokens(amplifier: SimulatedAmplifier, now: float) -> None:
+    """Forget which sets have been played."""
+    amplifier._sets.tokens.clear()
+    amplifier._sets.active = None
 
 
 def promises_more(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Answers with what was asked instead of what is played."""
+    """Report a higher level than is played."""
     reply = amplifier.handle(request, now)
     if isinstance(request, Apply) and isinstance(reply, Achieved):
         louder = tuple(replace(one, level=one.level + 0.01) for one in reply.commands)
@@ -86,63 +121,8 @@ def promises_more(amplifier: SimulatedAmplifier, request: Request, now: float) -
     return reply
 
 
-def plays_on_stage(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Does not wait for the commit."""
-    if isinstance(request, Stage):
-        return amplifier.handle(Apply(request.command_set), now)
-    return amplifier.handle(request, now)
-
-
-def knows_no_ramp(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Jumps."""
-    if isinstance(request, Apply):
-        asked = request.command_set
-        jump = CommandSet(asked.token, asked.commands, 0.0, asked.valid_for)
-        return amplifier.handle(Apply(jump), now)
-    return amplifier.handle(request, now)
-
-
-def clears_by_itself(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Arms out of a latched stop or fault."""
-    if isinstance(request, Arm):
-        amplifier.handle(Clear(), now)
-    return amplifier.handle(request, now)
-
-
-def keeps_high_voltage(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """The high voltage stays on."""
-    reply = amplifier.handle(request, now)
-    return replace(reply, high_voltage=True) if isinstance(reply, Status) else reply
-
-
-def is_fed_by_looking_on(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Any request feeds the watchdog."""
-    reply = amplifier.handle(request, now)
-    amplifier._fed = now
-    return reply
-
-
-def ignores_disarm(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Says yes and plays on."""
-    return amplifier.status(now) if isinstance(request, Disarm) else amplifier.handle(request, now)
-
-
-def ignores_valid_for(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Plays for ever."""
-    reply = amplifier.handle(request, now)
-    amplifier._vibration_end = float("inf")
-    return reply
-
-
-def ignores_endings(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Takes an envelope and does not play it."""
-    if isinstance(request, Apply):
-        amplifier._channels._endings = {}
-    return amplifier.handle(request, now)
-
-
 def keeps_empty_slots(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Never forgets an envelope."""
+    """Keep an envelope when its slot is emptied."""
     kept = dict(amplifier._sets.slots)
     reply = amplifier.handle(request, now)
     if isinstance(request, LoadEnvelope):
@@ -150,20 +130,8 @@ def keeps_empty_slots(amplifier: SimulatedAmplifier, request: Request, now: floa
     return reply
 
 
-def has_no_serial_number(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """No serial number."""
-    reply = amplifier.handle(request, now)
-    return replace(reply, serial_number="") if isinstance(reply, Identity) else reply
-
-
-def has_no_range(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """A range of frequencies without an end."""
-    reply = amplifier.handle(request, now)
-    return replace(reply, level_max=0.0) if isinstance(reply, Capabilities) else reply
-
-
 def commits_anything(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Plays what is staged whatever token is named."""
+    """Play the staged set whatever the token."""
     if isinstance(request, Commit) and amplifier._sets.staged is not None:
         reply = amplifier.handle(Commit(amplifier._sets.staged.token), now)
         return Achieved(request.token, ()) if isinstance(reply, Achieved) else reply
@@ -171,22 +139,19 @@ def commits_anything(amplifier: SimulatedAmplifier, request: Request, now: float
 
 
 def is_never_silent(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """A set without channels changes nothing."""
+    """Ignore a set without channels."""
     if isinstance(request, Apply) and not request.command_set.commands:
         return Achieved(request.command_set.token, ())
     return amplifier.handle(request, now)
 
 
-def stop_does_not_latch(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """After a stop it is merely disarmed."""
-    if isinstance(request, Stop):
-        amplifier.handle(request, now)
-        return amplifier.handle(Clear(), now)
-    return amplifier.handle(request, now)
+def ignores_disarm(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
+    """Confirm a disarm and play on."""
+    return amplifier.status(now) if isinstance(request, Disarm) else amplifier.handle(request, now)
 
 
 def does_not_beat(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Nothing but arming fills the watchdog."""
+    """Feed the watchdog by arming only."""
     fed = amplifier._fed
     reply = amplifier.handle(request, now)
     if not isinstance(request, Arm) and not isinstance(reply, Nak):
@@ -194,39 +159,40 @@ def does_not_beat(amplifier: SimulatedAmplifier, request: Request, now: float) -
     return amplifier.status(now) if isinstance(reply, Status) else reply
 
 
-MISTAKES: list[tuple[Answer, str]] = [
-    (has_no_serial_number, "identity"),
-    (has_no_range, "capabilities"),
-    (keeps_high_voltage, "starts_disarmed"),
-    (promises_more, "achieved"),
-    (is_never_silent, "unnamed_channels"),
-    (drops_bad_channels, "all_or_nothing"),
-    (plays_on_stage, "stage_and_commit"),
-    (commits_anything, "stage_and_commit"),
-    (forgets_tokens, "tokens"),
-    (knows_no_ramp, "ramps"),
-    (stop_does_not_latch, "quick_stop"),
-    (clears_by_itself, "quick_stop"),
-    (ignores_disarm, "disarm"),
-    (does_not_beat, "heartbeats"),
-    (ignores_valid_for, "valid_for"),
-    (is_fed_by_looking_on, "watchdog"),
-    (ignores_endings, "envelopes"),
-    (keeps_empty_slots, "missing_envelopes"),
+MISTAKES: list[tuple[str, Answer]] = [
+    ("identity", altered_reply(Identity, serial_number="")),
+    ("capabilities", altered_reply(Capabilities, level_max=0.0)),
+    ("starts_disarmed", altered_reply(Status, high_voltage=True)),
+    ("achieved", promises_more),
+    ("unnamed_channels", is_never_silent),
+    (
+        "all_or_nothing",
+        altered_set(lambda asked: {"commands": tuple(c for c in asked.commands if c.channel < 4)}),
+    ),
+    ("stage_and_commit", altered_request(Stage, lambda stage: Apply(stage.command_set))),
+    ("stage_and_commit", commits_anything),
+    ("tokens", beside(Apply, before=forget_tokens)),
+    ("ramps", altered_set(lambda asked: {"ramp": 0.0})),
+    ("quick_stop", beside(Stop, after=clear)),
+    ("quick_stop", beside(Arm, before=clear)),
+    ("disarm", ignores_disarm),
+    ("heartbeats", does_not_beat),
+    ("valid_for", beside(object, after=lambda one, now: setattr(one, "_vibration_end", math.inf))),
+    ("watchdog", beside(object, after=lambda one, now: setattr(one, "_fed", now))),
+    ("envelopes", beside(Apply, before=lambda one, now: setattr(one._channels, "_endings", {}))),
+    ("missing_envelopes", keeps_empty_slots),
 ]
 
 
-@pytest.mark.parametrize(
-    ("answer", "name"), MISTAKES, ids=[answer.__name__ for answer, _ in MISTAKES]
-)
+@pytest.mark.parametrize(("name", "answer"), MISTAKES)
 async def test_check_fails_for_its_mistake_only(
-    answer: Answer, name: str, monkeypatch: pytest.MonkeyPatch
+    name: str, answer: Answer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The check it is for says what happened instead; an honest amplifier passes that check."""
+    """An amplifier without the mistake passes."""
     monkeypatch.setattr("drivers.conformance.bench.EVENT_TIMEOUT", 1.0)
     (check,) = [check for check in CHECKS if check.name == name]
     outcomes = []
-    for behaviour in (answer, honest):
+    for behaviour in (answer, SimulatedAmplifier.handle):
         amplifier = Amplifier(Flawed(behaviour))
         await amplifier.open()
         outcomes.append(await run_check(check, amplifier))
@@ -235,8 +201,9 @@ async def test_check_fails_for_its_mistake_only(
 
 
 def test_reading_checks_come_first() -> None:
-    """Nothing is driven before."""
+    """Each check has its mistake above, except those that others cannot pass without."""
     drives = [check.drives for check in CHECKS]
     assert drives == sorted(drives)
     assert drives.count(False) >= 4
-    assert all(check.proves for check in CHECKS)
+    untested = {check.name for check in CHECKS} - {name for name, _ in MISTAKES}
+    assert untested == {"reading_changes_nothing", "plays_nothing_disarmed", "cancelled_requests"}

@@ -62,7 +62,6 @@ class Adapter:
             return self._came.wait_for(lambda: len(self.said) >= len(text), 5) and self.said == text
 
     def close(self) -> None:
-        """End all of it."""
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()

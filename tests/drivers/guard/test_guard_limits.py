@@ -22,7 +22,6 @@ class Clock:
         self.now = 100.0
 
     def __call__(self) -> float:
-        """The time [s]."""
         return self.now
 
 

@@ -27,7 +27,6 @@ class Users:
     def take(
         self, name: str, kind: RequestPriority = RequestPriority.ORDINARY
     ) -> "asyncio.Task[None]":
-        """Keep the turn until its event is set."""
         self.ends[name] = asyncio.Event()
 
         async def use() -> None:

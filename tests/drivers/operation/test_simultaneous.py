@@ -19,7 +19,6 @@ class Wire:
     sent: list[float] = field(default_factory=list)
 
     async def commit(self) -> float:
-        """Goes out now; its answer takes a while."""
         self.sent.append(asyncio.get_running_loop().time())
         await asyncio.sleep(0.01)
         return self.takes

@@ -60,7 +60,6 @@ class Gateway:
         self._thread.start()
 
     def say(self, frame: CanFrame) -> None:
-        """Send a frame to hosts."""
         if self.passing:
             self.virtual.send(
                 can.Message(
@@ -84,7 +83,6 @@ class Gateway:
             self.bus.send(frame, sender=self._listener)
 
     async def close(self) -> None:
-        """Separate the buses."""
         self._closing = True
         await asyncio.to_thread(self._thread.join)
         self.virtual.shutdown()
@@ -98,7 +96,6 @@ class Virtual:
     far: FarSide
 
     def url(self, node: int = 1, options: str = "") -> str:
-        """Of a node."""
         return f"can+virtual://{self.gateway.channel}{options}#{node}"
 
 

@@ -21,7 +21,6 @@ class Network(canopen.Network):
         self.on_send: Callable[[], None] = lambda: None
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """Into the void."""
         self.sent += 1
         self.on_send()
 

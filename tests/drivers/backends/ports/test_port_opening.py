@@ -24,18 +24,15 @@ class _Port:
         """It is open already."""
 
     def set_low_latency_mode(self, low_latency: bool) -> None:
-        """As Linux passes it on to the adapter."""
         self.is_low_latency = low_latency
 
     def reset_input_buffer(self) -> None:
         """Nothing is there."""
 
     def fileno(self) -> int:
-        """Descriptor of a pipe without a writer."""
         return self._read
 
     def close(self) -> None:
-        """Both ends."""
         os.close(self._read)
         os.close(self._write)
 

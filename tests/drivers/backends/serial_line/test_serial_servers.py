@@ -44,7 +44,6 @@ class Redirector:
         self._threads[0].start()
 
     def write(self, data: bytes) -> None:
-        """What the manager has to tell the client."""
         self.client.sendall(data)
 
     def _serve(self) -> None:
@@ -65,12 +64,10 @@ class Redirector:
                     self.client.sendall(b"".join(self.manager.escape(data)))
 
     def hang_up(self) -> None:
-        """The server's side of the connection ends."""
         self.client.shutdown(socket.SHUT_RDWR)
         self.client.close()
 
     def close(self) -> None:
-        """Everything ends."""
         self.listener.close()
         with contextlib.suppress(OSError, AttributeError):
             self.hang_up()

@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import pytest
 
-from can_fuzz import FakeDevice
 from can_session import Timers
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.protocol.messages import AmplifierState, Fault, Ping
+from fake_device import FakeDevice
 from sim.far_ends.can_bus.node import CanNode
 
 REQUEST, ANSWER, SYNC = 0x481, 0x181, CanFrame(0x080, b"")

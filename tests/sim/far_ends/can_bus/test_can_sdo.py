@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 import drivers
 from can_eds import eds_text
-from can_fuzz import FakeDevice
 from drivers.codec.can_bus.frame import CanFrame
+from fake_device import FakeDevice
 from sim.far_ends.can_bus import sdo
 from sim.far_ends.can_bus.node import CanNode
 from sim.far_ends.can_bus.sdo import NO_OBJECT, SdoAbort, SdoServer

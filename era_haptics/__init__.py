@@ -14,105 +14,73 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from controller.api.async_client import AsyncClient
-    from controller.api.client import Client
-    from controller.api.client_protocol import Notification, Unreachable
-    from controller.api.jsonrpc import RpcError
-    from drivers.blocking import BlockingAmplifier
-    from drivers.command import DriveCommand
-    from drivers.errors import CommandRefused, DriverError, LinkError
-    from drivers.guard import GuardLimits
-    from era_haptics.amplifiers import commands_for, open_amplifier
-    from era_haptics.drive import Drive
-    from era_haptics.pictures import draw_map, draw_pattern, draw_playback
-    from era_haptics.solved_plate import SolvedPlate
-    from era_haptics.tables import query, table
-    from model.errors import InputError
-    from model.finger.grid import Grid
-    from model.finger.load import FingerLoad
-    from model.reduction.supported_modes import SupportedModes
-    from model.rig.file import example_rig_path, load_rig
-    from model.rig.rig import Rig
-    from model.table.file import load_table, save_table
-    from model.table.pattern import Pattern
-    from model.table.table import LocalizationTable
-    from model.vibration.excitation import Tone
-    from model.vibration.maps import PlateMap
-    from sim.plant.playback import Playback
+    from controller.api.async_client import AsyncClient as AsyncClient
+    from controller.api.client import Client as Client
+    from controller.api.client_protocol import Notification as Notification
+    from controller.api.client_protocol import Unreachable as Unreachable
+    from controller.api.jsonrpc import RpcError as RpcError
+    from drivers.blocking import BlockingAmplifier as BlockingAmplifier
+    from drivers.command import DriveCommand as DriveCommand
+    from drivers.errors import CommandRefused as CommandRefused
+    from drivers.errors import DriverError as DriverError
+    from drivers.errors import LinkError as LinkError
+    from drivers.guard import GuardLimits as GuardLimits
+    from era_haptics.amplifiers import commands_for as commands_for
+    from era_haptics.amplifiers import open_amplifier as open_amplifier
+    from era_haptics.drive import Drive as Drive
+    from era_haptics.pictures import draw_map as draw_map
+    from era_haptics.pictures import draw_pattern as draw_pattern
+    from era_haptics.pictures import draw_playback as draw_playback
+    from era_haptics.solved_plate import SolvedPlate as SolvedPlate
+    from era_haptics.tables import query as query
+    from era_haptics.tables import table as table
+    from model.errors import InputError as InputError
+    from model.finger.grid import Grid as Grid
+    from model.finger.load import FingerLoad as FingerLoad
+    from model.reduction.supported_modes import SupportedModes as SupportedModes
+    from model.rig.file import example_rig_path as example_rig_path
+    from model.rig.file import load_rig as load_rig
+    from model.rig.rig import Rig as Rig
+    from model.table.file import load_table as load_table
+    from model.table.file import save_table as save_table
+    from model.table.pattern import Pattern as Pattern
+    from model.table.table import LocalizationTable as LocalizationTable
+    from model.vibration.excitation import Tone as Tone
+    from model.vibration.maps import PlateMap as PlateMap
+    from sim.plant.playback import Playback as Playback
 
-_HOMES = {
-    "AsyncClient": "controller.api.async_client",
-    "BlockingAmplifier": "drivers.blocking",
-    "Client": "controller.api.client",
-    "CommandRefused": "drivers.errors",
-    "Drive": "era_haptics.drive",
-    "DriveCommand": "drivers.command",
-    "DriverError": "drivers.errors",
-    "FingerLoad": "model.finger.load",
-    "Grid": "model.finger.grid",
-    "GuardLimits": "drivers.guard",
-    "InputError": "model.errors",
-    "LinkError": "drivers.errors",
-    "LocalizationTable": "model.table.table",
-    "Notification": "controller.api.client_protocol",
-    "Pattern": "model.table.pattern",
-    "PlateMap": "model.vibration.maps",
-    "Playback": "sim.plant.playback",
-    "Rig": "model.rig.rig",
-    "RpcError": "controller.api.jsonrpc",
-    "SolvedPlate": "era_haptics.solved_plate",
-    "SupportedModes": "model.reduction.supported_modes",
-    "Tone": "model.vibration.excitation",
-    "Unreachable": "controller.api.client_protocol",
-    "commands_for": "era_haptics.amplifiers",
-    "draw_map": "era_haptics.pictures",
-    "draw_pattern": "era_haptics.pictures",
-    "draw_playback": "era_haptics.pictures",
-    "example_rig_path": "model.rig.file",
-    "load_rig": "model.rig.file",
-    "load_table": "model.table.file",
-    "open_amplifier": "era_haptics.amplifiers",
-    "query": "era_haptics.tables",
-    "save_table": "model.table.file",
-    "table": "era_haptics.tables",
+_NAMES = {
+    "controller.api.async_client": "AsyncClient",
+    "controller.api.client": "Client",
+    "controller.api.client_protocol": "Notification Unreachable",
+    "controller.api.jsonrpc": "RpcError",
+    "drivers.blocking": "BlockingAmplifier",
+    "drivers.command": "DriveCommand",
+    "drivers.errors": "CommandRefused DriverError LinkError",
+    "drivers.guard": "GuardLimits",
+    "era_haptics.amplifiers": "commands_for open_amplifier",
+    "era_haptics.drive": "Drive",
+    "era_haptics.pictures": "draw_map draw_pattern draw_playback",
+    "era_haptics.solved_plate": "SolvedPlate",
+    "era_haptics.tables": "query table",
+    "model.errors": "InputError",
+    "model.finger.grid": "Grid",
+    "model.finger.load": "FingerLoad",
+    "model.reduction.supported_modes": "SupportedModes",
+    "model.rig.file": "example_rig_path load_rig",
+    "model.rig.rig": "Rig",
+    "model.table.file": "load_table save_table",
+    "model.table.pattern": "Pattern",
+    "model.table.table": "LocalizationTable",
+    "model.vibration.excitation": "Tone",
+    "model.vibration.maps": "PlateMap",
+    "sim.plant.playback": "Playback",
 }
+"""Names by the module that defines them."""
 
-__all__ = [
-    "AsyncClient",
-    "BlockingAmplifier",
-    "Client",
-    "CommandRefused",
-    "Drive",
-    "DriveCommand",
-    "DriverError",
-    "FingerLoad",
-    "Grid",
-    "GuardLimits",
-    "InputError",
-    "LinkError",
-    "LocalizationTable",
-    "Notification",
-    "Pattern",
-    "PlateMap",
-    "Playback",
-    "Rig",
-    "RpcError",
-    "SolvedPlate",
-    "SupportedModes",
-    "Tone",
-    "Unreachable",
-    "commands_for",
-    "draw_map",
-    "draw_pattern",
-    "draw_playback",
-    "example_rig_path",
-    "load_rig",
-    "load_table",
-    "open_amplifier",
-    "query",
-    "save_table",
-    "table",
-]
+_HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
+
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
@@ -126,4 +94,4 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     """All names, for completion."""
-    return list(__all__)
+    return __all__

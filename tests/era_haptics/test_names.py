@@ -12,16 +12,27 @@ import era_haptics as era
 SOURCE = Path(era.__file__)
 
 
-def test_every_name_is_there_once() -> None:
-    """What type checkers are told of a name's home is where it is loaded from."""
-    (told,) = (
+def modules_after(program: str) -> set[str]:
+    """Names of the modules that a program has loaded."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys; {program}; print(*sys.modules)"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return set(done.stdout.split())
+
+
+def test_every_name_is_loaded_from_where_type_checkers_find_it() -> None:
+    """The table of homes against the imports under TYPE_CHECKING."""
+    (imports,) = (
         node
         for node in ast.parse(SOURCE.read_text("utf-8")).body
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
     )
     homes = {
         alias.name: node.module
-        for node in told.body
+        for node in imports.body
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
     }
@@ -31,45 +42,36 @@ def test_every_name_is_there_once() -> None:
         assert getattr(era, name).__name__ == name
 
 
-def test_a_name_that_is_none_is_told_the_others() -> None:
-    """As a spelling mistake in a notebook would find it."""
+def test_unknown_name_lists_the_known_ones() -> None:
+    """As an AttributeError."""
     with pytest.raises(AttributeError, match=r"laod_rig; .*load_rig"):
         _ = era.laod_rig
 
 
 @pytest.mark.parametrize(
-    ("name", "never"),
+    ("module", "not_loaded"),
     [
-        ("Client", ("scipy", "matplotlib", "sim", "pymodbus")),
-        ("load_rig", ("matplotlib", "sim", "controller")),
-        ("SolvedPlate", ("matplotlib", "controller")),
+        ("Client", "scipy matplotlib sim pymodbus"),
+        ("load_rig", "matplotlib sim controller"),
+        ("SolvedPlate", "matplotlib controller"),
+        ("draw_map", "matplotlib.pyplot"),
+        ("plugins.backends", "model controller sim numpy scipy pymodbus can serial"),
+        ("plugins.touch_sources", "sim numpy scipy matplotlib pythonosc"),
+        ("plugins.effects", "sim scipy matplotlib drivers.backend"),
+        ("plugins.materials", "sim controller drivers numpy"),
+        ("plugins.elements", "sim controller drivers scipy matplotlib"),
     ],
 )
-def test_a_name_brings_nothing_that_it_does_not_need(name: str, never: tuple[str, ...]) -> None:
-    """A client of the daemon waits for no linear algebra, a plate for no pictures."""
-    program = f"import sys, era_haptics; era_haptics.{name}; print(*sys.modules)"
-    said = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    ).stdout.split()
-    assert set(said) & set(never) == set()
-
-
-def test_the_commands_do_without() -> None:
-    """`era --help` does not load it."""
-    program = (
-        "import sys, contextlib\nsys.argv = ['era', '--help']\n"
-        "from controller.cli.main import main\n"
-        "with contextlib.suppress(SystemExit):\n    main()\nprint('era_haptics' in sys.modules)"
-    )
-    said = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert said.stdout.splitlines()[-1] == "False"
+def test_name_loads_only_what_it_needs(module: str, not_loaded: str) -> None:
+    """A client of the daemon is loaded without linear algebra, a plate without pyplot."""
+    names = module.partition(".")
+    load = f"import era_haptics.{module}" if names[1] else f"import era_haptics as e; e.{module}"
+    assert modules_after(load) & set(not_loaded.split()) == set()
 
 
 @pytest.mark.parametrize(
     "package", ["registry", "controller", "drivers", "era_haptics", "model", "sim"]
 )
-def test_every_package_says_that_it_is_typed(package: str) -> None:
-    """By the marker that type checkers look for."""
+def test_package_is_marked_as_typed(package: str) -> None:
+    """By py.typed."""
     assert (SOURCE.parents[1] / package / "py.typed").is_file()

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from controller.sources.touch import Touch, TouchFrame
+from model.finger import MAX_CONTACTS
 from model.structure.plate import Plate
-from model.table.question import MAX_CONTACTS
 
 # s; sources repeat their frames at least every 100 ms, and a contact that is not confirmed must not
 # be driven.

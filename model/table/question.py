@@ -10,15 +10,13 @@ from model.config.points import in_metres
 from model.counting import counted
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
+from model.finger import MAX_CONTACTS
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import STRONG_DB_SL
 from model.structure.plate import Plate
 
 Point: TypeAlias = tuple[float, float]
 """x, y [m]."""
-
-MAX_CONTACTS = 10
-"""Ten fingers; more are a forearm, a spill or a broken panel."""
 
 MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 200.0
 """Below the smallest amplitude of a channel, and above what a plate survives."""

@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, nullcontext
 
 from drivers.errors import CommandError
 from drivers.protocol.messages import AmplifierEvent, Broadcast, Reply, Request
-from drivers.protocol.wire_times import NoTimes, WireTimes
+from drivers.protocol.wire_times import WireTimes
 from drivers.statistics import WireCounters
 
 
@@ -96,5 +96,5 @@ class Backend(ABC):
 
     @property
     def wire_times(self) -> WireTimes:
-        """Durations on its wire; `NoTimes` if unknown."""
-        return NoTimes()
+        """Durations on its wire; zero if unknown."""
+        return WireTimes()

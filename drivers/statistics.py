@@ -18,22 +18,17 @@ class WireCounters:
     events: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class LinkStatistics:
+@dataclass
+class LinkStatistics(WireCounters):
     """Statistics of a link at one moment.
 
-    Frames as in `WireCounters`. retries: repeated requests; timeouts: requests without a reply in
-    time; refusals: Naks. last_round_trip [s]; heartbeat_age [s] since the last acknowledged
-    heartbeat: None before the first.
+    retries: repeated requests; timeouts: requests without a reply in time; refusals: Naks.
+    last_round_trip [s]; heartbeat_age [s] since the last acknowledged heartbeat: None before the
+    first.
     """
 
-    frames_out: int
-    frames_in: int
-    crc_errors: int
-    unexpected_frames: int
-    events: int
-    retries: int
-    timeouts: int
-    refusals: int
-    last_round_trip: float | None
-    heartbeat_age: float | None
+    retries: int = 0
+    timeouts: int = 0
+    refusals: int = 0
+    last_round_trip: float | None = None
+    heartbeat_age: float | None = None

@@ -23,7 +23,7 @@ from controller.api.schema import LatencySummary
 from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Capabilities
-from drivers.protocol.wire_times import NoTimes, WireTimes
+from drivers.protocol.wire_times import WireTimes
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
@@ -83,7 +83,7 @@ class _Open:
 
     capabilities: Capabilities
     bus: str | None = None
-    wire_times: WireTimes = field(default_factory=NoTimes)
+    wire_times: WireTimes = field(default_factory=WireTimes)
 
 
 def attempt(

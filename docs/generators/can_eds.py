@@ -1,9 +1,11 @@
 """The electronic data sheet (CiA 306) of an amplifier, from protocol.yaml."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 
 from drivers.codec.can_bus.frame import CANOPEN, cob_id, command_id
-from drivers.codec.can_bus.objects import Entry, entries, index_of
+from drivers.codec.can_bus.objects import index_of
+from drivers.protocol.definition import PROTOCOL, Quantity
 
 _TYPES = {"u8": 0x5, "u16": 0x6, "u32": 0x7, "u64": 0x1B, "i16": 0x3, "text": 0x9, "domain": 0xF}
 _MANDATORY = (0x1000, 0x1001, 0x1018)
@@ -11,6 +13,52 @@ _VAR, _ARRAY, _RECORD = 7, 8, 9
 _SYNCHRONOUS, _EVENT_DRIVEN = 0, 255
 _ORDER_PDO, _SLOTS_PDO = 0x10, 0x11  # RPDO 17 and 18 and so on
 _BAUD_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One subindex of an object: type u8..u64, i16, text or domain; access ro, wo, rw or const.
+
+    alone: the only subindex; quantity: of its integer, if any.
+    """
+
+    index: int
+    subindex: int
+    name: str
+    type: str
+    access: str
+    alone: bool
+    mappable: bool
+    quantity: Quantity | None
+
+
+def entries(channels: int) -> Iterator[Entry]:
+    """Yield every subindex except the counts, for a number of channels."""
+    for name, declared in CANOPEN["objects"].items():
+        per = declared.get("per")
+        if "types" in declared:
+            listed = list(enumerate(declared["types"].items(), start=1))
+        elif per is None:
+            listed = [(0, (name, declared["type"]))]
+        else:
+            first = 1 if isinstance(per, int) else 0
+            listed = [
+                (number + 1, (f"{name} {number + first}", declared["type"]))
+                for number in range(_count(per, channels))
+            ]
+        for subindex, (title, kind) in listed:
+            quantity = vars(PROTOCOL.quantities).get(kind)
+            wire = kind if quantity is None else quantity.wire
+            access, mappable = declared["access"], bool(declared.get("pdo"))
+            yield Entry(
+                declared["index"], subindex, title, wire, access, not subindex, mappable, quantity
+            )
+
+
+def _count(per: str | int, channels: int) -> int:
+    if per == "channel":
+        return channels
+    return -(-channels // CANOPEN["channels_per_node"]) if per == "four_channels" else int(per)
 
 
 def eds_text(channels: int = 4) -> str:

@@ -29,19 +29,6 @@ class Malformed(FrameError):
         self.channel = channel
 
 
-class Record:
-    """Consecutive numbers, packed and read at once."""
-
-    def __init__(self, *quantities: Quantity) -> None:
-        self.quantities = quantities
-        self.layout = struct.Struct("<" + "".join(each.struct_code for each in quantities))
-
-    def pack(self, *values: float) -> bytes:
-        """Pack values, each in its unit; CommandError for one out of range."""
-        wanted = zip(self.quantities, values, strict=True)
-        return self.layout.pack(*[quantity.to_wire(value) for quantity, value in wanted])
-
-
 class Cursor:
     """Reads a payload from front to back; Malformed for missing or out-of-range values."""
 
@@ -55,18 +42,6 @@ class Cursor:
         if not quantity.holds(value):
             raise _out_of_range(quantity, value)
         return value
-
-    def record(self, record: Record) -> tuple[int, ...]:
-        """Read the integers of a record."""
-        at = self._at
-        self._at += record.layout.size
-        if self._at > len(self._payload):
-            raise Malformed("payload is too short", code=NakCode.BAD_LENGTH)
-        values: tuple[int, ...] = record.layout.unpack_from(self._payload, at)
-        for quantity, value in zip(record.quantities, values, strict=True):
-            if not quantity.minimum <= value <= quantity.maximum:
-                raise _out_of_range(quantity, value)
-        return values
 
     def number(self, quantity: Quantity) -> float:
         """Read a value in its unit."""

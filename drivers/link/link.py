@@ -6,6 +6,7 @@ A lost link stays lost until it is reopened: every request raises LinkError at o
 import asyncio
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import asdict
 from typing import TypeVar, final
 
 from drivers import clock
@@ -84,13 +85,9 @@ class Link:
     @property
     def statistics(self) -> LinkStatistics:
         """Link statistics; frames since opening, retries since construction."""
-        seen, beat = self.backend.counters, self._last_heartbeat
+        beat = self._last_heartbeat
         return LinkStatistics(
-            frames_out=seen.frames_out,
-            frames_in=seen.frames_in,
-            crc_errors=seen.crc_errors,
-            unexpected_frames=seen.unexpected_frames,
-            events=seen.events,
+            **asdict(self.backend.counters),
             retries=self._retries,
             timeouts=self._timeouts,
             refusals=self._refusals,

@@ -18,8 +18,8 @@ from drivers.backends.hardware import Worker
 from drivers.backends.waiting import SETTLE
 from drivers.codec.can_bus.frame import cob_id
 from drivers.codec.can_bus.objects import (
+    CAPABILITY_ENTRIES,
     TEXTS,
-    capability_entries,
     index_of,
     nak_of_abort,
     pack_envelope,
@@ -123,7 +123,7 @@ class ObjectClient:
                 name: self._client.upload(index_of("texts"), place)
                 for place, name in enumerate(TEXTS, start=1)
             }
-            version = capability_entries()[0]
+            version = CAPABILITY_ENTRIES[0]
             data = self._client.upload(version.index, version.subindex)
             return unpack_identity(texts, read_integer(version, data))
 
@@ -144,7 +144,7 @@ class ObjectClient:
 
         def read() -> Capabilities:
             values = {}
-            for entry in capability_entries():
+            for entry in CAPABILITY_ENTRIES:
                 data = self._client.upload(entry.index, entry.subindex)
                 values[entry.name] = read_integer(entry, data)
             return unpack_capabilities(values)

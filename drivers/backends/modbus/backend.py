@@ -10,7 +10,7 @@ Modbus has no unsolicited messages: events are changes of state or fault between
 
 import asyncio
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from drivers.backends.hardware import number_below
 from drivers.backends.line_turns import kind_on_line
@@ -40,15 +40,14 @@ from drivers.protocol.messages import (
     Reply,
     Request,
 )
-from drivers.protocol.wire_times import NoTimes, WireTimes
+from drivers.protocol.wire_times import WireTimes
 
 _ILLEGAL_FUNCTION = 1
 _GATEWAY = (10, 11)  # gateway: no path to the amplifier, or no response from it
 _TAGS = (1 << 16) - 1
 
 
-@dataclass(frozen=True)
-class _Asked:
+class _Asked(NamedTuple):
     """Priority of a request on the line, and timeout [s] of each transaction."""
 
     kind: RequestPriority
@@ -80,7 +79,7 @@ class ModbusBackend(WireBackend):
     def wire_times(self) -> WireTimes:
         """Durations on a serial line, also behind a gateway; unknown on a network."""
         if not self._url.baud:
-            return NoTimes()
+            return WireTimes()
         return ModbusTimes(self._url.baud, self._url.bits_per_byte)
 
     @property
@@ -163,7 +162,7 @@ class ModbusBackend(WireBackend):
         return self._tag
 
     async def _ask(
-        self, request: Request, asked: "_Asked", *, records: int = exchanges.RECORDS_FIRST
+        self, request: Request, asked: _Asked, *, records: int = exchanges.RECORDS_FIRST
     ) -> tuple[Reply, tuple[int, ...]]:
         """Return the reply to a request, and its registers; records: number of faults to read."""
         tag = self._next_tag()
@@ -178,7 +177,7 @@ class ModbusBackend(WireBackend):
             await self._check_alone()
         return exchanges.decode_reply(request, answer.registers), answer.registers
 
-    async def _carry_out(self, exchange: Exchange, tag: int, asked: "_Asked") -> ModbusResponse:
+    async def _carry_out(self, exchange: Exchange, tag: int, asked: _Asked) -> ModbusResponse:
         read, write = exchange.read, exchange.write
         if write is None:
             return await self._transact(read, None, asked, tag=None)
@@ -191,7 +190,7 @@ class ModbusBackend(WireBackend):
         return answer if answer.exception else await self._transact(read, None, asked, tag=tag)
 
     async def _transact(
-        self, read: Read | None, write: Write | None, asked: "_Asked", *, tag: int | None
+        self, read: Read | None, write: Write | None, asked: _Asked, *, tag: int | None
     ) -> ModbusResponse:
         def accept(answer: ModbusResponse) -> bool:
             if answer.exception or read is None:
@@ -217,7 +216,7 @@ class ModbusBackend(WireBackend):
             )
         return answer
 
-    async def _refusal(self, answer: ModbusResponse, tag: int, asked: "_Asked") -> Nak:
+    async def _refusal(self, answer: ModbusResponse, tag: int, asked: _Asked) -> Nak:
         """Read the reason of a refused write, unless the exception is unambiguous."""
         if answer.exception == _ILLEGAL_FUNCTION:
             return Nak(NakCode.UNKNOWN_TYPE)

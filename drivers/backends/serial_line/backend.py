@@ -20,7 +20,7 @@ from drivers.codec.serial_line.timing import SerialTimes
 from drivers.errors import DriverError, LinkError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Broadcast, Hello, Reply, Request, Stop
-from drivers.protocol.wire_times import NoTimes, WireTimes
+from drivers.protocol.wire_times import WireTimes
 from drivers.statistics import WireCounters
 
 
@@ -62,7 +62,7 @@ class SerialBackend(WireBackend):
     @property
     def wire_times(self) -> WireTimes:
         """Durations on the line; unknown behind a server."""
-        return self._times if self._url.is_local else NoTimes()
+        return self._times if self._url.is_local else WireTimes()
 
     @property
     def takes_turns(self) -> bool:

@@ -25,24 +25,18 @@ _Q = PROTOCOL.quantities
 _QUANTITIES: Mapping[str, Quantity] = vars(_Q)
 _OBJECTS: Mapping[str, Mapping[str, Any]] = CANOPEN["objects"]
 _NAKS = {code: NakCode[name] for name, code in CANOPEN["aborts"].items()}
-_WIDTHS = {"u8": 1, "u16": 2, "u32": 4, "u64": 8, "i16": 2}
+_WIDTHS = {"u8": 1, "u16": 2, "u32": 4, "i16": 2}
 TEXTS = ("vendor", "product", "serial_number", "firmware")
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One subindex of an object: type u8..u64, i16, text or domain; access ro, wo, rw or const.
-
-    alone: the only subindex; quantity: of its integer, if any.
-    """
+    """One subindex with an integer of type u8, u16 or i16; quantity: None for a plain integer."""
 
     index: int
     subindex: int
     name: str
     type: str
-    access: str
-    alone: bool
-    mappable: bool
     quantity: Quantity | None
 
 
@@ -51,53 +45,16 @@ def index_of(name: str) -> int:
     return int(_OBJECTS[name]["index"])
 
 
-def entries(channels: int) -> Iterator[Entry]:
-    """Yield every subindex except the counts, for a number of channels."""
-    for name, declared in _OBJECTS.items():
-        index = index_of(name)
-        access, mappable = str(declared["access"]), bool(declared.get("pdo"))
-        types = declared.get("types")
-        per = declared.get("per")
-        if types is not None:
-            for subindex, (field, kind) in enumerate(types.items(), start=1):
-                yield _entry(index, subindex, field, kind, access, mappable=mappable)
-        elif per is None:
-            yield _entry(
-                index, 0, name, str(declared["type"]), access, mappable=mappable, alone=True
-            )
-        else:
-            for number in range(_count(per, channels)):
-                kind = str(declared["type"])
-                title = f"{name} {number + 1 if isinstance(per, int) else number}"
-                yield _entry(index, number + 1, title, kind, access, mappable=mappable)
+def _capability_entries() -> Iterator[Entry]:
+    types = _OBJECTS["capabilities"]["types"]
+    for subindex, (name, kind) in enumerate(types.items(), start=1):
+        quantity = _QUANTITIES.get(kind)
+        wire = kind if quantity is None else quantity.wire
+        yield Entry(index_of("capabilities"), subindex, name, wire, quantity)
 
 
-def _count(per: str | int, channels: int) -> int:
-    if per == "channel":
-        return channels
-    if per == "four_channels":
-        return int(-(-channels // CANOPEN["channels_per_node"]))
-    return int(per)
-
-
-def _entry(
-    index: int,
-    subindex: int,
-    name: str,
-    kind: str,
-    access: str,
-    *,
-    mappable: bool,
-    alone: bool = False,
-) -> Entry:
-    quantity = _QUANTITIES.get(kind)
-    wire = kind if quantity is None else quantity.wire
-    return Entry(index, subindex, name, wire, access, alone, mappable, quantity)
-
-
-def capability_entries() -> tuple[Entry, ...]:
-    """Return the entries of the capabilities, in order; each has the name of a field."""
-    return tuple(entry for entry in entries(0) if entry.index == index_of("capabilities"))
+CAPABILITY_ENTRIES = tuple(_capability_entries())
+"""Entries of the capabilities, in order, named as their fields."""
 
 
 def read_integer(entry: Entry, data: bytes) -> int:
@@ -120,9 +77,9 @@ def unpack_identity(texts: Mapping[str, bytes], version: int) -> Identity:
 
 
 def unpack_capabilities(values: Mapping[str, int]) -> Capabilities:
-    """Decode capabilities from the integers of `capability_entries`, by name."""
+    """Decode capabilities from the integers of `CAPABILITY_ENTRIES`, by name."""
     fields: dict[str, float] = {}
-    for entry in capability_entries():
+    for entry in CAPABILITY_ENTRIES:
         value, quantity = values[entry.name], entry.quantity
         if quantity is not None and quantity.per_unit > 1:
             fields[entry.name] = quantity.from_wire(value)

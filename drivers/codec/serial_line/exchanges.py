@@ -30,7 +30,7 @@ from drivers.codec.serial_line.sets import (
     unpack_set,
 )
 from drivers.guard import require_safe
-from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import (
     Achieved,
     AmplifierEvent,
@@ -74,6 +74,20 @@ class _Layout:
     unpack: Callable[[Cursor], Any]
 
 
+def _numbers(
+    message: type[Any], *, read: Callable[[Cursor, Quantity], float], **quantities: Quantity
+) -> _Layout:
+    """Return the layout of a message that consists of these numbers."""
+
+    def pack_numbers(values: Any) -> bytes:
+        return pack(*((quantity, getattr(values, name)) for name, quantity in quantities.items()))
+
+    def unpack_numbers(cursor: Cursor) -> Any:
+        return message(**{name: read(cursor, quantity) for name, quantity in quantities.items()})
+
+    return _Layout(message, pack_numbers, unpack_numbers)
+
+
 def _empty(message: type[Any]) -> _Layout:
     return _Layout(message, lambda _: b"", lambda _: message())
 
@@ -84,47 +98,20 @@ _STATUS = _Layout(Status, pack_status, unpack_status)
 _ACHIEVED = _Layout(Achieved, pack_achieved, unpack_achieved)
 _FAULTS = _Layout(FaultList, pack_faults, unpack_faults)
 
-_ARM = _Layout(
-    Arm,
-    lambda arm: pack((_Q.watchdog, arm.watchdog)),
-    lambda cursor: Arm(watchdog=cursor.number(_Q.watchdog)),
-)
-_DISARM = _Layout(
-    Disarm,
-    lambda disarm: pack((_Q.ramp, disarm.ramp)),
-    lambda cursor: Disarm(ramp=cursor.nearest(_Q.ramp)),
-)
 _STAGE = _Layout(
     Stage,
     lambda stage: pack_set(stage.command_set),
     lambda cursor: Stage(unpack_set(cursor)),
-)
-_COMMIT = _Layout(
-    Commit,
-    lambda commit: pack((_Q.token, commit.token)),
-    lambda cursor: Commit(token=cursor.integer(_Q.token)),
 )
 _APPLY = _Layout(
     Apply,
     lambda apply: pack_set(apply.command_set),
     lambda cursor: Apply(unpack_set(cursor)),
 )
-_STOP = _Layout(
-    Stop,
-    lambda stop: pack((_Q.ramp, stop.ramp)),
-    lambda cursor: Stop(ramp=cursor.nearest(_Q.ramp)),
-)
 _LOAD_ENVELOPE = _Layout(
     LoadEnvelope,
     lambda load: pack_envelope(load.envelope),
     lambda cursor: LoadEnvelope(unpack_envelope(cursor)),
-)
-_LOADED = _Layout(
-    Loaded,
-    lambda loaded: pack((_Q.envelope_slot, loaded.slot), (_Q.envelope_knots, loaded.knots)),
-    lambda cursor: Loaded(
-        slot=cursor.integer(_Q.envelope_slot), knots=cursor.integer(_Q.envelope_knots)
-    ),
 )
 _EVENT_LAYOUT = _Layout(
     AmplifierEvent,
@@ -140,17 +127,20 @@ _EVENT_LAYOUT = _Layout(
 _EXCHANGES: dict[int, tuple[_Layout, _Layout]] = {
     PROTOCOL.types["hello"]: (_empty(Hello), _IDENTITY),
     PROTOCOL.types["get_caps"]: (_empty(GetCaps), _CAPABILITIES),
-    PROTOCOL.types["arm"]: (_ARM, _STATUS),
-    PROTOCOL.types["disarm"]: (_DISARM, _STATUS),
+    PROTOCOL.types["arm"]: (_numbers(Arm, read=Cursor.number, watchdog=_Q.watchdog), _STATUS),
+    PROTOCOL.types["disarm"]: (_numbers(Disarm, read=Cursor.nearest, ramp=_Q.ramp), _STATUS),
     PROTOCOL.types["stage"]: (_STAGE, _ACHIEVED),
-    PROTOCOL.types["commit"]: (_COMMIT, _ACHIEVED),
+    PROTOCOL.types["commit"]: (_numbers(Commit, read=Cursor.integer, token=_Q.token), _ACHIEVED),
     PROTOCOL.types["apply"]: (_APPLY, _ACHIEVED),
-    PROTOCOL.types["stop"]: (_STOP, _STATUS),
+    PROTOCOL.types["stop"]: (_numbers(Stop, read=Cursor.nearest, ramp=_Q.ramp), _STATUS),
     PROTOCOL.types["get_status"]: (_empty(GetStatus), _STATUS),
     PROTOCOL.types["get_faults"]: (_empty(GetFaults), _FAULTS),
     PROTOCOL.types["clear"]: (_empty(Clear), _STATUS),
     PROTOCOL.types["ping"]: (_empty(Ping), _STATUS),
-    PROTOCOL.types["load_envelope"]: (_LOAD_ENVELOPE, _LOADED),
+    PROTOCOL.types["load_envelope"]: (
+        _LOAD_ENVELOPE,
+        _numbers(Loaded, read=Cursor.integer, slot=_Q.envelope_slot, knots=_Q.envelope_knots),
+    ),
 }
 _TYPE_OF = {request.message: code for code, (request, _) in _EXCHANGES.items()}
 

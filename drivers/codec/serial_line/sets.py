@@ -3,20 +3,15 @@
 Unpacking yields plain values in range or raises Malformed.
 """
 
-from drivers.codec.payload import Cursor, Malformed, Record, pack
+from drivers.codec.payload import Cursor, Malformed, pack
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Achieved, NakCode
 
 _Q = PROTOCOL.quantities
 _KEEP_PHASE = 0x01
 _SKIP_ENDING = 0x02
 _ENVELOPES = 0x04  # onset and ending follow the command
-
-_FLAGS = Quantity("flags", "u8", 1, "", 0, _KEEP_PHASE | _SKIP_ENDING | _ENVELOPES)
-_COMMAND = Record(_Q.channel, _FLAGS, _Q.frequency, _Q.level, _Q.phase)
-_SLOTS = Record(_Q.envelope_slot, _Q.envelope_slot)
-_TIMES = Record(_Q.token, _Q.ramp, _Q.valid_for)
 
 
 def _pack_commands(commands: tuple[DriveCommand, ...]) -> bytes:
@@ -26,11 +21,18 @@ def _pack_commands(commands: tuple[DriveCommand, ...]) -> bytes:
         flags = _KEEP_PHASE if command.keep_phase else 0
         flags |= _SKIP_ENDING if command.skip_ending else 0
         flags |= _ENVELOPES if is_shaped else 0
+        packed += [pack((_Q.channel, command.channel)), bytes([flags])]
         packed.append(
-            _COMMAND.pack(command.channel, flags, command.frequency, command.level, command.phase)
+            pack(
+                (_Q.frequency, command.frequency),
+                (_Q.level, command.level),
+                (_Q.phase, command.phase),
+            )
         )
         if is_shaped:
-            packed.append(_SLOTS.pack(command.onset, command.ending))
+            packed.append(
+                pack((_Q.envelope_slot, command.onset), (_Q.envelope_slot, command.ending))
+            )
     return b"".join(packed)
 
 
@@ -38,19 +40,22 @@ def _unpack_commands(cursor: Cursor) -> tuple[DriveCommand, ...]:
     commands: list[DriveCommand] = []
     seen: set[int] = set()
     for _ in range(cursor.integer(_Q.channel_count)):
-        channel, flags, frequency, level, phase = cursor.record(_COMMAND)
+        channel = cursor.integer(_Q.channel)
+        flags = cursor.flags(_KEEP_PHASE | _SKIP_ENDING | _ENVELOPES)
+        frequency, level, phase = map(cursor.number, (_Q.frequency, _Q.level, _Q.phase))
         if channel in seen:
             raise Malformed(
                 f"channel {channel} occurs twice", code=NakCode.BAD_CHANNEL, channel=channel
             )
         seen.add(channel)
-        onset, ending = cursor.record(_SLOTS) if flags & _ENVELOPES else (0, 0)
+        onset = cursor.integer(_Q.envelope_slot) if flags & _ENVELOPES else 0
+        ending = cursor.integer(_Q.envelope_slot) if flags & _ENVELOPES else 0
         commands.append(
             DriveCommand(
                 channel=channel,
-                frequency=_Q.frequency.from_wire(frequency),
-                level=_Q.level.from_wire(level),
-                phase=_Q.phase.from_wire(phase),
+                frequency=frequency,
+                level=level,
+                phase=phase,
                 keep_phase=bool(flags & _KEEP_PHASE),
                 onset=onset,
                 ending=ending,
@@ -62,19 +67,19 @@ def _unpack_commands(cursor: Cursor) -> tuple[DriveCommand, ...]:
 
 def pack_set(command_set: CommandSet) -> bytes:
     """Pack a set."""
-    times = _TIMES.pack(command_set.token, command_set.ramp, command_set.valid_for)
+    times = pack(
+        (_Q.token, command_set.token),
+        (_Q.ramp, command_set.ramp),
+        (_Q.valid_for, command_set.valid_for),
+    )
     return times + _pack_commands(command_set.commands)
 
 
 def unpack_set(cursor: Cursor) -> CommandSet:
     """Unpack a set, which must pass a guard before it can be encoded."""
-    token, ramp, valid_for = cursor.record(_TIMES)
-    return CommandSet(
-        token=token,
-        commands=_unpack_commands(cursor),
-        ramp=_Q.ramp.from_wire(ramp),
-        valid_for=_Q.valid_for.from_wire(valid_for),
-    )
+    token = cursor.integer(_Q.token)
+    ramp, valid_for = cursor.number(_Q.ramp), cursor.number(_Q.valid_for)
+    return CommandSet(token, _unpack_commands(cursor), ramp=ramp, valid_for=valid_for)
 
 
 def pack_envelope(envelope: Envelope) -> bytes:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from can_dbc import dbc_text
 from drivers.codec.can_bus.frame import LAYOUTS, CanFrame
 from drivers.codec.can_bus.objects import (
-    capability_entries,
+    CAPABILITY_ENTRIES,
     read_integer,
     unpack_achieved,
     unpack_capabilities,
@@ -246,7 +246,7 @@ def test_objects_are_decoded() -> None:
 
 def test_invalid_integer_of_an_entry_is_a_frame_error() -> None:
     """Channels are one byte, up to 16."""
-    channels = next(entry for entry in capability_entries() if entry.name == "channels")
+    channels = next(entry for entry in CAPABILITY_ENTRIES if entry.name == "channels")
     assert read_integer(channels, b"\x10") == 16
     with pytest.raises(FrameError, match=r"channels .*got 2"):
         read_integer(channels, b"\x04\x00")

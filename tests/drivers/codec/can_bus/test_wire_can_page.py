@@ -4,10 +4,10 @@ from pathlib import Path
 import pytest
 
 import drivers
+from can_eds import entries
 from can_files import FILES
 from can_session import session
 from drivers.codec.can_bus.frame import CANOPEN, LAYOUTS
-from drivers.codec.can_bus.objects import entries
 from drivers.protocol.definition import PROTOCOL
 
 DOCS = Path(drivers.__file__).parent.parent / "docs" / "reference"

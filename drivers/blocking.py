@@ -34,16 +34,6 @@ class BlockingAmplifier:
     """
 
     def __init__(self, url: str, *, limits: GuardLimits) -> None:
-        if not isinstance(url, str):
-            raise CommandError(
-                "URL of an amplifier must be a string such as serial:///dev/ttyUSB0, got "
-                f"{type(url).__name__}"
-            )
-        if not isinstance(limits, GuardLimits):
-            raise CommandError(
-                "limits must be GuardLimits of lowest and highest frequency [Hz] and highest "
-                f"level, such as GuardLimits(40, 500, 0.5), got {type(limits).__name__}"
-            )
         self._url = url
         self._limits = limits
         self._loop = asyncio.new_event_loop()

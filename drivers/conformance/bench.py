@@ -7,7 +7,7 @@ from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, GuardLimits, SafeCommandSet
-from drivers.protocol.messages import Capabilities, Status
+from drivers.protocol.messages import AmplifierState, Capabilities, Status
 
 LEVEL = 0.2
 """Level of driven channels: perceptible, and far from any limit."""
@@ -85,6 +85,13 @@ class Bench:
                     await asyncio.sleep(0.005)
         except TimeoutError:
             raise ContractViolation(f"{what} must happen within {EVENT_TIMEOUT:g} s") from None
+
+    def expect_state(self, status: Status, state: AmplifierState, *, after: str) -> None:
+        """Require a state."""
+        expect(
+            status.state is state,
+            f"state after {after} must be {state.name}, got {status.state.name}",
+        )
 
     async def refused(self, call: Awaitable[object], *, what: str) -> None:
         """Require a refusal."""

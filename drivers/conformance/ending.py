@@ -9,18 +9,12 @@ async def quick_stop(bench: Bench) -> None:
     await bench.arm()
     await bench.amplifier.apply(bench.tones(1.0))
     status = await bench.amplifier.stop(0.0)
-    expect(
-        status.state is AmplifierState.QUICK_STOP_ACTIVE,
-        f"state after a stop is {status.state.name}",
-    )
+    bench.expect_state(status, AmplifierState.QUICK_STOP_ACTIVE, after="a stop")
     expect(not any(status.levels), f"levels after a stop are {status.levels}")
     await bench.refused(bench.amplifier.apply(bench.tones(1.0)), what="an apply while stopped")
     await bench.refused(bench.arm(), what="arming while stopped")
     status = await bench.amplifier.clear()
-    expect(
-        status.state is AmplifierState.SWITCH_ON_DISABLED,
-        f"state after Clear is {status.state.name}",
-    )
+    bench.expect_state(status, AmplifierState.SWITCH_ON_DISABLED, after="Clear")
 
 
 async def disarm(bench: Bench) -> None:
@@ -59,10 +53,7 @@ async def watchdog(bench: Bench) -> None:
     await bench.refused(bench.arm(), what="arming in FAULT")
     await bench.refused(bench.amplifier.apply(bench.tones(1.0)), what="an apply in FAULT")
     status = await bench.amplifier.clear()
-    expect(
-        status.state is AmplifierState.SWITCH_ON_DISABLED,
-        f"state after Clear is {status.state.name}",
-    )
+    bench.expect_state(status, AmplifierState.SWITCH_ON_DISABLED, after="Clear")
 
 
 async def heartbeats(bench: Bench) -> None:
@@ -93,10 +84,7 @@ async def valid_for(bench: Bench) -> None:
     status = await bench.until(
         lambda status: not any(status.levels), what="end of a vibration", feed=True
     )
-    expect(
-        status.state is AmplifierState.OPERATION_ENABLED,
-        f"state after valid_for is {status.state.name}",
-    )
+    bench.expect_state(status, AmplifierState.OPERATION_ENABLED, after="valid_for")
     await bench.amplifier.apply(ending)
     await bench.expect_levels(why="ended set applied again")
     await bench.amplifier.commit(staged.token)

@@ -12,9 +12,7 @@ async def plays_nothing_disarmed(bench: Bench) -> None:
     """It plays nothing before it is armed, and plays no earlier set once armed."""
     await bench.refused(bench.amplifier.apply(bench.tones(1.0)), what="an apply while disarmed")
     status = await bench.arm()
-    expect(
-        status.state is AmplifierState.OPERATION_ENABLED, f"state after Arm is {status.state.name}"
-    )
+    bench.expect_state(status, AmplifierState.OPERATION_ENABLED, after="Arm")
     expect(status.high_voltage, "high voltage after Arm is off")
     expect(status.token == 0, f"token after Arm must be 0, got {status.token}")
     expect(not any(status.levels), f"levels after Arm are {status.levels}")
@@ -131,7 +129,4 @@ async def cancelled_requests(bench: Bench) -> None:
         asking.cancel()
         await asyncio.gather(asking, return_exceptions=True)
         status = await bench.arm()
-        expect(
-            status.state is AmplifierState.OPERATION_ENABLED,
-            f"state after Arm is {status.state.name}",
-        )
+        bench.expect_state(status, AmplifierState.OPERATION_ENABLED, after="Arm")

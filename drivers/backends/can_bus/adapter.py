@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import errno
 import logging
 import threading
 from collections.abc import Callable, Sequence
@@ -13,6 +12,7 @@ import serial
 
 from drivers.backends.can_bus.interfaces import open_bus, send_all, wake
 from drivers.backends.hardware import HARDWARE_PROVIDER, Adapter
+from drivers.backends.ports.watched import remedy_of
 from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.errors import LinkError, LinkTimeout, system_message
@@ -136,20 +136,8 @@ def _shut(bus: can.BusABC) -> None:
 
 
 def _why_not_open(url: CanBusUrl, problem: Exception) -> str:
-    cause: BaseException | None = problem
-    code = None
-    while cause is not None and code is None:
-        code = getattr(cause, "errno", None)
-        cause = cause.__cause__ or cause.__context__
-    if url.interface == "slcan" and code in (errno.EACCES, errno.EPERM):
-        remedy = (
-            "no permission; add the user to the group that owns the port (often "
-            "dialout: sudo usermod -aG dialout $USER) and log in again"
-        )
-    elif url.interface == "slcan" and code in (errno.EAGAIN, errno.EBUSY):
-        remedy = "in use by another program; close that one"
-    elif url.interface == "slcan":
-        remedy = "check the port's name, the adapter and the bit rate"
+    if url.interface == "slcan":
+        remedy = remedy_of(problem) or "check the port's name, the adapter and the bit rate"
     elif url.interface == "socketcand":
         remedy = "check address and port, and that socketcand serves this bus there"
     elif url.interface == "socketcan":

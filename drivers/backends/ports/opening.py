@@ -1,7 +1,6 @@
 """Opening of serial ports, USB adapters and serial servers, named as in pyserial."""
 
 import contextlib
-import errno
 import os
 import socket
 from collections.abc import Callable
@@ -81,14 +80,12 @@ def _open_port(name: str, baud: int, parity: str, stop: int) -> serial.Serial:
 
 
 def _why_not_open(port: str, problem: Exception) -> str:
-    refused = getattr(problem, "errno", None) == errno.ECONNREFUSED
-    if (remedy := remedy_of(problem)) is not None:
-        pass
-    elif refused or port.startswith(("socket://", "rfc2217://")):
+    remedy = remedy_of(problem)
+    if remedy is None and port.startswith(("socket://", "rfc2217://")):
         remedy = "no server there; check the address, and that the serial server runs"
-    elif port.startswith("hwgrep://"):
+    elif remedy is None and port.startswith("hwgrep://"):
         remedy = "no port matches; list them: python -m serial.tools.list_ports -v"
-    else:
+    elif remedy is None:
         remedy = "check its name, the plug, its speed and its parity"
     said = system_message(problem)
     return f"serial port {port} cannot be opened: {remedy} (the system says: {said})"

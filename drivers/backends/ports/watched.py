@@ -154,9 +154,11 @@ def connection_of(port: serial.Serial) -> socket.socket | None:
 
 def remedy_of(problem: Exception) -> str | None:
     """Return the remedy for an opening error by its error code, if there is one."""
-    code = getattr(problem, "errno", None)
-    if code is None and isinstance(problem.__context__, OSError):
-        code = problem.__context__.errno
+    cause: BaseException | None = problem
+    code = None
+    while cause is not None and code is None:
+        code = getattr(cause, "errno", None)
+        cause = cause.__cause__ or cause.__context__
     if code == errno.ENOENT:
         return "no such port; plug in the adapter and check its name in /dev"
     if code in (errno.EACCES, errno.EPERM):

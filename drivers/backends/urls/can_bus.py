@@ -1,10 +1,9 @@
 """CAN amplifier URLs, such as can+socketcan://can0#NODE, with the node after the hash sign."""
 
-import re
 from dataclasses import dataclass
 from urllib.parse import unquote, urlsplit
 
-from drivers.backends.urls.options import options_of, whole_number
+from drivers.backends.urls.options import device_of, options_of, whole_number
 from drivers.codec.can_bus.frame import CANOPEN
 from drivers.errors import CommandError
 
@@ -63,9 +62,7 @@ class CanUrl:
             case "socketcan" | "virtual":
                 channel, rest = parts.netloc, parts.path.strip("/")
             case "slcan":
-                channel, rest = unquote(parts.path), parts.netloc
-                if re.fullmatch(r"/COM\d+", channel, re.IGNORECASE):
-                    channel = channel[1:]
+                channel, rest = device_of(unquote(parts.path)), parts.netloc
             case "socketcand":
                 channel, rest = parts.path.strip("/"), "" if port else "no port"
                 host = parts.hostname or ""

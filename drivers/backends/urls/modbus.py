@@ -1,10 +1,9 @@
 """Modbus amplifier URLs: modbus+tcp://HOST:PORT/UNIT and modbus+rtu:///dev/ttyS1?baud=115200#UNIT."""
 
-import re
 from dataclasses import dataclass, replace
 from urllib.parse import SplitResult, unquote, urlsplit
 
-from drivers.backends.urls.options import options_of, whole_number
+from drivers.backends.urls.options import device_of, options_of, whole_number
 from drivers.errors import CommandError
 from drivers.protocol.definition import PROTOCOL
 
@@ -81,9 +80,7 @@ def _tcp(parts: SplitResult, url: str) -> ModbusUrl:
 def _rtu(parts: SplitResult, url: str) -> ModbusUrl:
     known = ("baud", "parity", "stop")
     options = options_of(parts.query, known=known, url=url, kind="a Modbus RTU")
-    device = unquote(parts.path)
-    if re.fullmatch(r"/COM\d+", device, re.IGNORECASE):
-        device = device[1:]
+    device = device_of(unquote(parts.path))
     if parts.netloc:
         if not parts.hostname or parts.port is None or device.strip("/"):
             raise CommandError(

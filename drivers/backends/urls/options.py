@@ -1,5 +1,6 @@
 """Options of an amplifier URL: the name=value pairs after its question mark."""
 
+import re
 from collections.abc import Collection
 from urllib.parse import parse_qsl
 
@@ -32,3 +33,8 @@ def whole_number(text: str, name: str, *, low: int = 1, high: int, url: str) -> 
     if not (is_number and low <= int(text) <= high):
         raise CommandError(f"{url!r}: {name} must be an integer of {low} to {high}, got {text!r}")
     return int(text)
+
+
+def device_of(path: str) -> str:
+    """Return the device of a URL's path: /dev/ttyUSB0, or COM3 of /COM3."""
+    return path[1:] if re.fullmatch(r"/COM\d+", path, re.IGNORECASE) else path

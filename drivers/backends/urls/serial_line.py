@@ -6,11 +6,10 @@ rfc2217://HOST:PORT?baud=115200                 a serial server with RFC 2217
 hwgrep://0403:6001                              the port whose description matches
 """
 
-import re
 from dataclasses import dataclass
 from urllib.parse import unquote, urlsplit
 
-from drivers.backends.urls.options import options_of, whole_number
+from drivers.backends.urls.options import device_of, options_of, whole_number
 from drivers.errors import CommandError
 from drivers.protocol.definition import PROTOCOL
 
@@ -56,10 +55,8 @@ class SerialUrl:
                 raise CommandError(f"{url!r} must name a host and port; use {_FORM}")
             kind = "rfc2217" if parts.scheme == "rfc2217" else "socket"
             port = f"{kind}://{parts.netloc}"
-        elif re.fullmatch(r"/COM\d+", path, re.IGNORECASE):
-            port = path[1:]
         elif path.strip("/"):
-            port = path
+            port = device_of(path)
         else:
             raise CommandError(f"{url!r} must name a port; use {_FORM}")
         line = PROTOCOL.serial

@@ -30,24 +30,17 @@ _NAKS = {code.value: code for code in NakCode}
 class CanReply:
     """Reply to a request, or with sequence 0 an event.
 
-    refusal: None if carried out; exact: the set plays exactly as requested. status: in replies to
-    all requests except those about sets, unless refused.
+    event: state, fault and channel at fault; refusal: None if carried out; exact: the set plays
+    exactly as requested. status: in replies to requests not about sets, unless refused.
     """
 
     sequence: int
     action: int
-    state: AmplifierState
-    fault: Fault
+    event: AmplifierEvent
     token: int
     exact: bool
     refusal: Nak | None
-    channel: int | None
     status: Status | None
-
-    @property
-    def event(self) -> AmplifierEvent:
-        """The event, if unsolicited."""
-        return AmplifierEvent(self.state, self.fault, self.channel)
 
 
 @dataclass
@@ -96,35 +89,26 @@ class CanReplyReader:
                 self._levels[group] = _unpack("levels", data[begin : begin + BLOCK])
         values = _unpack("answer", data[:BLOCK])
         sequence, action, result = values["sequence"], values["action"], values["result"]
-        if values["state"] not in _STATES or values["fault"] not in _FAULTS:
-            raise FrameError(
-                f"unknown state {values['state']} or fault {values['fault']} in a reply"
-            )
         if result not in (0, _INCOMPLETE_SET) and result not in _NAKS:
             raise FrameError(f"unknown result {result} in a reply")
-        channel = values["channel"]
-        if channel != _NO_CHANNEL and not _Q.channel.holds(channel):
-            raise FrameError(f"invalid channel {channel} in a reply")
+        event = _event(values)
         about_set = action in (_ACTIONS["apply"], _ACTIONS["stage"], _ACTIONS["commit"])
         status = None
         if sequence != UNSOLICITED and not result and not about_set:
-            status = self._status(values)
+            status = self._status(values, event)
             if status is None:
                 return None
-        faulty = None if channel == _NO_CHANNEL else channel
         return CanReply(
             sequence=sequence,
             action=action,
-            state=_STATES[values["state"]],
-            fault=_FAULTS[values["fault"]],
+            event=event,
             token=values["active_token"],
             exact=bool(values["exact"]),
-            refusal=_refusal(result, _STATES[values["state"]], faulty),
-            channel=faulty,
+            refusal=_refusal(result, event),
             status=status,
         )
 
-    def _status(self, answer: dict[str, int]) -> Status | None:
+    def _status(self, answer: dict[str, int], event: AmplifierEvent) -> Status | None:
         """Return the status of a reply; None if a frame of it is missing."""
         condition = self._condition
         each = CANOPEN["channels_per_node"]
@@ -143,8 +127,8 @@ class CanReplyReader:
         ):
             raise FrameError("values of a status are out of range")
         return Status(
-            state=_STATES[answer["state"]],
-            fault=_FAULTS[answer["fault"]],
+            state=event.state,
+            fault=event.fault,
             token=answer["active_token"],
             high_voltage=bool(condition["high_voltage"]),
             temperature=_Q.temperature.from_wire(condition["temperature"]),
@@ -156,18 +140,17 @@ class CanReplyReader:
 
 def decode_emergency(data: bytes) -> AmplifierEvent:
     """Decode an EMCY message; raises FrameError."""
-    values = _unpack("emergency", data)
-    channel = values["channel"]
-    if (
-        values["state"] not in _STATES
-        or values["fault"] not in _FAULTS
-        or not (channel == _NO_CHANNEL or _Q.channel.holds(channel))
-    ):
-        raise FrameError(f"invalid emergency: {data.hex(' ')}")
+    return _event(_unpack("emergency", data))
+
+
+def _event(values: dict[str, int]) -> AmplifierEvent:
+    state, fault, channel = values["state"], values["fault"], values["channel"]
+    if state not in _STATES or fault not in _FAULTS:
+        raise FrameError(f"unknown state {state} or fault {fault}")
+    if channel != _NO_CHANNEL and not _Q.channel.holds(channel):
+        raise FrameError(f"invalid channel {channel}")
     return AmplifierEvent(
-        _STATES[values["state"]],
-        _FAULTS[values["fault"]],
-        None if channel == _NO_CHANNEL else channel,
+        _STATES[state], _FAULTS[fault], None if channel == _NO_CHANNEL else channel
     )
 
 
@@ -176,15 +159,15 @@ def plain_reply(answer: CanReply) -> Reply | None:
     return answer.refusal or answer.status
 
 
-def _refusal(result: int, state: AmplifierState, channel: int | None) -> Nak | None:
+def _refusal(result: int, event: AmplifierEvent) -> Nak | None:
     if result == 0:
         return None
     if result != _INCOMPLETE_SET:
-        return Nak(_NAKS[result], channel)
+        return Nak(_NAKS[result], event.channel)
     # A frame of the set was lost and nothing applied: it can be repeated, unless the state shows
     # that the complete set would be refused too.
-    is_armed = state is AmplifierState.OPERATION_ENABLED
-    return Nak(NakCode.BUSY if is_armed else NakCode.WRONG_STATE, channel)
+    is_armed = event.state is AmplifierState.OPERATION_ENABLED
+    return Nak(NakCode.BUSY if is_armed else NakCode.WRONG_STATE, event.channel)
 
 
 def _unpack(layout: str, data: bytes) -> dict[str, int]:

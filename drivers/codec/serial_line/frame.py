@@ -52,18 +52,10 @@ class Frame:
 
 @dataclass
 class FrameCounters:
-    """Frames by the result of their check."""
+    """Received frames: good ones, and damaged ones by checksum, length, form or version."""
 
     good: int = 0
-    bad_crc: int = 0
-    too_long: int = 0
-    truncated: int = 0
-    bad_version: int = 0
-
-    @property
-    def crc_errors(self) -> int:
-        """All discarded frames."""
-        return self.bad_crc + self.too_long + self.truncated + self.bad_version
+    crc_errors: int = 0
 
 
 def encode_frame(frame: Frame) -> bytes:
@@ -111,7 +103,7 @@ class FrameReader:
         if self._skipping:
             return
         if len(self._stuffed) + len(piece) > _STUFFED_MAX:
-            self.counters.too_long += 1
+            self.counters.crc_errors += 1
             self._skipping = True
             self._stuffed.clear()
             return
@@ -123,26 +115,29 @@ class FrameReader:
         skipped, self._skipping = self._skipping, False
         if skipped or not stuffed:
             return None
-        try:
-            content = cobs.decode(stuffed)
-        except cobs.DecodeError:
-            self.counters.truncated += 1
-            return None
-        if len(content) < _OVERHEAD:
-            self.counters.truncated += 1
-            return None
-        body, crc = content[: -_CRC.size], content[-_CRC.size :]
-        if _CRC.unpack(crc) != (zlib.crc32(body),):
-            self.counters.bad_crc += 1
-            return None
-        first, address, sequence = _HEADER.unpack_from(body)
-        if (first & _VERSION_MASK) >> _VERSION_SHIFT != PROTOCOL.version:
-            self.counters.bad_version += 1
-            return None
-        self.counters.good += 1
-        return Frame(
-            kind=first & (REPLY | _TYPE_MASK),
-            address=address,
-            sequence=sequence,
-            payload=body[_HEADER.size :],
-        )
+        frame = _decode_frame(stuffed)
+        if frame is None:
+            self.counters.crc_errors += 1
+        else:
+            self.counters.good += 1
+        return frame
+
+
+def _decode_frame(stuffed: bytes) -> Frame | None:
+    """Decode a frame without its delimiters; None if it is damaged."""
+    try:
+        content = cobs.decode(stuffed)
+    except cobs.DecodeError:
+        return None
+    body, crc = content[: -_CRC.size], content[-_CRC.size :]
+    if len(content) < _OVERHEAD or _CRC.unpack(crc) != (zlib.crc32(body),):
+        return None
+    first, address, sequence = _HEADER.unpack_from(body)
+    if (first & _VERSION_MASK) >> _VERSION_SHIFT != PROTOCOL.version:
+        return None
+    return Frame(
+        kind=first & (REPLY | _TYPE_MASK),
+        address=address,
+        sequence=sequence,
+        payload=body[_HEADER.size :],
+    )

@@ -14,7 +14,7 @@ from model.rig.rig import Rig
 from model.structure.actuator import Era
 from model.studies.cases import Cases
 from model.studies.receptances import Receptances, solve_receptances
-from model.version import code_version
+from model.version import NUMERICS_VERSION
 from model.vibration.activation import (
     MEDIAN,
     STATISTICS,
@@ -35,14 +35,12 @@ DRIVE_NAMES = {"1": "best single ERA", "2": "best pair of ERAs", "all": "all ERA
 class StudyProblem:
     """What the statistics of all cases depend on.
 
-    positions (c, 2) [m]: possible places of ERAs; frequencies (f,) [Hz]; code_version: of the
-    code that made it.
+    positions (c, 2) [m]: possible places of ERAs; frequencies (f,) [Hz].
     """
 
     rig: Rig
     positions: FloatArray
     frequencies: FloatArray
-    code_version: str
 
     @property
     def points(self) -> FloatArray:
@@ -55,7 +53,7 @@ class StudyProblem:
         """SHA-256 over all but the positions, which are part of the cases."""
         digest = hashlib.sha256()
         mesh = json.dumps(self.rig.mesh.to_dict(), sort_keys=True)
-        for text in (self.rig.fingerprint, mesh, self.code_version):
+        for text in (self.rig.fingerprint, mesh, NUMERICS_VERSION):
             digest.update(f"{text}\n".encode())
         digest.update(self.frequencies.tobytes())
         return digest.hexdigest()
@@ -94,7 +92,7 @@ def study_problem(rig: Rig, cases: Cases, frequencies: FloatArray) -> StudyProbl
     if len(frequencies) == 0:
         raise InputError("a study needs at least one frequency")
     check_frequencies(rig.plate, rig.mesh, frequencies)
-    return StudyProblem(rig, cases.positions, frequencies, code_version())
+    return StudyProblem(rig, cases.positions, frequencies)
 
 
 def solve_cases(receptances: Receptances, eras: tuple[Era, ...], cases: Cases) -> CaseResults:

@@ -73,10 +73,11 @@ def on_cluster(address: str) -> Workers:
                 raise InputError(
                     f"the Dask scheduler at {address} has no workers; start `dask worker {address}`"
                 )
+            version = code_version()
             # Solved on the cluster, so that the scheduler can repeat it if its worker is lost.
-            shared = client.submit(_solve_plate, problem, pure=False)
+            shared = client.submit(_solve_plate, version, problem, pure=False)
             numbers = {
-                client.submit(_solve_on_cluster, problem.code_version, shared, cases, pure=False): n
+                client.submit(_solve_on_cluster, version, shared, cases, pure=False): n
                 for n, cases in chunks.items()
             }
             try:
@@ -97,8 +98,8 @@ def _solve_chunk(shared: _Shared, cases: Cases) -> CaseResults:
     return solve_cases(receptances, eras, cases)
 
 
-def _solve_plate(problem: StudyProblem) -> _Shared:
-    _check_code(problem.code_version)
+def _solve_plate(version: str, problem: StudyProblem) -> _Shared:
+    _check_code(version)
     return problem.solve(), problem.rig.eras
 
 

@@ -21,10 +21,10 @@ from model.config.editing import data_text
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.studies.run import CHUNK
-from same_code import era_program
 
 RUNNER = CliRunner()
 RIG = str(example_rig_path())
+ERA = str(Path(sys.executable).with_name("era"))
 QUICK = ["--mesh", "12x9", "--frequencies", "60,110,250", "--candidates", "7x5"]
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -213,10 +213,9 @@ def test_study_names_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
 
 def test_study_resumes_when_it_was_interrupted(tmp_path: Path) -> None:
     """SIGINT in the middle, with two workers: status 130, and a whole file to resume from."""
-    command = [sys.executable, "-c", era_program()]
     arguments = ["study", "placement", RIG, "-o", str(tmp_path), "--layouts", "30000", *QUICK]
     with subprocess.Popen(
-        [*command, *arguments, "--workers", "2"],
+        [ERA, *arguments, "--workers", "2"],
         stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         text=True,

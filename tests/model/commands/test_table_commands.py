@@ -21,9 +21,9 @@ from model.errors import InputError
 from model.rig.file import example_rig_path
 from model.table.file import load_table, save_table
 from model.table.pattern_choice import UnreachableLevel
-from same_code import era_program
 
 RIG = str(example_rig_path())
+ERA = str(Path(sys.executable).with_name("era"))
 QUICK = ["--mesh", "12x9", "--frequencies", "60,110,250", "--grid", "4x3"]
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -106,7 +106,7 @@ def test_build_resumes_when_it_was_ended(
     path, folder = tmp_path / "t.npz", tmp_path / "t.npz.parts"
     long = ["--mesh", "12x9", "--frequencies", "60:320:4", "--grid", "48x36"]
     with subprocess.Popen(
-        [sys.executable, "-c", era_program(), "table", "build", RIG, "-o", str(path), *long,
+        [ERA, "table", "build", RIG, "-o", str(path), *long,
          "--workers", "2"],
         stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,

@@ -11,8 +11,9 @@ from distributed import Client, LocalCluster
 from model.errors import InputError
 from model.studies import workers
 from model.studies.workers import on_cluster, on_processes
-from same_code_workers import give_same_code
 from studies import chunks_of, same_to_the_bit, small_study
+
+OTHER = "0.0.1+123456789abc"
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +22,6 @@ def address() -> Iterator[str]:
     with LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
     ) as running:
-        give_same_code(running.scheduler_address)
         yield running.scheduler_address
 
 
@@ -57,10 +57,10 @@ def test_killed_workers_are_survived(address):
     assert not set(before) & set(worker_pids(address))
 
 
-def test_a_worker_with_other_code_is_refused(address):
+def test_a_worker_with_other_code_is_refused(address, monkeypatch):
     """A study made by other code than the workers have is not mixed with theirs."""
     problem, cases = small_study(layouts=4)
-    object.__setattr__(problem, "code_version", "0.0.1+123456789abc")
+    monkeypatch.setattr(workers, "code_version", lambda: OTHER)
     with pytest.raises(InputError, match="same era-haptics"):
         dict(on_cluster(address)(problem, chunks_of(cases, 4)))
 
@@ -68,11 +68,10 @@ def test_a_worker_with_other_code_is_refused(address):
 def test_every_worker_looks_at_its_own_code():
     """Not only the one that solves the plate: another may join later, with other code."""
     problem, cases = small_study(layouts=4)
-    object.__setattr__(problem, "code_version", "0.0.1+123456789abc")
     with pytest.raises(InputError, match="same era-haptics"):
-        workers._solve_plate(problem)
+        workers._solve_plate(OTHER, problem)
     with pytest.raises(InputError, match="same era-haptics"):
-        workers._solve_on_cluster(problem.code_version, (problem.solve(), problem.rig.eras), cases)
+        workers._solve_on_cluster(OTHER, (problem.solve(), problem.rig.eras), cases)
 
 
 def test_a_cluster_without_workers_is_refused():

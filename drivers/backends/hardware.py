@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
-from typing import Protocol, TypeVar, final
+from typing import Protocol, TypeVar
 
 from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.frame import CanFrame
@@ -46,50 +46,29 @@ class Adapter(Protocol):
         """Wait until it is closed."""
 
 
-class Worker(ABC):
-    """Runs blocking jobs one after the other, outside the event loop.
+class Worker:
+    """Runs blocking jobs one after the other in a thread; name: of the thread.
 
     Jobs wait only by its queues and its `sleep`.
     """
-
-    @abstractmethod
-    def submit(self, job: Callable[[], _T]) -> "asyncio.Future[_T]":
-        """Run a job after those before it; the future has its result or exception."""
-
-    @abstractmethod
-    async def close(self) -> None:
-        """Finish the running job and take no more."""
-
-    @abstractmethod
-    def make_queue(self) -> "queue.Queue[bytes]":
-        """Make a queue whose `get` blocks."""
-
-    @abstractmethod
-    def sleep(self, seconds: float) -> None:
-        """Block for a time [s]."""
-
-
-@final
-class ThreadWorker(Worker):
-    """Runs them in a thread."""
 
     def __init__(self, name: str) -> None:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=name)
 
     def submit(self, job: Callable[[], _T]) -> "asyncio.Future[_T]":
-        """See `Worker`."""
+        """Run a job after those before it; the future has its result or exception."""
         return asyncio.get_running_loop().run_in_executor(self._thread, job)
 
     async def close(self) -> None:
-        """See `Worker`."""
+        """Finish the running job and take no more."""
         await asyncio.to_thread(self._thread.shutdown)
 
     def make_queue(self) -> "queue.Queue[bytes]":
-        """See `Worker`."""
+        """Make a queue whose `get` blocks."""
         return queue.Queue()
 
     def sleep(self, seconds: float) -> None:
-        """See `Worker`."""
+        """Block for a time [s]."""
         time.sleep(seconds)
 
 
@@ -130,7 +109,7 @@ HARDWARE_PROVIDER: ContextVar[HardwareProvider | None] = ContextVar(
 def make_worker(name: str) -> Worker:
     """Make a worker for blocking jobs; name: of its thread."""
     hardware = HARDWARE_PROVIDER.get()
-    return ThreadWorker(name) if hardware is None else hardware.make_worker()
+    return Worker(name) if hardware is None else hardware.make_worker()
 
 
 def number_below(limit: int) -> int:

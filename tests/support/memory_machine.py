@@ -309,7 +309,7 @@ class _Socketcand(asyncio.Protocol):
 class GreenletWorker(Worker):
     """Runs blocking jobs in greenlets: while one waits, the event loop goes on."""
 
-    def __init__(self) -> None:
+    def __init__(self) -> None:  # without a thread
         self._turn = asyncio.Lock()
         self._tasks: list[asyncio.Task[Any]] = []
 

@@ -8,6 +8,7 @@ amplifier is not fed by the heartbeats of others.
 import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 from drivers import clock
@@ -129,19 +130,14 @@ class CanBackend(WireBackend):
             case Hello():
                 return await self._hello(timeout)
             case GetCaps():
-                capabilities = await self._objects_job(
-                    lambda objects: objects.capabilities(timeout=timeout), timeout
-                )
+                capabilities = await self._objects_job(ObjectClient.capabilities, timeout)
                 self._channels = capabilities.channels
                 return capabilities
             case GetFaults():
-                return await self._objects_job(
-                    lambda objects: objects.faults(timeout=timeout), timeout
-                )
-            case LoadEnvelope() as load:
-                return await self._objects_job(
-                    lambda objects: objects.load_envelope(load, timeout=timeout), timeout
-                )
+                return await self._objects_job(ObjectClient.faults, timeout)
+            case LoadEnvelope():
+                load = partial(ObjectClient.load_envelope, request=request)
+                return await self._objects_job(load, timeout)
             case _:
                 return await self._exchange_pdo(request, timeout)
 
@@ -153,7 +149,7 @@ class CanBackend(WireBackend):
     async def _hello(self, timeout: float) -> Reply:
         heartbeat = round(self._url.heartbeat * 1000)
 
-        def ask(objects: ObjectClient) -> Reply:
+        def ask(objects: ObjectClient, *, timeout: float) -> Reply:
             identity = objects.identity(timeout=timeout)
             objects.set_heartbeat(heartbeat, timeout=timeout)
             return identity
@@ -210,20 +206,18 @@ class CanBackend(WireBackend):
         if wanted is not None and answer.exact:
             achieved = wanted
         else:
-            achieved = await self._objects_job(
-                lambda objects: objects.achieved(timeout=timeout), timeout
-            )
+            achieved = await self._objects_job(ObjectClient.achieved, timeout)
             if wanted is not None:
                 achieved = _in_order_of(wanted, achieved)
         if isinstance(request, Apply | Stage):
             self._staged = achieved
         return achieved
 
-    async def _objects_job(self, job: Callable[[ObjectClient], _T], timeout: float) -> _T:
-        """Run an SDO job outside the event loop."""
+    async def _objects_job(self, job: Callable[..., _T], timeout: float) -> _T:
+        """Run an SDO job, with the object client and timeout [s], outside the event loop."""
         joined = self._opened()
         objects = joined.objects
-        future = joined.worker.submit(lambda: job(objects))
+        future = joined.worker.submit(lambda: job(objects, timeout=timeout))
         try:
             async with asyncio.timeout(_OBJECTS_WAIT * timeout):
                 result = await asyncio.shield(future)
@@ -280,7 +274,7 @@ class CanBackend(WireBackend):
 
 
 def _in_order_of(wanted: Achieved, achieved: Achieved) -> Achieved:
-    """Sort the achieved commands into the requested request."""
+    """Sort the achieved commands into the requested order."""
     places = {command.channel: place for place, command in enumerate(wanted.commands)}
     commands = sorted(
         achieved.commands, key=lambda command: places.get(command.channel, len(places))

@@ -58,42 +58,25 @@ def encode_request(
     sequence: 1..255. fd: as CAN FD; the reply then is one CAN FD frame.
     """
     require_safe(request)
+    order = _order(request, node, sequence, fd=fd)
     match request:
         case Ping():
             beat = CanFrame(cob_id("heartbeat", host_number(node)), bytes([_OPERATIONAL]))
-            return (beat, _order(request, node, sequence, fd=fd))
-        case Arm(watchdog=watchdog):
-            time = _Q.watchdog.to_wire(watchdog)
-            return (_order(request, node, sequence, fd=fd, token=host_number(node), time=time),)
-        case Disarm(ramp=ramp) | Stop(ramp=ramp):
-            return (_order(request, node, sequence, fd=fd, ramp=_Q.ramp.to_wire(ramp)),)
-        case Commit(token=token):
-            return (_order(request, node, sequence, fd=fd, token=_Q.token.to_wire(token)), SYNC)
+            return (beat, order)
+        case Commit():
+            return (order, SYNC)
         case Apply(command_set=wanted) | Stage(command_set=wanted):
-            head = _order(
-                request,
-                node,
-                sequence,
-                fd=fd,
-                token=_Q.token.to_wire(wanted.token),
-                ramp=_Q.ramp.to_wire(wanted.ramp),
-                time=_Q.valid_for.to_wire(wanted.valid_for),
-                count=len(wanted.commands),
-            )
-            shapes = tuple(_slots(wanted.commands, node, sequence))
             together = _in_fd_frames if fd else _in_classic_frames
-            return (*shapes, *together(head, wanted.commands, node, sequence), SYNC)
+            shapes = _slots(wanted.commands, node, sequence)
+            return (*shapes, *together(order, wanted.commands, node, sequence), SYNC)
         case _:
-            return (_order(request, node, sequence, fd=fd),)
+            return (order,)
 
 
 def encode_broadcast(request: Broadcast) -> tuple[CanFrame, ...]:
     """Encode a request to every amplifier of the bus; there are no replies."""
-    match request:
-        case Commit(token=token):
-            return (_order(request, 0, 0, token=_Q.token.to_wire(token)), SYNC)
-        case Stop(ramp=ramp):
-            return (_order(request, 0, 0, ramp=_Q.ramp.to_wire(ramp)),)
+    order = _order(request, 0, 0)
+    return (order, SYNC) if isinstance(request, Commit) else (order,)
 
 
 def wanted_commands(wanted: CommandSet) -> tuple[DriveCommand, ...]:
@@ -109,25 +92,24 @@ def wanted_commands(wanted: CommandSet) -> tuple[DriveCommand, ...]:
     )
 
 
-def _order(
-    request: PdoRequest,
-    node: int,
-    sequence: int,
-    *,
-    fd: bool = False,
-    token: int = 0,
-    ramp: int = 0,
-    time: int = 0,
-    count: int = 0,
-) -> CanFrame:
-    data = LAYOUTS["order"].pack(
-        token=token,
-        ramp=ramp,
-        time=time,
-        action=action_of(request),
-        count=count,
-        sequence=sequence,
-    )
+def _order(request: PdoRequest, node: int, sequence: int, *, fd: bool = False) -> CanFrame:
+    """Encode the order PDO of a request."""
+    fields: dict[str, int] = {}
+    match request:
+        case Arm(watchdog=watchdog):
+            fields = {"token": host_number(node), "time": _Q.watchdog.to_wire(watchdog)}
+        case Disarm(ramp=ramp) | Stop(ramp=ramp):
+            fields = {"ramp": _Q.ramp.to_wire(ramp)}
+        case Commit(token=token):
+            fields = {"token": _Q.token.to_wire(token)}
+        case Apply(command_set=wanted) | Stage(command_set=wanted):
+            fields = {
+                "token": _Q.token.to_wire(wanted.token),
+                "ramp": _Q.ramp.to_wire(wanted.ramp),
+                "time": _Q.valid_for.to_wire(wanted.valid_for),
+                "count": len(wanted.commands),
+            }
+    data = LAYOUTS["order"].pack(action=action_of(request), sequence=sequence, **fields)
     return CanFrame(cob_id("order", node), data, fd=fd)
 
 

@@ -11,7 +11,6 @@ from drivers.backends.hardware import (
     Adapter,
     HardwareProvider,
     Port,
-    ThreadWorker,
     Worker,
 )
 from drivers.backends.modbus.backend import ModbusBackend
@@ -219,7 +218,7 @@ class _Machine(HardwareProvider):
         return _Open(self.sent)
 
     def make_worker(self) -> Worker:
-        return ThreadWorker("era-test")
+        return Worker("era-test")
 
     def below(self, limit: int) -> int:
         return 0

@@ -197,8 +197,8 @@ class Table:
 
 
 @dataclass
-class Told:
-    """What an observer was told."""
+class Reports:
+    """What the control loop reported to its observer."""
 
     applied: list[Applied] = field(default_factory=list)
     silenced: list[Silenced] = field(default_factory=list)
@@ -208,7 +208,7 @@ class Told:
     contacts: list[int] = field(default_factory=list)
 
     def observer(self) -> Observer:
-        """The observer that writes it down."""
+        """The observer that records it."""
         return Observer(
             contacts_changed=lambda contacts, change: self.contacts.append(len(contacts)),
             pattern_applied=self.applied.append,
@@ -236,18 +236,33 @@ def _rig(*amplifiers: str) -> Rig:
 
 @dataclass
 class Bench:
-    """A controller with its far ends, its table and what it told."""
+    """A controller with its far ends, its table, its reports and its running loop."""
 
     controller: Controller
     rig: Rig
     far_ends: list[Any]
     table: Table
-    told: Told
+    reports: Reports
+    loop: asyncio.Task[None] | None = None
 
     @property
     def far_end(self) -> Any:
         """The first amplifier."""
         return self.far_ends[0]
+
+    def states(self) -> set[AmplifierState]:
+        """The states of all amplifiers."""
+        return {far_end.state for far_end in self.far_ends}
+
+    def silences(self) -> list[bool]:
+        """Whether each set of the first amplifier was silent."""
+        return [each.is_silent for each in self.far_end.sets()]
+
+    async def ended(self) -> None:
+        """Wait for the end of the loop; raises what ended it."""
+        assert self.loop is not None
+        loop, self.loop = self.loop, None
+        await loop
 
     def touch(self, *touches: tuple[int, float, float], ago: float = 0.0) -> None:
         """Deliver a frame that arrived some time ago [s]."""
@@ -278,7 +293,7 @@ def make_bench(
     """
     names = amplifiers or ("main",)
     far_ends = far_ends or [FarEnd(channels) for _ in names]
-    told = Told()
+    reports = Reports()
     rig = _rig(*names)
     rig = replace(rig, limits=replace(rig.limits, rate=rate))
     table = Table({"SW": Tone(110.0, 20e-6, math.pi / 2)}, rig.plate)
@@ -287,25 +302,33 @@ def make_bench(
         table,
         amplifiers={n: Amplifier(far_end) for n, far_end in zip(names, far_ends, strict=True)},
         sources=sources,
-        observer=observer or told.observer(),
+        observer=observer or reports.observer(),
         **options,
     )
-    return Bench(controller, rig, far_ends, table, told)
+    return Bench(controller, rig, far_ends, table, reports)
 
 
 @asynccontextmanager
-async def running(*amplifiers: str, **options: Any) -> AsyncIterator[Bench]:
-    """A bench that is open, armed and runs; closed at the end, and its loop must have survived.
-
-    Amplifiers and options as for `make_bench`.
-    """
+async def armed(*amplifiers: str, **options: Any) -> AsyncIterator[Bench]:
+    """A bench that is open and armed, without a loop; closed at the end."""
     bench = make_bench(*amplifiers, **options)
     await bench.controller.open()
     await bench.controller.arm()
-    task = asyncio.create_task(bench.controller.run())
-    await asyncio.sleep(0.001)
     try:
         yield bench
     finally:
         await bench.controller.close()
-        await task
+
+
+@asynccontextmanager
+async def running(*amplifiers: str, **options: Any) -> AsyncIterator[Bench]:
+    """A bench that is open, armed and runs; its loop must survive unless the test awaits `ended`.
+
+    Amplifiers and options as for `make_bench`.
+    """
+    async with armed(*amplifiers, **options) as bench:
+        bench.loop = asyncio.create_task(bench.controller.run())
+        await asyncio.sleep(0.001)
+        yield bench
+    if bench.loop is not None:
+        await bench.loop

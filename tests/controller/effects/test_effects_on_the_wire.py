@@ -61,7 +61,7 @@ async def test_an_effect_that_fails_is_silence_and_no_more() -> None:
         _, played, silent = bench.far_end.sets()
         assert any(command.level for command in played.commands)
         assert not any(command.level for command in silent.commands)
-        assert "ZeroDivisionError" in bench.told.silenced[-1].reason
+        assert "ZeroDivisionError" in bench.reports.silenced[-1].reason
         bench.touch()
         await asyncio.sleep(0.01)
         player.layout = Layout(effects=layout.effects, elsewhere="buzz")

@@ -41,7 +41,7 @@ async def test_controller_starts_disarmed() -> None:
     assert bench.controller.phase is Phase.DISARMED
     task = asyncio.create_task(bench.controller.run())
     await bench.hold(FINGER, seconds=0.3)
-    assert bench.told.contacts == [1]
+    assert bench.reports.contacts == [1]
     assert bench.far_end.requests(Apply, Ping, Arm) == []
     await bench.controller.arm()
     await bench.hold(FINGER, seconds=0.1)
@@ -70,8 +70,8 @@ async def test_lost_link_stops_the_others_and_ends_the_loop() -> None:
     await asyncio.sleep(0.1)
     assert bench.controller.phase is Phase.LOST
     assert len(bench.far_ends[1].requests(Stop)) == 1
-    assert len(bench.told.lost) == 1
-    assert "the cable was pulled" in bench.told.lost[0]
+    assert len(bench.reports.lost) == 1
+    assert "the cable was pulled" in bench.reports.lost[0]
     with pytest.raises(LinkError, match="the cable was pulled"):
         await task
     with pytest.raises(CommandError, match=r"LOST.*open"):
@@ -99,7 +99,7 @@ async def test_amplifiers_stage_before_any_commits() -> None:
             if isinstance(request, Stage)
         }
         assert tokens == {first.token} == {second.token}
-        assert bench.told.applied[-1].drive.keys() == {"SW"}
+        assert bench.reports.applied[-1].drive.keys() == {"SW"}
 
 
 @pytest.mark.parametrize(
@@ -122,8 +122,8 @@ async def test_failure_of_one_stops_all(kind: type[Request], reply: Reply) -> No
         await bench.hold(FINGER, seconds=0.2)
         assert [len(far_end.requests(Stop)) for far_end in bench.far_ends] == [1, 1]
         assert bench.controller.phase is Phase.DISARMED
-        assert len(bench.told.refused) == 1
-        assert bench.told.applied == [] or kind is Ping
+        assert len(bench.reports.refused) == 1
+        assert bench.reports.applied == [] or kind is Ping
         asked = len(bench.far_ends[0].asked)
         await bench.hold(FINGER, OTHER, seconds=0.2)
         assert len(bench.far_ends[0].asked) == asked
@@ -139,7 +139,7 @@ async def test_refusal_of_one_guard_silences_all() -> None:
         for far_end in bench.far_ends:
             assert len(far_end.requests(Stage)) == 1
             assert [each.is_silent for each in far_end.sets()] == [True, True]
-        assert bench.told.refused[0].startswith("b: level of channel 1")
+        assert bench.reports.refused[0].startswith("b: level of channel 1")
         assert bench.controller.phase is Phase.ARMED
 
 
@@ -169,7 +169,7 @@ async def test_stop_prevents_the_commit_of_a_staged_set() -> None:
         await bench.controller.stop()
         await asyncio.sleep(0.1)
         assert len(bench.far_ends[1].requests(Commit)) == commits
-        assert bench.told.refused == []
+        assert bench.reports.refused == []
 
 
 @pytest.mark.parametrize("silencing", ["disarm", "stop", "close"])
@@ -256,8 +256,8 @@ async def test_contacts_are_followed_while_amplifiers_are_stopped() -> None:
     bench.touch()
     await asyncio.sleep(0.03)
     assert bench.far_end.state is AmplifierState.QUICK_STOP_ACTIVE
-    assert bench.told.contacts == [1, 1, 0]
-    assert len(bench.told.refused) == 1
+    assert bench.reports.contacts == [1, 1, 0]
+    assert len(bench.reports.refused) == 1
     await bench.controller.close()
     await task
 
@@ -484,4 +484,4 @@ async def test_silencing_prevents_commits_on_slower_wires(
         await getattr(bench.controller, silencing)()
         await asyncio.sleep(0.1)
         assert bench.far_ends[1].requests(Commit) == []
-        assert bench.told.refused == []
+        assert bench.reports.refused == []

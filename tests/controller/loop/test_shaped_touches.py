@@ -66,7 +66,7 @@ async def test_touch_starts_along_its_onset(link: Link, shapes: Shapes) -> None:
             (0, 0.0),
         ]
         assert link.levels()[0] == pytest.approx(FULL / 2, abs=1e-4)
-        (applied,) = bench.told.applied
+        (applied,) = bench.reports.applied
         assert applied.pattern.onset is not None
         assert (applied.time, applied.from_rest) == (pytest.approx(begin), True)
         assert applied.transient_contrast_db == 30.0
@@ -95,7 +95,7 @@ async def test_endings_are_loaded_once_the_onset_is_over(link: Link, shapes: Sha
         assert (tone.ending, tone.onset, tone.keep_phase) == (ending.slot, 0, True)
         assert tone.phase == first.commands[0].phase
         assert seen[-30:] == pytest.approx([FULL] * 30, abs=1e-4)
-        assert len(bench.told.applied) == 1
+        assert len(bench.reports.applied) == 1
 
 
 @in_virtual_time
@@ -125,7 +125,7 @@ async def test_lifted_target_fades_along_its_ending(link: Link, shapes: Shapes) 
         assert link.levels()[0] == pytest.approx(FULL / 2, abs=1e-3)
         await asyncio.sleep(0.0205)
         assert link.levels() == (0.0, 0.0)
-        assert bench.told.silenced[-1].reason == "the target was lifted"
+        assert bench.reports.silenced[-1].reason == "the target was lifted"
         bench.touch()
         await asyncio.sleep(0.001)
         assert [each.skip_ending for each in sets(link)[-1].commands] == [True, True]
@@ -200,7 +200,7 @@ async def test_continued_tone_has_no_onset(link: Link, shapes: Shapes) -> None:
             *(False, True),
             *(True, True),
         ]
-        _, moved = bench.told.applied
+        _, moved = bench.reports.applied
         assert moved.pattern.onset is None
         assert moved.transient_contrast_db is None
 
@@ -282,7 +282,7 @@ async def test_ramps_replace_envelopes_when_amplifiers_cannot_play_them(
         assert not bench.controller.capabilities.shaping
         await bench.hold(FINGER, OTHER, seconds=0.3)
         assert loaded(link) == []
-        (applied,) = bench.told.applied
+        (applied,) = bench.reports.applied
         assert applied.pattern.onset is None
         assert applied.pattern.ramp == sets(link)[0].ramp == 0.015
         assert applied.transient_contrast_db == 10.0
@@ -303,7 +303,7 @@ async def test_ramps_replace_envelopes_when_loading_is_slow(
             slow = duration
             await bench.hold(FINGER, seconds=0.1)
             await bench.hold(seconds=0.05)
-            return bench.told.applied[-1].pattern.onset is not None
+            return bench.reports.applied[-1].pattern.onset is not None
 
         shaped = []
         for duration in (0.021, 0.021, 0.001, 0.021, 0.021):
@@ -326,10 +326,10 @@ async def test_ramp_replaces_an_onset_that_the_guard_refuses(link: Link, shapes:
     async with running(far_ends=[link], timing=shapes) as bench:
         await bench.hold(FINGER, OTHER, seconds=0.05)
         assert [len(envelope.knots) for envelope in loaded(link)] == [7]  # its brake
-        (applied,) = bench.told.applied
+        (applied,) = bench.reports.applied
         assert applied.pattern.onset is None
         assert applied.transient_contrast_db == 10.0
-        assert bench.told.refused == []
+        assert bench.reports.refused == []
 
 
 @in_virtual_time
@@ -378,7 +378,7 @@ async def test_expired_intent_ends_its_pattern(link: Link) -> None:
         _, start, end = times
         assert (start, end) == pytest.approx((begin, begin + 0.08))
         assert over.is_silent
-        assert bench.told.silenced[-1].reason == "it is over"
+        assert bench.reports.silenced[-1].reason == "it is over"
 
 
 @in_virtual_time
@@ -387,7 +387,7 @@ async def test_applied_has_a_prediction_per_target(link: Link) -> None:
     async with running(far_ends=[link], intent_source=Click()) as bench:
         bench.touch(FINGER, OTHER)
         await asyncio.sleep(0.001)
-        (applied,) = bench.told.applied
+        (applied,) = bench.reports.applied
         assert [felt.contact.key.id for felt in applied.targets] == [1, 2]
         assert applied.quiet == ()
         assert len(bench.table.asked[-1].targets) == 2
@@ -407,7 +407,7 @@ async def test_failing_intent_source_silences_until_it_recovers(
             patch.setattr(Click, "intent", lambda self, contacts, now: 1 / 0)
             await bench.hold(FINGER, OTHER, seconds=0.3)
         assert link.levels() == (0.0, 0.0)
-        assert bench.told.silenced[-1].reason.startswith("ZeroDivisionError")
+        assert bench.reports.silenced[-1].reason.startswith("ZeroDivisionError")
         assert link.amplifier.state is AmplifierState.OPERATION_ENABLED
         bench.touch((3, 0.2, 0.2))
         await asyncio.sleep(0.030)
@@ -426,5 +426,5 @@ async def test_contact_is_new_only_once_when_the_table_fails(link: Link) -> None
         bench.table.excitation = good
         bench.touch(FINGER)
         await asyncio.sleep(0.05)
-        assert bench.told.silenced[-1].reason == "the target was lifted"
+        assert bench.reports.silenced[-1].reason == "the target was lifted"
         assert link.levels() == (0.0, 0.0)

@@ -18,8 +18,7 @@ from drivers.protocol.messages import AmplifierEvent, Reply, Request
 from drivers.statistics import WireCounters
 from model.errors import InputError
 from model.rig.file import load_rig
-from sim.bench.bench import Bench
-from sim.bench.bench_clock import keep_time
+from sim.bench.bench import Bench, keep_time
 from sim.control.context import SimulationContext
 from sim.control.server import control_socket
 

@@ -39,11 +39,10 @@ from drivers.protocol.messages import (
     Stop,
 )
 from sim.amplifier.channels import Channels
-from sim.amplifier.quantiser import RefusedSet
-from sim.amplifier.set_store import SetStore
+from sim.amplifier.set_store import RefusedSet, SetStore
 from sim.amplifier.states import ENABLED, next_state
 from sim.amplifier.thermal_model import DERATE_ABOVE, DERATED, FAULT_ABOVE, GOOD_BELOW, ThermalState
-from sim.waveform.output import Output
+from sim.waveform import Output
 
 SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expires
 _Q = PROTOCOL.quantities

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.protocol.messages import Achieved
-from sim.waveform.output import Output, end_along, fade_to, level_of, shape_to
+from sim.waveform import Output, end_along, fade_to, level_of, shape_to
 
 _DERATING_RAMP = 0.02  # s; no click
 

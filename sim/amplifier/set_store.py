@@ -1,13 +1,24 @@
-"""Sets and envelopes stored in a simulated amplifier."""
+"""Sets and envelopes of a simulated amplifier: checked, rounded to steps, and stored."""
 
 from collections import deque
+from dataclasses import replace
 
-from drivers.command import CommandSet, Envelope
-from drivers.protocol.messages import Achieved, Capabilities, Loaded, NakCode
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot
+from drivers.errors import CommandError
+from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.messages import Achieved, Capabilities, Loaded, Nak, NakCode
 from sim.amplifier.channels import PlayableSet
-from sim.amplifier.quantiser import RefusedSet, quantise_envelope, quantise_set
 
+_Q = PROTOCOL.quantities
 _TOKENS_REMEMBERED = 16  # late duplicates are older than a few exchanges at most
+
+
+class RefusedSet(Exception):
+    """A set or an envelope that is refused with a Nak."""
+
+    def __init__(self, code: NakCode, channel: int | None = None) -> None:
+        super().__init__(code.name)
+        self.nak = Nak(code, channel)
 
 
 class SetStore:
@@ -31,7 +42,7 @@ class SetStore:
 
     def load(self, envelope: Envelope) -> Loaded:
         """Store an envelope in its slot; one without knots clears it."""
-        kept = quantise_envelope(envelope, self._capabilities)
+        kept = _quantised_envelope(envelope, self._capabilities)
         if kept.knots:
             self.slots[kept.slot] = kept
         else:
@@ -42,7 +53,7 @@ class SetStore:
         """Stage a set with the present envelopes, at a share of its levels."""
         if wanted.token in self.tokens:  # a late duplicate
             raise RefusedSet(NakCode.BAD_TOKEN)
-        staged = self._with_envelopes(quantise_set(wanted, self._capabilities))
+        staged = self._with_envelopes(_quantised_set(wanted, self._capabilities))
         self.staged = staged if share == 1 else staged.derated(share)
         return self.staged.achieved
 
@@ -69,3 +80,59 @@ class SetStore:
                 if slot:
                     shapes[command.channel] = self.slots[slot]
         return PlayableSet(wanted, onsets, endings)
+
+
+def _quantised_set(wanted: CommandSet, capabilities: Capabilities) -> CommandSet:
+    """The set as it will be played; raises RefusedSet.
+
+    The frequency of a silent channel may be out of range.
+    """
+    if not _Q.token.holds(wanted.token):
+        raise RefusedSet(NakCode.BAD_TOKEN)
+    channels = [command.channel for command in wanted.commands]
+    for channel in channels:
+        if not 0 <= channel < capabilities.channels or channels.count(channel) > 1:
+            raise RefusedSet(NakCode.BAD_CHANNEL, channel)
+    return CommandSet(
+        token=wanted.token,
+        commands=tuple(_quantised(command, capabilities) for command in wanted.commands),
+        ramp=_in_steps(_Q.ramp, wanted.ramp),
+        valid_for=_in_steps(_Q.valid_for, wanted.valid_for),
+    )
+
+
+def _quantised_envelope(wanted: Envelope, capabilities: Capabilities) -> Envelope:
+    """The envelope as it will be stored; raises RefusedSet."""
+    low, high = capabilities.envelope_step_min, capabilities.envelope_step_max
+    step = _in_steps(_Q.envelope_step, wanted.step)
+    if (
+        not 1 <= wanted.slot <= capabilities.envelope_slots
+        or not low <= step <= high
+        or len(wanted.knots) > capabilities.envelope_knots
+    ):
+        raise RefusedSet(NakCode.BAD_VALUE)
+    knots = tuple(
+        Knot(_in_steps(_Q.level, knot.level), _in_steps(_Q.phase, knot.phase))
+        for knot in wanted.knots
+    )
+    return Envelope(wanted.slot, step, knots)
+
+
+def _quantised(command: DriveCommand, capabilities: Capabilities) -> DriveCommand:
+    played = replace(
+        command,
+        frequency=_in_steps(_Q.frequency, command.frequency, channel=command.channel),
+        level=_in_steps(_Q.level, command.level, channel=command.channel),
+        phase=_in_steps(_Q.phase, command.phase, channel=command.channel),
+    )
+    low, high = capabilities.frequency_min, capabilities.frequency_max
+    if played.level > 0 and not low <= played.frequency <= high:
+        raise RefusedSet(NakCode.BAD_VALUE, command.channel)
+    return played
+
+
+def _in_steps(quantity: Quantity, value: float, *, channel: int | None = None) -> float:
+    try:
+        return quantity.quantise(value)
+    except CommandError as error:
+        raise RefusedSet(NakCode.BAD_VALUE, channel) from error

@@ -1,9 +1,10 @@
 """The simulated rig: its amplifiers, its plate in the time domain, and fingers on it.
 
-Time is passed in; no clock is read. Channels drive the ERAs by the rig's wiring, level 1 being the
-full stroke, with the imperfections given.
+Time is passed in; only `keep_time` reads a clock. Channels drive the ERAs by the rig's wiring,
+level 1 being the full stroke, with the imperfections given.
 """
 
+import asyncio
 from collections import deque
 from collections.abc import Collection, Mapping
 from functools import lru_cache
@@ -11,6 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
+from drivers import clock
 from drivers.protocol.messages import Reply, Request
 from model.arrays import FloatArray
 from model.fem.assembly import era_positions
@@ -23,13 +25,13 @@ from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, load_positions
 from model.transients.base_motion import Term
 from sim.amplifier.amplifier import SimulatedAmplifier
-from sim.plant.base_motion import terms_of
 from sim.plant.felt import Felt, feel
 from sim.plant.fingers import KEPT, Fingers, Position, Record
 from sim.plant.imperfections import ChannelErrors, Imperfections, delayed, draw_noise, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
-from sim.waveform.output import Output, Tone
+from sim.waveform import Output, Tone
 
+_TICK = 0.01  # s; of `keep_time`
 _MAX_STEP = 1.0  # s; sampled at once
 _MAX_SHAPES = 16  # sets of points
 
@@ -201,7 +203,7 @@ class Bench:
     def _motion(self, index: int, playing: Output) -> list[Term]:
         """The base motion of an ERA by the output of its channel, imperfections included."""
         era = self.rig.eras[index]
-        terms = [term for tone in playing for term in terms_of(tone, stroke=era.stroke)]
+        terms = [term for tone in playing for term in tone.terms(stroke=era.stroke)]
         errors = self.imperfections.channels.get(self.rig.wiring[era.name], ChannelErrors())
         terms = realised(terms, errors)
         if errors.noise and playing:
@@ -234,3 +236,10 @@ def _reduced(
 def _channel_count(rig: Rig, amplifier: str) -> int:
     numbers = [channel.number for channel in rig.wiring.values() if channel.amplifier == amplifier]
     return max(numbers, default=0) + 1
+
+
+async def keep_time(bench: Bench) -> None:
+    """Advance the bench with time.monotonic(), one clock for all processes, until cancelled."""
+    while True:
+        bench.advance(clock.now())
+        await asyncio.sleep(_TICK)

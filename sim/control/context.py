@@ -9,7 +9,7 @@ from typing import Any
 from model.errors import InputError
 from sim.bench.bench import Bench
 from sim.bench.simulated_device import SimulatedDevice
-from sim.sensors.bench_accelerometers import Accelerometers
+from sim.sensors.accelerometer import Accelerometers
 from sim.sensors.recorder import Recorder
 
 

@@ -1,16 +1,23 @@
 """Control operations on fingers."""
 
+import asyncio
 from collections.abc import Mapping
 
 from model.errors import InputError
 from sim.control.context import SimulationContext
-from sim.control.responses import Operation, Request, Response, ResponseBuilder, ready
-from sim.control.values import parse_finger, parse_position, parse_window
+from sim.control.values import (
+    Operation,
+    Request,
+    Response,
+    parse_finger,
+    parse_position,
+    parse_window,
+)
 from sim.plant.felt import feel
 from sim.plant.fingers import Position
 
 
-def _fingers(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+async def _fingers(context: SimulationContext, request: Request, now: float) -> Response:
     fingers = request.get("fingers")
     if not isinstance(fingers, dict):
         raise InputError('fingers must be an object of positions, as in {"1": [0.10, 0.08]}')
@@ -20,7 +27,7 @@ def _fingers(context: SimulationContext, request: Request, now: float) -> Respon
     return _placed(context, positions, now)
 
 
-def _touch_or_move(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+async def _touch_or_move(context: SimulationContext, request: Request, now: float) -> Response:
     name, present = parse_finger(request), context.bench.fingers.layout.positions
     if (name in present) != (request["op"] == "move"):
         state = "already" if name in present else "not"
@@ -29,40 +36,38 @@ def _touch_or_move(context: SimulationContext, request: Request, now: float) -> 
     return _placed(context, {**present, name: at}, now)
 
 
-def _lift(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+async def _lift(context: SimulationContext, request: Request, now: float) -> Response:
     name, present = parse_finger(request), context.bench.fingers.layout.positions
     if name not in present:
         raise InputError(f"finger {name!r} is not on the plate")
     return _placed(context, {id: at for id, at in present.items() if id != name}, now)
 
 
-def _placed(
-    context: SimulationContext, positions: Mapping[str, Position], now: float
-) -> ResponseBuilder:
+def _placed(context: SimulationContext, positions: Mapping[str, Position], now: float) -> Response:
     context.bench.place_fingers(positions, now=now)
-    return ready({"ok": True, "time_s": context.bench.time})
+    return {"ok": True, "time_s": context.bench.time}
 
 
-def _felt(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+async def _felt(context: SimulationContext, request: Request, now: float) -> Response:
     since, until = parse_window(request)
     context.bench.advance(now)
     records, frequencies = context.bench.records(since, until)
-
-    def build() -> Response:
-        felt = {id: feel(record, frequencies) for id, record in records.items()}
-        return {
-            "fingers": {
-                id: {
-                    "points_m": one.points.tolist(),
-                    "frequencies_hz": list(one.frequencies),
-                    "amplitude_m_s2": one.amplitude.tolist(),
-                    "peak_m_s2": one.peak.tolist(),
-                }
-                for id, one in felt.items()
+    felt = {
+        # In a thread: a long fit must not delay the amplifiers' replies.
+        id: await asyncio.to_thread(feel, record, frequencies)
+        for id, record in records.items()
+    }
+    return {
+        "fingers": {
+            id: {
+                "points_m": one.points.tolist(),
+                "frequencies_hz": list(one.frequencies),
+                "amplitude_m_s2": one.amplitude.tolist(),
+                "peak_m_s2": one.peak.tolist(),
             }
+            for id, one in felt.items()
         }
-
-    return build
+    }
 
 
 OPERATIONS: Mapping[str, Operation] = {

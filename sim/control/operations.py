@@ -40,27 +40,21 @@ and changes nothing.
 """
 
 import json
+import math
 from collections.abc import Mapping
 
 from model.errors import InputError
-from sim.control import fault_operations, finger_operations, sensor_operations
+from sim.control import finger_operations, sensor_operations
 from sim.control.context import SimulationContext
-from sim.control.responses import (
-    Deferred,
-    Operation,
-    Request,
-    Response,
-    ResponseBuilder,
-    ready,
-)
-from sim.control.values import parse_number
+from sim.control.values import Operation, Request, Response, parse_number
+from sim.faults.fault_file import parse_fault
 
 VERSION = 3
 _MAX_STEP = 3600.0  # s of virtual time in one request
 
 
-def carry_out(context: SimulationContext, line: bytes, *, now: float) -> ResponseBuilder | Deferred:
-    """Execute one request line at a time [s]; returns what builds the response."""
+async def carry_out(context: SimulationContext, line: bytes, *, now: float) -> Response:
+    """Execute one request line at a time [s]."""
     try:
         request = json.loads(line)
         if not isinstance(request, dict):
@@ -68,41 +62,27 @@ def carry_out(context: SimulationContext, line: bytes, *, now: float) -> Respons
         op = request.get("op")
         if not isinstance(op, str) or op not in _OPERATIONS:
             raise InputError(f"op must be one of {', '.join(_OPERATIONS)}, got {str(op)[:40]!r}")
-        result = _OPERATIONS[op](context, request, now)
+        return await _OPERATIONS[op](context, request, now)
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        return ready({"error": f"invalid JSON: {error}"})
-    except (InputError, OSError) as error:
-        return ready({"error": _message(error)})
-    return result if isinstance(result, Deferred) else lambda: _build(result)
+        return {"error": f"invalid JSON: {error}"}
+    except InputError as error:
+        return {"error": str(error)}
+    except OSError as error:
+        problem = f"{error.filename or 'file'}: cannot be written: {error.strerror}"
+        return {"error": problem if error.strerror else str(error)}
 
 
-def _build(builder: ResponseBuilder) -> Response:
-    try:
-        return builder()
-    except (InputError, OSError) as error:
-        return {"error": _message(error)}
+async def _hello(context: SimulationContext, request: Request, now: float) -> Response:
+    return {
+        "protocol": "era-sim-control",
+        "version": VERSION,
+        "clock": "wall" if context.step is None else "virtual",
+        "ops": list(_OPERATIONS),
+        "urls": dict(context.urls),
+    }
 
 
-def _message(error: InputError | OSError) -> str:
-    """The message of an error, without the errno of one about a file."""
-    if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename or 'file'}: cannot be written: {error.strerror}"
-    return str(error)
-
-
-def _hello(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
-    return ready(
-        {
-            "protocol": "era-sim-control",
-            "version": VERSION,
-            "clock": "wall" if context.step is None else "virtual",
-            "ops": list(_OPERATIONS),
-            "urls": dict(context.urls),
-        }
-    )
-
-
-def _state(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+async def _state(context: SimulationContext, request: Request, now: float) -> Response:
     bench = context.bench
     bench.advance(now)
     amplifiers = {}
@@ -116,21 +96,47 @@ def _state(context: SimulationContext, request: Request, now: float) -> Response
             "levels": list(status.levels),
         }
     resting = {name: list(position) for name, position in bench.fingers.layout.positions.items()}
-    return ready({"time_s": bench.time, "fingers": resting, "amplifiers": amplifiers})
+    return {"time_s": bench.time, "fingers": resting, "amplifiers": amplifiers}
 
 
-def _step(context: SimulationContext, request: Request, now: float) -> Deferred:
-    seconds, step = parse_number(request, "seconds", "seconds"), context.step
-    if step is None:
+async def _inject_fault(context: SimulationContext, request: Request, now: float) -> Response:
+    window = parse_fault({key: value for key, value in request.items() if key != "op"})
+    for device in context.devices_of(window.amplifier):
+        device.inject_fault(window)
+    return {"ok": True, "time_s": now}
+
+
+async def _faults(context: SimulationContext, request: Request, now: float) -> Response:
+    listed = {}
+    for name, device in context.devices.items():
+        begin = device.faults.begin
+        listed[name] = [
+            {
+                "fault": window.fault,
+                "begin_s": begin + window.at,
+                "end_s": begin + window.end if math.isfinite(window.end) else None,
+                "is_on": window.at <= now - begin < window.end,
+            }
+            for window in device.faults.windows
+        ]
+    return {"faults": listed}
+
+
+async def _recover(context: SimulationContext, request: Request, now: float) -> Response:
+    for device in context.devices_of(request.get("amplifier")):
+        device.recover()
+    return {"ok": True, "time_s": now}
+
+
+async def _step(context: SimulationContext, request: Request, now: float) -> Response:
+    seconds = parse_number(request, "seconds", "seconds")
+    if context.step is None:
         raise InputError("step needs virtual time: start era sim with --virtual-time")
     if not 0 < seconds <= _MAX_STEP:
         raise InputError(f"seconds must be above 0 and at most {_MAX_STEP:g}, got {seconds:g}")
-
-    async def wait() -> None:
-        await step(seconds)
-        context.bench.advance(now + seconds)
-
-    return Deferred(wait, lambda: {"ok": True, "time_s": context.bench.time})
+    await context.step(seconds)
+    context.bench.advance(now + seconds)
+    return {"ok": True, "time_s": context.bench.time}
 
 
 _OPERATIONS: Mapping[str, Operation] = {
@@ -138,6 +144,8 @@ _OPERATIONS: Mapping[str, Operation] = {
     "state": _state,
     **finger_operations.OPERATIONS,
     **sensor_operations.OPERATIONS,
-    **fault_operations.OPERATIONS,
+    "inject_fault": _inject_fault,
+    "faults": _faults,
+    "recover": _recover,
     "step": _step,
 }

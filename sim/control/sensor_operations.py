@@ -1,13 +1,21 @@
 """Control operations on sensors and recordings."""
 
+import asyncio
 import math
 from collections.abc import Mapping
 from pathlib import Path
 
 from model.errors import InputError
 from sim.control.context import SimulationContext
-from sim.control.responses import Operation, Request, Response, ResponseBuilder, ready
-from sim.control.values import is_number, parse_number, parse_position, parse_window
+from sim.control.values import (
+    Operation,
+    Request,
+    Response,
+    is_number,
+    parse_number,
+    parse_position,
+    parse_window,
+)
 from sim.sensors.accelerometer import Accelerometer
 from sim.sensors.recording import Recording
 from sim.sensors.signal_measures import tone_phasors
@@ -21,14 +29,14 @@ _SENSOR_KEYS = {  # by key: unit, and the value where it is left out
 }
 
 
-def _sensors(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+async def _sensors(context: SimulationContext, request: Request, now: float) -> Response:
     given = request.get("sensors")
     if not isinstance(given, dict):
         raise InputError('sensors must be an object, as in {"P1": {"at_m": [0.10, 0.08]}}')
     sensors = [_sensor(name, values) for name, values in given.items()]
     context.bench.advance(now)
     context.accelerometers.place(sensors)
-    return ready({"ok": True, "time_s": context.bench.time})
+    return {"ok": True, "time_s": context.bench.time}
 
 
 def _sensor(name: str, given: object) -> Accelerometer:
@@ -46,23 +54,19 @@ def _sensor(name: str, given: object) -> Accelerometer:
     return Accelerometer(name, x, y, *values)
 
 
-def _signals(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+async def _signals(context: SimulationContext, request: Request, now: float) -> Response:
     recording = _recorded(context, request, now)
-
-    def build() -> Response:
-        columns = zip(
-            recording.names, recording.points.tolist(), recording.samples.T.tolist(), strict=True
-        )
-        return {
-            "sample_rate_hz": recording.sample_rate,
-            "start_s": recording.start,
-            "sensors": {name: {"at_m": at, "m_s2": samples} for name, at, samples in columns},
-        }
-
-    return build
+    columns = zip(
+        recording.names, recording.points.tolist(), recording.samples.T.tolist(), strict=True
+    )
+    return {
+        "sample_rate_hz": recording.sample_rate,
+        "start_s": recording.start,
+        "sensors": {name: {"at_m": at, "m_s2": samples} for name, at, samples in columns},
+    }
 
 
-def _tones(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+async def _tones(context: SimulationContext, request: Request, now: float) -> Response:
     frequencies = request.get("frequencies_hz")
     nyquist = context.bench.sample_rate / 2
     if not (
@@ -75,18 +79,15 @@ def _tones(context: SimulationContext, request: Request, now: float) -> Response
             f"frequencies_hz must be 1 to {_MAX_TONES} different frequencies below {nyquist:g} Hz"
         )
     recording = _recorded(context, request, now)
-
-    def build() -> Response:
-        phasors = tone_phasors(recording, frequencies)
-        columns = zip(recording.names, recording.points.tolist(), phasors.T, strict=True)
-        return {
-            "sensors": {
-                name: {"at_m": at, "real_m_s2": a.real.tolist(), "imag_m_s2": a.imag.tolist()}
-                for name, at, a in columns
-            }
+    # In a thread: a long fit must not delay the amplifiers' replies.
+    phasors = await asyncio.to_thread(tone_phasors, recording, frequencies)
+    columns = zip(recording.names, recording.points.tolist(), phasors.T, strict=True)
+    return {
+        "sensors": {
+            name: {"at_m": at, "real_m_s2": a.real.tolist(), "imag_m_s2": a.imag.tolist()}
+            for name, at, a in columns
         }
-
-    return build
+    }
 
 
 def _recorded(context: SimulationContext, request: Request, now: float) -> Recording:
@@ -95,28 +96,24 @@ def _recorded(context: SimulationContext, request: Request, now: float) -> Recor
     return context.accelerometers.read(since, until)
 
 
-def _record(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+async def _record(context: SimulationContext, request: Request, now: float) -> Response:
     file = request.get("file")
     if not isinstance(file, str) or not file:
         raise InputError("file must be the name of a recording, as in run.csv")
     context.bench.advance(now)
     context.record(Path(file))
-    return ready({"ok": True, "time_s": context.bench.time})
+    return {"ok": True, "time_s": context.bench.time}
 
 
-def _finish(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+async def _finish(context: SimulationContext, request: Request, now: float) -> Response:
     context.bench.advance(now)
     recorder = context.stop_recording()
-
-    def build() -> Response:
-        recorder.finish()
-        return {
-            "file": str(recorder.path),
-            "seconds": recorder.seconds,
-            "is_full": recorder.is_full,
-        }
-
-    return build
+    await asyncio.to_thread(recorder.finish)
+    return {
+        "file": str(recorder.path),
+        "seconds": recorder.seconds,
+        "is_full": recorder.is_full,
+    }
 
 
 OPERATIONS: Mapping[str, Operation] = {

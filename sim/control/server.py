@@ -17,7 +17,6 @@ from drivers import clock
 from drivers.errors import LinkError
 from sim.control.context import SimulationContext
 from sim.control.operations import carry_out
-from sim.control.responses import Deferred, ResponseBuilder
 
 LINE_MAX = 64 * 1024  # bytes; thirty fingers take a tenth of it
 
@@ -48,7 +47,7 @@ async def control_socket(context: SimulationContext, path: Path) -> AsyncIterato
     finally:
         loop.remove_reader(sock)
         sock.close()
-        _remove(path)
+        await asyncio.to_thread(path.unlink, missing_ok=True)
         for client in clients:
             client.cancel()
         await asyncio.gather(*clients, return_exceptions=True)
@@ -62,21 +61,12 @@ async def _serve_client(context: SimulationContext, connection: socket.socket) -
         while data := await loop.sock_recv(connection, LINE_MAX):
             *lines, rest = (rest + data).split(b"\n")
             for line in lines:
-                builder = carry_out(context, line, now=clock.now())
-                if isinstance(builder, Deferred):
-                    await builder.wait()
-                    builder = builder.then
-                # In a thread: a long fit must not delay the amplifiers' replies.
-                reply = await asyncio.to_thread(_build_and_encode, builder)
-                await loop.sock_sendall(connection, reply)
+                response = await carry_out(context, line, now=clock.now())
+                await loop.sock_sendall(connection, await asyncio.to_thread(_encode, response))
             if len(rest) > LINE_MAX:  # the next line cannot be found
                 error = {"error": f"line must be at most {LINE_MAX} bytes"}
                 await loop.sock_sendall(connection, _encode(error))
                 return
-
-
-def _build_and_encode(builder: ResponseBuilder) -> bytes:
-    return _encode(builder())
 
 
 def _encode(reply: dict[str, Any]) -> bytes:
@@ -102,10 +92,6 @@ def _bind(path: Path) -> socket.socket:
     finally:
         os.umask(mask)
     return sock
-
-
-def _remove(path: Path) -> None:
-    path.unlink(missing_ok=True)
 
 
 def _is_dead(path: Path) -> bool:

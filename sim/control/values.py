@@ -1,13 +1,20 @@
-"""Check the values in requests of the control socket."""
+"""Types of control operations, and checks of the values in their requests."""
 
 import math
-from typing import Any, TypeGuard
+from collections.abc import Awaitable, Callable
+from typing import Any, TypeAlias, TypeGuard
 
 from model.errors import InputError
+from sim.control.context import SimulationContext
 from sim.plant.fingers import Position
 
+Request: TypeAlias = dict[str, Any]
+Response: TypeAlias = dict[str, Any]
+Operation: TypeAlias = Callable[[SimulationContext, Request, float], Awaitable[Response]]
+"""Executes a request at a time [s], or raises InputError and changes nothing."""
 
-def parse_window(request: dict[str, Any]) -> tuple[float, float]:
+
+def parse_window(request: Request) -> tuple[float, float]:
     """The time window since_s to until_s [s]."""
     since = parse_number(request, "since_s", "seconds")
     until = parse_number(request, "until_s", "seconds")
@@ -16,7 +23,7 @@ def parse_window(request: dict[str, Any]) -> tuple[float, float]:
     return since, until
 
 
-def parse_number(given: dict[str, Any], key: str, unit: str) -> float:
+def parse_number(given: Request, key: str, unit: str) -> float:
     """The finite number under a key; unit: for the error."""
     value = given.get(key)
     if not is_number(value):
@@ -34,7 +41,7 @@ def is_number(value: object) -> TypeGuard[int | float]:
         return False
 
 
-def parse_finger(request: dict[str, Any]) -> str:
+def parse_finger(request: Request) -> str:
     """The id of a finger."""
     name = request.get("finger")
     if not isinstance(name, str) or not 0 < len(name) <= 40:

@@ -10,6 +10,9 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from sim.bench.simulated_device import SimulatedDevice
+from sim.far_ends.can_bus.ends import slcan, socketcand
+from sim.far_ends.modbus.end import ModbusRtuEnd, ModbusTcpEnd
+from sim.far_ends.serial_end import SerialEnd
 
 
 @dataclass(frozen=True)
@@ -60,8 +63,6 @@ async def open_wires(
 async def _serial(
     wire: Wire, devices: Sequence[SimulatedDevice]
 ) -> AsyncIterator[Mapping[str, str]]:
-    from sim.far_ends.serial_end import SerialEnd
-
     lines = [list(devices)] if wire.shared else [[device] for device in devices]
     urls = {}
     async with AsyncExitStack() as stack:
@@ -77,8 +78,6 @@ async def _serial(
 async def _modbus_tcp(
     wire: Wire, devices: Sequence[SimulatedDevice]
 ) -> AsyncIterator[Mapping[str, str]]:
-    from sim.far_ends.modbus.end import ModbusTcpEnd
-
     end = ModbusTcpEnd(devices, port=wire.port)
     try:
         await end.start()
@@ -91,8 +90,6 @@ async def _modbus_tcp(
 async def _modbus_rtu(
     wire: Wire, devices: Sequence[SimulatedDevice]
 ) -> AsyncIterator[Mapping[str, str]]:
-    from sim.far_ends.modbus.end import ModbusRtuEnd
-
     end = ModbusRtuEnd(devices, speed=wire.speed, unpluggable=wire.unpluggable)
     try:
         end.start()
@@ -102,14 +99,10 @@ async def _modbus_rtu(
 
 
 def _socketcand(wire: Wire, devices: Sequence[SimulatedDevice]) -> FarEnd:
-    from sim.far_ends.can_bus.ends import socketcand
-
     return socketcand(devices, port=wire.port, bitrate=wire.speed)
 
 
 def _slcan(wire: Wire, devices: Sequence[SimulatedDevice]) -> FarEnd:
-    from sim.far_ends.can_bus.ends import slcan
-
     return slcan(devices, bitrate=wire.speed, unpluggable=wire.unpluggable)
 
 

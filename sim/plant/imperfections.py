@@ -14,7 +14,7 @@ from model.errors import InputError
 from model.rig.rig import Channel, Rig
 from model.transients.base_motion import Term
 from model.vibration.excitation import GAIN_ERROR, PHASE_ERROR
-from sim.waveform.output import Output
+from sim.waveform import Output
 
 NOISE_LINES = 32
 NOISE_LOW, NOISE_HIGH = 10.0, 1000.0  # Hz

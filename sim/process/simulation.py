@@ -14,8 +14,7 @@ from drivers import clock
 from drivers.operation.steady import no_long_collections
 from model.finger.load import FingerLoad
 from model.rig.rig import Rig
-from sim.bench.bench import Bench
-from sim.bench.bench_clock import keep_time
+from sim.bench.bench import Bench, keep_time
 from sim.bench.simulated_device import SimulatedDevice
 from sim.control.context import SimulationContext, finish_recording
 from sim.control.server import control_socket

@@ -12,10 +12,9 @@ import numpy as np
 from model.errors import InputError
 from model.files.replacing import begins_with
 from sim.sensors.formats.csv_file import CSV
-from sim.sensors.formats.format import Format
 from sim.sensors.formats.uff_file import UFF
 from sim.sensors.formats.wav_file import WAV
-from sim.sensors.recording import Recording
+from sim.sensors.recording import Format, Recording
 
 _FORMATS = {".csv": CSV, ".wav": WAV, ".uff": UFF, ".unv": UFF}
 

@@ -22,9 +22,8 @@ from sim.witness.decoded import (
     Request,
     RequestKind,
     StateEvent,
-    Status,
 )
-from sim.witness.quantities import OutOfRange, value, whole
+from sim.witness.quantities import INVALID, OutOfRange
 
 _ACTIONS = (
     *(RequestKind.STATUS, RequestKind.APPLY, RequestKind.STAGE, RequestKind.COMMIT),
@@ -65,7 +64,7 @@ class CanDecoder:
             if direction == "amplifier":
                 return self._decode_request(frame)
             return self._decode_reply(frame)
-        except (OutOfRange, struct.error, IndexError) as problem:
+        except INVALID as problem:
             node = frame.identifier & 0x7F
             if direction == "amplifier":
                 return [Request(RequestKind.READ, node, problem=str(problem))]
@@ -171,14 +170,14 @@ class _Node:
                 commands = self._channel_commands(sequence)
                 if len(commands) != count:
                     problem = f"{INCOMPLETE_SET}: {len(commands)} of {count} commands"
-            return Request(
+            return q.request_of(
                 kind,
                 self.number,
                 key,
-                token=whole(q.TOKEN, token, "token") if kind in SETS else 0,
-                ramp=value(q.RAMP, ramp, "ramp"),
-                valid_for=value(q.VALID_FOR, time, "valid_for") if commands else 0.0,
-                watchdog=value(q.WATCHDOG, time, "watchdog") if kind is RequestKind.ARM else 0.0,
+                token=token if kind in SETS else None,
+                ramp=ramp,
+                valid_for=time if commands else 0,
+                watchdog=time if kind is RequestKind.ARM else None,
                 commands=commands,
                 problem=problem,
             )
@@ -196,21 +195,15 @@ class _Node:
             onset, ending, of = self.slots.get(channel, (0, 0, -1)) if flags & 4 else (0, 0, own)
             if of != own:
                 raise OutOfRange(f"{INCOMPLETE_SET}: no slots for channel {channel}")
-            commands[channel] = ChannelCommand(
-                value(q.FREQUENCY, frequency, "frequency"),
-                value(q.LEVEL, level, "level"),
-                value(q.PHASE, phase, "phase"),
-                keep_phase=bool(flags & 1),
-                skip_ending=bool(flags & 2),
-                onset=onset,
-                ending=ending,
+            commands[channel] = q.command_of(
+                frequency, level, phase, flags, onset=onset, ending=ending
             )
         return commands
 
     def reply(self, frame: CanFrame) -> Message:
         """Decode a reply with the status and levels sent before it, or an event."""
         sequence, what, both, _, token, left = struct.unpack_from("<BBBBHH", frame.data)
-        state, fault = whole(q.STATE, both & 0xF, "state"), whole(q.FAULT, both >> 4, "fault")
+        state, fault = q.STATE.whole(both & 0xF), q.FAULT.whole(both >> 4)
         if sequence == 0:
             return StateEvent(self.number, state, fault)
         if frame.is_fd:
@@ -220,8 +213,8 @@ class _Node:
         result = what >> 4
         high_voltage = temperature = reported = None
         if status is not None and status[0] == sequence:
-            _, flag, degrees, _, count = struct.unpack_from("<BBhHB", status)
-            high_voltage, temperature = bool(flag & 1), degrees * 0.1
+            _, flag, temperature, _, count = struct.unpack_from("<BBhHB", status)
+            high_voltage = bool(flag & 1)
             reported = _levels(levels, count & 0x1F, sequence)
         kind = _ACTIONS[what & 7]
         is_whole = reported is not None or result or kind in SETS
@@ -231,11 +224,11 @@ class _Node:
             refusal=result,
             problem="" if is_whole else "status or levels are missing",
             is_exact=bool(what & 8) if kind in (RequestKind.APPLY, RequestKind.STAGE) else None,
-            status=Status(
-                state=state,
-                fault=fault,
-                token=token,
-                watchdog_left=value(q.WATCHDOG_LEFT, left, "watchdog_left"),
+            status=q.status_of(
+                state,
+                fault,
+                token,
+                left=left,
                 high_voltage=high_voltage,
                 temperature=temperature,
                 levels=reported,
@@ -254,21 +247,19 @@ def _broadcast(frame: CanFrame) -> Request:
     token, ramp, _, what, _ = struct.unpack_from("<HHHBB", frame.data)
     kind = _ACTIONS[what & 7]
     if kind is RequestKind.COMMIT:
-        return Request(kind, 0, token=whole(q.TOKEN, token, "token"))
+        return q.request_of(kind, 0, None, token=token)
     if kind is RequestKind.STOP:
-        return Request(kind, 0, ramp=value(q.RAMP, ramp, "ramp"))
+        return q.request_of(kind, 0, None, ramp=ramp)
     raise OutOfRange(f"{kind.value} as a broadcast")
 
 
-def _levels(blocks: dict[int, bytes], count: int, sequence: int) -> tuple[float, ...] | None:
+def _levels(blocks: dict[int, bytes], count: int, sequence: int) -> list[int] | None:
     """Levels of `count` channels; None where a block is missing."""
-    levels: list[float] = []
+    levels: list[int] = []
     for group in range(-(-count // _PER_NODE)):
         block = blocks.get(group)
         if block is None or block[7] != sequence:
             return None
         word = int.from_bytes(block[:7], "little")
-        levels += [
-            value(q.LEVEL, word >> 14 * place & 0x3FFF, "level") for place in range(_PER_NODE)
-        ]
-    return tuple(levels[:count])
+        levels += [word >> 14 * place & 0x3FFF for place in range(_PER_NODE)]
+    return levels[:count]

@@ -20,7 +20,7 @@ from sim.witness.decoded import (
     Status,
 )
 from sim.witness.modbus_frames import Adu, RtuSplitter, Splitter, TcpSplitter
-from sim.witness.quantities import OutOfRange, signed, value, whole
+from sim.witness.quantities import INVALID, OutOfRange, signed
 
 _CONTROL, _HEARTBEAT, _LOOK, _SET, _ENVELOPE = 0, 8, 10, 14, 100
 _STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS = 1000, 1032, 1040, 1064, 1140, 1220
@@ -87,7 +87,7 @@ class ModbusDecoder:
         key = None if adu.unit == 0 else (adu.unit, self._decode_request)
         try:
             return self._decode_pdu(adu, pdu, key)
-        except (OutOfRange, struct.error, IndexError) as problem:
+        except INVALID as problem:
             self._remember(adu, _Open(adu.unit, key, pdu[0], None, 0, None))
             return Request(RequestKind.READ, adu.unit, key, problem=str(problem) or "too short")
 
@@ -110,9 +110,7 @@ class ModbusDecoder:
                 pass
             case _:
                 raise OutOfRange(f"function {function}")
-        tag = None
-        if written is not None:
-            tag = self._tag(adu.unit, *written)
+        tag = None if written is None else self._tag(adu.unit, *written)
         expected = tag if tag is not None else self._tags.get(adu.unit)
         at, count = read or (None, 0)
         self._remember(adu, _Open(adu.unit, key, function, at, count, expected))
@@ -151,7 +149,7 @@ class ModbusDecoder:
             return Reply(adu.unit, key, refusal=pdu[1])
         try:
             reply = _of_read(adu.unit, pdu, request)
-        except (OutOfRange, struct.error, IndexError) as problem:
+        except INVALID as problem:
             return Damaged(f"an invalid reply: {problem}")
         if reply.key is not None:
             del self._open[adu.number]
@@ -199,23 +197,23 @@ def _control(unit: int, key: object, body: list[int]) -> Request:
     kind = _WORDS[body[0]]
     watchdog, ramp = (body[1:] + [250, 5][len(body) - 1 :])[:2]
     if kind is RequestKind.ARM:
-        return Request(kind, unit, key, watchdog=value(q.WATCHDOG, watchdog, "watchdog"))
-    return Request(kind, unit, key, ramp=value(q.RAMP, ramp, "ramp"))
+        return q.request_of(kind, unit, key, watchdog=watchdog)
+    return q.request_of(kind, unit, key, ramp=ramp)
 
 
 def _set(unit: int, key: object, body: list[int]) -> Request:
     if len(body) == 1:
-        return Request(RequestKind.COMMIT, unit, key, token=whole(q.TOKEN, body[0], "commit_token"))
+        return q.request_of(RequestKind.COMMIT, unit, key, token=body[0])
     commit, token, ramp, valid_for = body[:4]
     if commit not in (0, token):
         raise OutOfRange(f"commit_token {commit} with token {token}")
-    return Request(
+    return q.request_of(
         RequestKind.APPLY if commit else RequestKind.STAGE,
         unit,
         key,
-        token=whole(q.TOKEN, token, "token"),
-        ramp=value(q.RAMP, ramp, "ramp"),
-        valid_for=value(q.VALID_FOR, valid_for, "valid_for"),
+        token=token,
+        ramp=ramp,
+        valid_for=valid_for,
         commands=_channel_commands(body[4:]),
     )
 
@@ -230,12 +228,11 @@ def _channel_commands(words: Sequence[int]) -> dict[int, ChannelCommand]:
             continue  # not named
         if flags & 0b1100:
             raise OutOfRange(f"flags {flags:#06x}")
-        commands[channel] = ChannelCommand(
-            value(q.FREQUENCY, frequency, "frequency"),
-            value(q.LEVEL, level, "level"),
-            value(q.PHASE, signed(phase), "phase"),
-            keep_phase=bool(flags & 1),
-            skip_ending=bool(flags & 2),
+        commands[channel] = q.command_of(
+            frequency,
+            level,
+            signed(phase),
+            flags,
             onset=flags >> 4 & 0x3F,
             ending=flags >> 10 & 0x3F,
         )
@@ -244,17 +241,7 @@ def _channel_commands(words: Sequence[int]) -> dict[int, ChannelCommand]:
 
 def _envelope(body: list[int]) -> EnvelopeLoad:
     slot, step, count = body[:3]
-    knots = body[3:]
-    if len(knots) != 2 * count:
-        raise OutOfRange("envelope length does not match its knots")
-    whole(q.KNOTS, count, "envelope_knots")
-    for phase in knots[1::2]:
-        value(q.PHASE, signed(phase), "phase of a knot")
-    return EnvelopeLoad(
-        whole(q.SLOT, slot, "slot"),
-        value(q.STEP, step, "step"),
-        tuple(value(q.LEVEL, level, "level of a knot") for level in knots[::2]),
-    )
+    return q.envelope_of(slot, step, count, body[3::2], [signed(phase) for phase in body[4::2]])
 
 
 def _of_read(unit: int, pdu: bytes, request: _Open) -> Reply:
@@ -279,8 +266,8 @@ def _of_read(unit: int, pdu: bytes, request: _Open) -> Reply:
     if request.read_from == _STATUS:
         return Reply(unit, request.key, status=_decode_status(body))
     if request.read_from == _ACHIEVED:
-        status = Status(whole(q.STATE, body[0], "state"), whole(q.FAULT, body[1], "fault"))
-        token = whole(q.ACTIVE_TOKEN, body[2], "token")
+        status = Status(q.STATE.whole(body[0]), q.FAULT.whole(body[1]))
+        token = q.ACTIVE_TOKEN.whole(body[2])
         commands = _channel_commands(body[4:])
         return Reply(unit, request.key, status=status, token=token, achieved=commands)
     return Reply(unit, request.key)
@@ -288,12 +275,12 @@ def _of_read(unit: int, pdu: bytes, request: _Open) -> Reply:
 
 def _decode_status(body: Sequence[int]) -> Status:
     state, fault, token, high_voltage, _, temperature, left, count = body[:8]
-    return Status(
-        state=whole(q.STATE, state, "state"),
-        fault=whole(q.FAULT, fault, "fault"),
-        token=token,
-        watchdog_left=value(q.WATCHDOG_LEFT, left, "watchdog_left"),
+    return q.status_of(
+        state,
+        fault,
+        token,
+        left=left,
         high_voltage=bool(high_voltage),
-        temperature=value(q.TEMPERATURE, signed(temperature), "temperature"),
-        levels=tuple(value(q.LEVEL, level, "level") for level in body[8 : 8 + count]),
+        temperature=signed(temperature),
+        levels=body[8 : 8 + count],
     )

@@ -21,7 +21,7 @@ from sim.witness.decoded import (
     StateEvent,
     Status,
 )
-from sim.witness.quantities import OutOfRange, value, whole
+from sim.witness.quantities import INVALID, OutOfRange
 
 _KINDS = {
     1: RequestKind.HELLO,
@@ -41,6 +41,7 @@ _KINDS = {
 _EVENT, _NAK = 30, 31
 _MAX_LENGTH = 249  # bytes of a frame
 _DAMAGED = 16  # damaged requests kept, to recognise replies to them
+_WITH_NUMBER = {RequestKind.ARM, RequestKind.DISARM, RequestKind.COMMIT, RequestKind.STOP}
 _WITH_STATUS = {
     RequestKind.ARM,
     RequestKind.DISARM,
@@ -99,7 +100,7 @@ def _decode(direction: Direction, piece: bytes) -> Message:
         if direction == "amplifier":
             return _decode_request(first & 0x1F, address, sequence, payload)
         return _decode_reply(first & 0x1F, address, sequence, payload)
-    except (OutOfRange, struct.error, IndexError) as problem:
+    except INVALID as problem:
         if direction == "amplifier":
             kind = _KINDS.get(first & 0x1F, RequestKind.READ)
             return Request(kind, address, (sequence, kind), problem=str(problem) or "too short")
@@ -133,46 +134,29 @@ def _decode_request(number: int, address: int, sequence: int, payload: bytes) ->
         raise OutOfRange(f"unknown message type {number}")
     kind = _KINDS[number]
     key = None if address == 0 else (sequence, kind)
-    size = {
-        RequestKind.ARM: 2,
-        RequestKind.DISARM: 2,
-        RequestKind.COMMIT: 2,
-        RequestKind.STOP: 2,
-    }.get(kind, 0)
     if kind in (RequestKind.STAGE, RequestKind.APPLY):
-        token, ramp, valid_for, commands = _set(payload)
-        return Request(
+        token, ramp, valid_for = struct.unpack_from("<HHH", payload)
+        commands = _channel_commands(payload[6:])
+        return q.request_of(
             kind, address, key, token=token, ramp=ramp, valid_for=valid_for, commands=commands
         )
     if kind is RequestKind.ENVELOPE:
         return Request(kind, address, key, envelope=_envelope(payload))
+    size = 2 if kind in _WITH_NUMBER else 0
     if len(payload) != size:
         raise OutOfRange(f"{kind.value} payload must have {size} bytes, got {len(payload)}")
-    number = int.from_bytes(payload, "little")
+    given = int.from_bytes(payload, "little")
     match kind:
         case RequestKind.ARM:
-            return Request(kind, address, key, watchdog=value(q.WATCHDOG, number, "watchdog"))
-        case RequestKind.DISARM | RequestKind.STOP:
-            return Request(kind, address, key, ramp=value(q.RAMP, number, "ramp"))
+            return q.request_of(kind, address, key, watchdog=given)
         case RequestKind.COMMIT:
-            return Request(kind, address, key, token=whole(q.TOKEN, number, "token"))
+            return q.request_of(kind, address, key, token=given)
         case _:
-            return Request(kind, address, key)
-
-
-def _set(payload: bytes) -> tuple[int, float, float, dict[int, ChannelCommand]]:
-    token, ramp, valid_for = struct.unpack_from("<HHH", payload)
-    commands = _channel_commands(payload[6:])
-    return (
-        whole(q.TOKEN, token, "token"),
-        value(q.RAMP, ramp, "ramp"),
-        value(q.VALID_FOR, valid_for, "valid_for"),
-        commands,
-    )
+            return q.request_of(kind, address, key, ramp=given)
 
 
 def _channel_commands(data: bytes) -> dict[int, ChannelCommand]:
-    count = whole(q.CHANNEL_COUNT, data[0], "channel_count")
+    count = q.CHANNEL_COUNT.whole(data[0])
     at, commands = 1, {}
     for _ in range(count):
         channel, flags, frequency, level, phase = struct.unpack_from("<BBHHh", data, at)
@@ -183,14 +167,8 @@ def _channel_commands(data: bytes) -> dict[int, ChannelCommand]:
             at += 2
         if flags & ~7 or channel in commands:
             raise OutOfRange(f"flags {flags:#04x}, or channel {channel} named twice")
-        commands[whole(q.CHANNEL, channel, "channel")] = ChannelCommand(
-            value(q.FREQUENCY, frequency, "frequency"),
-            value(q.LEVEL, level, "level"),
-            value(q.PHASE, phase, "phase"),
-            keep_phase=bool(flags & 1),
-            skip_ending=bool(flags & 2),
-            onset=whole(q.SLOT, onset, "onset"),
-            ending=whole(q.SLOT, ending, "ending"),
+        commands[q.CHANNEL.whole(channel)] = q.command_of(
+            frequency, level, phase, flags, onset=onset, ending=ending
         )
     if at != len(data):
         raise OutOfRange(f"{len(data) - at} excess bytes")
@@ -199,23 +177,15 @@ def _channel_commands(data: bytes) -> dict[int, ChannelCommand]:
 
 def _envelope(payload: bytes) -> EnvelopeLoad:
     slot, step, count = struct.unpack_from("<BHB", payload)
-    knots = [struct.unpack_from("<Hh", payload, 4 + 4 * number) for number in range(count)]
-    if len(payload) != 4 + 4 * count:
-        raise OutOfRange("envelope length does not match its knots")
-    whole(q.KNOTS, count, "envelope_knots")
-    for _, phase in knots:
-        value(q.PHASE, phase, "phase of a knot")
-    return EnvelopeLoad(
-        whole(q.SLOT, slot, "envelope_slot"),
-        value(q.STEP, step, "envelope_step"),
-        tuple(value(q.LEVEL, level, "level of a knot") for level, _ in knots),
-    )
+    knots = list(struct.iter_unpack("<Hh", payload[4:]))
+    levels, phases = zip(*knots, strict=True) if knots else ((), ())
+    return q.envelope_of(slot, step, count, levels, phases)
 
 
 def _decode_reply(number: int, address: int, sequence: int, payload: bytes) -> Message:
     if number == _EVENT:
         state, fault, _ = struct.unpack("<BBB", payload)
-        return StateEvent(address, whole(q.STATE, state, "state"), whole(q.FAULT, fault, "fault"))
+        return StateEvent(address, q.STATE.whole(state), q.FAULT.whole(fault))
     if number == _NAK:
         refused, code, _ = struct.unpack("<BBB", payload)
         return Reply(address, (sequence, _KINDS.get(refused)), refusal=code)
@@ -223,7 +193,7 @@ def _decode_reply(number: int, address: int, sequence: int, payload: bytes) -> M
     if kind in _WITH_STATUS:
         return Reply(address, (sequence, kind), status=_decode_status(payload))
     if kind in SETS:
-        token = whole(q.TOKEN, int.from_bytes(payload[:2], "little"), "token")
+        token = q.TOKEN.whole(int.from_bytes(payload[:2], "little"))
         return Reply(
             address, (sequence, kind), token=token, achieved=_channel_commands(payload[2:])
         )
@@ -239,12 +209,12 @@ def _decode_status(payload: bytes) -> Status:
     levels = struct.unpack_from(f"<{count}H", payload, 12)
     if len(payload) != 12 + 2 * count or flags & ~1:
         raise OutOfRange("status length does not match its channels, or unknown flags")
-    return Status(
-        state=whole(q.STATE, state, "state"),
-        fault=whole(q.FAULT, fault, "fault"),
-        token=token,
-        watchdog_left=value(q.WATCHDOG_LEFT, left, "watchdog_left"),
+    return q.status_of(
+        state,
+        fault,
+        token,
+        left=left,
         high_voltage=bool(flags & 1),
-        temperature=value(q.TEMPERATURE, temperature, "temperature"),
-        levels=tuple(value(q.LEVEL, level, "level") for level in levels),
+        temperature=temperature,
+        levels=levels,
     )

@@ -6,8 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from model.transients.base_motion import Term, fade
-from sim.plant.base_motion import terms_of
-from sim.waveform.shaped_tone import ShapedTone
+from sim.waveform import ShapedTone
 
 
 @dataclass(frozen=True)
@@ -84,4 +83,4 @@ def shaped_base(
         return (value * turn).imag, ((slope + 1j * omega * value) * turn).imag
 
     tone = ShapedTone(frequency, 0.0, start, step, knots)
-    return Base(motion, terms_of(tone, stroke=amplitude))
+    return Base(motion, tone.terms(stroke=amplitude))

@@ -3,7 +3,7 @@
 from drivers.protocol.messages import AmplifierState, Identity, Reply, Request, Status
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.faults.fault_window import Faults
-from sim.waveform.shaped_tone import ShapedTone
+from sim.waveform import ShapedTone
 
 
 class FakeDevice:

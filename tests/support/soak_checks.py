@@ -22,7 +22,7 @@ from drivers.protocol.messages import (
 )
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.bench.bench import Bench
-from sim.waveform.output import level_of
+from sim.waveform import level_of
 from soak_plan import Plan
 
 AUDIBLE = 1e-3  # of full stroke; below it a ramp counts as ended

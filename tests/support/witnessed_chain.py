@@ -33,7 +33,7 @@ from model.vibration.excitation import Excitation, Tone
 from sim.bench.bench import Bench
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import Wire, open_wire
-from sim.waveform.output import level_of
+from sim.waveform import level_of
 from sim.witness.violation import Violation
 from sim.witness.witness import Witness
 from virtual_loop import VirtualLoop, run_virtual

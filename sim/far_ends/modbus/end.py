@@ -82,10 +82,6 @@ class _Wire(ABC):
     def send(self, data: bytes) -> None:
         """Send bytes that have arrived at the host's side."""
 
-    @abstractmethod
-    def reply_to(self, request: RequestAdu) -> bytes | None:
-        """The reply frame to a request, or None."""
-
     def _arrived(self, data: bytes) -> None:
         self._take(self.reader.feed(data, clock.now()))
 
@@ -95,8 +91,10 @@ class _Wire(ABC):
 
     def _take(self, requests: Sequence[RequestAdu]) -> None:
         for request in requests:
-            frame = self.reply_to(request)
-            if frame is not None:
+            over_tcp = isinstance(self.reader, TcpReader)
+            pdu = self.units.reply(request, over_tcp=over_tcp)
+            if pdu is not None:
+                frame = tcp_frame(request, pdu) if over_tcp else rtu_frame(request.unit, pdu)
                 self.line.outward.send(frame)
         if self._timer is not None:
             self._timer.cancel()
@@ -147,11 +145,6 @@ class ModbusRtuEnd(_Wire):
         """Send bytes that have arrived at the host's side."""
         self._terminal.write(data)
 
-    def reply_to(self, request: RequestAdu) -> bytes | None:
-        """The reply frame to a request, or None."""
-        pdu = self.units.reply(request, over_tcp=False)
-        return None if pdu is None else rtu_frame(request.unit, pdu)
-
     def _plug(self, is_plugged: bool) -> None:
         self.abandon()
         self._terminal.plug(is_plugged)
@@ -190,11 +183,6 @@ class _Connection(_Wire, asyncio.Protocol):
         self._transport.write(data)
         if self._transport.get_write_buffer_size() > _MAX_UNSENT:
             self._transport.abort()
-
-    def reply_to(self, request: RequestAdu) -> bytes | None:
-        """The reply frame to a request, or None."""
-        pdu = self.units.reply(request, over_tcp=True)
-        return None if pdu is None else tcp_frame(request, pdu)
 
 
 class ModbusTcpEnd:

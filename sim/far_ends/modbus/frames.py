@@ -27,14 +27,6 @@ class RequestAdu:
     transaction: int = 0
 
 
-@dataclass
-class Counters:
-    """Counters of valid frames, and of CRC and framing errors."""
-
-    good: int = 0
-    crc_errors: int = 0
-
-
 def crc(data: bytes) -> int:
     """CRC-16 of Modbus: polynomial 8005 reflected, initial FFFF; low byte first."""
     remainder = 0xFFFF
@@ -67,7 +59,6 @@ class Reader(ABC):
     """Splits a stream of bytes into requests."""
 
     def __init__(self) -> None:
-        self.counters = Counters()
         self._buffer = bytearray()
         self._last = 0.0
 
@@ -85,17 +76,14 @@ class Reader(ABC):
 
     def pause(self, now: float) -> list[RequestAdu]:
         """Discard a partial frame after a timeout; requests behind it are returned."""
-        found: list[RequestAdu] = []
-        if self._buffer and now - self._last > FRAME_TIMEOUT:
-            found = self._give_up()
-        return found
+        is_late = bool(self._buffer) and now - self._last > FRAME_TIMEOUT
+        return self._give_up() if is_late else []
 
     @abstractmethod
     def _take(self) -> list[RequestAdu]:
         """The complete requests, in order."""
 
     def _give_up(self) -> list[RequestAdu]:
-        self.counters.crc_errors += 1
         self._buffer.clear()
         return []
 
@@ -115,7 +103,6 @@ class TcpReader(Reader):
                 break
             found.append(RequestAdu(unit, bytes(self._buffer[_MBAP.size : end]), transaction))
             del self._buffer[:end]
-            self.counters.good += 1
         return found
 
 
@@ -139,10 +126,8 @@ class RtuReader(Reader):
                 break
             request = _checked(bytes(self._buffer[start : start + size]))
             if request is None:
-                self.counters.crc_errors += 1
                 self._is_out_of_sync = True
                 continue
-            self.counters.good += 1
             self._is_out_of_sync = False
             found.append(request)
             del self._buffer[: start + size]
@@ -161,13 +146,8 @@ class RtuReader(Reader):
 
     def _give_up(self) -> list[RequestAdu]:
         whole = None if self._is_out_of_sync else _checked(bytes(self._buffer))
-        if whole is not None:
-            self.counters.good += 1
-            found = [whole]
-        else:
-            self.counters.crc_errors += 1
-            self._is_out_of_sync = True
-            found = self._take()
+        self._is_out_of_sync = whole is None
+        found = self._take() if whole is None else [whole]
         self._buffer.clear()
         self._is_out_of_sync = False
         return found

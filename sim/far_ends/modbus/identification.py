@@ -1,7 +1,6 @@
 """Device identification over Modbus (function 43/14)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 from drivers.protocol.messages import Identity
 from sim.far_ends.modbus.pdu import ILLEGAL_ADDRESS, ILLEGAL_VALUE, ModbusException
@@ -15,32 +14,21 @@ _EXTENDED = 0x80  # objects from here on are the vendor's own
 _CONFORMITY = 0x83  # extended identification, as a stream and one by one
 
 
-@dataclass(frozen=True)
-class IdentificationRequest:
-    """A request for texts: its code, and the number of the first."""
-
-    code: int
-    first: int
-
-    @classmethod
-    def of(cls, body: bytes) -> "IdentificationRequest":
-        """Decode the bytes after the function; raises ModbusException."""
-        if len(body) != 3 or not 1 <= body[1] <= _ONE:
-            raise ModbusException(ILLEGAL_VALUE)
-        return cls(code=body[1], first=body[2])
-
-    def response(self, identity: Identity) -> bytes:
-        """The reply PDU; raises ModbusException."""
-        texts = {
-            number: text_bytes(getattr(identity, name))
-            for name, number in _NUMBERS.items()
-            if self.code not in _BASIC or number < _EXTENDED
-        }
-        if self.code == _ONE:
-            if self.first not in texts:
-                raise ModbusException(ILLEGAL_ADDRESS)
-            texts = {self.first: texts[self.first]}
-        elif self.first in texts:
-            texts = {number: text for number, text in texts.items() if number >= self.first}
-        listed = b"".join(bytes([number, len(text)]) + text for number, text in texts.items())
-        return bytes([IDENTIFY, _READ, self.code, _CONFORMITY, 0, 0, len(texts)]) + listed
+def identification(body: bytes, identity: Identity) -> bytes:
+    """The reply PDU to the bytes after the function; raises ModbusException."""
+    if len(body) != 3 or not 1 <= body[1] <= _ONE:
+        raise ModbusException(ILLEGAL_VALUE)
+    _, code, first = body
+    texts = {
+        number: text_bytes(getattr(identity, name))
+        for name, number in _NUMBERS.items()
+        if code not in _BASIC or number < _EXTENDED
+    }
+    if code == _ONE:
+        if first not in texts:
+            raise ModbusException(ILLEGAL_ADDRESS)
+        texts = {first: texts[first]}
+    elif first in texts:
+        texts = {number: text for number, text in texts.items() if number >= first}
+    listed = b"".join(bytes([number, len(text)]) + text for number, text in texts.items())
+    return bytes([IDENTIFY, _READ, code, _CONFORMITY, 0, 0, len(texts)]) + listed

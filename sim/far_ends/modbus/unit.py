@@ -31,7 +31,7 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
-from sim.far_ends.modbus.identification import IDENTIFY, IdentificationRequest
+from sim.far_ends.modbus.identification import IDENTIFY, identification
 from sim.far_ends.modbus.pdu import (
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
@@ -115,11 +115,10 @@ class _NoReply(Exception):
 
 
 class ModbusUnit:
-    """The registers of one amplifier. damaged: writes with a wrong CRC."""
+    """The registers of one amplifier."""
 
     def __init__(self, amplifier: Amplifier) -> None:
         self._amplifier = amplifier
-        self.damaged = 0
         self._tag = 0
         self._refusal = [0, NO_CHANNEL, 0]
         self._achieved: Achieved | None = None
@@ -163,8 +162,7 @@ class ModbusUnit:
             self._write(*to_write(READ_WRITE, body[4:]))
             return registers_read(function, self._read(*wanted))
         if function == IDENTIFY and body[:1] == b"\x0e":
-            asked = IdentificationRequest.of(body)
-            return asked.response(_expect(Identity, self._query(Hello())))
+            return identification(body, self._query(Hello(), Identity))
         raise ModbusException(ILLEGAL_FUNCTION)
 
     def _exchange(self, request: Request) -> Reply:
@@ -175,12 +173,15 @@ class ModbusUnit:
             raise RefusedWrite(reply.code, reply.channel)
         return reply
 
-    def _query(self, request: Request) -> Reply:
-        """Exchange a request that only a busy amplifier refuses."""
+    def _query(self, request: Request, kind: type[_T]) -> _T:
+        """Exchange a request that only a busy amplifier refuses, for a reply of a kind."""
         try:
-            return self._exchange(request)
+            reply = self._exchange(request)
         except RefusedWrite as refused:
             raise ModbusException(MAP["exceptions"][refused.code.name]) from None
+        if not isinstance(reply, kind):
+            raise TypeError(f"reply must be {kind.__name__}, got {type(reply).__name__}")
+        return reply
 
     # Reading
 
@@ -203,15 +204,15 @@ class ModbusUnit:
             case "refusal":
                 return self._refusal
             case "capabilities":
-                return capability_words(_expect(Capabilities, self._query(GetCaps())))
+                return capability_words(self._query(GetCaps(), Capabilities))
             case "identity":
-                return identity_words(_expect(Identity, self._query(Hello())))
+                return identity_words(self._query(Hello(), Identity))
             case "faults":
-                return fault_words(_expect(FaultList, self._query(GetFaults())))
+                return fault_words(self._query(GetFaults(), FaultList))
             case "achieved":
-                return achieved_words(self._achieved, _expect(Status, self._query(GetStatus())))
+                return achieved_words(self._achieved, self._query(GetStatus(), Status))
             case _:
-                return status_words(_expect(Status, self._query(GetStatus())))
+                return status_words(self._query(GetStatus(), Status))
 
     # Writing
 
@@ -242,7 +243,6 @@ class ModbusUnit:
         if len(words) <= _HEAD:
             raise RefusedWrite(NakCode.BAD_LENGTH)
         if words[1] not in (0, checksum(words[_HEAD:])):
-            self.damaged += 1
             raise _NoReply
         return words[_HEAD:]
 
@@ -282,9 +282,3 @@ class ModbusUnit:
                 return Clear()
             case _:
                 raise RefusedWrite(NakCode.BAD_VALUE)
-
-
-def _expect(kind: type[_T], reply: Reply) -> _T:
-    if not isinstance(reply, kind):
-        raise TypeError(f"reply must be {kind.__name__}, got {type(reply).__name__}")
-    return reply

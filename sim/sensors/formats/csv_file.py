@@ -9,8 +9,7 @@ import numpy as np
 
 from model.errors import InputError
 from model.files.uff import read_bytes
-from sim.sensors.formats.format import Format, rounded
-from sim.sensors.recording import Recording
+from sim.sensors.recording import Format, Recording, rounded
 
 _UNIT = "_m_s2"
 _POSITIONS = ("x_m", "y_m")

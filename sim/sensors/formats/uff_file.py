@@ -18,8 +18,7 @@ from model.files.uff import (
     read_universal,
     write_universal,
 )
-from sim.sensors.formats.format import Format, rounded
-from sim.sensors.recording import Recording
+from sim.sensors.recording import Format, Recording, rounded
 
 _UP = 3
 _MAX_NAME = 10

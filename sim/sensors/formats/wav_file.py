@@ -16,8 +16,7 @@ from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError
 
 from model.errors import InputError, first_problem
 from model.files.uff import read_bytes
-from sim.sensors.formats.format import Format
-from sim.sensors.recording import Recording
+from sim.sensors.recording import Format, Recording
 
 
 class _Sidecar(BaseModel):

@@ -23,7 +23,6 @@ from drivers.protocol.messages import (
 from model.transients.base_motion import Term
 from model.transients.envelope import Envelope as BaseEnvelope
 from sim.amplifier.amplifier import SimulatedAmplifier
-from sim.plant.base_motion import terms_of
 
 STROKE = 1e-4
 RISE = Envelope(1, 0.005, (Knot(0.2, 90.0), Knot(0.4, 0.0)))
@@ -79,7 +78,7 @@ def test_envelope_moves_the_base_as_modelled() -> None:
     """The plant's terms are those of the model's own envelope with the destination as last knot."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 0.8, onset=1)), 0.25)  # 27.5 periods: a phase of its own
-    terms = [term for tone in amplifier.outputs[0] for term in terms_of(tone, stroke=STROKE)]
+    terms = [term for tone in amplifier.outputs[0] for term in tone.terms(stroke=STROKE)]
     knots = tuple(STROKE * value for value in (0.2j, 0.4 + 0j, 0.8 + 0j))
     model = list(BaseEnvelope(110.0, 0j, knots, step=0.005).terms())
     times = np.linspace(0.0, 0.03, 500)

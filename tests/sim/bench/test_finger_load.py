@@ -16,8 +16,7 @@ from model.finger.load import FingerLoad, finger_loads, parse_finger_load
 from model.rig.rig import Rig
 from model.structure.point_load import PointLoad
 from sim.bench.bench import Bench
-from sim.sensors.accelerometer import Accelerometer
-from sim.sensors.bench_accelerometers import Accelerometers
+from sim.sensors.accelerometer import Accelerometer, Accelerometers
 
 A, B = (0.1, 0.07), (0.29, 0.2)
 FREQUENCY = 210.0

@@ -34,27 +34,25 @@ def mode(path: Path) -> int | None:
     return stat.S_IMODE(path.stat().st_mode) if path.exists() else None
 
 
-def ask(bench: Bench, now: float, **request: Any) -> dict[str, Any]:
+async def ask(bench: Bench, now: float, **request: Any) -> dict[str, Any]:
     """One line of control."""
-    made = carry_out(SimulationContext(bench), json.dumps(request).encode(), now=now)
-    assert callable(made)
-    return made()
+    return await carry_out(SimulationContext(bench), json.dumps(request).encode(), now=now)
 
 
-def test_control_places_fingers_and_returns_felt_and_state(coarse_rig: Rig) -> None:
+async def test_control_places_fingers_and_returns_felt_and_state(coarse_rig: Rig) -> None:
     """Responses have the documented keys and shapes."""
     bench = Bench(coarse_rig, now=5.0)
-    placed = ask(bench, 5.1, op="fingers", fingers={"7": [0.1, 0.08], "x": [0, 0]})
+    placed = await ask(bench, 5.1, op="fingers", fingers={"7": [0.1, 0.08], "x": [0, 0]})
     assert placed == {"ok": True, "time_s": 5.1}
     play(bench, DriveCommand(0, 110.0, 0.5), now=5.2, token=9, watchdog=2.0)
-    felt = ask(bench, 6.0, op="felt", since_s=5.5, until_s=6.0)["fingers"]
+    felt = (await ask(bench, 6.0, op="felt", since_s=5.5, until_s=6.0))["fingers"]
     assert felt.keys() == {"7", "x"}
     assert felt["7"]["frequencies_hz"] == [110.0]
     assert len(felt["7"]["points_m"]) == 19
     assert felt["7"]["points_m"][0] == [0.1, 0.08]
     assert len(felt["7"]["amplitude_m_s2"][0]) == len(felt["7"]["peak_m_s2"]) == 19
     assert min(felt["7"]["peak_m_s2"]) > 0
-    state = ask(bench, 6.5, op="state")
+    state = await ask(bench, 6.5, op="state")
     assert state == {
         "time_s": 6.5,
         "fingers": {"7": [0.1, 0.08], "x": [0.0, 0.0]},
@@ -94,13 +92,11 @@ def test_control_places_fingers_and_returns_felt_and_state(coarse_rig: Rig) -> N
         b"[" * 60_000 + b"\n",
     ],
 )
-def test_control_refuses_an_invalid_line(coarse_rig: Rig, line: bytes) -> None:
+async def test_control_refuses_an_invalid_line(coarse_rig: Rig, line: bytes) -> None:
     """The response is a short error, and nothing changes."""
     bench = Bench(coarse_rig, now=1.0)
-    ask(bench, 1.0, op="fingers", fingers={"a": [0.1, 0.1]})
-    made = carry_out(SimulationContext(bench), line, now=1.0)
-    assert callable(made)
-    reply = made()
+    await ask(bench, 1.0, op="fingers", fingers={"a": [0.1, 0.1]})
+    reply = await carry_out(SimulationContext(bench), line, now=1.0)
     assert reply.keys() == {"error"}
     assert len(reply["error"]) < 300
     assert bench.fingers.layout.positions == {"a": (0.1, 0.1)}

@@ -6,9 +6,7 @@ import math
 import pytest
 
 from model.transients.base_motion import Term
-from sim.plant.base_motion import terms_of
-from sim.waveform.fading_tone import FadingTone
-from sim.waveform.output import Output, fade_to, level_of
+from sim.waveform import FadingTone, Output, fade_to, level_of
 
 
 def moved(terms: tuple[Term, ...], t: float) -> float:
@@ -36,7 +34,7 @@ def test_fade_follows_a_raised_cosine() -> None:
 def test_base_motion_matches_the_faded_tone() -> None:
     """The exponentials add up to stroke x level x gain(t) x sin(2 pi f (t - origin) + phase)."""
     tone = FadingTone(110.0, cmath.rect(0.5, 0.7), 0.95, 1.0, 0.02, 0.3, 1.0)
-    terms = terms_of(tone, stroke=1e-4)
+    terms = tone.terms(stroke=1e-4)
     for t in [1.0, 1.003, 1.0125, 1.0199, 1.02, 1.5]:
         gain = 1.0 if t >= 1.02 else 0.3 + 0.7 * (1 - math.cos(math.pi * (t - 1.0) / 0.02)) / 2
         expected = 0.5e-4 * gain * math.sin(2 * math.pi * 110 * (t - 0.95) + 0.7)
@@ -54,7 +52,7 @@ def test_fade_phase_with_and_without_keep_phase() -> None:
     """Only keep_phase at the same frequency leaves the phase running through a change of level."""
 
     def motion(playing: Output, t: float) -> float:
-        return sum(moved(terms_of(tone, stroke=1.0), t) for tone in playing)
+        return sum(moved(tone.terms(stroke=1.0), t) for tone in playing)
 
     first = fade_to((), 0.0, ramp=0.0, frequency=110.0, amplitude=1.0)
     kept = fade_to(first, 1.0023, ramp=0.01, frequency=110.0, amplitude=0.5, keep_phase=True)

@@ -304,7 +304,7 @@ def test_witness_accepts_a_late_reply_to_a_repeated_request() -> None:
         (2, 17999, ""),
         (32, 0, ""),
         (33, 0, "envelope_knots must be 0 to 32, got 33"),
-        (2, 18000, "phase of a knot must be -18000 to 17999, got 18000"),
+        (2, 18000, "phase must be -18000 to 17999, got 18000"),
     ],
 )
 def test_decoders_check_the_bounds_of_envelopes(count: int, phase: int, problem: str) -> None:

@@ -116,5 +116,4 @@ def test_truncated_request_does_not_merge_with_the_next(
         assert reader.feed(frame[:-missing], 10.0) == []
         found = reader.feed(frame, 10.0 + 0.05)
         assert [request.pdu for request in found] == [frame[1:-2] if is_rtu else frame[7:]]
-        assert reader.counters.good == 1
     assert FRAME_TIMEOUT < 0.05

@@ -1,0 +1,243 @@
+"""Output of a channel in time: a sum of sinusoids that fade, or follow an envelope.
+
+Every change is a cross-fade along a raised cosine, whose two gains add up to one.
+"""
+
+import cmath
+import math
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TypeAlias
+
+from model.transients.base_motion import Term, fade
+
+
+@dataclass(frozen=True, slots=True)
+class FadingTone:
+    """gain(t) Im[full exp(2 pi i frequency (t - origin))] from start.
+
+    frequency [Hz]; full: complex amplitude at gain 1, in full strokes; origin [s]: of its phase.
+    The gain goes from gain_from at start [s] to gain_to along a raised cosine of ramp [s];
+    a ramp of 0 is a step.
+    """
+
+    frequency: float
+    full: complex
+    origin: float
+    start: float
+    ramp: float
+    gain_from: float
+    gain_to: float
+
+    @property
+    def settled(self) -> float:
+        """End of the fade [s]."""
+        return self.start + self.ramp
+
+    @property
+    def lasts(self) -> bool:
+        """Whether it is audible once settled."""
+        return self.gain_to > 0
+
+    @property
+    def settled_amplitude(self) -> complex:
+        """Settled complex amplitude in full strokes."""
+        return self.full * self.gain_to
+
+    @property
+    def silent_from(self) -> float:
+        """Time of silence [s]; infinity for a lasting tone."""
+        return self.settled if self.gain_to == 0 else math.inf
+
+    def gain(self, time: float) -> float:
+        """Gain at a time [s] not before start."""
+        if time >= self.settled:
+            return self.gain_to
+        share = (1 - math.cos(math.pi * (time - self.start) / self.ramp)) / 2
+        return self.gain_from + (self.gain_to - self.gain_from) * share
+
+    def amplitude(self, time: float) -> complex:
+        """Complex amplitude in full strokes at a time [s] not before start."""
+        return self.full * self.gain(time)
+
+    def fade_out(self, time: float, *, ramp: float) -> "FadingTone":
+        """This tone, silent within ramp [s]; a fade-out that ends sooner is kept.
+
+        An interrupted fade continues from its present gain.
+        """
+        if self.silent_from <= time + ramp:
+            return self
+        return replace(self, start=time, ramp=ramp, gain_from=self.gain(time), gain_to=0.0)
+
+    def terms(self, *, stroke: float) -> tuple[Term, ...]:
+        """Base motion of an ERA with this stroke [m] whose channel plays it."""
+        omega = 2 * math.pi * self.frequency
+        phase_factor = cmath.exp(1j * omega * (self.start - self.origin))
+        return fade(
+            stroke * self.full * phase_factor,
+            omega=omega,
+            start=self.start,
+            ramp=self.ramp,
+            gains=(self.gain_from, self.gain_to),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ShapedTone:
+    """Im[a(t) exp(2 pi i frequency (t - origin))] from start, a in full strokes.
+
+    frequency [Hz]; start, origin [s]; a interpolates `values` linearly, one per step [s] from
+    start, and stays at the last.
+    """
+
+    frequency: float
+    origin: float
+    start: float
+    step: float
+    values: tuple[complex, ...]
+
+    @property
+    def settled(self) -> float:
+        """Time of the last value [s]."""
+        return self.start + self.step * (len(self.values) - 1)
+
+    @property
+    def lasts(self) -> bool:
+        """Whether it is audible once settled."""
+        return self.values[-1] != 0
+
+    @property
+    def settled_amplitude(self) -> complex:
+        """Settled complex amplitude."""
+        return self.values[-1]
+
+    @property
+    def silent_from(self) -> float:
+        """Time of silence [s]; infinity for a lasting tone."""
+        return math.inf if self.lasts else self.settled
+
+    def amplitude(self, time: float) -> complex:
+        """Complex amplitude at a time [s] not before start."""
+        steps = (time - self.start) / self.step
+        before = int(steps)
+        if before >= len(self.values) - 1:
+            return self.values[-1]
+        here, there = self.values[before : before + 2]
+        return here + (there - here) * (steps - before)
+
+    def fade_out(self, time: float, *, ramp: float) -> "FadingTone | ShapedTone":
+        """Fade from the present amplitude, within ramp [s], unless it ends sooner."""
+        if self.silent_from <= time + ramp:
+            return self
+        reached = self.amplitude(time)
+        return FadingTone(self.frequency, reached, self.origin, time, ramp, 1.0, 0.0)
+
+    def terms(self, *, stroke: float) -> tuple[Term, ...]:
+        """Base motion of an ERA with this stroke [m] whose channel plays it."""
+        omega = 2 * math.pi * self.frequency
+        terms = []
+        for number, (here, there) in enumerate(pairwise(self.values)):
+            since = self.start + number * self.step
+            phase_factor = stroke * cmath.exp(1j * omega * (since - self.origin))
+            slope = (there - here) / self.step
+            terms.append(
+                Term(since, since + self.step, omega, here * phase_factor, slope * phase_factor)
+            )
+        if self.lasts:
+            phase_factor = stroke * cmath.exp(1j * omega * (self.settled - self.origin))
+            terms.append(Term(self.settled, math.inf, omega, self.values[-1] * phase_factor))
+        return tuple(terms)
+
+
+Tone: TypeAlias = FadingTone | ShapedTone
+
+Output: TypeAlias = tuple[Tone, ...]
+"""The output of one channel: the sum of these tones."""
+
+
+def fade_to(
+    playing: Output,
+    time: float,
+    *,
+    ramp: float,
+    frequency: float = 0.0,
+    amplitude: complex = 0j,
+    keep_phase: bool = False,
+) -> Output:
+    """The output after a command at a time [s] to fade to a tone within ramp [s].
+
+    amplitude in full strokes, 0 for silence. Its phase counts from `time`; with keep_phase, from
+    the origin of a lasting tone of the same frequency.
+    """
+    faded = (tone.fade_out(time, ramp=ramp) for tone in playing)
+    fading = tuple(tone for tone in faded if tone.silent_from > time)
+    if amplitude == 0:
+        return fading
+    origin = time
+    if keep_phase:
+        same = [tone for tone in playing if tone.lasts and tone.frequency == frequency]
+        origin = same[0].origin if same else time
+    gain_from = 1.0 if ramp == 0 else 0.0
+    return (*fading, FadingTone(frequency, amplitude, origin, time, ramp, gain_from, 1.0))
+
+
+def shape_to(
+    playing: Output,
+    time: float,
+    *,
+    ramp: float,
+    step: float,
+    knots: tuple[complex, ...],
+    frequency: float,
+    amplitude: complex,
+    keep_phase: bool,
+) -> Output:
+    """The output after a command at a time [s] to follow an envelope to a tone.
+
+    amplitude and knots in full strokes, ramp and step in s. With keep_phase a lasting tone of the
+    same frequency continues from its present amplitude; else the new one begins at zero. All others
+    fade out within ramp.
+    """
+    continuing = next(
+        (tone for tone in playing if keep_phase and tone.lasts and tone.frequency == frequency),
+        None,
+    )
+    faded = (tone.fade_out(time, ramp=ramp) for tone in playing if tone is not continuing)
+    fading = tuple(tone for tone in faded if tone.silent_from > time)
+    begin = 0j if continuing is None else continuing.amplitude(time)
+    origin = time if continuing is None else continuing.origin
+    return (*fading, ShapedTone(frequency, origin, time, step, (begin, *knots, amplitude)))
+
+
+def end_along(
+    playing: Output, time: float, *, ramp: float, step: float, knots: tuple[complex, ...]
+) -> Output:
+    """The output after a command at a time [s] to end along an envelope; see `shape_to`."""
+    lasting = next((tone for tone in playing if tone.lasts), None)
+    if lasting is None:
+        return tuple(tone for tone in playing if tone.silent_from > time)
+    return shape_to(
+        playing,
+        time,
+        ramp=ramp,
+        step=step,
+        knots=knots,
+        frequency=lasting.frequency,
+        amplitude=0j,
+        keep_phase=True,
+    )
+
+
+def level_of(playing: Output, time: float) -> float:
+    """Level 0..1 of a channel at a time [s], fades included.
+
+    Tones of one frequency add as complex amplitudes, magnitudes add across frequencies.
+    """
+    if len(playing) < 2:
+        return sum(abs(tone.amplitude(time)) for tone in playing)
+    amplitudes: dict[float, complex] = defaultdict(complex)
+    for tone in playing:
+        phase_factor = cmath.exp(-2j * math.pi * tone.frequency * tone.origin)
+        amplitudes[tone.frequency] += tone.amplitude(time) * phase_factor
+    return sum(abs(amplitude) for amplitude in amplitudes.values())

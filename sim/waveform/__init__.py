@@ -1,1 +1,0 @@
-"""Output of a channel in time: sinusoids that fade, or follow an envelope."""

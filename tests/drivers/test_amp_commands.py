@@ -6,12 +6,13 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import pytest
+from click.testing import Result
 from serial.tools.list_ports_common import ListPortInfo
 from typer.testing import CliRunner
 
@@ -26,16 +27,15 @@ from drivers.protocol.messages import (
     Disarm,
     Fault,
     GetCaps,
-    GetStatus,
     Hello,
     Nak,
     NakCode,
     Ping,
+    Reply,
     Stop,
 )
-from drivers.registry import known_schemes
 from scripted_amplifier import FarEnd
-from vendor_pages import ARMED
+from vendor_pages import ARMED, usual_reply
 
 T = TypeVar("T")
 
@@ -47,21 +47,23 @@ class BackgroundFarEnd:
         self.loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self.loop.run_forever)
         self._thread.start()
-        self.end = self.run(self._make())
+        self.end = self.run(self._do(FarEnd))
 
-    async def _make(self) -> FarEnd:
-        return FarEnd()
+    async def _do(self, work: Callable[[], T]) -> T:
+        return work()
 
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
-        """The result of a coroutine in the far end's loop."""
+        """Return the result of a coroutine in that loop."""
         return asyncio.run_coroutine_threadsafe(coroutine, self.loop).result(10)
 
+    def replies(self, **replies: Reply) -> None:
+        """Reply otherwise to requests of these types."""
+        self.end.answer = lambda request, _: (
+            replies.get(type(request).__name__) or usual_reply(request)
+        )
+
     def close(self) -> None:
-
-        async def close() -> None:
-            self.end.close()
-
-        self.run(close())
+        self.run(self._do(self.end.close))
         self.loop.call_soon_threadsafe(self.loop.stop)
         self._thread.join()
         self.loop.close()
@@ -69,101 +71,121 @@ class BackgroundFarEnd:
 
 @pytest.fixture
 def background() -> Iterator[BackgroundFarEnd]:
-    """A far end that answers while a command runs."""
+    """A far end that replies while a command runs."""
     background = BackgroundFarEnd()
     yield background
     background.close()
 
 
-def test_identify_in_json(background: BackgroundFarEnd) -> None:
-    """One JSON object whose keys carry the units."""
-    result = CliRunner().invoke(app, ["amp", "identify", background.end.url, "--json"])
+def invoke(*args: str) -> Result:
+    """Run `era amp` with these arguments."""
+    return CliRunner().invoke(app, ["amp", *args])
+
+
+def result_of(*args: str) -> dict[str, Any]:
+    """Run `era amp` with these arguments and --json; its result."""
+    result = invoke(*args, "--json")
     assert result.exit_code == 0, result.output
-    answer = json.loads(result.stdout)
-    assert answer["serial_number"] == "A-17"
-    assert answer["channels"] == 4
+    parsed: dict[str, Any] = json.loads(result.stdout)
+    return parsed
+
+
+def test_identify_reports_identity_capabilities_and_wire(background: BackgroundFarEnd) -> None:
+    """At 115 200 baud: 50 and 46 bytes are 8.33 ms, 120 sets a second, a watchdog of 158 ms."""
+    answer = result_of("identify", f"{background.end.url}?baud=115200")
+    assert (answer["serial_number"], answer["channels"]) == ("A-17", 4)
     assert (answer["frequency_min_hz"], answer["frequency_max_hz"]) == (20.0, 600.0)
     assert answer["watchdog_min_s"] == 0.1
+    assert answer["wire_round_trip_s"] == pytest.approx(96 * 10 / 115200, abs=1e-6)
+    assert answer["sets_per_second_max"] == 120
+    assert answer["watchdog_shortest_s"] == pytest.approx(0.15 + 96 * 10 / 115200, abs=1e-6)
 
 
 def test_status_stop_and_clear(background: BackgroundFarEnd) -> None:
-    """Status tells state, levels and faults; stop and clear are sent as such."""
-    result = CliRunner().invoke(app, ["amp", "status", background.end.url, "--json"])
-    answer = json.loads(result.stdout)
+    """State, levels and faults; stop and clear are sent as such."""
+    answer = result_of("status", background.end.url)
     assert (answer["state"], answer["levels"]) == ("OPERATION_ENABLED", [0.0] * 4)
     assert (answer["temperature_c"], answer["faults"]) == (25.0, [])
-    result = CliRunner().invoke(app, ["amp", "stop", background.end.url])
+    result = invoke("stop", background.end.url)
     assert result.exit_code == 0
-    assert re.findall(r"^(?:state|high_voltage|levels) +(.*)$", result.stdout, re.MULTILINE) == [
-        "OPERATION_ENABLED",
-        "yes",
-        "0, 0, 0, 0",
-    ]
+    shown = re.findall(r"^(?:state|high_voltage|levels) +(.*)$", result.stdout, re.MULTILINE)
+    assert shown == ["OPERATION_ENABLED", "yes", "0, 0, 0, 0"]
     assert isinstance(background.end.requests[-1], Stop)
-    result = CliRunner().invoke(app, ["amp", "clear", background.end.url])
-    assert result.exit_code == 0
+    assert invoke("clear", background.end.url).exit_code == 0
     assert isinstance(background.end.requests[-1], Clear)
 
 
 def test_drive_plays_and_ends_silent(background: BackgroundFarEnd) -> None:
     """Arm, one set on one channel, heartbeats, and a disarm at the end."""
     options = ["--channel", "2", "--frequency", "123.45", "--level", "0.3", "--for", "0.12"]
-    result = CliRunner().invoke(app, ["amp", "drive", background.end.url, *options, "--json"])
-    assert result.exit_code == 0, result.output
-    (achieved,) = json.loads(result.stdout)["achieved"]
+    (achieved,) = result_of("drive", background.end.url, *options)["achieved"]
     assert achieved == {"channel": 2, "frequency_hz": 123.45, "level": 0.3, "phase_deg": 0.0}
-    kinds = [type(request) for request in background.end.requests[2:]]
-    assert kinds[:2] == [Arm, Apply]
-    assert Ping in kinds
-    assert kinds[-2] is Disarm
-    apply = background.end.requests[3]
+    arm, apply, *others = background.end.requests[2:]
+    assert isinstance(arm, Arm)
+    assert isinstance(apply, Apply)
     assert apply.command_set.valid_for == 0.12
+    assert Ping() in others
+    assert isinstance(others[-2], Disarm)
 
 
-def test_a_refused_drive_is_disarmed(background: BackgroundFarEnd) -> None:
-    """Where the set is refused the amplifier does not stay armed."""
-    usual = background.end.answer
-    background.end.answer = lambda request, frame: (
-        Nak(NakCode.BAD_VALUE) if isinstance(request, Apply) else usual(request, frame)
-    )
-    result = CliRunner().invoke(app, ["amp", "drive", background.end.url])
+@pytest.mark.parametrize(
+    ("replies", "problem"),
+    [
+        ({"Apply": Nak(NakCode.BAD_VALUE)}, "Apply"),
+        (
+            {"Ping": replace(ARMED, state=AmplifierState.FAULT, fault=Fault.ARC)},
+            "FAULT, fault ARC",
+        ),
+    ],
+)
+def test_failed_drive_is_disarmed(
+    background: BackgroundFarEnd, replies: dict[str, Reply], problem: str
+) -> None:
+    """A refused set, or a fault during the drive, is reported."""
+    background.replies(**replies)
+    result = invoke("drive", background.end.url, "--for", "5")
     assert isinstance(result.exception, CommandRefused)
-    assert isinstance(background.end.requests[-1], Disarm)
-
-
-def test_a_drive_that_the_amplifier_ends_is_no_success(background: BackgroundFarEnd) -> None:
-    """A fault during a drive is reported, and the amplifier is disarmed."""
-    usual = background.end.answer
-    arc = replace(ARMED, state=AmplifierState.FAULT, fault=Fault.ARC)
-    background.end.answer = lambda request, frame: (
-        arc if isinstance(request, Ping) else usual(request, frame)
-    )
-    result = CliRunner().invoke(app, ["amp", "drive", background.end.url, "--for", "5"])
-    assert isinstance(result.exception, CommandRefused)
-    assert "FAULT, fault ARC" in str(result.exception)
+    assert problem in str(result.exception)
     assert isinstance(background.end.requests[-1], Disarm)
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("query", "options"),
     [
-        ["--level", "1.1"],
-        ["--frequency", "nan"],
-        ["--channel", "4"],
-        ["--for", "0"],
-        ["--for", "nan"],
+        ("", ["--level", "1.1"]),
+        ("", ["--frequency", "nan"]),
+        ("", ["--channel", "4"]),
+        ("", ["--for", "0"]),
+        ("", ["--for", "nan"]),
+        ("?baud=4800", []),  # too slow for three heartbeats and a round trip
     ],
 )
-def test_a_bad_drive_never_arms(background: BackgroundFarEnd, options: list[str]) -> None:
-    """An invalid drive is bad input and does not change the amplifier."""
-    result = CliRunner().invoke(app, ["amp", "drive", background.end.url, *options])
+def test_invalid_drive_never_arms(
+    background: BackgroundFarEnd, query: str, options: list[str]
+) -> None:
+    """It is bad input and does not change the amplifier."""
+    result = invoke("drive", background.end.url + query, *options)
     assert isinstance(result.exception, CommandError)
     assert not any(isinstance(request, Arm) for request in background.end.requests)
 
 
+def test_drive_after_a_stop_names_the_clear_command(background: BackgroundFarEnd) -> None:
+    """State, fault and remedy, with the URL quoted for a shell."""
+    stopped = replace(ARMED, state=AmplifierState.QUICK_STOP_ACTIVE)
+    background.replies(Arm=Nak(NakCode.WRONG_STATE), GetStatus=stopped)
+    url = f"{background.end.url}?baud=115200"
+    result = invoke("drive", url)
+    assert isinstance(result.exception, CommandRefused)
+    assert "QUICK_STOP_ACTIVE" in str(result.exception)
+    assert str(result.exception).endswith(f"era amp clear '{url}'")
+    assert invoke("stop", url).stdout.splitlines()[-1] == f"Next: era amp clear '{url}'"
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_ends_silent(background: BackgroundFarEnd, number: signal.Signals) -> None:
-    """An interrupt or an order to end in the middle of a drive disarms before the process ends."""
+def test_interrupted_drive_ends_silent(
+    background: BackgroundFarEnd, number: signal.Signals
+) -> None:
+    """SIGINT or SIGTERM during a drive disarms before the process ends."""
     command = [sys.executable, "-P", "-c", "from controller.cli.main import main; exit(main())"]
     process = subprocess.Popen(
         [*command, "amp", "drive", background.end.url, "--for", "30"],
@@ -192,16 +214,14 @@ def test_ctrl_c_ends_silent(background: BackgroundFarEnd, number: signal.Signals
     [(CommandError, 2), (CommandRefused, 1), (LinkError, 3), (LinkTimeout, 3), (FrameError, 3)],
 )
 def test_every_error_has_its_exit_status(error: type[Exception], status: int) -> None:
-    """1 the answer is no, 2 bad input, 3 hardware or link."""
+    """1: refused, 2: bad input, 3: hardware or link."""
     found = {code for kind, code in EXIT_STATUS.items() if issubclass(error, kind)}
     assert found == {status}
 
 
-def test_conformance_says_what_is_kept_and_what_is_not(background: BackgroundFarEnd) -> None:
-    """Over a far end that is armed from the first, looking shows it: exit 1, and nothing driven."""
-    result = CliRunner().invoke(
-        app, ["amp", "conformance", background.end.url, "--write", "--json"]
-    )
+def test_conformance_stops_after_a_failed_reading_check(background: BackgroundFarEnd) -> None:
+    """An amplifier that is armed already: exit status 1, and nothing is driven."""
+    result = invoke("conformance", background.end.url, "--write", "--json")
     assert result.exit_code == 1, result.output
     answer = json.loads(result.stdout)
     problems = {row["check"]: row["problem"] for row in answer["checks"]}
@@ -212,101 +232,47 @@ def test_conformance_says_what_is_kept_and_what_is_not(background: BackgroundFar
     assert not any(isinstance(request, Arm | Apply) for request in background.end.requests)
 
 
-def test_discover_asks_who_is_there_and_nothing_else(background: BackgroundFarEnd) -> None:
-    """A URL that answers is named, one that does not is no error; only Hello and GetCaps go out."""
+def test_discover_only_identifies(background: BackgroundFarEnd) -> None:
+    """Only Hello and GetCaps are sent; a URL without a reply is no error."""
     urls = [background.end.url, "serial:///dev/no-such-port"]
-    result = CliRunner().invoke(app, ["amp", "discover", *urls, "--no-probe", "--json"])
-    assert result.exit_code == 0, result.output
-    (found,) = json.loads(result.stdout)["amplifiers"]
+    (found,) = result_of("discover", *urls, "--no-probe")["amplifiers"]
     assert (found["url"], found["serial_number"]) == (background.end.url, "A-17")
     assert background.end.requests == [Hello(), GetCaps()]
 
 
-def test_discover_tells_how_to_mend_permissions(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A port that this user may not use is listed with its group, and is not asked."""
-    monkeypatch.setattr("drivers.discovery.search.comports", lambda: [ListPortInfo("/dev/null")])
-    monkeypatch.setattr("drivers.discovery.search.os.access", lambda path, mode: False)
-    (place,) = [one for one in candidates() if one.place == "/dev/null"]
-    assert place.description == "serial port"  # pyserial has n/a where nothing is known
-    assert "usermod -aG" in (place.remedy or "")
-    assert "chmod a+rw /dev/null" in (place.remedy or "")
-
-
-def test_discover_suggests_no_group_that_may_not_either(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+@pytest.mark.parametrize(("mode", "helps_group"), [(0o660, True), (0o600, False)])
+def test_discover_suggests_a_group_that_has_permission(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, mode: int, helps_group: bool
 ) -> None:
-    """A port that only its owner may use is not mended by joining its group."""
+    """Else only a temporary remedy."""
     port = tmp_path / "tty"
-    port.touch(mode=0o600)
+    port.touch()
+    port.chmod(mode)
     monkeypatch.setattr("drivers.discovery.search.comports", lambda: [ListPortInfo(str(port))])
     monkeypatch.setattr("drivers.discovery.search.os.access", lambda path, mode: False)
     (place,) = [one for one in candidates() if one.place == str(port)]
-    assert "usermod" not in (place.remedy or "")
+    assert place.description == "serial port"  # pyserial reports n/a
+    assert ("usermod -aG" in (place.remedy or "")) == helps_group
     assert f"chmod a+rw {port}" in (place.remedy or "")
 
 
-def test_discover_says_why_a_port_could_not_be_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A port that cannot be opened has a reason; a missing reply has none."""
-    monkeypatch.setattr(
-        "drivers.discovery.search.comports", lambda: [ListPortInfo("/dev/no-such-port")]
-    )
+def test_discover_reports_why_a_port_cannot_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A missing reply has no reason."""
+    port = ListPortInfo("/dev/no-such-port")
+    monkeypatch.setattr("drivers.discovery.search.comports", lambda: [port])
     monkeypatch.setattr("drivers.discovery.search.os.access", lambda path, mode: True)
-    result = CliRunner().invoke(app, ["amp", "discover"])
+    result = invoke("discover")
     assert result.exit_code == 0, result.output
     assert "no such port" in result.stdout
 
 
-def test_the_page_of_commands_names_what_is_printed(background: BackgroundFarEnd) -> None:
-    """Status, drive, stop and clear have the keys of their row, and status those of its wire."""
+def test_results_have_the_documented_keys(background: BackgroundFarEnd) -> None:
+    """Those of docs/reference/commands.md."""
     page = (Path(__file__).parents[2] / "docs" / "reference" / "commands.md").read_text("utf-8")
     (row,) = re.findall(r"^\| `era amp status`.* \| (.*) \|$", page, re.MULTILINE)
-    everyone, of_status, of_drive = re.split(r"; of `status`|, of `drive`", row)
+    common, of_status, of_drive = re.split(r"; of `status`|, of `drive`", row)
     (wire,) = re.findall(r"^\| `era amp identify` .* what it allows: (.*) \|$", page, re.MULTILINE)
     beside = {"status": of_status + wire, "drive": of_drive, "stop": "", "clear": ""}
     for command, more in beside.items():
-        result = CliRunner().invoke(app, ["amp", command, background.end.url, "--json"])
-        assert set(json.loads(result.stdout)) == set(re.findall(r"`(\w+)`", everyone + more))
-
-
-def test_identify_says_what_the_wire_allows(background: BackgroundFarEnd) -> None:
-    """At 115 200 baud: 50 and 46 bytes are 8.33 ms, 120 sets a second, a watchdog of 158 ms."""
-    url = f"{background.end.url}?baud=115200"
-    answer = json.loads(CliRunner().invoke(app, ["amp", "identify", url, "--json"]).stdout)
-    assert answer["wire_round_trip_s"] == pytest.approx(96 * 10 / 115200, abs=1e-6)
-    assert answer["sets_per_second_max"] == 120
-    assert answer["watchdog_shortest_s"] == pytest.approx(0.15 + 96 * 10 / 115200, abs=1e-6)
-
-
-def test_a_drive_over_too_slow_a_line_never_arms(background: BackgroundFarEnd) -> None:
-    """At 4800 baud three heartbeats and a round trip do not fit into the watchdog."""
-    result = CliRunner().invoke(app, ["amp", "drive", f"{background.end.url}?baud=4800"])
-    assert isinstance(result.exception, CommandError)
-    assert "350 ms" in str(result.exception)
-    assert not any(isinstance(request, Arm) for request in background.end.requests)
-
-
-def test_a_drive_after_a_stop_says_how_to_clear(background: BackgroundFarEnd) -> None:
-    """The state, the fault and the command that acknowledges it, as a shell takes the URL."""
-    usual = background.end.answer
-    stopped = replace(ARMED, state=AmplifierState.QUICK_STOP_ACTIVE)
-    background.end.answer = lambda request, frame: (
-        Nak(NakCode.WRONG_STATE)
-        if isinstance(request, Arm)
-        else stopped
-        if isinstance(request, GetStatus)
-        else usual(request, frame)
-    )
-    url = f"{background.end.url}?baud=115200"
-    result = CliRunner().invoke(app, ["amp", "drive", url])
-    assert isinstance(result.exception, CommandRefused)
-    assert "QUICK_STOP_ACTIVE" in str(result.exception)
-    assert str(result.exception).endswith(f"era amp clear '{url}'")
-    result = CliRunner().invoke(app, ["amp", "stop", url])
-    assert result.stdout.splitlines()[-1] == f"Next: era amp clear '{url}'"
-
-
-def test_the_help_shows_urls_of_all_wires() -> None:
-    """Every scheme, but for another spelling of a serial server and the bus inside a program."""
-    shown = CliRunner().invoke(app, ["amp", "--help"]).stdout
-    for scheme in set(known_schemes()) - {"socket", "can+virtual"}:
-        assert f"  {scheme}://" in shown
+        keys = set(re.findall(r"`(\w+)`", common + more))
+        assert set(result_of(command, background.end.url)) == keys

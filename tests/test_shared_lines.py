@@ -151,7 +151,7 @@ async def test_stop_does_not_wait_for_a_stuck_amplifier(
     amplifiers: dict[str, Amplifier],
     silence: Callable[[Amplifier, float], Awaitable[Status]],
 ) -> None:
-    """At most 8 ms, or 18 ms where a reply is pending; pending requests are repeated afterwards.
+    """It waits 8 ms, and 10 ms more where a reply could collide; requests are repeated afterwards.
 
     A busy machine only adds to it, so the best try counts.
     """

@@ -1,7 +1,6 @@
 """A stop precedes every request that is not on the wire yet, also on shared lines.
 
-In virtual time, so that it can come at any moment between two frames; requests are
-recorded in the order in which the amplifiers receive them.
+In virtual time, at any moment between two frames; requests are recorded in the order of arrival.
 """
 
 import asyncio
@@ -48,7 +47,7 @@ MOMENTS = [number * 0.0005 for number in range(1, 30)]  # s; one of them is in e
 class Chain:
     """Two armed amplifiers, east and west, and the requests that they received.
 
-    sent_at: when [s] the host has put a frame on the line since.
+    sent_at: times [s] of the host's frames.
     """
 
     def __init__(self) -> None:
@@ -75,6 +74,14 @@ class Chain:
     def kinds(self) -> list[tuple[str, str]]:
         return [(name, type(request).__name__) for name, request in self.asked]
 
+    async def rearm(self) -> None:
+        """Disarm, clear and arm both."""
+        for one in (self.east, self.west):
+            await one.disarm(0.0)
+            await asyncio.sleep(0.1)
+            await one.clear()
+            await one.arm(2.0)
+
     def tone(self, amplifier: Amplifier, token: int, level: float = 0.3) -> SafeCommandSet:
         guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifier.capabilities)
         commands = (DriveCommand(0, 110.0, level),)
@@ -82,7 +89,7 @@ class Chain:
 
 
 def on_a_line(line: str, rig: Rig, use: Callable[[Chain], Coroutine[Any, Any, None]]) -> None:
-    """Use both in virtual time, from a moment at which their line has long been silent."""
+    """Use both amplifiers in virtual time, on a line that is silent at first."""
     wiring = {
         era: Channel("west" if number % 2 else "east", number // 2)
         for number, era in enumerate(rig.wiring)
@@ -117,14 +124,14 @@ def note(
     exchange: Callable[[Request], Reply | None],
     request: Request,
 ) -> Reply | None:
-    """Record a request and let the amplifier reply; on Modbus all replies hold its status."""
+    """Record a request, unless it reads the status, and pass it on."""
     if not isinstance(request, GetStatus):
         asked.append((name, request))
     return exchange(request)
 
 
 async def refused(task: "asyncio.Task[Any]") -> None:
-    """It gave way, and says so."""
+    """Require that a request was superseded."""
     with pytest.raises(CommandRefused, match="superseded"):
         await task
 
@@ -141,8 +148,7 @@ SENDING: dict[str, Callable[[Chain], Coroutine[Any, Any, object]]] = {
 @pytest.mark.parametrize("line", LINES)
 @pytest.mark.parametrize("what", SENDING)
 def test_queued_request_is_superseded_by_a_stop(line: str, what: str, coarse_rig: Rig) -> None:
-    """West is on the line and east's request waits for it: then east's stop is what comes next,
-    and what waited is refused without ever having been sent."""
+    """While west's request is pending, east's stop supersedes east's waiting request unsent."""
 
     async def use(chain: Chain) -> None:
         beat = asyncio.create_task(chain.west.heartbeat())
@@ -163,8 +169,7 @@ def test_queued_request_is_superseded_by_a_stop(line: str, what: str, coarse_rig
 @pytest.mark.parametrize("line", LINES)
 @pytest.mark.parametrize("what", ["stage", "heartbeat"])
 def test_abort_unsent_drops_a_queued_request(line: str, what: str, coarse_rig: Rig) -> None:
-    """The last finger lifted while east's request waited for west's answer: it is given up at once,
-    so that what comes next on the line is what silences."""
+    """While west's reply is pending, east's waiting request is dropped at once."""
 
     async def use(chain: Chain) -> None:
         beat = asyncio.create_task(chain.west.heartbeat())
@@ -183,8 +188,7 @@ def test_abort_unsent_drops_a_queued_request(line: str, what: str, coarse_rig: R
 
 @pytest.mark.parametrize("line", LINES)
 def test_queued_stop_reserves_the_line(line: str, coarse_rig: Rig) -> None:
-    """West waits for a reply and east for the line when west is stopped: the stop is next, and
-    east's request follows once, with its reply."""
+    """West's stop precedes east's waiting request, which follows once and gets its reply."""
 
     async def use(chain: Chain) -> None:
         beat = asyncio.create_task(chain.west.heartbeat())
@@ -205,8 +209,7 @@ def test_queued_stop_reserves_the_line(line: str, coarse_rig: Rig) -> None:
 def test_stop_class_request_is_the_next_frame_at_any_moment(
     line: str, whose: str, silencing: type[Request], coarse_rig: Rig
 ) -> None:
-    """While sets and heartbeats follow each other on the line, what silences one amplifier is the
-    next frame that the host sends, and no token is played twice."""
+    """Also between sets and heartbeats of both amplifiers; no token is sent twice."""
 
     async def use(chain: Chain) -> None:
         amplifier = {"east": chain.east, "west": chain.west}[whose]
@@ -239,11 +242,7 @@ def test_stop_class_request_is_the_next_frame_at_any_moment(
             ]
             assert len(set(tokens_of_applies)) == len(tokens_of_applies)
             if silencing is not Apply:
-                for one in (chain.east, chain.west):
-                    await one.disarm(0.0)
-                    await asyncio.sleep(0.1)
-                    await one.clear()
-                    await one.arm(2.0)
+                await chain.rearm()
             await asyncio.sleep(0.1)
 
     on_a_line(line, coarse_rig, use)
@@ -251,8 +250,8 @@ def test_stop_class_request_is_the_next_frame_at_any_moment(
 
 @pytest.mark.parametrize("whose", ["east", "west"])
 def test_stop_preempts_a_request_in_the_rtu_gap(whose: str, coarse_rig: Rig) -> None:
-    """What has its turn but waits for the line to be silent for 3.5 characters gives way to a stop
-    of its own amplifier for good, and to that of another until it is out."""
+    """A request in the silence before its frame is superseded by a stop of its own amplifier, and
+    delayed by that of another."""
 
     async def use(chain: Chain) -> None:
         await chain.west.heartbeat()
@@ -275,8 +274,7 @@ def test_stop_preempts_a_request_in_the_rtu_gap(whose: str, coarse_rig: Rig) -> 
 @pytest.mark.parametrize("line", LINES)
 @pytest.mark.parametrize("what", ["disarm", "silent set"])
 def test_stop_precedes_other_stop_class_requests(line: str, what: str, coarse_rig: Rig) -> None:
-    """A disarm or a silent set that waits for the line lets a stop of its own amplifier, or of the
-    other, go first, and follows it."""
+    """A waiting disarm or silent set follows a later stop, of either amplifier."""
 
     async def use(chain: Chain) -> None:
         for amplifier, name in ((chain.east, "east"), (chain.west, "west")):
@@ -293,17 +291,13 @@ def test_stop_precedes_other_stop_class_requests(line: str, what: str, coarse_ri
             await asyncio.gather(beat, waiting, return_exceptions=True)
             kind = "Disarm" if what == "disarm" else "Apply"
             assert chain.kinds() == [("west", "Ping"), (name, "Stop"), ("east", kind)]
-            for one in (chain.east, chain.west):
-                await one.disarm(0.0)
-                await asyncio.sleep(0.1)
-                await one.clear()
-                await one.arm(2.0)
+            await chain.rearm()
 
     on_a_line(line, coarse_rig, use)
 
 
 def test_broadcast_stop_is_repeated_after_a_possible_collision(coarse_rig: Rig) -> None:
-    """At once, and once more when the line is theirs, 8 ms later at most; on a free line once."""
+    """On a free line it is sent once; else at once, and again at most 8 ms later."""
 
     async def use(chain: Chain) -> None:
         await chain.east.stop_on_bus()
@@ -320,14 +314,14 @@ def test_broadcast_stop_is_repeated_after_a_possible_collision(coarse_rig: Rig) 
         assert at_once == begin
         assert 0 < again - begin <= 0.0081
         chain.far.devices["west"].recover()
-        await beat  # it is asked again
+        await beat  # repeated
         assert [what for name, what in chain.kinds() if name == "east"] == ["Stop", "Stop"]
 
     on_a_line("serial", coarse_rig, use)
 
 
 def test_stop_preempts_an_arm_that_listens_on_can(coarse_rig: Rig) -> None:
-    """An arm that listens for another host's heartbeats, up to 60 ms, gives way and is refused."""
+    """An arm listens up to 60 ms for another host; a stop supersedes it meanwhile."""
 
     async def use(chain: Chain) -> None:
         await chain.east.close()
@@ -346,8 +340,7 @@ def test_stop_preempts_an_arm_that_listens_on_can(coarse_rig: Rig) -> None:
 
 @pytest.mark.parametrize("line", LINES)
 def test_cancelled_stop_releases_the_line(line: str, coarse_rig: Rig) -> None:
-    """Its caller is cancelled before its turn: what waits on the line is sent all the
-    same, and the next requests find it free."""
+    """A stop that is cancelled before its turn blocks no waiting or later request."""
 
     async def use(chain: Chain) -> None:
         beat = asyncio.create_task(chain.west.heartbeat())
@@ -366,8 +359,7 @@ def test_cancelled_stop_releases_the_line(line: str, coarse_rig: Rig) -> None:
 
 @pytest.mark.parametrize("line", LINES)
 def test_cancellation_during_preemption_is_a_cancellation(line: str, coarse_rig: Rig) -> None:
-    """A request that its caller gives up in the very moment in which it gives way ends as
-    cancelled, not as refused: time-outs of callers keep their meaning."""
+    """CancelledError, not CommandRefused, so that timeouts of callers work."""
 
     async def use(chain: Chain) -> None:
         beat = asyncio.create_task(chain.west.heartbeat())
@@ -391,8 +383,7 @@ def test_cancellation_during_preemption_is_a_cancellation(line: str, coarse_rig:
 def test_stop_precedes_retries_of_stop_class_requests(
     line: str, silencing: type[Request], first: Reply | None, coarse_rig: Rig
 ) -> None:
-    """Where a disarm or a silent set has to be repeated, a stop requested meanwhile is out
-    8 ms later at the latest, and 10 ms where an answer is owed; the repetition follows it."""
+    """A stop is sent within 8 ms, and 10 ms more where a reply is missing, before the retry."""
 
     async def use(chain: Chain) -> None:
         east = chain.far.devices["east"]
@@ -412,7 +403,7 @@ def test_stop_precedes_retries_of_stop_class_requests(
             else chain.east.apply(chain.tone(chain.east, 7, 0.0))
         )
         waiting = asyncio.create_task(silent)
-        await asyncio.sleep(0.004)  # it is out
+        await asyncio.sleep(0.004)  # it is sent
         begin = asyncio.get_running_loop().time()
         async with asyncio.timeout(1):
             status = await chain.east.stop()
@@ -431,8 +422,7 @@ def test_stop_precedes_retries_of_stop_class_requests(
 
 @pytest.mark.parametrize("line", LINES)
 def test_joining_amplifier_waits_for_a_pending_reply(line: str, coarse_rig: Rig) -> None:
-    """East had the line for itself and is being asked when west is opened: west's first request
-    goes out after east's answer, for two on one pair of wires would spoil each other."""
+    """West's first request waits for east's reply, with which it would collide."""
 
     async def use(chain: Chain) -> None:
         await chain.west.close()

@@ -1,4 +1,4 @@
-"""Effects through the control loop, on a virtual clock: what the amplifier is told, and when."""
+"""Effects through the control loop, in virtual time: what the amplifier receives, and when."""
 
 import asyncio
 
@@ -16,8 +16,8 @@ from virtual_loop import in_virtual_time
 
 @pytest.mark.parametrize("duration", [0.020, 0.040, 0.065])
 @in_virtual_time
-async def test_a_click_ends_on_time_while_nothing_moves(duration: float) -> None:
-    """Told to fall silent within a millisecond of its end, not with the next heartbeat."""
+async def test_click_ends_on_time_when_the_finger_rests(duration: float) -> None:
+    """Silence is sent within a millisecond of its end, not with the next heartbeat."""
     layout = Layout(effects={"click": Click(duration=duration)}, elsewhere="click")
     async with running(intent_source=EffectPlayer(layout)) as bench:
         loop = asyncio.get_running_loop()
@@ -33,11 +33,11 @@ async def test_a_click_ends_on_time_while_nothing_moves(duration: float) -> None
 
 
 @in_virtual_time
-async def test_an_effect_that_fails_is_silence_and_no_more() -> None:
-    """Of a plug-in that raises: all fall silent for as long as it does, then touches are felt."""
+async def test_failing_effect_is_silent_until_it_recovers() -> None:
+    """Touches are felt again once the plug-in does not raise."""
 
     class Broken(Effect):
-        """Raises at the second look."""
+        """Raises at the second call."""
 
         kind = "broken"
         is_for_motion = False

@@ -23,8 +23,8 @@ def refused(path: Path, text: str) -> str:
     return str(caught.value)
 
 
-def test_example() -> None:
-    """The layout in the examples, by its own numbers in metres."""
+def test_load_layout_reads_the_example() -> None:
+    """With its numbers in metres."""
     layout = load_layout(EXAMPLE, load_rig(example_rig_path()).plate)
     assert [region.name for region in layout.regions] == ["keypad", "slider", "knob", "patch"]
     keypad, slider, _, patch = layout.regions
@@ -43,8 +43,8 @@ def test_example() -> None:
     assert layout.region_at(0.30, 0.01) is None
 
 
-def test_later_regions_lie_on_top(tmp_path: Path) -> None:
-    """Where two overlap, the one that stands later in the file is touched."""
+def test_region_at_returns_the_later_region_where_two_overlap(tmp_path: Path) -> None:
+    """In the order of the file."""
     path = tmp_path / "layout.yaml"
     path.write_text(
         "regions:\n"
@@ -83,15 +83,15 @@ def test_load_layout_names_place_and_remedy(
     assert remedy in reported
 
 
-def test_all_problems_at_once(tmp_path: Path) -> None:
-    """Everything that is wrong is told in one go."""
-    told = refused(
+def test_load_layout_reports_all_problems_at_once(tmp_path: Path) -> None:
+    """Each with its key."""
+    reported = refused(
         tmp_path / "layout.yaml",
         "effects: {a: {kind: silk}, b: {kind: click, level: 90}}\n"
         "regions: {c: {on_press: d}}\nelsewhere: e\n",
     )
     keys = ("effects.a.kind", "effects.b.level", "regions.c", "regions.c.on_press", "elsewhere")
-    assert [key for key in keys if f"{key}:" not in told] == []
+    assert [key for key in keys if f"{key}:" not in reported] == []
 
 
 @pytest.mark.parametrize("text", ["plate: {}\n", "rig: rig.yaml\n"])

@@ -33,8 +33,8 @@ def in_force(rig: Rig, reports: Reports) -> GuardLimits:
     return make_guards(rig, {"main": reports})["main"].limits  # type: ignore[dict-item]
 
 
-def test_every_limit_of_the_file_reaches_the_guard(tmp_path: Path) -> None:
-    """What the file says holds where amplifier and ceiling allow more."""
+def test_make_guards_applies_every_limit_of_the_file(tmp_path: Path) -> None:
+    """Where amplifier and ceiling allow more."""
     text = example_rig_path().read_text(encoding="utf-8").replace("mesh: auto", "mesh: 12x9")
     for key in ("slew", "power", "on_time", "duty", "rate"):
         assert f"  # {key}:" in text
@@ -63,21 +63,21 @@ def test_every_limit_of_the_file_reaches_the_guard(tmp_path: Path) -> None:
         ({"on_time": 5.0, "power": 1.5}, {}, {"on_time": 5.0, "power": 1.5}),
     ],
 )
-def test_the_least_holds(
+def test_make_guards_applies_the_lowest_limit(
     coarse_rig: Rig,
     file: dict[str, float],
     reported: dict[str, float],
     least: dict[str, float],
 ) -> None:
-    """Of file, amplifier and built-in ceiling, whichever it is."""
+    """Of file, amplifier and built-in ceiling."""
     rig = replace(coarse_rig, limits=replace(Limits(40.0, 500.0, 1.0), **file))
     limits = in_force(rig, Reports(replace(CAPABILITIES, **reported)))  # type: ignore[arg-type]
     for name, value in least.items():
         assert getattr(limits, name) == pytest.approx(value)
 
 
-def test_a_limited_slew_makes_ramps_longer_instead_of_silencing(coarse_rig: Rig) -> None:
-    """Half of the stroke at 10 a second takes 50 ms; a ramp that is long enough stays."""
+def test_route_lengthens_ramps_to_the_slew_limit(coarse_rig: Rig) -> None:
+    """Half of the stroke at 10 /s takes 50 ms; a ramp that is long enough stays."""
     rig = replace(coarse_rig, limits=replace(coarse_rig.limits, slew=10.0))
     guard = make_guards(rig, {"main": Reports()})["main"]  # type: ignore[dict-item]
     half = {"SW": Tone(110.0, rig.era("SW").stroke / 2)}

@@ -1,4 +1,4 @@
-"""What the table is asked for intents, and when a pattern is chosen anew."""
+"""Questions to the table for an intent, and when a pattern is selected again."""
 
 import math
 from dataclasses import replace
@@ -26,7 +26,7 @@ CAPABILITIES = PlaybackCapabilities(
 
 
 class Table:
-    """A table that remembers what it was asked, and refuses targets left of `refuse_below`."""
+    """A table that records its questions, and refuses targets left of `refuse_below`."""
 
     plate = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
     frequencies = np.array([100.0])
@@ -39,7 +39,7 @@ class Table:
         self.quiet_level: float | None = None
 
     def prepare(self, mode: str) -> None:
-        """Not asked for here."""
+        """Do nothing."""
 
     def query(self, question: Question) -> Pattern:
         """A pattern that names its question."""
@@ -78,11 +78,13 @@ def table() -> Table:
     return Table()
 
 
-def test_all_others_are_quiet(table: Table) -> None:
-    """The table is asked for the target at its level, in the mode and band of the amplifiers."""
-    selection = Selector(table).select(
-        (at(1, 0.1), at(2, 0.2), at(3, 0.25)), wanting(c3=17.0), CAPABILITIES
-    )
+def test_selector_keeps_other_contacts_quiet(table: Table) -> None:
+    """The question has the target's level, and drive modes and band of the amplifiers."""
+    contacts = (at(1, 0.1), at(2, 0.2), at(3, 0.25))
+    shaped = replace(CAPABILITIES, shaping=replace(PLAIN, onsets=True))
+    Selector(table).select(contacts, wanting(c3=17.0), shaped)
+    assert table.asked.pop().envelopes
+    selection = Selector(table).select(contacts, wanting(c3=17.0), CAPABILITIES)
     (question,) = table.asked
     assert (question.targets, question.quiet) == (((0.25, 0.1),), ((0.1, 0.1), (0.2, 0.1)))
     assert (question.level_db_sl, question.drive_mode) == (17.0, "phased")
@@ -96,8 +98,8 @@ def test_all_others_are_quiet(table: Table) -> None:
     )
 
 
-def test_several_targets_are_told_one_by_one(table: Table) -> None:
-    """The strongest gives the level, the others are softer; each is told what it will feel.
+def test_selector_predicts_each_of_several_targets(table: Table) -> None:
+    """The strongest gives the level, the others are softer.
 
     By hand: amplitudes go with x, so the mean over a fingertip is that at its centre, 20 dB SL at
     0.1 m and 26 at 0.2; the loudest point of the quiet one, on a rim of 13 mm, lies at 0.063 m.
@@ -124,8 +126,8 @@ def test_beside_a_level_no_level_means_the_strongest_of_them(table: Table) -> No
     assert table.asked[0].softer_db == (0.0, 0.0, 6.0)
 
 
-def test_as_strong_as_the_neighbours_allow(table: Table) -> None:
-    """Asked for at 12 dB SL; with 14 dB less at the quiet finger, -10 dB there leave 4 here."""
+def test_selector_scales_to_what_the_neighbours_allow(table: Table) -> None:
+    """Queried at 12 dB SL; with 14 dB less at the quiet finger, -10 dB there leave 4 here."""
     table.quiet_level = -2.0
     selection = Selector(table).select((at(1, 0.1), at(2, 0.2)), wanting(c1=None), CAPABILITIES)
     assert table.asked[0].level_db_sl == 12.0
@@ -138,13 +140,15 @@ def test_as_strong_as_the_neighbours_allow(table: Table) -> None:
 @pytest.mark.parametrize(
     ("quiet", "largest", "level"),
     [
-        (-40.0, 1.0, 26.0),  # nobody is to be numbed
+        (-40.0, 1.0, 26.0),
         (None, 1.0, 26.0),
-        (-40.0, 2e-6, 12 + 20 * math.log10(2)),  # the ERA's stroke ends it
+        (-40.0, 2e-6, 12 + 20 * math.log10(2)),
     ],
 )
-def test_where_strength_ends(quiet: float | None, largest: float, level: float) -> None:
-    """At twice what is strong, or at the stroke; without neighbours too."""
+def test_strongest_is_bounded_by_level_and_stroke(
+    quiet: float | None, largest: float, level: float
+) -> None:
+    """Twice a strong vibration, or the full stroke; without neighbours too."""
     pattern = Pattern({"SW": Tone(100.0, 1e-6)}, 0.02, 12.0, None, quiet)
     found = strongest(pattern, {"SW": largest})
     assert found.level_db_sl == pytest.approx(level)
@@ -152,23 +156,23 @@ def test_where_strength_ends(quiet: float | None, largest: float, level: float) 
     assert found.excitation["SW"].amplitude == pytest.approx(1e-6 * gain)
 
 
-def test_what_cannot_be_felt_alone_is_not_played() -> None:
-    """Less than 10 dB between target and neighbour leave nothing to be felt."""
+def test_strongest_refuses_less_than_10_db_of_contrast() -> None:
+    """Nothing would be felt at the target alone."""
     pattern = Pattern({"SW": Tone(100.0, 1e-6)}, 0.02, 12.0, None, 3.0)
     with pytest.raises(InputError):
         strongest(pattern, {"SW": 1.0})
 
 
 def or_less(level: float) -> HapticIntent:
-    """One level at contact 1, or less where that cannot be had."""
+    """One level at contact 1, or less where the plate cannot reach it."""
     return HapticIntent((Target(ContactKey("a", 1), level, or_less=True),))
 
 
-def test_a_level_or_less(table: Table) -> None:
-    """Beyond what can be had: as strong as neighbours and stroke allow, and never above the level.
+def test_selector_saturates_a_level_or_less(table: Table) -> None:
+    """As strong as neighbours and stroke allow, and never above the level.
 
     12 dB SL at 1 um, a stroke of 2 um: 6 dB more; at the quiet finger there are -17 dB, 7 dB less
-    than it may have.
+    than allowed.
     """
     table.most, table.quiet_level = 15.0, -17.0
     capabilities = replace(CAPABILITIES, max_amplitudes={"SW": 2e-6})
@@ -183,8 +187,8 @@ def test_a_level_or_less(table: Table) -> None:
     assert (selection.pattern, selection.reason) == (None, "too loud")
 
 
-def test_a_level_or_less_on_a_plate() -> None:
-    """60 dB SL is more than the paper's ERAs can do: what they can is played, at full stroke."""
+def test_selector_saturates_at_full_stroke_on_a_plate() -> None:
+    """60 dB SL is more than the ERAs of the paper reach."""
     table, full = small_table(), dict.fromkeys(("SW", "SE", "NE", "NW"), 0.0001)
     capabilities = PlaybackCapabilities("switched", ("switched",), (40.0, 500.0), full, PLAIN)
     selection = Selector(table).select((at(1, 0.1),), or_less(60.0), capabilities)
@@ -194,8 +198,8 @@ def test_a_level_or_less_on_a_plate() -> None:
     assert loudest == pytest.approx(1e-4)
 
 
-def test_nothing_wanted(table: Table) -> None:
-    """No target, or none that is on the plate: nothing is asked, and the reason is the intent's."""
+def test_selector_queries_nothing_without_targets(table: Table) -> None:
+    """No target, or none on the plate; the reason is that of the intent."""
     for intent in (wanting(), wanting(c9=20.0)):
         selector = Selector(table)
         for contacts in [(), (at(1, 0.1),), (at(1, 0.29),)]:
@@ -206,11 +210,8 @@ def test_nothing_wanted(table: Table) -> None:
 
 
 @pytest.mark.parametrize("mover", [0, 1])
-def test_moves(table: Table, mover: int) -> None:
-    """Up to 8 mm from where the pattern was chosen it stays, beyond it is chosen anew.
-
-    It is the way from there that counts, not from the frame before, and of any contact.
-    """
+def test_selector_keeps_a_pattern_within_8_mm(table: Table, mover: int) -> None:
+    """The distance of any contact counts from where the pattern was selected."""
     selector, intent = Selector(table), wanting(c2=20.0)
 
     def contacts(distance: float) -> tuple[Contact, ...]:
@@ -226,7 +227,7 @@ def test_moves(table: Table, mover: int) -> None:
     assert selector.select(contacts(0.0), intent, CAPABILITIES) is not second
 
 
-def test_other_wishes_are_another_pattern(table: Table) -> None:
+def test_selector_queries_again_for_another_intent(table: Table) -> None:
     """Another level, one more target, one fewer."""
     selector, contacts = Selector(table), (at(1, 0.1), at(2, 0.2))
     for levels in ({"c1": 20.0}, {"c1": 14.0}, {"c1": 14.0, "c2": 14.0}, {"c2": 14.0}):
@@ -235,15 +236,15 @@ def test_other_wishes_are_another_pattern(table: Table) -> None:
     assert len(table.asked) == 4
 
 
-def test_a_quiet_contact_that_lifts_changes_nothing(table: Table) -> None:
-    """The target goes on feeling the same."""
+def test_selector_keeps_the_pattern_when_a_quiet_contact_lifts(table: Table) -> None:
+    """A change would be felt at the target."""
     selector, intent = Selector(table), wanting(c2=20.0)
     first = selector.select((at(1, 0.1), at(2, 0.2)), intent, CAPABILITIES)
     assert selector.select((at(2, 0.2),), intent, CAPABILITIES) is first
 
 
-def test_refused_by_the_table(table: Table) -> None:
-    """A table's refusal is silence with its words, asked again when it may have changed."""
+def test_selector_is_silent_when_the_table_refuses(table: Table) -> None:
+    """The reason is that of the table; contacts that change cause another query."""
     table.refuse_below = 0.2
     selector, intent = Selector(table), wanting(c2=20.0)
     refused = selector.select((at(1, 0.25), at(2, 0.1)), intent, CAPABILITIES)
@@ -256,8 +257,8 @@ def test_refused_by_the_table(table: Table) -> None:
     assert selector.select((at(2, 0.21),), intent, CAPABILITIES).pattern is not None
 
 
-def test_a_table_that_fails_is_not_asked_again_for_the_same(table: Table) -> None:
-    """Whatever it raises is silence with its words until something else is wanted."""
+def test_selector_queries_a_failing_table_once(table: Table) -> None:
+    """Its exception is the reason for silence until the contacts change."""
     table.error = ZeroDivisionError("by no ERA")
     selector, intent = Selector(table), wanting(c1=20.0)
     failed = selector.select((at(1, 0.1),), intent, CAPABILITIES)
@@ -266,10 +267,3 @@ def test_a_table_that_fails_is_not_asked_again_for_the_same(table: Table) -> Non
     assert len(table.asked) == 1
     table.error = None
     assert selector.select((at(1, 0.2),), intent, CAPABILITIES).pattern is not None
-
-
-def test_with_envelopes_the_table_is_told_so(table: Table) -> None:
-    """It may choose by steady contrast then."""
-    capabilities = replace(CAPABILITIES, shaping=replace(PLAIN, onsets=True))
-    Selector(table).select((at(1, 0.1),), wanting(c1=20.0), capabilities)
-    assert table.asked[0].envelopes

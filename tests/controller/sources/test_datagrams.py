@@ -1,4 +1,4 @@
-"""Datagrams that arrive while the event loop does something else."""
+"""Datagrams that arrive while the event loop is busy."""
 
 import asyncio
 import socket
@@ -20,7 +20,7 @@ Send: TypeAlias = Callable[..., Awaitable[list[tuple[bytes, float]]]]
 
 @asynccontextmanager
 async def receiving() -> AsyncIterator[Send]:
-    """Sends datagrams while the loop is busy, and gives them with when they are said to have come.
+    """Sends datagrams while the loop is busy; returns them with their reported arrival.
 
     pause [s]: after each of them.
     """
@@ -47,10 +47,10 @@ async def receiving() -> AsyncIterator[Send]:
 
 
 async def until_stamped(send: Send) -> None:
-    """Wait until the system notes when datagrams come.
+    """Wait until the system timestamps datagrams.
 
-    Linux begins to do so some time after the first socket of all has asked for it; until then they
-    have the time at which they are read.
+    Linux begins some time after the first socket requested it; until then they have the time at
+    which they are read.
     """
     loop = asyncio.get_running_loop()
     async with asyncio.timeout(20):
@@ -61,9 +61,9 @@ async def until_stamped(send: Send) -> None:
                 return
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not say when they came")
-async def test_each_has_the_time_at_which_it_arrived() -> None:
-    """However late the loop looks, they are as far apart as they were sent, and in the past."""
+@pytest.mark.skipif(sys.platform != "linux", reason="timestamps of Linux")
+async def test_datagrams_have_their_time_of_arrival() -> None:
+    """However late they are read: as far apart as they were sent, and in the past."""
     loop = asyncio.get_running_loop()
     async with receiving() as send:
         await until_stamped(send)
@@ -77,15 +77,15 @@ async def test_each_has_the_time_at_which_it_arrived() -> None:
     assert times[2] < loop.time() - 0.9 * PAUSE
 
 
-async def test_one_that_is_too_long_is_known_by_its_length() -> None:
-    """Of more than the largest exactly one byte more is handed on."""
+async def test_oversized_datagram_is_cut_to_one_byte_more() -> None:
+    """So that its receiver can tell."""
     async with receiving() as send:
         (short, _), (long, _) = await send(bytes(100), bytes(150))
     assert (len(short), len(long)) == (100, 101)
 
 
-async def test_whoever_receives_may_close() -> None:
-    """What has arrived behind the datagram that closed the line is not handed on."""
+async def test_receiver_may_close_within_its_callback() -> None:
+    """Datagrams that arrived after that one are not handed on."""
     received: list[bytes] = []
     lines: list[Datagrams] = []
     done = asyncio.Event()
@@ -105,10 +105,10 @@ async def test_whoever_receives_may_close() -> None:
     assert received == [b"1"]
 
 
-async def test_a_system_clock_that_was_set_makes_nothing_old(
+async def test_datagrams_have_the_time_of_reading_when_the_clock_was_set(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Between arrival and reading the clock jumped by an hour: it counts from when it is read."""
+    """The clock jumped by an hour between arrival and reading."""
     loop = asyncio.get_running_loop()
     begin = loop.time()
     clock = time.time

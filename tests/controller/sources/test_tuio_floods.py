@@ -1,4 +1,4 @@
-"""Bundles that wait in a queue: which of them are moot, and that leaving them out loses nothing."""
+"""Waiting bundles: which are superseded, and that dropping those loses nothing."""
 
 import asyncio
 import logging
@@ -18,7 +18,7 @@ HERE, THERE = ("127.0.0.1", 5001), ("127.0.0.1", 5002)
 
 
 def partial(source: str, alive: list[int], places: dict[int, float]) -> bytes:
-    """A bundle that names cursors and places only some of them, as TUIO 1.1 allows."""
+    """A bundle with the positions of only some cursors, as TUIO 1.1 allows."""
     bundle = OscBundleBuilder(IMMEDIATELY)
     messages: list[list[tuple[str, object]]] = [
         [("s", "source"), ("s", source)],
@@ -37,25 +37,25 @@ def partial(source: str, alive: list[int], places: dict[int, float]) -> bytes:
 
 
 def full(source: str, *ids: int) -> bytes:
-    """A bundle that places all."""
+    """A bundle with all positions."""
     return tuio_datagram(TouchFrame(source, 0.0, tuple(Touch(id, 0.5, 0.5) for id in ids)), -1)
 
 
-def waiting(*said: tuple[bytes, Peer]) -> list[Datagram]:
-    """Datagrams in the order in which they came."""
-    return [Datagram(data, peer, float(number)) for number, (data, peer) in enumerate(said)]
+def waiting(*sent: tuple[bytes, Peer]) -> list[Datagram]:
+    """Datagrams in order of arrival."""
+    return [Datagram(data, peer, float(number)) for number, (data, peer) in enumerate(sent)]
 
 
-def test_the_newest_complete_bundle_of_each_sender_is_enough() -> None:
-    """Another name, or another port, is another sender; the order stays."""
+def test_without_superseded_keeps_the_newest_complete_bundle_of_each_sender() -> None:
+    """Another name or port is another sender; the order stays."""
     all_of_it = waiting(
         (full("a", 1), HERE), (full("b", 1), HERE), (full("a", 2), THERE), (full("a"), HERE)
     )
     assert without_superseded(all_of_it) == all_of_it[1:]
 
 
-def test_what_a_later_bundle_does_not_repeat_is_kept() -> None:
-    """A cursor that is alive but not placed again is where an older bundle has put it."""
+def test_without_superseded_keeps_bundles_before_an_incomplete_one() -> None:
+    """The position of a cursor that is alive may be in an older bundle only."""
     all_of_it = waiting(
         (full("a", 1, 2), HERE), (partial("a", [1, 2], {1: 0.1}), HERE), (b"no bundle", HERE)
     )
@@ -74,14 +74,11 @@ bundles = st.builds(
 
 
 @given(st.lists(st.tuples(bundles, st.sampled_from([HERE, THERE])), max_size=12))
-def test_who_reads_the_rest_knows_the_same(said: list[tuple[bytes, Peer]]) -> None:
-    """What fingers there are in the end does not depend on whether moot bundles were read.
-
-    Each sender speaks from one port here: one that speaks from two contradicts itself.
-    """
-    said = [(data, peer) for data, peer in said if (peer == HERE) == (b"a\0\0\0" in data)]
+def test_without_superseded_preserves_the_final_touches(sent: list[tuple[bytes, Peer]]) -> None:
+    """For any bundles, of senders with one port each."""
+    sent = [(data, peer) for data, peer in sent if (peer == HERE) == (b"a\0\0\0" in data)]
     frames: list[dict[str, tuple[Touch, ...]]] = []
-    for each in (waiting(*said), without_superseded(waiting(*said))):
+    for each in (waiting(*sent), without_superseded(waiting(*sent))):
         reader = TuioReader(RejectCounter(logging.getLogger(__name__)))
         frames.append({})
         for data, peer, arrived in each:
@@ -91,8 +88,8 @@ def test_who_reads_the_rest_knows_the_same(said: list[tuple[bytes, Peer]]) -> No
     assert frames[0] == frames[1]
 
 
-async def test_of_a_queue_the_newest_is_handed_on_first_of_all() -> None:
-    """Two hundred frames that came while the loop was busy are one: that all fingers are up."""
+async def test_listen_drops_superseded_bundles_of_a_flood() -> None:
+    """Of 200 frames that arrived while the loop was busy a few and the newest are delivered."""
     received: list[bytes] = []
     done = asyncio.Event()
     up = full("a")

@@ -32,7 +32,7 @@ fuzz: .venv/installed-test
 	$(BIN)/python tests/support/mutation.py
 
 # Two hundred daemons killed at random moments, over every wire, and when all was silent;
-# `make test` takes fifteen. Others: make kill-test KILLS='--kills 20 --seed 7'
+# `make test` takes eight. Others: make kill-test KILLS='--kills 20 --seed 7'
 kill-test: .venv/installed-test
 	$(BIN)/python tests/support/kills.py $(KILLS)
 

@@ -12,7 +12,7 @@ from typed_page import Typed, Written, read_steps
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "tutorials"
-LONG = {"cluster-study", "daemon-with-a-layout"}  # real processes, watchdogs in real time
+IN_REAL_TIME = {"daemon-with-a-layout"}  # its amplifier has a watchdog
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def home() -> Iterator[Path]:
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, marks=[pytest.mark.alone] if page in LONG else [])
+        pytest.param(page, marks=[pytest.mark.alone] if page in IN_REAL_TIME else [])
         for page in sorted(path.stem for path in PAGES.glob("*.md"))
     ],
 )

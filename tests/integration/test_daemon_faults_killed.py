@@ -6,7 +6,7 @@ from kills import PLACES, kill_everywhere
 
 pytestmark = pytest.mark.alone
 
-KILLS = 15  # `make kill-test` takes two hundred
+KILLS = 8  # `make kill-test` takes two hundred
 
 
 async def test_every_channel_is_silent_in_time_whenever_it_is_killed() -> None:

@@ -8,13 +8,7 @@ import pytest
 from planted_bugs import Bug, lifts_are_dropped, routed
 
 BUGS = {
-    "levels are of three quarters of the stroke": Bug(
-        "level", routed(lambda one: replace(one, level=one.level / 0.75))
-    ),
     "phases have the other sign": Bug("phase", routed(lambda one: replace(one, phase=-one.phase))),
-    "frequencies are too high": Bug(
-        "frequency", routed(lambda one: replace(one, frequency=one.frequency + 40))
-    ),
     "lifts are dropped": Bug("lift", lifts_are_dropped),
 }
 """By name. The daemon's own reports show none of them; what a finger feels does."""

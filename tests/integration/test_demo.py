@@ -186,7 +186,7 @@ def far_end_of(pid):
     ],
 )
 def test_demo_refuses_bad_options_with_status_2(arguments, names, monkeypatch, capsys, tmp_path):
-    """An unknown wire, a recording that is missing or none: the place or the choices, nothing else."""
+    """An unknown wire, a recording that is missing or none: place or choices, no more."""
     monkeypatch.chdir(tmp_path)
     commands = entry_points(group="era_haptics.commands")
     assert run(["demo", *map(str, arguments)], commands) == 2

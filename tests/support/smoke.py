@@ -30,7 +30,8 @@ from installed_era import Failed, InstalledEra, try_demo, try_files, try_gateway
 PYTHONS = ("python3.11", "python3.12", "python3.13", "python3.14")
 REPEATS = 11
 HEAD = (
-    "| Python | distributions | MB installed | MB of era-haptics | era --help | a notebook's imports |\n"
+    "| Python | distributions | MB installed | MB of era-haptics | era --help "
+    "| a notebook's imports |\n"
     "|---|---|---|---|---|---|"
 )
 _OURS = ("registry", "controller", "drivers", "era_haptics", "model", "sim")

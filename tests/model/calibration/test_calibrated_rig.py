@@ -1,4 +1,4 @@
-"""New values in a rig file that somebody wrote, in whatever way they wrote it."""
+"""Calibrated values in rig files of any style."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -61,7 +61,7 @@ amplifiers: {m: {url: "sim://"}}
 
 
 def calibration(rig: Rig) -> Calibration:
-    """One that found other values everywhere, gains for all but the last ERA."""
+    """Other values everywhere, gains for all but the last ERA."""
     material = replace(rig.plate.material, E=1.2345678 * rig.plate.material.E)
     eras = tuple(
         replace(

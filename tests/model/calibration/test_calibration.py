@@ -76,17 +76,16 @@ def test_calibrate_finds_every_parameter(truth: Rig, fitted: Calibration) -> Non
 
 
 def test_calibrate_finds_gains(truth: Rig, fitted: Calibration) -> None:
-    """Complex gains, 8 % and 6 degrees off, are known to 1 % in the median, 4 % at worst."""
-    wrong = np.abs(gains_of(fitted.rig) / gains_of(truth) - 1)
+    """Gains 8 % and 6 degrees off are known to 1 % in the median, 4 % at worst.
+
+    Their standard error follows from noise of 1 %, half of its power in each part, over the eleven
+    live sensors: 0.21 %.
+    """
+    true = gains_of(truth)
+    wrong = np.abs(gains_of(fitted.rig) / true - 1)
     assert np.median(wrong) < 0.01
     assert wrong.max() < 0.04
-
-
-def test_calibrate_standard_error_of_gains_follows_from_noise(
-    truth: Rig, fitted: Calibration
-) -> None:
-    """Noise of 1 %, half of its power in each part, over the eleven live sensors: 0.21 %."""
-    errors = fitted.gains_error / np.abs(gains_of(truth))
+    errors = fitted.gains_error / np.abs(true)
     assert np.median(errors) == pytest.approx(0.01 / np.sqrt(2 * 11), rel=0.1)
 
 
@@ -207,7 +206,7 @@ def test_calibrate_refuses_too_few_sensors_and_silence(rig: Rig, truth: Rig) -> 
     """Two live sensors, and silence."""
     full = measured(truth)
     two = Responses(NAMES[:2], POINTS[:2], full.frequencies, full.values[:, :, :2])
-    with pytest.raises(InputError, match="2 sensors measured; at least 3"):
+    with pytest.raises(InputError, match="2 sensors"):
         calibrate(rig, two)
-    with pytest.raises(InputError, match="every measured response is zero"):
+    with pytest.raises(InputError, match="zero"):
         calibrate(rig, replace(full, values=0 * full.values))

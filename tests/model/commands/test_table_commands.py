@@ -50,20 +50,11 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_build_prints_numbers_file_and_next_command(tmp_path: Path) -> None:
+def test_build_writes_a_table_and_what_made_it(tmp_path: Path) -> None:
     """66 patterns, 4 * 3 alone and 6 * 3² in pairs, for 12 cells; no other file is left."""
     path = tmp_path / "t.npz"
     lines = table("build", RIG, "-o", path, *QUICK).stdout.splitlines()
-    assert lines[0].startswith("66 patterns of 3 frequencies for 12 cells")
-    assert "12x9" in lines[1]
-    assert str(path) in lines[-2]
     assert lines[-1] == f"Next: era table show {path}"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_build_json_has_what_made_the_table(tmp_path: Path) -> None:
-    """Frequencies, mesh, mode and fingerprint, which are those of the file."""
-    path = tmp_path / "t.npz"
     answer = as_json("build", RIG, "-o", path, "--mode", "phased", *QUICK)
     assert answer["drive_frequencies_hz"] == [60.0, 110.0, 250.0]
     assert (answer["patterns"], answer["cells"], answer["mode"]) == (66, 12, "phased")
@@ -72,6 +63,7 @@ def test_build_json_has_what_made_the_table(tmp_path: Path) -> None:
     assert answer["parts_reused"] == 0
     assert answer["files"] == [str(path)]
     assert load_table(path).fingerprint == answer["fingerprint"]
+    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize(
@@ -106,13 +98,12 @@ def test_build_resumes_when_it_was_ended(
     path, folder = tmp_path / "t.npz", tmp_path / "t.npz.parts"
     long = ["--mesh", "12x9", "--frequencies", "60:320:4", "--grid", "48x36"]
     with subprocess.Popen(
-        [ERA, "table", "build", RIG, "-o", str(path), *long,
-         "--workers", "2"],
+        [ERA, "table", "build", RIG, "-o", str(path), *long, "--workers", "2"],
         stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         text=True,
         start_new_session=True,
-    ) as running:  # fmt: skip
+    ) as running:
         while len(list(folder.glob("*.part.npz"))) < 3:
             assert running.poll() is None
             time.sleep(0.01)
@@ -129,23 +120,13 @@ def test_build_resumes_when_it_was_ended(
     assert [left.name for left in tmp_path.iterdir()] == ["t.npz"]
 
 
-def test_build_interrupted_at_once_names_no_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_show_prints_summary_map_and_a_query_that_has_an_answer(
+    built: Path, tmp_path: Path
 ) -> None:
-    """There is none to resume from."""
-
-    def interrupted(*arguments: object, **options: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("model.table.build.build_in_parts", interrupted)
-    result = CliRunner().invoke(app, ["table", "build", RIG, "-o", str(tmp_path / "t.npz"), *QUICK])
-    assert "interrupted" in result.stderr
-    assert ".parts" not in result.stderr
-
-
-def test_show_prints_summary_and_map(built: Path) -> None:
-    """Every row has a value, the map is 4 by 3, and each star of it is in the list."""
-    lines = table("show", built, "--weak").stdout.splitlines()
+    """The map is 4 by 3, each star of it is in the list, and the next command is quoted."""
+    spaced = tmp_path / "my table.npz"
+    spaced.write_bytes(built.read_bytes())
+    lines = table("show", spaced, "--weak").stdout.splitlines()
     rows = {line[:20].strip(): line[20:].strip() for line in lines}
     assert rows["dead zones"].startswith("0 %")
     for name in ("feasible cells", "contrast to 3 others", "mesh", "fingerprint"):
@@ -155,13 +136,7 @@ def test_show_prints_summary_and_map(built: Path) -> None:
     assert [len(line.split()) for line in cells] == [4, 4, 4]
     stars = sum(line.count("*") for line in cells)
     assert sum(line.startswith("(0.") for line in lines) == stars > 0
-
-
-def test_show_ends_with_a_query_that_has_an_answer(built: Path, tmp_path: Path) -> None:
-    """The next command is quoted for a shell, a space in the table's name included."""
-    spaced = tmp_path / "my table.npz"
-    spaced.write_bytes(built.read_bytes())
-    era, group, *words = shlex.split(table("show", spaced).stdout.splitlines()[-1])[1:]
+    era, group, *words = shlex.split(lines[-1])[1:]
     assert (era, group, words[1]) == ("era", "table", str(spaced))
     assert as_json(*words)["contrast_db"] > 0
 
@@ -226,34 +201,25 @@ def test_query_names_the_option_that_is_wrong(built: Path, options: list[str], n
         table("query", built, *options)
 
 
-def test_query_refuses_an_unreachable_level(built: Path) -> None:
-    """99 dB SL is beyond full stroke."""
-    with pytest.raises(UnreachableLevel):
-        table("query", built, "--target", "0.1,0.1", "--level", "99")
-
-
 def test_query_prints_levels_and_contrast(built: Path) -> None:
-    """One row per driven ERA, then measures; other ones without quiet fingers."""
+    """One row per driven ERA, then measures; 99 dB SL is beyond full stroke."""
     contacts = ["--target", "0.08,0.06", "--quiet", "0.22,0.16"]
     answer = as_json("query", built, *contacts)
     lines = table("query", built, *contacts).stdout.splitlines()
     assert [line.split()[0] for line in lines[: len(answer["drive"])]] == list(answer["drive"])
     assert f"{answer['contrast_db']:.1f} dB" in lines[len(answer["drive"]) + 1]
-    alone = table("query", built, "--target", "0.08,0.06").stdout
-    assert "cm²" in alone
+    assert "cm²" in table("query", built, "--target", "0.08,0.06").stdout
+    with pytest.raises(UnreachableLevel):
+        table("query", built, "--target", "0.1,0.1", "--level", "99")
 
 
 def test_plot_writes_its_pictures(built: Path, tmp_path: Path) -> None:
     """Four of them in a new folder, named in the answer; a command comes last."""
     folder = tmp_path / "new" / "pictures"
-    answer = as_json("plot", built, "-o", folder)
+    files = as_json("plot", built, "-o", folder)["files"]
     names = ["weak_cells", "levels", "contrast", "answer"]
-    assert answer["files"] == [str(folder / f"{name}.png") for name in names]
-    for file in answer["files"]:
-        assert Path(file).read_bytes().startswith(PNG)
-    lines = table("plot", built, "-o", folder).stdout.splitlines()
-    assert {Path(line.strip()) for line in lines[1:5]} == set(folder.glob("*.png"))
-    assert lines[5:] == [f"Next: era table show {built} --weak"]
+    assert files == [str(folder / f"{name}.png") for name in names]
+    assert all(Path(file).read_bytes().startswith(PNG) for file in files)
 
 
 def test_export_writes_both_formats(built: Path, tmp_path: Path) -> None:
@@ -263,6 +229,7 @@ def test_export_writes_both_formats(built: Path, tmp_path: Path) -> None:
     table("export", built, "--format", "csv", "--content", "fields", "-o", tmp_path / "f.csv")
     heads = [(tmp_path / name).read_text().split(",")[0] for name in ("t.csv", "f.csv")]
     assert heads == ["SW_hz", "x_m"]
+    assert (tmp_path / "t.mat").read_bytes().startswith(b"MATLAB 5.0")
     with pytest.raises(InputError, match="--content"):
         table("export", built, "--format", "mat", "--content", "fields", "-o", tmp_path / "t.mat")
 
@@ -283,6 +250,3 @@ def test_table_commands_do_not_replace_or_read_other_files(built: Path, tmp_path
         with pytest.raises(InputError):
             table(*arguments)
     assert rig.read_bytes() == disguised.read_bytes() == Path(RIG).read_bytes()
-    newer = tmp_path / "t.npz"
-    newer.write_bytes(built.read_bytes())
-    table("build", RIG, "-o", newer, *QUICK)  # replaces an older table

@@ -12,7 +12,7 @@ from model.diagnosis.polarity import phases_of_drive, signs_of_pairs
 @pytest.mark.parametrize(
     ("degrees", "sign"), [(0.0, 1), (80.0, 1), (-80.0, 1), (100.0, -1), (-100.0, -1), (180.0, -1)]
 )
-def test_a_channel_is_inverted_beyond_a_quarter_turn(degrees: float, sign: int) -> None:
+def test_phases_of_drive_inverts_beyond_a_quarter_turn(degrees: float, sign: int) -> None:
     """Measured is what was predicted, turned by an angle; that is found, and the nearer sign."""
     rng = np.random.default_rng(0)
     predicted = rng.standard_normal((5, 1, 4)) + 1j * rng.standard_normal((5, 1, 4))
@@ -26,7 +26,7 @@ def test_a_channel_is_inverted_beyond_a_quarter_turn(degrees: float, sign: int) 
     assert phase.confidence == pytest.approx(1.0)
 
 
-def test_signs_are_told_along_a_chain_of_pairs() -> None:
+def test_signs_of_pairs_follow_a_chain() -> None:
     """The first against the second, the second with the third: the first is the odd one out."""
     rng = np.random.default_rng(1)
     predicted = rng.standard_normal((4, 3, 6)) + 1j * rng.standard_normal((4, 3, 6))

@@ -1,10 +1,15 @@
-"""What a table is built for where nobody says which frequencies."""
+"""Drive frequencies of tables: defaults, and what is refused."""
 
 import numpy as np
 import pytest
 
+from model.errors import InputError
+from model.finger.grid import Grid
 from model.rig.rig import Limits
+from model.table.build import build_table
 from model.table.table import default_drive_frequencies
+from model.table.table_parts import TableProblem
+from paper_plate import make_paper_rig
 
 
 @pytest.mark.parametrize(
@@ -17,9 +22,23 @@ from model.table.table import default_drive_frequencies
         (61.0, 69.0, [61]),
     ],
 )
-def test_they_are_those_of_the_paper_that_the_rig_may_play(
-    low: float, high: float, expected: list[float]
-) -> None:
-    """60 to 320 Hz in steps of 10 (the paper's section 4) within the limits; never none at all."""
+def test_default_drive_frequencies_are_the_papers_within_the_limits(low, high, expected):
+    """60 to 320 Hz in steps of 10 (the paper's section 4) within the limits; at least one."""
     found = default_drive_frequencies(Limits(frequency_min=low, frequency_max=high, level=1.0))
     np.testing.assert_array_equal(found, list(expected))
+
+
+@pytest.mark.parametrize(
+    "frequencies",
+    [[], [100.0, 100.0], [200.0, 100.0], [10.0], [100.0, 900.0], [100.0, float("nan")]],
+)
+def test_build_refuses_impossible_frequencies(frequencies):
+    """None, unordered, outside the rig's limits, not a number."""
+    with pytest.raises(InputError, match="frequencies"):
+        build_table(make_paper_rig(12, 9), frequencies=np.array(frequencies))
+
+
+def test_table_problem_refuses_a_table_too_large_to_be_read():
+    """Two thousand frequencies on the finest grid, refused before anything is solved."""
+    with pytest.raises(InputError, match="GB"):
+        TableProblem(make_paper_rig(48, 36), np.linspace(40, 500, 2000), Grid(200, 200))

@@ -1,4 +1,4 @@
-"""The raster: fields read between its points are those of the plate."""
+"""Interpolation of fields on a raster."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from paper_table import FREQUENCIES, smooth_rig
 CONTACTS = [(0.15, 0.11), (0.0, 0.0), (0.3048, 0.1), (0.2, 0.225), (0.006, 0.0031)]
 
 
-def test_points_under_a_fingertip_are_those_of_the_disc():
+def test_fingertips_reads_the_points_of_the_disc():
     """Reading x and y themselves gives back the disc's points, finger after finger, edges cut."""
     plate = smooth_rig().plate
     raster = Raster.for_plate(plate, frequency_max=500.0)
@@ -23,7 +23,7 @@ def test_points_under_a_fingertip_are_those_of_the_disc():
     np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
-def test_fields_between_its_points_are_those_of_the_plate():
+def test_fingertips_interpolates_fields_of_the_plate():
     """At 500 Hz as well the interpolation is within 1e-4 of the field, beside an ERA as inside."""
     rig = smooth_rig()
     raster = Raster.for_plate(rig.plate, frequency_max=500.0)
@@ -39,7 +39,7 @@ def test_fields_between_its_points_are_those_of_the_plate():
 
 
 @pytest.mark.parametrize("thickness", [0.0001, 0.01])
-def test_very_thin_and_very_small_plates_have_a_raster_too(thickness):
+def test_for_plate_handles_thin_and_small_plates(thickness):
     """A foil of short waves, and a plate barely larger than a fingertip."""
     plate = Plate(0.02, 0.03, thickness, Material("any", E=70e9, rho=2700.0, nu=0.33))
     raster = Raster.for_plate(plate, frequency_max=500.0)
@@ -47,7 +47,7 @@ def test_very_thin_and_very_small_plates_have_a_raster_too(thickness):
     np.testing.assert_allclose(raster.at(heights, np.array([[0.011, 0.004]])), [[0.029]], rtol=1e-5)
 
 
-def test_a_raster_too_small_to_interpolate_in_is_refused():
+def test_raster_refuses_too_few_points():
     """Five points do not carry a quintic."""
     with pytest.raises(InputError, match="6 to"):
         Raster(5, 9, 0.1, 0.1)

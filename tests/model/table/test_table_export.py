@@ -1,4 +1,4 @@
-"""What other programs get of a table."""
+"""Export of tables to .mat and .csv files."""
 
 import csv
 import json
@@ -15,8 +15,6 @@ from model.table import export
 from model.table.export import export_csv, export_mat
 from model.table.file import save_table
 from small_table import FREQUENCIES, small_table
-
-PAGE = Path(__file__).parents[3] / "docs" / "reference" / "table-file.md"
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +36,7 @@ def read_csv(path):
         return list(csv.DictReader(stream))
 
 
-def test_a_mat_file_holds_the_table_by_value(table, struct):
+def test_export_mat_holds_the_table_to_the_bit(table, struct):
     """Fields, modes and provenance, to the bit and in their shapes."""
     np.testing.assert_array_equal(struct.acceleration_m_s2, table.acceleration)
     np.testing.assert_array_equal(struct.frequency_hz, FREQUENCIES)
@@ -54,7 +52,7 @@ def test_a_mat_file_holds_the_table_by_value(table, struct):
     assert struct.eras[2].x_m == 0.3048
 
 
-def test_patterns_in_a_mat_file_are_those_of_their_frequencies(table, struct):
+def test_export_mat_patterns_match_their_frequencies(table, struct):
     """4 * 3 + 6 * 9 rows; of two ERAs at two frequencies the response is the sum of both alone."""
     hz = struct.pattern_frequency_hz
     assert hz.shape == (66, 4)
@@ -71,7 +69,7 @@ def test_patterns_in_a_mat_file_are_those_of_their_frequencies(table, struct):
     assert (coherent < response(SW=110.0) + response(NE=110.0)).all()
 
 
-def test_what_the_plate_carries_is_in_a_mat_file(table, tmp_path):
+def test_export_mat_holds_masses(table, tmp_path):
     """One mass is a struct of one, none is empty."""
     held = np.vstack([table.held, table.held[:1]])
     laden = replace(table, masses=(PointMass(0.1, 0.15, 0.06),), held=held)
@@ -84,15 +82,15 @@ def test_what_the_plate_carries_is_in_a_mat_file(table, tmp_path):
     assert struct.masses.size == 0
 
 
-def test_a_table_that_a_mat_file_cannot_hold_is_refused(table, tmp_path, monkeypatch):
-    """Before anything is written; the error says what can be read instead."""
+def test_export_mat_refuses_a_table_too_large(table, tmp_path, monkeypatch):
+    """Before anything is written; the error names a remedy."""
     monkeypatch.setattr(export, "MAX_MAT_BYTES", 1000)
     with pytest.raises(InputError, match="numpy"):
         export_mat(table, tmp_path / "t.mat")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_patterns_as_csv(table, tmp_path):
+def test_export_csv_of_patterns(table, tmp_path):
     """A row a pattern, frequencies in Hz and empty where silent, a column a cell, to the bit."""
     export_csv(table, tmp_path / "t.csv", content="patterns")
     rows = read_csv(tmp_path / "t.csv")
@@ -109,7 +107,7 @@ def test_patterns_as_csv(table, tmp_path):
     np.testing.assert_array_equal(found, table.cell_sources[3] + table.cell_sources[10])
 
 
-def test_fields_as_csv(table, tmp_path):
+def test_export_csv_of_fields(table, tmp_path):
     """A row for each raster point and frequency, both parts of each ERA's field, to the bit."""
     export_csv(table, tmp_path / "t.csv", content="fields")
     rows = read_csv(tmp_path / "t.csv")
@@ -122,9 +120,9 @@ def test_fields_as_csv(table, tmp_path):
     assert found == table.acceleration[7, 2, 2]
 
 
-def test_the_page_names_everything_that_is_exported(struct, tmp_path, table):
+def test_format_page_names_everything_exported(struct, tmp_path, table):
     """Every field of the struct and of its structs, every array and every key of the header."""
-    page = PAGE.read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs/reference/table-file.md").read_text("utf-8")
     names = [*struct._fieldnames, *struct.plate._fieldnames, *struct.eras[0]._fieldnames]
     save_table(table, tmp_path / "t.npz")
     with np.load(tmp_path / "t.npz") as content:
@@ -133,8 +131,8 @@ def test_the_page_names_everything_that_is_exported(struct, tmp_path, table):
 
 
 @pytest.mark.parametrize("write", [export_mat, lambda t, p: export_csv(t, p, content="patterns")])
-def test_a_failed_export_leaves_the_old_file(table, tmp_path, monkeypatch, write):
-    """When the disk fails at the end, what was there before is there still, and nothing else."""
+def test_export_leaves_the_old_file_when_it_fails(table, tmp_path, monkeypatch, write):
+    """When the disk fails at the end, nothing else is left."""
     path = tmp_path / "t.out"
     path.write_text("before")
 

@@ -13,6 +13,8 @@ from model.table.file import load_table, save_table
 from paper_plate import make_paper_rig
 from small_table import FREQUENCIES, small_table
 
+REMEDY = "era table build"
+
 
 @pytest.fixture(scope="module")
 def table():
@@ -69,48 +71,42 @@ def test_save_table_leaves_the_old_file_when_writing_fails(table, path, monkeypa
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_load_table_refuses_another_plate(path):
+def test_load_table_refuses_another_plate_and_a_missing_file(path, tmp_path):
     """A plate a tenth of a millimetre thicker; the remedy is named."""
     rig = make_paper_rig(12, 9)
     thicker = replace(rig, plate=replace(rig.plate, thickness=0.0016))
-    with pytest.raises(InputError, match=r"fingerprint.*era table build"):
+    with pytest.raises(InputError, match=f"fingerprint.*{REMEDY}"):
         load_table(path, fingerprint=thicker.fingerprint)
-
-
-def test_load_table_names_the_command_when_there_is_none(tmp_path):
-    """The remedy for a missing table."""
-    with pytest.raises(InputError, match="era table build"):
+    with pytest.raises(InputError, match=REMEDY):
         load_table(tmp_path / "none.npz")
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.99])
-def test_load_table_refuses_a_flipped_bit(path, share):
-    """Anywhere in the file."""
-    data = bytearray(path.read_bytes())
-    data[int(share * len(data))] ^= 0x01
-    path.write_bytes(data)
-    with pytest.raises(InputError, match=str(path)):
-        load_table(path)
+def set_byte(data, at, value):
+    """Change a byte of a file."""
+    data[at] = value
 
 
 @pytest.mark.parametrize(
-    ("mark", "offset", "byte"),
-    [(b"PK\x01\x02", 8, 0x01), (b"), }", 3, ord(" "))],
-    ids=["encrypted member", "header that does not parse"],
+    "damage",
+    [
+        *(
+            lambda data, share=share: set_byte(
+                data, int(share * len(data)), data[int(share * len(data))] ^ 1
+            )
+            for share in (0.1, 0.5, 0.9, 0.99)
+        ),
+        lambda data: set_byte(data, data.rindex(b"PK\x01\x02") + 8, 1),
+        lambda data: set_byte(data, data.rindex(b"), }") + 3, ord(" ")),
+        lambda data: data.__delitem__(slice(len(data) // 2, None)),
+    ],
+    ids=["bit", "bit", "bit", "bit", "encrypted", "header that does not parse", "cut"],
 )
-def test_load_table_refuses_wrong_framing(path, mark, offset, byte):
-    """A flag that says encrypted, a bracket left open in an array's header."""
+def test_load_table_refuses_a_damaged_file(path, damage):
+    """A flipped bit anywhere, a wrong flag, half a header, half a file."""
     data = bytearray(path.read_bytes())
-    data[data.rindex(mark) + offset] = byte
+    damage(data)
     path.write_bytes(data)
-    with pytest.raises(InputError, match="readable"):
-        load_table(path)
-
-
-def test_load_table_refuses_a_truncated_file(path):
-    """The first half of the bytes."""
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(InputError, match="readable"):
+    with pytest.raises(InputError, match=str(path)):
         load_table(path)
 
 
@@ -154,88 +150,40 @@ def test_load_table_refuses_compressed_and_vast_members_unread(path, tmp_path):
         load_table(vast)
 
 
-def other_frequencies(header, arrays):
-    """In the header alone."""
-    header["frequencies_hz"][0] = 61.0
-
-
-def descending_frequencies(header, arrays):
-    """In the header and in the array."""
+def descending(header, arrays):
+    """Frequencies that descend."""
     header["frequencies_hz"].reverse()
     arrays["frequencies"] = arrays["frequencies"][::-1].copy()
 
 
-def no_frequencies(header, arrays):
-    """And nothing at them."""
+def without_frequencies(header, arrays):
+    """A table of no frequencies."""
     header["frequencies_hz"], header["discretisation_error"] = [], []
     arrays["frequencies"] = arrays["frequencies"][:0]
     arrays["acceleration"] = arrays["acceleration"][:, :0].copy()
     arrays["cell_sources"] = arrays["cell_sources"][:1]
 
 
-def cells_that_are_no_count(header, arrays):
-    """A count with a decimal point."""
-    header["grid"]["nx"] = 12.5
-
-
-def raster_that_is_no_count(header, arrays):
-    """A side of so many and a half points."""
-    header["raster"]["nx"] += 0.5
-
-
-def nothing_moves(header, arrays):
-    """At any frequency."""
-    arrays["acceleration"] *= 0
-
-
-def more_than_any_plate(header, arrays):
-    """What overflows when it is squared."""
-    arrays["acceleration"][3, 2, 1] = 1e30
-
-
-def not_a_number(header, arrays):
-    """One of all fields."""
-    arrays["acceleration"][0, 0, 0] = np.nan
-
-
-def another_plates_fingerprint(header, arrays):
-    """So that it would serve a rig that it was not built for."""
-    header["fingerprint"] = "0" * 64
-
-
-def raster_of_another_size(header, arrays):
-    """Fingers would be looked for elsewhere."""
-    header["raster"]["length"] *= 1.1
-
-
-def unknown_mode(header, arrays):
-    """What no question could be answered in."""
-    header["mode"] = "loud"
-
-
-def old_format(header, arrays):
-    """Of a version before the first."""
-    header["format_version"] = 0
-
-
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        (another_plates_fingerprint, "fingerprint"),
-        (raster_of_another_size, "raster"),
-        (unknown_mode, "'loud'"),
-        (raster_that_is_no_count, "raster.nx"),
-        (nothing_moves, "acceleration"),
-        (more_than_any_plate, r"acceleration.*1e\+30"),
-        (not_a_number, "acceleration must be finite"),
-        (other_frequencies, "frequencies"),
-        (descending_frequencies, "frequencies"),
-        (no_frequencies, "frequencies"),
-        (cells_that_are_no_count, "grid.nx"),
-        (old_format, "version 0"),
+        (lambda header, _: header.update(fingerprint="0" * 64), "fingerprint"),
+        (lambda header, _: header["raster"].update(length=0.4), "raster"),
+        (lambda header, _: header.update(mode="loud"), "'loud'"),
+        (lambda header, _: header["raster"].update(nx=40.5), "raster.nx"),
+        (lambda header, _: header["raster"].update(nx=39), "shape of acceleration"),
+        (lambda header, _: header["plate"].update(colour="red"), "plate"),
+        (lambda header, _: header["grid"].update(nx=12.5), "grid.nx"),
+        (lambda header, _: header.update(format_version=0), "version 0"),
+        (lambda header, _: header["frequencies_hz"].__setitem__(0, 61.0), "frequencies"),
+        (descending, "frequencies"),
+        (without_frequencies, "frequencies"),
+        (lambda _, arrays: arrays["acceleration"].fill(0), "acceleration"),
+        (lambda _, arrays: arrays["acceleration"].__setitem__((3, 2, 1), 1e30), r"1e\+30"),
+        (lambda _, arrays: arrays["acceleration"].__setitem__(0, np.nan), "acceleration"),
     ],
 )
-def test_load_table_refuses_a_header_that_contradicts_the_arrays(path, change, named):
+def test_load_table_refuses_content_that_contradicts_itself(path, change, named):
     """Impossible frequencies, counts and fields under a right checksum; the remedy is named."""
     with np.load(path) as content:
         arrays = dict(content)
@@ -245,5 +193,5 @@ def test_load_table_refuses_a_header_that_contradicts_the_arrays(path, change, n
     header["sha256"] = digest_of(json.dumps(header, sort_keys=True), arrays)
     encoded = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     np.savez(path, header=encoded, **arrays)
-    with pytest.raises(InputError, match=rf"{named}.*era table build"):
+    with pytest.raises(InputError, match=f"{named}.*{REMEDY}"):
         load_table(path)

@@ -1,7 +1,6 @@
 """Questions as JSON lines, and `era table query`."""
 
 import json
-from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -9,7 +8,7 @@ from typer.testing import CliRunner
 from model.cli import app
 from model.errors import InputError
 from model.table.file import save_table
-from model.table.query import query_batch, question_from_json
+from model.table.query import question_from_json
 from paper_table import smooth_table
 
 RUNNER = CliRunner()
@@ -23,8 +22,8 @@ def table_file(tmp_path_factory):
     return path
 
 
-def test_a_line_is_a_question():
-    """Every key of a line ends up where it belongs."""
+def test_question_from_json_reads_every_key():
+    """Targets, quiet fingers, mode, level and number of ERAs."""
     question = question_from_json(
         '{"targets": [[0.1, 0.1], [0.2, 0.2]], "quiet": [[0.05, 0.02]], "mode": "phased",'
         ' "level_db_sl": 15, "eras_at_most": 3}'
@@ -36,7 +35,7 @@ def test_a_line_is_a_question():
 
 
 @pytest.mark.parametrize(
-    ("line", "says"),
+    ("line", "named"),
     [
         ("nonsense", r'such as \{"target".*Invalid JSON'),
         ("[]", r'such as \{"target".*object'),
@@ -46,44 +45,37 @@ def test_a_line_is_a_question():
         ("{}", "at least one target"),
     ],
 )
-def test_lines_that_are_no_question_say_why(line, says):
+def test_question_from_json_refuses_a_bad_line(line, named):
     """The key that is wrong is named."""
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=named):
         question_from_json(line)
 
 
-def test_the_questions_on_the_page_are_questions():
-    """Whoever types what the page of commands shows has an answer to each line."""
-    page = (Path(__file__).parents[3] / "docs/reference/commands.md").read_text(encoding="utf-8")
-    block = page.split("```json\n")[1].split("```")[0]
-    first, second = [question_from_json(line) for line in block.splitlines()]
-    assert (first.targets, first.quiet) == (((0.08, 0.06),), ((0.22, 0.16),))
-    assert (len(second.targets), second.level_db_sl, second.drive_mode) == (2, 15.0, "signed")
-
-
-def test_a_bad_line_does_not_end_the_run():
-    """Each line has its answer; one without says its number; empty lines are passed over."""
-    lines = ['{"target": [0.1, 0.1]}\n', "\n", "oops\n", '{"target": [9, 9]}\n']
-    first, bad, off = query_batch(smooth_table(), lines)
-    assert first["level_db_sl"] == 20.0
-    assert (bad["line"], off["line"]) == (3, 4)
-    assert "(9, 9)" in off["error"]
-
-
-def test_a_batch_answers_line_by_line_and_exits_with_one_if_a_line_failed(table_file, tmp_path):
-    """Status 1 with a bad line among them, 0 without; answers are JSON lines."""
+@pytest.mark.parametrize("has_errors", [True, False])
+def test_batch_answers_line_by_line(table_file, tmp_path, has_errors):
+    """An error has its line's number and makes status 1; empty lines are skipped."""
     batch = tmp_path / "b.jsonl"
-    good = '{"target": [0.1, 0.1], "quiet": [[0.2, 0.15]], "mode": "phased"}\n'
-    for content, status in ((good * 2, 0), (good + "oops\n", 1)):
-        batch.write_text(content)
-        result = RUNNER.invoke(app, ["table", "query", str(table_file), "--batch", str(batch)])
-        assert result.exit_code == status
-        first, second = map(json.loads, result.stdout.splitlines())
-        assert first["mode"] == "phased"
-        assert ("error" in second) == (status == 1)
+    good = '{"target": [0.1, 0.1], "quiet": [[0.2, 0.15]], "mode": "phased"}\n\n'
+    batch.write_text(good * 2 + 'oops\n{"target": [9, 9]}\n' * has_errors)
+    result = RUNNER.invoke(app, ["table", "query", str(table_file), "--batch", str(batch)])
+    assert result.exit_code == has_errors
+    first, second, *errors = map(json.loads, result.stdout.splitlines())
+    assert first["mode"] == second["mode"] == "phased"
+    assert [each["line"] for each in errors] == [5, 6][: len(errors)]
+    assert all("error" in each for each in errors)
+    assert len(errors) == 2 * has_errors
 
 
-def test_a_query_has_all_measures(table_file):
+def test_batch_refuses_a_file_that_is_not_utf_8(table_file, tmp_path):
+    """The option is named."""
+    (tmp_path / "b.jsonl").write_bytes(b"\xff\xfe")
+    command = ["table", "query", str(table_file), "--batch", str(tmp_path / "b.jsonl")]
+    result = RUNNER.invoke(app, command)
+    assert isinstance(result.exception, InputError)
+    assert "--batch" in str(result.exception)
+
+
+def test_query_has_all_measures(table_file):
     """The keys that scripts rely on, and figures that fit each other."""
     options = "--target 0.09,0.07 --quiet 0.25,0.18 --mode signed --level 18 --json"
     result = RUNNER.invoke(app, ["table", "query", str(table_file), *options.split()])
@@ -100,8 +92,8 @@ def test_a_query_has_all_measures(table_file):
     assert "transient_contrast_db" in answer
 
 
-def test_more_eras_and_several_targets_can_be_asked_for(table_file):
-    """`--eras 4` is at least as good as two; two `--target` are both taken."""
+def test_query_takes_more_eras_and_several_targets(table_file):
+    """Four ERAs are at least as good as two; two targets at most as good as one."""
     contacts = ["--target", "0.09,0.07", "--quiet", "0.25,0.18", "--quiet", "0.2,0.05"]
     command = ["table", "query", str(table_file), *contacts, "--json"]
     two, four = (

@@ -1,4 +1,4 @@
-"""What `era table show` says of a table."""
+"""Summary of a table, and its map of weak cells."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -21,8 +21,14 @@ def table():
     return small_table()
 
 
-def test_the_map_of_a_symmetric_plate_is_symmetric(table):
-    """Cells that mirror each other are told from other fingers equally well."""
+def with_strokes(factor):
+    """The paper's rig with other strokes."""
+    rig = make_paper_rig(12, 9)
+    return replace(rig, eras=tuple(replace(era, stroke=factor * era.stroke) for era in rig.eras))
+
+
+def test_weak_cells_of_a_symmetric_plate_are_symmetric(table):
+    """Cells that mirror each other have the same contrast."""
     weak = find_weak_cells(table)
     for values in (weak.median_db, weak.tenth_db):
         rows = values.reshape(3, 4)
@@ -32,13 +38,18 @@ def test_the_map_of_a_symmetric_plate_is_symmetric(table):
     assert np.ptp(weak.median_db) > 0.5
 
 
-def test_of_a_cells_contrasts_the_median_and_the_tenth_percentile_are_kept(table, monkeypatch):
-    """Of random contrasts half are below the one, a tenth below the other, for every cell."""
+def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table, monkeypatch):
+    """Half of a cell's contrasts are below its median, a tenth below the other.
+
+    Other fingers are in each of 8 by 6 fields, at least 5 cm from the cell.
+    """
     rng = np.random.default_rng(0)
     drawn: dict[tuple[float, float], list[float]] = {}
+    tried = set()
 
     def at_random(table, target, other):
         assert np.linalg.norm(target - other) >= 0.05
+        tried.add(tuple(other))
         drawn.setdefault(tuple(target), []).append(float(rng.uniform(0, 30)))
         return drawn[tuple(target)][-1]
 
@@ -49,56 +60,35 @@ def test_of_a_cells_contrasts_the_median_and_the_tenth_percentile_are_kept(table
         for value, contrasts in zip(values, drawn.values(), strict=True):
             below = (np.array(contrasts) < value).mean()
             assert below == pytest.approx(share, abs=1.5 / len(contrasts))
-
-
-def test_other_fingers_are_tried_all_over_the_plate(table, monkeypatch):
-    """One in each twelfth of a quarter and at its mirror images: one in each of 8 by 6 fields."""
-    tried = set()
-    monkeypatch.setattr(
-        "model.table.weak_cells._contrast",
-        lambda table, target, other: tried.add(tuple(other)) or 0.0,
-    )
-    find_weak_cells(table)
-    x, y = np.array(sorted(tried)).T
     size = (table.plate.length, table.plate.width)
-    counts, *_ = np.histogram2d(x, y, bins=(8, 6), range=[(0, side) for side in size])
+    counts, *_ = np.histogram2d(
+        *np.array(sorted(tried)).T, bins=(8, 6), range=[(0, side) for side in size]
+    )
     assert (counts == 1).all()
 
 
-def test_a_fine_grid_is_asked_about_more_coarsely(table):
+def test_map_grid_is_coarser_than_a_fine_grid(table):
     """A cell of the map is no smaller than a sixteenth by a twelfth of the plate."""
     assert map_grid(replace(table, grid=Grid(24, 5))) == Grid(16, 5)
     assert map_grid(replace(table, grid=Grid(4, 20))) == Grid(4, 12)
 
 
 def test_weak_and_feasible_follow_from_twelve_decibels():
-    """Feasible by the median other finger, weak by one in ten; unreachable levels are neither."""
-    weak = WeakCells(
-        Grid(4, 1),
-        np.zeros((4, 2)),
-        median_db=np.array([20.0, 12.0, 9.0, -np.inf]),
-        tenth_db=np.array([12.0, 11.9, 5.0, -np.inf]),
-    )
-    assert weak.feasible.tolist() == [True, True, False, False]
-    assert weak.weak.tolist() == [False, True, True, True]
-
-
-def test_the_map_as_text_stands_as_the_plate_does():
-    """The largest y is the first line; weak cells carry a star, those without a value a dash."""
+    """Feasible by the median other finger, weak by one in ten; a text map shows both."""
     weak = WeakCells(
         Grid(2, 2),
         np.zeros((4, 2)),
-        median_db=np.array([20.4, 9.0, -np.inf, 14.6]),
-        tenth_db=np.array([13.0, 4.0, -np.inf, 3.0]),
+        median_db=np.array([20.4, 12.0, -np.inf, 9.0]),
+        tenth_db=np.array([12.0, 11.9, -np.inf, 5.0]),
     )
-    assert list(text_map(weak)) == ["   -*  15*", "  20    9*"]
+    assert weak.feasible.tolist() == [True, True, False, False]
+    assert weak.weak.tolist() == [False, True, True, True]
+    assert list(text_map(weak)) == ["   -*   9*", "  20   12*"]  # the largest y first
 
 
-def test_where_nothing_is_felt_all_is_dead_and_weak():
-    """ERAs that move a nanometre: no cell is felt, none feasible, and no contrast is made up."""
-    rig = make_paper_rig(12, 9)
-    still = replace(rig, eras=tuple(replace(era, stroke=1e-9) for era in rig.eras))
-    table = build_table(still, frequencies=np.array([60.0, 250.0]), grid=Grid(3, 2))
+def test_summary_of_strokes_too_small():
+    """Of a nanometre all is dead and weak, and there is no contrast."""
+    table = build_table(with_strokes(1e-5), frequencies=np.array([60.0, 250.0]), grid=Grid(3, 2))
     summary = summarize(table, find_weak_cells(table))
     assert summary["dead_zone_share"] == 1.0
     assert summary["feasible_share"] == 0.0
@@ -106,11 +96,24 @@ def test_where_nothing_is_felt_all_is_dead_and_weak():
     assert summary["contrast_1_quiet_median_db"] is None
 
 
-def test_a_cell_that_is_felt_but_not_strongly_is_not_feasible(table):
-    """Strokes with which the loudest cell reaches 19 dB SL: of 20 dB SL there is none to tell."""
-    rig = make_paper_rig(12, 9)
-    least = 10 ** ((19.0 - table.available_level_db_sl.max()) / 20)
-    weaker = replace(rig, eras=tuple(replace(era, stroke=least * era.stroke) for era in rig.eras))
+def test_summary_of_a_plate_too_small_for_two_fingers():
+    """Where no two fingers fit 5 cm apart the distribution is empty, not an endless loop."""
+    rig = make_paper_rig(6, 6)
+    small = replace(
+        rig,
+        plate=replace(rig.plate, length=0.03, width=0.03),
+        mesh=replace(rig.mesh, length=0.03, width=0.03),
+        eras=tuple(replace(era, x=0.03 * (era.x > 0), y=0.03 * (era.y > 0)) for era in rig.eras),
+    )
+    built = build_table(small, grid=Grid(2, 2))
+    summary = summarize(built, find_weak_cells(built))
+    assert summary["contrast_1_quiet_median_db"] is None
+    assert summary["feasible_share"] is None
+
+
+def test_a_cell_that_reaches_only_19_db_sl_is_not_feasible(table):
+    """The map is at 20 dB SL, which no pattern reaches with these strokes."""
+    weaker = with_strokes(10 ** ((19.0 - table.available_level_db_sl.max()) / 20))
     table = build_table(weaker, frequencies=table.frequencies, grid=table.grid)
     assert table.available_level_db_sl.max() == pytest.approx(19.0, abs=0.01)
     weak = find_weak_cells(table)
@@ -118,7 +121,7 @@ def test_a_cell_that_is_felt_but_not_strongly_is_not_feasible(table):
     assert not weak.feasible.any()
 
 
-def test_the_numbers_of_a_table(table, monkeypatch):
+def test_summary_counts_levels_and_shares(table, monkeypatch):
     """Levels from 12 dB SL count as felt; shares are of the cells for which there is a value."""
     asked = []
 
@@ -129,9 +132,7 @@ def test_the_numbers_of_a_table(table, monkeypatch):
     monkeypatch.setattr("model.table.summary.contrast_distribution", one_to_hundred)
     levels = np.sort(table.available_level_db_sl)
     lower = 10 ** ((12.0 - levels[5:7].mean()) / 20)  # six of twelve cells are below 12 dB SL then
-    rig = make_paper_rig(12, 9)
-    eras = tuple(replace(era, stroke=lower * era.stroke) for era in rig.eras)
-    quieter = build_table(replace(rig, eras=eras), frequencies=table.frequencies, grid=table.grid)
+    quieter = build_table(with_strokes(lower), frequencies=table.frequencies, grid=table.grid)
     values = np.array([20.0, 12.0, 9.0, -np.inf, *[np.nan] * 8])
     weak = WeakCells(table.grid, np.zeros((12, 2)), median_db=values, tenth_db=values - 0.1)
     summary = summarize(quieter, weak)
@@ -152,7 +153,7 @@ def test_the_numbers_of_a_table(table, monkeypatch):
 
 
 @pytest.mark.parametrize("others", [1, 3])
-def test_contrast_is_asked_of_fingers_apart(table, others):
+def test_contrast_distribution_uses_fingers_apart(table, others):
     """Two hundred sets at least 5 cm apart; where no target is reached it ends at four hundred."""
     asked = []
 
@@ -180,8 +181,8 @@ def test_contrast_is_asked_of_fingers_apart(table, others):
         assert gaps[np.triu_indices(others + 1, 1)].min() >= 0.05
 
 
-def test_alike_patterns_are_counted(table):
-    """Copies of one pattern are all alike, noise is not; a single cell tells nothing."""
+def test_similar_share_of_copies_noise_and_a_single_cell(table):
+    """Copies of one pattern are all similar, noise is not; a single cell has no share."""
     row = table.cell_sources[0]
     copies = np.tile(row, (len(table.cell_sources), 1))
     copies[-1] = 0  # nothing driven beside the first source

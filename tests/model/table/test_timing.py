@@ -38,39 +38,31 @@ def solved(rig):
     return Transients(plate_in_time(reduced, rig.eras))
 
 
-def test_without_envelopes_the_measures_are_those_of_the_ramp(rig, table, solved):
-    """Nothing but a plain ramp is played, and that is what is predicted, whoever solves it."""
-    pattern = Timing(table).with_transient_measures(QUESTION, table.query(QUESTION))
-    assert pattern.onset is None
-    assert pattern.ending is None
-    onset = ramped_onset(pattern.excitation, rig.eras, ramp=0.040)
-    ending = ramped_ending(pattern.excitation, rig.eras, ramp=0.040)
-    contrast = solved.contrast_db(onset, targets=QUESTION.targets, quiet=QUESTION.quiet)
-    assert pattern.transient_contrast_db == pytest.approx(contrast, abs=0.1)
-    left = solved.residual_db(pattern.excitation, ending)
-    assert pattern.left_after_db == pytest.approx(left, abs=0.1)
-
-
-def test_envelopes_are_part_of_the_pattern_and_measured_with_it(rig, table, solved):
-    """Shaped onset and ending do better than the ramp, as another solution of the plate finds."""
+def test_transient_measures_agree_with_another_solution_of_the_plate(rig, table, solved):
+    """Of the ramp and of shaped onset and ending, which do better with the same excitation."""
     timing = Timing(table)
     plain = timing.with_transient_measures(QUESTION, table.query(QUESTION))
-    pattern = timing.with_transient_measures(
+    shaped_pattern = timing.with_transient_measures(
         QUESTION, timing.with_envelopes(QUESTION, table.query(QUESTION))
     )
-    contrast = solved.contrast_db(
-        shaped(pattern.onset, rig.eras), targets=QUESTION.targets, quiet=QUESTION.quiet
+    assert plain.onset is plain.ending is None
+    ramps = (
+        ramped_onset(plain.excitation, rig.eras, ramp=0.040),
+        ramped_ending(plain.excitation, rig.eras, ramp=0.040),
     )
-    assert pattern.transient_contrast_db == pytest.approx(contrast, abs=0.1)
-    left = solved.residual_db(pattern.excitation, shaped(pattern.ending, rig.eras))
-    assert pattern.left_after_db == pytest.approx(left, abs=0.2)
-    assert pattern.transient_contrast_db > plain.transient_contrast_db + 3
-    assert pattern.left_after_db < plain.left_after_db - 10
-    assert pattern.excitation == plain.excitation
+    envelopes = (shaped(shaped_pattern.onset, rig.eras), shaped(shaped_pattern.ending, rig.eras))
+    for pattern, (onset, ending) in ((plain, ramps), (shaped_pattern, envelopes)):
+        contrast = solved.contrast_db(onset, targets=QUESTION.targets, quiet=QUESTION.quiet)
+        assert pattern.transient_contrast_db == pytest.approx(contrast, abs=0.1)
+        left = solved.residual_db(pattern.excitation, ending)
+        assert pattern.left_after_db == pytest.approx(left, abs=0.2)
+    assert shaped_pattern.transient_contrast_db > plain.transient_contrast_db + 3
+    assert shaped_pattern.left_after_db < plain.left_after_db - 10
+    assert shaped_pattern.excitation == plain.excitation
 
 
-def test_a_lone_finger_has_an_ending_but_no_contrast(table):
-    """There is nobody to tell it from; what is left after the end can be said all the same."""
+def test_transient_measures_without_quiet_fingers(table):
+    """There is no contrast; what is left after the end is known all the same."""
     alone = Question(((0.09, 0.07),), drive_mode="phased")
     timing = Timing(table)
     pattern = timing.with_transient_measures(
@@ -80,8 +72,8 @@ def test_a_lone_finger_has_an_ending_but_no_contrast(table):
     assert pattern.left_after_db < -20
 
 
-def test_answers_in_json_carry_knots_only_where_asked_for(table):
-    """A line that says envelopes gets 21 and 8 knots for every ERA, another one null."""
+def test_query_batch_has_knots_only_with_envelopes(table):
+    """21 and 8 knots for every ERA, from silence to the pattern and back; else null."""
     line = {"target": [0.09, 0.07], "quiet": [[0.25, 0.18]]}
     plain, with_knots = query_batch(
         table, [json.dumps(line), json.dumps(line | {"envelopes": True})]
@@ -100,4 +92,3 @@ def test_answers_in_json_carry_knots_only_where_asked_for(table):
         assert with_knots["onset"][era]["frequency_hz"] == tone["frequency_hz"]
         assert with_knots["ending"][era]["knots"][-1]["level"] == 0
     assert with_knots["transient_contrast_db"] > plain["transient_contrast_db"]
-    json.dumps(with_knots)

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
+import drivers.cli
+from drivers.errors import CommandRefused, LinkError
 from model.counting import counted
 from model.errors import InputError
 from registry.suggestions import did_you_mean
@@ -26,13 +27,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-EXIT_STATUS: dict[type[BaseException], int] = {
-    InputError: 2,
-    CommandError: 2,
-    CommandRefused: 1,
-    LinkError: 3,
-    FrameError: 3,
-}
+EXIT_STATUS = {**drivers.cli.EXIT_STATUS, InputError: 2}
 """Exit status by error class."""
 
 Socket = Annotated[

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import drivers.cli
 from controller.cli.rig import rig_app
-from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
 from model.commands.next_line import next_line
 from model.counting import counted
 from model.errors import InputError
@@ -18,13 +18,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 app.add_typer(rig_app, name="rig")
 
-EXIT_STATUS: dict[type[BaseException], int] = {
-    InputError: 2,
-    CommandError: 2,
-    CommandRefused: 1,
-    LinkError: 3,
-    FrameError: 3,
-}
+EXIT_STATUS = {**drivers.cli.EXIT_STATUS, InputError: 2}
 """Exit status by error class."""
 
 

@@ -61,12 +61,11 @@ class PatternTable(Protocol):
 class Prediction:
     """What a target is predicted to feel in the steady state.
 
-    contact: as it was when the pattern was chosen; wanted_db_sl: None for as strongly as the
-    neighbours allow; contrast_db: to the loudest quiet point, None without quiet contacts.
+    contact: as it was when the pattern was chosen; contrast_db: to the loudest quiet point, None
+    without quiet contacts.
     """
 
     contact: Contact
-    wanted_db_sl: float | None
     level_db_sl: float
     contrast_db: float | None
 
@@ -183,10 +182,8 @@ class Selector:
     ) -> tuple[Prediction, ...]:
         """Predict what each target will feel; a pattern states it for a single target."""
         if len(targets) == 1:
-            ((contact, target),) = targets
-            return (
-                Prediction(contact, target.level_db_sl, pattern.level_db_sl, pattern.contrast_db),
-            )
+            ((contact, _),) = targets
+            return (Prediction(contact, pattern.level_db_sl, pattern.contrast_db),)
         fingers = [*(contact for contact, _ in targets), *quiet]
         discs = [fingertip_points(each.x, each.y, self._table.plate) for each in fingers]
         frequencies, all_fields = self._table.amplitudes(pattern.excitation, np.concatenate(discs))
@@ -196,11 +193,10 @@ class Selector:
         return tuple(
             Prediction(
                 contact,
-                target.level_db_sl,
                 mean_level_db_sl(frequencies, field),
                 float(contrast_db([peak_acceleration(field)], loudest)) if quiet else None,
             )
-            for (contact, target), field in zip(targets, fields, strict=True)
+            for (contact, _), field in zip(targets, fields, strict=True)
         )
 
 

@@ -1,7 +1,6 @@
 """The contacts on the plate, from any sequence of touch frames."""
 
 import math
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -52,13 +51,12 @@ class Change:
 class ContactTracker:
     """The contacts on one plate; a pure function of the frames and times it is given.
 
-    x = X L and y = (1 - Y) W, since touch sensors count Y downwards. Touches are rejected and
-    counted that are not finite, off the plate (outside 0..1), duplicated in a frame (the last one
+    x = X L and y = (1 - Y) W, since touch sensors count Y downwards. Touches are rejected
+    that are not finite, off the plate (outside 0..1), duplicated in a frame (the last one
     counts) or beyond the tenth contact; a contact whose touch is rejected is lifted.
     """
 
     def __init__(self, plate: Plate) -> None:
-        self.rejected: Counter[str] = Counter()
         self._plate = plate
         self._contacts: dict[ContactKey, Contact] = {}
         self._last_frame: dict[str, float] = {}
@@ -101,7 +99,6 @@ class ContactTracker:
             self._last_frame[frame.source] = frame.time
         else:
             self._last_frame.pop(frame.source, None)
-        self.rejected.update(rejected)
         return Change(tuple(down), tuple(moved), up, tuple(rejected))
 
     def expire(self, now: float) -> Change:

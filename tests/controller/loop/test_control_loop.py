@@ -75,7 +75,7 @@ async def test_controller_plays_a_touch_within_one_turn() -> None:
         assert applied.latency == pytest.approx(0.003)
         (felt,) = applied.targets
         assert (felt.contact.x, felt.contact.y) == pytest.approx((0.15, 0.1))
-        assert (felt.wanted_db_sl, felt.level_db_sl, felt.contrast_db) == (20.0, 20.0, None)
+        assert (felt.level_db_sl, felt.contrast_db) == (20.0, None)
         assert applied.quiet == ()
         assert applied.pattern.level_db_sl == 20.0
         assert applied.drive == {"SW": played.commands[0]}

@@ -91,11 +91,7 @@ def test_selector_keeps_other_contacts_quiet(table: Table) -> None:
     assert (question.playable, question.frequencies) == (("switched", "phased"), (45.0, 300.0))
     assert not question.envelopes
     (predicted,) = selection.predictions
-    assert (predicted.contact.key.id, predicted.wanted_db_sl, predicted.level_db_sl) == (
-        3,
-        17.0,
-        17.0,
-    )
+    assert (predicted.contact.key.id, predicted.level_db_sl) == (3, 17.0)
 
 
 def test_selector_predicts_each_of_several_targets(table: Table) -> None:
@@ -110,7 +106,7 @@ def test_selector_predicts_each_of_several_targets(table: Table) -> None:
     (question,) = table.asked
     assert question.targets == ((0.1, 0.1), (0.2, 0.1))
     assert (question.level_db_sl, question.softer_db) == (20.0, (8.0, 0.0))
-    assert [each.wanted_db_sl for each in selection.predictions] == [12.0, 20.0]
+    assert [target.level_db_sl for _, target in selection.targets] == [12.0, 20.0]
     levels = [each.level_db_sl for each in selection.predictions]
     assert levels == pytest.approx([20.0, 20 + 20 * math.log10(2)], abs=0.01)
     rim = 0.05 + 0.013 * math.cos(math.pi / 12)

@@ -17,8 +17,11 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: .venv/installed
 	$(BIN)/era demo
 
-test: lint
-	$(BIN)/pytest -m 'not alone' --numprocesses auto --dist loadfile --no-loadscope-reorder
+# Types are checked beside the tests; those that measure time run afterwards, with nothing beside.
+test: .venv/installed-test
+	$(MAKE) --no-print-directory lint & lint=$$!; \
+	$(BIN)/pytest -m 'not alone' --numprocesses auto --dist loadfile --no-loadscope-reorder; \
+	tests=$$?; wait $$lint && exit $$tests
 	$(BIN)/pytest -m alone
 
 lint: .venv/installed-test

@@ -10,10 +10,12 @@ import json
 import signal
 import socket
 import time
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
 
+from controller.cli.main import run
 from daemon_bench import PATIENCE, daemon_table, far_end, until, until_state, write_daemon
 from daemon_process import (
     ERA,
@@ -173,15 +175,21 @@ async def _serves(port: int) -> bool:
     return True
 
 
-async def test_check_touches_no_amplifier(tmp_path: Path) -> None:
+async def test_check_touches_no_amplifier(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """`--check` reads everything that is named: exit status 0, or 2 with what is wrong."""
+
+    async def check(path: Path) -> int:
+        # In a thread, for the command has an event loop of its own.
+        commands = entry_points(group="era_haptics.commands")
+        return await asyncio.to_thread(run, ["daemon", str(path), "--check"], commands)
+
     async with far_end(tmp_path) as far:
         save_table(daemon_table(), tmp_path / "table.npz")
         path = write_daemon(tmp_path, {"main": far.url}, "table: table.npz\n")
-        status, out, _ = await run_era("daemon", path, "--check")
-        assert (status, far.device.status().token) == (0, 0)
-        assert str(path) in out
+        assert (await check(path), far.device.status().token) == (0, 0)
+        assert str(path) in capsys.readouterr().out
         (tmp_path / "table.npz").write_bytes(b"no table")
-        status, _, err = await run_era("daemon", path, "--check")
-        assert status == 2
-        assert "table.npz" in err
+        assert await check(path) == 2
+        assert "table.npz" in capsys.readouterr().err

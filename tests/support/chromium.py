@@ -5,8 +5,6 @@ import base64
 import contextlib
 import itertools
 import json
-import os
-import shutil
 from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,8 @@ from typing import Any
 import httpx
 import pytest
 import websockets
+
+from installed_program import installed_program
 
 BINARIES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = (
@@ -31,17 +31,6 @@ FLAGS = (
 )
 STARTING = 60.0  # s; a loaded machine takes its time
 WAITING = 30.0  # s; for anything that should be seen
-
-
-def chromium() -> str:
-    """The browser's path; without one the test is skipped, but fails where CI=true."""
-    for name in BINARIES:
-        if found := shutil.which(name):
-            return found
-    reason = "no Chromium is installed; on Debian: apt install chromium"
-    if os.environ.get("CI") == "true":
-        pytest.fail(reason)
-    pytest.skip(reason)
 
 
 class Navigated(Exception):
@@ -199,7 +188,7 @@ class Browser:
 async def open_browser(profile: Path) -> AsyncIterator[Browser]:
     """Start a browser; profile: an empty folder."""
     process = await asyncio.create_subprocess_exec(
-        *(chromium(), f"--user-data-dir={profile}", *FLAGS),
+        *(installed_program(*BINARIES, package="chromium"), f"--user-data-dir={profile}", *FLAGS),
         stdout=asyncio.subprocess.DEVNULL,
         stderr=asyncio.subprocess.DEVNULL,
     )

@@ -78,16 +78,20 @@ class InstalledEra:
         return kept | {name: str(self.folder / place) for name, place in places.items()}
 
 
-def try_files(era: InstalledEra) -> None:
-    """Help, configuration files, the plate and a small table, a bug report."""
+def try_first(era: InstalledEra) -> None:
+    """Help, the example rig, and its plate's modes."""
     expect("Usage: era " in era("--help"), "help")
     era("config", "init", "rig.yaml")
+    modes = json.loads(era("plate", "modes", "rig.yaml", "-n", "6", "--json"))
+    expect(modes["frequencies_hz"] == sorted(modes["frequencies_hz"]), "modes out of order")
+
+
+def try_files(era: InstalledEra) -> None:
+    """Configuration files, a small table, a picture, a bug report; after `try_first`."""
     for kind in ("layout", "daemon"):
         era("config", "init", "--kind", kind, f"{kind}.yaml")
     for kind in ("rig", "layout", "daemon"):
         expect("good" in era("config", "check", f"{kind}.yaml"), f"the example of a {kind} is bad")
-    modes = json.loads(era("plate", "modes", "rig.yaml", "-n", "6", "--json"))
-    expect(modes["frequencies_hz"] == sorted(modes["frequencies_hz"]), "modes out of order")
     coarse = ("--frequencies", "100:200:50", "--grid", "4x3", "--mesh", "12x9")
     era("table", "build", "rig.yaml", "-o", "small.npz", *coarse)
     asked = ("--target", "0.06,0.05", "--quiet", "0.2,0.1")

@@ -25,7 +25,15 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from installed_era import Failed, InstalledEra, try_demo, try_files, try_gateway, try_wire
+from installed_era import (
+    Failed,
+    InstalledEra,
+    try_demo,
+    try_files,
+    try_first,
+    try_gateway,
+    try_wire,
+)
 
 PYTHONS = ("python3.11", "python3.12", "python3.13", "python3.14")
 REPEATS = 11
@@ -143,7 +151,7 @@ def try_out(python: str, wheel: Path, *, constraints: str) -> Weight:
     """Every step in a clean environment of this Python; raises Failed."""
     with tempfile.TemporaryDirectory(prefix="era-smoke-") as made:
         era = clean_environment(python, Path(made), wheel, constraints=constraints)
-        for step in (try_files, try_wire, try_demo):
+        for step in (try_first, try_files, try_wire, try_demo):
             step(era)
         weight = weigh(era)
         _install(era, f"{wheel}[gateway]")

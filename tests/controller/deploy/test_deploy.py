@@ -1,9 +1,7 @@
 """Files of the system service, checked by systemd itself."""
 
 import json
-import os
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,6 +14,7 @@ from controller.cli.main import run
 from controller.deploy.files import service_files
 from controller.deploy.permissions import Permissions, required_permissions
 from full_disk import full_disk
+from installed_program import installed_program
 from model.errors import InputError
 
 UNIT = Path("/etc/systemd/system/era-haptics.service")
@@ -25,13 +24,8 @@ MAX_EXPOSURE = 2.0
 
 
 def systemd_analyze(*arguments: str) -> "subprocess.CompletedProcess[str]":
-    """Run systemd-analyze; skip without it, but fail under CI=true."""
-    program = shutil.which("systemd-analyze")
-    if program is None:
-        reason = "systemd-analyze is not installed; on Debian: apt install systemd"
-        if os.environ.get("CI") == "true":
-            pytest.fail(reason)
-        pytest.skip(reason)
+    """Run systemd-analyze; skip the test without it, fail it under CI=true."""
+    program = installed_program("systemd-analyze", package="systemd")
     return subprocess.run([program, *arguments], capture_output=True, text=True, check=False)
 
 

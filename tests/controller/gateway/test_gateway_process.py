@@ -26,7 +26,13 @@ from gateway_bench import (
     wait_for,
     wait_for_daemon,
 )
+from installed_program import installed_program
 from model.errors import InputError
+
+
+def openssl() -> str:
+    """The program that makes certificates."""
+    return installed_program("openssl", package="openssl")
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +42,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     certificate, key = folder / "panel.pem", folder / "panel.key"
     subprocess.run(
         [
-            *("openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"),
+            *(openssl(), "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"),
             *("-nodes", "-days", "1", "-subj", "/CN=localhost"),
             *("-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1"),
             *("-keyout", str(key), "-out", str(certificate)),
@@ -220,7 +226,7 @@ def test_gateway_refuses_unusable_certificates(tmp_path: Path, pair: tuple[Path,
     """The key of another certificate, a key with a password, and a file without a certificate."""
     certificate, _ = pair
     other, locked = tmp_path / "other.key", tmp_path / "locked.key"
-    new = ("openssl", "genpkey", "-algorithm", "EC", "-pkeyopt", "ec_paramgen_curve:P-256")
+    new = (openssl(), "genpkey", "-algorithm", "EC", "-pkeyopt", "ec_paramgen_curve:P-256")
     for path, more in ((other, ()), (locked, ("-aes256", "-pass", "pass:secret"))):
         subprocess.run([*new, *more, "-out", str(path)], check=True, capture_output=True)
     text = tmp_path / "text"

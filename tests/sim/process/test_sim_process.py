@@ -5,10 +5,12 @@ import signal
 import sys
 import tempfile
 from collections.abc import Sequence
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
 
+from controller.cli.main import run
 from drivers.amplifier import Amplifier
 from drivers.backends.serial_line.backend import SerialBackend
 from drivers.command import DriveCommand
@@ -89,11 +91,12 @@ async def test_sim_until_eof_exits_with_standard_input() -> None:
         ([str(example_rig_path()), "--serial", "--control", "/no/where"], 3, "/no/where"),
     ],
 )
-async def test_sim_refuses_bad_usage_in_one_line(
-    arguments: list[str], status: int, words: str
+def test_sim_refuses_bad_usage_in_one_line(
+    arguments: list[str], status: int, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Exit status 2 for input, 3 for the link; one line that names the option or file."""
-    returned, out, err = await wait(await start(arguments))
-    assert (returned, out) == (status, "")
+    assert run(["sim", *arguments], entry_points(group="era_haptics.commands")) == status
+    out, err = capsys.readouterr()
+    assert out == ""
     assert words in err
     assert err.count("\n") == 1

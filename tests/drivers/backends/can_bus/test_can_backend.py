@@ -35,7 +35,7 @@ from sim.far_ends.can_bus.ends import nodes_on
 from sim.far_ends.can_bus.node import CanNode
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultWindow
-from wires import FarSide, far_side
+from wires import FarSide, far_side, patient
 
 PATIENCE = 5.0  # s; for a busy machine
 _NUMBERS = itertools.count()
@@ -551,7 +551,7 @@ async def test_exception_of_a_frame_callback_is_logged(
 
 async def test_exchange_works_on_a_flooded_bus(virtual: Virtual) -> None:
     """Thousands of foreign frames and invalid replies between request and reply."""
-    async with opened(virtual.url(), reply_timeout=PATIENCE) as amplifier:
+    async with opened(patient(virtual.url()), reply_timeout=PATIENCE) as amplifier:
         await amplifier.arm(2.0)
         for number in range(3000):
             virtual.gateway.say(CanFrame(number % 0x700, bytes(number % 9)))

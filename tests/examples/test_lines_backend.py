@@ -153,5 +153,5 @@ async def test_what_no_guard_has_seen_is_not_sent(backend: Backend) -> None:
 @pytest.mark.parametrize("url", ["lines://", "lines://host", "lines://host:x", "lines://h:1/2?a=b"])
 async def test_a_url_that_makes_no_sense_is_refused(url: str, backend: Backend) -> None:
     """Before any wire is touched."""
-    with pytest.raises(CommandError, match="write lines://HOST:PORT"):
+    with pytest.raises(CommandError, match="must be lines://HOST:PORT"):
         type(backend)(url)

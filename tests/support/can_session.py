@@ -86,7 +86,7 @@ class Session:
 
     def steps(self) -> Iterator[Step]:
         self.node.start(self.timers.call_later)
-        yield self._heard("The supply comes: boot-up")
+        yield self._heard("Power-up: boot-up")
         self.timers.ring()
         yield self._heard("Heartbeat, pre-operational")
         yield self._asked("Read the serial number, 1018sub4", _read(0x1018, 4))
@@ -103,9 +103,9 @@ class Session:
         yield self._ordered("Arm, watchdog 250 ms", Arm(0.25), 1)
         safe = self.guard.check(CommandSet(513, _COMMANDS, ramp=0.02, valid_for=0.5))
         yield self._ordered("Apply token 513", Apply(safe), 2)
-        yield self._ordered("The same again, for its answer was lost", Apply(safe), 3)
+        yield self._ordered("The same again, after a lost answer", Apply(safe), 3)
         self.device.pass_time(0.05)
-        yield self._ordered("Ping: the host's heartbeat, and how are you?", Ping(), 4)
+        yield self._ordered("Ping: the host's heartbeat, and a status order", Ping(), 4)
         staged = self.guard.check(CommandSet(514, _COMMANDS[:1], ramp=0.0, valid_for=0.0))
         yield self._ordered("Stage token 514", Stage(staged), 5)
         yield self._ordered("Commit token 514", Commit(514), 6)
@@ -120,7 +120,7 @@ class Session:
             sequence=8,
         )
         yield self._asked(
-            "Apply token 516, but the frame of channel 3 is lost", incomplete[0], *incomplete[2:]
+            "Apply token 516, with the frame of channel 3 lost", incomplete[0], *incomplete[2:]
         )
         shape = self.guard.check_envelope(Envelope(5, 0.005, (Knot(0.1, 90.0), Knot(1.0, -0.01))))
         assert (
@@ -133,8 +133,8 @@ class Session:
         yield self._ordered("Apply token 518, as CAN FD", Apply(self._next(518)), 10, fd=True)
         yield self._ordered("Status, as CAN FD", GetStatus(), 11, fd=True)
         self.device.pass_time(0.3)
-        yield self._heard("No host is heard for 250 ms: an emergency, and one more once silent")
-        yield self._ordered("Arm, but it has to be cleared first", Arm(0.25), 12)
+        yield self._heard("No heartbeat for 250 ms: an emergency, and another once silent")
+        yield self._ordered("Arm, refused before Clear", Arm(0.25), 12)
         yield self._ordered("Clear", Clear(), 13)
         yield self._ordered("Stop, ramp 5 ms", Stop(0.005), 14)
         self.device.pass_time(0.01)

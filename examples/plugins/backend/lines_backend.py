@@ -66,7 +66,7 @@ class LinesBackend(WireBackend):
         except ValueError:
             host = port = None
         if not host or not port or place.path or place.query or place.fragment:
-            raise CommandError(f"{url!r} is no address; write lines://HOST:PORT")
+            raise CommandError(f"URL must be lines://HOST:PORT, got {url!r}")
         self._url, self._host, self._port = url, host, port
         self._line: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
         self._number = 0
@@ -81,7 +81,7 @@ class LinesBackend(WireBackend):
             )
         except OSError as error:  # a timeout is one, too
             raise LinkError(
-                f"nobody answers at {self._url} ({str(error) or 'no answer'}); check that the "
+                f"no reply from {self._url} ({str(error) or 'timeout'}); check that the "
                 "amplifier is switched on, and its address"
             ) from error
 

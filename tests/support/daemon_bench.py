@@ -1,15 +1,20 @@
-"""A whole daemon within the test's event loop, over a pseudo-terminal to a far end beside it."""
+"""A daemon within the test's event loop, over a pseudo-terminal to a simulated amplifier."""
 
 import asyncio
+import contextlib
 import logging
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import pytest
+
 from controller.api.async_client import AsyncClient
+from controller.api.client_protocol import Notification
+from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
 from controller.daemon.log import LogHandler, LogThread
@@ -21,13 +26,14 @@ from rig_files import write_rig
 from small_table import small_table
 from wires import WIRES, FarSide, far_side
 
-PATIENCE = 20.0  # s; for a loaded machine, not an expectation
+PATIENCE = 20.0  # s; generous, for a loaded machine
 PLACE = (0.1, 0.1)
+READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 
 
 @dataclass
 class DaemonBench:
-    """A daemon that serves, and its far end."""
+    """A serving daemon and its far end."""
 
     daemon: Daemon
     far: FarSide
@@ -35,7 +41,7 @@ class DaemonBench:
     socket: Path
 
     async def client(self, name: str = "test") -> AsyncClient:
-        """A client that has said hello."""
+        """Connect a client."""
         return await AsyncClient.connect(self.socket, name=name, timeout=PATIENCE)
 
 
@@ -52,9 +58,9 @@ def write_daemon(
     *,
     changes: Sequence[tuple[str, str]] = (),
 ) -> Path:
-    """A rig at these URLs and a daemon's file beside it.
+    """Write a rig with these URLs and a daemon's file beside it.
 
-    more: further lines of that; changes: of the rig's text, before the URLs.
+    more: further lines of the daemon's file; changes: replacements in the rig's text.
     """
     write_rig(
         folder / "rig.yaml",
@@ -70,8 +76,18 @@ def write_daemon(
 
 
 @asynccontextmanager
+async def ready_daemon(
+    folder: Path, more: str = ""
+) -> AsyncIterator[tuple[DaemonBench, AsyncClient]]:
+    """A daemon that is ready to be armed, and a client of it."""
+    async with running_daemon(folder, more) as bench, await bench.client() as era:
+        await until_state(era, READY)
+        yield bench, era
+
+
+@asynccontextmanager
 async def running_daemon(folder: Path, more: str = "") -> AsyncIterator[DaemonBench]:
-    """A daemon that serves, from a file with these further lines; ended with the context."""
+    """A serving daemon; more: further lines of its file."""
     async with far_end(folder) as far, daemon_at(far, folder, more) as bench:
         yield bench
 
@@ -80,7 +96,7 @@ async def running_daemon(folder: Path, more: str = "") -> AsyncIterator[DaemonBe
 async def far_end(
     folder: Path, *, changes: Sequence[tuple[str, str]] = ()
 ) -> AsyncIterator[FarSide]:
-    """The example's amplifier on a pseudo-terminal; changes: of the rig's text."""
+    """The example's amplifier on a pseudo-terminal; changes: replacements in the rig's text."""
     rig = load_rig(write_rig(folder / "bench.yaml", *changes))
     async with far_side(WIRES["serial"], rig) as far:
         yield far
@@ -90,13 +106,13 @@ async def far_end(
 async def daemon_at(
     far: FarSide, folder: Path, more: str = "", *, changes: Sequence[tuple[str, str]] = ()
 ) -> AsyncIterator[DaemonBench]:
-    """A daemon that serves, for a far end that is there; changes: of the rig's text."""
+    """A serving daemon at an existing far end; changes: replacements in the rig's text."""
     config = load_daemon_config(write_daemon(folder, dict(far.urls), more, changes=changes))
-    place = SocketLock(config.socket)
+    lock = SocketLock(config.socket)
     log = LogThread(folder / "log")
     handler = LogHandler(log)
     daemon = Daemon(config, daemon_table(), log=log, manager=ServiceManager({}), dashboard=None)
-    task = asyncio.create_task(daemon.run(place))
+    task = asyncio.create_task(daemon.run(lock))
     logging.getLogger().addHandler(handler)
     try:
         await until(lambda: config.socket.is_socket() or task.done())
@@ -104,27 +120,65 @@ async def daemon_at(
             task.result()
         yield DaemonBench(daemon, far, folder, config.socket)
     finally:
-        daemon.shut_down("the test is over")
+        daemon.shut_down("end of the test")
         try:
             await asyncio.wait_for(task, PATIENCE)
         finally:
             logging.getLogger().removeHandler(handler)
             log.close()
-            place.release()
+            lock.release()
+
+
+@asynccontextmanager
+async def holding(
+    era: AsyncClient, *places: tuple[float, float], far: FarSide | None = None
+) -> AsyncIterator[None]:
+    """Hold fingers down while the connection lasts; far: wait until its amplifier plays."""
+
+    async def repeat() -> None:
+        with contextlib.suppress(ConnectionError):
+            while True:
+                await era.touch(places or [PLACE])
+                await asyncio.sleep(0.03)
+
+    task = asyncio.create_task(repeat())
+    try:
+        if far is not None:
+            await until(lambda: any(far.device.status().levels))
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
 
 
 async def until(holds: Callable[[], object], *, patience: float = PATIENCE) -> None:
-    """Wait until something holds; fails when the patience [s] is over."""
+    """Wait until a condition holds; fail after `patience` [s]."""
     end = time.monotonic() + patience
     while not holds():
-        assert time.monotonic() < end, "it never came to hold"
+        assert time.monotonic() < end, "condition not met in time"
         await asyncio.sleep(0.005)
 
 
 async def until_state(client: AsyncClient, *states: str) -> str:
-    """Wait until the daemon is in one of these states; which one."""
+    """Wait until the daemon is in one of these states; return it."""
     end = time.monotonic() + PATIENCE
     while (state := (await client.status()).state) not in states:
-        assert time.monotonic() < end, f"the daemon stays in {state}"
+        assert time.monotonic() < end, f"daemon stays in {state}"
         await asyncio.sleep(0.01)
     return state
+
+
+async def next_event(client: AsyncClient, *topics: str) -> Notification:
+    """Wait for the next notification of one of these topics."""
+    async with asyncio.timeout(PATIENCE):
+        async for event in client.events():
+            if event.topic in topics:
+                return event
+    raise AssertionError("connection closed")
+
+
+async def error_code(request: Awaitable[object]) -> ErrorCode:
+    """Await a request that must be refused; return the code."""
+    with pytest.raises(RpcError) as caught:
+        await request
+    return caught.value.code

@@ -3,7 +3,6 @@
 import asyncio
 import re
 import socket
-from typing import Any
 
 import pytest
 
@@ -18,23 +17,12 @@ from sim.witness.endpoint import parse_endpoint
 from sim.witness.witness import Witness
 from sim.witness_relay import relays
 from wires import WIRES, far_side
+from witness_config import witness_config
 
 
 def _witness(url: str, *, level: float) -> Witness:
-    endpoint = parse_endpoint(url)
-    limits = {"frequency_hz": [40, 500], "level": level}
-    plan: dict[str, Any] = {
-        "wires": {"line": endpoint.kind},
-        "amplifiers": {
-            "main": {
-                "wire": "line",
-                "address": endpoint.address,
-                "channels": dict.fromkeys(range(4), limits),
-            }
-        },
-        "times_s": dict.fromkeys(("slack", "reply", "heartbeat"), 5.0),
-    }
-    return Witness(plan)
+    times = dict.fromkeys(("slack", "reply", "heartbeat"), 5.0)
+    return Witness(witness_config({"main": url}, times_s=times, level=level))
 
 
 async def _drive(url: str) -> None:
@@ -62,7 +50,8 @@ async def test_relay_shows_a_session_to_the_witness(wire: str, coarse_rig: Rig) 
     async with far_side(WIRES[wire], coarse_rig) as far:
         for level, broken in ((0.5, set()), (0.3, {"limits"})):
             witness = _witness(far.url, level=level)
-            async with relays([parse_endpoint(far.url)], ["line"], witness) as (url,):
+            endpoint = parse_endpoint(far.url)
+            async with relays([endpoint], [endpoint.location], witness) as (url,):
                 assert url != far.url
                 await _drive(url)
             found = witness.finish()
@@ -109,7 +98,8 @@ async def test_relay_closes_connections_when_the_server_refuses(
     with socket.socket() as bound:
         bound.bind(("127.0.0.1", 0))
         url = f"modbus+tcp://127.0.0.1:{bound.getsockname()[1]}/1"
-        async with relays([parse_endpoint(url)], ["line"], _witness(url, level=0.5)) as (end,):
+        endpoint, witness = parse_endpoint(url), _witness(url, level=0.5)
+        async with relays([endpoint], [endpoint.location], witness) as (end,):
             host, _, port = parse_endpoint(end).location.rpartition(":")
             reader, writer = await asyncio.open_connection(host, int(port))
             assert await reader.read() == b""

@@ -44,7 +44,7 @@ _PLAYING = (
 )
 
 
-Sense = Callable[[str, SimulatedAmplifier, Sequence[float]], None]
+Sense = Callable[[str, SimulatedAmplifier], None]
 
 
 class TouchState:
@@ -98,8 +98,8 @@ class Checks:
         self._touched = touch_state
         self._arming = arming
         self._fed = dict.fromkeys(bench.amplifiers, -math.inf)
-        self.sense: Sense = lambda name, amplifier, levels: None
-        """Called with every amplifier and the levels of its channels at each check."""
+        self.sense: Sense = lambda name, amplifier: None
+        """Called with every amplifier at each check."""
         self._starving: dict[str, asyncio.TimerHandle] = {}
         self._releasing: asyncio.TimerHandle | None = None
         self._is_closed = False
@@ -127,7 +127,7 @@ class Checks:
             if not level <= AUDIBLE:
                 loud[name] = level
                 self._check_loud(name, level, now)
-            self.sense(name, amplifier, levels)
+            self.sense(name, amplifier)
         if loud:
             self._check_touched(loud, now)
 

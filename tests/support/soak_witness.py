@@ -6,17 +6,13 @@ from the controller but when it opens its links and closes them.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.faults.fault_window import FaultWindow
-from sim.witness.endpoint import parse_endpoint
 from sim.witness.witness import OperatorCommand, Witness
 from soak_contacts import FrameTouches, SourceContacts
 from virtual_loop import START, VirtualLoop
-
-_CHANNEL = {"frequency_hz": [40, 500], "level": 1.0}
-"""The paper's rig: its band and its levels, written by hand."""
+from witness_config import sense, witness_config
 
 _TOUCH = 0.19  # s; from a touch to its pattern
 _HEARTBEAT = 0.055  # s; between two signs of life, and as long as what is on the wire takes
@@ -33,27 +29,15 @@ class SoakWitness:
     def __init__(
         self, loop: VirtualLoop, urls: Mapping[str, str], *, channels: int, release: float
     ) -> None:
-        endpoints = {name: parse_endpoint(url) for name, url in urls.items()}
-        plan: dict[str, Any] = {
-            "wires": {endpoint.location: endpoint.kind for endpoint in endpoints.values()},
-            "amplifiers": {
-                name: {
-                    "wire": endpoint.location,
-                    "address": endpoint.address,
-                    "channels": dict.fromkeys(range(channels), _CHANNEL),
-                }
-                for name, endpoint in endpoints.items()
-            },
-            "times_s": {
-                "lift": release,
-                "release": release + _RAMP,
-                "touch": _TOUCH,
-                "stop": release,
-                "heartbeat": _HEARTBEAT + release,
-            },
+        times = {
+            "lift": release,
+            "release": release + _RAMP,
+            "touch": _TOUCH,
+            "stop": release,
+            "heartbeat": _HEARTBEAT + release,
         }
         self._loop = loop
-        self._witness = Witness(plan)
+        self._witness = Witness(witness_config(urls, channels=channels, times_s=times))
         self._open: set[str] = set()
         self._contacts = SourceContacts()
         self._active_faults = 0
@@ -102,16 +86,9 @@ class SoakWitness:
         lasts = window.lasts + (window.delay if window.fault == "delay" else 0.0)
         self._loop.call_later(lasts, self._over)
 
-    def sense(self, name: str, amplifier: SimulatedAmplifier, levels: Sequence[float]) -> None:
-        """What sensors find on an amplifier's channels just now."""
-        now = self._loop.time()
-        frequencies = {
-            channel: tone.frequency
-            for channel, output in enumerate(amplifier.outputs)
-            for tone in output
-            if tone.lasts
-        }
-        self._witness.levels(now, name, levels, frequencies=frequencies)
+    def sense(self, name: str, amplifier: SimulatedAmplifier) -> None:
+        """Show what an amplifier plays now."""
+        sense(self._witness, self._loop.time(), name, amplifier)
 
     def found(self) -> Sequence[str]:
         """What it has found until now, with the frames around it."""

@@ -24,6 +24,7 @@ from sim.witness.witness import Witness
 from sim.witness_relay import relays
 from stream_daemon import LINK_FAILED, DidNotStart, RunningDaemon, running_daemon
 from touch_stream import Stream, play_stream
+from witness_config import witness_config
 
 POLL = 0.01  # s
 ATTEMPTS = 8
@@ -235,21 +236,16 @@ async def _witnessed(
     stack: contextlib.AsyncExitStack, far_end: FarEndProcess
 ) -> tuple[dict[str, str], Witness]:
     """A witness in every wire of a far end, and the URLs that lead through it."""
-    endpoints = {name: parse_endpoint(url) for name, url in far_end.urls.items()}
-    limits = {"frequency_hz": list(FREQUENCY_LIMITS), "level": LEVEL_LIMIT}
-    plan = {
-        "wires": {name: endpoint.kind for name, endpoint in endpoints.items()},
-        "amplifiers": {
-            name: {
-                "wire": name,
-                "address": endpoint.address,
-                "channels": dict.fromkeys(range(4 if len(endpoints) == 1 else 2), limits),
-            }
-            for name, endpoint in endpoints.items()
-        },
+    endpoints = [parse_endpoint(url) for url in far_end.urls.values()]
+    config = witness_config(
+        far_end.urls,
+        channels=4 if len(endpoints) == 1 else 2,
         # Times of real processes on a machine that does other work, too.
-        "times_s": {"slack": 0.3},
-    }
-    witness = Witness(plan)
-    ends = await stack.enter_async_context(relays([*endpoints.values()], [*endpoints], witness))
-    return dict(zip(endpoints, ends, strict=True)), witness
+        times_s={"slack": 0.3},
+        frequency_hz=list(FREQUENCY_LIMITS),
+        level=LEVEL_LIMIT,
+    )
+    witness = Witness(config)
+    names = [endpoint.location for endpoint in endpoints]
+    ends = await stack.enter_async_context(relays(endpoints, names, witness))
+    return dict(zip(far_end.urls, ends, strict=True)), witness

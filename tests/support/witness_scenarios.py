@@ -13,83 +13,62 @@ _STOP = bytes.fromhex("00042801070205 05B4C3FD8600")  # one bit of its CRC is wr
 
 async def day(chain: Chain) -> None:
     """Touches, a neighbour, a lift, a stop amid a touch, clearing, arming, disarming."""
-    await chain.arm()
-    await chain.rest(0.12)
-    chain.touch(1)
-    await chain.rest(0.1)
-    chain.touch(1, 2)
-    await chain.rest(0.12)
-    chain.touch(1)
-    await chain.rest(0.05)
-    chain.touch()
-    await chain.rest(0.1)
-    chain.touch(3)
-    await chain.rest(0.1)
-    await chain.stop()
-    await chain.rest(0.1)
-    chain.touch()
-    await chain.clear()
-    await chain.arm()
-    chain.touch(4)
-    await chain.rest(0.06)
-    chain.touch()
-    await chain.rest(0.06)
-    await chain.disarm()
-    await chain.rest(0.1)
+    await chain.operate("arm", rest=0.12)
+    await chain.touch(1, rest=0.1)
+    await chain.touch(1, 2, rest=0.12)
+    await chain.touch(1, rest=0.05)
+    await chain.touch(rest=0.1)
+    await chain.touch(3, rest=0.1)
+    await chain.operate("stop", rest=0.1)
+    await chain.touch()
+    await chain.operate("clear")
+    await chain.operate("arm")
+    await chain.touch(4, rest=0.06)
+    await chain.touch(rest=0.06)
+    await chain.operate("disarm", rest=0.1)
 
 
 async def hung(chain: Chain) -> None:
     """The control loop stalls during a touch; a client polls the status, clears and rearms."""
-    await chain.arm()
-    chain.touch(1)
-    await chain.rest(0.1)
+    await chain.operate("arm")
+    await chain.touch(1, rest=0.1)
     await chain.hang()
     for _ in range(20):
         await chain.rest(0.02)
         await chain.amplifier.status()
-    chain.touch()
-    await chain.clear()
-    await chain.rest(0.05)
-    await chain.arm()
+    await chain.touch()
+    await chain.operate("clear", rest=0.05)
+    await chain.operate("arm")
     chain.run()
-    chain.touch(2)
-    await chain.rest(0.06)
-    chain.touch()
-    await chain.rest(0.06)
+    await chain.touch(2, rest=0.06)
+    await chain.touch(rest=0.06)
 
 
 async def source_dies(chain: Chain) -> None:
     """The source of touches dies with a finger down."""
-    await chain.arm()
-    chain.touch(1)
-    await chain.rest(0.1)
+    await chain.operate("arm")
+    await chain.touch(1, rest=0.1)
     await chain.fall_silent()
     await chain.rest(0.1)
 
 
 async def slow_stop(chain: Chain) -> None:
-    """An amplifier that takes its time over answers is stopped while it does."""
-    await chain.arm()
-    await chain.rest(0.02)
+    """An amplifier with late replies is stopped before one."""
+    await chain.operate("arm", rest=0.02)
     chain.between.delay = 0.025
-    chain.touch(1)
-    await chain.rest(0.001)
-    await chain.stop()
-    chain.touch()
-    await chain.rest(0.05)
+    await chain.touch(1, rest=0.001)
+    await chain.operate("stop")
+    await chain.touch(rest=0.05)
     chain.between.delay = 0.0
     await chain.rest(0.05)
 
 
 async def slow_lift(chain: Chain) -> None:
-    """The last finger goes while an amplifier takes its time over the answer to its touch."""
-    await chain.arm()
-    await chain.rest(0.02)
+    """The last finger is lifted before a late reply to its touch."""
+    await chain.operate("arm", rest=0.02)
     chain.between.delay = 0.025
-    chain.touch(1)
-    await chain.rest(0.001)
-    chain.touch()
-    await chain.rest(0.05)
+    await chain.touch(1, rest=0.001)
+    await chain.touch(rest=0.05)
     chain.between.delay = 0.0
     await chain.rest(0.05)
 
@@ -113,51 +92,43 @@ async def not_a_number(chain: Chain) -> None:
 
 
 async def _unanswerable(chain: Chain) -> None:
-    await chain.arm()
-    chain.touch(1, answerable=False)
+    await chain.operate("arm")
+    await chain.touch(1, answerable=False)
     chain.witness.expect(None)
     await chain.rest(0.1)
-    chain.touch()
-    await chain.rest(0.05)
+    await chain.touch(rest=0.05)
 
 
 async def reopened(chain: Chain) -> None:
     """Everything is closed, opened again and armed."""
-    await chain.arm()
-    await chain.rest(0.05)
+    await chain.operate("arm", rest=0.05)
     await chain.reopen()
-    await chain.arm()
-    chain.touch(1)
-    await chain.rest(0.06)
-    chain.touch()
-    await chain.rest(0.05)
+    await chain.operate("arm")
+    await chain.touch(1, rest=0.06)
+    await chain.touch(rest=0.05)
 
 
 async def arc(chain: Chain) -> None:
     """An amplifier has a fault of its own while a finger is felt; later it is cleared."""
-    await chain.arm()
-    chain.touch(1)
-    await chain.rest(0.06)
+    await chain.operate("arm")
+    await chain.touch(1, rest=0.06)
     chain.trip()
     for _ in range(10):
         await chain.rest(0.02)
         await chain.amplifier.status()
-    chain.touch()
-    await chain.clear()
-    await chain.rest(0.05)
+    await chain.touch()
+    await chain.operate("clear", rest=0.05)
 
 
 async def noise(chain: Chain) -> None:
     """Damaged frames come to the amplifier (a stop and a ping), which must not mind them."""
-    await chain.arm()
-    chain.touch(1)
-    await chain.rest(0.06)
-    chain.witness.faults(chain.loop.time(), chain.link, are_on=True)
+    await chain.operate("arm")
+    await chain.touch(1, rest=0.06)
+    chain.disturb()
     chain.inject("amplifier", _STOP)
     await chain.rest(0.1)
-    chain.witness.faults(chain.loop.time(), chain.link, are_on=False)
-    chain.touch()
-    await chain.rest(0.05)
+    chain.disturb(False)
+    await chain.touch(rest=0.05)
 
 
 async def late_copy(chain: Chain) -> None:
@@ -169,19 +140,16 @@ async def late_copy(chain: Chain) -> None:
             kept.append(data)
         return data
 
-    await chain.arm()
+    await chain.operate("arm")
     chain.between.mangle = keep
-    chain.touch(1)
-    await chain.rest(0.03)
-    chain.touch(1, 2)
-    await chain.rest(0.1)
-    chain.witness.faults(chain.loop.time(), chain.link, are_on=True)
+    await chain.touch(1, rest=0.03)
+    await chain.touch(1, 2, rest=0.1)
+    chain.disturb()
     stale = next(data for data in kept if len(data) > 30)
     chain.inject("amplifier", stale)
     await chain.rest(0.1)
-    chain.witness.faults(chain.loop.time(), chain.link, are_on=False)
-    chain.touch()
-    await chain.rest(0.05)
+    chain.disturb(False)
+    await chain.touch(rest=0.05)
 
 
 async def damaged_answer(chain: Chain) -> None:
@@ -195,16 +163,13 @@ async def damaged_answer(chain: Chain) -> None:
             return data[:at] + bytes([data[at] ^ 0x55 or 1]) + data[at + 1 :]
         return data
 
-    await chain.arm()
-    await chain.rest(0.02)
-    chain.witness.faults(chain.loop.time(), chain.link, are_on=True)
+    await chain.operate("arm", rest=0.02)
+    chain.disturb()
     chain.between.mangle = damage
     await damaged.wait()
     await chain.rest(0.005)
-    chain.touch(1)
-    await chain.rest(0.15)
-    chain.touch()
-    await chain.rest(0.05)
+    await chain.touch(1, rest=0.15)
+    await chain.touch(rest=0.05)
 
 
 async def foreign_answer(chain: Chain) -> None:
@@ -221,16 +186,13 @@ async def foreign_answer(chain: Chain) -> None:
             return kept[-2]
         return data
 
-    await chain.arm()
-    await chain.rest(0.02)
-    chain.witness.faults(chain.loop.time(), chain.link, are_on=True)
+    await chain.operate("arm", rest=0.02)
+    chain.disturb()
     chain.between.mangle = replace
     await replaced.wait()
     await chain.rest(0.005)
-    chain.touch(1)
-    await chain.rest(0.15)
-    chain.touch()
-    await chain.rest(0.05)
+    await chain.touch(1, rest=0.15)
+    await chain.touch(rest=0.05)
 
 
 async def incomplete_set(chain: Chain) -> None:
@@ -244,14 +206,11 @@ async def incomplete_set(chain: Chain) -> None:
             return data[:at] + data[data.index(b"\r", at) + 1 :]
         return data
 
-    await chain.arm()
-    await chain.rest(0.02)
-    chain.witness.faults(chain.loop.time(), chain.link, are_on=True)
+    await chain.operate("arm", rest=0.02)
+    chain.disturb()
     chain.between.mangle = lose
-    chain.touch(1)
-    await chain.rest(0.1)
-    chain.touch()
-    await chain.rest(0.05)
+    await chain.touch(1, rest=0.1)
+    await chain.touch(rest=0.05)
 
 
 async def slow_touch(chain: Chain) -> None:
@@ -263,29 +222,25 @@ async def slow_touch(chain: Chain) -> None:
             asked.set()
         return data
 
-    await chain.arm()
-    await chain.rest(0.02)
+    await chain.operate("arm", rest=0.02)
     chain.between.delay = 0.020
     chain.between.mangle = look
     await asked.wait()
     await chain.rest(0.005)
-    chain.touch(1)
+    await chain.touch(1)
     await chain.amplifier.status()
     await chain.rest(0.1)
     chain.between.delay = 0.0
-    chain.touch()
-    await chain.rest(0.05)
+    await chain.touch(rest=0.05)
 
 
 async def disarmed_amid(chain: Chain) -> None:
     """Somebody disarms it while a finger is felt."""
-    await chain.arm()
-    chain.touch(1)
-    await chain.rest(0.06)
-    await chain.disarm()
-    await chain.rest(0.1)
+    await chain.operate("arm")
+    await chain.touch(1, rest=0.06)
+    await chain.operate("disarm", rest=0.1)
     await chain.amplifier.status()
-    chain.touch()
+    await chain.touch()
 
 
 async def strangers_set(chain: Chain) -> None:
@@ -300,8 +255,7 @@ async def strangers_set(chain: Chain) -> None:
 
 async def touched_beside(chain: Chain) -> None:
     """A sensor tells of a finger beside the plate."""
-    await chain.arm()
-    await chain.rest(0.05)
+    await chain.operate("arm", rest=0.05)
     chain.touch_beside()
     await chain.rest(0.1)
 
@@ -328,20 +282,15 @@ async def _spoilt(chain: Chain, *, flips: bool) -> None:
             return data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :]
         return data
 
-    await chain.arm()
-    chain.touch(1)
-    await chain.rest(0.1)
-    chain.witness.faults(chain.loop.time(), chain.link, are_on=True)
+    await chain.operate("arm")
+    await chain.touch(1, rest=0.1)
+    chain.disturb()
     chain.between.mangle = spoil
     for _ in range(6):
-        chain.touch(1)
-        await chain.rest(0.08)
-        chain.touch()
-        await chain.rest(0.05)
+        await chain.touch(1, rest=0.08)
+        await chain.touch(rest=0.05)
     chain.between.mangle = lambda toward, data: data
-    chain.witness.faults(chain.loop.time(), chain.link, are_on=False)
+    chain.disturb(False)
     await chain.rest(0.6)
-    chain.touch(2)
-    await chain.rest(0.12)
-    chain.touch()
-    await chain.rest(0.05)
+    await chain.touch(2, rest=0.12)
+    await chain.touch(rest=0.05)

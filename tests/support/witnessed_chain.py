@@ -33,24 +33,18 @@ from model.vibration.excitation import Excitation, Tone
 from sim.bench.bench import Bench
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import Wire, open_wire
-from sim.waveform import level_of
 from sim.witness.violation import Violation
-from sim.witness.witness import Witness
+from sim.witness.witness import OperatorCommand, Witness
 from virtual_loop import VirtualLoop, run_virtual
+from witness_config import sense, witness_config
 
 STROKE = 100e-6  # m
 SENSED_EVERY = 0.001  # s
 _LONGEST = 5.0  # s; a chain with a bug in it may wait for ever
 ALONE: Excitation = {"SW": Tone(110.0, 20e-6, math.pi / 2), "NE": Tone(150.0, 40e-6, -math.pi)}
 SHARED: Excitation = {"SW": Tone(90.0, 30e-6, 0.0)}
-WITNESSED = {
-    "serial": Wire("serial"),
-    "modbus-tcp": Wire("modbus-tcp"),
-    "modbus-rtu": Wire("modbus-rtu"),
-    "socketcand": Wire("socketcand"),
-    "slcan": Wire("slcan"),
-}
-"""Every kind of wire, by the name that the witness has for it."""
+WITNESSED = ("serial", "modbus-tcp", "modbus-rtu", "socketcand", "slcan")
+"""Every kind of wire."""
 
 Mangle = Callable[[str, bytes], bytes | None]
 
@@ -104,34 +98,6 @@ def make_rig(amplifiers: Sequence[str], limits: Limits) -> Rig:
     )
 
 
-def plan_for(wire: str, urls: Mapping[str, str], links: Mapping[str, str]) -> dict[str, Any]:
-    """The witness's configuration, independent of the rig."""
-    channel = {"frequency_hz": [40, 500], "level": 0.5, "slew_per_s": 100}
-    return {
-        "wires": dict.fromkeys(links.values(), wire),
-        "amplifiers": {
-            name: {
-                "wire": links[name],
-                "address": _address(wire, url),
-                "channels": dict.fromkeys(range(3), channel),
-            }
-            for name, url in urls.items()
-        },
-    }
-
-
-def _address(wire: str, url: str) -> int:
-    if wire == "serial":
-        return int(url.partition("address=")[2] or 1)
-    return int(url.rpartition("/" if wire == "modbus-tcp" else "#")[2])
-
-
-def _link(wire: str, url: str) -> str:
-    """The name that the memory network has for what a URL leads to."""
-    place = url.partition("://")[2]
-    return place.partition("/" if wire in ("modbus-tcp", "socketcand") else "?")[0]
-
-
 @dataclass
 class Chain:
     """A running chain and its witness; names of amplifiers as in the rig."""
@@ -162,27 +128,14 @@ class Chain:
 
     async def rest(self, seconds: float) -> None:
         """Let time pass."""
-        await asyncio.sleep(seconds)
+        if seconds:
+            await asyncio.sleep(seconds)
 
-    async def arm(self) -> None:
-        """Somebody arms it."""
-        self.witness.operator_command(self.loop.time(), "arm")
-        await self._try(self.controller.arm())
-
-    async def stop(self) -> None:
-        """Somebody stops it."""
-        self.witness.operator_command(self.loop.time(), "stop")
-        await self._try(self.controller.stop())
-
-    async def disarm(self) -> None:
-        """Somebody disarms it."""
-        self.witness.operator_command(self.loop.time(), "disarm")
-        await self._try(self.controller.disarm())
-
-    async def clear(self) -> None:
-        """Somebody clears what is latched."""
-        self.witness.operator_command(self.loop.time(), "clear")
-        await self._try(self.controller.clear())
+    async def operate(self, command: OperatorCommand, *, rest: float = 0.0) -> None:
+        """Carry out an operator's command, then let time [s] pass."""
+        self.witness.operator_command(self.loop.time(), command)
+        await self._try(getattr(self.controller, command)())
+        await self.rest(rest)
 
     def run(self) -> None:
         """The control loop runs from now on."""
@@ -202,12 +155,17 @@ class Chain:
         touches = (Touch(9, 1.3, 0.5),)
         self.controller.deliver(TouchFrame("test", self.loop.time(), touches))
 
-    def touch(self, *fingers: int, answerable: bool = True) -> None:
-        """These fingers are on the plate from now on; the source repeats them, as it must."""
+    async def touch(self, *fingers: int, answerable: bool = True, rest: float = 0.0) -> None:
+        """Replace the fingers on the plate, which the source repeats, then let time [s] pass."""
         self.fingers = fingers
         self.witness.expect(self.expected())
         self.witness.contacts(self.loop.time(), fingers, is_answerable=answerable)
         self._deliver()
+        await self.rest(rest)
+
+    def disturb(self, are_on: bool = True) -> None:
+        """Tell the witness that faults of the first wire begin or end."""
+        self.witness.faults(self.loop.time(), self.link, are_on=are_on)
 
     def expected(self) -> dict[str, dict[int, tuple[float, float, float]]]:
         """What the patterns are on the wire, by hand: metres over 100 um, radians in degrees."""
@@ -332,9 +290,10 @@ async def _play(
         SimulatedDevice(bench, name, number=number)
         for number, name in enumerate(bench.amplifiers, 1)
     ]
-    async with open_wire(WITNESSED[wire], devices) as urls:
-        links = {name: _link(wire, url) for name, url in urls.items()}
-        tap.witness = witness = Witness(plan_for(wire, urls, links))
+    async with open_wire(Wire(wire), devices) as urls:
+        config = witness_config(urls, channels=3, times_s={}, level=0.5, slew_per_s=100)
+        links = {name: amplifier["wire"] for name, amplifier in config["amplifiers"].items()}
+        tap.witness = witness = Witness(config)
         for link in {*links.values()}:
             witness.opened(link, loop.time())
         witness.contacts(loop.time(), ())
@@ -397,27 +356,21 @@ class Between:
 async def _sensed(chain: Chain) -> AsyncIterator[None]:
     """Sensors on every channel, a thousand times a second."""
 
-    async def sense() -> None:
+    async def keep_sensing() -> None:
         while True:
             now = chain.loop.time()
             chain.bench.advance(now)
             for name, amplifier in chain.bench.amplifiers.items():
-                levels = [min(level_of(output, now), 1.0) for output in amplifier.outputs]
-                frequencies = {
-                    channel: tone.frequency
-                    for channel, output in enumerate(amplifier.outputs)
-                    for tone in output
-                    if tone.lasts
-                }
-                chain.witness.levels(now, name, levels, frequencies=frequencies)
+                sense(chain.witness, now, name, amplifier)
             await asyncio.sleep(SENSED_EVERY)
 
-    task = asyncio.get_running_loop().create_task(sense())
+    task = asyncio.get_running_loop().create_task(keep_sensing())
     try:
         yield
     finally:
         task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
 
 
 def with_level(

@@ -1,0 +1,41 @@
+"""Configure a witness by the URLs of amplifiers, and show it what they play."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.waveform import level_of
+from sim.witness.endpoint import parse_endpoint
+from sim.witness.witness import Witness
+
+
+def witness_config(
+    urls: Mapping[str, str], *, channels: int = 4, times_s: Mapping[str, float], **limits: Any
+) -> dict[str, Any]:
+    """A configuration with wires named by their location; limits: of all channels."""
+    endpoints = {name: parse_endpoint(url) for name, url in urls.items()}
+    limits = {"frequency_hz": [40, 500], "level": 1.0} | limits
+    return {
+        "wires": {endpoint.location: endpoint.kind for endpoint in endpoints.values()},
+        "amplifiers": {
+            name: {
+                "wire": endpoint.location,
+                "address": endpoint.address,
+                "channels": dict.fromkeys(range(channels), limits),
+            }
+            for name, endpoint in endpoints.items()
+        },
+        "times_s": times_s,
+    }
+
+
+def sense(witness: Witness, now: float, name: str, amplifier: SimulatedAmplifier) -> None:
+    """Show the levels and frequencies of an amplifier's channels at a time [s]."""
+    levels = [min(level_of(output, now), 1.0) for output in amplifier.outputs]
+    frequencies = {
+        channel: tone.frequency
+        for channel, output in enumerate(amplifier.outputs)
+        for tone in output
+        if tone.lasts
+    }
+    witness.levels(now, name, levels, frequencies=frequencies)

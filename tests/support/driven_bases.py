@@ -2,9 +2,12 @@
 
 import cmath
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from model.arrays import FloatArray
 from model.transients.base_motion import Term, fade
 from sim.waveform import ShapedTone
 
@@ -15,6 +18,16 @@ class Base:
 
     motion: Callable[[float], tuple[float, float]]
     terms: tuple[Term, ...]
+
+
+def motion_of(terms: Iterable[Term], times: FloatArray) -> FloatArray:
+    """Displacement [m] at times (n,) [s] by the definition of a term."""
+    y = np.zeros(len(times))
+    for term in terms:
+        tau = times - term.start
+        value = (term.c0 + term.c1 * tau) * np.exp(1j * term.omega * tau)
+        y += np.where((times >= term.start) & (times < term.end), value.imag, 0.0)
+    return y
 
 
 STILL = Base(lambda time: (0.0, 0.0), ())

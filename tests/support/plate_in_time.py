@@ -1,4 +1,4 @@
-"""The paper's plate on its ERAs in time, small enough for a stepping solver."""
+"""The paper's plate on its ERAs in time: a stepping solver, amplitudes and distances."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.fem.assembly import era_positions
 from model.reduction.modal_matrices import modal_matrices
 from model.reduction.reduced_plate import reduce_plate
@@ -25,6 +25,19 @@ def make_plate_in_time(*, frequency_max: float = 500.0) -> tuple[Rig, PlateInTim
         rig.plate, rig.mesh, era_positions(rig.eras), frequency_max=frequency_max
     )
     return rig, plate_in_time(reduced, rig.eras)
+
+
+def lock_in(times: FloatArray, samples: FloatArray, frequency: float) -> ComplexArray:
+    """Complex amplitudes (p,) A of Im[A exp(i w t)] in samples (n, p), by least squares."""
+    w = 2 * np.pi * frequency
+    basis = np.column_stack([np.sin(w * times), np.cos(w * times)])
+    fit = np.linalg.lstsq(basis, samples, rcond=None)[0]
+    return np.asarray(fit[0] + 1j * fit[1])
+
+
+def apart(found: FloatArray, expected: FloatArray) -> float:
+    """Relative L2 distance."""
+    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
 
 def stepped_acceleration(

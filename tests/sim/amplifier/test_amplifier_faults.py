@@ -38,24 +38,17 @@ def armed() -> SimulatedAmplifier:
     return amplifier
 
 
-def test_temperature_rises_with_the_load() -> None:
-    """First order with 120 s: 63 % of 30 K after that time at full stroke, a quarter at half."""
-    for level, rise in ((1.0, 30.0), (0.5, 7.5)):
-        amplifier = armed()
-        amplifier.handle(Apply(playing(1, level)), 0.0)
-        assert amplifier.status(0.0).temperature == 25.0
-        warm = amplifier.status(120.0).temperature
-        assert warm == pytest.approx(25 + rise * (1 - math.exp(-1)), abs=1e-9)
-
-
-def test_temperature_falls_when_silent() -> None:
-    """From the moment of silence on towards 25 °C, with the same time constant."""
+@pytest.mark.parametrize(("level", "rise"), [(1.0, 30.0), (0.5, 7.5)])
+def test_temperature_follows_the_load(level: float, rise: float) -> None:
+    """First order with 120 s: 30 K at full stroke, a quarter at half, 25 °C when silent."""
     amplifier = armed()
-    amplifier.handle(Apply(playing(1, 1.0)), 0.0)
-    hot = amplifier.status(1.0).temperature
+    amplifier.handle(Apply(playing(1, level)), 0.0)
+    assert amplifier.status(0.0).temperature == 25.0
+    warm = 25 + rise * (1 - math.exp(-1 / 120))
+    assert amplifier.status(1.0).temperature == pytest.approx(warm, abs=1e-9)
     amplifier.handle(Disarm(0.0), 1.0)
     cooler = amplifier.status(121.0).temperature
-    assert cooler - 25 == pytest.approx((hot - 25) * math.exp(-1), rel=1e-9)
+    assert cooler - 25 == pytest.approx((warm - 25) * math.exp(-1), rel=1e-9)
 
 
 def test_temperature_derates_above_70_and_trips_above_85() -> None:

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from driven_bases import motion_of
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.protocol.messages import (
     Achieved,
@@ -17,10 +18,10 @@ from drivers.protocol.messages import (
     Nak,
     NakCode,
     Ping,
+    Request,
     Stage,
     Stop,
 )
-from model.transients.base_motion import Term
 from model.transients.envelope import Envelope as BaseEnvelope
 from sim.amplifier.amplifier import SimulatedAmplifier
 
@@ -53,16 +54,6 @@ def level(amplifier: SimulatedAmplifier, time: float) -> float:
     return amplifier.status(time).levels[0]
 
 
-def motion(terms: list[Term], times: np.ndarray) -> np.ndarray:
-    """The base's motion by the definition of a term."""
-    y = np.zeros(len(times))
-    for term in terms:
-        tau = times - term.start
-        value = (term.c0 + term.c1 * tau) * np.exp(1j * term.omega * tau)
-        y += np.where((times >= term.start) & (times < term.end), value.imag, 0.0)
-    return y
-
-
 def test_onset_follows_its_knots() -> None:
     """From zero, one knot every 5 ms, the level of the command after a third step, then steady."""
     amplifier = armed()
@@ -82,7 +73,7 @@ def test_envelope_moves_the_base_as_modelled() -> None:
     knots = tuple(STROKE * value for value in (0.2j, 0.4 + 0j, 0.8 + 0j))
     model = list(BaseEnvelope(110.0, 0j, knots, step=0.005).terms())
     times = np.linspace(0.0, 0.03, 500)
-    assert motion(terms, times + 0.25) == pytest.approx(motion(model, times), abs=1e-12)
+    assert motion_of(terms, times + 0.25) == pytest.approx(motion_of(model, times), abs=1e-12)
 
 
 def test_ending_plays_before_a_silent_set() -> None:
@@ -99,13 +90,29 @@ def test_ending_plays_before_a_silent_set() -> None:
     assert tone.silent_from == pytest.approx(1.215)
 
 
-def test_ending_is_skipped_on_command() -> None:
-    """With the flag the channel falls silent along the ramp."""
+@pytest.mark.parametrize(
+    "silencing",
+    [Apply(playing(2, 0.0, ramp=0.005, skip_ending=True)), Stop(0.005), Disarm(0.005), None],
+)
+def test_ending_is_skipped(silencing: Request | None) -> None:
+    """By its flag, a stop, a disarm and the watchdog: silent within the ramp, without its knots."""
     amplifier = armed()
+    amplifier.handle(Arm(0.1), 1.0)
     amplifier.handle(Apply(playing(1, 0.8, ending=2)), 1.0)
-    amplifier.handle(Apply(playing(2, 0.0, ramp=0.02, skip_ending=True)), 1.2)
-    assert level(amplifier, 1.205) == pytest.approx(0.8 * (1 + math.cos(math.pi / 4)) / 2)
-    assert level(amplifier, 1.21) == pytest.approx(0.4)
+    if silencing is not None:
+        amplifier.handle(silencing, 1.1 - 1e-9)
+    assert level(amplifier, 1.1) == pytest.approx(0.8)
+    assert level(amplifier, 1.1025) == pytest.approx(0.4)
+    assert level(amplifier, 1.1051) == 0.0
+
+
+def test_stop_amid_an_onset_fades_from_the_reached_level() -> None:
+    """Half of the level at the stop after half of its ramp."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.8, onset=1, ending=2)), 1.0)
+    amplifier.handle(Stop(0.005), 1.01)
+    assert level(amplifier, 1.0125) == pytest.approx(0.2)  # half of 0.4
+    assert level(amplifier, 1.0151) == 0.0
 
 
 def test_ending_plays_after_valid_for() -> None:
@@ -116,25 +123,6 @@ def test_ending_plays_after_valid_for() -> None:
     assert level(amplifier, 1.1) == pytest.approx(before, abs=1e-6)
     assert level(amplifier, 1.105) == pytest.approx(0.5, abs=1e-6)
     assert level(amplifier, 1.1151) == 0.0
-
-
-@pytest.mark.parametrize("request_", [Stop(0.005), Disarm(0.005)])
-def test_stop_skips_endings(request_: Stop | Disarm) -> None:
-    """Silent within the ramp of 5 ms, also in the midst of an onset, from what was reached."""
-    amplifier = armed()
-    amplifier.handle(Apply(playing(1, 0.8, onset=1, ending=2)), 1.0)
-    amplifier.handle(request_, 1.01)
-    assert level(amplifier, 1.0125) == pytest.approx(0.2)  # half of 0.4
-    assert level(amplifier, 1.0151) == 0.0
-
-
-def test_watchdog_skips_endings() -> None:
-    """5 ms after it ran out everything is silent."""
-    amplifier = armed()
-    amplifier.handle(Arm(0.1), 1.0)
-    amplifier.handle(Apply(playing(1, 0.8, ending=2)), 1.0)
-    assert level(amplifier, 1.1) == pytest.approx(0.8)
-    assert level(amplifier, 1.1051) == 0.0
 
 
 def test_onset_with_keep_phase_continues_the_tone() -> None:

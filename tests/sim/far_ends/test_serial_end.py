@@ -83,14 +83,6 @@ async def host(end: SerialEnd) -> AsyncIterator[Host]:
     host.close()
 
 
-async def test_serial_end_replies(host: Host) -> None:
-    """Hello brings the identity; the reply carries the request's sequence number and address."""
-    reply = await host.ask(Hello(), sequence=513)
-    assert isinstance(reply, Identity)
-    assert reply.serial_number == "SIM-main"
-    assert reply.protocol_version == PROTOCOL.version
-
-
 async def test_serial_end_skips_noise(end: SerialEnd, host: Host) -> None:
     """Garbage and a frame with a flipped bit have no effect; the next good frame is understood."""
     good = encode_frame(encode_request(Stop(0.0), address=ADDRESS, sequence=4))

@@ -14,6 +14,7 @@ from drivers.protocol.messages import Apply, Arm, Stop
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
+from plate_in_time import lock_in
 from sim.bench.bench import Bench
 from sim.plant.imperfections import ChannelErrors, Imperfections, draw_imperfections, draw_noise
 
@@ -56,10 +57,7 @@ def played(
 def phasor(times: FloatArray, samples: FloatArray, frequency: float, *, since: float) -> complex:
     """Complex amplitude of a frequency from a moment on, by least squares."""
     late = times >= since
-    angle = 2 * np.pi * frequency * times[late]
-    basis = np.column_stack([np.sin(angle), np.cos(angle)])
-    sine, cosine = np.linalg.lstsq(basis, samples[late], rcond=None)[0]
-    return complex(sine, cosine)
+    return complex(lock_in(times[late], samples[late], frequency))
 
 
 def test_imperfections_apply_gain_and_phase(two_amplifiers: Rig) -> None:
@@ -179,37 +177,6 @@ def test_draw_imperfections_has_the_given_deviations(two_amplifiers: Rig) -> Non
     gains, phases = np.array([(each.gain, np.degrees(each.phase)) for each in errors]).T
     assert (gains.mean(), gains.std()) == pytest.approx((1, 0.05), abs=0.004)
     assert (phases.mean(), phases.std()) == pytest.approx((0, 5), abs=0.4)
-
-
-@pytest.mark.parametrize("keep_phase", [True, False])
-def test_phase_is_kept_or_reset_as_commanded(two_amplifiers: Rig, keep_phase: bool) -> None:
-    """A level that changes in mid-cycle: kept, the tone goes on; reset, it begins anew.
-
-    Late and wrong in phase by the same amount before and after, as hardware is.
-    """
-    bench = Bench(
-        two_amplifiers,
-        now=0.0,
-        imperfections=Imperfections({Channel("left", 0): ChannelErrors(0.9, 0.3)}, latency=0.0021),
-    )
-    bench.place_fingers({"a": AT}, now=0.0)
-    ask(bench, "left", Arm(2.0), 0.0)
-    change = 3.0 + 0.3 / 110.0  # three tenths of a cycle further than the first command
-    for token, (now, level, keep) in enumerate(
-        [(0.0, 0.5, False), (change, 0.25, keep_phase)], start=1
-    ):
-        command = DriveCommand(0, 110.0, level, keep_phase=keep)
-        keep_alive(bench, now)
-        ask(bench, "left", Apply(CommandSet(token, (command,), 0.0, 0.0)), now)
-    keep_alive(bench, 6.0)
-    (record,) = bench.fingers.felt(2.5, 6.0).values()
-    times, samples = record.times, record.accelerations[:, 0]
-    early = times < change
-    before = phasor(times[early], samples[early], 110.0, since=2.5)
-    after = phasor(times, samples, 110.0, since=5.5)
-    turned = np.angle(after / before) / (2 * np.pi)
-    assert abs(after) == pytest.approx(abs(before) / 2, rel=1e-3)
-    assert turned == pytest.approx(0.0 if keep_phase else -0.3, abs=1e-3)
 
 
 @pytest.mark.parametrize(

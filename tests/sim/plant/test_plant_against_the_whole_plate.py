@@ -18,6 +18,7 @@ from model.structure.actuator import Era
 from model.structure.point_load import PointLoad
 from model.transients.base_motion import Term
 from paper_plate import make_paper_rig
+from plate_in_time import apart, lock_in
 from sim.plant.plant import Plant
 from whole_plate import WholePlate, whole_plate
 
@@ -71,11 +72,6 @@ def felt(samples: FloatArray) -> FloatArray:
     return np.asarray(sosfiltfilt(butter(6, 1000.0, fs=RATE, output="sos"), samples, axis=0))
 
 
-def apart(found: FloatArray, expected: FloatArray) -> float:
-    """Relative L2 distance."""
-    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
-
-
 def test_plant_ramps_agree_with_newmark(rig: Rig, whole: WholePlate, reduced: ReducedPlate) -> None:
     """Without a finger: within 0.1 % of Newmark's method, over the plate, nothing filtered."""
     plant = Plant(reduced, rig.eras)
@@ -123,13 +119,10 @@ def phasors(
     plant: Plant, points: FloatArray, driven: int, frequency: float, since: float
 ) -> ComplexArray:
     """Accelerations per base amplitude [1/s²] at points, of one ERA that has been driven long."""
-    w = 2 * np.pi * frequency
     times, samples = plant.advance(
         since + 0.2, sample_rate=10_000.0, shapes=plant.reduced.at(points)
     )
-    basis = np.column_stack([np.sin(w * times), np.cos(w * times)])
-    fit = np.linalg.lstsq(basis, samples, rcond=None)[0]
-    return np.asarray((fit[0] + 1j * fit[1]) / STROKE)
+    return lock_in(times, samples, frequency) / STROKE
 
 
 @pytest.mark.parametrize("frequency", [60.0, 110.0, 207.0, 250.0, 320.0, 410.0, 500.0])

@@ -15,7 +15,7 @@ from model.finger.load import FingerLoad, finger_loads
 from model.reduction.modal_matrices import modal_matrices
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
-from model.structure.point_load import PointLoad, load_positions
+from model.structure.point_load import PointLoad
 from model.transients.base_motion import Term
 from sim.plant.plant import Plant
 
@@ -118,19 +118,6 @@ def test_contacts_tap_is_passive(coarse_rig: Rig, reduced: ReducedPlate) -> None
     assert stored(plant, coarse_rig) < 0.1 * start
 
 
-def test_contacts_increase_the_decay(coarse_rig: Rig, reduced: ReducedPlate) -> None:
-    """Half a second after the drive there is far less left under a finger than without one."""
-    left = []
-    for contacts in ([], FINGERS):
-        plant = Plant(reduced, coarse_rig.eras)
-        plant.set_input(1, [Term(0.0, 0.4, 2 * np.pi * 110.0, STROKE)])
-        plant.skip(0.4)
-        plant.set_contacts(contacts)
-        plant.skip(0.7)
-        left.append(stored(plant, coarse_rig))
-    assert left[1] < 0.1 * left[0]
-
-
 def test_contacts_apply_to_later_drives(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """It does not matter whether the drive or the finger is announced first."""
     shapes, samples = reduced.at(np.array([[0.05, 0.2]])), []
@@ -178,16 +165,6 @@ def test_contacts_result_is_independent_of_steps(coarse_rig: Rig, reduced: Reduc
     assert_allclose(cut, whole, rtol=0, atol=1e-10 * np.abs(whole).max())
 
 
-def test_contacts_superpose_drives(coarse_rig: Rig, reduced: ReducedPlate) -> None:
-    """Superposition holds while fingers come and go, since the plate is linear throughout."""
-    together = run(coarse_rig, reduced, BASES, np.array([]))
-    alone = sum(
-        run(coarse_rig, reduced, [b if b is base else None for b in BASES], np.array([]))
-        for base in BASES
-    )
-    assert_allclose(alone, together, rtol=0, atol=1e-10 * np.abs(together).max())
-
-
 def test_contacts_are_solved_once(
     coarse_rig: Rig, reduced: ReducedPlate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -221,22 +198,6 @@ def test_contacts_on_a_plate_without_nodes(coarse_rig: Rig) -> None:
     spring = k + 1j * w * c
     expected = w**2 * abs(spring / (4 * spring + 1e4 - w**2)) * STROKE
     assert np.abs(samples).max() == pytest.approx(expected, rel=1e-3)
-
-
-def test_contacts_positions(coarse_rig: Rig, reduced: ReducedPlate) -> None:
-    """The static deflection under a stiff finger is next to none: it holds the plate there."""
-    plant = Plant(reduced, coarse_rig.eras)
-    stiff = PointLoad(0.11, 0.07, stiffness=1e7, damping=1e3)
-    plant.set_contacts([stiff])
-    plant.set_input(0, [Term(0.0, np.inf, 2 * np.pi * 20.0, STROKE)])
-    plant.skip(30.0)
-    at = plant.reduced.at(np.vstack([load_positions([stiff]), [[0.2, 0.15]]]))
-    moved = []
-    for number in range(50):
-        plant.skip(30.0 + number / 1000)
-        moved.append(np.abs(at @ plant.state[0]))
-    held, free = np.max(moved, axis=0)
-    assert held < 0.01 * free
 
 
 def test_plant_sampling_rate_may_change(coarse_rig: Rig, reduced: ReducedPlate) -> None:

@@ -67,34 +67,6 @@ async def server(bus: CanBus) -> AsyncIterator[SocketcandEnd]:
     await end.close()
 
 
-async def test_socketcand_serves_python_can(bus: CanBus, server: SocketcandEnd) -> None:
-    """Its own client opens the bus, sends, and hears what others send."""
-    member = Member(bus)
-
-    def connect() -> can.BusABC:
-        return can.Bus(
-            interface="socketcand",
-            channel="can0",
-            host="127.0.0.1",
-            port=server.port,
-            ignore_config=True,
-        )
-
-    client = await asyncio.to_thread(connect)
-    try:
-        for data in (b"", b"\x00", bytes(range(8))):
-            client.send(message(CanFrame(0x7FF, data)))
-        assert await member.hears(3) == [
-            CanFrame(0x7FF, data) for data in (b"", b"\x00", bytes(range(8)))
-        ]
-        member.send(FRAME)
-        received = await asyncio.to_thread(client.recv, TIMEOUT)
-        assert received is not None
-        assert (received.arbitration_id, bytes(received.data)) == (0x181, FRAME.data)
-    finally:
-        client.shutdown()
-
-
 class Talk:
     """A connection on which text is written by hand."""
 

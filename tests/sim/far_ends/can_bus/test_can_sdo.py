@@ -1,5 +1,6 @@
 """The far end's SDO server against the client of `canopen`, and against frames by hand."""
 
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 import drivers
 from can_eds import eds_text
 from drivers.codec.can_bus.frame import CanFrame
+from drivers.protocol.messages import Fault
 from fake_device import FakeDevice
 from sim.far_ends.can_bus import sdo
 from sim.far_ends.can_bus.node import CanNode
@@ -143,9 +145,14 @@ def test_sdo_sends_at_most_one_reply(frames: list[bytes]) -> None:
 
 
 @pytest.fixture
-def node() -> canopen.RemoteNode:
+def device() -> FakeDevice:
+    """The amplifier of the far end."""
+    return FakeDevice()
+
+
+@pytest.fixture
+def node(device: FakeDevice) -> canopen.RemoteNode:
     """A far end as `canopen` sees it with the data sheet."""
-    device = FakeDevice()
 
     class Wire(canopen.Network):
         def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
@@ -191,6 +198,29 @@ def test_capabilities_read_by_the_eds(node: canopen.RemoteNode) -> None:
     assert node.sdo["status"]["temperature"].raw == 250
     assert node.sdo[0x1400][1].raw == 0x205
     assert node.sdo[0x1600][1].raw == 0x20200140
+
+
+def test_node_is_driven_by_a_canopen_master(node: canopen.RemoteNode, device: FakeDevice) -> None:
+    """By EDS and page alone: it plays a set on SYNC, and sends EMCY 8130 without heartbeats."""
+    network = node.network
+    node.nmt.state = "OPERATIONAL"
+    arm = struct.pack("<HHHBB", 100, 0, 600, 4, 1)  # by host 100, for 600 ms
+    node.sdo["order"].raw = int.from_bytes(arm, "little")
+    assert node.sdo["heartbeat_consumer"][1].raw == 100 << 16 | 600
+    for channel, level in ((0, 2500), (3, 5000)):
+        command = struct.pack("<HHhBB", 11000, level, 0, channel << 4, 2)
+        network.send_message(0x205 + 0x100 * channel, command)
+    network.send_message(0x485, struct.pack("<HHHBB", 7, 0, 0, 1 | 2 << 3, 2))
+    network.sync.transmit()
+    for _ in range(8):
+        device.pass_time(0.5)
+        network.send_message(0x700 + 100, b"\x05")
+    assert node.sdo["status"]["active_token"].raw == 7
+    levels = [node.sdo["channel_levels"][channel].raw for channel in range(1, 5)]
+    assert levels == [2500, 0, 0, 5000]
+    device.pass_time(0.601)
+    assert [(each.code, each.register) for each in node.emcy.log] == [(0x8130, 0x11)]
+    assert device.amplifier.fault is Fault.WATCHDOG
 
 
 def test_eds_of_sixteen_channels(tmp_path: Path) -> None:

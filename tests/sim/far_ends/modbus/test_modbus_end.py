@@ -14,7 +14,6 @@ import minimalmodbus
 import pytest
 from pymodbus.client import AsyncModbusTcpClient
 
-from drivers.errors import LinkError
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import AmplifierState, Commit, Fault, NakCode, Ping, Stop
 from model.rig.file import example_rig_path
@@ -132,24 +131,6 @@ async def rtu(coarse_rig: Rig) -> AsyncIterator[FarSide]:
 
 
 every_wire = pytest.mark.parametrize("wire", ["RTU", "TCP"])
-
-
-@every_wire
-async def test_vendor_pages_of_the_page(wire: str) -> None:
-    """Its request bytes, sent over a real wire, bring its reply bytes, one after the other."""
-    device = ScriptedDevice()
-    async with scripted(wire, device) as master:
-        for name, example in EXAMPLES.items():
-            if name == "GetCaps":  # its tag is the one before it, and before it there is none
-                assert master.received == b""
-            device.follow(example)
-            master.send(FRAMES[f"{name} request, {wire}"])
-            reply = FRAMES[f"{name} reply, {wire}"]
-            assert await master.receive(len(reply)) == reply, name
-            if name == "Refused Apply":
-                master.send(FRAMES[f"Refusal request, {wire}"])
-                reply = FRAMES[f"Refusal reply, {wire}"]
-                assert await master.receive(len(reply)) == reply
 
 
 @every_wire
@@ -393,18 +374,6 @@ async def test_modbus_set_by_pymodbus(tcp: FarSide) -> None:
     client.close()
 
 
-async def test_modbus_refusal_by_pymodbus(tcp: FarSide) -> None:
-    """An exception, and in the refusal block the reason and the channel."""
-    client = await foreign_client(tcp.url)
-    await client.write_registers(2, [MAP["controlwords"]["ARM"], 1000, 0], device_id=1)
-    channels = [0] * 36 + [11000, 2000, 0, 0]  # the tenth channel
-    refused = await client.write_registers(16, [5, 5, 0, 0, *channels], device_id=1)
-    assert refused.exception_code == 3
-    reply = await client.read_input_registers(1034, count=3, device_id=1)
-    assert reply.registers == [NakCode.BAD_CHANNEL, 9, 0]
-    client.close()
-
-
 async def test_modbus_set_by_minimalmodbus(rtu: FarSide) -> None:
     """A master that is not ours drives the amplifier over the serial line, register by register."""
     await asyncio.to_thread(play_with_minimalmodbus, rtu.url)
@@ -448,11 +417,6 @@ async def test_modbus_rtu_unknown_function_ends_with_a_pause() -> None:
         assert await master.receive(5) == expected + struct.pack("<H", crc(expected))
 
 
-def test_modbus_crc() -> None:
-    """4B37 over the digits 1 to 9, the catalogue's check value of CRC-16/MODBUS."""
-    assert crc(b"123456789") == 0x4B37
-
-
 async def test_modbus_tcp_disconnects_a_client_that_does_not_read() -> None:
     """Its answers fill no memory, and others are served meanwhile."""
     device = ScriptedDevice()
@@ -489,14 +453,4 @@ async def test_modbus_tcp_limits_connections() -> None:
         masters[0].send(FRAMES["Hello request, TCP"])
         await masters[0].receive(len(FRAMES["Hello reply, TCP"]))
         assert len(end.connections) == 16
-    await end.close()
-
-
-async def test_modbus_tcp_refuses_a_port_in_use() -> None:
-    """LinkError with the port and what to do."""
-    end = ModbusTcpEnd([ScriptedDevice()])
-    await end.start()
-    port = int(re.findall(r":(\d+)/", end.urls["main"])[0])
-    with pytest.raises(LinkError, match=f"port {port}"):
-        await ModbusTcpEnd([ScriptedDevice()], port=port).start()
     await end.close()

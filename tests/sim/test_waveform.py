@@ -3,21 +3,11 @@
 import cmath
 import math
 
+import numpy as np
 import pytest
 
-from model.transients.base_motion import Term
+from driven_bases import motion_of
 from sim.waveform import FadingTone, Output, fade_to, level_of
-
-
-def moved(terms: tuple[Term, ...], t: float) -> float:
-    """The base motion that terms describe."""
-    total = 0.0
-    for term in terms:
-        if term.start <= t < term.end:
-            tau = t - term.start
-            angle = term.omega * tau
-            total += ((term.c0 + term.c1 * tau) * complex(math.cos(angle), math.sin(angle))).imag
-    return total
 
 
 def test_fade_follows_a_raised_cosine() -> None:
@@ -38,7 +28,7 @@ def test_base_motion_matches_the_faded_tone() -> None:
     for t in [1.0, 1.003, 1.0125, 1.0199, 1.02, 1.5]:
         gain = 1.0 if t >= 1.02 else 0.3 + 0.7 * (1 - math.cos(math.pi * (t - 1.0) / 0.02)) / 2
         expected = 0.5e-4 * gain * math.sin(2 * math.pi * 110 * (t - 0.95) + 0.7)
-        assert moved(terms, t) == pytest.approx(expected, abs=1e-13)
+        assert motion_of(terms, np.array([t]))[0] == pytest.approx(expected, abs=1e-13)
 
 
 def test_fade_with_zero_ramp_is_a_step() -> None:
@@ -52,7 +42,8 @@ def test_fade_phase_with_and_without_keep_phase() -> None:
     """Only keep_phase at the same frequency leaves the phase running through a change of level."""
 
     def motion(playing: Output, t: float) -> float:
-        return sum(moved(tone.terms(stroke=1.0), t) for tone in playing)
+        terms = [term for tone in playing for term in tone.terms(stroke=1.0)]
+        return float(motion_of(terms, np.array([t]))[0])
 
     first = fade_to((), 0.0, ramp=0.0, frequency=110.0, amplitude=1.0)
     kept = fade_to(first, 1.0023, ramp=0.01, frequency=110.0, amplitude=0.5, keep_phase=True)

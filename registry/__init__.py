@@ -1,1 +1,1 @@
-"""What people call by a name: what installed packages add, and which one a mistyped name meant."""
+"""Look-up by name: plug-ins of installed packages, and suggestions for mistyped names."""

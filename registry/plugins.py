@@ -1,8 +1,7 @@
-"""Things found by name: those that come with this project, and those of installed packages.
+"""Registries of this project's objects and of plug-ins of installed packages, by name.
 
-A plug-in is an entry point: its group says what it adds, its name which one. It is imported when
-that name is looked up and never before, so that a broken one affects nothing else. A name that
-several packages claim is refused: which of them won would depend on the order of files in a folder.
+A plug-in is an entry point of a group. It is imported only when its name is looked up, so that a
+broken one affects nothing else. A name that several packages claim is refused.
 """
 
 import sys
@@ -19,18 +18,18 @@ _T = TypeVar("_T")
 _Made = TypeVar("_Made")
 
 _OURS = "era-haptics"
-_GROUPS = "era_haptics."  # what the names of our groups begin with
+_GROUP_PREFIX = "era_haptics."
 _REMEDY = "repair or remove that package"
 
 
 @dataclass(frozen=True)
 class Instance:
-    """An entry point leads to an object of this class."""
+    """Requirement that a plug-in is an instance of a class."""
 
     of: type
 
     def is_met_by(self, found: object) -> bool:
-        """Whether it does."""
+        """Whether an object satisfies the requirement."""
         return isinstance(found, self.of)
 
     def __str__(self) -> str:
@@ -39,12 +38,12 @@ class Instance:
 
 @dataclass(frozen=True)
 class Derived:
-    """An entry point leads to a class derived from this one."""
+    """Requirement that a plug-in is a class derived from another."""
 
     of: type
 
     def is_met_by(self, found: object) -> bool:
-        """Whether it does."""
+        """Whether an object satisfies the requirement."""
         return isinstance(found, type) and issubclass(found, self.of)
 
     def __str__(self) -> str:
@@ -53,13 +52,13 @@ class Derived:
 
 @dataclass(frozen=True)
 class PluginRegistry(Generic[_T]):
-    """The things of one kind by name.
+    """Objects of one kind by name.
 
-    what: the kind, for error messages; group: of its entry points; wanted: what these lead to;
-    error: the class of errors raised; own: what comes with this project and is not an entry point;
-    called: the name that such a thing has itself, if it has one; problem: what is wrong with one,
-    None if nothing; hint: the end of the message for an unknown name. If the name is the scheme of
-    a URL, ending: what follows the scheme; example: such a URL.
+    what: the kind, for error messages; group: of its entry points; wanted: requirement on these;
+    error: the class of errors raised; own: objects of this project without an entry point; called:
+    returns the name of an object, if it has one; problem: returns what is wrong with an object, or
+    None; hint: the end of the message for an unknown name. If the name is the scheme of a URL,
+    ending: what follows the scheme; example: such a URL.
     """
 
     what: str
@@ -137,7 +136,7 @@ class PluginRegistry(Generic[_T]):
     def _attributed(
         self, point: EntryPoint, within: str, *, but: tuple[type[Exception], ...] = ()
     ) -> Iterator[None]:
-        """Raise whatever a plug-in raises as `error`, with its package; but: what it may raise."""
+        """Convert exceptions of a plug-in to `error`, with its package; but: exceptions to pass."""
         try:
             yield
         except but:
@@ -162,7 +161,7 @@ class WrongResultError(TypeError):
 
 
 def failure_text(error: BaseException) -> str:
-    """An unexpected error in words; attributed to a plug-in's package if its code was running."""
+    """Text of an unexpected error; attributed to a plug-in's package if its code was running."""
     point = failed_plugin(error)
     return f"{type(error).__name__}: {error}" if point is None else _failed(point, error)
 
@@ -180,7 +179,7 @@ def failed_plugin(error: BaseException) -> EntryPoint | None:
 
 
 def package_remedy(point: EntryPoint) -> str:
-    """What to do about a plug-in that cannot be used."""
+    """Remedy for a plug-in that cannot be used."""
     package = _package(point)
     return f"reinstall {package}" if package == _OURS else f"repair or remove {package}"
 
@@ -204,7 +203,7 @@ def _installed(group: str) -> dict[str, tuple[EntryPoint, ...]]:
 
 @cache
 def _found(group: str, path: tuple[str, ...]) -> dict[str, tuple[EntryPoint, ...]]:
-    """Those of the same value count once, for one installation may lie on the path twice."""
+    """Equal entry points count once: an installation may be on the path twice."""
     found: dict[str, dict[str, EntryPoint]] = {}
     for point in entry_points(group=group):
         found.setdefault(point.name, {}).setdefault(point.value, point)
@@ -213,11 +212,11 @@ def _found(group: str, path: tuple[str, ...]) -> dict[str, tuple[EntryPoint, ...
 
 @cache
 def _of_others(path: tuple[str, ...]) -> dict[str, EntryPoint]:
-    """A plug-in of every other package, by the name of its top-level module."""
+    """One plug-in of each other package, by its top-level module."""
     points = [
         point
         for group in entry_points().groups
-        if group.startswith(_GROUPS)
+        if group.startswith(_GROUP_PREFIX)
         for point in entry_points(group=group)
     ]
     ours = {point.module.partition(".")[0] for point in points if _package(point) == _OURS}

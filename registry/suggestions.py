@@ -1,17 +1,15 @@
-"""Which of the names that there are somebody meant."""
+"""Suggestions for mistyped names."""
 
 from collections.abc import Iterable
 
 _NEAR = 0.65
-"""So alike are two names of which one may be meant by the other; `unobtainium` is no aluminium."""
+"""Least similarity of a suggestion; `unobtainium` is not similar to `aluminium`."""
 
 
 def did_you_mean(name: str, known: Iterable[str], *, ending: str = "") -> str:
-    """`did you mean SW? ` for a name that is nearly a known one, in whatever case; else nothing.
+    """Return `did you mean SW? ` for a name similar to a known one, ignoring case, else "".
 
-    Also for one that is a word of known ones: glass of soda-lime-glass.
-
-    ending: what stands behind a name where people write it; it makes no two of them more alike.
+    Also for a word of known names: glass of soda-lime-glass. ending: appended to suggestions.
     """
     from difflib import get_close_matches  # not loaded for --help
 

@@ -198,13 +198,13 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         package: str, kind: Kind, name: str, source: str | None, *, module: str = ""
     ) -> str:
         folder = tmp_path / package
-        told = folder / f"{package}-1.0.dist-info"
-        told.mkdir(parents=True)
-        (told / "METADATA").write_text(
+        info = folder / f"{package}-1.0.dist-info"
+        info.mkdir(parents=True)
+        (info / "METADATA").write_text(
             f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n", "utf-8"
         )
         module = module or f"era_try_{package}"
-        (told / "entry_points.txt").write_text(
+        (info / "entry_points.txt").write_text(
             f"[era_haptics.{kind.group}]\n{name} = {module}:THING\n", "utf-8"
         )
         if source is not None:
@@ -218,7 +218,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 
 
 def is_made_by(found: object, thing: object) -> bool:
-    """Whether what was found is a thing, or what a class makes of a URL."""
+    """Whether an object is `thing`, or an instance of it."""
     return found is thing or type(found) is thing
 
 
@@ -321,7 +321,7 @@ def test_name_claimed_by_several_packages_is_refused(kind: Kind, install: Instal
 
 @of_every_kind
 def test_plugin_on_the_path_twice_is_one(kind: Kind, install: Install) -> None:
-    """The same object of the same module, as where an old folder has been left on the path."""
+    """The same object of the same module, as with an old folder left on the path."""
     module = install("good", kind, "fine", kind.works)
     install("left", kind, "fine", kind.works, module=module)
     assert is_made_by(kind.look_up("fine"), sys.modules[module].THING)

@@ -1,1 +1,1 @@
-"""The founding paper: what it prints, and its figures as they come out here."""
+"""The founding paper: its printed numbers, and its figures reproduced."""

@@ -1,4 +1,4 @@
-"""Figures 10 and 11 (box plots): how strongly layouts of four ERAs make the plate vibrate."""
+"""Figures 10 and 11 (box plots): cumulative peak acceleration of layouts of four ERAs."""
 
 from dataclasses import dataclass
 
@@ -28,7 +28,7 @@ from model.vibration.peak import G
 
 @dataclass(frozen=True)
 class _Drive:
-    """A layout with one of its activation sets, and STATISTICS (6,) of what that set does."""
+    """A layout with one of its activation sets, and STATISTICS (6,) of its acceleration."""
 
     layout: Layout
     active: ActivationSet
@@ -36,7 +36,7 @@ class _Drive:
 
 
 def one_era_figure(rig: Rig, free_plate: FreePlate) -> PaperFigure:
-    """Figure 10: one active ERA; of each layout the ERA that gives the highest median is drawn."""
+    """Figure 10: one active ERA, for each layout that of the highest median."""
     drives = _drives(rig, free_plate, active_count=1)
     best = _best(drives)
     return PaperFigure(
@@ -48,7 +48,7 @@ def one_era_figure(rig: Rig, free_plate: FreePlate) -> PaperFigure:
 
 
 def two_era_figure(rig: Rig, free_plate: FreePlate) -> PaperFigure:
-    """Figure 11, box plots: two active ERAs; of each layout the best pair is drawn."""
+    """Figure 11, box plots: two active ERAs, for each layout the pair of the highest median."""
     single = _best(_drives(rig, free_plate, active_count=1))
     drives = _drives(rig, free_plate, active_count=2)
     best = _best(drives)
@@ -65,7 +65,7 @@ def two_era_figure(rig: Rig, free_plate: FreePlate) -> PaperFigure:
 
 
 def _drives(rig: Rig, free_plate: FreePlate, *, active_count: int) -> list[_Drive]:
-    """Every set of so many ERAs of every named layout; ERAs like the rig's first."""
+    """Activation sets of `active_count` ERAs of each named layout; ERAs like the rig's first."""
     points = equal_area_points(rig.plate, frequency_max=float(PAPER_FREQUENCIES[-1]))
     felt = felt_acceleration(PAPER_FREQUENCIES)
     drives = []
@@ -82,11 +82,11 @@ def _drives(rig: Rig, free_plate: FreePlate, *, active_count: int) -> list[_Driv
 
 
 def _best(drives: list[_Drive]) -> list[_Drive]:
-    """Of each layout the drive with the highest median."""
+    """The drive of the highest median for each layout."""
     return [
         max(
             (drive for drive in drives if drive.layout == layout),
-            # Equal by symmetry is equal: the first one then, not the one that rounding favours.
+            # Rounded: of drives equal by symmetry the first.
             key=lambda drive: float(f"{drive.statistics[MEDIAN]:.6g}"),
         )
         for layout in FOUR_ERA_LAYOUTS

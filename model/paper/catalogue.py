@@ -32,10 +32,10 @@ HIGHEST_FREQUENCY = max(max(pair) for pair in FIGURE_12_FREQUENCIES)
 
 
 def paper_figures(rig: Rig, number: str) -> Iterator[PaperFigure]:
-    """The figures of one number, or of `all`, on a rig's plate and mesh, one after the other.
+    """Make the figures of one number, or of `all`, on a rig's plate and mesh.
 
-    Raises InputError for a number that the paper does not have, or that holds no result; for a
-    mesh too coarse for 320 Hz; and for a rig with fewer than two ERAs where a pair is driven.
+    Raises InputError for a number without results in the paper, for a mesh too coarse for 320 Hz,
+    and for a rig with fewer than two ERAs where a pair is driven.
     """
     if number not in (*FIGURE_NUMBERS, "all"):
         raise InputError(

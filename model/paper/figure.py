@@ -13,10 +13,10 @@ Finding: TypeAlias = float | int | bool | str | list[float] | list[str] | dict[s
 
 @dataclass(frozen=True)
 class PaperFigure:
-    """name: the picture's file name without its ending.
+    """A figure of the paper.
 
-    tables: the numbers that are drawn, by the end of their file's name; findings: what the paper
-    says about this figure, as numbers, by a name that ends in the unit.
+    name: of the picture's file, without suffix; tables: the numbers drawn, by the end of their
+    file's name; findings: claims of the paper about this figure as numbers, named with their unit.
     """
 
     name: str

@@ -67,7 +67,7 @@ def thin_plate_frequencies(plate: Plate, count: int) -> FloatArray:
 
 
 def paper_mesh(plate: Plate) -> Mesh:
-    """Elements as large as the paper's, one inch; 12x9 on its plate."""
+    """A mesh of the paper's element size, one inch; 12x9 on its plate."""
     return Mesh(
         max(2, round(plate.length / ELEMENT_SIDE)),
         max(2, round(plate.width / ELEMENT_SIDE)),

@@ -1,4 +1,4 @@
-"""Figures 11 (maps), 12 and 13: where the plate vibrates how strongly, and where not at all."""
+"""Figures 11 (maps), 12 and 13: peak acceleration over the plate, and its nulls."""
 
 import math
 from collections.abc import Sequence
@@ -26,19 +26,18 @@ from model.vibration.maps import PlateMap, plate_map
 from model.vibration.peak import NULL_SHARE, G
 
 NEARLY_STILL = 0.3
-"""The paper's switched patterns are judged by where all of them stay below this share of their
-maximum."""
+"""Share of its maximum below which the paper counts a point of a switched pattern as still."""
 
 
 @dataclass(frozen=True)
 class MapSolver:
-    """Maps of a rig's plate on any ERAs, on the raster that all figures have."""
+    """Solver of maps of a rig's plate on any ERAs, on the raster of all figures."""
 
     rig: Rig
     free_plate: FreePlate
 
     def __call__(self, eras: Sequence[Era], excitation: Excitation) -> PlateMap:
-        """The map of an excitation of these ERAs."""
+        """Solve the map of an excitation of these ERAs."""
         rig = replace(self.rig, eras=tuple(eras))
         return plate_map(rig, excitation, raster=raster(rig.plate), free=self.free_plate)
 
@@ -66,7 +65,7 @@ def activation_maps_figure(rig: Rig, free_plate: FreePlate) -> PaperFigure:
             "maximum_edge_to_diagonal_ratio": float(edge.peak.max() / diagonal.peak.max()),
             "edge_null_count": len(edge.nulls),
             "diagonal_null_count": len(diagonal.nulls),
-            "edge_nulls_kept_on_diagonal_share": _kept(edge, diagonal),
+            "edge_nulls_kept_on_diagonal_share": _shared(edge, diagonal),
         },
     )
 
@@ -95,7 +94,7 @@ def switched_patterns_figure(rig: Rig, free_plate: FreePlate) -> PaperFigure:
         {
             "maximum_g": [float(solved.peak.max() / G) for solved in maps],
             "null_count": [float(len(solved.nulls)) for solved in maps],
-            "nulls_kept_by_the_next_share": [_kept(now, then) for now, then in pairwise(maps)],
+            "nulls_kept_by_the_next_share": [_shared(now, then) for now, then in pairwise(maps)],
             "nearly_still_in_all_share": float(still.mean()),
             "nearly_still_in_one_share": [
                 float((solved.peak < NEARLY_STILL * solved.peak.max()).mean()) for solved in maps
@@ -166,7 +165,7 @@ def _panel(
     *,
     title: str,
 ) -> MapPanel:
-    """The map of a pair of ERAs; {names} and {tones} in the title stand for what is driven."""
+    """The map of a pair of ERAs; the title may contain {names} and {tones} of the driven ones."""
     excitation = full_stroke(eras, pair, frequencies)
     names = ", ".join(excitation)
     tones = ", ".join(f"{name} {tone.frequency:g} Hz" for name, tone in excitation.items())
@@ -185,8 +184,8 @@ def _columns(maps: dict[str, PlateMap]) -> Columns:
     }
 
 
-def _kept(now: PlateMap, then: PlateMap) -> float:
-    """Share of the nulls of one map at which another is nearly still too; 0 without nulls."""
+def _shared(now: PlateMap, then: PlateMap) -> float:
+    """Share of the nulls of one map that are nulls of another; 0 without nulls."""
     if not len(now.nulls):
         return 0.0
     rows = np.searchsorted(now.y, now.nulls[:, 1] - 1e-9)

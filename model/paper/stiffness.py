@@ -14,16 +14,13 @@ from model.rig.rig import Rig
 from model.vibration.peak import G
 
 STIFFNESSES = 500.0 * 2 ** (np.arange(61) / 6)
-"""Stiffness [N/m], from a plate that hardly feels its ERAs to one that is all but pinned there.
-
-0.5 to 512 kN/m, six to a doubling.
-"""
+"""Stiffness [N/m], 0.5 to 512 kN/m, six per octave: from nearly free to nearly pinned."""
 
 
 def stiffness_study_figure(rig: Rig, free_plate: FreePlate) -> PaperFigure:
-    """Largest and median peak acceleration, and likeness of the map, against ERA stiffness.
+    """Largest and median peak acceleration against ERA stiffness, diagonal pair at 250 Hz.
 
-    The diagonal pair at 250 Hz. Likeness: correlation with the map at 17 kN/m.
+    Also the correlation of the map with that at 17 kN/m.
     """
     solve = MapSolver(rig, free_plate)
     drive = full_stroke(rig.eras, diagonal_pair(rig.eras), (FIGURE_13_FREQUENCY,) * 2)
@@ -40,7 +37,7 @@ def stiffness_study_figure(rig: Rig, free_plate: FreePlate) -> PaperFigure:
         "correlation": np.array([correlation(values, reference) for values in peaks]),
     }
     alike = STIFFNESSES[study["correlation"] > 0.95]
-    shown = [(f"{STIFFNESSES[k] / 1000:g}", k) for k in range(6, 61, 12)]  # every second doubling
+    shown = [(f"{STIFFNESSES[k] / 1000:g}", k) for k in range(6, 61, 12)]  # every second octave
     return PaperFigure(
         "figure_13_stiffness",
         _draw(study),

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from numbers import Real
-from typing import Any
 
 from model.errors import InputError
 from model.fem.mesh import Mesh
@@ -112,11 +111,11 @@ def physics_fingerprint(
 
     Rigs with the same fingerprint share localization tables, whatever their material is called.
     """
-    numbers = _as_floats(asdict(plate))
+    numbers = asdict(plate)
     del numbers["material"]["name"]
     # ERAs without gains have the fingerprint of a rig that has no such key.
     held = [
-        {key: value for key, value in _as_floats(asdict(era)).items() if key != "gains" or value}
+        {key: value for key, value in asdict(era).items() if key != "gains" or value}
         for era in eras
     ]
     physics = {
@@ -144,12 +143,3 @@ def _with_floats(value: object) -> object:
             return [_with_floats(each) for each in value]
         case _:
             raise TypeError(f"no plain data: {type(value).__name__}")
-
-
-def _as_floats(value: Any) -> Any:
-    """Convert all numbers to floats, so that 1 and 1.0 give one fingerprint."""
-    if isinstance(value, Mapping):
-        return {key: _as_floats(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_as_floats(entry) for entry in value]
-    return float(value) if isinstance(value, Real) else value

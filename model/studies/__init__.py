@@ -1,1 +1,1 @@
-"""Design studies: which layout, how many ERAs, how stiff, over as many layouts as asked."""
+"""Design studies: placement, number and stiffness of ERAs, over many layouts."""

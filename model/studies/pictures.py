@@ -11,30 +11,30 @@ from model.rig.rig import Rig
 from model.studies.ranking import Ranking, era_counts
 from model.studies.solve import DRIVE_NAMES, DRIVES
 
-_WIDE = 5.0  # where medians differ by more than this factor, boxes stand on a logarithmic scale
+_MAX_LINEAR_RATIO = 5.0  # of medians; beyond it the scale is logarithmic
 
 
 def ranking_figure(rig: Rig, ranking: Ranking) -> Figure:
-    """Box plots of the rig as it is and of the best, the middle and the worst case."""
+    """Box plots of the rig's own, the best, the middle and the worst case."""
     shown = {"best": ranking.best, "middle": ranking.middle, "worst": ranking.worst}
     if ranking.own is not None:
         shown = {"the rig": ranking.own, **shown}
     if ranking.recommended != ranking.best:
         shown["recommended"] = ranking.recommended
     title = f"{counted(len(ranking.order), 'case')}, {DRIVE_NAMES[DRIVES[ranking.drive]]} driven"
-    wide = ranking.medians[ranking.best] > _WIDE * ranking.medians[ranking.worst]
+    wide = ranking.medians[ranking.best] > _MAX_LINEAR_RATIO * ranking.medians[ranking.worst]
     return _boxes(rig, ranking, shown.items(), title=title, logarithmic=wide)
 
 
 def count_figure(rig: Rig, ranking: Ranking) -> Figure:
-    """Box plots of the best layout for every number of ERAs."""
+    """Box plots of the best layout for each number of ERAs."""
     best = ranking.best_by(era_counts(ranking.cases))
     named = [("one ERA" if count == 1 else f"{count:.0f} ERAs", n) for count, n in best.items()]
     return _boxes(rig, ranking, named, title="The best layout for each number of ERAs")
 
 
 def stiffness_figure(rig: Rig, ranking: Ranking) -> Figure:
-    """Box plots of the best layout at every stiffness, on a logarithmic scale."""
+    """Box plots of the best layout for each stiffness, on a logarithmic scale."""
     stiffest = max(era.stiffness for era in rig.eras) / 1000
     best = ranking.best_by(ranking.cases.stiffness_factors)
     named = [(f"{stiffest * factor:.3g}\nkN/m", case) for factor, case in best.items()]
@@ -48,7 +48,7 @@ PICTURES: dict[str, Mapping[str, Callable[[Rig, Ranking], Figure]]] = {
     "count": {"count_ranking.png": ranking_figure, "count_best.png": count_figure},
     "stiffness": {"stiffness_ranking.png": ranking_figure, "stiffness_best.png": stiffness_figure},
 }
-"""The pictures of each study, by the names of their files."""
+"""Functions that draw the pictures of each study, by file name."""
 
 
 def _boxes(

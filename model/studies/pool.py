@@ -1,4 +1,4 @@
-"""Distinct layouts to study: the rig's own, those with a name, random ones on a raster."""
+"""Pool of distinct layouts for a study: the rig's own, named ones, random ones on a raster."""
 
 import math
 from itertools import combinations, permutations
@@ -10,15 +10,15 @@ from model.rig.layouts import candidate_places, named_layouts
 from model.rig.rig import Rig
 from model.studies.cases import OWN, VACANT, Cases, Numbers, all_alike
 
-# So few possible layouts are all listed and shuffled; of more, some are drawn. Not by how many are
-# wanted, so that asking for more keeps those that were solved before.
-_FEW = 100_000
+# Up to so many possible layouts are enumerated and shuffled, of more some are drawn. Independent of
+# the number wanted, so that a longer study starts with the layouts of a shorter one.
+_MAX_ENUMERATED = 100_000
 
 _BLOCK = 4096  # layouts drawn at once
 
 
 class LayoutPool:
-    """Gathers distinct layouts on a raster of positions and on those that the rig has."""
+    """Collects distinct layouts on a raster of positions and the positions of the rig."""
 
     def __init__(self, rig: Rig, raster: tuple[int, int]) -> None:
         self._rig = rig
@@ -29,7 +29,7 @@ class LayoutPool:
         self._names: list[str] = []
 
     def add(self, era_count: int, wanted: int, rng: np.random.Generator, *, own: bool) -> None:
-        """Add so many layouts of so many ERAs, fewer where there are no more."""
+        """Add up to `wanted` layouts of `era_count` ERAs; own: include that of the rig."""
         named = [
             (layout.name, layout.positions(self._rig.plate)) for layout in named_layouts(era_count)
         ]
@@ -49,7 +49,7 @@ class LayoutPool:
         self._places += extra
 
     def cases(self) -> Cases:
-        """All layouts that were added, with the stiffness that the rig's ERAs have."""
+        """All layouts, with the stiffness of the rig's ERAs."""
         count = max(len(row) for row in self._places)
         places = np.full((len(self._places), count), VACANT, dtype=np.int32)
         for row, numbers in zip(places, self._places, strict=True):
@@ -57,7 +57,7 @@ class LayoutPool:
         return Cases(np.array(self._positions), places, np.ones(len(places)), tuple(self._names))
 
     def _number(self, position: FloatArray) -> int:
-        """Number of a position [m]; a candidate's where one is there."""
+        """Number of a position [m], added unless it is a candidate."""
         distance = np.hypot(*(np.array(self._positions) - position).T)
         nearest = int(distance.argmin())
         if distance[nearest] < 1e-9:
@@ -66,7 +66,7 @@ class LayoutPool:
         return len(self._positions) - 1
 
     def _key(self, numbers: tuple[int, ...]) -> tuple[int, ...]:
-        """What two equal layouts share: ERAs that are alike may change places."""
+        """Identity of a layout: equal ERAs may change places."""
         return tuple(sorted(numbers)) if all_alike(self._rig.eras) else numbers
 
     def _draw(self, era_count: int, wanted: int, rng: np.random.Generator) -> list[Numbers]:
@@ -74,15 +74,15 @@ class LayoutPool:
         count = len(self._candidates)
         in_order = not all_alike(self._rig.eras)
         possible = math.perm(count, era_count) if in_order else math.comb(count, era_count)
-        if possible <= _FEW:
+        if possible <= _MAX_ENUMERATED:
             choose = permutations if in_order else combinations
             every = np.array(list(choose(range(count), era_count)), dtype=np.int32)
             return list(rng.permutation(every))
-        # Known layouts may be among the drawn ones: draw as many more.
+        # Named layouts may be among the drawn ones: draw as many more.
         needed = min(wanted + len(named_layouts(era_count)) + 1, possible)
         rows = np.empty((0, era_count), dtype=np.int32)
         while len(rows) < needed:
-            # Whole blocks, for the same reason.
+            # Whole blocks, so that a longer study draws the same ones first.
             blocks = [
                 self._block(era_count, rng, in_order=in_order)
                 for _ in range(-(-(needed - len(rows)) // _BLOCK))
@@ -93,7 +93,7 @@ class LayoutPool:
         return list(rows[:needed])
 
     def _block(self, era_count: int, rng: np.random.Generator, *, in_order: bool) -> Numbers:
-        """Random layouts (_BLOCK, era_count), no position twice in one."""
+        """Random layouts (_BLOCK, era_count) without repeated positions."""
         keys = rng.random((_BLOCK, len(self._candidates)))
         block = keys.argpartition(era_count, axis=1)[:, :era_count]
         block = rng.permuted(block, axis=1) if in_order else np.sort(block, axis=1)

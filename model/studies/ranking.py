@@ -87,7 +87,7 @@ def rank(rig: Rig, cases: Cases, results: CaseResults, *, drive: int) -> Ranking
     """Rank cases of a rig by the median; those with too few ERAs for the drive are skipped."""
     medians = results.statistics[:, drive, MEDIAN]
     ranked = np.flatnonzero(~np.isnan(medians))
-    # Equal by symmetry is equal: then in the order of the cases, whatever rounding says.
+    # Rounded, so that cases equal by symmetry stay in their order.
     rounded = np.array([float(f"{median:.9g}") for median in medians[ranked]])
     supported = [
         support_problem(rig.plate, cases.eras_of(case, rig.eras), loads=rig.loads) is None

@@ -1,7 +1,6 @@
-"""The free plate seen from all places where ERAs may stand: what a study of layouts solves once.
+"""Receptances of a plate without ERAs between candidate positions, solved once for a study.
 
-With the receptance between these places, and from them to the points that are looked at, every
-layout is a system of equations as small as its number of ERAs for each frequency.
+With them each layout is one system of equations per frequency, of the size of its number of ERAs.
 """
 
 from dataclasses import dataclass
@@ -22,48 +21,46 @@ _MAX_BYTES = 2 << 30
 
 @dataclass(frozen=True, eq=False)
 class Receptances:
-    """Receptance [m/N] of a plate without ERAs, with the point masses that it carries.
+    """Receptances [m/N] of a plate with its point masses, without ERAs.
 
-    frequencies (f,) [Hz]; between (f, c, c), from place to place; to_points (f, c, p).
+    frequencies (f,) [Hz]; between (f, c, c): candidate positions; to_points (f, c, p).
     """
 
     frequencies: FloatArray
     between: ComplexArray
     to_points: ComplexArray
 
-    def room(self, era_count: int) -> ComplexArray:
-        """Room for `acceleration` to work in, (2, f, eras, p)."""
+    def buffer(self, era_count: int) -> ComplexArray:
+        """Buffer for `acceleration`, (2, f, eras, p)."""
         shape = (2, len(self.frequencies), era_count, self.to_points.shape[2])
         return np.empty(shape, dtype=complex)
 
     def acceleration(
-        self, places: IntArray, eras: tuple[Era, ...], *, room: ComplexArray | None = None
+        self, places: IntArray, eras: tuple[Era, ...], *, buffer: ComplexArray | None = None
     ) -> ComplexArray:
-        """Acceleration [m/s²] of each ERA alone at full stroke, the others holding: (f, eras, p).
+        """Acceleration [m/s²] for each ERA alone at full stroke: (f, eras, p).
 
-        places: at which of the c places each ERA stands; its own position is not looked at. room:
-        used again from call to call, for memory fresh from the system costs more than the sums;
-        the answer lies in it.
+        places (eras,): candidate position of each ERA, in place of its own. buffer: reused between
+        calls, since allocating costs more than the sums; holds the result.
         """
-        if room is None:
-            room = self.room(len(eras))
+        if buffer is None:
+            buffer = self.buffer(len(eras))
         omega = 2 * np.pi * self.frequencies
         at_eras = self.between[:, places[:, None], places]
         applied = on_diagonal(drive_forces(eras, omega), rows=len(eras))
         forces = coupled_forces(at_eras, attached_stiffness(eras, (), omega), applied)
         scaled = -(omega**2)[:, None, None] * forces.transpose(0, 2, 1)
-        np.take(self.to_points, places, axis=1, out=room[0], mode="clip")  # else it is buffered
-        acceleration: ComplexArray = np.matmul(scaled, room[0], out=room[1])
+        np.take(self.to_points, places, axis=1, out=buffer[0], mode="clip")  # others copy
+        acceleration: ComplexArray = np.matmul(scaled, buffer[0], out=buffer[1])
         return acceleration
 
 
 def solve_receptances(
     rig: Rig, positions: FloatArray, points: FloatArray, frequencies: FloatArray
 ) -> Receptances:
-    """Solve a rig's plate, without its ERAs, for places (c, 2) and points (p, 2) [m].
+    """Solve a rig's plate without its ERAs for positions (c, 2) and points (p, 2) [m].
 
-    Raises InputError for frequencies [Hz] that the mesh cannot carry, and where the result would
-    not fit into memory.
+    Raises InputError for frequencies [Hz] too high for the mesh, and a result too large for memory.
     """
     count = len(positions)
     size = 16 * len(frequencies) * count * (count + len(points))

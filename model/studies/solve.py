@@ -80,7 +80,7 @@ class CaseResults:
 
 
 def empty_results(count: int) -> CaseResults:
-    """Results of no case, with room for so many."""
+    """Results to be filled in for a number of cases."""
     return CaseResults(
         np.full((count, len(DRIVES), len(STATISTICS)), np.nan),
         np.zeros((count, len(DRIVES)), dtype=np.uint64),
@@ -88,7 +88,7 @@ def empty_results(count: int) -> CaseResults:
 
 
 def study_problem(rig: Rig, cases: Cases, frequencies: FloatArray) -> StudyProblem:
-    """The problem of a study; raises InputError for frequencies (f,) [Hz] that no mesh carries."""
+    """The problem of a study; raises InputError for frequencies (f,) [Hz] out of range."""
     if len(frequencies) == 0:
         raise InputError("a study needs at least one frequency")
     check_frequencies(rig.plate, rig.mesh, frequencies)
@@ -99,13 +99,13 @@ def solve_cases(receptances: Receptances, eras: tuple[Era, ...], cases: Cases) -
     """Solve cases with ERAs like those of the rig; none depends on another."""
     felt = felt_acceleration(receptances.frequencies)
     results = empty_results(len(cases))
-    rooms: dict[int, ComplexArray] = {}
+    buffers: dict[int, ComplexArray] = {}
     for case in range(len(cases)):
         placed = cases.eras_of(case, eras)
-        if len(placed) not in rooms:
-            rooms[len(placed)] = receptances.room(len(placed))
+        if len(placed) not in buffers:
+            buffers[len(placed)] = receptances.buffer(len(placed))
         acceleration = receptances.acceleration(
-            cases.places_of(case), placed, room=rooms[len(placed)]
+            cases.places_of(case), placed, buffer=buffers[len(placed)]
         )
         every = cumulative_statistics(acceleration, felt=felt)
         sets = activation_sets(len(placed))

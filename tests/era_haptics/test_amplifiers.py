@@ -12,25 +12,25 @@ RIG = make_paper_rig(12, 9)
 URL = f"sim://{era.example_rig_path()}"
 
 
-def test_commands_go_by_the_rigs_wiring() -> None:
-    """Levels of the stroke, degrees, every wired channel by its own amplifier, others silent."""
+def test_commands_for_follows_the_wiring() -> None:
+    """Levels, degrees, and every wired channel by its amplifier; others are silent."""
     wiring = {
         "SW": Channel("a", 1), "SE": Channel("a", 0), "NE": Channel("b", 5), "NW": Channel("b", 2),
     }  # fmt: skip
     rig = replace(RIG, wiring=wiring, amplifiers={"a": "sim://", "b": "sim://"})
-    asked = era.commands_for(rig, {"SW": era.Drive(110, level=0.25), "NE": era.Tone(90, 5e-5, -1)})
-    told = {
+    sets = era.commands_for(rig, {"SW": era.Drive(110, level=0.25), "NE": era.Tone(90, 5e-5, -1)})
+    found = {
         name: [(c.channel, c.frequency, round(c.level, 9), round(c.phase, 3)) for c in commands]
-        for name, commands in asked.items()
+        for name, commands in sets.items()
     }
-    assert told == {
+    assert found == {
         "a": [(0, 40.0, 0.0, 0.0), (1, 110, 0.25, 0.0)],
         "b": [(2, 40.0, 0.0, 0.0), (5, 90, 0.5, -57.296)],
     }
 
 
-def test_it_is_opened_within_the_rigs_limits() -> None:
-    """It plays what the rig allows and refuses the rest."""
+def test_open_amplifier_applies_the_limits_of_the_rig() -> None:
+    """It plays within the limits and refuses commands beyond them."""
     rig = replace(RIG, limits=replace(RIG.limits, level=0.2))
     with era.open_amplifier(rig, url=URL) as amplifier:
         amplifier.arm()
@@ -44,8 +44,8 @@ def test_it_is_opened_within_the_rigs_limits() -> None:
             amplifier.apply(commands)
 
 
-def test_one_of_several_must_be_named() -> None:
-    """None named, or one that the rig has not: the names that it has are told."""
+def test_open_amplifier_needs_a_name_when_there_are_several() -> None:
+    """No name or an unknown one: the error lists the known names."""
     rig = replace(RIG, amplifiers={"a": "sim://", "b": "sim://"})
     for name in (None, "c"):
         with pytest.raises(era.InputError, match="a, b"):

@@ -1,7 +1,4 @@
-"""Whatever else a notebook hands to a public function is told in words, never by an AttributeError.
-
-Of every function, and every argument of it, so that a new one is not forgotten.
-"""
+"""Arguments of another type: refused by every public function, never as an AttributeError."""
 
 import inspect
 from collections.abc import Callable, Iterator
@@ -40,7 +37,7 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.FingerLoad: {"stiffness": 1.0, "damping": 1.0, "mass": 0.0},
     era.Grid: {"nx": 4, "ny": 3},
 }  # fmt: skip
-"""Arguments that can be used, by function; None: a small table, or what was played before."""
+"""Valid arguments by function; None: a small table."""
 
 TAKES_ANYTHING = {"title", "envelopes", "measures"}
 
@@ -50,7 +47,7 @@ STRAYS = (object(), "here", 3.5, [object()])
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory: pytest.TempPathFactory) -> Iterator[era.LocalizationTable]:
-    """A small one, and its file t.npz."""
+    """A small table, saved as t.npz."""
     folder = tmp_path_factory.mktemp("home")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -65,24 +62,24 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Iterator[era.Localization
     [(function, name) for function, given in GOOD.items() for name in given],
     ids=lambda value: value if isinstance(value, str) else value.__name__,
 )
-def test_another_kind_of_thing_is_told(
+def test_function_refuses_an_argument_of_another_type(
     table: era.LocalizationTable, function: Callable[..., Any], name: str
 ) -> None:
-    """By an InputError, or a CommandError of an amplifier, in a sentence that says what to give."""
+    """By an InputError or a DriverError with a message."""
     good = {key: table if value is None else value for key, value in GOOD[function].items()}
     for stray in STRAYS:
         if isinstance(stray, type(good[name])) or (name == "path" and isinstance(stray, str)):
             continue
-        with pytest.raises((era.InputError, era.DriverError)) as told:
+        with pytest.raises((era.InputError, era.DriverError)) as caught:
             function(**{**good, name: stray})
-        assert len(str(told.value)) > 30
+        assert len(str(caught.value)) > 30
 
 
-def test_all_functions_are_here() -> None:
-    """Each public function, and each of its arguments."""
+def test_every_function_and_argument_is_listed() -> None:
+    """So that a new function or argument is tested, too."""
     public = {getattr(era, name) for name in era.__all__}
     functions = {each for each in public if inspect.isfunction(each)}
     assert functions <= set(GOOD)
     for function, given in GOOD.items():
-        asked = set(inspect.signature(function).parameters) - TAKES_ANYTHING
-        assert asked == set(given)
+        arguments = set(inspect.signature(function).parameters) - TAKES_ANYTHING
+        assert arguments == set(given)

@@ -1,4 +1,4 @@
-"""What people write for drives and places, and what they are told where it cannot be used."""
+"""Drives and places as scripts write them."""
 
 import math
 
@@ -13,8 +13,8 @@ from paper_plate import make_paper_rig
 RIG = make_paper_rig(12, 9)
 
 
-def test_a_drive_in_three_ways() -> None:
-    """A bare frequency is full stroke, 100 µm; a share and degrees; physics as it is."""
+def test_excitation_of_accepts_frequency_drive_and_tone() -> None:
+    """A bare frequency is at full stroke, 100 µm; a Drive in shares and degrees; a Tone is kept."""
     tone = era.Tone(250.0, 3e-5, 0.1)
     drives = {"SW": 110, "SE": era.Drive(110, level=0.25, phase_deg=-90), "NE": tone}
     assert excitation_of(drives, RIG) == {

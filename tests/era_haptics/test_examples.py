@@ -1,4 +1,4 @@
-"""The notebooks of the examples and the lines of the API's page, run as users run them."""
+"""The notebooks of the examples and the code on the API page, executed."""
 
 import os
 import re
@@ -24,42 +24,44 @@ TABLE_2 = ["31.98", "68.50", "76.62", "107.84", "160.77"]
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A cache of tables that all of them share, and nobody else."""
+    """A cache of tables for this module."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
 
 
 def run(name: str) -> str:
-    """What an example prints, run as a script."""
-    said = subprocess.run(
+    """Run an example as a script and return its output."""
+    done = subprocess.run(
         [sys.executable, EXAMPLES / name],
         capture_output=True,
         text=True,
         check=False,
         env={**os.environ, "MPLBACKEND": "Agg"},
     )
-    assert (said.returncode, said.stderr) == (0, "")
-    return said.stdout
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
 
 
 def number_in(text: str, pattern: str) -> float:
-    """The one number that a pattern finds."""
+    """The only number that matches a pattern."""
     (found,) = re.findall(pattern, text)
     return float(found)
 
 
 @pytest.mark.usefixtures("cache")
-def test_the_researchers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The paper's table and claim come out, felt is what was predicted, pictures are written."""
+def test_researcher_example_reproduces_the_paper(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Table 2, the claim on stiffness, predicted against played measures, and pictures."""
     monkeypatch.setenv("ERA_PICTURES", str(tmp_path))
     ran: dict[str, Any] = runpy.run_path(str(EXAMPLES / "researcher.py"))
     assert [f"{frequency:.2f}" for frequency in ran["paper_frequencies"]] == TABLE_2
     assert 1.5 < ran["rise"] < 1.8  # of the paper's claim, by solvers of their own
     assert ran["alike"] > 0.98
-    for asked, felt in ran["played"].values():
-        assert felt.contrast_db == pytest.approx(asked.contrast_db, abs=0.2)
-        assert felt.transient_contrast_db == pytest.approx(asked.transient_contrast_db, abs=0.4)
+    for predicted, felt in ran["played"].values():
+        assert felt.contrast_db == pytest.approx(predicted.contrast_db, abs=0.2)
+        assert felt.transient_contrast_db == pytest.approx(predicted.transient_contrast_db, abs=0.4)
         assert felt.level_db_sl == pytest.approx(20.0, abs=0.05)
     ramp, shaped = (felt.transient_contrast_db for _, felt in ran["played"].values())
     assert shaped > ramp + 3
@@ -71,8 +73,8 @@ def test_the_researchers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.alone
 @pytest.mark.usefixtures("cache")
-def test_the_hmi_engineers() -> None:
-    """What the finger felt on the plate in time is what the daemon predicted; all ends in order."""
+def test_hmi_engineer_example_feels_what_was_predicted() -> None:
+    """The contrast on the plate in time is the predicted one, and the daemon ends with status 0."""
     said = run("hmi_engineer.py")
     felt = number_in(said, r"contrast (\S+) dB felt")
     predicted = number_in(said, r"(\S+) dB predicted")
@@ -82,8 +84,8 @@ def test_the_hmi_engineers() -> None:
 
 
 @pytest.mark.alone
-def test_the_vendors() -> None:
-    """The frame by hand is that of the wire's page, it is answered, and all checks pass."""
+def test_amplifier_vendor_example_passes_conformance() -> None:
+    """Its frame is that of the wire page, it gets a reply, and all checks pass."""
     said = run("amplifier_vendor.py")
     (ping,) = re.findall(r"^Ping request: `([0-9A-F ]+)`$", WIRE_PAGE, re.MULTILINE)
     assert f"by hand  {ping}" in said
@@ -95,8 +97,10 @@ def test_the_vendors() -> None:
 
 
 @pytest.mark.usefixtures("cache")
-def test_the_ten_lines_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They run as they stand there, and predicted is felt."""
+def test_page_example_feels_what_was_predicted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten lines, executed as printed; played contrast is the predicted one."""
     (tmp_path / "examples").mkdir()
     shutil.copy(EXAMPLES / "paper_plate.yaml", tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
@@ -108,8 +112,8 @@ def test_the_ten_lines_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert (tmp_path / "pattern.png").stat().st_size > 10_000
 
 
-def test_the_page_has_every_name() -> None:
-    """What is exported is documented, and nothing else."""
+def test_page_documents_every_name() -> None:
+    """Exactly the exported names."""
     import era_haptics as era
 
     documented = set(re.findall(r"^\.\. auto\w+:: era_haptics\.(\w+)", PAGE, re.MULTILINE))

@@ -1,7 +1,4 @@
-"""What the pictures of the API show, read back from the figures."""
-
-import subprocess
-import sys
+"""Pictures of the API, read back from the figures."""
 
 import numpy as np
 import pytest
@@ -29,8 +26,8 @@ def markers(figure: Figure) -> dict[str, str]:
     }
 
 
-def test_a_map_marks_who_is_driven() -> None:
-    """Red where driven, green where only holding; the largest value is at the top of the scale."""
+def test_draw_map_marks_driven_eras() -> None:
+    """Red where driven, green elsewhere; the scale ends at the largest value."""
     figure = era.draw_map(PLATE, {"SW": 110, "NE": era.Drive(110, level=0.5)}, title="a diagonal")
     red, green = "#d62728", "#2ca02c"
     assert markers(figure) == {"0,0": red, "30,0": green, "30,23": red, "0,23": green}
@@ -39,8 +36,8 @@ def test_a_map_marks_who_is_driven() -> None:
     assert figure.axes[1].get_ylim()[1] == pytest.approx(peak)
 
 
-def test_a_pattern_is_drawn_with_its_fingers() -> None:
-    """Circles of 13 mm where fingers are, the contrast in the title, the plate in decibels."""
+def test_draw_pattern_shows_fingers_and_levels() -> None:
+    """Circles of 13 mm at the fingers, the contrast in the title, levels in decibels."""
     table = build_table(
         PLATE.rig,
         frequencies=np.array([60.0, 110.0, 250.0]),
@@ -64,8 +61,8 @@ def test_a_pattern_is_drawn_with_its_fingers() -> None:
     assert drawn[row, column] == pytest.approx(20.0, abs=1.0)
 
 
-def test_a_playback_is_drawn_over_time() -> None:
-    """A line a finger; the last of the target's is its steady amplitude, peak by peak."""
+def test_draw_playback_shows_peaks_over_time() -> None:
+    """A line for each finger, at the end in the ratio of the steady contrast."""
     played = PLATE.play({"SW": era.Drive(110, level=0.1)}, TARGET, quiet=QUIET, duration=1.2)
     figure = era.draw_playback(played)
     axes = figure.axes[0]
@@ -77,12 +74,3 @@ def test_a_playback_is_drawn_over_time() -> None:
     loudest = max(float(lines[name].get_ydata()[-1]) for name in names[1:])
     assert 20 * np.log10(at_target / loudest) == pytest.approx(played.contrast_db, abs=0.1)
     assert f"{played.contrast_db:.1f} dB steady" in axes.get_title()
-
-
-def test_pictures_leave_pyplot_alone() -> None:
-    """Nothing global is touched, so that a notebook keeps its own settings and windows."""
-    program = "import sys, era_haptics as e; e.draw_map; print('matplotlib.pyplot' in sys.modules)"
-    said = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert said.stdout == "False\n"

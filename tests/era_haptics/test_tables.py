@@ -1,4 +1,4 @@
-"""Tables and their answers from Python, against the commands."""
+"""Tables and queries from Python, against the commands."""
 
 import json
 from pathlib import Path
@@ -17,7 +17,7 @@ TARGET, QUIET = (0.08, 0.06), [(0.22, 0.16), (0.25, 0.04)]
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory: pytest.TempPathFactory) -> era.LocalizationTable:
-    """A small one, from a cache of its own."""
+    """A small table in a cache of its own."""
     rig = era.load_rig(str(era.example_rig_path()), mesh="12x9")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
@@ -25,7 +25,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> era.LocalizationTable:
 
 
 @pytest.mark.parametrize("envelopes", [False, True])
-def test_a_query_is_the_commands(
+def test_query_equals_the_command(
     table: era.LocalizationTable, tmp_path: Path, envelopes: bool
 ) -> None:
     """Every measure of `era table query --json`, from the table's file."""
@@ -48,23 +48,23 @@ def test_a_query_is_the_commands(
     assert bool(pattern.onset) is envelopes
 
 
-def test_a_table_is_what_was_asked_for(table: era.LocalizationTable) -> None:
+def test_table_has_the_requested_mode_frequencies_and_grid(table: era.LocalizationTable) -> None:
     """Mode, frequencies and cells."""
     assert table.drive_mode == "signed"
     np.testing.assert_array_equal(table.frequencies, [60.0, 110.0, 250.0])
     assert table.grid == era.Grid(4, 3)
 
 
-def test_a_level_of_numpy_comes_out_as_a_plain_number(table: era.LocalizationTable) -> None:
-    """Single precision would go on into amplitudes, where JSON knows none."""
+def test_query_converts_numbers_of_numpy(table: era.LocalizationTable) -> None:
+    """Single precision becomes float, so that results can be written as JSON."""
     plain, given = (era.query(table, TARGET, level_db_sl=kind(12)) for kind in (float, np.float32))
     assert json.dumps(given.level_db_sl) == "12.0"
     amplitudes = {type(tone.amplitude) for tone in given.excitation.values()}
     assert (given.excitation, amplitudes) == (plain.excitation, {float})
 
 
-def test_several_targets_and_no_quiet_finger(table: era.LocalizationTable) -> None:
-    """Both targets feel at least what was asked for; alone there is nobody to be told from."""
+def test_query_serves_several_targets_and_a_lone_finger(table: era.LocalizationTable) -> None:
+    """Both targets reach the level; without quiet fingers there is no contrast."""
     targets = [(0.25, 0.2), TARGET]
     both = era.query(table, targets, quiet=(0.15, 0.11))
     levels = [

@@ -1,4 +1,4 @@
-"""The example plug-ins, installed as a user installs them."""
+"""The example plug-ins, installed by pip."""
 
 import subprocess
 import sys
@@ -11,7 +11,7 @@ PLUGINS = Path(__file__).parents[2] / "examples" / "plugins"
 
 @pytest.fixture(scope="session")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """All of them, in a folder of their own, built without asking a package index."""
+    """A folder with all of them, built without a package index."""
     target = tmp_path_factory.mktemp("site")
     options = ["--no-deps", "--no-build-isolation", "--disable-pip-version-check", "--quiet"]
     subprocess.run(

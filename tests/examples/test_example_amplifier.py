@@ -1,4 +1,4 @@
-"""The example amplifier, in a time of its own: silent when it must be, deaf to damaged bytes."""
+"""The example amplifier on a virtual clock: watchdog, validity, and damaged bytes."""
 
 import math
 import re
@@ -18,7 +18,7 @@ WRONG_STATE = 5
 
 @pytest.fixture
 def serial(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    """Its modules, that find each other as they lie in their folder."""
+    """The module of its serial end, imported from its folder."""
     monkeypatch.syspath_prepend(str(ROOT / "examples" / "amplifier"))
     import on_a_serial_line
 
@@ -28,18 +28,18 @@ def serial(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
 
 
 def frame_of(name: str) -> bytes:
-    """The bytes of an example on the wire's page."""
+    """The bytes of an example on the wire page."""
     (text,) = re.findall(rf"^{name}: `([0-9A-F ]+)`$", WIRE_PAGE, re.MULTILINE)
     return bytes.fromhex(text)
 
 
 def amplifier_at(serial: ModuleType, now: list[float]) -> Any:
-    """One whose clock stands at now [ms]."""
+    """An amplifier with a clock at now [ms]."""
     return serial.Amplifier(clock=lambda: now[0])
 
 
-def test_it_is_silent_5_ms_after_its_watchdog(serial: ModuleType) -> None:
-    """Along a raised cosine from when it bites, however late it is read; the fault latches."""
+def test_amplifier_is_silent_5_ms_after_its_watchdog_expired(serial: ModuleType) -> None:
+    """Along a raised cosine from when it expires, however late it is read; the fault latches."""
     now = [1000.0]
     amplifier = amplifier_at(serial, now)
     amplifier.arm(WATCHDOG)
@@ -59,8 +59,8 @@ def test_it_is_silent_5_ms_after_its_watchdog(serial: ModuleType) -> None:
     assert refused.value.code == WRONG_STATE
 
 
-def test_a_set_ends_by_itself_however_late_anybody_looks(serial: ModuleType) -> None:
-    """valid_for counts from the commit; the amplifier stays armed."""
+def test_amplifier_ends_a_set_after_its_validity(serial: ModuleType) -> None:
+    """valid_for counts from the commit, and the amplifier stays armed."""
     now = [0.0]
     amplifier = amplifier_at(serial, now)
     amplifier.arm(2000)
@@ -75,20 +75,20 @@ def test_a_set_ends_by_itself_however_late_anybody_looks(serial: ModuleType) -> 
     assert amplifier.state == 4
 
 
-def test_frames_of_the_page_are_answered(serial: ModuleType) -> None:
-    """Byte for byte where the page's amplifier would say the same, also byte by byte."""
+def test_serial_end_replies_to_the_frames_of_the_page(serial: ModuleType) -> None:
+    """Whole and byte by byte; the refusal byte for byte."""
     end = serial.SerialEnd()
     assert end.take(frame_of("Commit request")) != b""
-    refused = end.take(frame_of("Refused Apply request"))  # disarmed: WRONG_STATE
-    assert serial.unstuff(refused[1:-1])[:7] == bytes.fromhex("BF 01 07 00 07 05 FF")
+    reply = end.take(frame_of("Refused Apply request"))  # disarmed: WRONG_STATE
+    assert serial.unstuff(reply[1:-1])[:7] == bytes.fromhex("BF 01 07 00 07 05 FF")
     assert end.take(frame_of("LoadEnvelope request")) != b""
     stop = frame_of("Stop request")
     assert b"".join(end.take(bytes([byte])) for byte in stop) != b""
     assert end.amplifier.state == 5
 
 
-def test_what_is_damaged_has_no_effect_and_no_answer(serial: ModuleType) -> None:
-    """Any byte of a Stop changed, any beginning of it, too much without an end; then a good one."""
+def test_serial_end_ignores_damaged_frames(serial: ModuleType) -> None:
+    """A Stop with a byte changed or cut short, and overlong data; then a valid one works."""
     end = serial.SerialEnd()
     stop = frame_of("Stop request")
     for place in range(1, len(stop) - 1):
@@ -103,7 +103,7 @@ def test_what_is_damaged_has_no_effect_and_no_answer(serial: ModuleType) -> None
     assert end.amplifier.state == 5
 
 
-def test_of_broadcasts_stop_and_commit_are_carried_out_without_an_answer(
+def test_serial_end_obeys_only_stop_and_commit_as_broadcasts(
     serial: ModuleType,
 ) -> None:
     """Other requests to address 0 are dropped."""

@@ -1,4 +1,4 @@
-"""The pages that tell how to add something: followed to the letter, they work as they say."""
+"""How-to pages for extensions: their commands, executed in order."""
 
 import re
 import shlex
@@ -28,7 +28,7 @@ NAMES = [
 
 @pytest.fixture
 def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
-    """In a checkout that has nothing but the examples; what `pip` installs was built before."""
+    """A reader in a checkout with the examples alone; `pip` installs prebuilt packages."""
     home = Path(tempfile.mkdtemp(prefix="era"))
     folder, site, programs = tmp_path / "checkout", home / "site", home / "bin"
     folder.mkdir()
@@ -44,14 +44,14 @@ def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
 
 
 def _run_alone(name: str) -> object:
-    """Pages whose amplifiers answer in real time: on a busy machine they would count as lost."""
+    """Mark pages with amplifiers, which reply in real time."""
     has_amplifier = name in ("add-a-backend", "write-an-amplifier")
     return pytest.param(name, marks=pytest.mark.alone) if has_amplifier else name
 
 
 @pytest.mark.parametrize("name", [_run_alone(name) for name in NAMES])
-def test_a_page_is_followed(name: str, reader: Reader) -> None:
-    """Every command of the page, in order, prints what the page shows."""
+def test_page_commands_print_what_is_shown(name: str, reader: Reader) -> None:
+    """In order, with the output on the page."""
     steps = read_steps(PAGES / f"{name}.md")
     assert sum(isinstance(step, Typed) and step.shown is not None for step in steps) > 2
     for step in steps:
@@ -59,8 +59,8 @@ def test_a_page_is_followed(name: str, reader: Reader) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_page_shows_whole_files(name: str) -> None:
-    """Code stands on a page by being included, so that page and file cannot differ."""
+def test_page_includes_code_from_files(name: str) -> None:
+    """So that page and file cannot differ."""
     text = (PAGES / f"{name}.md").read_text("utf-8")
     included = re.findall(r"^```\{literalinclude\} (\S+)$", text, re.MULTILINE)
     assert included

@@ -1,4 +1,4 @@
-"""The example backend against an amplifier that answers late, wrongly, or not at all."""
+"""The example backend against late, damaged and missing replies."""
 
 import asyncio
 import json
@@ -22,29 +22,29 @@ STATUS = {"state": 1, "fault": 0, "token": 0, "high_voltage": False} | {
 }
 SOON, LONG = 0.05, 5.0  # s
 
-Answers = Callable[[int], bytes | None]
-"""The bytes that follow the request of a number; None to hang up."""
+Replies = Callable[[int], bytes | None]
+"""Reply to the request of a number; None closes the connection."""
 
 
-def line(number: int, told: dict[str, Any]) -> bytes:
-    """An answer."""
-    return json.dumps({"id": number, **told}).encode() + b"\n"
+def line(number: int, reply: dict[str, Any]) -> bytes:
+    """The line of a reply."""
+    return json.dumps({"id": number, **reply}).encode() + b"\n"
 
 
 class FarEnd:
-    """Answers as scripted."""
+    """An amplifier with scripted replies."""
 
     def __init__(self) -> None:
-        self.answers: Answers = lambda number: line(number, STATUS)
+        self.replies: Replies = lambda number: line(number, STATUS)
         self.is_over = asyncio.Event()
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """One host, until it is hung up."""
+        """Serve one host until the connection is closed."""
         while request := await reader.readline():
-            said = self.answers(json.loads(request)["id"])
-            if said is None:
+            reply = self.replies(json.loads(request)["id"])
+            if reply is None:
                 break
-            writer.write(said)
+            writer.write(reply)
         writer.close()
         await writer.wait_closed()
         self.is_over.set()
@@ -52,13 +52,13 @@ class FarEnd:
 
 @pytest.fixture
 def far_end() -> FarEnd:
-    """The other side."""
+    """The amplifier."""
     return FarEnd()
 
 
 @pytest.fixture
 async def backend(far_end: FarEnd) -> AsyncIterator[Backend]:
-    """The example, open."""
+    """The example backend, open."""
     spec = util.spec_from_file_location("lines_backend", MODULE)
     assert spec is not None
     assert spec.loader is not None
@@ -75,17 +75,15 @@ async def backend(far_end: FarEnd) -> AsyncIterator[Backend]:
     assert sys.modules.get("lines_backend") is None
 
 
-async def test_units_are_those_of_the_wire(backend: Backend) -> None:
-    """2500 on the wire is a level of a quarter."""
+async def test_backend_converts_levels(backend: Backend) -> None:
+    """2500 on the wire is a level of 0.25."""
     status = await backend.exchange(Ping(), timeout=LONG)
     assert isinstance(status, Status)
     assert status.levels == pytest.approx((0.0, 0.25))
 
 
-async def test_a_late_reply_is_no_answer_to_the_next_request(
-    backend: Backend, far_end: FarEnd
-) -> None:
-    """It is dropped and counted, and the next request gets its own."""
+async def test_backend_drops_a_late_reply(backend: Backend, far_end: FarEnd) -> None:
+    """It is counted, and the next request gets its own."""
     late: list[bytes] = []
 
     def later(number: int) -> bytes:
@@ -94,7 +92,7 @@ async def test_a_late_reply_is_no_answer_to_the_next_request(
             return b""
         return late[0] + line(number, STATUS)
 
-    far_end.answers = later
+    far_end.replies = later
     with pytest.raises(LinkTimeout, match="no answer from lines://"):
         await backend.exchange(Ping(), timeout=SOON)
     status = await backend.exchange(Ping(), timeout=LONG)
@@ -116,24 +114,26 @@ async def test_a_late_reply_is_no_answer_to_the_next_request(
     ],
     ids=range(7),
 )
-async def test_damaged_lines_are_counted_and_dropped(
+async def test_backend_counts_and_drops_damaged_lines(
     damaged: bytes, backend: Backend, far_end: FarEnd
 ) -> None:
-    """Whatever they hold; the good one after them is understood."""
-    far_end.answers = lambda number: damaged + line(number, STATUS)
+    """The valid line after them is read."""
+    far_end.replies = lambda number: damaged + line(number, STATUS)
     assert isinstance(await backend.exchange(Ping(), timeout=LONG), Status)
     assert backend.counters.crc_errors >= 1
 
 
-async def test_a_refusal_is_returned(backend: Backend, far_end: FarEnd) -> None:
-    """As a Nak, with its channel."""
-    far_end.answers = lambda number: line(number, {"refused": 4, "channel": 3})
+async def test_backend_returns_a_refusal_as_nak(backend: Backend, far_end: FarEnd) -> None:
+    """With its channel."""
+    far_end.replies = lambda number: line(number, {"refused": 4, "channel": 3})
     assert await backend.exchange(Ping(), timeout=LONG) == Nak(NakCode.BAD_CHANNEL, 3)
 
 
-async def test_a_line_that_is_cut_is_told_of(backend: Backend, far_end: FarEnd) -> None:
-    """While it waits, and of one that is closed; closing twice is no error."""
-    far_end.answers = lambda number: None
+async def test_backend_reports_a_lost_and_a_closed_connection(
+    backend: Backend, far_end: FarEnd
+) -> None:
+    """During a request and after closing, which may be repeated."""
+    far_end.replies = lambda number: None
     with pytest.raises(LinkError, match="is lost: the amplifier has hung up"):
         await backend.exchange(Ping(), timeout=LONG)
     for _ in range(2):
@@ -142,8 +142,8 @@ async def test_a_line_that_is_cut_is_told_of(backend: Backend, far_end: FarEnd) 
         await backend.exchange(Ping(), timeout=LONG)
 
 
-async def test_what_no_guard_has_seen_is_not_sent(backend: Backend) -> None:
-    """A TypeError, before anything is on the wire."""
+async def test_backend_sends_only_guarded_sets(backend: Backend) -> None:
+    """Anything else raises TypeError before it is sent."""
     plain = CommandSet(1, (DriveCommand(0, 110.0, 0.5),), ramp=0.0, valid_for=0.0)
     with pytest.raises(TypeError, match="SafeCommandSet"):
         await backend.exchange(Apply(plain), timeout=LONG)
@@ -151,7 +151,7 @@ async def test_what_no_guard_has_seen_is_not_sent(backend: Backend) -> None:
 
 
 @pytest.mark.parametrize("url", ["lines://", "lines://host", "lines://host:x", "lines://h:1/2?a=b"])
-async def test_a_url_that_makes_no_sense_is_refused(url: str, backend: Backend) -> None:
-    """Before any wire is touched."""
+async def test_backend_refuses_an_invalid_url(url: str, backend: Backend) -> None:
+    """Without opening a connection."""
     with pytest.raises(CommandError, match="must be lines://HOST:PORT"):
         type(backend)(url)

@@ -1,4 +1,4 @@
-"""What the example plug-ins import."""
+"""Imports of the example plug-ins."""
 
 import re
 from pathlib import Path
@@ -11,8 +11,8 @@ MODULES = sorted(PLUGINS.glob("*/*.py"))
 
 
 @pytest.mark.parametrize("path", MODULES, ids=[path.stem for path in MODULES])
-def test_a_plug_in_imports_stable_names_only(path: Path) -> None:
-    """Of this project `era_haptics` alone, whose names stay while modules move."""
-    brought = re.findall(r"^\s*(?:from|import) ([\w.]+)", path.read_text("utf-8"), re.MULTILINE)
-    homes = {name.partition(".")[0] for name in brought}
+def test_example_plugin_imports_stable_names_only(path: Path) -> None:
+    """Of this project from `era_haptics` only."""
+    imported = re.findall(r"^\s*(?:from|import) ([\w.]+)", path.read_text("utf-8"), re.MULTILINE)
+    homes = {name.partition(".")[0] for name in imported}
     assert homes & {"registry", "controller", "drivers", "model", "sim"} == set()

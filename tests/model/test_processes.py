@@ -1,4 +1,4 @@
-"""Work shared out among processes, where these do not live."""
+"""Worker processes that die."""
 
 import os
 
@@ -9,11 +9,11 @@ from model.processes import on_processes
 
 
 def die(shared: int, task: int) -> None:
-    """As a process does that the system ends for want of memory."""
+    """End the process at once, as the system does when memory is short."""
     os._exit(shared + task)
 
 
-def test_processes_that_die_again_and_again_are_given_up() -> None:
-    """After four pools of them, in a sentence that names the likely cause and what to try."""
-    with pytest.raises(InputError, match="died 4 times"):
+def test_on_processes_gives_up_after_repeated_deaths() -> None:
+    """After four pools, with a remedy."""
+    with pytest.raises(InputError, match=r"died 4 times.*--workers"):
         list(on_processes(1, die, 1, {0: 8}))

@@ -1,4 +1,4 @@
-"""Quantities and shares as people read them."""
+"""Formatting of quantities and shares."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from model.quantities import in_display_unit, percent
 
 
 @pytest.mark.parametrize(
-    ("value", "unit", "digits", "told"),
+    ("value", "unit", "digits", "expected"),
     [
         (70e9, "Pa", 3, "70 GPa"),
         (19041.2, "N/m", 5, "19.041 kN/m"),
@@ -19,17 +19,17 @@ from model.quantities import in_display_unit, percent
         (117e3, "N/m", 2, "117 kN/m"),
     ],
 )
-def test_a_quantity_is_told_in_the_unit_of_plates(
-    value: float, unit: str, digits: int, told: str
+def test_in_display_unit_scales_to_giga_kilo_or_milli(
+    value: float, unit: str, digits: int, expected: str
 ) -> None:
     """Giga, kilo and milli where plates have them; any other unit as it is, and none without."""
-    assert in_display_unit(value, unit, digits=digits) == told
+    assert in_display_unit(value, unit, digits=digits) == expected
 
 
 @pytest.mark.parametrize(
-    ("share", "told"),
+    ("share", "expected"),
     [(1.43, "143 %"), (0.124, "12 %"), (0.0999, "10 %"), (0.0123, "1.2 %"), (0.0, "0 %")],
 )
-def test_a_share_has_two_digits_that_say_something(share: float, told: str) -> None:
+def test_percent_has_two_significant_digits(share: float, expected: str) -> None:
     """Whole per cents from ten on, below with two digits."""
-    assert percent(share) == told
+    assert percent(share) == expected

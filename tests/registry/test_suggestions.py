@@ -1,4 +1,4 @@
-"""Which name is taken to be meant by a mistyped one."""
+"""Suggestions for mistyped names."""
 
 import pytest
 
@@ -22,13 +22,13 @@ from registry.suggestions import did_you_mean
         ("x", [], ""),
     ],
 )
-def test_only_what_is_nearly_the_same_is_meant(name: str, known: list[str], meant: str) -> None:
-    """A letter left out or turned round, in whatever case, or a word; not what sounds alike."""
+def test_did_you_mean_suggests_similar_names(name: str, known: list[str], meant: str) -> None:
+    """Mistyped, in another case, or one word of the name."""
     assert did_you_mean(name, known) == meant
 
 
-def test_what_ends_all_names_makes_none_alike() -> None:
-    """`usb://` has more in common with `sim://` than `usb` with `sim`, and does not mean it."""
+def test_did_you_mean_ignores_a_common_ending() -> None:
+    """`usb://` is more similar to `sim://` than `usb` to `sim`."""
     assert did_you_mean("usb", ["sim"], ending="://") == ""
     assert did_you_mean("usb://", ["sim://"]) != ""
     assert did_you_mean("sym", ["sim"], ending="://") == "did you mean sim://? "

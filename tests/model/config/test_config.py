@@ -92,9 +92,3 @@ def test_validation_returns_valid_parts_of_an_invalid_file(tmp_path: Path) -> No
     assert validation.field(("parts", "a", "word"), Inner) is None
     assert list(validation.mapping(("parts",))) == ["a", "b"]
     assert validation.mapping(("rate",)) == {}
-
-
-def test_message_shortens_a_long_value(tmp_path: Path) -> None:
-    """It does not repeat a page of text."""
-    ((_, _, message),) = problems(read(tmp_path, f"parts: [{'x' * 5000}]\n"))
-    assert len(message) < 150

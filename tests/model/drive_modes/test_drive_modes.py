@@ -180,45 +180,28 @@ def test_quiet_forms_are_the_expected_power():
             assert (w.conj() @ R @ w).real == pytest.approx(power, rel=1e-5)
 
 
-def test_phased_equals_closed_form_for_one_quiet_point():
-    """With one point at the target and one quiet, the best score is sqrt(h^H R^-1 h)."""
-    for seed in range(5):
-        given = random_fields(seed, quiet=1, points=1)
-        best = 0.0
-        for f in range(F):
-            q, t = given.quiet[f, :, 0].astype(complex), given.targets[0][f, :, 0]
-            R = np.outer(q.conj(), q) + ERROR_SHARE**2 * np.diag(np.abs(q) ** 2)
-            best = max(best, np.sqrt((t @ np.linalg.solve(R, t.conj())).real))
-        drive = found_alone("phased", given, 0.0)
-        assert evaluate(given, drive).score == pytest.approx(best, rel=1e-3)
+@pytest.mark.parametrize(
+    ("mode", "quiet", "is_alone", "eras"),
+    [("phased", 1, False, 3), ("phased", 6, True, 3), ("signed", 20, True, 4)],
+)
+def test_coherent_mode_equals_closed_form(mode, quiet, is_alone, eras):
+    """One target point, one quiet point or a mean: the largest Rayleigh quotient of h h^H by R.
 
-
-def test_phased_equals_closed_form_for_a_lone_finger():
-    """What is around it counts by its mean power, so at every frequency it is h^H R^-1 h."""
-    for seed in range(5):
-        given = random_fields(seed, points=1, is_alone=True)
-        best = 0.0
-        for f in range(F):
-            q, t = given.quiet[f].astype(complex), given.targets[0][f, :, 0]
-            power = (np.abs(q) ** 2).mean(axis=1)
-            R = q.conj() @ q.T / q.shape[1] + ERROR_SHARE**2 * np.diag(power)
-            best = max(best, np.sqrt((t @ np.linalg.solve(R, t.conj())).real))
-        drive = found_alone("phased", given, 0.0)
-        assert evaluate(given, drive).score == pytest.approx(best, rel=1e-3)
-
-
-def test_signed_equals_top_eigenvector_for_a_lone_finger():
-    """Around it a mean counts: for real weights the best of w^T Re(h h^H) w by w^T Re(R) w."""
-    for seed in range(10):
-        given = random_fields(seed, quiet=20, points=1, is_alone=True, eras=4)
+    Complex weights reach sqrt(h^H R^-1 h), real ones the top eigenvalue of the real parts.
+    """
+    for seed in range(8):
+        given = random_fields(seed, quiet=quiet, points=1, is_alone=is_alone, eras=eras)
         best = 0.0
         for f in range(F):
             q, t = given.quiet[f].astype(complex), given.targets[0][f, :, 0].astype(complex)
             power = (np.abs(q) ** 2).mean(axis=1)
             R = q.conj() @ q.T / q.shape[1] + ERROR_SHARE**2 * np.diag(power)
-            top = eigh(np.outer(t.conj(), t).real, R.real, eigvals_only=True)[-1]
+            if mode == "phased":
+                top = (t @ np.linalg.solve(R, t.conj())).real
+            else:
+                top = eigh(np.outer(t.conj(), t).real, R.real, eigvals_only=True)[-1]
             best = max(best, np.sqrt(top))
-        drive = found_alone("signed", given, 0.0)
+        drive = found_alone(mode, given, 0.0)
         assert evaluate(given, drive).score == pytest.approx(best, rel=1e-3)
 
 

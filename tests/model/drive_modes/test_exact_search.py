@@ -87,13 +87,6 @@ def test_search_exactly_equals_brute_force_when_fronts_are_split(monkeypatch):
         assert found.is_complete
 
 
-def test_search_exactly_has_no_drive_when_no_pattern_reaches_the_level():
-    """A level beyond all ERAs together."""
-    found = search_exactly(random_fields(0, is_alone=False, wanted=100.0), eras_at_most=E)
-    assert found.drive is None
-    assert found.is_complete
-
-
 def test_sensation_found_is_within_1_5_db_of_the_maximum():
     """Of 1295 patterns of four ERAs on the plate, at one or two targets: within 1.5 dB below."""
     some = np.arange(0, 27, 6)

@@ -1,4 +1,4 @@
-"""Meshes: where nodes lie, what is interpolated between them, and what is none."""
+"""Meshes: nodes, interpolation, automatic choice and refused values."""
 
 import json
 
@@ -94,12 +94,6 @@ def test_coarsest_mesh_is_the_coarsest_that_resolves_its_frequency(sides):
     paper = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
     again = Mesh.coarsest(paper, frequency=exact.highest_frequency(paper) * (1 - 1e-8))
     assert (again.nx, again.ny) == (12, 9)
-
-
-def test_mesh_prints_strips_in_three_digits():
-    """Twice the thickness of a laminate's equivalent plate is a long number."""
-    mesh = Mesh(4, 3, LENGTH, WIDTH, ELEMENTS["Q5"], 0.003127438)
-    assert str(mesh) == "4x3 Q5 with strips of 3.13 mm"
 
 
 @pytest.mark.parametrize(

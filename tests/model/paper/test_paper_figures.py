@@ -4,18 +4,14 @@ Checks and their bounds: the paper's Tables 1 and 2 and its sections 3.2 and 3.3
 parameters recovered from Table 2.
 """
 
-import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from model.errors import InputError
-from model.fem.mesh import Mesh
-from model.paper.catalogue import FIGURE_NUMBERS, paper_figures
+from model.paper.catalogue import paper_figures
 from model.paper.figure import PaperFigure
-from model.paper.mode_shapes import paper_mesh, thin_plate_frequencies
 from paper_plate import make_paper_rig
 
 
@@ -32,21 +28,6 @@ def peaks(figure: PaperFigure) -> dict[str, np.ndarray]:
         for name, column in figure.tables[""].items()
         if name.startswith("peak_")
     }
-
-
-def test_paper_figures_lists_all_with_results(figures):
-    """Figures 6, 7, 10, 11 (twice, as in the paper), 12 and 13 (maps and study)."""
-    assert set(figures) == {
-        "figure_6",
-        "figure_7",
-        "figure_10",
-        "figure_11_boxplots",
-        "figure_11_maps",
-        "figure_12",
-        "figure_13_maps",
-        "figure_13_stiffness",
-    }
-    assert FIGURE_NUMBERS == ("6", "7", "10", "11", "12", "13")
 
 
 def test_figure_6_reproduces_table_1(figures):
@@ -102,17 +83,6 @@ def test_box_plots_list_every_activation_set(figures, name, sets):
     assert five.min() > 0
 
 
-def test_figure_10_is_symmetric_for_corner_eras(figures):
-    """Each corner ERA alone gives the same statistics, for the plate mirrors."""
-    table = figures["figure_10"].tables[""]
-    medians = [
-        median
-        for layout, median in zip(table["layout"], table["median_m_s2"], strict=True)
-        if layout == "corners"
-    ]
-    np.testing.assert_allclose(medians, medians[0], rtol=1e-6)
-
-
 def test_figure_11_edge_and_diagonal_maxima_agree(figures):
     """Section 3.2, 110 Hz: a negligible change in maximum, about 1 %, but other nulls."""
     edge, diagonal = peaks(figures["figure_11_maps"]).values()
@@ -160,32 +130,6 @@ def test_figure_13_study_contains_the_maps(figures):
     assert correlation.max() <= 1 + 1e-12
 
 
-@pytest.mark.parametrize("name", ["figure_11_maps", "figure_12", "figure_13_maps"])
-def test_maps_share_one_colour_scale(figures, name):
-    """From 0 to the largest value of all of them, and the colour bar says its unit."""
-    *maps, bar = figures[name].figure.axes
-    (limits,) = {axes.collections[0].get_clim() for axes in maps}
-    largest = max(peak.max() for peak in peaks(figures[name]).values()) / 9.8
-    assert limits == pytest.approx((0.0, largest))
-    assert bar.get_ylabel().endswith("/ g")
-
-
-def test_figure_12_titles_name_the_pairs(figures):
-    """Each map of Figure 12 says which ERA has which frequency, in the paper's order."""
-    titles = [axes.get_title() for axes in figures["figure_12"].figure.axes[:6]]
-    assert titles[0] == "(a) SW 320 Hz, NE 320 Hz"
-    assert titles[1] == "(b) SW 300 Hz, NE 100 Hz"
-    assert titles[5] == "(f) SW 150 Hz, NE 150 Hz"
-
-
-def test_figures_render_without_a_display(figures):
-    """As PNG without a display, at least 1000 pixels wide at 150 dots an inch."""
-    for made in figures.values():
-        FigureCanvasAgg(made.figure)
-        made.figure.savefig(io.BytesIO(), dpi=20)
-        assert made.figure.get_figwidth() * 150 >= 1000
-
-
 def test_figures_of_another_plate_have_no_printed_columns():
     """Only the paper's plate can be compared with what the paper prints."""
     rig = make_paper_rig(12, 9)
@@ -194,15 +138,6 @@ def test_figures_of_another_plate_have_no_printed_columns():
     assert list(made.tables[""]) == ["mode", "analytical_hz", "model_12x9_hz", "model_fine_hz"]
     (made,) = paper_figures(replace(rig, eras=rig.eras[:3]), "7")
     assert list(made.tables[""]) == ["mode", "model_12x9_hz", "model_fine_hz"]
-
-
-def test_paper_mesh_and_thin_plate_frequencies():
-    """12 x 9 elements of an inch; Eq. 29 gives the analytical column of Table 1."""
-    plate = make_paper_rig(12, 9).plate
-    assert str(paper_mesh(plate)) == "12x9"
-    np.testing.assert_allclose(
-        thin_plate_frequencies(plate, 5), [109.70, 228.17, 320.31, 425.62, 438.79], atol=0.006
-    )
 
 
 @pytest.mark.parametrize("number", ["1", "8", "14", "", "figure_6"])
@@ -217,11 +152,3 @@ def test_figure_12_refuses_a_rig_of_one_era():
     rig = make_paper_rig(12, 9)
     with pytest.raises(InputError, match="two ERAs"):
         list(paper_figures(replace(rig, eras=rig.eras[:1]), "12"))
-
-
-def test_figure_12_refuses_a_mesh_too_coarse():
-    """Three by two elements carry no wave of 320 Hz."""
-    rig = make_paper_rig(12, 9)
-    coarse = replace(rig, mesh=Mesh(3, 2, rig.plate.length, rig.plate.width))
-    with pytest.raises(InputError, match="Hz"):
-        list(paper_figures(coarse, "12"))

@@ -1,4 +1,4 @@
-"""ERAs that move otherwise than they are asked to."""
+"""ERAs with measured gains."""
 
 import math
 from dataclasses import replace
@@ -30,14 +30,14 @@ def uneven(coarse_rig: Rig) -> Rig:
     return replace(coarse_rig, eras=tuple(eras))
 
 
-def test_gains_between_and_beyond_their_frequencies(uneven: Rig) -> None:
+def test_era_gain_is_interpolated_and_held_beyond_its_frequencies(uneven: Rig) -> None:
     """On the line between two complex gains, and the last one beyond."""
     low, high = 0.9 * np.exp(0.2j), 1.3 * np.exp(-0.4j)
     found = uneven.eras[1].gain(np.array([50.0, 100.0, 125.0, 300.0]))
     np.testing.assert_allclose(found, [low, low, 0.75 * low + 0.25 * high, high])
 
 
-def test_the_response_has_the_gain_and_nothing_else_changes(coarse_rig: Rig, uneven: Rig) -> None:
+def test_acceleration_is_scaled_by_the_gain_of_its_era(coarse_rig: Rig, uneven: Rig) -> None:
     """Direct solve and free plate: the ERA's own response times its gain, its neighbours' not."""
     points = np.array([[0.1, 0.05], [0.2, 0.2]])
     frequencies = np.array([100.0, 150.0, 200.0])
@@ -55,7 +55,7 @@ def test_the_response_has_the_gain_and_nothing_else_changes(coarse_rig: Rig, une
     )
 
 
-def test_the_plate_in_time_has_it_too(coarse_rig: Rig, uneven: Rig) -> None:
+def test_particular_solution_is_scaled_by_the_gain_of_its_era(coarse_rig: Rig, uneven: Rig) -> None:
     """A steady tone's particular solution is the ungained one times the gain at its frequency."""
     reduced = reduce_plate(coarse_rig.plate, coarse_rig.mesh, era_positions(coarse_rig.eras))
     s = np.array([2j * math.pi * 125.0])
@@ -65,7 +65,7 @@ def test_the_plate_in_time_has_it_too(coarse_rig: Rig, uneven: Rig) -> None:
     np.testing.assert_allclose(gained, gain * plain, rtol=1e-9, atol=1e-12 * abs(plain).max())
 
 
-def test_one_motion_has_one_answer_whichever_way_its_phasor_turns(
+def test_particular_solution_is_the_same_for_negative_frequency(
     coarse_rig: Rig, uneven: Rig
 ) -> None:
     """Im[c exp(i w t)] is Im[-conj(c) exp(-i w t)]: quick ramps of low tones are made of both."""
@@ -78,7 +78,9 @@ def test_one_motion_has_one_answer_whichever_way_its_phasor_turns(
     np.testing.assert_allclose(back.state(0.0123), expected, atol=1e-9 * np.abs(expected).max())
 
 
-def test_a_table_is_of_these_gains(coarse_rig: Rig, uneven: Rig, tmp_path: Path) -> None:
+def test_table_file_keeps_gains_and_fingerprint(
+    coarse_rig: Rig, uneven: Rig, tmp_path: Path
+) -> None:
     """Gains change the fingerprint, and come back from a table's file."""
     assert uneven.fingerprint != coarse_rig.fingerprint
     table = build_table(uneven, frequencies=np.array([100.0, 110.0]))
@@ -88,8 +90,8 @@ def test_a_table_is_of_these_gains(coarse_rig: Rig, uneven: Rig, tmp_path: Path)
     assert back.fingerprint == uneven.fingerprint
 
 
-def test_gains_in_a_rig_file(tmp_path: Path) -> None:
-    """Rows of frequency, magnitude and degrees; a row that is none is refused with its line."""
+def test_load_rig_reads_gains_and_refuses_invalid_rows(tmp_path: Path) -> None:
+    """Rows of frequency, magnitude and degrees; an invalid row with its line."""
     text = """\
 plate: {length: 0.3, width: 0.2, thickness: 1.5 mm, material: steel}
 mesh: 12x9
@@ -111,7 +113,7 @@ amplifiers: {m: {url: "sim://"}}
             load_rig(path)
 
 
-def test_gains_that_are_none_are_refused(coarse_rig: Rig) -> None:
+def test_era_refuses_invalid_gains(coarse_rig: Rig) -> None:
     """No magnitude, no number, or frequencies that do not ascend."""
     for gains in (
         ((50.0, 0.0, 0.0),),

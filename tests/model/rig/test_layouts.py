@@ -16,7 +16,7 @@ from model.structure.actuator import Era
 from paper_plate import LENGTH, WIDTH, make_paper_rig
 
 
-def test_at_least_five_layouts_of_four_eras_have_names():
+def test_four_era_layouts_are_distinct_and_on_the_plate():
     """Five or more, no two alike, no two ERAs of one at the same place, all on the plate."""
     assert len(FOUR_ERA_LAYOUTS) >= 5
     assert len({layout.name for layout in FOUR_ERA_LAYOUTS}) == len(FOUR_ERA_LAYOUTS)
@@ -26,7 +26,7 @@ def test_at_least_five_layouts_of_four_eras_have_names():
         assert all(0 <= share <= 1 for place in layout.places for share in place)
 
 
-def test_the_corners_are_those_of_the_papers_rig():
+def test_corners_layout_is_that_of_the_paper():
     """The layout `corners` on the paper's plate is the paper's own rig."""
     rig = make_paper_rig(12, 9)
     corners = next(layout for layout in FOUR_ERA_LAYOUTS if layout.name == "corners")
@@ -35,7 +35,7 @@ def test_the_corners_are_those_of_the_papers_rig():
 
 
 @pytest.mark.parametrize("count", range(1, 7))
-def test_a_raster_of_13_by_13_holds_all_named_layouts(count):
+def test_candidate_places_of_13_by_13_include_named_layouts(count):
     """Every twelfth of a side: each named place is one of the candidates."""
     candidates = candidate_places(13, 13)
     assert len(candidates) == 169
@@ -46,20 +46,20 @@ def test_a_raster_of_13_by_13_holds_all_named_layouts(count):
 
 
 @pytest.mark.parametrize("nx", [0, 1, 101])
-def test_a_raster_without_a_plate_in_it_is_refused(nx):
+def test_candidate_places_refuse_rasters_out_of_range(nx):
     """Fewer than two places along a side, or more than memory takes, is bad input."""
     with pytest.raises(InputError, match="2x2 to 100x100"):
         candidate_places(nx, 5)
 
 
-def test_the_papers_pairs_are_found():
+def test_edge_and_diagonal_pairs_of_the_paper():
     """On the paper's rig: SW and SE share the long edge, SW and NE are diagonal."""
     eras = make_paper_rig(12, 9).eras
     assert [eras[era].name for era in edge_pair(eras)] == ["SW", "SE"]
     assert [eras[era].name for era in diagonal_pair(eras)] == ["SW", "NE"]
 
 
-def test_a_pair_needs_two_eras():
+def test_pairs_need_two_eras():
     """One ERA alone makes no pair."""
     single = alike(Era("A", 0, 0, 17000.0, 1.0, 0.0, 1e-4), np.array([[LENGTH, WIDTH]]))
     for find in (edge_pair, diagonal_pair):

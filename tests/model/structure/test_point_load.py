@@ -1,9 +1,7 @@
 """Point loads: against ERAs of the same total, and refused values."""
 
 import numpy as np
-import pytest
 
-from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.reduction.free_plate import solve_free_plate
 from model.structure.actuator import Era
@@ -36,13 +34,3 @@ def test_point_load_at_an_era_acts_as_bolt_mass_and_parallel_spring():
         free.acceleration(stiffer, frequencies, free.mesh.nodes) * share[:, None, None],
         rtol=1e-8,
     )
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("x", float("nan")), ("mass", -0.1), ("stiffness", -1.0), ("damping", float("inf"))],
-)
-def test_point_load_refuses_values_out_of_range(key, value):
-    """Values that are not finite, and negative ones, which would add energy."""
-    with pytest.raises(InputError, match=rf"^point load: {key} .*got {value}"):
-        PointLoad(**({"x": 0.1, "y": 0.1} | {key: value}))

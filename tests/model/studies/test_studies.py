@@ -53,7 +53,7 @@ def npy_bytes(array):
 
 
 def counting(solved):
-    """Workers that note which chunks they were asked for."""
+    """Workers that record the numbers of their chunks."""
 
     def solve_and_note(problem, chunks):
         solved.extend(chunks)
@@ -62,7 +62,7 @@ def counting(solved):
     return solve_and_note
 
 
-def test_statistics_are_those_of_the_direct_solve(study, results):
+def test_statistics_equal_the_direct_solve(study, results):
     """For the rig itself and random layouts, against one sparse factorisation per frequency."""
     problem, cases = study
     matrices = assemble(problem.rig.plate, problem.rig.mesh)
@@ -78,7 +78,7 @@ def test_statistics_are_those_of_the_direct_solve(study, results):
         assert results.statistics[case, 0, MEDIAN] == pytest.approx(best, rel=1e-4)
 
 
-def test_eras_that_differ_are_solved_as_they_are():
+def test_acceleration_of_unequal_eras_equals_the_direct_solve():
     """Stiffness, damping, bolt mass and stroke of each ERA are its own, as in the direct solve."""
     paper = make_paper_rig(12, 9)
     parameters = [(8e3, 1.0, 0.0, 1e-4), (3e4, 5.0, 0.01, 5e-5), (17e3, 3.0, 0.02, 2e-4)]
@@ -95,7 +95,7 @@ def test_eras_that_differ_are_solved_as_they_are():
     np.testing.assert_allclose(fast, direct, rtol=1e-4, atol=1e-4 * np.abs(direct).max())
 
 
-def test_what_the_plate_carries_is_in_the_answer(study):
+def test_statistics_include_point_masses(study):
     """A point mass of the rig is there in every layout, as in the direct solve."""
     problem, cases = study
     mass = PointMass(0.1, 0.08, 0.05)
@@ -114,8 +114,8 @@ def test_what_the_plate_carries_is_in_the_answer(study):
     assert solved.statistics[0, 1, MEDIAN] == pytest.approx(expected, rel=1e-4)
 
 
-def test_one_era_has_no_pair_and_two_have_no_more():
-    """A count study leaves the pair of a lone ERA out; of two, the pair is all."""
+def test_pairs_are_skipped_for_one_era_and_all_for_two():
+    """A lone ERA has no pair; of two ERAs the pair is all."""
     rig = make_paper_rig(12, 9)
     cases = count_cases(rig, layouts=6, seed=0, raster=(7, 5))
     problem = study_problem(rig, cases, FREQUENCIES)
@@ -128,35 +128,27 @@ def test_one_era_has_no_pair_and_two_have_no_more():
     assert sorted(era_counts(cases)[pairs.order]) == [2, 3, 4, 5, 6]
 
 
-def test_more_workers_give_the_same_to_the_bit(study):
-    """Two processes and this one agree in every bit of every chunk."""
-    problem, cases = study
-    chunks = chunks_of(cases, 30)
-    two = dict(on_processes(2)(problem, chunks))
-    assert same_to_the_bit(two, dict(on_processes(1)(problem, chunks)))
-
-
-def test_a_run_puts_chunks_together_in_order(study, results, tmp_path):
-    """Whatever order workers finish in; each case is told to the progress bar once."""
+def test_run_study_orders_chunks_and_counts_progress(study, results, tmp_path):
+    """In any order of completion; each case counts once as progress."""
     problem, cases = study
 
     def backwards(problem, chunks):
         yield from reversed(list(on_processes(1)(problem, chunks)))
 
-    told = []
+    progress = []
     run = run_study(
         problem,
         cases,
         workers=backwards,
         finished=FinishedCases(tmp_path, problem.digest),
-        progress=told.append,
+        progress=progress.append,
     )
     assert same_to_the_bit({0: run.results}, {0: results})
-    assert (sum(told), run.solved_count, run.cached_count) == (len(cases), len(cases), 0)
+    assert (sum(progress), run.solved_count, run.cached_count) == (len(cases), len(cases), 0)
 
 
-def test_interrupted_run_resumes_without_solving_anything_twice(study, results, tmp_path):
-    """Ctrl-C after the first chunk; the second run solves the other two, the third none at all."""
+def test_run_study_resumes_after_an_interrupt(study, results, tmp_path):
+    """Ctrl-C after the first chunk: the second run solves the other two, the third none."""
     problem, cases = study
 
     def interrupted(problem, chunks):
@@ -167,18 +159,18 @@ def test_interrupted_run_resumes_without_solving_anything_twice(study, results, 
         run_study(
             problem, cases, workers=interrupted, finished=FinishedCases(tmp_path, problem.digest)
         )
-    asked = []
+    chunks = []
     for solved in (len(cases) - CHUNK, 0):
         finished = FinishedCases(tmp_path, problem.digest)
-        run = run_study(problem, cases, workers=counting(asked), finished=finished)
+        run = run_study(problem, cases, workers=counting(chunks), finished=finished)
         assert (run.solved_count, run.cached_count) == (solved, len(cases) - solved)
         assert same_to_the_bit({0: run.results}, {0: results})
-    assert asked == [0, 1]
+    assert chunks == [0, 1]
     assert list(tmp_path.iterdir()) == [finished.path]
 
 
 @pytest.mark.parametrize("harm", ["cut", "flipped", "emptied", "foreign", "an array"])
-def test_damaged_file_is_logged_and_solved_again(study, results, tmp_path, caplog, harm):
+def test_finished_cases_ignore_and_log_a_damaged_file(study, results, tmp_path, caplog, harm):
     """Cut short, a bit flipped, empty, or not such a file at all: one warning, right numbers."""
     problem, cases = study
     finished = FinishedCases(tmp_path, problem.digest)
@@ -212,7 +204,9 @@ def test_damaged_file_is_logged_and_solved_again(study, results, tmp_path, caplo
     ],
     ids=["frequencies", "mesh", "ERAs"],
 )
-def test_results_of_another_problem_are_not_used(study, results, tmp_path, monkeypatch, change):
+def test_finished_cases_of_another_problem_are_not_used(
+    study, results, tmp_path, monkeypatch, change
+):
     """Each problem and NUMERICS_VERSION has its own file, and no other may be renamed to it."""
     problem, cases = study
     FinishedCases(tmp_path, problem.digest).add(cases, results)
@@ -227,7 +221,7 @@ def test_results_of_another_problem_are_not_used(study, results, tmp_path, monke
     assert not FinishedCases(tmp_path, other).find(cases)[0].any()
 
 
-def test_results_are_found_by_the_cases_themselves(study, results, tmp_path):
+def test_finished_cases_are_found_by_layout_and_stiffness(study, results, tmp_path):
     """The same layouts of a longer list are found again, others or stiffer ones are not."""
     problem, cases = study
     first = cases.take(range(4))
@@ -241,8 +235,8 @@ def test_results_are_found_by_the_cases_themselves(study, results, tmp_path):
     assert finished.find(stiffer)[0].tolist() == [True, True, True, False]
 
 
-def test_a_worker_process_that_dies_is_replaced(study, results, caplog):
-    """All workers killed when the first chunk is there: a warning, and all results come."""
+def test_on_processes_replaces_workers_that_die(study, results, caplog):
+    """All workers killed after the first chunk: a warning, and all results."""
     problem, cases = study
     chunks = chunks_of(cases, 2)
     others = multiprocessing.active_children()
@@ -257,7 +251,7 @@ def test_a_worker_process_that_dies_is_replaced(study, results, caplog):
     assert "died" in caplog.text
 
 
-def test_the_ranking_is_by_the_median_of_the_drive(study, results):
+def test_rank_orders_by_median(study, results):
     """Best first, the middle in the middle, the worst last; the rig has its place in it."""
     problem, cases = study
     ranking = rank(problem.rig, cases, results, drive=DRIVES.index("2"))
@@ -269,19 +263,19 @@ def test_the_ranking_is_by_the_median_of_the_drive(study, results):
     assert ranking.recommended == ranking.best
 
 
-def test_the_rig_as_it_is_is_told_even_from_the_end_of_the_ranking(study):
+def test_ranking_summary_includes_the_own_rig(study):
     """Ten cases and, where it is not among them, the rig's own with its rank."""
     problem, cases = study
     part = cases.take(range(0, 30))
     statistics = np.ones((30, 3, 6))
     statistics[:, 1, MEDIAN] = np.arange(30)  # the first one, the rig's, comes last
     results = CaseResults(statistics, np.ones((30, 3), dtype=np.uint64))
-    told = ranking_summary(problem.rig, rank(problem.rig, part, results, drive=1))["ranking"]
-    assert [case["rank"] for case in told] == [*range(1, 11), 30]
-    assert told[-1]["layout"] == "own"
+    cases = ranking_summary(problem.rig, rank(problem.rig, part, results, drive=1))["ranking"]
+    assert [case["rank"] for case in cases] == [*range(1, 11), 30]
+    assert cases[-1]["layout"] == "own"
 
 
-def test_unsupported_layouts_are_marked_and_not_recommended() -> None:
+def test_rank_marks_unsupported_layouts_and_recommends_a_supported_one() -> None:
     """One or two ERAs are ranked, and the best layout of three or more is recommended."""
     rig = make_paper_rig(12, 9)
     cases = count_cases(rig, layouts=6, seed=0, raster=(7, 5))
@@ -301,7 +295,7 @@ def test_unsupported_layouts_are_marked_and_not_recommended() -> None:
     assert nothing.recommended == 0
 
 
-def test_softer_eras_are_recommended_where_they_do_as_well():
+def test_rank_recommends_the_softest_of_nearly_equal_eras():
     """Of those within a tenth of the best median: the fewest, then the softest."""
     rig = make_paper_rig(12, 9)
     cases = stiffness_cases(rig, layouts=1, seed=0, raster=(7, 5))
@@ -314,14 +308,14 @@ def test_softer_eras_are_recommended_where_they_do_as_well():
 
 
 @pytest.mark.parametrize("frequencies", [[], [0.0], [-60.0], [np.nan], [60.0, 5000.0]])
-def test_bad_frequencies_are_refused(study, frequencies):
+def test_study_problem_refuses_invalid_frequencies(study, frequencies):
     """None, nought, no number, or more than the mesh carries."""
     problem, cases = study
     with pytest.raises(InputError, match=r"frequenc|Hz"):
         study_problem(problem.rig, cases, np.array(frequencies))
 
 
-def test_a_study_too_large_for_memory_is_refused_before_it_starts(study):
+def test_study_problem_too_large_for_memory_is_refused(study):
     """3600 places at 27 frequencies: 27 x 3600 x (3600 + 432) complex numbers are 6.3 GB."""
     problem, _ = study
     cases = placement_cases(problem.rig, layouts=10, seed=0, raster=(60, 60))

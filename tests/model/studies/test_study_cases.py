@@ -1,4 +1,4 @@
-"""What a study compares: layouts by seed, each once, and the ERAs that stand there."""
+"""Cases of studies: layouts by seed, each once, and their ERAs."""
 
 from dataclasses import replace
 from math import comb
@@ -34,8 +34,8 @@ def layouts_of(cases):
     ]
 
 
-def test_the_rig_comes_first_then_named_layouts_then_random_ones(rig):
-    """Its own layout is the paper's corners and is not told twice."""
+def test_placement_cases_start_with_the_rig_and_named_layouts(rig):
+    """Its own layout is the paper's corners and is not repeated."""
     cases = placement_cases(rig, layouts=30, seed=0, raster=(13, 13))
     assert cases.names[:3] == (OWN, "mid-edges", "long edges")
     assert "corners" not in cases.names
@@ -44,7 +44,7 @@ def test_the_rig_comes_first_then_named_layouts_then_random_ones(rig):
 
 
 @pytest.mark.parametrize("study", STUDIES)
-def test_layouts_depend_on_the_seed_alone(rig, study):
+def test_cases_depend_on_the_seed(rig, study):
     """The same seed gives the same cases, another one others."""
     first, again, other = (
         STUDIES[study](rig, layouts=40, seed=seed, raster=(13, 13)) for seed in (3, 3, 4)
@@ -55,7 +55,7 @@ def test_layouts_depend_on_the_seed_alone(rig, study):
 
 
 @pytest.mark.parametrize("raster", [(13, 13), (7, 5)], ids=["drawn", "shuffled"])
-def test_more_layouts_begin_with_the_same_ones(rig, raster):
+def test_placement_cases_of_a_longer_study_start_with_the_same(rig, raster):
     """Asking for more keeps those that were solved before."""
     few = placement_cases(rig, layouts=50, seed=1, raster=raster)
     many = placement_cases(rig, layouts=20_000, seed=1, raster=raster)
@@ -63,7 +63,7 @@ def test_more_layouts_begin_with_the_same_ones(rig, raster):
     assert (many.places[:50] == few.places).all()
 
 
-def test_no_layout_is_there_twice(rig):
+def test_placement_cases_are_distinct(rig):
     """Thousands of layouts, all different, four ERAs at four places in each."""
     cases = placement_cases(rig, layouts=5000, seed=0, raster=(13, 13))
     layouts = layouts_of(cases)
@@ -71,7 +71,7 @@ def test_no_layout_is_there_twice(rig):
     assert {len(layout) for layout in layouts} == {4}
 
 
-def test_a_small_raster_is_exhausted_and_not_repeated(rig):
+def test_placement_cases_exhaust_a_small_raster(rig):
     """On 3x2 places there are C(6, 4) layouts, and named ones that lie between: no more."""
     cases = placement_cases(rig, layouts=1000, seed=0, raster=(3, 2))
     layouts = layouts_of(cases)
@@ -80,7 +80,7 @@ def test_a_small_raster_is_exhausted_and_not_repeated(rig):
     assert len(random) == comb(6, 4) - 1  # the corners are the rig's own
 
 
-def test_eras_that_differ_keep_their_parameters_and_names(rig):
+def test_placement_cases_keep_parameters_of_unequal_eras(rig):
     """A stiffer SW stays the stiffer one, wherever it goes; its places are not sorted away."""
     different = (replace(rig.eras[0], stiffness=30_000.0), *rig.eras[1:])
     unequal = replace(rig, eras=different)
@@ -92,7 +92,7 @@ def test_eras_that_differ_keep_their_parameters_and_names(rig):
     assert (np.diff(cases.places[10:], axis=1) < 0).any()
 
 
-def test_a_count_study_keeps_the_damping_ratio(rig):
+def test_count_cases_keep_the_damping_ratio(rig):
     """Two ERAs carry half the plate each: c = 2 zeta sqrt(k m / 2), by the definition."""
     cases = count_cases(rig, layouts=60, seed=0, raster=(13, 13))
     counts = era_counts(cases)
@@ -108,7 +108,7 @@ def test_a_count_study_keeps_the_damping_ratio(rig):
         assert [era.name for era in eras] == [f"E{number + 1}" for number in range(len(eras))]
 
 
-def test_a_stiffness_study_scales_all_eras_and_keeps_the_damping_ratio(rig):
+def test_stiffness_cases_scale_all_eras_and_keep_the_damping_ratio(rig):
     """Each layout nine times, from a sixteenth to sixteen times as stiff."""
     cases = stiffness_cases(rig, layouts=4, seed=0, raster=(13, 13))
     assert len(cases) == 4 * len(STIFFNESS_FACTORS) == 36
@@ -118,21 +118,11 @@ def test_a_stiffness_study_scales_all_eras_and_keeps_the_damping_ratio(rig):
     assert eras[0].damping == pytest.approx(4 * rig.eras[0].damping)
 
 
-def test_a_count_of_unequal_eras_is_refused(rig):
-    """Which of them should be left out cannot be told."""
+@pytest.mark.parametrize("study", STUDIES)
+def test_cases_refuse_too_few_layouts(rig, study):
+    """None; of a count study, fewer than one for each of 1 to 6 ERAs, and ERAs that differ."""
+    with pytest.raises(InputError, match="layouts"):
+        STUDIES[study](rig, layouts=5 if study == "count" else 0, seed=0, raster=(13, 13))
     unequal = replace(rig, eras=(replace(rig.eras[0], stroke=50e-6), *rig.eras[1:]))
     with pytest.raises(InputError, match="alike"):
         count_cases(unequal, layouts=60, seed=0, raster=(13, 13))
-
-
-def test_too_few_layouts_for_a_count_study_are_refused(rig):
-    """One for each number of ERAs is the least."""
-    with pytest.raises(InputError, match="at least 6"):
-        count_cases(rig, layouts=5, seed=0, raster=(13, 13))
-
-
-@pytest.mark.parametrize("study", STUDIES)
-def test_no_layouts_are_no_study(rig, study):
-    """Nought or fewer layouts are bad input."""
-    with pytest.raises(InputError, match="layouts"):
-        STUDIES[study](rig, layouts=0, seed=0, raster=(13, 13))

@@ -31,7 +31,7 @@ def worker_pids(address: str) -> list[int]:
         return list(client.run(os.getpid).values())
 
 
-def test_a_cluster_gives_the_same_to_the_bit(address):
+def test_cluster_equals_one_process_bit_for_bit(address):
     """Two worker processes and this process agree in every bit of every chunk."""
     assert len(set(worker_pids(address)) - {os.getpid()}) == 2
     problem, cases = small_study(layouts=40)
@@ -40,7 +40,7 @@ def test_a_cluster_gives_the_same_to_the_bit(address):
     assert same_to_the_bit(there, dict(on_processes(1)(problem, chunks)))
 
 
-def test_killed_workers_are_survived(address):
+def test_cluster_replaces_killed_workers(address):
     """Both workers killed when the first chunk is there: the rest comes all the same, bit by bit.
 
     With them goes the solved plate, which the scheduler has solved once more.
@@ -57,7 +57,7 @@ def test_killed_workers_are_survived(address):
     assert not set(before) & set(worker_pids(address))
 
 
-def test_a_worker_with_other_code_is_refused(address, monkeypatch):
+def test_cluster_refuses_workers_with_other_code(address, monkeypatch):
     """A study made by other code than the workers have is not mixed with theirs."""
     problem, cases = small_study(layouts=4)
     monkeypatch.setattr(workers, "code_version", lambda: OTHER)
@@ -65,16 +65,7 @@ def test_a_worker_with_other_code_is_refused(address, monkeypatch):
         dict(on_cluster(address)(problem, chunks_of(cases, 4)))
 
 
-def test_every_worker_looks_at_its_own_code():
-    """Not only the one that solves the plate: another may join later, with other code."""
-    problem, cases = small_study(layouts=4)
-    with pytest.raises(InputError, match="same era-haptics"):
-        workers._solve_plate(OTHER, problem)
-    with pytest.raises(InputError, match="same era-haptics"):
-        workers._solve_on_cluster(OTHER, (problem.solve(), problem.rig.eras), cases)
-
-
-def test_a_cluster_without_workers_is_refused():
+def test_cluster_without_workers_is_refused():
     """Waiting for ever for a worker to come is no answer."""
     problem, cases = small_study(layouts=4)
     with (
@@ -84,7 +75,7 @@ def test_a_cluster_without_workers_is_refused():
         dict(on_cluster(empty.scheduler_address)(problem, chunks_of(cases, 4)))
 
 
-def test_workers_that_die_of_a_chunk_are_given_up(address, monkeypatch):
+def test_cluster_gives_up_on_a_chunk_that_kills_its_workers(address, monkeypatch):
     """A chunk that ends whichever worker takes it, as one does for which memory is too short."""
     problem, cases = small_study(layouts=4)
     monkeypatch.setattr(
@@ -101,14 +92,14 @@ def _allow_failures(count, dask_scheduler):
     dask_scheduler.allowed_failures = count
 
 
-def test_without_dask_it_is_said_how_to_have_it(monkeypatch):
+def test_cluster_without_dask_names_the_extra(monkeypatch):
     """The extra to install, by its name."""
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"\[cluster\]"):
         dict(on_cluster("tcp://127.0.0.1:1")(None, {}))
 
 
-def test_no_scheduler_is_told(monkeypatch):
+def test_cluster_without_scheduler_is_refused(monkeypatch):
     """Nothing listens at the address: the error says so, and how to start one."""
     monkeypatch.setattr(workers, "_CONNECT_TIMEOUT", 0.2)
     problem, cases = small_study(layouts=4)
@@ -117,7 +108,16 @@ def test_no_scheduler_is_told(monkeypatch):
 
 
 @pytest.mark.parametrize("text", ["", "nonsense", "foo://x:1", "tcp://host", "tcp://host:port"])
-def test_what_is_no_address_is_refused_at_once(text):
+def test_on_cluster_refuses_an_invalid_address(text):
     """An address that Dask would hang over never reaches it."""
     with pytest.raises(InputError, match="dask scheduler"):
         on_cluster(text)
+
+
+def test_every_worker_checks_its_code():
+    """Not only the one that solves the plate: another may join later, with other code."""
+    problem, cases = small_study(layouts=4)
+    with pytest.raises(InputError, match="same era-haptics"):
+        workers._solve_plate(OTHER, problem)
+    with pytest.raises(InputError, match="same era-haptics"):
+        workers._solve_on_cluster(OTHER, (problem.solve(), problem.rig.eras), cases)

@@ -8,7 +8,7 @@ import pytest
 
 from model.errors import InputError
 from model.transients.base_motion import Term
-from model.transients.envelope import Envelope, ramped_ending, ramped_onset, shaped
+from model.transients.envelope import Envelope, ramped_ending, ramped_onset
 from model.vibration.excitation import Tone
 from paper_plate import make_paper_rig
 
@@ -39,14 +39,6 @@ def test_envelope_terms_are_linear_between_knots():
         assert envelope.amplitude(np.array([time]))[0] == pytest.approx(amplitude)
 
 
-def test_envelope_terms_end_when_the_last_knot_is_zero():
-    """From a tone's own amplitude it begins as that tone, and after its last knot all is still."""
-    terms = Envelope(70.0, 3e-5, (3e-5, 0j), step=0.004).terms()
-    tone = 3e-5 * math.sin(2 * math.pi * 70.0 * 0.001)
-    assert motion(terms, 0.001) == pytest.approx(tone, abs=1e-17)
-    assert motion(terms, 0.0081) == 0.0
-
-
 def test_ramped_onset_and_ending_are_raised_cosines():
     """Half way through a ramp, up or down, the amplitude is half, and none or all at its ends."""
     rig = make_paper_rig(2, 2)
@@ -59,13 +51,6 @@ def test_ramped_onset_and_ending_are_raised_cosines():
         tone = 1e-4 * math.sin(2 * math.pi * 50.0 * time + 0.3)
         assert motion(up[se], time) == pytest.approx(share * tone, abs=1e-17)
         assert motion(down[se], time) == pytest.approx((1 - share) * tone, abs=1e-17)
-
-
-def test_shaped_bases_follow_the_order_of_the_rig():
-    """An envelope moves the base of the ERA that it is named for and no other."""
-    rig = make_paper_rig(2, 2)
-    bases = shaped({"NE": Envelope(90.0, 0j, (1e-5 + 0j,))}, rig.eras)
-    assert [era.name for era, base in zip(rig.eras, bases, strict=True) if base] == ["NE"]
 
 
 @pytest.mark.parametrize(

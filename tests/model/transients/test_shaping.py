@@ -230,29 +230,6 @@ def test_ending_keeps_known_quiet_finger_quiet(setup):
         assert transients.residual_db(excitation, knowing) < limit
 
 
-def test_shaping_is_symmetric_for_mirrored_contacts(setup):
-    """On a symmetric plate, west and east swap with the contacts."""
-    rig, _, shaper, _ = setup
-    swap = {"SW": "SE", "SE": "SW", "NE": "NW", "NW": "NE"}
-    excitation = random_excitation(rig, 160.0, np.random.default_rng(3))
-    mirrored = {swap[name]: tone for name, tone in excitation.items()}
-    length = rig.plate.length
-    target, quiet = (0.07, 0.06), [(0.2, 0.1), (0.1, 0.19)]
-    here = shaper.onset(excitation, targets=[target], quiet=quiet)
-    there = shaper.onset(
-        mirrored,
-        targets=[(length - target[0], target[1])],
-        quiet=[(length - x, y) for x, y in quiet],
-    )
-    for name, envelope in here.items():
-        np.testing.assert_allclose(there[swap[name]].knots, envelope.knots, atol=1e-6 * 1e-4)
-    brake, mirrored_brake = shaper.ending(excitation), shaper.ending(mirrored)
-    for name, envelope in brake.items():
-        np.testing.assert_allclose(
-            mirrored_brake[swap[name]].knots, envelope.knots, atol=1e-6 * 1e-4
-        )
-
-
 def test_shaping_is_linear_in_level_when_bounds_are_inactive(setup):
     """Far below the stroke shaping is linear in the pattern."""
     rig, _, shaper, _ = setup

@@ -89,20 +89,6 @@ def test_acceleration_equals_time_stepping(few_modes):
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
-def test_acceleration_superposes_eras(plate):
-    """Linear: what two ERAs do together is the sum of what each does alone."""
-    rig, in_time = plate
-    transients = Transients(in_time)
-    points = fingertip_points(0.2, 0.05, rig.plate)
-    one = {"SW": Envelope(110.0, 0j, (5e-5 + 0j, 1e-5j, 4e-5 + 0j))}
-    other = {"NE": Envelope(230.0, 0j, (0j, 7e-5j))}
-    felt = [
-        transients.acceleration(shaped(envelopes, rig.eras), points)
-        for envelopes in (one, other, one | other)
-    ]
-    np.testing.assert_allclose(felt[2], felt[0] + felt[1], atol=1e-9 * np.abs(felt[2]).max())
-
-
 def test_acceleration_stays_steady_after_steady_state(plate):
     """A tone that goes on after having been steady neither grows nor fades."""
     rig, in_time = plate
@@ -178,19 +164,6 @@ def test_residual_db_equals_sampled_plate(plate):
     assert found == pytest.approx(expected, abs=0.1)
 
 
-def test_residual_db_adds_powers_of_two_frequencies(plate):
-    """What is left of two tones lies between what is left of each, weighted by their powers."""
-    rig, in_time = plate
-    transients = Transients(in_time)
-    low, high = {"SW": Tone(90.0, 1e-4)}, {"NE": Tone(300.0, 1e-4)}
-    alone = [
-        transients.residual_db(each, ramped_ending(each, rig.eras, ramp=0.02))
-        for each in (low, high)
-    ]
-    both = transients.residual_db(low | high, ramped_ending(low | high, rig.eras, ramp=0.02))
-    assert min(alone) < both < max(alone)
-
-
 def test_ending_contrast_db_equals_sampled_peaks(plate):
     """What the target felt steadily, by sampling, to the loudest quiet peak from the end on."""
     rig, in_time = plate
@@ -216,3 +189,16 @@ def test_ending_contrast_db_equals_sampled_peaks(plate):
     expected = 20 * np.log10(steady.mean() / np.abs(felt).max())
     found = transients.ending_contrast_db(excitation, ending, targets=[target], quiet=[quiet])
     assert found == pytest.approx(expected, abs=0.1)
+
+
+def test_residual_db_adds_powers_of_two_frequencies(plate):
+    """What is left of two tones lies between what is left of each, weighted by their powers."""
+    rig, in_time = plate
+    transients = Transients(in_time)
+    low, high = {"SW": Tone(90.0, 1e-4)}, {"NE": Tone(300.0, 1e-4)}
+    alone = [
+        transients.residual_db(each, ramped_ending(each, rig.eras, ramp=0.02))
+        for each in (low, high)
+    ]
+    both = transients.residual_db(low | high, ramped_ending(low | high, rig.eras, ramp=0.02))
+    assert min(alone) < both < max(alone)

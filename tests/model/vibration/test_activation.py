@@ -1,7 +1,5 @@
 """Cumulative peak acceleration of activation sets, against sums written out by hand."""
 
-from itertools import combinations
-
 import numpy as np
 import pytest
 
@@ -27,19 +25,6 @@ def free_plate():
     return solve_free_plate(plate, Mesh.auto(plate, frequency_max=500.0), frequency_max=320.0)
 
 
-@pytest.mark.parametrize(
-    ("eras", "sets"),
-    [(1, 1), (2, 3), (3, 7), (4, 11)],
-)
-def test_activation_sets_are_singles_pairs_and_all(eras, sets):
-    """One ERA: itself; two: each and both; four: 4 alone, 6 pairs, all."""
-    every = activation_sets(eras)
-    assert len(every) == len(set(every)) == sets
-    assert every[:eras] == tuple((era,) for era in range(eras))
-    assert set(combinations(range(eras), 2)) <= set(every)
-    assert every[-1] == tuple(range(eras))
-
-
 def test_cumulative_statistics_add_eras_as_complex_numbers():
     """Two ERAs in opposition leave a null, which magnitudes added would fill."""
     acceleration = np.array([[[1.0 + 2j, 3.0], [-1.0 - 2j, 3.0]], [[2.0, 1j], [0.0, 0.0]]])
@@ -63,11 +48,6 @@ def test_cumulative_statistics_sum_over_frequencies():
         expected = [*np.percentile(total, [0, 25, 50, 75, 100]), unfelt / 200]
         np.testing.assert_allclose(row, expected)
     assert len(STATISTICS) == 6
-
-
-def test_unfelt_share_is_zero_without_threshold():
-    """The share is only told where it was asked for."""
-    assert cumulative_statistics(np.ones((1, 1, 2), dtype=complex))[0, -1] == 0
 
 
 def test_felt_acceleration_is_twelve_decibels_above_detection():

@@ -79,15 +79,15 @@ def test_unsupported_motion_is_not_compared(count, free):
     assert np.abs(study.errors[0].frequency).max() < 0.03
 
 
-@pytest.mark.parametrize(("limit", "asked"), [(500.0, [110, 250]), (200.0, [110]), (80.0, [80])])
-def test_default_frequencies_are_those_of_the_papers_maps(limit, asked):
+@pytest.mark.parametrize(("limit", "expected"), [(500.0, [110, 250]), (200.0, [110]), (80.0, [80])])
+def test_default_frequencies_are_those_of_the_papers_maps(limit, expected):
     """At 110 Hz and 250 Hz, as far as the rig's limit allows."""
     rig = make_paper_rig(12, 9)
     limited = replace(rig, limits=replace(rig.limits, frequency_max=limit))
-    assert default_frequencies(limited).tolist() == asked
+    assert default_frequencies(limited).tolist() == expected
 
 
-def test_the_documentation_shows_these_figures(study):
+def test_page_shows_the_errors_of_the_study(study):
     """The page on the plate model prints each mesh with the errors that are found here."""
     page = Path(__file__).parents[3] / "docs" / "concepts" / "plate-model.md"
     rows = re.findall(r"^ +(\d+x\d+) +\S+ .*?((?: +[\d.]+ %){3})", page.read_text(), re.MULTILINE)

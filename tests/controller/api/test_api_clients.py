@@ -211,15 +211,6 @@ def test_client_closes_after_an_incomplete_line(tmp_path: Path) -> None:
                 assert lines.read().endswith(b"x")
 
 
-@pytest.mark.parametrize("name", [3, "", "a\nb"])
-async def test_connect_refuses_an_invalid_name(name: str, tmp_path: Path) -> None:
-    """Before a connection is made, with the key and the value."""
-    with pytest.raises(InputError, match=f"client .*got {re.escape(repr(name))}$"):
-        Client.connect(tmp_path / "s", name=name)
-    with pytest.raises(InputError, match=f"client .*got {re.escape(repr(name))}$"):
-        await AsyncClient.connect(tmp_path / "s", name=name)
-
-
 def test_client_refuses_invalid_arguments(tmp_path: Path) -> None:
     """Before anything is sent, with the method, the key and the value."""
     with responding(tmp_path / "s"):
@@ -230,6 +221,7 @@ def test_client_refuses_invalid_arguments(tmp_path: Path) -> None:
             (lambda: era.touch((0.1, 0.05)), "place .*got 0.1"),  # type: ignore[arg-type]
             (lambda: era.play("tap", (0.1, 0.1, 0.1)), "place "),  # type: ignore[arg-type]
             (lambda: era.subscribe("weather"), "subscribe: topics.0"),  # type: ignore[arg-type]
+            (lambda: Client.connect(tmp_path / "s", name="a\nb"), r"client .*got 'a\\nb'$"),
         ]:
             with pytest.raises(InputError, match=words):
                 call()

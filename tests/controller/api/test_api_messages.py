@@ -11,15 +11,13 @@ from controller.api.jsonrpc import (
     ErrorCode,
     RpcError,
     error_line,
-    event_line,
     read_params,
     read_request,
     request_line,
     result_line,
 )
-from controller.api.methods import METHODS, ArmParams, SubscribeParams, TouchParams
+from controller.api.methods import METHODS, ArmParams, SubscribeParams
 from controller.api.schema import Empty, Message
-from controller.api.topics import StateEvent
 from page_part import insert
 
 
@@ -28,6 +26,9 @@ def refusal(line: bytes) -> RpcError:
     with pytest.raises(RpcError) as caught:
         read_params(METHODS[(request := read_request(line)).method].params, request)
     return caught.value
+
+
+TOUCH = '{"id":1,"x_m":0.1,"y_m":0.1}'
 
 
 def call(method: str, params: str) -> bytes:
@@ -65,9 +66,7 @@ def test_request_expects_response_only_with_an_id(id: str, expected: bool) -> No
         (call("touch", '{"source":"a","touches":[{"id":1,"x_m":NaN,"y_m":0}]}'), ErrorCode.PARSE),
         (call("arm", '{"owner":"me","lease_s":Infinity}'), ErrorCode.PARSE),
         (b"[" * 60_000, ErrorCode.PARSE),
-        (b'{"a":' * 10_000, ErrorCode.PARSE),
         (b"1", ErrorCode.INVALID_REQUEST),
-        (b"null", ErrorCode.INVALID_REQUEST),
         (b"[]", ErrorCode.INVALID_REQUEST),
         (b'[{"jsonrpc":"2.0","id":1,"method":"stop"}]', ErrorCode.INVALID_REQUEST),
         (b"{}", ErrorCode.INVALID_REQUEST),
@@ -76,7 +75,6 @@ def test_request_expects_response_only_with_an_id(id: str, expected: bool) -> No
         (b'{"jsonrpc":"2.0","id":1,"method":7}', ErrorCode.INVALID_REQUEST),
         (b'{"jsonrpc":"2.0","id":1.5,"method":"stop"}', ErrorCode.INVALID_REQUEST),
         (b'{"jsonrpc":"2.0","id":true,"method":"stop"}', ErrorCode.INVALID_REQUEST),
-        (b'{"jsonrpc":"2.0","id":{},"method":"stop"}', ErrorCode.INVALID_REQUEST),
         (
             b'{"jsonrpc":"2.0","id":1' + b"0" * 4000 + b',"method":"stop"}',
             ErrorCode.INVALID_REQUEST,
@@ -116,6 +114,7 @@ def test_line_that_is_no_request_is_refused(line: bytes, code: ErrorCode) -> Non
         ("touch", '{"source":"a","touches":[{"id":1.5,"x_m":0,"y_m":0}]}', "touches.0.id"),
         ("touch", '{"source":"a","touches":[{"id":1,"x_m":null,"y_m":0}]}', "touches.0.x_m"),
         ("touch", '{"source":"a","touches":[{"id":9e99,"x_m":0,"y_m":0}]}', "touches.0.id"),
+        ("touch", f'{{"source":"a","touches":[{",".join([TOUCH] * 65)}]}}', "touches"),
         ("subscribe", '{"topics":["weather"]}', "topics.0"),
         ("subscribe", '{"topics":["state"],"rate_hz":61}', "rate_hz"),
         ("subscribe", '{"topics":[]}', "topics"),
@@ -129,17 +128,6 @@ def test_parameter_that_is_wrong_is_refused_with_its_key(
     assert error.code is ErrorCode.INVALID_PARAMS
     assert error.data.where == key
     assert error.data.remedy
-
-
-def test_touch_frame_has_at_most_64_touches() -> None:
-    """The bound, from both sides."""
-    touch = {"id": 1, "x_m": 0.1, "y_m": 0.1}
-
-    def frame(count: int) -> bytes:
-        return call("touch", json.dumps({"source": "a", "touches": [touch] * count}))
-
-    assert len(read_params(TouchParams, read_request(frame(64))).touches) == 64
-    assert refusal(frame(65)).code is ErrorCode.INVALID_PARAMS
 
 
 def test_response_has_the_members_of_the_specification() -> None:
@@ -159,28 +147,6 @@ def test_response_has_the_members_of_the_specification() -> None:
             "code": 1001,
             "message": "the\nplate; arm first",
             "data": {"what": "the\nplate", "where": "state", "remedy": "arm first"},
-        },
-    }
-
-
-def test_notification_has_a_method_and_no_id() -> None:
-    """An event as docs/reference/api.md has it: topic, time_s, lost and data."""
-    data = StateEvent(old="FAULT", new="SWITCH_ON_DISABLED", cause="cleared", remedy=None)
-    line = event_line("state", time=12.5, lost=3, data=data.model_dump_json().encode())
-    assert line.count(b"\n") == 1
-    assert json.loads(line) == {
-        "jsonrpc": "2.0",
-        "method": "event",
-        "params": {
-            "topic": "state",
-            "time_s": 12.5,
-            "lost": 3,
-            "data": {
-                "old": "FAULT",
-                "new": "SWITCH_ON_DISABLED",
-                "cause": "cleared",
-                "remedy": None,
-            },
         },
     }
 

@@ -1,4 +1,4 @@
-"""Effects at a finger, and who gives way where several fingers ask at once."""
+"""Effects at a finger, regions, and priorities among several fingers."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,6 @@ from controller.effects.effect import Effect, EffectRun, NoSensation, Sensation
 from controller.effects.layout import Layout, Region
 from controller.effects.player import EffectPlayer
 from controller.effects.ramp import Ramp
-from controller.effects.registry import effect_kind, effect_kinds
 from controller.effects.shapes import Circle, Polygon, Rectangle
 from controller.effects.texture import Texture
 from controller.sources.contacts import Contact, ContactKey
@@ -32,7 +31,7 @@ RIGHT = Rectangle(0.1001, 0.0, 0.1, 0.2)
 def wanted(
     player: EffectPlayer, contacts: Sequence[Contact], now: float
 ) -> dict[int, float | None]:
-    """Levels that are wished, by the finger's id."""
+    """Intended levels by the id of the finger."""
     intent = player.intent(contacts, now)
     return {target.key.id: target.level_db_sl for target in intent.targets}
 
@@ -88,31 +87,15 @@ def test_ramp_steps_are_no_shorter_than_the_plate_response() -> None:
 
 
 def test_ramp_holds_its_last_level() -> None:
-    """It stays at its last level; one as strong as the neighbours allow ends with that."""
+    """After it has risen; as strong as the neighbours allow if that is the level."""
+    course = Ramp(start_level=8.0, duration=0.3, hold=True).start(finger(1), 0.0, level_db_sl=12.0)
+    felt = [course.feel(finger(1), now) for now in (0.0, 0.11, 0.21, 9.0)]
+    assert [getattr(one, "level_db_sl", None) for one in felt] == [8.0, 10.0, 12.0, 12.0]
+    assert [getattr(one, "until", 0) for one in felt][2:] == [None, None]
     ramp = Ramp(start_level=6.0, duration=0.8, hold=True)
     for level in (20.0, None):
         felt = ramp.start(finger(1), 0.0, level_db_sl=level).feel(finger(1), 60.0)
         assert felt == Sensation(level, or_less=True)
-
-
-def test_ramp_with_hold_rises_first() -> None:
-    """8, 10, 12 dB for a tenth of a second each, then 12 for good."""
-    course = Ramp(start_level=8.0, duration=0.3, hold=True, level=12.0).start(
-        finger(1), 0.0, level_db_sl=12.0
-    )
-    felt = [course.feel(finger(1), now) for now in (0.0, 0.11, 0.21, 9.0)]
-    assert [one.level_db_sl for one in felt if isinstance(one, Sensation)] == [
-        8.0,
-        10.0,
-        12.0,
-        12.0,
-    ]
-    assert [one.until for one in felt if isinstance(one, Sensation)] == [
-        pytest.approx(0.1),
-        pytest.approx(0.2),
-        None,
-        None,
-    ]
 
 
 def test_texture_level_follows_speed() -> None:
@@ -173,21 +156,6 @@ def test_player_keeps_the_region_of_a_finger_on_an_edge() -> None:
     assert wanted(player, [finger(1, 0.1009)], 2.0) == {1: 15.0}
     for step in range(1, 20):
         assert wanted(player, [finger(1, 0.1009 - 0.0009 * (step % 2))], 2 + 0.1 * step) == {}
-
-
-def test_effects_accept_decreasing_times() -> None:
-    """A ramp that is asked about a moment before it began is at its first level, not at its last.
-
-    No other effect asks for more than its level then, either.
-    """
-    assert Ramp(start_level=6.0).start(finger(1), 5.0, level_db_sl=20.0).feel(
-        finger(1), 4.0
-    ) == Sensation(6.0, until=5.125, or_less=True)
-    for effect in (Click(), Buzz(), Texture(), Detents()):
-        course = effect.start(finger(1), 5.0, level_db_sl=20.0)
-        for now, x in ((4.0, 0.2), (3.0, 0.1)):
-            felt = course.feel(finger(1, x), now)
-            assert not isinstance(felt, Sensation) or (felt.level_db_sl or 0) <= 20.0
 
 
 def test_layout_max_level() -> None:
@@ -450,10 +418,3 @@ def test_effect_kinds_include_plug_ins() -> None:
     (_, rhythm) = (each.model_dump(mode="json") for each in listed)
     assert rhythm["description"] == "Beats of one's own."
     assert (rhythm["parameters"]["beats"], rhythm["parameters"]["count"]) == ([0.1, 0.2], 3)
-
-
-def test_effect_kind_finds_builtin_kinds() -> None:
-    """All five are installed, each under its own name."""
-    assert {"buzz", "click", "detents", "ramp", "texture"} <= set(effect_kinds())
-    for name in effect_kinds():
-        assert effect_kind(name).kind == name

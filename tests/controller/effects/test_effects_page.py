@@ -18,7 +18,6 @@ from controller.effects.layout_file import (
     RegionSection,
     load_layout,
 )
-from controller.effects.layout_kind import LAYOUT
 from controller.effects.ramp import Ramp
 from controller.effects.texture import Texture
 from key_tables import bounds_in_words, key_rows, quantities
@@ -31,7 +30,7 @@ PAGE = Path(__file__).parents[3] / "docs" / "reference" / "effects.md"
 KINDS: tuple[type[Effect], ...] = (Click, Buzz, Ramp, Texture, Detents)
 
 CIRCLE = "circle: {at: [0.1, 0.1], radius: 1 cm}"
-# Lines of a layout, each with what none may say under that key.
+# Lines of a layout with an invalid value of each key.
 WRONG = {
     "The file": {
         "effects": "effects: 5",
@@ -113,18 +112,19 @@ CASES = [
 
 @pytest.mark.parametrize("heading", ["The file", "Effects", "Regions"])
 def test_every_key_is_documented_and_no_other(heading: str) -> None:
-    """A section's table names exactly the keys that the section has, in their order."""
+    """In their order; each has an invalid value in the table of this file."""
     named = list(rows(heading))
+    assert list(WRONG[heading]) == named
     if heading == "Effects":
         assert named.pop(0) == "kind"
     assert named == list(fields(heading))
 
 
 @pytest.mark.parametrize(("heading", "key", "field"), CASES)
-def test_unit_limits_and_default_are_those_that_are_checked(
+def test_page_has_units_limits_and_defaults_of_the_sections(
     heading: str, key: str, field: FieldInfo
 ) -> None:
-    """The SI unit, every finite bound in the words of the error, and what stands in for the key."""
+    """Limits in the words of the error."""
     unit, default, limits, _ = rows(heading)[key]
     found = quantities(field)
     assert unit == (found[0].dimension.unit if found else "")
@@ -154,32 +154,28 @@ def bounds(key: str, field: FieldInfo) -> str:
     for part in get_args(field.annotation):  # of `... | None`
         for each in getattr(part, "__metadata__", ()):
             carried += each.metadata if isinstance(each, FieldInfo) else [each]
-    told = {
+    limits = {
         name: bound
         for each in carried
         for name in ("min_length", "max_length", "ge", "le")
         if (bound := getattr(each, name, None)) is not None
     }
-    if "ge" in told:
-        return f"at least {told['ge']}, at most {told['le']}"
-    most = told.get("max_length")
-    count = f"{told['min_length']} to {most}" if "min_length" in told else f"up to {most}"
+    if "ge" in limits:
+        return f"at least {limits['ge']}, at most {limits['le']}"
+    most = limits.get("max_length")
+    count = f"{limits['min_length']} to {most}" if "min_length" in limits else f"up to {most}"
     within = next((bounds_in_words(asked) for asked in quantities(field)), "")
     return ", each ".join(part for part in (count if most else "", within) if part)
-
-
-@pytest.mark.parametrize("heading", WRONG)
-def test_every_key_has_a_wrong_value(heading: str) -> None:
-    """None is left out of the test below."""
-    assert list(WRONG[heading]) == list(rows(heading))
 
 
 @pytest.mark.parametrize(
     ("heading", "key"), [(heading, key) for heading, lines in WRONG.items() for key in lines]
 )
-def test_a_wrong_value_is_refused_at_its_key(tmp_path: Path, heading: str, key: str) -> None:
-    """With the line that it stands in, and nothing else is blamed."""
-    blamed = {
+def test_load_layout_refuses_an_invalid_value_at_its_key(
+    tmp_path: Path, heading: str, key: str
+) -> None:
+    """With its line, and no other problem."""
+    expected = {
         "The file": key,
         "Effects": f"effects.{key}" if "." in key else f"effects.mine.{key}",
         "Regions": f"regions.a.{key}",
@@ -189,15 +185,4 @@ def test_a_wrong_value_is_refused_at_its_key(tmp_path: Path, heading: str, key: 
     with pytest.raises(ConfigError) as caught:
         load_layout(path, load_rig(example_rig_path()).plate)
     found = [(problem.line, problem.key.partition("[")[0]) for problem in caught.value.problems]
-    assert found == [(2, blamed)]
-
-
-def test_every_key_stands_in_the_example() -> None:
-    """The commented file that people begin with leaves no key of a kind that it shows out."""
-    example = LAYOUT.example()
-    names = {
-        key.rpartition(".")[2]
-        for heading in ("The file", "Effects", "Regions")
-        for key in fields(heading)
-    }
-    assert [name for name in names if f"{name}:" not in example] == []
+    assert found == [(2, expected)]

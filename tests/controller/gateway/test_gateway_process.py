@@ -237,18 +237,12 @@ def test_gateway_refuses_unusable_certificates(tmp_path: Path, pair: tuple[Path,
         assert "without password" in message
 
 
-def test_read_token_strips_the_line_end(tmp_path: Path) -> None:
-    """As an editor leaves it."""
+def test_read_token_refuses_unsafe_and_unreadable_files(tmp_path: Path) -> None:
+    """Readable by others, not text, not a file: a pipe does not block, an endless file ends."""
     file = tmp_path / "token"
     file.write_text(f"{TOKEN}\n")
     file.chmod(0o600)
     assert read_token(file) == TOKEN
-
-
-def test_read_token_refuses_unsafe_and_unreadable_files(tmp_path: Path) -> None:
-    """Readable by others, not text, not a file: a pipe does not block, an endless file ends."""
-    file = tmp_path / "token"
-    file.write_text(TOKEN)
     for mode in (0o640, 0o604, 0o620):
         file.chmod(mode)
         with pytest.raises(InputError, match=f"{file}: .*chmod 600"):
@@ -277,6 +271,8 @@ def test_read_token_refuses_a_file_of_another_user(
         read_token(file)
 
 
+FILE = Path(__file__)
+TLS: dict[str, object] = {"host": "0.0.0.0", "certificate": FILE, "key": FILE}
 SETTINGS: dict[str, tuple[dict[str, object], str]] = {
     "port": ({"port": 65536}, "port .* 65536"),
     "name": ({"host": "localhost"}, "--allow-host"),
@@ -287,6 +283,8 @@ SETTINGS: dict[str, tuple[dict[str, object], str]] = {
     "all addresses": ({"host": "0.0.0.0"}, "--certificate, --key and --token-file"),
     "all IPv6 addresses": ({"host": "::"}, "--certificate, --key and --token-file"),
     "only a token": ({"host": "192.0.2.1", "chose_token": True}, "--certificate, --key and"),
+    "TLS without a token": ({**TLS, "names": ("panel.local",)}, "--token-file"),
+    "TLS without a host": ({**TLS, "chose_token": True}, "--allow-host"),
     "any host": ({"names": ("*",)}, "--allow-host"),
     "host with a port": ({"names": ("panel.local:80",)}, "--allow-host .*without port"),
     "IPv6 host without brackets": ({"names": ("2001:db8::7",)}, r"\[2001:db8::7\]"),
@@ -309,26 +307,6 @@ def test_settings_allow_the_loopback_address_listened_on() -> None:
     settings = Settings(socket=Path("era.sock"), host="127.0.0.2")
     assert settings.shown_host == "127.0.0.2"
     assert settings.allowed_names == {"localhost", "127.0.0.1", "[::1]", "127.0.0.2"}
-
-
-@pytest.mark.parametrize(
-    ("chose", "names", "remedy"),
-    [(False, ("panel.local",), "--token-file"), (True, (), "--allow-host")],
-)
-def test_settings_need_a_token_and_a_host_with_tls(
-    pair: tuple[Path, Path], chose: bool, names: tuple[str, ...], remedy: str
-) -> None:
-    """Outside the loopback TLS alone is not enough."""
-    certificate, key = pair
-    with pytest.raises(InputError, match=remedy):
-        Settings(
-            socket=Path("era.sock"),
-            host="0.0.0.0",
-            certificate=certificate,
-            key=key,
-            chose_token=chose,
-            names=names,
-        )
 
 
 @pytest.mark.parametrize("listen", ["127.0.0.1", "127.0.0.1:-1"])

@@ -45,35 +45,29 @@ def test_read_capture_reads_the_documented_format(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "place"),
     [
+        (None, "No such file"),
         ("", "line 1"),
         ("# era-haptics TUIO capture 2\n0 00\n", "line 1"),
         (f"{HEADER}\n", "bad.tuio"),
         (f"{HEADER}\n0 00\n\n", "line 3"),
         (f"{HEADER}\n0 0\n", "line 2"),
         (f"{HEADER}\n0 zz\n", "line 2"),
-        (f"{HEADER}\n0\n", "line 2"),
         (f"{HEADER}\n-1 00\n", "line 2"),
         (f"{HEADER}\nnan 00\n", "line 2"),
-        (f"{HEADER}\n1e3 00\n", "line 2"),
         (f"{HEADER}\n0 00 00\n", "line 2"),
         (f"{HEADER}\n1 00\n0.5 00\n", "line 3"),
         (f"{HEADER}\n1 {'00' * 65508}\n", "line 2.*65507"),
         (f"{HEADER}\n0 é\n", "bad.tuio"),
     ],
 )
-def test_read_capture_names_file_and_line(tmp_path: Path, text: str, place: str) -> None:
+def test_read_capture_names_file_and_line(tmp_path: Path, text: str | None, place: str) -> None:
     """Each error names the file and the line."""
     path = tmp_path / "bad.tuio"
-    path.write_text(text, encoding="utf-8")
+    if text is not None:
+        path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=place) as caught:
         read_capture(path)
     assert str(caught.value).startswith(str(path))
-
-
-def test_read_capture_refuses_a_missing_file(tmp_path: Path) -> None:
-    """A missing file is an input error."""
-    with pytest.raises(InputError, match=r"No such file.*path"):
-        read_capture(tmp_path / "missing.tuio")
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Touch panels read from the kernel's input devices; the device itself is a pipe here."""
+"""Touch panels read from the kernel's input devices, with a pipe for the device."""
 
 import asyncio
 import contextlib
@@ -50,17 +50,17 @@ class PipePanel:
         os.set_blocking(self._out, False)
 
     def fileno(self) -> int:
-        """The pipe's end to read from."""
+        """Return the pipe's read end."""
         return self._out
 
     def slots(self) -> dict[int, SlotState]:
-        """What a test has put there."""
+        """Return the state that a test has set."""
         if self.is_gone:
             raise OSError(errno.ENODEV, "No such device")
         return self.state
 
     def read(self) -> list[InputEvent]:
-        """What came through the pipe."""
+        """Return the events in the pipe."""
         if self.is_gone:
             raise OSError(errno.ENODEV, "No such device")
         try:
@@ -69,7 +69,7 @@ class PipePanel:
             return []
 
     def close(self) -> None:
-        """Both ends."""
+        """Close both ends."""
         os.close(self._out)
         os.close(self.into)
 
@@ -111,6 +111,13 @@ async def follow(
     return seen
 
 
+def touches_of(
+    panels: list[PipePanel], play: Callable[[], Coroutine[Any, Any, None]]
+) -> list[dict[int, tuple[float, float]]]:
+    """The touches of each frame that a source delivers while something plays."""
+    return [touches for _, touches in run_virtual_on_sockets(follow(panels, play))]
+
+
 def test_evdev_source_follows_fingers() -> None:
     """Each report is a frame, in shares of the panel's axes, y downwards as the kernel counts."""
     panel = PipePanel()
@@ -120,8 +127,7 @@ def test_evdev_source_follows_fingers() -> None:
             os.write(panel.into, raw(words))
             await asyncio.sleep(0.01)
 
-    seen = run_virtual_on_sockets(follow([panel], play))
-    assert [touches for _, touches in seen] == [
+    assert touches_of([panel], play) == [
         {},
         {7: (0.25, 0.2)},
         {7: (0.25, 0.2), 8: (1.0, 1.0)},
@@ -131,7 +137,7 @@ def test_evdev_source_follows_fingers() -> None:
 
 
 def test_evdev_source_starts_from_the_state_of_the_kernel() -> None:
-    """What rests on the panel when it is opened is there at once, by the kernel's own state."""
+    """Fingers on the panel when it is opened are delivered at once."""
     panel = PipePanel()
     panel.state = {0: EMPTY, 1: SlotState(5, 500, 250)}
     panel.current_slot = 1
@@ -140,14 +146,13 @@ def test_evdev_source_starts_from_the_state_of_the_kernel() -> None:
         os.write(panel.into, raw("x 600"))
         await asyncio.sleep(0.01)
 
-    seen = run_virtual_on_sockets(follow([panel], play))
-    assert [touches for _, touches in seen] == [{5: (0.5, 0.5)}, {5: (0.6, 0.5)}]
+    assert touches_of([panel], play) == [{5: (0.5, 0.5)}, {5: (0.6, 0.5)}]
 
 
 def test_evdev_source_repeats_resting_fingers() -> None:
-    """Every 50 ms the kernel is asked, well within the 150 ms after which a contact counts as gone.
+    """The kernel's state is polled every 50 ms, well within the contact timeout of 150 ms.
 
-    If it knows of a lift that no event told, the finger is lifted then.
+    A lift without an event is noticed then.
     """
     panel = PipePanel()
 
@@ -169,7 +174,7 @@ def test_evdev_source_repeats_resting_fingers() -> None:
 
 
 def test_evdev_source_resyncs_after_lost_events() -> None:
-    """After SYN_DROPPED the kernel's state counts, as its documentation asks for."""
+    """After SYN_DROPPED the kernel's state counts, as its documentation demands."""
     panel = PipePanel()
 
     async def play() -> None:
@@ -179,13 +184,12 @@ def test_evdev_source_resyncs_after_lost_events() -> None:
         os.write(panel.into, raw("x 900", dropped=True))
         await asyncio.sleep(0.01)
 
-    seen = run_virtual_on_sockets(follow([panel], play))
-    assert [touches for _, touches in seen][-1] == {9: (1.0, 0.0)}
+    assert touches_of([panel], play)[-1] == {9: (1.0, 0.0)}
 
 
-@pytest.mark.parametrize("notices", ["by reading", "by asking"])
+@pytest.mark.parametrize("notices", ["by reading", "by polling"])
 def test_evdev_source_reopens_an_unplugged_panel(notices: str) -> None:
-    """Its fingers are lifted when it goes; it is waited for, and followed when it is back."""
+    """Its fingers are lifted when it is unplugged; it is followed once it is back."""
     first, second = PipePanel(), PipePanel()
     first.state = {0: SlotState(7, 0, 0), 1: EMPTY}
     panels = [first]
@@ -214,27 +218,15 @@ def test_ioctl_request_numbers() -> None:
 
 
 def test_parse_events_skips_incomplete_events() -> None:
-    """Type, code and value of each event; what is no whole event at the end is left out."""
+    """Type, code and value of each complete event."""
     assert list(parse_events(raw("x -5") + b"\0" * 10)) == [
         InputEvent(3, 0x35, -5),
         InputEvent(0, 0, 0),
     ]
 
 
-@pytest.mark.parametrize(
-    ("path", "words"),
-    [("/dev/null", "evtest"), ("/dev/input/event987", "by-id")],
-)
-def test_input_device_refuses_what_is_no_panel(path: str, words: str) -> None:
-    """A file that is no panel, and none at all: an error that says so, and no open descriptor."""
-    before = sorted(Path("/proc/self/fd").iterdir())
-    with pytest.raises(InputError, match=words):
-        InputDevice(path)
-    assert sorted(Path("/proc/self/fd").iterdir()) == before
-
-
 def kernel(monkeypatch: pytest.MonkeyPatch, *, width: int, grab: OSError | None = None) -> None:
-    """What the kernel answers of a panel with ten slots of so many units."""
+    """Let the kernel report a panel with ten slots and a width."""
 
     def ioctl(descriptor: int, request: int, argument: bytes | int) -> bytes:
         if request == GRAB:
@@ -247,27 +239,42 @@ def kernel(monkeypatch: pytest.MonkeyPatch, *, width: int, grab: OSError | None 
     monkeypatch.setattr("controller.sources.input_device.fcntl.ioctl", ioctl)
 
 
-def test_input_device_reports_a_grabbed_panel(monkeypatch: pytest.MonkeyPatch) -> None:
-    """EVIOCGRAB is refused with EBUSY then: told with how to find that one; nothing stays open."""
-    kernel(monkeypatch, width=1000, grab=OSError(errno.EBUSY, "Device or resource busy"))
-    InputDevice("/dev/null").close()
+BUSY = OSError(errno.EBUSY, "Device or resource busy")
+
+
+@pytest.mark.parametrize(
+    ("path", "reported", "words"),
+    [
+        ("/dev/null", None, "evtest"),
+        ("/dev/input/event987", None, "by-id"),
+        ("/dev/null", {"width": 1000, "grab": BUSY}, "`sudo fuser -v /dev/null`"),
+        ("/dev/null", {"width": 0}, "0x35.*0 and 0"),
+    ],
+)
+def test_input_device_refuses_what_is_no_usable_panel(
+    monkeypatch: pytest.MonkeyPatch, path: str, reported: dict[str, Any] | None, words: str
+) -> None:
+    """Another file, none, one grabbed by another program, an axis without width; all are closed."""
+    if reported is not None:
+        kernel(monkeypatch, **reported)
     before = sorted(Path("/proc/self/fd").iterdir())
-    with pytest.raises(InputError, match=r"/dev/null: .*`sudo fuser -v /dev/null`"):
-        InputDevice("/dev/null", grab=True)
+    with pytest.raises(InputError, match=words):
+        InputDevice(path, grab=True)
     assert sorted(Path("/proc/self/fd").iterdir()) == before
 
 
-def test_input_device_refuses_an_empty_axis(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As of devices that name the axis and do not fill it in; nobody divides by its width."""
-    kernel(monkeypatch, width=0)
-    with pytest.raises(InputError, match=r"/dev/null: .*0x35.*0 and 0"):
-        InputDevice("/dev/null")
+def test_input_device_opens_a_panel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the ranges of its axes."""
+    kernel(monkeypatch, width=1000)
+    device = InputDevice("/dev/null")
+    assert (device.x_range, device.y_range) == ((0, 1000), (0, 1000))
+    device.close()
 
 
 @pytest.mark.parametrize(
     "url", ["evdev:", "evdev:?grab=yes", "evdev:/dev/x?grab=no", "evdev:/dev/x?grab=yes&a=b"]
 )
 def test_evdev_source_refuses_bad_urls(url: str) -> None:
-    """They are refused with what is expected."""
+    """With the form of the URL."""
     with pytest.raises(InputError, match=r"evdev:PATH.grab=yes"):
         open_source(url)

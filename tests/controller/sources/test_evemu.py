@@ -2,6 +2,7 @@
 
 import asyncio
 from pathlib import Path
+from typing import TypeAlias
 
 import pytest
 from hypothesis import given
@@ -11,6 +12,8 @@ from controller.sources.evemu import EvemuSource, read_evemu
 from controller.sources.touch import TouchFrame
 from model.errors import InputError
 from virtual_loop import in_virtual_time
+
+Shown: TypeAlias = list[tuple[float, dict[int, tuple[float, float]]]]
 
 RANGES = """\
 # EVEMU 1.3
@@ -64,7 +67,7 @@ def write(folder: Path, *reports: tuple[float, str], header: str = RANGES.format
     return path
 
 
-def shown(frames: list[TouchFrame]) -> list[tuple[float, dict[int, tuple[float, float]]]]:
+def shown(frames: list[TouchFrame]) -> Shown:
     """Frames, to compare."""
     return [
         (round(frame.time, 6), {touch.id: (touch.x, touch.y) for touch in frame.touches})
@@ -72,40 +75,63 @@ def shown(frames: list[TouchFrame]) -> list[tuple[float, dict[int, tuple[float, 
     ]
 
 
-def test_read_evemu_follows_two_fingers(tmp_path: Path) -> None:
-    """Slots are followed from down to up; values left out have not changed; times start at 0 s."""
-    path = write(
-        tmp_path,
-        (3.25, "id 7 x 100 y 0"),
-        (3.50, "slot 1 id 8 x 900 y 50"),
-        (3.75, "x 800 slot 0 y -50"),
-        (4.00, "id -1"),
-        (4.25, "slot 1 id -1"),
-    )
-    assert shown(read_evemu(path)) == [
-        (0.0, {7: (0.1, 0.5)}),
-        (0.25, {7: (0.1, 0.5), 8: (0.9, 0.75)}),
-        (0.5, {7: (0.1, 0.25), 8: (0.8, 0.75)}),
-        (0.75, {8: (0.8, 0.75)}),
-        (1.0, {}),
-    ]
+SEQUENCES: dict[str, tuple[list[tuple[float, str]], Shown]] = {
+    "two fingers, unchanged values omitted, times from 0 s": (
+        [
+            (3.25, "id 7 x 100 y 0"),
+            (3.50, "slot 1 id 8 x 900 y 50"),
+            (3.75, "x 800 slot 0 y -50"),
+            (4.00, "id -1"),
+            (4.25, "slot 1 id -1"),
+        ],
+        [
+            (0.0, {7: (0.1, 0.5)}),
+            (0.25, {7: (0.1, 0.5), 8: (0.9, 0.75)}),
+            (0.5, {7: (0.1, 0.25), 8: (0.8, 0.75)}),
+            (0.75, {8: (0.8, 0.75)}),
+            (1.0, {}),
+        ],
+    ),
+    "a new contact keeps the coordinates of its slot": (
+        [(0, "id 1 x 100 y 0"), (1, "id -1"), (2, "id 2 y 50")],
+        [(0.0, {1: (0.1, 0.5)}), (1.0, {}), (2.0, {2: (0.1, 0.75)})],
+    ),
+    "a position after the lift": (
+        [(0, "id 1 x 100 y 0"), (1, "id -1"), (2, "x 200")],
+        [(0.0, {1: (0.1, 0.5)}), (1.0, {}), (2.0, {})],
+    ),
+    "taps within one report": (
+        [(0, "id 1 x 100 y 0 id -1"), (1, "id 2 x 300 y 0 id -1 id 3 x 400")],
+        [
+            (0.0, {1: (0.1, 0.5)}),
+            (0.0, {}),
+            (1.0, {2: (0.3, 0.5)}),
+            (1.0, {}),
+            (1.0, {3: (0.4, 0.5)}),
+        ],
+    ),
+    "a lift within one report, the same id again": (
+        [(0, "id 1 x 100 y 0"), (1, "id -1 id 1")],
+        [(0.0, {1: (0.1, 0.5)}), (1.0, {}), (1.0, {1: (0.1, 0.5)})],
+    ),
+    "another id without -1 before it": (
+        [(0, "id 1 x 100 y 0"), (1, "id 2 x 200")],
+        [(0.0, {1: (0.1, 0.5)}), (1.0, {2: (0.2, 0.5)})],
+    ),
+}
 
 
-def test_read_evemu_keeps_coordinates_of_the_slot(tmp_path: Path) -> None:
-    """The kernel leaves out a coordinate that did not change since the slot's last contact."""
-    path = write(tmp_path, (0, "id 1 x 100 y 0"), (1, "id -1"), (2, "id 2 y 50"))
-    assert shown(read_evemu(path))[-1] == (2.0, {2: (0.1, 0.75)})
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_read_evemu_follows_slots(tmp_path: Path, name: str) -> None:
+    """Frames by the multi-touch protocol, worked out by hand."""
+    reports, expected = SEQUENCES[name]
+    assert shown(read_evemu(write(tmp_path, *reports))) == expected
 
 
 def test_read_evemu_starts_with_the_slot_of_the_header(tmp_path: Path) -> None:
     """Events before the first slot event belong to the slot that the header says is current."""
-    path = write(
-        tmp_path,
-        (0, "id 5 x 100 y 0"),
-        (1, "slot 0 id 6 x 200 y 0"),
-        (2, "slot 3 id -1"),
-        header=RANGES.format(slot=3),
-    )
+    reports = ((0, "id 5 x 100 y 0"), (1, "slot 0 id 6 x 200 y 0"), (2, "slot 3 id -1"))
+    path = write(tmp_path, *reports, header=RANGES.format(slot=3))
     assert shown(read_evemu(path))[1:] == [
         (1.0, {5: (0.1, 0.5), 6: (0.2, 0.5)}),
         (2.0, {6: (0.2, 0.5)}),
@@ -113,7 +139,7 @@ def test_read_evemu_starts_with_the_slot_of_the_header(tmp_path: Path) -> None:
 
 
 def test_read_evemu_follows_a_contact_that_was_already_down(tmp_path: Path) -> None:
-    """A slot that moves without having begun is followed once its place is known, and lifted."""
+    """It has a negative id, from when both its coordinates are known."""
     path = write(
         tmp_path, (0, "x 100"), (1, "y 0"), (2, "slot 1 id 4 x 500 y 0"), (3, "slot 0 id -1")
     )
@@ -126,42 +152,8 @@ def test_read_evemu_follows_a_contact_that_was_already_down(tmp_path: Path) -> N
     assert frames[3][1] == {4: (0.5, 0.5)}
 
 
-def test_read_evemu_ignores_positions_after_the_lift(tmp_path: Path) -> None:
-    """A slot that says where its lifted finger was stays empty."""
-    path = write(tmp_path, (0, "id 1 x 100 y 0"), (1, "id -1"), (2, "x 200"))
-    assert shown(read_evemu(path))[-1] == (2.0, {})
-
-
-def test_read_evemu_sees_a_tap_within_one_report(tmp_path: Path) -> None:
-    """A contact that came and went within one report is seen down and up."""
-    path = write(tmp_path, (0, "id 1 x 100 y 0 id -1"), (1, "id 2 x 300 y 0 id -1 id 3 x 400"))
-    assert shown(read_evemu(path)) == [
-        (0.0, {1: (0.1, 0.5)}),
-        (0.0, {}),
-        (1.0, {2: (0.3, 0.5)}),
-        (1.0, {}),
-        (1.0, {3: (0.4, 0.5)}),
-    ]
-
-
-def test_read_evemu_sees_a_lift_within_one_report(tmp_path: Path) -> None:
-    """A lift within one report is seen even if the same id comes back in it."""
-    path = write(tmp_path, (0, "id 1 x 100 y 0"), (1, "id -1 id 1"))
-    assert shown(read_evemu(path)) == [
-        (0.0, {1: (0.1, 0.5)}),
-        (1.0, {}),
-        (1.0, {1: (0.1, 0.5)}),
-    ]
-
-
-def test_read_evemu_sees_a_replaced_contact(tmp_path: Path) -> None:
-    """A tracking id that follows another without -1 is another contact."""
-    path = write(tmp_path, (0, "id 1 x 100 y 0"), (1, "id 2 x 200"))
-    assert shown(read_evemu(path))[-1] == (1.0, {2: (0.2, 0.5)})
-
-
 def test_read_evemu_lifts_all_after_lost_events(tmp_path: Path) -> None:
-    """After SYN_DROPPED nothing is believed to be down until it moves, then under a new id."""
+    """After SYN_DROPPED a contact is down again once it moves, under a new id."""
     path = write(
         tmp_path,
         (0, "id 1 x 100 y 0"),
@@ -196,10 +188,7 @@ def test_read_evemu_lifts_all_after_lost_events(tmp_path: Path) -> None:
 def test_read_evemu_invariants_for_any_events(
     tmp_path_factory: pytest.TempPathFactory, reports: list[list[tuple[str, int]]]
 ) -> None:
-    """Whatever a panel reports, a frame holds no slot without its place and time never runs back.
-
-    A slot holds one contact at most, so there are never more touches than slots were named.
-    """
+    """Times never decrease, and there are at most as many touches as slots."""
     words = [" ".join(f"{code} {value}" for code, value in report) for report in reports]
     path = write(tmp_path_factory.mktemp("any"), *enumerate(words))
     frames = read_evemu(path)
@@ -230,6 +219,7 @@ GOOD = RANGES.format(slot=0)
 @pytest.mark.parametrize(
     ("text", "place"),
     [
+        (b"\xff\xfe\x00\x81", "bad.events"),
         (GOOD + "E: 0.0 0003\n", "line 22"),
         (GOOD + "E: nan 0003 0035 0001\n", "line 22"),
         (GOOD + events((2, "x 1"), (1, "x 2")), "line 24"),
@@ -242,23 +232,13 @@ GOOD = RANGES.format(slot=0)
         ("", "ABS_MT_POSITION_X"),
     ],
 )
-def test_read_evemu_names_file_and_line(tmp_path: Path, text: str, place: str) -> None:
+def test_read_evemu_names_file_and_line(tmp_path: Path, text: str | bytes, place: str) -> None:
     """Each error names the file and, where there is one, the line."""
     path = tmp_path / "bad.events"
-    path.write_text(text, encoding="utf-8")
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(InputError, match=place) as caught:
         read_evemu(path)
     assert str(caught.value).startswith(str(path))
-
-
-def test_read_evemu_refuses_missing_and_binary_files(tmp_path: Path) -> None:
-    """A missing file and one that is no text are input errors."""
-    with pytest.raises(InputError, match=r"No such file.*path"):
-        read_evemu(tmp_path / "missing.events")
-    binary = tmp_path / "binary.events"
-    binary.write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(InputError, match=r"binary.events"):
-        read_evemu(binary)
 
 
 @in_virtual_time
@@ -282,9 +262,8 @@ async def test_evemu_source_keeps_times(tmp_path: Path) -> None:
     assert {frame.source for frame in delivered} == {"evemu:panel.taps.events"}
 
 
-def test_evemu_source_refuses_bad_urls(tmp_path: Path) -> None:
-    """A source needs a path, and refuses a bad recording before anything is replayed."""
-    with pytest.raises(InputError, match="evemu:PATH"):
-        EvemuSource("evemu:")
-    with pytest.raises(InputError, match=r"missing.events"):
-        EvemuSource(f"evemu:{tmp_path / 'missing.events'}")
+@pytest.mark.parametrize(("path", "words"), [("", "evemu:PATH"), ("missing", "No such file")])
+def test_evemu_source_refuses_bad_urls(path: str, words: str) -> None:
+    """Before anything is replayed."""
+    with pytest.raises(InputError, match=words):
+        EvemuSource(f"evemu:{path}")

@@ -109,13 +109,6 @@ def test_reader_omits_cursors_without_a_position(reader: TuioReader) -> None:
     assert touches(reader.read(late, PEER, now=0)) == [(5, 0.5, 0.5)]
 
 
-def test_frame_at_the_end_of_a_bundle_without_fseq(reader: TuioReader) -> None:
-    """A bundle without a number is a frame all the same."""
-    assert touches(reader.read(bundle(message("alive", 1), cursor(1, 0.5, 1.0)), PEER, now=0)) == [
-        (1, 0.5, 1.0)
-    ]
-
-
 def test_reader_drops_late_frames(reader: TuioReader) -> None:
     """A reordered frame changes nothing, neither positions nor what is alive."""
     reader.read(frame((1, 0.25, 0.5), fseq=10), PEER, now=0)

@@ -23,57 +23,56 @@ SHORTER = 5  # so much shorter than the first are most cases
 QUIET = 0.25  # processors; where others kept more of them busy, it is said
 
 HEAD = (
-    "| case | touches | commands | no touch's | median | 99th | 99.9th | most | jitter | "
-    "longest waiting: median | 99th | 99.9th | daemon: median | 99th | 99.9th | computing | "
-    "others |\n"
+    "| case | touches | commands | unmatched | median | 99th | 99.9th | maximum | jitter | "
+    "oldest touch: median | 99th | 99.9th | daemon: median | 99th | 99.9th | CPU | "
+    "other load |\n"
     "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
 
 HEAD_CELLS = HEAD.split("\n")[1].count("---")
 
-INTRODUCTION = """# How long a touch takes to the wire
+INTRODUCTION = """# Touch-to-wire latency
 
-Printed by `make bench-latency`, which runs `python -m benchmarks.latency --report`{options} on a
-machine that does nothing else (two cores); {lasts}.{machine}
-`python -m benchmarks.latency --seconds 2` takes a minute, and shows that it works.
+Printed by `make bench-latency`, which runs `python -m benchmarks.latency --report`{options} on an
+otherwise idle machine (two cores); {lasts}.{machine}
+`python -m benchmarks.latency --seconds 2` is a functional check of one minute.
 
-**What is measured.** A panel sends TUIO datagrams over UDP. The daemon reads them, asks the table
-who feels what, lets the guard check it and writes the set to a serial line. At its far end a
-program notes when the last byte of each set has arrived. Both ends read CLOCK_MONOTONIC, the panel
-just before it sends. Which touch a set answers is found from outside too: the table is asked again,
-offline, what it answers for the touches that were sent, and a set that plays that answers it. Sets
-that answer none would be counted under *no touch's*.
+**Method.** A panel sends TUIO datagrams over UDP. The daemon reads them, queries the table,
+checks the set with the guard and writes it to a serial line. At the far end a
+program records the arrival of the last byte of each set. Both ends read CLOCK_MONOTONIC, the panel
+just before it sends. Sets are matched with touches from outside the daemon: the table is queried offline
+for the touches that were sent, and a set that plays the resulting pattern belongs to that touch. Other sets
+would be counted as *unmatched*.
 
-- **The line** is a TCP connection on the loopback, as to a serial server (`socket://`): what the
-  daemon writes is at the far end when the system call returns. The same over a **pseudo-terminal**
-  stands beside it, where a thread of the kernel carries the bytes on, which is as urgent as any
-  program and has to get a core first, there and back: that is no part of a real port, which has its
-  own way and its own time, by arithmetic ([wires](../reference/wire-protocol.md)).
-- **Devices of their own**: an amplifier and a panel do not share the daemon's processors. The
-  programs that stand for them have to, so they come first (SCHED_RR, else nice {device}), and
-  what they compute is lost to the daemon, as it would not be.
-- **Taps**: every frame is another finger somewhere else, a thousand times a second, beside one that
-  stays and is to feel nothing. Each asks the table anew, and each answer is another set.
-- **Slide**: one finger wanders at {slide:g} m/s. What plays stays while no finger has moved by more
-  than {tolerance:g} mm since it was chosen, so about every ninth frame asks for a set; frames that
-  ask for none have no latency and are not counted.
-- **Faster than sets**: only one set is on its way at a time, since the next one depends on what the
-  amplifier made of it. Touches that come meanwhile are taken together, and the next set answers the
-  newest; the fingers of those before are gone by then. The latency counts from the newest, the one
-  that is answered. *Longest waiting* counts from the oldest of those that were taken together, and
-  that is what the daemon counts for itself: in `era status`, the topic `latency` and Prometheus,
-  from when the system received the datagram until the last byte was written.
-- **Loaded**: another client sends {flood} touches a second to the API, each of them news, and
-  {workers} other programs compute all the time, all of them ordinary programs. The daemon runs at
+- **The line** is a TCP connection over loopback, as to a serial server (`socket://`): what the
+  daemon writes is at the far end when the system call returns. For comparison, the same over a
+  **pseudo-terminal**: there a kernel thread of ordinary priority carries the bytes and
+  needs a core, in both directions. A real port has no such thread; its transmission time can be
+  calculated ([wires](../reference/wire-protocol.md)).
+- **Devices**: an amplifier and a panel do not use the daemon's processors. The
+  programs that represent them do, so they run at the highest priority (SCHED_RR, else nice {device}), and
+  the daemon loses the processor time they use, unlike in a real setup.
+- **Taps**: every frame has a new finger in another place, a thousand times per second, beside a quiet one that
+  stays. Each is a new query of the table and a new set.
+- **Slide**: one finger moves at {slide:g} m/s. The pattern stays until the finger has moved by more
+  than {tolerance:g} mm, so about every ninth frame causes a set; the other frames
+  have no latency and are not counted.
+- **Faster than sets**: only one set is under way at a time, since the next one depends on the
+  amplifier's reply. Touches that arrive meanwhile are combined, and the next set is for the
+  newest; the earlier fingers have lifted by then. The latency counts from this newest touch.
+  *Oldest touch* counts from the oldest of those combined. The daemon reports this latency
+  itself, in `era status`, the topic `latency` and Prometheus, from the reception of the datagram by the system
+  until the last byte was written.
+- **Loaded**: another client sends {flood} touches per second to the API, each at a new place, and
+  {workers} other programs compute continuously, all at ordinary priority. The daemon runs at
   nice {nice}, as in the unit that `era systemd install` prints.
-- **Beside it** *plain asyncio*: python-osc reads the same datagrams, the place chooses among sets
-  that were encoded beforehand, and out they go, over the same line to the same far end.
-  No table, no guard, nobody kept quiet, no answer waited for.
+- **Baseline** *plain asyncio*: python-osc reads the same datagrams, the position selects one of the pre-encoded sets,
+  which is written over the same line to the same far end.
+  No table, no guard, no quiet fingers, no wait for replies.
 
-Jitter is the standard deviation. *Computing* is the processor time of the daemon for each set, all
-else that it does meanwhile included. All times in milliseconds. *Others* is how many processors
-were kept busy by whoever does not belong to this, the kernel's own work among them: a machine that
-does nothing else shows next to none.
+Jitter is the standard deviation. *CPU* is the processor time of the daemon per set, including all
+other work of the daemon. All times in milliseconds. *Other load* is the number of processors
+kept busy by unrelated programs and the kernel; it is close to zero on an idle machine.
 
 """
 
@@ -81,16 +80,16 @@ WITHOUT = "No figures yet: the command writes them here, with the histogram.\n"
 
 END = """
 **Shaped onsets.** With `touch_wait: 30 ms`, the default of the [daemon](../reference/daemon.md), a
-touch that starts from rest waits until its [shaped onset](../concepts/transients.md) is found and
-loaded: four envelopes, each with an answer of its own. With `touch_wait: 0 ms` it starts along a
-plain ramp, at once. That costs contrast while it starts, not afterwards: over the first 100 ms
-19 dB in place of 28 to one quiet finger, 12 in place of 16 to two
-([measured](../concepts/transients.md)). A finger that slides waits in neither case,
-for what plays already needs no onset.
+touch that starts from rest waits until its [shaped onset](../concepts/transients.md) is computed and
+loaded: four envelopes, each with its own reply. With `touch_wait: 0 ms` it starts along a
+plain ramp at once, which costs contrast during the onset only: over the first 100 ms
+19 dB instead of 28 to one quiet finger, 12 instead of 16 to two
+([measured](../concepts/transients.md#measured)). A sliding finger waits in neither case,
+since its continuing pattern needs no onset.
 
-**Nice and sessions.** Where the system shares the cores among sessions first (autogroup, see
-sched(7)), nice counts within a session only: the daemon has a session of its own here, as urgent as
-itself. Why it is not scheduled in real time is a
+**Nice level and sessions.** Where the system shares the cores among sessions first (autogroup, see
+sched(7)), nice applies within a session only; here the daemon has its own session.
+The reasons against real-time scheduling are in a
 [decision](../decisions/0019-nice-not-real-time.md).
 """
 
@@ -164,7 +163,7 @@ def report(found: Sequence[Found | Failed], *, seconds: float, seed: int, minute
     text = INTRODUCTION.format(
         options=options,
         machine=machine if found else "",
-        lasts=f"it took {minutes:.0f} minutes" if found else "it takes some nine minutes",
+        lasts=f"it took {minutes:.0f} minutes" if found else "it takes about nine minutes",
         slide=SLIDE,
         tolerance=1e3 * MOVE_TOLERANCE,
         flood=f"{FLOOD_RATE:_}".replace("_", " "),
@@ -195,8 +194,8 @@ def _disturbance(one: Found | Failed) -> str | None:
         return f"**No figures of *{one.case.name}***: {attempts}."
     if one.others > QUIET:
         return (
-            f"***{one.case.name}* was disturbed**: others kept {one.others:.1f} processors busy, "
-            "so its figures are those of a machine that has other work as well."
+            f"***{one.case.name}* was disturbed**: other programs kept {one.others:.1f} processors busy, "
+            "so its figures are not those of an idle machine."
         )
     return None
 
@@ -250,8 +249,8 @@ def _verdict(daemon: Found, exchange: Found) -> str:
     )
     more = ours[0] - plain[0]
     return (
-        f"Targets, loaded: {limits}. Times the plain exchange in the same run: {ratios}; the "
-        f"table, the guard and the rest cost {more:.2f} ms of the median."
+        f"Targets, loaded: {limits}. Ratio to the baseline in the same run: {ratios}; the "
+        f"table, the guard and the rest take {more:.2f} ms of the median."
     )
 
 

@@ -94,8 +94,8 @@ def contrast_section(sets: int, draws: int, seed: int) -> Section:
         ["", *(cell for quiet in QUIET for cell in (f"{quiet} quiet", "realised"))],
         rows,
         notes=[
-            "bounds hold for any drive of their kind without errors; the robust score counts what",
-            "errors of 10 % add on average, and its bound is that of any complex weights at any of",
+            "bounds hold for any drive of their kind without errors; the robust score includes the",
+            "mean effect of errors of 10 %, and its bound holds for any complex weights at any of",
             "the frequencies.",
         ],
         data={"realised": realised, "names": names},
@@ -142,7 +142,7 @@ def _best(fields: Fields, drive_mode: str) -> Choice:
 
 
 def two_target_section(sets: int, draws: int, seed: int) -> Section:
-    """Two targets at once: the contrast of the lesser one."""
+    """Two targets at once: the contrast of the weaker one."""
     rows = []
     for quiet in (1, 2):
         cells: dict[str, list[float]] = {drive_mode: [] for drive_mode in DRIVE_MODES}
@@ -163,8 +163,8 @@ def two_target_section(sets: int, draws: int, seed: int) -> Section:
             [f"2 targets, {quiet} quiet", *(shown(v) for v in cells.values()), shown(for_one)]
         )
     return Section(
-        "Two targets: realised contrast [dB] of the lesser one, median (10th percentile)",
-        ["", *DRIVE_MODES, "phased, only one of them"],
+        "Two targets: realised contrast [dB] of the weaker one, median (10th percentile)",
+        ["", *DRIVE_MODES, "phased, one of them only"],
         rows,
     )
 
@@ -185,13 +185,13 @@ def ensemble_section(sets: int, seed: int) -> Section:
             row.append(shown(values))
         rows.append(row)
     return Section(
-        "On other plates too: robust contrast [dB], median (10th percentile)",
+        "Deviating plates: robust contrast [dB], median (10th percentile)",
         ["", *(f"{quiet} quiet" for quiet in QUIET)],
         rows,
         notes=[
-            "nine of ten plates have more: gains, phases, stiffness of each ERA within 10 %,",
-            "thickness within 2 %, damping half to twice, fingers that press on the plate.",
-            "Patterns as they are chosen for a plain ramp.",
+            "nine of ten plates have more. They vary in gains, phases, stiffness of each ERA (10 %),",
+            "thickness (2 %) and damping (half to twice), with fingers that press on the plate.",
+            "Patterns are chosen for a plain ramp.",
         ],
     )
 
@@ -213,7 +213,8 @@ def freedom_section(sets: int, seed: int) -> Section:
             + [f"{int((column > 1e-6).sum())}, {max(column.max(), 0):.2f} dB" for column in ahead.T]
         )
     return Section(
-        f"Where more freedom was worse: how many of {sets} contact sets, by how much at the most",
-        ["", *(f"{name} behind {poorer}" for poorer, name in pairwise(names))],
+        f"Modes with more freedom but less contrast: number of {sets} contact sets, maximum "
+        "difference",
+        ["", *(f"{name} below {poorer}" for poorer, name in pairwise(names))],
         rows,
     )

@@ -11,34 +11,34 @@ from benchmarks.localization.picture import modes_figure
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = "measured/localization-benchmarks.md"
 
-INTRODUCTION = """# What contrast can be had, and how fast
+INTRODUCTION = """# Localization benchmarks: contrast and speed
 
 Printed by `python -m benchmarks.localization --sets {sets} --draws {draws} --seed {seed} --report`.
 The paper's plate on four corner ERAs, 27 frequencies from 40 to 500 Hz. Contact sets: fingertips
 (discs of 13 mm radius) anywhere on the plate, at least 5 cm apart, one of them the target, which
-gets 1 m/s² or more; {sets} sets for each count. Contrast is the target's mean peak acceleration to
-the loudest quiet point. *Realised*: gains wrong by 5 %, phases by 5 degrees (standard deviations);
-of each set the median of {draws} draws. Cells show the median over the sets, in brackets the tenth
+reaches at least 1 m/s²; {sets} sets for each count. Contrast is the target's mean peak acceleration to
+the loudest quiet point. *Realised*: errors of 5 % in gain and 5 degrees in phase (standard deviations);
+for each set the median of {draws} draws. Cells show the median over the sets, in brackets the tenth
 percentile.
 
-Methods beside ours, all on the same plate and contact sets, each at the best of the frequencies for
-every set: the paper's own (one or two ERAs at full level, each at a frequency of its own), and two
-of the methods that it cites. The inverse filter solves for 1 at the target and 0 at the centres of
-the other fingertips; time reversal plays the target's own answer backwards, at one frequency or as
+Other methods, on the same plate and contact sets, each at the best frequency for
+every set: the paper's (one or two ERAs at full level, each at its own frequency), and two
+of the methods it cites. The inverse filter solves for 1 at the target and 0 at the centres of
+the other fingertips; time reversal plays the time-reversed response at the target, at one frequency or as
 a pulse of all 27 (peaks over time).
 """
 
 READING = """
-## How to read it
+## Interpretation
 
-- `switched` cannot be better than its exact search, which goes through all 614 655 patterns of four
-  ERAs, and no amplitudes for the same sources can be better than the mixture's bound: where a goal
-  lies above these lines it lies above what the plate can do for these contact sets.
-- `phased` is judged by what is left of it under errors. Its robust score is the contrast with the
-  average error of 10 % of each ERA's share added to every quiet point; the bound below it holds for
+- The exact search over all 614 655 patterns of four ERAs is the optimum of `switched`, and the bound of the mixture
+  limits all amplitudes of the same sources: a goal above these lines is out of reach
+  for this plate and these contact sets.
+- `phased` is judged by its contrast under errors. Its robust score is the contrast with the
+  mean error of 10 % of each ERA's share added to every quiet point; the bound below it holds for
   any complex weights at any one of the frequencies.
-- Two targets take two of the four amplitudes: what is left for quiet fingers is what one target has
-  with about one quiet finger more.
+- Two targets take two of the four amplitudes: the remaining contrast is about that of one target
+  with one more quiet finger.
 """
 
 
@@ -108,10 +108,10 @@ def _growth_figure(section: Section) -> Figure:
     for axes, what in zip(figure.subplots(1, len(kinds), sharey=True), kinds, strict=True):
         sizes = [value for kind, value in section.data if kind == what]
         for name, label in (
-            ("build", "the table from nothing"),
+            ("build", "table build"),
             ("exact", "exact search, one contact set"),
-            ("phased", "live answer, phased"),
-            ("switched", "live answer, switched"),
+            ("phased", "query, phased"),
+            ("switched", "query, switched"),
         ):
             times = [1e3 * section.data[what, size][name] for size in sizes]
             axes.plot(sizes, times, "o-", label=label)

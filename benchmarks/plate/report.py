@@ -46,7 +46,7 @@ def write_report(
         return f"{slow['seconds'] / quick['seconds']:.0f}"
 
     head = [
-        "| | median | from to | peak memory | times as fast as the fastest peer |",
+        "| | median | range | peak memory | speed-up over the fastest peer |",
         "|---|---|---|---|---|",
     ]
     from_nothing = [
@@ -59,9 +59,9 @@ def write_report(
         row(f"{name}, {peer_finest['dof']} unknowns (one run)", peer_finest),
     ]  # fmt: skip
     further = [
-        row("era-haptics, places of a raster solved before", places, times(peer_again, places)),
-        row("era-haptics, places never seen before", new, times(peer_again, new)),
-        *(row(f"{measured[f'layout {p}']['name']}, factored again", measured[f"layout {p}"])
+        row("era-haptics, known positions of a raster", places, times(peer_again, places)),
+        row("era-haptics, new positions", new, times(peer_again, new)),
+        *(row(f"{measured[f'layout {p}']['name']}, factorised again", measured[f"layout {p}"])
           for p in peers),
     ]  # fmt: skip
     hours = 10_000 * peer_again["seconds"] / 2 / 3600
@@ -73,56 +73,56 @@ def write_report(
         + " |"
         for each in agreement
     ]
-    page = f"""# How fast the plate model is
+    page = f"""# Plate model benchmarks
 
 Printed by `make bench`, which installs the peers and runs `python -m benchmarks.plate`. Medians of
 {len(loads)} runs in {len(loads)} processes, BLAS on one thread, imports not counted.
 
 Machine: {_machine()}.
 {_versions()}.
-Load while measuring, one to two of it our own: {min(loads):.1f} to {max(loads):.1f}. What runs
-beside it makes all times longer; the ratios suffer less.
+Load average during the measurement, including the benchmark's own one to two: {min(loads):.1f} to {max(loads):.1f}. Other
+load lengthens all times, and affects the ratios less.
 
 The task is the founding paper's plate on four actuators (ERAs): 27 frequencies from 60 to 320 Hz,
-each ERA driven alone. Peers factor the dynamic stiffness at every frequency, as a user of theirs
-would; those that leave the solving to scipy do so with the options of SuperLU that are fastest
-here. NGSolve takes elements three times as large and of order 3, which makes as many unknowns.
+each ERA driven alone. Peers factorise the dynamic stiffness at every frequency, as their users
+would; those that solve with scipy use the options of SuperLU that are fastest
+here. NGSolve uses elements three times as large and of order 3, for the same number of unknowns.
 
-## The same answer
+## Agreement
 
-Distance from era-haptics on its automatic mesh, relative L2 over all frequencies, drives and 221
-points on two layouts, the ERAs at the corners and not; in brackets the median over frequencies and
-drives. Near a resonance a natural frequency that is 0.2 % off, for want of elements or for a theory
-without shear, makes an error of several percent. The benchmark stops where a program is more than
-10 % away at 96x72.
+Difference from era-haptics on its automatic mesh, relative L2 over all frequencies, drives and 221
+points on two layouts, one with the ERAs at the corners; in brackets the median over frequencies and
+drives. Near a resonance an error of 0.2 % in a natural frequency, from a coarse mesh or a theory
+without shear, causes an error of several per cent. The benchmark fails if a program differs by more than
+10 % at 96x72.
 
 | | plate and element | 48x36 | 96x72 |
 |---|---|---|---|
 {chr(10).join(checks)}
 
-## From nothing: mesh, matrices, reduction, sweep
+## Complete solution: mesh, matrices, reduction, sweep
 
 {chr(10).join(head + from_nothing)}
 
-The response at all nodes of the mesh is part of it.
+The response at all nodes of the mesh is included.
 
 ## Every further layout of ERAs on the same plate
 
 {chr(10).join(head + further)}
 
-A place that no force has acted at before costs a few solves with the factors of the free plate (16
-for four ERAs, in four quarters); after that a layout is a system of four equations for each
-frequency. Studies choose among the places of a raster, so they pay for each place once.
+A new position costs a few solves with the factors of the free plate (16
+for four ERAs, in four symmetry classes); after that a layout is a system of four equations per
+frequency. Studies use the positions of a raster, so each is solved once.
 
 ## Ten thousand layouts
 
-`era study placement examples/paper_plate.yaml --layouts 10000 --workers 2`, from typing the command
+`era study placement examples/paper_plate.yaml --layouts 10000 --workers 2`, from the start of the command
 to the ranking and its pictures, with the quartiles and extremes of peak acceleration over 432
 points for every set of active ERAs of every layout; the memory is that of the largest process:
 
 {chr(10).join([*head, row("era-haptics, two processes", study)])}
 
-Factoring every layout again, {name} would take {hours:.1f} hours on both cores, by its time above.
+Factorising every layout again, {name} would take {hours:.1f} hours on both cores, by its time above.
 
 ![Times of era-haptics and its peers](../pictures/benchmarks.png)
 """
@@ -134,7 +134,7 @@ Factoring every layout again, {name} would take {hours:.1f} hours on both cores,
 
 def _picture(measured: Mapping[str, Result], peers: Sequence[str]) -> Figure:
     titles = {
-        "nothing": "27 frequencies x 4 drives\nfrom nothing, 48x36",
+        "nothing": "27 frequencies x 4 drives\ncomplete solution, 48x36",
         "layout": "every further layout\non the same plate",
     }
     figure = Figure(figsize=(9, 3.6), layout="constrained")
@@ -151,7 +151,7 @@ def _picture(measured: Mapping[str, Result], peers: Sequence[str]) -> Figure:
                 (measured["layout ours"], OURS_COLOR),
                 (measured["places ours 48"], OURS_COLOR),
             ]
-            labels += ["era-haptics,\nnew places", "era-haptics,\nplaces solved before"]
+            labels += ["era-haptics,\nnew positions", "era-haptics,\nknown positions"]
         seconds = [entry[0]["seconds"] for entry in entries]
         colors = [entry[1] for entry in entries]
         axes.hlines(labels, 1e-6, seconds, colors="#dddddd", zorder=0)

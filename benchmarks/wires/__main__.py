@@ -196,25 +196,26 @@ def _coarse_rig(folder: Path) -> Path:
 def _page(rows: Sequence[str], eight: Sequence[str]) -> str:
     return "\n".join(
         [
-            "# What the wires cost",
+            "# Wire benchmarks",
             "",
-            "Written by `make bench-wires` "
+            "Printed by `make bench-wires` "
             f"(Python {platform.python_version()}, {platform.system()} {platform.machine()}).",
-            f"An apply of {CHANNELS} channels and its answer, over loopback, to a simulated "
-            "amplifier in a process of its own; beside it the bare library of the wire, which "
-            "sends the same bytes, encoded beforehand, to the same far end and looks at nothing. "
-            f"{COUNT} exchanges each, in {ROUNDS} turns.",
+            f"An `Apply` of {CHANNELS} channels and its reply, over loopback, to a simulated "
+            "amplifier in a separate process; for comparison the bare library of the wire, which "
+            "sends the same bytes, pre-encoded, to the same far end and does not decode the reply. "
+            f"{COUNT} exchanges each, in {ROUNDS} alternating rounds. *Ratio* is the driver's "
+            "median over that of the bare library.",
             "",
             "| wire | median [ms] | 99th [ms] | applies/s | bare library | median [ms] | 99th [ms] "
-            "| ours / bare | codec [sets/s, there and back] |",
+            "| ratio | codec [sets/s, encode and decode] |",
             "|---|---|---|---|---|---|---|---|---|",
             *rows,
             "",
-            "Eight amplifiers, one far end playing all of them: a set to each at once, what this "
-            "process computes for that, and how far apart the commits of one start go out. On one "
-            "bus the controller commits by one broadcast instead.",
+            "Eight amplifiers simulated by one far end: one set to each at once, the processor "
+            "time of the host for it, and the skew between the commits. On one bus the controller "
+            "commits by one broadcast instead.",
             "",
-            "| on | median [ms] | 99th [ms] | computed here [ms] | commits apart, median [ms] | "
+            "| arrangement | median [ms] | 99th [ms] | CPU [ms] | skew of commits, median [ms] | "
             "99th [ms] |",
             "|---|---|---|---|---|---|",
             *eight,

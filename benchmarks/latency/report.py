@@ -37,38 +37,38 @@ Printed by `make bench-latency`, which runs `python -m benchmarks.latency --repo
 otherwise idle machine (two cores); {lasts}.{machine}
 `python -m benchmarks.latency --seconds 2` is a functional check of one minute.
 
-**Method.** A panel sends TUIO datagrams over UDP. The daemon reads them, queries the table,
-checks the set with the guard and writes it to a serial line. At the far end a
-program records the arrival of the last byte of each set. Both ends read CLOCK_MONOTONIC, the panel
-just before it sends. Sets are matched with touches from outside the daemon: the table is queried offline
-for the touches that were sent, and a set that plays the resulting pattern belongs to that touch. Other sets
-would be counted as *unmatched*.
+**Method.** A panel sends TUIO datagrams over UDP. The daemon reads them, queries the table, checks
+the set with the guard and writes it to a serial line. At the far end a program records the arrival
+of the last byte of each set. Both ends read CLOCK_MONOTONIC, the panel just before it sends. Sets
+are matched with touches from outside the daemon: the table is queried offline for the touches that
+were sent, and a set that plays the resulting pattern belongs to that touch. Other sets would be
+counted as *unmatched*.
 
 - **The line** is a TCP connection over loopback, as to a serial server (`socket://`): what the
   daemon writes is at the far end when the system call returns. For comparison, the same over a
   **pseudo-terminal**: there a kernel thread of ordinary priority carries the bytes and
   needs a core, in both directions. A real port has no such thread; its transmission time can be
   calculated ([wires](../reference/wire-protocol.md)).
-- **Devices**: an amplifier and a panel do not use the daemon's processors. The
-  programs that represent them do, so they run at the highest priority (SCHED_RR, else nice {device}), and
-  the daemon loses the processor time they use, unlike in a real setup.
-- **Taps**: every frame has a new finger in another place, a thousand times per second, beside a quiet one that
-  stays. Each is a new query of the table and a new set.
+- **Devices**: an amplifier and a panel do not use the daemon's processors. The programs that
+  represent them do, so they run at the highest priority (SCHED_RR, else nice {device}), and the
+  daemon loses the processor time they use, unlike in a real setup.
+- **Taps**: every frame has a new finger in another place, a thousand times per second, beside a
+  quiet one that stays. Each is a new query of the table and a new set.
 - **Slide**: one finger moves at {slide:g} m/s. The pattern stays until the finger has moved by more
   than {tolerance:g} mm, so about every ninth frame causes a set; the other frames
   have no latency and are not counted.
 - **Faster than sets**: only one set is under way at a time, since the next one depends on the
-  amplifier's reply. Touches that arrive meanwhile are combined, and the next set is for the
-  newest; the earlier fingers have lifted by then. The latency counts from this newest touch.
-  *Oldest touch* counts from the oldest of those combined. The daemon reports this latency
-  itself, in `era status`, the topic `latency` and Prometheus, from the reception of the datagram by the system
-  until the last byte was written.
+  amplifier's reply. Touches that arrive meanwhile are combined, and the next set is for the newest;
+  the earlier fingers have lifted by then. The latency counts from this newest touch. *Oldest touch*
+  counts from the oldest of those combined. The daemon reports this latency itself, in `era status`,
+  the topic `latency` and Prometheus, from the reception of the datagram by the system until the
+  last byte was written.
 - **Loaded**: another client sends {flood} touches per second to the API, each at a new place, and
   {workers} other programs compute continuously, all at ordinary priority. The daemon runs at
   nice {nice}, as in the unit that `era systemd install` prints.
-- **Baseline** *plain asyncio*: python-osc reads the same datagrams, the position selects one of the pre-encoded sets,
-  which is written over the same line to the same far end.
-  No table, no guard, no quiet fingers, no wait for replies.
+- **Baseline** *plain asyncio*: python-osc reads the same datagrams, the position selects one of the
+  pre-encoded sets, which is written over the same line to the same far end. No table, no guard, no
+  quiet fingers, no wait for replies.
 
 Jitter is the standard deviation. *CPU* is the processor time of the daemon per set, including all
 other work of the daemon. All times in milliseconds. *Other load* is the number of processors
@@ -194,8 +194,8 @@ def _disturbance(one: Found | Failed) -> str | None:
         return f"**No figures of *{one.case.name}***: {attempts}."
     if one.others > QUIET:
         return (
-            f"***{one.case.name}* was disturbed**: other programs kept {one.others:.1f} processors busy, "
-            "so its figures are not those of an idle machine."
+            f"***{one.case.name}* was disturbed**: other programs kept {one.others:.1f} processors "
+            "busy, so its figures are not those of an idle machine."
         )
     return None
 

@@ -16,24 +16,24 @@ INTRODUCTION = """# Localization benchmarks: contrast and speed
 Printed by `python -m benchmarks.localization --sets {sets} --draws {draws} --seed {seed} --report`.
 The paper's plate on four corner ERAs, 27 frequencies from 40 to 500 Hz. Contact sets: fingertips
 (discs of 13 mm radius) anywhere on the plate, at least 5 cm apart, one of them the target, which
-reaches at least 1 m/s²; {sets} sets for each count. Contrast is the target's mean peak acceleration to
-the loudest quiet point. *Realised*: errors of 5 % in gain and 5 degrees in phase (standard deviations);
-for each set the median of {draws} draws. Cells show the median over the sets, in brackets the tenth
-percentile.
+reaches at least 1 m/s²; {sets} sets for each count. Contrast is the target's mean peak acceleration
+to the loudest quiet point. *Realised*: errors of 5 % in gain and 5 degrees in phase (standard
+deviations); for each set the median of {draws} draws. Cells show the median over the sets, in
+brackets the tenth percentile.
 
-Other methods, on the same plate and contact sets, each at the best frequency for
-every set: the paper's (one or two ERAs at full level, each at its own frequency), and two
-of the methods it cites. The inverse filter solves for 1 at the target and 0 at the centres of
-the other fingertips; time reversal plays the time-reversed response at the target, at one frequency or as
-a pulse of all 27 (peaks over time).
+Other methods, on the same plate and contact sets, each at the best frequency for every set: the
+paper's (one or two ERAs at full level, each at its own frequency), and two of the methods it cites.
+The inverse filter solves for 1 at the target and 0 at the centres of the other fingertips; time
+reversal plays the time-reversed response at the target, at one frequency or as a pulse of all 27
+(peaks over time).
 """
 
 READING = """
 ## Interpretation
 
-- The exact search over all 614 655 patterns of four ERAs is the optimum of `switched`, and the bound of the mixture
-  limits all amplitudes of the same sources: a goal above these lines is out of reach
-  for this plate and these contact sets.
+- The exact search over all 614 655 patterns of four ERAs is the optimum of `switched`, and the
+  bound of the mixture limits all amplitudes of the same sources: a goal above these lines is out of
+  reach for this plate and these contact sets.
 - `phased` is judged by its contrast under errors. Its robust score is the contrast with the
   mean error of 10 % of each ERA's share added to every quiet point; the bound below it holds for
   any complex weights at any one of the frequencies.

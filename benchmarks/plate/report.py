@@ -78,10 +78,9 @@ def write_report(
 Printed by `make bench`, which installs the peers and runs `python -m benchmarks.plate`. Medians of
 {len(loads)} runs in {len(loads)} processes, BLAS on one thread, imports not counted.
 
-Machine: {_machine()}.
-{_versions()}.
-Load average during the measurement, including the benchmark's own one to two: {min(loads):.1f} to {max(loads):.1f}. Other
-load lengthens all times, and affects the ratios less.
+Machine: {_machine()}. {_versions()}. Load average during the measurement, including the benchmark's
+own one to two: {min(loads):.1f} to {max(loads):.1f}. Other load lengthens all times, and affects
+the ratios less.
 
 The task is the founding paper's plate on four actuators (ERAs): 27 frequencies from 60 to 320 Hz,
 each ERA driven alone. Peers factorise the dynamic stiffness at every frequency, as their users
@@ -93,8 +92,8 @@ here. NGSolve uses elements three times as large and of order 3, for the same nu
 Difference from era-haptics on its automatic mesh, relative L2 over all frequencies, drives and 221
 points on two layouts, one with the ERAs at the corners; in brackets the median over frequencies and
 drives. Near a resonance an error of 0.2 % in a natural frequency, from a coarse mesh or a theory
-without shear, causes an error of several per cent. The benchmark fails if a program differs by more than
-10 % at 96x72.
+without shear, causes an error of several per cent. The benchmark fails if a program differs by more
+than 10 % at 96x72.
 
 | | plate and element | 48x36 | 96x72 |
 |---|---|---|---|
@@ -122,7 +121,8 @@ points for every set of active ERAs of every layout; the memory is that of the l
 
 {chr(10).join([*head, row("era-haptics, two processes", study)])}
 
-Factorising every layout again, {name} would take {hours:.1f} hours on both cores, by its time above.
+Factorising every layout again, {name} would take {hours:.1f} hours on both cores, by its time
+above.
 
 ![Times of era-haptics and its peers](../pictures/benchmarks.png)
 """

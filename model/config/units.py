@@ -35,6 +35,21 @@ RATE = Dimension("a rate", "1/s", "50 Hz")
 SLEW = Dimension("a rise of the level", "1/s", "2 %/ms")
 RATIO = Dimension("a plain number", "", "0.05 or 5 %")
 
+COMMON_FACTORS = {
+    LENGTH.unit: {"m": "1", "cm": "0.01", "mm": "0.001", "um": "0.000001", "in": "0.0254"},
+    MODULUS.unit: {"Pa": "1", "MPa": "1000000", "GPa": "1000000000"},
+    DENSITY.unit: {"kg/m^3": "1"},
+    STIFFNESS.unit: {"N/m": "1", "kN/m": "1000", "N/mm": "1000"},
+    DAMPING.unit: {"N s/m": "1"},
+    MASS.unit: {"kg": "1", "g": "0.001"},
+    FREQUENCY.unit: {"Hz": "1", "kHz": "1000"},
+    TIME.unit: {"s": "1", "ms": "0.001"},
+    SPEED.unit: {"m/s": "1", "cm/s": "0.01", "mm/s": "0.001"},
+    RATE.unit: {"Hz": "1", "%/ms": "10"},
+    RATIO.unit: {"%": "0.01"},
+}
+"""Factors of common units by SI unit, as pint has them: loading pint doubles a command's start."""
+
 # The number is split from its unit here and texts are short, so that nothing is evaluated: pint
 # by itself would compute `9**9**9 m`.
 _MAX_LENGTH = 40
@@ -69,11 +84,13 @@ def _parse(text: str, dimension: Dimension) -> float:
     number, unit = match.groups()
     if unit is None:
         return _to_float(number, dimension)
-    return _to_float(Decimal(number) * _factor(text, unit, dimension), dimension)
+    known = COMMON_FACTORS[dimension.unit].get(unit)
+    factor = unit_factor(text, unit, dimension) if known is None else Decimal(known)
+    return _to_float(Decimal(number) * factor, dimension)
 
 
-def _factor(text: str, unit: str, dimension: Dimension) -> Decimal:
-    """The factor from a unit to the SI unit of a dimension.
+def unit_factor(text: str, unit: str, dimension: Dimension) -> Decimal:
+    """The factor from a unit to the SI unit of a dimension, by pint.
 
     The base units must be the same, not just the dimension: revolutions per minute and rad/s have
     the dimension of Hz.
@@ -97,7 +114,7 @@ def _factor(text: str, unit: str, dimension: Dimension) -> Decimal:
 def _registry() -> "pint.UnitRegistry[Decimal]":
     """Pint's units with decimal factors, so that 12 in is 0.3048 m and not 0.30479999999999996.
 
-    Made for the first unit, since it takes a tenth of a second.
+    Made for the first unit that is not common, since it takes a tenth of a second.
     """
     import pint
 

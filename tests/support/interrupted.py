@@ -69,10 +69,8 @@ def _waiting(command: str, inside: str, writing: int) -> int:
 
 if __name__ == "__main__":
     from controller.cli.main import main
-    from model.config.units import LENGTH, quantity
 
     asked = json.loads(sys.stdin.read())
     for module in {at.rpartition(".")[0] for at in asked.values()}:
         import_module(module)
-    quantity("1 mm", LENGTH)  # reads all the units that there are
     json.dump({command: _interrupted(command, at) for command, at in asked.items()}, sys.stdout)

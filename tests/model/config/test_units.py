@@ -1,11 +1,13 @@
 import subprocess
 import sys
+from decimal import Decimal
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from model.config.units import (
+    COMMON_FACTORS,
     DAMPING,
     DENSITY,
     FREQUENCY,
@@ -16,6 +18,7 @@ from model.config.units import (
     STIFFNESS,
     Dimension,
     quantity,
+    unit_factor,
 )
 from model.errors import InputError
 
@@ -148,3 +151,12 @@ def test_quantity_of_bare_numbers_does_not_load_pint() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize(
+    ("si", "unit"), [(si, unit) for si, factors in COMMON_FACTORS.items() for unit in factors]
+)
+def test_common_factors_are_those_of_pint(si: str, unit: str) -> None:
+    """To the last digit, so that it does not matter which of the two is used."""
+    factor = unit_factor(f"1 {unit}", unit, Dimension("a value", si, ""))
+    assert factor == Decimal(COMMON_FACTORS[si][unit])

@@ -1,4 +1,4 @@
-"""Work in a thread: what comes of it, and what of work that was given up."""
+"""Work in threads, finished or cancelled."""
 
 import asyncio
 import contextlib
@@ -12,7 +12,7 @@ from drivers.threads import in_thread
 
 
 async def test_in_thread_returns_and_raises_as_its_work() -> None:
-    """The result, and the very exception, from a thread of that name."""
+    """Result or exception, from a thread of that name."""
     assert await in_thread(lambda: threading.current_thread().name, name="opening") == "opening"
     problem = OSError("no such port")
 
@@ -25,7 +25,7 @@ async def test_in_thread_returns_and_raises_as_its_work() -> None:
 
 
 async def test_cancelled_work_is_undone_once() -> None:
-    """Who waits is cancelled at once; what is opened afterwards is closed, by its own thread."""
+    """The task ends at once; a device opened afterwards is closed by its thread."""
     may_open, closed, closings = threading.Event(), threading.Event(), []
 
     def open_port() -> str:
@@ -89,7 +89,7 @@ def test_result_after_the_end_of_the_loop_is_undone() -> None:
 
 
 def test_program_ends_while_work_hangs() -> None:
-    """Its end does not wait for a thread that waits for ever, unlike asyncio's own pool."""
+    """Unlike with asyncio's own pool."""
     program = """
 import asyncio, threading
 from drivers.threads import in_thread

@@ -1,4 +1,4 @@
-"""Waiting for a reply: in time, too late, and in a process that was held up itself."""
+"""Waiting for a reply: in time, too late, and in a delayed process."""
 
 import asyncio
 import os
@@ -10,7 +10,7 @@ from drivers.backends.waiting import reply_within
 
 
 async def test_reply_within_returns_a_reply_or_times_out() -> None:
-    """What is there is given at once; what does not come is a TimeoutError, and the future over."""
+    """A missing reply is a TimeoutError and ends the future."""
     loop = asyncio.get_running_loop()
     there: asyncio.Future[str] = loop.create_future()
     there.set_result("here")
@@ -22,7 +22,7 @@ async def test_reply_within_returns_a_reply_or_times_out() -> None:
 
 
 async def test_reply_counts_when_the_process_was_delayed() -> None:
-    """A reply that lay in the pipe when the time was over is no missing one."""
+    """A reply in the pipe at the timeout is in time."""
     loop = asyncio.get_running_loop()
     reply: asyncio.Future[bytes] = loop.create_future()
     reading, writing = os.pipe()
@@ -40,7 +40,7 @@ async def test_reply_counts_when_the_process_was_delayed() -> None:
 
 
 async def test_reply_counts_when_the_reader_thread_was_delayed() -> None:
-    """After a hold-up a reply that is posted a little later still counts."""
+    """A reply posted a little later is in time."""
     loop = asyncio.get_running_loop()
     reply: asyncio.Future[str] = loop.create_future()
     waiting = asyncio.create_task(reply_within(reply, 0.002))

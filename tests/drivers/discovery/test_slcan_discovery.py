@@ -1,4 +1,4 @@
-"""Serial ports that are CAN adapters: found by two characters, and only listened to."""
+"""Detection of slcan adapters by two characters, and listening."""
 
 import asyncio
 import json
@@ -21,7 +21,7 @@ from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter as FarAdapter
 
 
 class Adapter:
-    """A serial port and the far end's adapter behind it, in a thread; nodes 1 and 5 beat."""
+    """A serial port with a far end's adapter, in a thread; nodes 1 and 5 send heartbeats."""
 
     def __init__(self) -> None:
         self.said = b""
@@ -57,7 +57,7 @@ class Adapter:
         self.receive(data)
 
     def has_got(self, text: bytes) -> bool:
-        """Whether this is all that was written to it, once that has arrived."""
+        """Whether exactly this was written to it."""
         with self._came:
             return self._came.wait_for(lambda: len(self.said) >= len(text), 5) and self.said == text
 
@@ -70,17 +70,17 @@ class Adapter:
 
 
 def reply(adapter: Adapter, answer: bytes, data: bytes) -> None:
-    """Say this, whatever is asked."""
+    """Reply with fixed bytes."""
     os.write(adapter._far, answer)
 
 
 def void(_: object) -> None:
-    """Of what is returned nothing is wanted."""
+    """Discard a result."""
 
 
 @pytest.fixture
 def adapter() -> Iterator[Adapter]:
-    """One on a port of its own."""
+    """An adapter on its own port."""
     adapter = Adapter()
     yield adapter
     adapter.close()
@@ -95,7 +95,7 @@ def test_adapter_listens_and_is_closed(adapter: Adapter) -> None:
 
 
 def test_other_device_receives_two_characters(adapter: Adapter) -> None:
-    """Whatever else it says or does not say: nothing is sent but V and CR."""
+    """V and CR, whatever it replies."""
     for answer in (b"", b"?\r", b"Version 2\r", b"V10"):
         adapter.said = b""
         adapter.receive = partial(reply, adapter, answer)
@@ -104,7 +104,7 @@ def test_other_device_receives_two_characters(adapter: Adapter) -> None:
 
 
 def test_adapter_without_listen_only_mode_is_not_opened(adapter: Adapter) -> None:
-    """It refuses L: it is named, and O is never tried."""
+    """O is never sent."""
     usual = adapter.receive
     adapter.receive = lambda data: usual(data.replace(b"L\r", b"nonsense\r"))
     found = ask_for_slcan(adapter.port)

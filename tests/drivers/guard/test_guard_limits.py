@@ -158,6 +158,8 @@ def test_duty_limits_the_vibration_time() -> None:
     assert strict.check(playing(3, 0.0)).is_silent
     clock.now += 9.5
     assert strict.check(playing(4, 0.5)).valid_for == pytest.approx(0.5)
+    clock.now += 20.0
+    assert strict.check(playing(5, 0.5)).valid_for == pytest.approx(1.0)
 
 
 def test_rate_limits_sets_per_second() -> None:

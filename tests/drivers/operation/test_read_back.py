@@ -15,7 +15,7 @@ def after(*reports: tuple[float, tuple[float, ...]], settled_from: float = 1.0) 
 
 
 def test_equal_levels_are_no_fault() -> None:
-    """However long, and up to a hundredth of full stroke."""
+    """For any time, up to a hundredth of full stroke."""
     near = (0.509, 0.009, 0.191, 0.0)
     expected = after((1.0, WANTED), (9.0, near))
     assert expected.differs_since is None
@@ -32,12 +32,12 @@ def test_levels_differing_for_100_ms_are_a_fault() -> None:
 
 
 def test_channel_without_a_command_must_be_silent() -> None:
-    """A level where none was commanded differs, too."""
+    """Any level differs there."""
     assert is_fault(after((2.0, (0.5, 0.3, 0.2, 0.0)), (2.2, (0.5, 0.3, 0.2, 0.0))), 2.2)
 
 
 def test_ramp_is_no_fault() -> None:
-    """Before the set has settled, levels are on their way."""
+    """Levels do not count before the set has settled."""
     expected = after((0.0, DERATED), (0.5, DERATED), (0.99, DERATED))
     assert not is_fault(expected, 0.99)
     assert not is_fault(read_back(expected, DERATED, 1.0), 1.0)

@@ -1,4 +1,4 @@
-"""Commits over wires of different speed, in virtual time: when each goes out, when it arrives."""
+"""Commits over wires of different speed, in virtual time."""
 
 import asyncio
 from collections.abc import Callable, Coroutine
@@ -13,7 +13,7 @@ from virtual_loop import VirtualLoop
 
 @dataclass
 class Wire:
-    """An amplifier whose commits take so long [s] to arrive, and when they did."""
+    """An amplifier, the time [s] its commits take, and when they were sent."""
 
     takes: float
     sent: list[float] = field(default_factory=list)
@@ -25,7 +25,7 @@ class Wire:
 
 
 def in_virtual_time(work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    """Run it on a clock that jumps."""
+    """Run it in virtual time."""
     loop = VirtualLoop()
     try:
         loop.run_until_complete(work())
@@ -47,7 +47,7 @@ def test_commits_arrive_together() -> None:
 
 
 def test_equal_wires_commit_at_once() -> None:
-    """They go out in one go, without the loop being left in between."""
+    """Within one iteration of the event loop."""
 
     async def work() -> None:
         wires = [Wire(0.003) for _ in range(4)]

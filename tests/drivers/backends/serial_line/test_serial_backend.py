@@ -182,11 +182,16 @@ async def test_unusable_port_has_a_remedy(url: str, remedy: str) -> None:
         await SerialBackend(url).open()
 
 
-async def test_forbidden_port_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The group that owns the port."""
-    forbidden = serial.SerialException(errno.EACCES, "Permission denied")
-    monkeypatch.setattr(opening.serial, "serial_for_url", Mock(side_effect=forbidden))
-    with pytest.raises(LinkError, match="dialout"):
+@pytest.mark.parametrize(
+    ("code", "remedy"), [(errno.EACCES, "dialout"), (errno.EBUSY, "another program")]
+)
+async def test_refused_port_has_a_remedy(
+    monkeypatch: pytest.MonkeyPatch, code: int, remedy: str
+) -> None:
+    """By the system's error code."""
+    refused = serial.SerialException(code, "could not open port")
+    monkeypatch.setattr(opening.serial, "serial_for_url", Mock(side_effect=refused))
+    with pytest.raises(LinkError, match=remedy):
         await SerialBackend("serial:///dev/ttyUSB9").open()
 
 

@@ -1,4 +1,4 @@
-"""CAN frames as text of adapters: golden lines, any split, any nonsense in between."""
+"""CAN frames as text of adapters: golden lines, any split, any noise."""
 
 import itertools
 from collections.abc import Callable, Iterator
@@ -42,12 +42,12 @@ SAID: dict[type[Reader], Callable[[CanFrame], bytes]] = {
 
 
 def pieces(text: bytes, cuts: list[int]) -> Iterator[bytes]:
-    """The text in pieces, cut at these places."""
+    """Cut the text at these places."""
     edges = [0, *sorted(cut % (len(text) + 1) for cut in cuts), len(text)]
     return (text[begin:end] for begin, end in itertools.pairwise(edges))
 
 
-def test_frames_are_written_as_the_adapters_want_them() -> None:
+def test_frames_are_encoded_as_text() -> None:
     """Classic, empty, and CAN FD, against text by hand."""
     fd = CanFrame(0x481, bytes(12), fd=True)
     assert slcan_line(FRAME) == b"t18180102030405060708\r"
@@ -62,7 +62,7 @@ def test_frames_are_written_as_the_adapters_want_them() -> None:
 def test_any_split_of_the_stream_gives_the_same_frames(
     make: type[Reader], sent: list[CanFrame], cuts: list[int]
 ) -> None:
-    """Wherever the bytes are cut."""
+    """For both kinds of adapters."""
     reader = make()
     text = b"".join(map(SAID[make], sent))
     assert [frame for piece in pieces(text, cuts) for frame in reader.feed(piece)] == sent
@@ -70,8 +70,8 @@ def test_any_split_of_the_stream_gives_the_same_frames(
 
 @pytest.mark.parametrize("make", SAID)
 @given(noise=st.binary(max_size=600))
-def test_after_any_noise_one_end_resynchronises(make: type[Reader], noise: bytes) -> None:
-    """Whatever came: after the next end of a line or element, a good frame is understood."""
+def test_reader_resynchronizes_after_noise(make: type[Reader], noise: bytes) -> None:
+    """A good frame after the next end of a line or element is understood."""
     reader = make()
     list(reader.feed(noise))
     list(reader.feed(b">\r"))
@@ -85,14 +85,14 @@ def test_after_any_noise_one_end_resynchronises(make: type[Reader], noise: bytes
         *(b"T000001818" + b"00" * 8 + b"\r", b"r1810\r", b"z\r", b"\r", b"\x07", b"t18\r"),
     ],
 )
-def test_lines_that_are_no_frame_are_skipped(line: bytes) -> None:
+def test_slcan_line_without_a_frame_is_skipped(line: bytes) -> None:
     """Too short, too long, an identifier too large, long identifiers, remote frames, answers."""
     reader = SlcanReader()
     assert list(reader.feed(line)) == []
     assert list(reader.feed(LINES[SlcanReader])) == [FRAME]
 
 
-def test_a_time_stamp_is_left_out() -> None:
+def test_slcan_timestamp_is_skipped() -> None:
     """Four digits after the data, from adapters that are configured to send them."""
     assert list(SlcanReader().feed(b"t18180102030405060708ABCD\r")) == [FRAME]
 
@@ -105,15 +105,15 @@ def test_a_time_stamp_is_left_out() -> None:
         b"< frame 181 1.5 000000000000000000 >",
     ],
 )
-def test_elements_that_are_no_frame_are_skipped(element: bytes) -> None:
+def test_socketcand_element_without_a_frame_is_skipped(element: bytes) -> None:
     """Answers, long identifiers, missing parts, too much data."""
     reader = SocketcandReader()
     assert list(reader.feed(element)) == []
     assert list(reader.feed(LINES[SocketcandReader])) == [FRAME]
 
 
-def test_what_never_ends_is_not_kept() -> None:
-    """Megabytes without an end of line take no memory."""
+def test_unterminated_text_is_discarded() -> None:
+    """It takes no memory."""
     for reader in (SlcanReader(), SocketcandReader()):
         for _ in range(100):
             assert list(reader.feed(b"t1818" * 1000)) == []

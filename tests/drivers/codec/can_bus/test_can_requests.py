@@ -90,12 +90,13 @@ def test_broadcast_is_for_node_zero() -> None:
     level=st.floats(0.0, 1.0),
     phase=st.floats(-180.0, 179.9),
     keep=st.booleans(),
+    skip=st.booleans(),
 )
 def test_cantools_decodes_a_set_by_the_dbc(
-    frequency: float, level: float, phase: float, keep: bool
+    frequency: float, level: float, phase: float, keep: bool, skip: bool
 ) -> None:
     """An independent decoder finds frequency, level and phase to their steps."""
-    wanted = DriveCommand(2, frequency, level, phase, keep_phase=keep)
+    wanted = DriveCommand(2, frequency, level, phase, keep_phase=keep, skip_ending=skip)
     guard = Guard(GuardLimits(20.0, 600.0, 1.0), WIDE)
     safe = guard.check(CommandSet(token=77, commands=(wanted,), ramp=0.25, valid_for=1.5))
     frames = encode_request(Apply(safe), node=1, sequence=5)
@@ -104,7 +105,8 @@ def test_cantools_decodes_a_set_by_the_dbc(
     assert command["frequency"] == pytest.approx(achieved.frequency, abs=1e-9)
     assert command["level"] == pytest.approx(level, abs=0.51e-4)
     assert command["phase"] == pytest.approx(achieved.phase, abs=1e-9)
-    assert (command["keep_phase"], command["channel"], command["sequence"]) == (keep, 2, 5)
+    assert (command["keep_phase"], command["skip_ending"]) == (keep, skip)
+    assert (command["channel"], command["sequence"]) == (2, 5)
     assert order["token"] == 77
     assert order["ramp"] == pytest.approx(0.25)
     assert order["time"] == pytest.approx(1.5)

@@ -16,7 +16,7 @@ STEPS = session()
 
 
 def shown() -> dict[str, list[str]]:
-    """The steps of the session on the page: title and frames; titles that come twice get a mark."""
+    """Return the session of the page: frames by title; repeated titles are marked."""
     steps: dict[str, list[str]] = {}
     title = ""
     for line in PAGE[PAGE.index("## A session") :].splitlines():
@@ -29,7 +29,7 @@ def shown() -> dict[str, list[str]]:
     return steps
 
 
-def test_the_session_is_what_encoder_and_far_end_say() -> None:
+def test_session_equals_encoder_and_far_end() -> None:
     """Every frame of the page, host's and amplifier's, to the byte and in its order."""
     played: dict[str, list[str]] = {}
     for step in STEPS:
@@ -38,7 +38,7 @@ def test_the_session_is_what_encoder_and_far_end_say() -> None:
     assert shown() == played
 
 
-def test_the_fields_are_those_of_the_definition() -> None:
+def test_fields_equal_the_definition() -> None:
     """The table of frames gives first bit and length of every field of protocol.yaml."""
     rows = {
         (frame, field): (int(first), int(bits))
@@ -54,8 +54,8 @@ def test_the_fields_are_those_of_the_definition() -> None:
     assert rows == declared
 
 
-def test_no_two_fields_share_a_bit() -> None:
-    """The fields of a frame lie side by side within its eight bytes."""
+def test_fields_do_not_overlap() -> None:
+    """Within eight bytes."""
     for layout in LAYOUTS.values():
         bits = [
             bit
@@ -66,7 +66,7 @@ def test_no_two_fields_share_a_bit() -> None:
         assert max(bits) < 64
 
 
-def test_the_objects_are_those_of_the_definition() -> None:
+def test_objects_equal_the_definition() -> None:
     """Every object stands in the table with its index and access."""
     rows = set(
         re.findall(r"^\| ([0-9A-F]{4}) \| [^|]+ \| ([\w ]+) \| \w+ \| (\w+) \|$", PAGE, re.M)
@@ -77,7 +77,7 @@ def test_the_objects_are_those_of_the_definition() -> None:
 
 
 @pytest.mark.parametrize("table", ["emergencies", "aborts"])
-def test_the_codes_are_those_of_the_definition(table: str) -> None:
+def test_codes_equal_the_definition(table: str) -> None:
     """Emergency and abort codes stand in hexadecimal beside their names."""
     for name, code in CANOPEN[table].items():
         if table == "emergencies":
@@ -88,12 +88,12 @@ def test_the_codes_are_those_of_the_definition(table: str) -> None:
 
 
 def test_every_fault_and_nak_has_a_code() -> None:
-    """Nothing that can go wrong lacks its emergency or its abort code."""
+    """Emergencies and aborts are complete."""
     assert CANOPEN["emergencies"].keys() == PROTOCOL.faults.keys()
     assert CANOPEN["aborts"].keys() == PROTOCOL.naks.keys()
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_the_files_are_up_to_date(name: str) -> None:
+def test_eds_and_dbc_are_up_to_date(name: str) -> None:
     """EDS and DBC are what `python docs/generators/can_files.py docs/reference` writes."""
     assert (DOCS / name).read_text("utf-8") == FILES[name]()

@@ -1,4 +1,4 @@
-"""Modbus frames as the host takes them: in any pieces, behind anything, with any bit flipped."""
+"""Modbus frames at the host: in any pieces, after any data, with any bit flipped."""
 
 from itertools import pairwise
 
@@ -24,7 +24,7 @@ from vendor_pages import ARMED, SET, ScriptedDevice
 
 
 def asked_and_answered(is_rtu: bool) -> tuple[RequestAdu, bytes]:
-    """A heartbeat with tag 4711 and the frame that answers it."""
+    """Make a heartbeat with tag 4711 and the frame of its response."""
     exchange = exchanges.encode_request(Ping(), tag=4711, channels=4)
     request = build_adu(
         exchange.read, exchange.write, unit=1, transaction=0 if is_rtu else 300, is_rtu=is_rtu
@@ -39,7 +39,7 @@ EXAMPLES = {is_rtu: asked_and_answered(is_rtu) for is_rtu in (True, False)}
 
 
 def read(is_rtu: bool, *pieces: bytes) -> tuple[list[ModbusResponse], WireCounters]:
-    """What the host finds in some pieces of bytes, and what it counts."""
+    """Feed pieces to a reader; its responses and counters."""
     counters = WireCounters()
     reader = ResponseReader(is_rtu=is_rtu, counters=counters)
     request = EXAMPLES[is_rtu][0]
@@ -47,7 +47,7 @@ def read(is_rtu: bool, *pieces: bytes) -> tuple[list[ModbusResponse], WireCounte
 
 
 def accepted(answers: list[ModbusResponse]) -> list[Status]:
-    """Those that a backend would take for the answer to this request."""
+    """Decode the responses that a backend would accept."""
     return [
         exchanges.decode_reply(Ping(), one.registers)
         for one in answers
@@ -57,7 +57,7 @@ def accepted(answers: list[ModbusResponse]) -> list[Status]:
 
 @given(is_rtu=st.booleans(), cuts=st.lists(st.integers(0, 40)), garbage=st.binary(max_size=12))
 def test_response_is_found_in_any_pieces(is_rtu: bool, cuts: list[int], garbage: bytes) -> None:
-    """Over RTU behind any garbage too."""
+    """Over RTU also after garbage."""
     stream = (garbage if is_rtu else b"") + EXAMPLES[is_rtu][1]
     edges = sorted({0, len(stream), *(cut for cut in cuts if cut < len(stream))})
     pieces = [stream[a:b] for a, b in pairwise(edges)]
@@ -86,7 +86,7 @@ def test_response_with_flipped_bits_is_discarded(is_rtu: bool, data: st.DataObje
 
 @given(is_rtu=st.booleans(), stream=st.lists(st.binary(max_size=300), max_size=6))
 def test_any_bytes_leave_the_reader_usable(is_rtu: bool, stream: list[bytes]) -> None:
-    """Whatever comes: no exception but FrameError, and the buffer does not grow without end."""
+    """No exception but FrameError, and a bounded buffer."""
     reader = ResponseReader(is_rtu=is_rtu, counters=WireCounters())
     for piece in stream:
         for answer in reader.feed(piece, EXAMPLES[is_rtu][0]):
@@ -104,10 +104,7 @@ def test_any_bytes_leave_the_reader_usable(is_rtu: bool, stream: list[bytes]) ->
 def test_truncated_request_does_not_merge_with_the_next(
     reader_type: type[RtuReader] | type[TcpReader],
 ) -> None:
-    """A set that ends early, and 50 ms later a whole one: nothing of the one is in the other.
-
-    Without the pause the missing end of the first would be filled up with the second.
-    """
+    """A set that ends early, and 50 ms later a complete one."""
     is_rtu = reader_type is RtuReader
     exchange = exchanges.encode_request(Apply(SET), tag=1, channels=4)
     frame = build_adu(exchange.read, exchange.write, unit=1, transaction=0, is_rtu=is_rtu).frame

@@ -8,14 +8,15 @@ import drivers
 from drivers.codec.modbus import exchanges
 from drivers.codec.modbus.adu import RequestAdu, ResponseReader, build_adu
 from drivers.codec.modbus.exchanges import Exchange, Read, Write
+from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import Commit, Nak, Ping, Request, Stop
+from drivers.protocol.messages import Apply, Commit, Nak, Ping, Request, Stop
 from drivers.statistics import WireCounters
 from sim.far_ends.modbus.frames import RequestAdu as Asked
 from sim.far_ends.modbus.frames import rtu_frame, tcp_frame
 from sim.far_ends.modbus.registers import checksum
 from sim.far_ends.modbus.unit import ModbusUnit
-from vendor_pages import EXAMPLES, ScriptedDevice, plain
+from vendor_pages import EXAMPLES, GUARD, ScriptedDevice, plain
 
 PAGE = (Path(drivers.__file__).parent.parent / "docs" / "reference" / "wire-modbus.md").read_text(
     "utf-8"
@@ -35,12 +36,12 @@ every_example = pytest.mark.parametrize(("name", "number"), NUMBERED, ids=EXAMPL
 
 
 def pdu_of(frame: bytes, wire: str) -> bytes:
-    """What stands between unit and CRC, or behind the header."""
+    """Return the PDU of a frame."""
     return frame[1:-2] if wire == "RTU" else frame[7:]
 
 
 def exchange_of(name: str, number: int) -> Exchange:
-    """What the host writes and reads; before GetCaps it does not know how many channels it has."""
+    """Encode a request of the page; before GetCaps for 16 channels."""
     return exchanges.encode_request(
         EXAMPLES[name].request, tag=number, channels=16 if name in ("Hello", "GetCaps") else 4
     )
@@ -49,13 +50,13 @@ def exchange_of(name: str, number: int) -> Exchange:
 def adu(
     read: Read | None, write: Write | None, number: int, wire: str, unit: int = 1
 ) -> RequestAdu:
-    """What the host sends; number: of the transaction, where there is one."""
+    """Build a request; number: of the transaction over TCP."""
     is_rtu = wire == "RTU"
     return build_adu(read, write, unit=unit, transaction=0 if is_rtu else number, is_rtu=is_rtu)
 
 
 def answered(device: ScriptedDevice, name: str, wire: str) -> bytes:
-    """What the far end answers to a request of the page, as a frame."""
+    """Return the far end's response to a request of the page, as a frame."""
     request = FRAMES[f"{name} request, {wire}"]
     pdu = ModbusUnit(device).reply(pdu_of(request, wire))
     assert pdu is not None
@@ -64,8 +65,8 @@ def answered(device: ScriptedDevice, name: str, wire: str) -> bytes:
     return tcp_frame(Asked(1, b"", int.from_bytes(request[:2], "big")), pdu)
 
 
-def test_the_page_shows_every_message() -> None:
-    """A request and a reply of every message over both wires, and nothing that is not checked."""
+def test_page_shows_every_message() -> None:
+    """A request and a reply over both wires; every frame is checked below."""
     pairs = [f"{name} {part}" for name in (*EXAMPLES, *BESIDE) for part in ("request", "reply")]
     broadcasts = [f"{name} request" for name in BROADCASTS]
     assert set(FRAMES) == {
@@ -76,8 +77,8 @@ def test_the_page_shows_every_message() -> None:
 
 @every_wire
 @every_example
-def test_the_request_is_what_the_host_sends(name: str, number: int, wire: str) -> None:
-    """The host's own encoder, to the byte."""
+def test_host_encodes_the_request(name: str, number: int, wire: str) -> None:
+    """To the byte."""
     exchange = exchange_of(name, number)
     sent = adu(exchange.read, exchange.write, number, wire)
     assert sent.frame == FRAMES[f"{name} request, {wire}"]
@@ -85,8 +86,8 @@ def test_the_request_is_what_the_host_sends(name: str, number: int, wire: str) -
 
 @every_wire
 @every_example
-def test_the_host_understands_the_reply(name: str, number: int, wire: str) -> None:
-    """The frame, coming byte by byte, becomes the message that the page speaks of."""
+def test_host_decodes_the_reply(name: str, number: int, wire: str) -> None:
+    """Byte by byte."""
     exchange, example = exchange_of(name, number), EXAMPLES[name]
     sent = adu(exchange.read, exchange.write, number, wire)
     reader = ResponseReader(is_rtu=wire == "RTU", counters=WireCounters())
@@ -102,8 +103,8 @@ def test_the_host_understands_the_reply(name: str, number: int, wire: str) -> No
 
 @every_wire
 @every_example
-def test_the_far_end_understands_and_answers(name: str, number: int, wire: str) -> None:
-    """The far end, which shares no code with the host, reads the message and says the reply."""
+def test_far_end_decodes_and_replies(name: str, number: int, wire: str) -> None:
+    """It shares no code with the host."""
     device = ScriptedDevice()
     device.follow(EXAMPLES[name])
     assert answered(device, name, wire) == FRAMES[f"{name} reply, {wire}"]
@@ -111,8 +112,8 @@ def test_the_far_end_understands_and_answers(name: str, number: int, wire: str) 
 
 
 @every_wire
-def test_the_reason_of_a_refusal_can_be_read(wire: str) -> None:
-    """The far end names it with the tag of the refused write, and the host takes it for its own."""
+def test_reason_of_a_refusal_is_read(wire: str) -> None:
+    """With the tag of the refused write, which the host compares."""
     device, name = ScriptedDevice(), "Refused Apply"
     number = dict(NUMBERED)[name]
     device.follow(EXAMPLES[name])
@@ -129,8 +130,8 @@ def test_the_reason_of_a_refusal_can_be_read(wire: str) -> None:
 
 
 @every_wire
-def test_without_function_23_it_takes_two(wire: str) -> None:
-    """The same block by function 16, whose echo is checked, and its outcome by function 4."""
+def test_functions_16_and_4_replace_23(wire: str) -> None:
+    """The same block, and its result."""
     exchange, example = exchange_of("Apply", 20), EXAMPLES["Apply"]
     device = ScriptedDevice()
     device.follow(example)
@@ -149,8 +150,8 @@ def test_without_function_23_it_takes_two(wire: str) -> None:
 
 @every_wire
 @pytest.mark.parametrize("name", BROADCASTS)
-def test_broadcasts_are_heard(name: str, wire: str) -> None:
-    """What the host sends to unit 0 is on the page, and every unit carries it out."""
+def test_broadcast_is_carried_out(name: str, wire: str) -> None:
+    """By every unit."""
     number, request = BROADCASTS[name]
     sent = adu(None, exchanges.encode_broadcast(request), number, wire, unit=0)
     assert sent.frame == FRAMES[f"{name} request, {wire}"]
@@ -176,8 +177,19 @@ def test_other_masters_are_served(wire: str) -> None:
     assert device.asked == [Ping()]
 
 
+@pytest.mark.parametrize("flag", ["keep_phase", "skip_ending"])
+def test_flags_reach_the_far_end(flag: str) -> None:
+    """Each alone; the slots are in the session."""
+    command = DriveCommand(0, 110.0, 0.2, **{flag: True})
+    request = Apply(GUARD.check(CommandSet(515, (command,), ramp=0.0, valid_for=0.0)))
+    exchange = exchanges.encode_request(request, tag=1, channels=4)
+    device = ScriptedDevice()
+    ModbusUnit(device).reply(pdu_of(adu(exchange.read, exchange.write, 1, "RTU").frame, "RTU"))
+    assert device.asked[0] == plain(request)
+
+
 def addresses() -> dict[int, str]:
-    """Every register that the definition names, by its address."""
+    """Return the registers of the definition by address."""
     named = {MAP["heartbeat"]: "heartbeat", MAP["look"]: "look"}
     behind = {"set": "channels", "envelope": "knots", "status": "levels", "achieved": "channels"}
     for name, block in [*MAP["holding"].items(), *MAP["input"].items()]:
@@ -194,15 +206,15 @@ def addresses() -> dict[int, str]:
     return named
 
 
-def test_every_register_stands_at_its_address() -> None:
-    """The tables name the registers of the definition, all of them and no others."""
+def test_registers_equal_the_definition() -> None:
+    """All of them and no others."""
     rows = re.findall(r"^\| (\d+) \| (\w+) \|", PAGE, re.MULTILINE)
     assert {int(address): name for address, name in rows} == addresses()
     assert len(rows) == len(addresses())
 
 
-def test_the_exceptions_are_those_of_the_definition() -> None:
-    """Each refusal has its exception, and the controlwords and functions their numbers."""
+def test_exceptions_equal_the_definition() -> None:
+    """And the controlwords."""
     rows = dict(re.findall(r"^\| ([A-Z_]+) \| (\d+) \|$", PAGE, re.MULTILINE))
     assert {name: int(code) for name, code in rows.items()} == MAP["exceptions"]
     words = re.search(r"\| 2 \| controlword \| (.*?);", PAGE)
@@ -213,6 +225,6 @@ def test_the_exceptions_are_those_of_the_definition() -> None:
 
 
 @pytest.mark.parametrize("check_of", [exchanges.crc_of, checksum])
-def test_the_check_is_that_of_the_page(check_of: Callable[[list[int]], int]) -> None:
-    """CRC-16 with polynomial 1021 from FFFF, by its published value over the digits 1 to 8."""
+def test_check_has_its_published_value(check_of: Callable[[list[int]], int]) -> None:
+    """CRC-16 with polynomial 1021 from FFFF, over the digits 1 to 8."""
     assert check_of([0x3132, 0x3334, 0x3536, 0x3738]) == 0xA12B

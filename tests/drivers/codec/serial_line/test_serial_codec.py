@@ -79,8 +79,9 @@ def largest(pick: Callable[[Quantity], float]) -> tuple[list[Request], dict[int,
     value = {name: pick(quantity) for name, quantity in vars(Q).items()}
     whole = {name: int(number) for name, number in value.items()}
     slots = {"onset": whole["envelope_slot"], "ending": whole["envelope_slot"]}
+    flags = {"keep_phase": pick(Q.level) > 0, "skip_ending": True}
     commands = tuple(
-        DriveCommand(n, value["frequency"], value["level"], value["phase"], True, **slots)
+        DriveCommand(n, value["frequency"], value["level"], value["phase"], **slots, **flags)
         for n in range(16)
     )
     playable = tuple(replace(one, frequency=pick(FREQUENCIES)) for one in commands)

@@ -18,7 +18,7 @@ FRAMES = st.builds(
 
 
 def cobs_by_hand(data: bytes) -> bytes:
-    """Stuffing for blocks below 254 bytes, straight from the paper's definition."""
+    """COBS of blocks below 254 bytes, by its definition."""
     return b"".join(bytes([len(part) + 1]) + part for part in data.split(b"\0"))
 
 
@@ -29,7 +29,7 @@ def frame_by_hand(first: int, address: int, sequence: int, payload: bytes) -> by
 
 
 def test_ping_is_these_bytes() -> None:
-    """A ping to address 1, sequence 7, is what the page for vendors and paper and pencil say."""
+    """A ping to address 1, sequence 7, by hand."""
     # 2C = version 1 << 5 | type 12; the zero of the sequence's high byte is stuffed.
     body = bytes.fromhex("2c 01 07 00")
     crc = zlib.crc32(body)
@@ -37,8 +37,8 @@ def test_ping_is_these_bytes() -> None:
     assert encode_frame(Frame(kind=12, address=1, sequence=7, payload=b"")) == expected
 
 
-def test_crc_is_the_standard_one() -> None:
-    """The CRC's check value over "123456789" is the catalogued 0xCBF43926, sent low byte first."""
+def test_crc_has_its_published_value() -> None:
+    """0xCBF43926 over "123456789", low byte first."""
     # A frame whose CRC-covered bytes are exactly "123456789": 0x31 is version 1, type 17.
     stuffed = b"\x0e123456789\x26\x39\xf4\xcb"
     frames = FrameReader().feed(b"\0" + stuffed + b"\0")
@@ -46,8 +46,8 @@ def test_crc_is_the_standard_one() -> None:
 
 
 @given(FRAMES)
-def test_frames_as_by_hand(frame: Frame) -> None:
-    """Every frame is the specification's bytes, is as long as arithmetic says, and comes back."""
+def test_frame_equals_its_specification(frame: Frame) -> None:
+    """Bytes and length; it is decoded again."""
     wire = encode_frame(frame)
     first = (frame.kind & REPLY) | 1 << 5 | (frame.kind & 0x1F)
     assert wire == frame_by_hand(first, frame.address, frame.sequence, frame.payload)
@@ -57,7 +57,7 @@ def test_frames_as_by_hand(frame: Frame) -> None:
 
 @given(st.lists(FRAMES, min_size=1, max_size=5), st.data())
 def test_any_split_gives_the_same_frames(frames: list[Frame], data: st.DataObject) -> None:
-    """Where the stream is cut into reads does not matter."""
+    """However the stream is cut."""
     stream = b"".join(encode_frame(frame) for frame in frames)
     cuts = data.draw(st.lists(st.integers(0, len(stream)), max_size=8).map(sorted))
     reader = FrameReader()
@@ -69,8 +69,8 @@ def test_any_split_gives_the_same_frames(frames: list[Frame], data: st.DataObjec
 
 
 @given(FRAMES, st.integers(0, 10**6))
-def test_a_flipped_bit_is_never_another_message(frame: Frame, where: int) -> None:
-    """One bit flipped anywhere loses the frame at most; it is never read as another one."""
+def test_flipped_bit_never_gives_another_message(frame: Frame, where: int) -> None:
+    """At most the frame is lost."""
     wire = bytearray(encode_frame(frame))
     where %= len(wire) * 8
     wire[where // 8] ^= 1 << where % 8
@@ -82,7 +82,7 @@ def test_a_flipped_bit_is_never_another_message(frame: Frame, where: int) -> Non
 
 
 @given(st.binary(max_size=2000))
-def test_noise_is_no_frame_and_does_no_harm(noise: bytes) -> None:
+def test_noise_gives_no_frame(noise: bytes) -> None:
     """Random bytes give no frame, and the next good frame is understood."""
     reader = FrameReader()
     after = Frame(kind=12, address=1, sequence=1, payload=b"x")
@@ -105,8 +105,8 @@ def test_damaged_frames_are_counted() -> None:
     assert reader.counters.good == 1
 
 
-def test_the_buffer_is_bounded() -> None:
-    """A megabyte without a delimiter is one frame too long, and is not kept."""
+def test_buffer_is_bounded() -> None:
+    """A megabyte without a delimiter is one damaged frame."""
     reader = FrameReader()
     for _ in range(256):
         reader.feed(b"\x55" * 4096)
@@ -114,7 +114,7 @@ def test_the_buffer_is_bounded() -> None:
     assert len(reader._stuffed) == 0
 
 
-def test_a_payload_that_does_not_fit_is_refused() -> None:
+def test_long_payload_is_refused() -> None:
     """A frame stays within one COBS block."""
     with pytest.raises(ValueError, match="at most 240 bytes, got 241"):
         encode_frame(Frame(kind=7, address=1, sequence=1, payload=bytes(241)))

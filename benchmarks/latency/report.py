@@ -80,8 +80,8 @@ WITHOUT = "No figures yet: the command writes them here, with the histogram.\n"
 
 END = """
 **Shaped onsets.** With `touch_wait: 30 ms`, the default of the [daemon](../reference/daemon.md), a
-touch that starts from rest waits until its [shaped onset](../concepts/transients.md) is computed and
-loaded: four envelopes, each with its own reply. With `touch_wait: 0 ms` it starts along a
+touch that starts from rest waits until its [shaped onset](../concepts/transients.md) is computed
+and loaded: four envelopes, each with its own reply. With `touch_wait: 0 ms` it starts along a
 plain ramp at once, which costs contrast during the onset only: over the first 100 ms
 19 dB instead of 28 to one quiet finger, 12 instead of 16 to two
 ([measured](../concepts/transients.md#measured)). A sliding finger waits in neither case,

@@ -190,8 +190,8 @@ def ensemble_section(sets: int, seed: int) -> Section:
         rows,
         notes=[
             "nine of ten plates have more. They vary in gains, phases, stiffness of each ERA",
-            "(10 %), thickness (2 %) and damping (half to twice), with fingers that press on the plate.",
-            "Patterns are chosen for a plain ramp.",
+            "(10 %), thickness (2 %) and damping (half to twice), with fingers that press on the",
+            "plate. Patterns are chosen for a plain ramp.",
         ],
     )
 

@@ -78,9 +78,10 @@ def write_report(
 Printed by `make bench`, which installs the peers and runs `python -m benchmarks.plate`. Medians of
 {len(loads)} runs in {len(loads)} processes, BLAS on one thread, imports not counted.
 
-Machine: {_machine()}. {_versions()}. Load average during the measurement, including the benchmark's
-own one to two: {min(loads):.1f} to {max(loads):.1f}. Other load lengthens all times, and affects
-the ratios less.
+Machine: {_machine()}.
+{_versions()}.
+Load average during the measurement, including the benchmark's own one to two:
+{min(loads):.1f} to {max(loads):.1f}. Other load lengthens all times, and affects the ratios less.
 
 The task is the founding paper's plate on four actuators (ERAs): 27 frequencies from 60 to 320 Hz,
 each ERA driven alone. Peers factorise the dynamic stiffness at every frequency, as their users
@@ -115,9 +116,9 @@ frequency. Studies use the positions of a raster, so each is solved once.
 
 ## Ten thousand layouts
 
-`era study placement examples/paper_plate.yaml --layouts 10000 --workers 2`, from the start of the command
-to the ranking and its pictures, with the quartiles and extremes of peak acceleration over 432
-points for every set of active ERAs of every layout; the memory is that of the largest process:
+`era study placement examples/paper_plate.yaml --layouts 10000 --workers 2`, from the start of the
+command to the ranking and its pictures, with the quartiles and extremes of peak acceleration over
+432 points for every set of active ERAs of every layout; the memory is that of the largest process:
 
 {chr(10).join([*head, row("era-haptics, two processes", study)])}
 

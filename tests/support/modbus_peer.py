@@ -1,4 +1,4 @@
-"""A Modbus server on a TCP port that answers as a test scripts it, in RTU or TCP frames."""
+"""A scripted Modbus server on a TCP port, with RTU or TCP frames."""
 
 import asyncio
 import time
@@ -11,14 +11,14 @@ from sim.far_ends.modbus.unit import ModbusUnit
 from vendor_pages import ScriptedDevice
 
 Answer: TypeAlias = bytes | None
-"""A PDU, or nothing."""
+"""A PDU, or none."""
 
 
 class Peer(asyncio.Protocol):
-    """The far side of a line; its connection is one at a time.
+    """The far side of a line, with one connection at a time.
 
-    answer(request) gives the PDU that answers at once, None is silence; by default that of the
-    `device`'s registers, a unit for each number that is asked for.
+    answer: returns the PDU of a response, None for none; by default from the registers of
+    `device`, whatever the unit.
     """
 
     def __init__(self, *, is_rtu: bool) -> None:
@@ -27,7 +27,7 @@ class Peer(asyncio.Protocol):
         self.unit = ModbusUnit(self.device)
         self.requests: list[RequestAdu] = []
         self.connections = 0
-        self.answer: Callable[[RequestAdu], Answer] = lambda request: self.unit.reply(request.pdu)
+        self.answer: Callable[[RequestAdu], Answer] = self.usual
         self.url = ""
         self._reader: RtuReader | TcpReader = TcpReader()
         self._transport: asyncio.Transport | None = None
@@ -45,6 +45,12 @@ class Peer(asyncio.Protocol):
             pdu = self.answer(request) if request.unit else None
             if pdu is not None:
                 self.send(request, pdu)
+
+    def usual(self, request: RequestAdu) -> bytes:
+        """Return the response of the device's registers."""
+        pdu = self.unit.reply(request.pdu)
+        assert pdu is not None
+        return pdu
 
     def send(self, request: RequestAdu, pdu: bytes) -> None:
         self.send_raw(self.frame(request, pdu))
@@ -73,7 +79,7 @@ class Peer(asyncio.Protocol):
 
 @asynccontextmanager
 async def peer(*, is_rtu: bool) -> AsyncIterator[Peer]:
-    """A peer that listens; over RTU as a serial server does."""
+    """A listening peer; over RTU like a serial server."""
     peer = Peer(is_rtu=is_rtu)
     server = await asyncio.get_running_loop().create_server(lambda: peer, "127.0.0.1", 0)
     host, port = server.sockets[0].getsockname()

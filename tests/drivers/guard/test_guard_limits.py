@@ -152,7 +152,9 @@ def test_duty_limits_the_vibration_time() -> None:
     clock = Clock()
     strict = guard(clock, duty=0.1)
     assert strict.check(playing(1, 0.5)).valid_for == pytest.approx(1.0)
-    clock.now += 1.0
+    clock.now += 0.4
+    assert strict.check(playing(1, 0.5)).valid_for == pytest.approx(0.6)
+    clock.now += 0.6
     with pytest.raises(CommandRefused, match="duty"):
         strict.check(playing(2, 0.5))
     assert strict.check(playing(3, 0.0)).is_silent

@@ -83,12 +83,10 @@ async def test_timeout_includes_the_line_behind_a_gateway() -> None:
         assert backend.wire_times.round_trip(4) == pytest.approx(0.12948, abs=1e-5)
         await backend.open()
         try:
-            at_once = far.answer
             loop = asyncio.get_running_loop()
 
             def later(request: Telegram) -> None:
-                pdu = at_once(request)
-                assert pdu is not None
+                pdu = far.usual(request)
                 loop.call_later(0.035, far.send, request, pdu)
 
             far.answer = later
@@ -178,11 +176,10 @@ async def test_late_response_is_not_credited_to_the_next_request(
     """It is discarded and counted; the next request gets its own response."""
     late: list[bytes] = []
 
-    def answer(request: object) -> bytes | None:
-        pdu = far.unit.reply(far.requests[-1].pdu)
+    def answer(request: Telegram) -> bytes | None:
+        pdu = far.usual(request)
         if not late:
-            assert pdu is not None
-            late.append(far.frame(far.requests[-1], pdu))
+            late.append(far.frame(request, pdu))
             return None
         far.send_raw(late[0])
         return pdu
@@ -204,11 +201,10 @@ async def test_late_exception_is_not_credited_to_the_next_request(
     """An RTU exception has no tag; the tag of the refusal block shows the write it belongs to."""
     late: list[bytes] = []
 
-    def answer(request: object) -> bytes | None:
-        pdu = far.unit.reply(far.requests[-1].pdu)
+    def answer(request: Telegram) -> bytes | None:
+        pdu = far.usual(request)
         if not late:
-            assert pdu is not None
-            late.append(far.frame(far.requests[-1], pdu))
+            late.append(far.frame(request, pdu))
             return None
         if len(late) == 1:
             late.append(b"")
@@ -236,7 +232,7 @@ async def test_transaction_numbers_and_tags_wrap(far: Peer, backend: ModbusBacke
 async def test_exception_without_a_refusal_is_a_timeout(far: Peer, backend: ModbusBackend) -> None:
     """The write is repeated by the link."""
 
-    def answer(request: object) -> bytes | None:
+    def answer(request: Telegram) -> bytes | None:
         pdu = far.requests[-1].pdu
         return far.unit.reply(pdu) if pdu[0] == 4 else bytes([pdu[0] | 0x80, 3])
 
@@ -261,11 +257,10 @@ async def test_damaged_response_is_discarded(far: Peer, backend: ModbusBackend, 
     """A wrong transaction, protocol, length, unit, function, count, tag or CRC; not the next."""
     spoil = off_by(place)
 
-    def answer(request: object) -> bytes | None:
-        pdu = far.unit.reply(far.requests[-1].pdu)
-        assert pdu is not None
-        asyncio.get_running_loop().call_later(0.01, far.send, far.requests[-1], pdu)
-        far.send_raw(spoil(far.frame(far.requests[-1], pdu)))
+    def answer(request: Telegram) -> bytes | None:
+        pdu = far.usual(request)
+        asyncio.get_running_loop().call_later(0.01, far.send, request, pdu)
+        far.send_raw(spoil(far.frame(request, pdu)))
         return None
 
     far.answer = answer
@@ -276,7 +271,7 @@ async def test_damaged_response_is_discarded(far: Peer, backend: ModbusBackend, 
         assert place == 5  # a length that is longer swallows the beginning of the next frame
     counters = backend.counters
     assert counters.crc_errors + counters.unexpected_frames >= 1
-    far.answer = lambda request: far.unit.reply(request.pdu)
+    far.answer = far.usual
     assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
 
 
@@ -287,9 +282,8 @@ async def test_echo_of_another_write_is_discarded(place: int) -> None:
         link = modbus_line(ModbusUrl.parse(far.url))
         await link.join(1, lambda _: None)
 
-        def answer(request: object) -> bytes | None:
-            pdu = far.unit.reply(far.requests[-1].pdu)
-            assert pdu is not None
+        def answer(request: Telegram) -> bytes | None:
+            pdu = far.usual(request)
             return off_by(place)(pdu)
 
         far.answer = answer
@@ -331,7 +325,7 @@ async def test_closed_connection_is_detected_at_once(far: Peer, backend: ModbusB
     lost = asyncio.get_running_loop().create_future()
     backend.listen(lambda _: None, lost.set_result)
     await backend.open()
-    far.answer = lambda request: far.unit.reply(request.pdu)
+    far.answer = far.usual
     assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
     far.hang_up()
     assert "was lost" in await asyncio.wait_for(lost, PATIENCE)
@@ -353,15 +347,14 @@ async def test_units_share_one_connection(far: Peer) -> None:
     assert first.bus == second.bus
     waiting: list[int] = []
 
-    def answer(request: object) -> bytes | None:
-        waiting.append(far.requests[-1].unit)
+    def answer(request: Telegram) -> bytes | None:
+        waiting.append(request.unit)
         assert len(waiting) == 1
 
         def reply() -> None:
             waiting.clear()
-            pdu = far.unit.reply(far.requests[-1].pdu)
-            assert pdu is not None
-            far.send(far.requests[-1], pdu)
+            pdu = far.usual(request)
+            far.send(request, pdu)
 
         asyncio.get_running_loop().call_later(0.003, reply)
         return None
@@ -392,13 +385,11 @@ async def test_next_request_waits_for_the_response_to_a_cancelled_one(
             await far.count(1)
             asking.cancel()
             await asyncio.gather(asking, return_exceptions=True)
-            far.answer = lambda request, far=far: far.unit.reply(request.pdu)
+            far.answer = far.usual
             stopping = asyncio.create_task(backend.exchange(Stop(0.0), timeout=PATIENCE))
             await asyncio.sleep(SHORT)
             assert len(far.requests) == (1 if is_rtu else 2)
-            pdu = far.unit.reply(far.requests[0].pdu)
-            assert pdu is not None
-            far.send(far.requests[0], pdu)
+            far.send(far.requests[0], far.usual(far.requests[0]))
             assert await asyncio.wait_for(stopping, PATIENCE) == ARMED
             await backend.close()
 

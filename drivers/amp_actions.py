@@ -15,7 +15,7 @@ from drivers.guard import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, Gua
 from drivers.operation.keep_alive import keep_alive
 from drivers.operation.watchdog import check_watchdog, shortest_watchdog
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import Achieved, AmplifierState, Status
+from drivers.protocol.messages import AmplifierState, Status
 from drivers.registry import open_backend
 
 _RAMP = 0.05  # s; neither start nor end of a drive clicks
@@ -115,7 +115,16 @@ async def drive(
                 await amplifier.disarm(_RAMP)
         await asyncio.sleep(_RAMP)
         after = await amplifier.status()
-    return {"url": url, **_achieved_rows(achieved), "duration_s": duration, **_status_rows(after)}
+    played = [
+        {
+            "channel": command.channel,
+            "frequency_hz": command.frequency,
+            "level": command.level,
+            "phase_deg": command.phase,
+        }
+        for command in achieved.commands
+    ]
+    return {"url": url, "achieved": played, "duration_s": duration, **_status_rows(after)}
 
 
 async def conform(url: str, checks: tuple[Check, ...]) -> AsyncIterator[CheckResult]:
@@ -162,20 +171,6 @@ def _wire_rows(amplifier: Amplifier) -> dict[str, Any]:
         "wire_round_trip_s": round(round_trip, 6),
         "sets_per_second_max": int(1 / round_trip),
         "watchdog_shortest_s": round(shortest_watchdog(round_trip), 6),
-    }
-
-
-def _achieved_rows(achieved: Achieved) -> dict[str, Any]:
-    return {
-        "achieved": [
-            {
-                "channel": command.channel,
-                "frequency_hz": command.frequency,
-                "level": command.level,
-                "phase_deg": command.phase,
-            }
-            for command in achieved.commands
-        ]
     }
 
 

@@ -1,17 +1,21 @@
 """Base of backends over real wires: counters, time of the last byte, callbacks."""
 
 from collections.abc import Callable
+from typing import TypeVar
 
 from drivers.backend import Backend
+from drivers.errors import LinkError
 from drivers.protocol.messages import AmplifierEvent
 from drivers.statistics import WireCounters
+
+_LineT = TypeVar("_LineT")
 
 
 class WireBackend(Backend):
     """A backend with counters and callbacks.
 
-    Subclasses count in `_counters`, set `_last_sent` when a request has gone out, and call
-    `_on_event` and `_on_loss`, which have no effect before `listen`.
+    Subclasses count in `_counters`, set `_last_sent` when a request has gone out, `_loss` when the
+    wire is lost, and call `_on_event` and `_on_loss`, which have no effect before `listen`.
     """
 
     def __init__(self) -> None:
@@ -19,6 +23,7 @@ class WireBackend(Backend):
         self._last_sent = 0.0
         self._on_event: Callable[[AmplifierEvent], None] = _ignore
         self._on_loss: Callable[[str], None] = _ignore
+        self._loss: str | None = None  # until reopened, even if others have joined the line again
 
     @property
     def counters(self) -> WireCounters:
@@ -35,6 +40,12 @@ class WireBackend(Backend):
     ) -> None:
         """See `Backend.listen`."""
         self._on_event, self._on_loss = on_event, on_loss
+
+    def _require(self, line: _LineT | None, place: str) -> _LineT:
+        """Return the open line; LinkError if it is not open, or lost."""
+        if line is None or self._loss is not None:
+            raise LinkError(self._loss or f"{place} is not open; open the amplifier first")
+        return line
 
 
 def _ignore(_: object) -> None:

@@ -76,7 +76,6 @@ class CanBackend(WireBackend):
         self._pending = PendingRequests()
         self._staged: Achieved | None = None  # as requested
         self._channels = PROTOCOL.quantities.channel_count.maximum
-        self._loss: str | None = None
         self._is_listening = False
 
     @property
@@ -268,9 +267,7 @@ class CanBackend(WireBackend):
         self._pending.fail(self._loss)
 
     def _opened(self) -> _Joined:
-        if self._joined is None or self._loss is not None:
-            raise LinkError(self._loss or f"{self._url.bus} is not open; open the amplifier first")
-        return self._joined
+        return self._require(self._joined, str(self._url.bus))
 
 
 def _in_order_of(wanted: Achieved, achieved: Achieved) -> Achieved:

@@ -67,7 +67,6 @@ class ModbusBackend(WireBackend):
         self._can_read_back = True
         self._channels = exchanges.CHANNELS_MAX
         self._last_state: tuple[AmplifierState, Fault] | None = None
-        self._loss: str | None = None  # until reopened, even if others have joined the line again
         self._is_asking = False
 
     @property
@@ -243,11 +242,7 @@ class ModbusBackend(WireBackend):
             self._on_event(AmplifierEvent(*state))
 
     def _opened(self) -> ModbusLine:
-        if self._line is None or self._loss is not None:
-            raise LinkError(
-                self._loss or f"{self._url.place} is not open; open the amplifier first"
-            )
-        return self._line
+        return self._require(self._line, self._url.place)
 
     def _lost(self, what: str) -> None:
         self._loss = what

@@ -45,8 +45,6 @@ class SerialBackend(WireBackend):
         self._sequence = number_below(1 << 16)
         self._last_reply: Frame | None = None  # the reply to the last request, if received
         self._has_duplicate_responder = False  # a second, different reply
-        self._why_closed = f"{self._url.port} is not open; open the amplifier first"
-        self._loss: str | None = None  # until reopened, even if others have joined the line again
 
     @property
     def counters(self) -> WireCounters:
@@ -97,8 +95,7 @@ class SerialBackend(WireBackend):
         if line is None:
             return
         self._counters.crc_errors = line.crc_errors
-        self._why_closed = f"{self._url.port} was closed"
-        self._fail(LinkError(self._why_closed))
+        self._fail(LinkError(f"{self._url.port} was closed"))
         line.listen(self._url.address, None)
         await line.leave(self._url.address)
 
@@ -179,9 +176,7 @@ class SerialBackend(WireBackend):
         return encode_request(request, address=address, sequence=self._sequence)
 
     def _opened(self) -> SerialLine:
-        if self._line is None or self._loss is not None:
-            raise LinkError(self._loss or self._why_closed)
-        return self._line
+        return self._require(self._line, self._url.port)
 
     def _received(self, frame: Frame) -> None:
         self._counters.frames_in += 1

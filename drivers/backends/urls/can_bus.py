@@ -1,9 +1,9 @@
 """CAN amplifier URLs, such as can+socketcan://can0#NODE, with the node after the hash sign."""
 
 from dataclasses import dataclass
-from urllib.parse import unquote, urlsplit
+from urllib.parse import unquote
 
-from drivers.backends.urls.options import device_of, options_of, whole_number
+from drivers.backends.urls.options import device_of, options_of, split_url, whole_number
 from drivers.codec.can_bus.frame import CANOPEN
 from drivers.errors import CommandError
 
@@ -51,11 +51,9 @@ class CanUrl:
     @classmethod
     def parse(cls, url: str) -> "CanUrl":
         """Parse a URL; CommandError names the invalid part."""
-        try:
-            parts = urlsplit(url)
-            port = parts.port if parts.scheme == "can+socketcand" else None
-        except ValueError as problem:
-            raise CommandError(f"{url!r} must be a CAN URL: {problem}; use {_FORMS}") from None
+        is_server = url.startswith("can+socketcand:")
+        parts = split_url(url, kind="a CAN", forms=_FORMS, has_port=is_server)
+        port = parts.port if is_server else None
         options = options_of(parts.query, known=_OPTIONS, url=url, kind="a CAN")
         interface, host = parts.scheme.removeprefix("can+"), ""
         match interface:

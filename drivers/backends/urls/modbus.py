@@ -1,9 +1,9 @@
 """Modbus amplifier URLs: modbus+tcp://HOST:PORT/UNIT and modbus+rtu:///dev/ttyS1?baud=115200#UNIT."""
 
 from dataclasses import dataclass, replace
-from urllib.parse import SplitResult, unquote, urlsplit
+from urllib.parse import SplitResult, unquote
 
-from drivers.backends.urls.options import device_of, options_of, whole_number
+from drivers.backends.urls.options import device_of, options_of, split_url, whole_number
 from drivers.errors import CommandError
 from drivers.protocol.definition import PROTOCOL
 
@@ -50,13 +50,7 @@ class ModbusUrl:
     @classmethod
     def parse(cls, url: str) -> "ModbusUrl":
         """Parse a URL; CommandError names the invalid part."""
-        try:
-            parts = urlsplit(url)
-            _ = parts.port
-        except ValueError as problem:
-            raise CommandError(
-                f"{url!r} must be a Modbus URL: {problem}; use {_TCP_FORM}"
-            ) from None
+        parts = split_url(url, kind="a Modbus", forms=_TCP_FORM)
         if parts.scheme == "modbus+tcp":
             return _tcp(parts, url)
         if parts.scheme == "modbus+rtu":

@@ -2,11 +2,24 @@
 
 import re
 from collections.abc import Collection
-from urllib.parse import parse_qsl
+from urllib.parse import SplitResult, parse_qsl, urlsplit
 
 from drivers.errors import CommandError
 
 _DIGITS_MAX = 9  # more are out of every range, and int() refuses thousands of them
+
+
+def split_url(url: str, *, kind: str, forms: str, has_port: bool = True) -> SplitResult:
+    """Split a URL; CommandError for an invalid one or, if it may have a port, an invalid port.
+
+    kind: of the URL, with its article; forms: valid ones, for the message.
+    """
+    try:
+        parts = urlsplit(url)
+        _ = has_port and parts.port
+    except ValueError as problem:
+        raise CommandError(f"{url!r} must be {kind} URL: {problem}; use {forms}") from None
+    return parts
 
 
 def options_of(query: str, *, known: Collection[str], url: str, kind: str) -> dict[str, str]:

@@ -7,9 +7,9 @@ hwgrep://0403:6001                              the port whose description match
 """
 
 from dataclasses import dataclass
-from urllib.parse import unquote, urlsplit
+from urllib.parse import unquote
 
-from drivers.backends.urls.options import device_of, options_of, whole_number
+from drivers.backends.urls.options import device_of, options_of, split_url, whole_number
 from drivers.errors import CommandError
 from drivers.protocol.definition import PROTOCOL
 
@@ -33,11 +33,8 @@ class SerialUrl:
     @classmethod
     def parse(cls, url: str) -> "SerialUrl":
         """Parse a URL; CommandError names the invalid part."""
-        try:
-            parts = urlsplit(url)
-            number = None if parts.scheme == "hwgrep" else parts.port
-        except ValueError as problem:
-            raise CommandError(f"{url!r} must be a serial URL: {problem}; use {_FORM}") from None
+        is_pattern = url.startswith("hwgrep:")
+        parts = split_url(url, kind="a serial", forms=_FORM, has_port=not is_pattern)
         if parts.fragment:
             raise CommandError(
                 f"{url!r}: a serial URL must not contain #; write ?address={parts.fragment} for "
@@ -45,13 +42,13 @@ class SerialUrl:
             )
         options = options_of(parts.query, known=("baud", "address"), url=url, kind="a serial")
         path = unquote(parts.path)
-        if parts.scheme == "hwgrep":
+        if is_pattern:
             pattern = unquote(parts.netloc) + path
             if not pattern:
                 raise CommandError(f"{url!r} must name a pattern; use hwgrep://VENDOR:PRODUCT")
             port = f"hwgrep://{pattern}"
         elif parts.netloc:
-            if parts.hostname is None or number is None or path.strip("/"):
+            if parts.hostname is None or parts.port is None or path.strip("/"):
                 raise CommandError(f"{url!r} must name a host and port; use {_FORM}")
             kind = "rfc2217" if parts.scheme == "rfc2217" else "socket"
             port = f"{kind}://{parts.netloc}"

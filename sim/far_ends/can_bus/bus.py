@@ -54,7 +54,6 @@ class Stub:
     ) -> None:
         self._bus = bus
         self._hears = receive
-        self.damaged = 0
         # Eight bytes beside the data, about the overhead of a frame with stuffing and gap.
         self._line = TwoWayLine(
             to_amplifier=self._arrive,
@@ -91,7 +90,6 @@ class Stub:
     def _checked(self, frame_bytes: bytes) -> CanFrame | None:
         body, check = frame_bytes[:-4], frame_bytes[-4:]
         if len(body) < _HEAD.size or zlib.crc32(body).to_bytes(4, "little") != check:
-            self.damaged += 1
             return None
         (head,) = _HEAD.unpack_from(body)
         return CanFrame(head & ~_FD, body[_HEAD.size :], fd=bool(head & _FD))

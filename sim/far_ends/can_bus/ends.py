@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 
 from drivers.protocol.definition import PROTOCOL
@@ -28,9 +28,8 @@ async def nodes_on(
         numbers = {}
         number = 1
         for device in devices:
-            node = _join(bus, device, number, bitrate=bitrate, stack=stack)
             numbers[device.name] = number
-            node.start()
+            stack.enter_context(_node_on(bus, device, number, bitrate))
             number += -(-device.capabilities.channels // _PER_NODE)
         yield numbers
 
@@ -82,16 +81,15 @@ async def slcan(
         }
 
 
-def _join(
-    bus: CanBus,
-    device: SimulatedDevice,
-    number: int,
-    *,
-    bitrate: int | None,
-    stack: contextlib.ExitStack,
-) -> CanNode:
+@contextlib.contextmanager
+def _node_on(
+    bus: CanBus, device: SimulatedDevice, number: int, bitrate: int | None
+) -> Iterator[None]:
     stub = Stub(bus, lambda frame: node.receive(frame), faults=device.faults, bitrate=bitrate)
     node = CanNode(device, number, send=stub.send)
-    stack.callback(stub.close)
-    stack.callback(node.close)
-    return node
+    node.start()
+    try:
+        yield
+    finally:
+        node.close()
+        stub.close()

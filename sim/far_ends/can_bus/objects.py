@@ -6,13 +6,14 @@ Indices and ranges are those of protocol.yaml; the encoding shares no code with 
 import struct
 import zlib
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
+from drivers.command import Envelope, Knot
 from drivers.protocol.definition import PROTOCOL, Quantity
-from drivers.protocol.messages import FaultList, GetFaults, LoadEnvelope, Nak
+from drivers.protocol.messages import FaultList, GetFaults, LoadEnvelope, Nak, NakCode
 from sim.bench.simulated_device import SimulatedDevice
-from sim.far_ends.can_bus.domain_objects import ABORTS, envelope_of, faults_domain
 from sim.far_ends.can_bus.sdo import (
     BAD_LENGTH,
     NO_OBJECT,
@@ -21,18 +22,18 @@ from sim.far_ends.can_bus.sdo import (
     WRITE_ONLY,
     SdoAbort,
 )
+from sim.far_ends.can_bus.set_buffer import NO_CHANNEL
 
 CANOPEN: Mapping[str, Any] = PROTOCOL.canopen
 IDS: Mapping[str, int] = CANOPEN["cob_ids"]
 _Q = PROTOCOL.quantities
 _INDEX = {name: declared["index"] for name, declared in CANOPEN["objects"].items()}
+_ABORTS = {NakCode[name]: code for name, code in CANOPEN["aborts"].items()}
 _WIDTH = {"u8": "<B", "u16": "<H", "u32": "<L", "i16": "<h"}
 _PDO_SYNCHRONOUS, _PDO_ASYNCHRONOUS = 0, 255
 _RPDO, _RPDO_MAP, _TPDO, _TPDO_MAP = 0x1400, 0x1600, 0x1800, 0x1A00
 _REQUEST_PDO, _SLOTS_PDO = 16, 17  # RPDO 17, 18, ..., for any number of channels
-
-Read = Callable[[], bytes]
-Write = Callable[[bytes], None]
+_SLOTS = 63
 
 
 def channel_ids(node: int, channels: int) -> dict[int, int]:
@@ -65,9 +66,15 @@ class ObjectDictionary:
         self.achieved = b""
         self.blocks: dict[int, bytes] = {}  # last data by PDO identifier
         self.reset()
-        self._reads: dict[tuple[int, int], Read] = {}
-        self._writes: dict[tuple[int, int], Write] = {}
-        self._fill()
+        self._reads: dict[tuple[int, int], Callable[[], bytes]] = {}
+        self._writes: dict[tuple[int, int], Callable[[bytes], None]] = {}
+        self._communication()
+        self._identity()
+        self._status()
+        self._pdos()
+        self._reads[_INDEX["envelope"], 0] = lambda: bytes([_SLOTS])
+        for slot in range(1, _SLOTS + 1):
+            self._writes[_INDEX["envelope"], slot] = partial(self._load, slot)
 
     def reset(self) -> None:
         """Reset the communication objects."""
@@ -79,43 +86,30 @@ class ObjectDictionary:
         """Read an object; raises SdoAbort."""
         found = self._reads.get((index, subindex))
         if found is None:
-            raise SdoAbort(self._missing(index, subindex, elsewhere=self._writes, code=WRITE_ONLY))
+            is_other = (index, subindex) in self._writes
+            raise SdoAbort(WRITE_ONLY if is_other else self._missing(index))
         return found()
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
         """Write an object; raises SdoAbort."""
         found = self._writes.get((index, subindex))
         if found is None:
-            raise SdoAbort(self._missing(index, subindex, elsewhere=self._reads, code=READ_ONLY))
+            is_other = (index, subindex) in self._reads
+            raise SdoAbort(READ_ONLY if is_other else self._missing(index))
         found(data)
 
-    def _missing(
-        self,
-        index: int,
-        subindex: int,
-        *,
-        elsewhere: Mapping[tuple[int, int], object],
-        code: int,
-    ) -> int:
-        if (index, subindex) in elsewhere:
-            return code
+    def _missing(self, index: int) -> int:
         known = any(index == other for other, _ in (*self._reads, *self._writes))
         return NO_SUBINDEX if known else NO_OBJECT
 
-    def _fill(self) -> None:
-        self._communication()
-        self._identity()
-        self._status()
-        self._pdos()
-        for slot in range(1, 64):
-            self._writes[_INDEX["envelope"], slot] = partial(self._load, slot)
-        self._reads[_INDEX["envelope"], 0] = lambda: b"\x3f"
-
     def _communication(self) -> None:
-        self._constant("device_type", 0, _pack("u32", CANOPEN["device_type"]))
-        self._reads[_INDEX["error_register"], 0] = self._error_register
-        self._constant("sync_cob_id", 0, _pack("u32", IDS["sync"]))
-        self._constant("emergency_cob_id", 0, _pack("u32", IDS["emergency"] + self._node))
+        self._constant(_INDEX["device_type"], 0, _pack("u32", CANOPEN["device_type"]))
+        self._reads[_INDEX["error_register"], 0] = lambda: bytes(
+            [CANOPEN["emergencies"][self._device.status().fault.name]["error_register"]]
+        )
+        self._constant(_INDEX["sync_cob_id"], 0, _pack("u32", IDS["sync"]))
+        emergency = IDS["emergency"] + self._node
+        self._constant(_INDEX["emergency_cob_id"], 0, _pack("u32", emergency))
         consumer, producer = _INDEX["heartbeat_consumer"], _INDEX["heartbeat_producer"]
         self._count(consumer, 1)
         self._reads[consumer, 1] = lambda: _pack("u32", self.host << 16 | self.watchdog)
@@ -124,20 +118,17 @@ class ObjectDictionary:
         self._writes[producer, 0] = self._set_producer
 
     def _identity(self) -> None:
+        identity = self._device.identity
         numbers = [CANOPEN["vendor_id"], CANOPEN["product_code"], CANOPEN["revision"]]
-        self._record("identity", [_pack("u32", value) for value in numbers])
-        self._count(_INDEX["identity"], 4)
-        self._reads[_INDEX["identity"], 4] = self._serial_number
-        texts = ("vendor", "product", "serial_number", "firmware")
-        self._count(_INDEX["texts"], len(texts))
-        for subindex, text in enumerate(texts, start=1):
-            self._reads[_INDEX["texts"], subindex] = partial(self._text, text)
-        able = self._device.capabilities
+        numbers.append(zlib.crc32(identity.serial_number.encode()))
+        self._record(_INDEX["identity"], [_pack("u32", value) for value in numbers])
+        texts = (identity.vendor, identity.product, identity.serial_number, identity.firmware)
+        self._record(_INDEX["texts"], [text.encode() for text in texts])
+        values = asdict(self._device.capabilities) | {"protocol_version": identity.protocol_version}
         kinds = CANOPEN["objects"]["capabilities"]["types"]
-        values = {**_fields(able), "protocol_version": self._device.identity.protocol_version}
         self._record(
-            "capabilities",
-            [_scaled(_quantity(kind), values[name]) for name, kind in kinds.items()],
+            _INDEX["capabilities"],
+            [_scaled(getattr(_Q, kind), values[name]) for name, kind in kinds.items()],
         )
 
     def _status(self) -> None:
@@ -153,70 +144,60 @@ class ObjectDictionary:
         levels = _INDEX["channel_levels"]
         self._count(levels, self._channels)
         for channel in range(self._channels):
-            self._reads[levels, channel + 1] = partial(self._level, channel)
+            self._reads[levels, channel + 1] = partial(
+                lambda channel: _scaled(_Q.level, status().levels[channel]), channel
+            )
         self._reads[_INDEX["achieved"], 0] = lambda: self.achieved
         self._reads[_INDEX["faults"], 0] = self._faults
 
     def _pdos(self) -> None:
         """The fixed PDOs, and the objects that they map."""
-        command, order, slots = _INDEX["command"], _INDEX["order"], _INDEX["slots"]
+        command, request, slots = _INDEX["command"], _INDEX["order"], _INDEX["slots"]
         groups = -(-self._channels // 4)
         self._count(command, self._channels)
         self._count(slots, groups)
         for cob_id, channel in channel_ids(self._node, self._channels).items():
-            self._received_pdo(channel, cob_id, command, channel + 1)
-        self._received_pdo(_REQUEST_PDO, IDS["order"] + self._node, order, 0)
+            self._received_pdo(channel, cob_id, command, channel + 1, kind=_PDO_SYNCHRONOUS)
+        self._received_pdo(_REQUEST_PDO, IDS["order"] + self._node, request, 0)
         for group in range(groups):
             self._received_pdo(_SLOTS_PDO + group, IDS["slots"] + self._node, slots, group + 1)
         sent = [("answer", 0), ("condition", 0), *(("levels", 1 + n) for n in range(groups))]
         self._count(_INDEX["levels"], groups)
         sent_by = sent_ids(self._node, self._channels)
         for number, (cob_id, (name, subindex)) in enumerate(zip(sent_by, sent, strict=True)):
-            self._reads[_INDEX[name], subindex] = partial(self._block, cob_id)
-            self._pdo(
-                _TPDO + number,
-                _TPDO_MAP + number,
-                cob_id,
-                _PDO_ASYNCHRONOUS,
-                _INDEX[name],
-                subindex,
-            )
+            self._pdo(_TPDO + number, _TPDO_MAP + number, cob_id, _INDEX[name], subindex)
 
-    def _received_pdo(self, number: int, cob_id: int, index: int, subindex: int) -> None:
-        is_command = index == _INDEX["command"]
-        kind = _PDO_SYNCHRONOUS if is_command else _PDO_ASYNCHRONOUS
-        self._pdo(_RPDO + number, _RPDO_MAP + number, cob_id, kind, index, subindex)
-        self._writes[index, subindex] = lambda data: self._write_pdo(cob_id, data)
-        self._reads[index, subindex] = partial(self._block, cob_id)
+    def _received_pdo(
+        self,
+        number: int,
+        cob_id: int,
+        index: int,
+        subindex: int,
+        *,
+        kind: int = _PDO_ASYNCHRONOUS,
+    ) -> None:
+        self._pdo(_RPDO + number, _RPDO_MAP + number, cob_id, index, subindex, kind=kind)
+        self._writes[index, subindex] = partial(self._write_pdo, cob_id)
 
     def _pdo(
-        self, parameter: int, mapping: int, cob_id: int, kind: int, index: int, subindex: int
+        self,
+        parameter: int,
+        mapping: int,
+        cob_id: int,
+        index: int,
+        subindex: int,
+        *,
+        kind: int = _PDO_ASYNCHRONOUS,
     ) -> None:
-        self._count(parameter, 2)
-        self._reads[parameter, 1] = lambda: _pack("u32", cob_id)
-        self._reads[parameter, 2] = lambda: bytes([kind])
-        self._count(mapping, 1)
-        self._reads[mapping, 1] = lambda: _pack("u32", index << 16 | subindex << 8 | 64)
+        self._record(parameter, [_pack("u32", cob_id), bytes([kind])])
+        self._record(mapping, [_pack("u32", index << 16 | subindex << 8 | 64)])
+        self._reads[index, subindex] = lambda: self.blocks.get(cob_id, bytes(8))
 
     def _write_pdo(self, cob_id: int, data: bytes) -> None:
         if len(data) != 8:
             raise SdoAbort(BAD_LENGTH)
         self.blocks[cob_id] = data
         self._pdo_written(cob_id, data)
-
-    def _serial_number(self) -> bytes:
-        """The CRC-32 of its text."""
-        return _pack("u32", zlib.crc32(self._device.identity.serial_number.encode()))
-
-    def _text(self, name: str) -> bytes:
-        text: str = getattr(self._device.identity, name)
-        return text.encode()
-
-    def _block(self, cob_id: int) -> bytes:
-        return self.blocks.get(cob_id, bytes(8))
-
-    def _level(self, channel: int) -> bytes:
-        return _scaled(_Q.level, self._device.status().levels[channel])
 
     def _set_consumer(self, data: bytes) -> None:
         value = _unpack("u32", data)
@@ -225,38 +206,47 @@ class ObjectDictionary:
     def _set_producer(self, data: bytes) -> None:
         self.heartbeat = _unpack("u16", data)
 
-    def _error_register(self) -> bytes:
-        fault = self._device.status().fault
-        return bytes([CANOPEN["emergencies"][fault.name]["error_register"]])
-
     def _faults(self) -> bytes:
         reply = self._device.exchange(GetFaults())
-        return faults_domain(reply.faults if isinstance(reply, FaultList) else ())
+        return b"".join(
+            struct.pack(
+                "<BBL",
+                record.fault,
+                NO_CHANNEL if record.channel is None else record.channel,
+                min(round(record.age * 1000), _Q.age.maximum),
+            )
+            for record in (reply.faults if isinstance(reply, FaultList) else ())
+        )
 
     def _load(self, slot: int, data: bytes) -> None:
-        reply = self._device.exchange(LoadEnvelope(envelope_of(slot, data)))
+        reply = self._device.exchange(LoadEnvelope(_envelope_of(slot, data)))
         if isinstance(reply, Nak):
-            raise SdoAbort(ABORTS[reply.code])
+            raise SdoAbort(_ABORTS[reply.code])
 
-    def _constant(self, name: str, subindex: int, value: bytes) -> None:
-        self._reads[_INDEX[name], subindex] = lambda: value
-
-    def _record(self, name: str, values: list[bytes]) -> None:
-        self._count(_INDEX[name], len(values))
+    def _record(self, index: int, values: list[bytes]) -> None:
+        self._count(index, len(values))
         for subindex, value in enumerate(values, start=1):
-            self._constant(name, subindex, value)
+            self._constant(index, subindex, value)
 
     def _count(self, index: int, count: int) -> None:
-        self._reads[index, 0] = lambda: bytes([count])
+        self._constant(index, 0, bytes([count]))
+
+    def _constant(self, index: int, subindex: int, value: bytes) -> None:
+        self._reads[index, subindex] = lambda: value
 
 
-def _fields(values: Any) -> dict[str, float]:
-    return {name: getattr(values, name) for name in values.__dataclass_fields__}
-
-
-def _quantity(name: str) -> Quantity:
-    found: Quantity = getattr(_Q, name)
-    return found
+def _envelope_of(slot: int, data: bytes) -> Envelope:
+    """Decode an envelope written to a slot; raises SdoAbort."""
+    if len(data) < 3 or len(data) != 3 + 4 * data[2]:
+        raise SdoAbort(BAD_LENGTH)
+    step, _ = struct.unpack_from("<HB", data)
+    pairs = list(struct.iter_unpack("<Hh", data[3:]))
+    if not _Q.envelope_step.holds(step) or not all(
+        _Q.level.holds(level) and _Q.phase.holds(phase) for level, phase in pairs
+    ):
+        raise SdoAbort(_ABORTS[NakCode.BAD_VALUE])
+    knots = tuple(Knot(level / 10_000, phase / 100) for level, phase in pairs)
+    return Envelope(slot, step / 10_000, knots)
 
 
 def _scaled(quantity: Quantity, value: float) -> bytes:

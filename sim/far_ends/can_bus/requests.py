@@ -27,7 +27,6 @@ from drivers.protocol.messages import (
 )
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.bus import LENGTHS
-from sim.far_ends.can_bus.domain_objects import achieved_domain
 from sim.far_ends.can_bus.objects import IDS, ObjectDictionary, channel_ids, sent_ids
 from sim.far_ends.can_bus.set_buffer import (
     INCOMPLETE_SET,
@@ -38,6 +37,7 @@ from sim.far_ends.can_bus.set_buffer import (
     RefusedRequest,
     RequestFrame,
     SetBuffer,
+    achieved_domain,
     integers_of,
 )
 

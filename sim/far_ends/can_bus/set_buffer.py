@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import NakCode
+from drivers.protocol.messages import Achieved, NakCode
 
 INCOMPLETE_SET = 15  # result code; the others are those of refusals
 NO_CHANNEL = 255
@@ -164,3 +164,21 @@ def integers_of(command: DriveCommand) -> tuple[object, ...]:
         command.ending,
         command.skip_ending,
     )
+
+
+def achieved_domain(achieved: Achieved) -> bytes:
+    """The object `achieved`: the set as played."""
+    data = struct.pack("<HB", achieved.token, len(achieved.commands))
+    for command in achieved.commands:
+        flags = command.keep_phase | command.skip_ending << 1 | command.channel << 4
+        flags |= bool(command.onset or command.ending) << 2
+        data += struct.pack(
+            "<HHhBxBB",
+            _Q.frequency.to_wire(command.frequency),
+            _Q.level.to_wire(command.level),
+            _Q.phase.to_wire(command.phase),
+            flags,
+            command.onset,
+            command.ending,
+        )
+    return data

@@ -50,7 +50,6 @@ class SlcanAdapter:
         self._bus = bus
         self._write = write
         self._listener = self._hear  # one object, by which the bus knows it
-        self.refused = 0
         self.reset()
         bus.join(self._listener)
 
@@ -70,7 +69,7 @@ class SlcanAdapter:
             self._write(self._answer(line.strip(b"\n")))
         if len(self._rest) > _MAX_LENGTH:
             self._rest = b""
-            self._write(self._refuse())
+            self._write(_BELL)
 
     def _answer(self, line: bytes) -> bytes:
         match line:
@@ -94,10 +93,6 @@ class SlcanAdapter:
                 return b"z" + _CR
         if not self._is_open and _SETTING.fullmatch(line):
             return _CR
-        return self._refuse()
-
-    def _refuse(self) -> bytes:
-        self.refused += 1
         return _BELL
 
     def _hear(self, frame: CanFrame) -> None:

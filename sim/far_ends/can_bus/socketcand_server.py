@@ -31,7 +31,6 @@ class SocketcandEnd:
         self._clients: set[_Client] = set()
         self._is_empty = asyncio.Event()
         self._is_empty.set()
-        self.refused = 0
 
     async def open(self) -> None:
         """Listen; raises LinkError where the port is in use."""
@@ -106,7 +105,6 @@ class _Client(asyncio.Protocol):
                 self.element(text[begin + 1 : end].strip())
             text = text[end + 1 :]
         if len(text) > _MAX_LENGTH:
-            self.end.refused += 1
             text = ""
         self.rest = text
 
@@ -130,9 +128,7 @@ class _Client(asyncio.Protocol):
             self.send("< echo >")
         elif name in ("send", "fdsend"):
             frame = _parse(element)
-            if frame is None:
-                self.end.refused += 1  # socketcand sends no error either
-            else:
+            if frame is not None:  # socketcand sends no error either
                 self.bus.send(frame, sender=self.listener)
         else:
             self.send_error("unknown command")
@@ -148,7 +144,6 @@ class _Client(asyncio.Protocol):
 
     def send_error(self, why: str) -> None:
         """Send an error."""
-        self.end.refused += 1
         self.send(f"< error {why} >")
 
     def send(self, text: str) -> None:

@@ -165,6 +165,16 @@ def test_contacts_result_is_independent_of_steps(coarse_rig: Rig, reduced: Reduc
     assert_allclose(cut, whole, rtol=0, atol=1e-10 * np.abs(whole).max())
 
 
+def test_contacts_superpose_drives(coarse_rig: Rig, reduced: ReducedPlate) -> None:
+    """Superposition holds while fingers come and go, since the plate is linear throughout."""
+    together = run(coarse_rig, reduced, BASES, np.array([]))
+    alone = sum(
+        run(coarse_rig, reduced, [b if b is base else None for b in BASES], np.array([]))
+        for base in BASES
+    )
+    assert_allclose(alone, together, rtol=0, atol=1e-10 * np.abs(together).max())
+
+
 def test_contacts_are_solved_once(
     coarse_rig: Rig, reduced: ReducedPlate, monkeypatch: pytest.MonkeyPatch
 ) -> None:

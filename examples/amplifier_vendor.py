@@ -2,11 +2,10 @@
 """
 # An amplifier's side of the wire, byte by byte
 
-For who builds an amplifier. Run it: `python examples/amplifier_vendor.py`, or open it as a notebook
-in VS Code or, with jupytext, in Jupyter. The protocol is told in
-docs/reference/wire-protocol.md; here frames are made by hand and by the project's codec, a
-simulated amplifier answers them on a serial line, and the contract that every amplifier must keep
-is run against it.
+For vendors of amplifiers. Run `python examples/amplifier_vendor.py`, or open it as a notebook in VS
+Code or, with jupytext, in Jupyter. The protocol is described in
+docs/reference/wire-protocol.md. Here frames are made by hand and by the project's codec, a
+simulated amplifier replies to them on a serial line, and the conformance checks are run on it.
 """
 
 # %%
@@ -31,14 +30,14 @@ from drivers.registry import open_backend
 # %% [markdown]
 """
 ## A frame by hand
-first · address · sequence · payload · CRC-32, all little-endian, stuffed by COBS so that no zero is
-in it, between two zeros. A Ping (type 12, version 1, so first = 2C) to address 1 with sequence 7:
+first · address · sequence · payload · CRC-32, little-endian, encoded by COBS so that it contains no
+zero, between two zeros. A Ping (type 12, version 1, so first = 2C) to address 1 with sequence 7:
 """
 
 
 # %%
 def stuffed(data):
-    """COBS: in front of each piece between zeros its length plus one."""
+    """Encode by COBS: before each piece between zeros its length plus one."""
     return b"".join(bytes([len(piece) + 1]) + piece for piece in data.split(b"\0"))
 
 
@@ -51,9 +50,9 @@ print("by codec", by_codec.hex(" ").upper())
 
 # %% [markdown]
 """
-## A far end that answers
-`era sim` puts a simulated amplifier on a pseudo-terminal. To it the frame above is one like any
-other; the reader takes bytes as they come and says what it could not use.
+## A simulated amplifier
+`era sim` runs a simulated amplifier on a pseudo-terminal. The reader takes bytes as they arrive and
+counts what is not a frame.
 """
 
 # %%
@@ -67,13 +66,13 @@ path = url.removeprefix("serial://").partition("?")[0]
 
 
 def exchange(line, frame):
-    """Send the bytes of a request and read the bytes of its answer."""
+    """Send a request and read its reply; return the bytes and the message."""
     line.write(encode_frame(frame))
     reader, raw = FrameReader(), b""
     while True:
         byte = line.read(1)
         if not byte:
-            raise TimeoutError(f"no answer; got {raw.hex(' ')}")
+            raise TimeoutError(f"no reply; got {raw.hex(' ')}")
         raw += byte
         for answer in reader.feed(byte):
             return raw, decode_reply(answer, frame)
@@ -87,15 +86,15 @@ with serial.Serial(path, 921_600, timeout=5) as line:
 
 # %% [markdown]
 """
-## The contract
-The same checks as `era amp conformance URL --write`, over the same line. Those that drive its
-channels arm the amplifier; each begins and ends disarmed. Put your amplifier's URL here.
+## Conformance
+The checks of `era amp conformance URL --write`, over the same line. Checks that drive channels arm
+the amplifier; each starts and ends disarmed. Insert your amplifier's URL here.
 """
 
 
 # %%
 async def conform(url):
-    """What came of every check."""
+    """Run all checks and return their outcomes."""
     amplifier = Amplifier(open_backend(url))
     await amplifier.open()
     try:

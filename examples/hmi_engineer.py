@@ -2,13 +2,13 @@
 """
 # A panel from Python: simulated amplifier, daemon, touches
 
-For who builds a panel. Run it: `python examples/hmi_engineer.py`, or open it as a notebook in VS
-Code or, with jupytext, in Jupyter. It starts what a running panel has, each a process of its own:
+For engineers of touch panels. Run `python examples/hmi_engineer.py`, or open it as a notebook in VS
+Code or, with jupytext, in Jupyter. It starts the processes of a panel:
 
     simulated amplifier, plate (era sim)  <- serial ->  daemon (era daemon)  <- socket ->  here
 
-With a real amplifier and a real panel the first goes, its URL in the rig becomes that of the
-hardware, and the daemon gets a `touch:` in its file. Nothing else changes.
+With real hardware, leave out the first, put the amplifier's URL into the rig, and add `touch:` to
+the daemon's file.
 """
 
 # %%
@@ -28,13 +28,13 @@ import era_haptics as era
 
 target, quiet = (0.08, 0.06), (0.22, 0.16)
 ERA = Path(sys.executable).with_name("era")
-panel = ExitStack()  # what is closed at the end: daemon, then amplifier
+panel = ExitStack()  # closed at the end: daemon, then amplifier
 atexit.register(panel.close)  # also where a cell fails
 folder = Path(panel.enter_context(tempfile.TemporaryDirectory(prefix="era-")))
 
 
 def start(*arguments):
-    """An `era` command that ends with the panel."""
+    """Start an `era` command that ends with the panel."""
     process = subprocess.Popen([ERA, *map(str, arguments)], stdout=subprocess.PIPE, text=True)
 
     def end():
@@ -48,8 +48,8 @@ def start(*arguments):
 # %% [markdown]
 """
 ## The simulated amplifier
-It prints where it is, and serves a control socket on which fingers are put on the plate and asked
-what they felt: one JSON object a line each way.
+It prints its URL and serves a control socket, which places fingers on the plate and returns what
+they felt: one JSON object per line each way.
 """
 
 # %%
@@ -62,7 +62,7 @@ lines = panel.enter_context(control_socket.makefile("rw", encoding="utf-8"))
 
 
 def ask_plate(**question):
-    """One question to the simulated plate, and its answer."""
+    """Send a request to the simulated plate and return its reply."""
     print(json.dumps(question), file=lines, flush=True)
     return json.loads(lines.readline())
 
@@ -72,8 +72,8 @@ ask_plate(op="fingers", fingers={"target": target, "quiet": quiet})
 # %% [markdown]
 """
 ## One amplifier by hand
-Before a daemon takes it over: who it is, and a buzz of a tenth of a second on one ERA. Nothing
-beyond the rig's limits is sent, and it is disarmed when the block ends.
+Before a daemon uses it: its identity, and a buzz of a tenth of a second on one ERA. Commands stay
+within the rig's limits, and the amplifier is disarmed when the block ends.
 """
 
 # %%
@@ -86,7 +86,7 @@ with era.open_amplifier(rig, url=url) as amplifier:
 # %% [markdown]
 """
 ## The daemon
-Its file needs the rig; its table is built once and kept. It starts disarmed.
+Its file names the rig; its table is built once and cached. It starts disarmed.
 """
 
 # %%
@@ -99,7 +99,7 @@ daemon = start("daemon", folder / "daemon.yaml")
 
 
 def connect():
-    """A client, as soon as the daemon serves and is in order; the first start builds its table."""
+    """Connect as soon as the daemon is ready; its first start builds the table."""
     for _ in range(600):
         try:
             client = era.Client.connect(folder / "era.sock", name="example")
@@ -111,20 +111,20 @@ def connect():
                 return client
             client.close()
         time.sleep(0.1)
-    raise TimeoutError("the daemon does not get ready")
+    raise TimeoutError("the daemon is not ready after a minute")
 
 
 # %% [markdown]
 """
 ## Touches
-A finger rests in one place, then another comes down: the newest one feels it, the other must not.
-The daemon forgets fingers that it does not hear of for 150 ms, so frames are repeated.
+A finger rests, then another comes down: the newest one feels the vibration, the other one does not.
+Fingers expire after 150 ms without a frame, so frames are repeated.
 """
 
 
 # %%
 def hold(client, places, seconds):
-    """Fingers at these places for a while."""
+    """Hold fingers at places for some seconds."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         client.touch(places)

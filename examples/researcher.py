@@ -2,10 +2,9 @@
 """
 # A plate, its table, and what fingers feel
 
-For who asks what localized vibration can be. Open it as a notebook in VS Code or, with jupytext, in
-Jupyter, and begin with `%matplotlib inline` to see its pictures; or run it:
-`python examples/researcher.py`. With ERA_PICTURES=FOLDER in the environment the pictures are
-written there; otherwise nothing is.
+For researchers. Open it as a notebook in VS Code or, with jupytext, in Jupyter, and start with
+`%matplotlib inline` to see its pictures, or run it with `python examples/researcher.py`. It writes
+pictures to the folder ERA_PICTURES if that is set.
 
 Places are metres from the corner SW, x along the plate's length, y along its width. A vibration is
 felt from 12 dB SL on, decibels above what a fingertip just detects, and strong at 20.
@@ -24,7 +23,7 @@ pictures = os.environ.get("ERA_PICTURES")
 
 
 def show(figure, name):
-    """Write a picture where that is wanted; a notebook shows what comes back."""
+    """Write a picture if a folder is set; a notebook shows the returned figure."""
     if pictures:
         figure.savefig(Path(pictures) / f"{name}.png", dpi=150)
     return figure
@@ -34,8 +33,8 @@ def show(figure, name):
 """
 ## The plate
 The founding paper's: 12 x 9 inches of aluminium, 1.5 mm thick, on four ERAs under its corners. On
-the paper's own mesh of 12 x 9 elements its Table 2 comes out, digit by digit; `mesh: auto`, which
-the rig asks for, is within a per mille of converged.
+the paper's own mesh of 12 x 9 elements its Table 2 comes out, digit by digit; `mesh: auto`, as
+in the rig, is within 0.1 % of converged.
 """
 
 # %%
@@ -97,8 +96,8 @@ print(f"8 to 16 kN/m: the maximum rises by {rise:.2f}, the maps correlate by {al
 # %% [markdown]
 """
 ## Felt here, not there
-One finger shall feel it at 20 dB SL, the other must not. The table has every ERA's field at every
-frequency, and picks amplitudes and phases for these fingers.
+One finger shall feel 20 dB SL, the other nothing. The table has each ERA's field at each frequency;
+from these it picks amplitudes and phases for the fingers.
 """
 
 # %%
@@ -116,24 +115,23 @@ show(era.draw_pattern(table, pattern, target, quiet=quiet), "pattern")
 # %% [markdown]
 """
 ## In time
-Predictions above are of the frequency domain. Here the same pattern starts from rest on the plate
-in time, and fingertips measure; then the same with shaped onsets, which keep the quiet finger quiet
-from the first millisecond on.
+The predictions above are steady ones. Here the pattern starts from rest on the plate in time, along
+a ramp and with shaped onsets, which keep the quiet finger quiet from the first millisecond on.
 """
 
 # %%
 shaped = era.query(table, target, quiet=quiet, envelopes=True)
 played = {
-    name: (asked, plate.play(asked, target, quiet=quiet))
-    for name, asked in (("ramp", pattern), ("shaped", shaped))
+    name: (each, plate.play(each, target, quiet=quiet))
+    for name, each in (("ramp", pattern), ("shaped", shaped))
 }
 print("              steady / dB      first 100 ms / dB    target / dB SL")
 print("         predicted   felt    predicted   felt     predicted   felt")
-for name, (asked, felt) in played.items():
+for name, (predicted, felt) in played.items():
     print(
-        f"{name:8} {asked.contrast_db:7.1f} {felt.contrast_db:8.1f} "
-        f"{asked.transient_contrast_db:10.1f} {felt.transient_contrast_db:8.1f} "
-        f"{asked.level_db_sl:11.1f} {felt.level_db_sl:8.1f}"
+        f"{name:8} {predicted.contrast_db:7.1f} {felt.contrast_db:8.1f} "
+        f"{predicted.transient_contrast_db:10.1f} {felt.transient_contrast_db:8.1f} "
+        f"{predicted.level_db_sl:11.1f} {felt.level_db_sl:8.1f}"
     )
 show(era.draw_playback(played["ramp"][1]), "ramp")
 
@@ -143,8 +141,8 @@ show(era.draw_playback(played["shaped"][1]), "shaped")
 # %% [markdown]
 """
 ## A small study: how near may the other finger be?
-The other finger goes away from the target along a line, in the paper's mode (`switched`: ERAs on or
-off) and with free amplitudes and phases (`phased`), which any one table answers.
+The other finger moves away from the target along a line, in the paper's mode (`switched`: ERAs on
+or off) and with free amplitudes and phases (`phased`), from one table.
 """
 
 # %%

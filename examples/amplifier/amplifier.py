@@ -1,9 +1,9 @@
-"""An amplifier without its wire: states, watchdog, sets and fades, by the wire protocol's page.
+"""An amplifier without its wire: states, watchdog, sets and fades of the wire protocol.
 
-It imports nothing of era-haptics, and could be rewritten in C. Numbers are the wire's: frequency in
-0.01 Hz, level in 1/10000 of full stroke, phase in 0.01 degrees, times in ms. Envelopes are left
-out. Where `levels` is read, your waveform generator goes: each channel plays level * sin(2 pi
-frequency t + phase) from the commit on.
+It imports nothing of era-haptics, and could be rewritten in C. Units are those of the wire:
+frequency in 0.01 Hz, level in 1/10000 of full stroke, phase in 0.01 degrees, times in ms. Envelopes
+are not supported. A waveform generator reads `levels`: each channel plays
+level * sin(2 pi frequency t + phase) from the commit on.
 """
 
 import math
@@ -15,22 +15,22 @@ NO_FAULT, WATCHDOG = 0, 1
 BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN, NO_ENVELOPE = 3, 4, 5, 6, 9
 
 CHANNELS = 4
-FREQUENCY = (2000, 60000)  # what it can play
-LONGEST_RAMP = 1000
+FREQUENCY = (2000, 60000)  # range
+MAX_RAMP = 1000
 WATCHDOG_RANGE = (100, 2000)
 SHORT_FADE = 5
-REMEMBERED = 16  # tokens that were played, so that no late copy is played again
+REMEMBERED = 16  # tokens played, so that a late copy is not played again
 
 
 class Refused(Exception):
-    """A request that is not carried out: the code of its Nak, and the channel to blame or None."""
+    """A refused request: the code of its Nak, and the channel or None."""
 
     def __init__(self, code, channel=None):
         self.code, self.channel = code, channel
 
 
 class Amplifier:
-    """Requests are its methods; call `live` before each, and now and then in between."""
+    """An amplifier; requests are its methods. Call `update` before each and regularly."""
 
     def __init__(self, clock=lambda: 1000 * time.monotonic()):
         self._clock = clock
@@ -40,40 +40,38 @@ class Amplifier:
         self._ramp, self._begin = 0, clock()
         self._forget()
 
-    # What it does by itself
-
-    def live(self):
-        """Let happen what time has brought: the watchdog, the end of a vibration or of a fade."""
+    def update(self):
+        """Handle expired times: the watchdog, the end of a set or of a fade."""
         if self._ends_at is not None and self._clock() >= self._ends_at:
             self._fade_to([0] * CHANNELS, ramp=self._end_ramp, begin=self._ends_at)
             self._ends_at = None
-        if self.state == ARMED and self._clock() >= self._bites_at:
-            self._fade_to([0] * CHANNELS, ramp=SHORT_FADE, begin=self._bites_at)
+        if self.state == ARMED and self._clock() >= self._expires_at:
+            self._fade_to([0] * CHANNELS, ramp=SHORT_FADE, begin=self._expires_at)
             self._ends_at = self._staged = None
             self.state, self.fault = REACTING, WATCHDOG
-            self._faults.appendleft((WATCHDOG, self._bites_at))
+            self._faults.appendleft((WATCHDOG, self._expires_at))
         if self._is_silent():
             self.state = {SWITCHED_ON: DISARMED, REACTING: FAULT}.get(self.state, self.state)
 
     @property
     def levels(self):
-        """Of each channel at this moment of a fade."""
+        """Current level of each channel."""
         return self._levels_at(self._clock())
 
     @property
     def faults(self):
-        """Each with its age, newest first."""
+        """Faults with their ages, newest first."""
         return [(fault, round(self._clock() - since)) for fault, since in self._faults]
 
     @property
     def high_voltage(self):
-        """Whether it is on."""
+        """Whether the high voltage is on."""
         return self.state in (SWITCHED_ON, ARMED, REACTING) or not self._is_silent()
 
     @property
     def watchdog_left(self):
-        """How long the host may still be silent, 0 while disarmed."""
-        return max(0, round(self._bites_at - self._clock())) if self.state == ARMED else 0
+        """Time until the watchdog expires, 0 while disarmed."""
+        return max(0, round(self._expires_at - self._clock())) if self.state == ARMED else 0
 
     def _levels_at(self, moment):
         share = 1.0
@@ -97,15 +95,13 @@ class Amplifier:
         self.token, self._staged, self._ends_at = 0, None, None
         self._playing, self._played = [], deque(maxlen=REMEMBERED)
 
-    # What it is asked to do
-
     def feed(self):
-        """The host is alive: after every request but those that only look on."""
+        """Restart the watchdog, after every request but those that only read."""
         if self.state == ARMED:
-            self._bites_at = self._clock() + self._watchdog
+            self._expires_at = self._clock() + self._watchdog
 
     def arm(self, watchdog):
-        """High voltage on, every channel enabled at level zero."""
+        """Switch the high voltage on and enable all channels at level zero."""
         if not WATCHDOG_RANGE[0] <= watchdog <= WATCHDOG_RANGE[1]:
             raise Refused(BAD_VALUE)
         if self.state not in (DISARMED, SWITCHED_ON, ARMED):
@@ -115,24 +111,24 @@ class Amplifier:
         self.state, self._watchdog = ARMED, watchdog
 
     def disarm(self, ramp):
-        """Silent, then high voltage off; a latch stays."""
+        """Fade to silence, then switch the high voltage off; a latched state stays."""
         self._silence(ramp)
         if self.state == ARMED:
             self.state = SWITCHED_ON
 
     def stop(self, ramp):
-        """Quick stop, latched."""
+        """Stop quickly and latch."""
         self._silence(ramp)
         if self.state in (DISARMED, SWITCHED_ON, ARMED):
             self.state = STOPPED
 
     def clear(self):
-        """Leave a stop or a fault, once silent."""
+        """Leave a stop or a fault once silent."""
         if self.state == FAULT or (self.state == STOPPED and self._is_silent()):
             self.state, self.fault = DISARMED, NO_FAULT
 
     def stage(self, token, ramp, valid_for, commands):
-        """Keep a set, with (channel, frequency, level, phase) for each command; returns it."""
+        """Hold a set of (channel, frequency, level, phase) until its commit; return it."""
         self._check(token, ramp, valid_for, commands)
         if token == self.token or token in self._played:
             raise Refused(BAD_TOKEN)
@@ -140,7 +136,7 @@ class Amplifier:
         return token, commands
 
     def commit(self, token):
-        """Play what is staged under a token; again the same for one that is playing."""
+        """Play the set staged under a token; repeat the reply for the one playing."""
         self._check_token(token)
         if token != self.token:
             if self._staged is None or token != self._staged[0] or token in self._played:
@@ -150,7 +146,7 @@ class Amplifier:
         return token, self._playing
 
     def apply(self, token, ramp, valid_for, commands):
-        """Stage and commit at once; what is staged under another token stays."""
+        """Stage and commit at once; a set staged under another token stays."""
         self._check(token, ramp, valid_for, commands)
         if token != self.token:
             if token in self._played:
@@ -159,7 +155,7 @@ class Amplifier:
         return token, self._playing
 
     def _play(self, token, ramp, valid_for, commands):
-        levels = [0] * CHANNELS  # a channel that is not named falls silent
+        levels = [0] * CHANNELS  # channels without a command fall silent
         for channel, _, level, _ in commands:
             levels[channel] = level
         self._fade_to(levels, ramp=ramp)
@@ -169,7 +165,7 @@ class Amplifier:
         self._played.append(token)
 
     def _silence(self, ramp):
-        self._fade_to([0] * CHANNELS, ramp=min(max(ramp, 0), LONGEST_RAMP))
+        self._fade_to([0] * CHANNELS, ramp=min(max(ramp, 0), MAX_RAMP))
         self._staged, self._ends_at = None, None
 
     def _check_token(self, token):
@@ -179,9 +175,9 @@ class Amplifier:
             raise Refused(BAD_TOKEN)
 
     def _check(self, token, ramp, valid_for, commands):
-        """The whole set or nothing of it."""
+        """Check a whole set; raise Refused."""
         self._check_token(token)
-        if not (0 <= ramp <= LONGEST_RAMP and 0 <= valid_for <= 60000):
+        if not (0 <= ramp <= MAX_RAMP and 0 <= valid_for <= 60000):
             raise Refused(BAD_VALUE)
         seen = set()
         for channel, frequency, level, phase in commands:

@@ -1,8 +1,8 @@
-"""The amplifier of `amplifier.py` on a serial line, by the wire protocol's page and nothing else.
+"""The amplifier of `amplifier.py` on a serial line, following the wire protocol alone.
 
     python on_a_serial_line.py
 
-The line is a pseudo-terminal, whose URL is printed first.
+The line is a pseudo-terminal; its URL is printed first.
 """
 
 import contextlib
@@ -16,22 +16,22 @@ import amplifier as parts
 from amplifier import Amplifier, Refused
 
 ADDRESS = 1
-LONGEST = 249  # bytes between two zeros
+MAX_FRAME = 249  # bytes between two zeros
 IDENTITY = ("Example", "Bench amplifier", "EX-1", "0.1")
 HELLO, GET_CAPS, ARM, DISARM, STAGE, COMMIT, APPLY, STOP = range(1, 9)
 GET_STATUS, GET_FAULTS, CLEAR, PING, LOAD_ENVELOPE, NAK = 9, 10, 11, 12, 13, 31
-LOOKING_ON = (HELLO, GET_CAPS, GET_STATUS, GET_FAULTS)
+READ_ONLY = (HELLO, GET_CAPS, GET_STATUS, GET_FAULTS)
 UNKNOWN_TYPE, BAD_LENGTH = 1, 2
 REPLY, VERSION_1 = 0x80, 0x20
 
 
 def stuff(data):
-    """COBS: in front of each piece between zeros its length plus one."""
+    """Encode by COBS: before each piece between zeros its length plus one."""
     return b"".join(bytes([len(piece) + 1]) + piece for piece in data.split(b"\0"))
 
 
 def unstuff(data):
-    """The reverse; None for what cannot be."""
+    """Decode COBS; None for invalid data."""
     pieces = []
     while data:
         length, data = data[0], data[1:]
@@ -43,23 +43,23 @@ def unstuff(data):
 
 
 def framed(kind, address, sequence, payload):
-    """A frame with its delimiters."""
+    """Make a frame with its delimiters."""
     body = struct.pack("<BBH", VERSION_1 | kind, address, sequence) + payload
     return b"\0" + stuff(body + struct.pack("<I", zlib.crc32(body))) + b"\0"
 
 
 class SerialEnd:
-    """Bytes in, bytes out."""
+    """The amplifier's end of the line: bytes in, bytes out."""
 
     def __init__(self):
         self.amplifier = Amplifier()
         self._waiting = b""
 
     def take(self, data):
-        """What is to be answered to bytes as they come."""
+        """Process received bytes and return the replies."""
         *frames, self._waiting = (self._waiting + data).split(b"\0")
-        self._waiting = self._waiting[: LONGEST + 1]  # whatever else comes before the next zero
-        return b"".join(self._frame(frame) for frame in frames if 0 < len(frame) <= LONGEST)
+        self._waiting = self._waiting[: MAX_FRAME + 1]  # the rest cannot be a frame
+        return b"".join(self._frame(frame) for frame in frames if 0 < len(frame) <= MAX_FRAME)
 
     def _frame(self, stuffed):
         frame = unstuff(stuffed)
@@ -72,7 +72,7 @@ class SerialEnd:
         kind, payload = first & 0x1F, body[4:]
         if address == 0 and kind not in (COMMIT, STOP):
             return b""
-        self.amplifier.live()
+        self.amplifier.update()
         try:
             reply_kind, reply = REPLY | kind, self._answer(kind, payload)
         except Refused as refused:
@@ -82,32 +82,32 @@ class SerialEnd:
 
     def _answer(self, kind, payload):
         """The payload of the reply; raises Refused."""
-        if kind in LOOKING_ON:
-            return self._tell(kind, payload)
+        if kind in READ_ONLY:
+            return self._read(kind, payload)
         done = self._carry_out(kind, payload)
         self.amplifier.feed()
         return self._status() if done is None else achieved(*done)
 
     def _carry_out(self, kind, payload):
-        """What comes of a request that is no mere look: token and commands, of one about sets."""
+        """Carry out a request; return token and commands of one about sets."""
         a = self.amplifier
         if kind in (STAGE, APPLY):
-            asked = read_set(payload)
-            return a.stage(*asked) if kind == STAGE else a.apply(*asked)
+            command_set = read_set(payload)
+            return a.stage(*command_set) if kind == STAGE else a.apply(*command_set)
         if kind in (ARM, DISARM, COMMIT, STOP):
             if len(payload) != 2:
                 raise Refused(BAD_LENGTH)
             number = int.from_bytes(payload, "little")
             return {ARM: a.arm, DISARM: a.disarm, COMMIT: a.commit, STOP: a.stop}[kind](number)
         if kind == LOAD_ENVELOPE:
-            raise Refused(parts.BAD_VALUE)  # it has no slots
+            raise Refused(parts.BAD_VALUE)  # there are no slots
         if kind not in (CLEAR, PING):
             raise Refused(UNKNOWN_TYPE)
         if payload:
             raise Refused(BAD_LENGTH)
         return a.clear() if kind == CLEAR else None
 
-    def _tell(self, kind, payload):
+    def _read(self, kind, payload):
         a = self.amplifier
         if payload:
             raise Refused(BAD_LENGTH)
@@ -115,7 +115,7 @@ class SerialEnd:
             texts = (text.encode() for text in IDENTITY)
             return b"\1" + b"".join(bytes([len(text)]) + text for text in texts)
         if kind == GET_CAPS:
-            steps = (1, 10000, 1, 1, parts.LONGEST_RAMP, *parts.WATCHDOG_RANGE)
+            steps = (1, 10000, 1, 1, parts.MAX_RAMP, *parts.WATCHDOG_RANGE)
             no_envelopes, no_events = bytes(6), bytes(1)
             numbers = struct.pack("<B9H", parts.CHANNELS, *parts.FREQUENCY, *steps)
             return numbers + no_envelopes + no_events
@@ -126,7 +126,7 @@ class SerialEnd:
 
     def _status(self):
         a = self.amplifier
-        a.live()
+        a.update()
         head = struct.pack("<BBHB", a.state, a.fault, a.token, a.high_voltage)
         rest = struct.pack("<hHHB", 250, a.watchdog_left, 0, parts.CHANNELS)
         return head + rest + struct.pack(f"<{parts.CHANNELS}H", *a.levels)
@@ -173,7 +173,7 @@ def main():
         ready, _, _ = select.select([line], [], [], 0.005)
         if ready:
             os.write(line, end.take(os.read(line, 4096)))
-        end.amplifier.live()
+        end.amplifier.update()
 
 
 if __name__ == "__main__":

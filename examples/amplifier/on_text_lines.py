@@ -19,30 +19,30 @@ HELLO = {"vendor": "Example", "product": "Lines", "serial_number": "LN-1", "firm
 CAPABILITIES = {
     "channels": parts.CHANNELS,
     "frequency": parts.FREQUENCY,
-    "longest_ramp": parts.LONGEST_RAMP,
+    "longest_ramp": parts.MAX_RAMP,
     "watchdog": parts.WATCHDOG_RANGE,
 }
 
 
 def answer(amplifier, line):
-    """The line that answers a line; None for one that is no request."""
+    """Reply to a line; None for one that is not a request."""
     try:
         request = json.loads(line)
         number, ask = request.pop("id"), request.pop("ask")
     except (ValueError, KeyError, AttributeError, RecursionError):
         return None
-    amplifier.live()
+    amplifier.update()
     try:
-        told = carry_out(amplifier, ask, request)
+        reply = carry_out(amplifier, ask, request)
     except Refused as refused:
-        told = {"refused": refused.code, "channel": refused.channel}
-    except (TypeError, ValueError):  # values that are missing, too many, or no numbers
-        told = {"refused": parts.BAD_VALUE, "channel": None}
-    return json.dumps({"id": number, **told})
+        reply = {"refused": refused.code, "channel": refused.channel}
+    except (TypeError, ValueError):  # missing, too many, or not numbers
+        reply = {"refused": parts.BAD_VALUE, "channel": None}
+    return json.dumps({"id": number, **reply})
 
 
 def carry_out(amplifier, ask, values):
-    """What comes of a request; raises Refused."""
+    """Carry out a request and return the reply; raises Refused."""
     if ask == "hello":
         return HELLO
     if ask == "capabilities":
@@ -59,7 +59,7 @@ def carry_out(amplifier, ask, values):
         amplifier.feed()
     if done is not None:
         return {"token": done[0], "commands": done[1]}
-    amplifier.live()
+    amplifier.update()
     return {
         "state": amplifier.state,
         "fault": amplifier.fault,
@@ -71,28 +71,28 @@ def carry_out(amplifier, ask, values):
 
 
 def serve(amplifier, connection):
-    """One host, until it is gone; the amplifier lives on meanwhile."""
-    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # a reply waits for nothing
+    """Serve one host until it disconnects, and update the amplifier meanwhile."""
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # send replies at once
     connection.settimeout(0.005)
     waiting = b""
     while True:
         try:
             data = connection.recv(4096)
         except TimeoutError:
-            amplifier.live()
+            amplifier.update()
             continue
         if not data:
             return
         *lines, waiting = (waiting + data).split(b"\n")
-        waiting = waiting[:4096]  # of a line without an end
+        waiting = waiting[:4096]  # of an unfinished line
         for line in lines:
-            told = answer(amplifier, line)
-            if told is not None:
-                connection.sendall(told.encode() + b"\n")
+            reply = answer(amplifier, line)
+            if reply is not None:
+                connection.sendall(reply.encode() + b"\n")
 
 
 def main():
-    """Serve one host after the other until it is ended."""
+    """Serve one host after the other."""
     amplifier = Amplifier()
     with socket.create_server(("127.0.0.1", int(sys.argv[1]))) as server:
         host, port = server.getsockname()
@@ -102,7 +102,7 @@ def main():
             try:
                 connection, _ = server.accept()
             except TimeoutError:
-                amplifier.live()
+                amplifier.update()
                 continue
             with connection:
                 try:

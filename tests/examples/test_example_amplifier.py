@@ -47,10 +47,10 @@ def test_amplifier_is_silent_5_ms_after_its_watchdog_expired(serial: ModuleType)
     amplifier.apply(1, 0, 0, [(0, 11000, 10000, 0), (3, 11000, 5000, 0)])
     for after, share in ((-0.1, 1.0), (1.25, (1 + math.cos(math.pi / 4)) / 2), (2.5, 0.5)):
         now[0] = 1000.0 + WATCHDOG + after
-        amplifier.live()
+        amplifier.update()
         assert amplifier.levels == [round(10000 * share), 0, 0, round(5000 * share)]
     now[0] = 1000.0 + WATCHDOG + 5
-    amplifier.live()
+    amplifier.update()
     assert amplifier.levels == [0, 0, 0, 0]
     assert (amplifier.state, amplifier.fault) == (7, 1)
     assert not amplifier.high_voltage
@@ -67,10 +67,10 @@ def test_amplifier_ends_a_set_after_its_validity(serial: ModuleType) -> None:
     amplifier.feed()
     amplifier.apply(1, 10, 100, [(0, 11000, 10000, 0)])
     now[0] = 105.0
-    amplifier.live()
+    amplifier.update()
     assert amplifier.levels == [5000, 0, 0, 0]
     now[0] = 111.0
-    amplifier.live()
+    amplifier.update()
     assert amplifier.levels == [0, 0, 0, 0]
     assert amplifier.state == 4
 

@@ -1,7 +1,7 @@
-"""An amplifier that speaks lines of JSON over TCP, at lines://HOST:PORT.
+"""A backend for amplifiers with lines of JSON over TCP, at lines://HOST:PORT.
 
-A backend says the messages that amplifiers know in the words and units of its own wire,
-and nothing else: retries, tokens, turns and states belong to the `Amplifier` above it.
+A backend only converts messages to the format and units of its wire; retries, tokens, order and
+states belong to the `Amplifier` above it.
 """
 
 import asyncio
@@ -86,23 +86,23 @@ class LinesBackend(WireBackend):
             ) from error
 
     async def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         line, self._line = self._line, None
         if line is not None:
             _, writer = line
             writer.close()
-            with suppress(OSError):  # of a line that was lost before
+            with suppress(OSError):  # the connection was lost before
                 await writer.wait_closed()
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
-        """Send a request and wait for the answer that carries its number."""
+        """Send a request and wait for the reply with its number."""
         require_safe(request)
         if self._line is None:
             raise LinkError(f"{self._url} is not open")
         reader, writer = self._line
-        question = in_words(request)
+        question = encode(request)
         if question is None:
-            return Nak(NakCode.UNKNOWN_TYPE)  # envelopes: this wire has none
+            return Nak(NakCode.UNKNOWN_TYPE)  # this wire has no envelopes
         self._number += 1
         try:
             async with asyncio.timeout(timeout):
@@ -120,19 +120,19 @@ class LinesBackend(WireBackend):
             raise LinkError(f"{self._url} is lost: {error}") from error
 
     async def _reply_to(self, request: Request, reader: asyncio.StreamReader) -> Reply | None:
-        """The next line, if it is the answer; a damaged or a late one is counted and dropped."""
+        """Read a line; return None for a damaged or late one, which is counted."""
         try:
             line = await reader.readline()
-        except ValueError:  # longer than any answer
+        except ValueError:  # longer than any reply
             self._counters.crc_errors += 1
             return None
         if not line.endswith(b"\n"):
             raise ConnectionResetError("the amplifier has hung up")
         self._counters.frames_in += 1
         try:
-            told = json.loads(line, parse_constant=refuse)
-            if told["id"] == self._number:
-                return read(request, told)
+            reply = json.loads(line, parse_constant=refuse)
+            if reply["id"] == self._number:
+                return read(request, reply)
             self._counters.unexpected_frames += 1
         except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
             self._counters.crc_errors += 1
@@ -140,12 +140,12 @@ class LinesBackend(WireBackend):
 
 
 def refuse(constant: str) -> NoReturn:
-    """NaN and Infinity are none of JSON's numbers, and none of ours."""
+    """Refuse NaN and Infinity, which are not JSON."""
     raise ValueError(constant)
 
 
-def in_words(request: Request) -> dict[str, Any] | None:
-    """A request in the words and units of the wire; None for one that it does not know."""
+def encode(request: Request) -> dict[str, Any] | None:
+    """Encode a request; None for one that the wire does not have."""
     if type(request) in PLAIN:
         return {"ask": PLAIN[type(request)]}
     match request:
@@ -157,12 +157,12 @@ def in_words(request: Request) -> dict[str, Any] | None:
             return {"ask": "stop", "ramp": round(ramp / SECONDS)}
         case Commit(token):
             return {"ask": "commit", "token": token}
-        case Stage(asked) | Apply(asked):
+        case Stage(wanted) | Apply(wanted):
             return {
                 "ask": "stage" if isinstance(request, Stage) else "apply",
-                "token": asked.token,
-                "ramp": round(asked.ramp / SECONDS),
-                "valid_for": round(asked.valid_for / SECONDS),
+                "token": wanted.token,
+                "ramp": round(wanted.ramp / SECONDS),
+                "valid_for": round(wanted.valid_for / SECONDS),
                 "commands": [
                     (
                         one.channel,
@@ -170,58 +170,60 @@ def in_words(request: Request) -> dict[str, Any] | None:
                         round(one.level / LEVEL),
                         (round(one.phase / DEGREES) + 18000) % 36000 - 18000,
                     )
-                    for one in asked.commands
+                    for one in wanted.commands
                 ],
             }
     return None
 
 
-def read(request: Request, told: dict[str, Any]) -> Reply:
-    """The reply that an answer means; raises what goes with an answer that is none."""
-    if "refused" in told:
-        return Nak(NakCode(told["refused"]), told["channel"])
+def read(request: Request, reply: dict[str, Any]) -> Reply:
+    """Decode a reply; raises ValueError, TypeError or LookupError for an invalid one."""
+    if "refused" in reply:
+        return Nak(NakCode(reply["refused"]), reply["channel"])
     match request:
         case Hello():
             return Identity(
-                told["vendor"],
-                told["product"],
-                told["serial_number"],
-                told["firmware"],
+                reply["vendor"],
+                reply["product"],
+                reply["serial_number"],
+                reply["firmware"],
                 protocol_version=1,
             )
         case GetCaps():
-            (lowest, highest), (shortest, longest) = told["frequency"], told["watchdog"]
+            (lowest, highest), (shortest, longest) = reply["frequency"], reply["watchdog"]
             return Capabilities(
-                channels=told["channels"],
+                channels=reply["channels"],
                 frequency_min=lowest * HERTZ,
                 frequency_max=highest * HERTZ,
                 frequency_step=HERTZ,
                 level_max=1.0,
                 level_step=LEVEL,
                 phase_step=DEGREES,
-                ramp_max=told["longest_ramp"] * SECONDS,
+                ramp_max=reply["longest_ramp"] * SECONDS,
                 watchdog_min=shortest * SECONDS,
                 watchdog_max=longest * SECONDS,
                 envelope_knots=0,
             )
         case GetFaults():
             return FaultList(
-                tuple(FaultRecord(Fault(kind), None, age * SECONDS) for kind, age in told["faults"])
+                tuple(
+                    FaultRecord(Fault(kind), None, age * SECONDS) for kind, age in reply["faults"]
+                )
             )
         case Stage() | Apply() | Commit():
             return Achieved(
-                told["token"],
+                reply["token"],
                 tuple(
                     DriveCommand(channel, frequency * HERTZ, level * LEVEL, phase * DEGREES)
-                    for channel, frequency, level, phase in told["commands"]
+                    for channel, frequency, level, phase in reply["commands"]
                 ),
             )
     return Status(
-        state=AmplifierState(told["state"]),
-        fault=Fault(told["fault"]),
-        token=told["token"],
-        high_voltage=told["high_voltage"],
+        state=AmplifierState(reply["state"]),
+        fault=Fault(reply["fault"]),
+        token=reply["token"],
+        high_voltage=reply["high_voltage"],
         temperature=25.0,
-        watchdog_left=told["watchdog_left"] * SECONDS,
-        levels=tuple(level * LEVEL for level in told["levels"]),
+        watchdog_left=reply["watchdog_left"] * SECONDS,
+        levels=tuple(level * LEVEL for level in reply["levels"]),
     )

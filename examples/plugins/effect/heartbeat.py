@@ -1,4 +1,4 @@
-"""A heartbeat: two pulses, the second one weaker, again and again while the finger is there."""
+"""A heartbeat: two pulses, the second one weaker, repeated while the finger rests."""
 
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
@@ -13,22 +13,22 @@ from era_haptics.plugins.effects import (
     Sensation,
 )
 
-PULSE = 0.08  # s; the plate needs 20 ms to follow, and a pulse that is felt as one some more
+PULSE = 0.08  # s; the plate needs 20 ms to follow
 SECOND = 0.25  # s; from the first pulse of a beat to its second
 WEAKER = 6.0  # dB
-_ROUNDING = 1e-6  # s; who asks at the very end of a pulse is told what comes after it
+_ROUNDING = 1e-6  # s; at the end of a pulse the next part counts
 
 
 @dataclass(frozen=True)
 class Beating(EffectRun):
-    """One play of it at one finger."""
+    """A heartbeat at one finger."""
 
     start: float
     period: float
     level_db_sl: float | None
 
     def feel(self, contact: Contact, now: float) -> Sensation | NoSensation:
-        """The pulse or the pause that is on, and when it is over."""
+        """Return the current pulse or pause, and when it ends."""
         beats, into = divmod(now - self.start + _ROUNDING, self.period)
         begin = self.start + beats * self.period
         if into < PULSE:
@@ -42,18 +42,18 @@ class Beating(EffectRun):
 
 
 class Heartbeat(Effect):
-    """Its fields are its parameters in a layout; `level` is there already."""
+    """The effect; its fields are its parameters in a layout, beside `level`."""
 
     kind: ClassVar[str] = "heartbeat"
-    is_for_motion: ClassVar[bool] = False  # it goes by itself: for on_press
+    is_for_motion: ClassVar[bool] = False  # for on_press
 
     period: Annotated[float, Quantity(TIME, at_least=0.4, at_most=5.0)] = 0.9
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
-        """Begin at a finger."""
+        """Start at a finger."""
         return Beating(now, self.period, level_db_sl)
 
     @property
     def ends(self) -> bool:
-        """Not before the finger goes."""
+        """Whether it ends before the finger lifts."""
         return False

@@ -1,4 +1,4 @@
-"""What a finger that rests for two seconds feels of a kind of effect with its usual parameters.
+"""Print what a finger that rests for two seconds feels of a kind of effect.
 
 python try_effect.py KIND
 """

@@ -1,7 +1,7 @@
-"""Touches as JSON over UDP: [[1, 0.25, 0.5], ...], id, x and y of every finger that is down.
+"""Touches as JSON over UDP: [[1, 0.25, 0.5], ...], id, x and y of each finger that is down.
 
-x and y are 0 to 1 from the top left corner. The sender repeats itself every 50 ms while a finger is
-down, and says [] when the last one goes: whoever is not heard for 150 ms is taken for dead.
+x and y are 0 to 1 from the top left corner. The sender repeats its datagram every 50 ms while a
+finger is down, and sends [] when the last one lifts; after 150 ms without one all fingers lift.
 """
 
 import asyncio
@@ -18,21 +18,21 @@ from era_haptics.plugins.touch_sources import (
     listen,
 )
 
-LONGEST = 4096  # bytes of a datagram; ten fingers need 400
+MAX_SIZE = 4096  # bytes of a datagram; ten fingers need 400
 
 
 class JsonTouch(TouchSource):
-    """Listens at jsontouch:HOST:PORT."""
+    """A source that listens at jsontouch:HOST:PORT."""
 
     def __init__(self, url: str) -> None:
         host, _, port = url.removeprefix("jsontouch:").rpartition(":")
         if not host or not (port.isascii() and port.isdecimal() and 0 < int(port) < 65536):
             raise InputError(f"touch source {url}: write jsontouch:HOST:PORT")
         self._host, self._port = host, int(port)
-        self.rejects = RejectCounter(logging.getLogger(__name__))  # and log once a second
+        self.rejects = RejectCounter(logging.getLogger(__name__))  # logs once a second
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
-        """Deliver a frame a datagram until cancelled; malformed ones are counted, never raised."""
+        """Deliver a frame for each datagram until cancelled; malformed ones are counted."""
 
         def received(data: bytes, peer: tuple[str, int], arrived: float) -> None:
             try:
@@ -43,7 +43,7 @@ class JsonTouch(TouchSource):
             deliver(TouchFrame(f"{peer[0]}:{peer[1]}", arrived, touches))
 
         try:
-            line = await listen(self._host, self._port, received, max_size=LONGEST)
+            line = await listen(self._host, self._port, received, max_size=MAX_SIZE)
         except OSError as error:
             raise InputError(
                 f"jsontouch: cannot listen on {self._host}:{self._port} ({error.strerror}); "

@@ -1,4 +1,4 @@
-"""A finger that comes down, slides to the right for a second and lifts, told over UDP.
+"""Send a finger over UDP that comes down, slides to the right for a second and lifts.
 
 python send.py PORT
 """

@@ -1,4 +1,4 @@
-"""What a touch source delivers, as contacts on the paper's plate, until the last finger lifts.
+"""Print the contacts of a touch source on the paper's plate until the last finger lifts.
 
 python try_source.py URL
 """
@@ -15,18 +15,18 @@ from era_haptics.plugins.touch_sources import (
     open_source,
 )
 
-LOOK = 0.015  # s; whoever is silent for 150 ms is found soon after
+EXPIRY_INTERVAL = 0.015  # s
 
 
 async def main(url: str) -> None:
-    """Follow its contacts; a finger that is not heard of in time is lifted, as in the daemon."""
+    """Follow contacts; fingers that are not repeated in time are lifted, as in the daemon."""
     tracker = ContactTracker(era.load_rig(era.example_rig_path()).plate)
     source = open_source(url)
     ended = asyncio.Event()
-    told = {"frames": 0, "moves": 0}
+    counts = {"frames": 0, "moves": 0}
 
     def show(change: Change) -> None:
-        told["moves"] += len(change.moved)
+        counts["moves"] += len(change.moved)
         for word, contacts in (("down", change.down), ("up  ", change.up)):
             for contact in contacts:
                 print(f"{word} at {100 * contact.x:.1f}, {100 * contact.y:.1f} cm")
@@ -36,16 +36,16 @@ async def main(url: str) -> None:
             ended.set()
 
     def deliver(frame: TouchFrame) -> None:
-        told["frames"] += 1
+        counts["frames"] += 1
         show(tracker.update(frame))
 
     async def expire() -> None:
         while True:
-            await asyncio.sleep(LOOK)
+            await asyncio.sleep(EXPIRY_INTERVAL)
             show(tracker.expire(now()))
 
     tasks = [asyncio.create_task(work) for work in (source.run(deliver), expire(), ended.wait())]
-    await asyncio.sleep(0.1)  # for it to open, or to say why it cannot
+    await asyncio.sleep(0.1)  # until it is open or has failed
     print(f"listening to {url}", flush=True)
     done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     for task in tasks:
@@ -53,7 +53,7 @@ async def main(url: str) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
     for task in done:
         task.result()
-    print(f"{told['frames']} frames, {told['moves']} moves")
+    print(f"{counts['frames']} frames, {counts['moves']} moves")
 
 
 if len(sys.argv) != 2:

@@ -114,14 +114,14 @@ def test_another_rig_is_not_written(measured: Path, tmp_path: Path) -> None:
     """Measured on the paper's plate, asked of a longer one: no, and no file is written."""
     other, new = tmp_path / "other.yaml", tmp_path / "new.yaml"
     other.write_text(example_rig_path().read_text().replace("12 in", "16 in"))
-    status, said = run(other, measured / "measured.uff", "-o", new, "--mesh", "24x18")
+    status, said = run(other, measured / "measured.uff", "-o", new, "--mesh", MESH)
     assert status == 2
     assert re.search(r"SE\b.*\(0\.3048, 0\).*\(0\.4064, 0\)", said)
     # Where the file does not tell the ERAs' places only the fit can.
     rows = [line.split(",") for line in (measured / "measured.csv").read_text().splitlines()]
     placeless = tmp_path / "placeless.csv"
     placeless.write_text("\n".join(",".join([row[0], *row[3:]]) for row in rows))
-    status, said = run(other, placeless, "-o", new, "--mesh", "24x18")
+    status, said = run(other, placeless, "-o", new, "--mesh", MESH)
     assert status == 1
     assert not new.exists()
 

@@ -24,6 +24,7 @@ from controller.api.client import Client
 from daemon_bench import PLACE
 from gateway_bench import (
     ARM,
+    ERA,
     TOKEN,
     GatewayProcess,
     RawWebSocket,
@@ -43,6 +44,15 @@ pytestmark = pytest.mark.alone
 ENABLED = "OPERATION_ENABLED"
 WATCHDOG = 0.25  # s; of the amplifiers, by default
 LATE = 0.06  # s; of a process that does nothing, on a machine that is busy with something else
+
+IMPATIENT = """
+import sys
+from controller.cli.main import main
+from controller.gateway import connections, session
+connections.REQUEST_TIMEOUT = connections.UNREAD_TIMEOUT = session.SEND_TIMEOUT = 1.0
+sys.exit(main())
+"""
+"""`era` with shorter timeouts of the gateway."""
 
 _logger = logging.getLogger(__name__)  # what was measured; shown by pytest --log-cli-level=info
 
@@ -173,9 +183,15 @@ def watched(daemon: Path, metronome: "Metronome") -> Iterator[Watch]:
 
 
 @pytest.fixture
-def gateway(watched: Watch, daemon: Path, tmp_path: Path) -> Iterator[GatewayProcess]:
-    """A gateway to be mistreated; it writes nothing to its log all the while."""
-    with gateway_process(tmp_path, daemon) as made:
+def gateway(
+    request: pytest.FixtureRequest, watched: Watch, daemon: Path, tmp_path: Path
+) -> Iterator[GatewayProcess]:
+    """A gateway to be mistreated; it writes nothing to its log all the while.
+
+    By the command of the fixture's parameter, `era` without one.
+    """
+    program = getattr(request, "param", (ERA,))
+    with gateway_process(tmp_path, daemon, program=program) as made:
         wait_for_daemon(made)
         yield made
         if made.process.poll() is None:
@@ -238,7 +254,8 @@ def trickles(gateway: GatewayProcess) -> list[bytes]:
     return [said.encode() for said in begun]
 
 
-def test_whoever_trickles_or_does_not_read_is_left(gateway: GatewayProcess) -> None:
+@pytest.mark.parametrize("gateway", [(sys.executable, "-c", IMPATIENT)], indirect=True)
+def test_gateway_closes_connections_that_trickle_or_do_not_read(gateway: GatewayProcess) -> None:
     """A byte now and then wins no time; ten over WebSockets and ten over HTTP ask much and read
     nothing. All of them are closed, and a browser is served meanwhile.
     """

@@ -239,9 +239,16 @@ class GatewayProcess:
 
 @contextmanager
 def gateway_process(
-    folder: Path, daemon: Path, *options: str, token: str | None = TOKEN
+    folder: Path,
+    daemon: Path,
+    *options: str,
+    token: str | None = TOKEN,
+    program: Sequence[str | Path] = (ERA,),
 ) -> Iterator[GatewayProcess]:
-    """`era gateway` on a free port of the loopback; token: None for a random one."""
+    """`era gateway` on a free port of the loopback.
+
+    token: None for a random one; program: the command before `gateway`.
+    """
     if token is not None:
         file = folder / "token"
         file.write_text(token, encoding="ascii")
@@ -253,7 +260,7 @@ def gateway_process(
     with (
         errors.open("w", encoding="utf-8") as stderr,
         subprocess.Popen(
-            [ERA, "gateway", "--socket", str(daemon), *options],
+            [*program, "gateway", "--socket", str(daemon), *options],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=stderr,

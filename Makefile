@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint format docs fuzz kill-test fault-test soak bench bench-latency \
+.PHONY: demo test lint style format docs fuzz kill-test fault-test soak bench bench-latency \
 	bench-localization bench-plant bench-wires dist smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -18,16 +18,18 @@ demo: .venv/installed
 	$(BIN)/era demo
 
 # Types are checked beside the tests; those that measure time run afterwards, with nothing beside.
-test: .venv/installed-test
-	$(MAKE) --no-print-directory lint & lint=$$!; \
+test: style
+	$(BIN)/mypy & types=$$!; \
 	$(BIN)/pytest -m 'not alone' --numprocesses auto --dist loadfile --no-loadscope-reorder; \
-	tests=$$?; wait $$lint && exit $$tests
+	tests=$$?; wait $$types && exit $$tests
 	$(BIN)/pytest -m alone
 
-lint: .venv/installed-test
+lint: style
+	$(BIN)/mypy
+
+style: .venv/installed-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 	$(BIN)/lint-imports
 
 # A million damaged frames for every codec; `make test` takes a few thousand.

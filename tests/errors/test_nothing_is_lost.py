@@ -162,7 +162,10 @@ def test_a_recording_whose_disk_is_full_is_told_and_leaves_nothing(home: Path) -
         assert process.stdout is not None
         assert "serial://" in process.stdout.readline()
         resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (1024, resource.RLIM_INFINITY))
-        time.sleep(0.2)
+        deadline = time.monotonic() + 20
+        while not any(path.stat().st_size >= 1024 for path in home.glob("*run*")):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=20)
     assert process.returncode == 2

@@ -11,8 +11,8 @@ import pytest
 
 from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import RpcError
-from daemon_bench import PATIENCE, far_end, until
-from daemon_process import DaemonProcess, daemon_process, holding, play, plays_on
+from daemon_bench import PATIENCE, far_end, holding, until
+from daemon_process import DaemonProcess, daemon_process, play, plays_on
 from floods import flood
 from journal import Journal, loudness
 

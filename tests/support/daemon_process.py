@@ -19,13 +19,21 @@ from pathlib import Path
 from best_of import best_of
 from controller.api.async_client import AsyncClient
 from controller.api.jsonrpc import RpcError
-from daemon_bench import PATIENCE, PLACE, daemon_table, until, until_state, write_daemon
+from daemon_bench import (
+    ENABLED,
+    PATIENCE,
+    READY,
+    daemon_table,
+    holding,
+    until,
+    until_state,
+    write_daemon,
+)
 from journal import Journal, loudness
 from model.table.file import save_table
 from wires import FarSide
 
 ERA = Path(sys.executable).with_name("era")
-READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 STARTING = 60.0  # s; for a loaded machine
 WATCHDOG, REACTION = 0.25, 0.005  # s; what an amplifier may take to be silent
 
@@ -129,29 +137,10 @@ async def run_era(*arguments: object) -> tuple[int, str, str]:
 async def playing(daemon: DaemonProcess) -> AsyncIterator[AsyncClient]:
     """A client whose finger is felt, for as long as the daemon lives."""
     async with await daemon.client() as era:
-        await until_state(era, "READY_TO_SWITCH_ON")
+        await until_state(era, READY)
         await era.arm("test", lease_s=60)
-        async with holding(era):
-            await until(lambda: any(daemon.far.device.status().levels))
+        async with holding(era, far=daemon.far):
             yield era
-
-
-@asynccontextmanager
-async def holding(era: AsyncClient) -> AsyncIterator[None]:
-    """A finger that is down, for as long as the daemon lives."""
-
-    async def hold() -> None:
-        with contextlib.suppress(ConnectionError):
-            while True:
-                await era.touch([PLACE])
-                await asyncio.sleep(0.03)
-
-    task = asyncio.create_task(hold())
-    try:
-        yield
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
 
 
 async def ready(era: AsyncClient) -> None:

@@ -1,4 +1,4 @@
-"""What may happen while a daemon arms, reads its configuration again, or waits for amplifiers."""
+"""Interruptions while a daemon arms, reloads its configuration, or waits for amplifiers."""
 
 import asyncio
 import contextlib
@@ -9,60 +9,63 @@ from pathlib import Path
 
 import pytest
 
-from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.jsonrpc import ErrorCode
 from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
 from controller.daemon.log import LogThread
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
-from daemon_bench import daemon_table, far_end, running_daemon, until, until_state, write_daemon
+from daemon_bench import (
+    ENABLED,
+    PATIENCE,
+    READY,
+    daemon_table,
+    error_code,
+    far_end,
+    next_event,
+    ready_daemon,
+    running_daemon,
+    until,
+    until_state,
+    write_daemon,
+)
 from drivers.errors import LinkError
 from drivers.protocol.messages import AmplifierState
 from sim.faults.fault_window import FaultWindow
 
-READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 
-
-def arming_waits(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, *, then: Callable[[], None] | None = None
+def delay_arming(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, *, then: Callable[[], None] = lambda: None
 ) -> asyncio.Event:
-    """What the arming of a daemon waits for; then: what happens before it goes on."""
-    arm, goes_on = daemon._controller.arm, asyncio.Event()
+    """Let the daemon's arming wait for the returned event, and call `then` before it continues."""
+    arm, released = daemon._controller.arm, asyncio.Event()
 
     async def slow() -> None:
-        await goes_on.wait()
-        if then is not None:
-            then()
+        await released.wait()
+        then()
         await arm()
 
     monkeypatch.setattr(daemon._controller, "arm", slow)
-    return goes_on
+    return released
 
 
-async def test_arming_that_takes_longer_than_the_lease(
+async def test_lease_lasts_from_armed_state_when_arming_takes_longer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The lease then lasts from when it is armed, and with it the armed state: never without one.
+    """The armed state has a lease at every moment, and no other client gets one meanwhile."""
+    async with ready_daemon(tmp_path) as (bench, era):
+        leases = bench.daemon._api._lease
 
-    Meanwhile nobody else gets a lease.
-    """
-    async with running_daemon(tmp_path) as bench, await bench.client() as era:
-        await until_state(era, READY)
-        daemon = bench.daemon
-        book = daemon._api._lease
+        def expire() -> None:
+            assert leases._lease is not None
+            leases._lease = replace(leases._lease, expires_at=0.0)
 
-        def pass_time() -> None:
-            assert book._lease is not None
-            book._lease = replace(book._lease, expires_at=0.0)
-
-        goes_on = arming_waits(daemon, monkeypatch, then=pass_time)
+        released = delay_arming(bench.daemon, monkeypatch, then=expire)
         arming = asyncio.ensure_future(era.arm("me", lease_s=1))
         await until_state(era, "SWITCHED_ON")
         async with await bench.client("other") as other:
-            with pytest.raises(RpcError) as caught:
-                await other.arm("you")
-            assert caught.value.code is ErrorCode.LEASE
-        goes_on.set()
+            assert await error_code(other.arm("you")) is ErrorCode.LEASE
+        released.set()
         lease = await arming
         status = await era.status()
         assert (status.state, status.armed_by) == (ENABLED, "me")
@@ -72,161 +75,119 @@ async def test_arming_that_takes_longer_than_the_lease(
         assert bench.far.device.status().state is AmplifierState.SWITCH_ON_DISABLED
 
 
-async def test_who_hangs_up_while_arming_leaves_nothing_armed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("is_cancelled", [False, True])
+async def test_daemon_disarms_when_arming_client_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_cancelled: bool
 ) -> None:
-    """Nobody knows the lease then, which would have lasted for a minute: disarmed at once."""
-    async with running_daemon(tmp_path) as bench, await bench.client() as era:
-        await until_state(era, READY)
-        goes_on = arming_waits(bench.daemon, monkeypatch)
-        other = await bench.client("other")
-        arming = asyncio.ensure_future(other.arm("other", lease_s=60))
+    """Disconnected or cancelled before it got its lease of a minute, which is ended at once."""
+    async with ready_daemon(tmp_path) as (bench, era), await bench.client("other") as other:
+        released = delay_arming(bench.daemon, monkeypatch)
+
+        async def use() -> None:
+            async with other.armed("other", lease_s=60):
+                raise AssertionError("must not be armed")
+
+        using = asyncio.create_task(use())
         await until_state(era, "SWITCHED_ON")
-        await other.close()
-        with pytest.raises(LinkError):
-            await arming
-        goes_on.set()
+        if is_cancelled:
+            using.cancel()
+            await asyncio.sleep(0)
+        else:
+            await other.close()
+        released.set()
+        with pytest.raises((asyncio.CancelledError, LinkError)):
+            await using
         await until_state(era, READY)
         assert (await era.status()).armed_by is None
         assert bench.far.device.status().state is AmplifierState.SWITCH_ON_DISABLED
 
 
-async def test_who_is_cancelled_while_arming_leaves_nothing_armed(
+async def test_reload_ends_after_unexpected_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its connection stays, and with it a lease that nobody would renew: so it disarms."""
-    async with running_daemon(tmp_path) as bench, await bench.client() as era:
-        await until_state(era, READY)
-        goes_on = arming_waits(bench.daemon, monkeypatch)
-
-        async def use() -> None:
-            async with era.armed("me", lease_s=60):
-                raise AssertionError("it was cancelled before")
-
-        using = asyncio.create_task(use())
-        await until_state(era, "SWITCHED_ON")
-        using.cancel()
-        await asyncio.sleep(0)
-        goes_on.set()
-        with pytest.raises(asyncio.CancelledError):
-            await using
-        await until_state(era, READY)
-        assert (await era.status()).armed_by is None
-
-
-async def test_a_reload_that_fails_in_an_unheard_of_way_is_over_all_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The service manager is told that it is over, and the next one works."""
+    """The service manager gets the end of it, and the next reload works."""
     async with running_daemon(tmp_path) as bench:
-        told: list[str] = []
+        notices: list[str] = []
         manager = bench.daemon._manager
-        monkeypatch.setattr(manager, "reloading", lambda: told.append("begins"))
-        monkeypatch.setattr(manager, "ready", lambda status: told.append("is over"))
+        monkeypatch.setattr(manager, "reloading", lambda: notices.append("reloading"))
+        monkeypatch.setattr(manager, "ready", lambda status: notices.append("ready"))
 
-        def broken(path: Path) -> None:
-            raise RuntimeError("a disk that makes things up")
+        def fail(path: Path) -> None:
+            raise RuntimeError("injected")
 
         with monkeypatch.context() as patched:
-            patched.setattr("controller.daemon.daemon.load_daemon_config", broken)
+            patched.setattr("controller.daemon.daemon.load_daemon_config", fail)
             await bench.daemon.reload()
         await bench.daemon.reload()
-        assert told == ["begins", "is over"] * 2
+        assert notices == ["reloading", "ready"] * 2
 
 
-async def test_an_end_during_a_reload_starts_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Touch sources of a configuration that is still being read are not opened after the end."""
+async def test_shutdown_cancels_reload(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Touch sources of a configuration that is still being read are not opened."""
     async with running_daemon(tmp_path) as bench:
-        daemon = bench.daemon
-        reads = asyncio.Event()
+        daemon, is_reading = bench.daemon, asyncio.Event()
 
-        async def slowly(load: object, *, name: str) -> object:
-            reads.set()
-            await asyncio.sleep(3600)
-            raise AssertionError("it was waited for")
+        async def read_for_ever(load: object, *, name: str) -> object:
+            is_reading.set()
+            await asyncio.Event().wait()
+            raise AssertionError("unreachable")
 
-        with monkeypatch.context() as patched:
-            patched.setattr("controller.daemon.daemon.in_thread", slowly)
-            daemon._request_reload()
-            await reads.wait()
+        monkeypatch.setattr("controller.daemon.daemon.in_thread", read_for_ever)
+        daemon._request_reload()
+        await is_reading.wait()
         (reload,) = daemon._reloads
-        daemon.shut_down("the test is over")
+        daemon.shut_down("end of the test")
         await until(reload.done)
         with contextlib.suppress(asyncio.CancelledError):
             await reload
         assert reload.cancelled()
 
 
-async def test_an_end_while_an_amplifier_is_waited_for(tmp_path: Path) -> None:
-    """It does not answer when the daemon starts: being told to end ends that at once."""
+async def test_shutdown_ends_wait_for_amplifier_at_start(tmp_path: Path) -> None:
+    """An amplifier that does not reply does not delay it."""
     async with far_end(tmp_path) as far:
         far.device.inject_fault(FaultWindow("hang"))
         config = load_daemon_config(write_daemon(tmp_path, {"main": far.url}))
-        place, log = SocketLock(config.socket), LogThread(tmp_path / "log")
+        lock, log = SocketLock(config.socket), LogThread(tmp_path / "log")
         daemon = Daemon(config, daemon_table(), log=log, manager=ServiceManager({}), dashboard=None)
-        running = asyncio.create_task(daemon.run(place))
+        running = asyncio.create_task(daemon.run(lock))
         try:
             await asyncio.sleep(0.1)
             begin = asyncio.get_running_loop().time()
-            daemon.shut_down("told to end")
-            await asyncio.wait_for(running, 20)
+            daemon.shut_down("end of the test")
+            await asyncio.wait_for(running, PATIENCE)
             assert asyncio.get_running_loop().time() - begin < 1.0
         finally:
             log.close()
-            place.release()
+            lock.release()
 
 
-async def test_an_end_while_a_lost_amplifier_is_tried_again(
+async def test_daemon_stays_alive_and_shuts_down_during_endless_reconnection(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A connection that never comes about does not hold up the end."""
-    async with running_daemon(tmp_path) as bench, await bench.client() as era:
-        await until_state(era, READY)
-        tries = asyncio.Event()
+    """An attempt may take longer than the service manager's watchdog of 2 s."""
+    async with ready_daemon(tmp_path) as (bench, _):
+        signs_of_life: list[float] = []
+        is_opening = asyncio.Event()
 
-        async def endless() -> None:
-            tries.set()
+        async def open_for_ever() -> None:
+            is_opening.set()
             await asyncio.Event().wait()
 
-        monkeypatch.setattr(bench.daemon._controller, "open", endless)
+        monkeypatch.setattr(bench.daemon._controller, "open", open_for_ever)
         bench.far.device.inject_fault(FaultWindow("hang"))
-        await asyncio.wait_for(tries.wait(), 20)
+        await asyncio.wait_for(is_opening.wait(), PATIENCE)
+        monkeypatch.setattr(bench.daemon._manager, "alive", signs_of_life.append)
+        await until(lambda: len(signs_of_life) >= 3)
 
 
-async def test_the_service_manager_hears_of_a_daemon_that_waits_for_an_amplifier(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An attempt to come back may take longer than the service manager's patience of 2 s."""
-    async with running_daemon(tmp_path) as bench, await bench.client() as era:
-        await until_state(era, READY)
-        alive, tries = 0, asyncio.Event()
-
-        async def endless() -> None:
-            tries.set()
-            await asyncio.Event().wait()
-
-        def count(now: float) -> None:
-            nonlocal alive
-            alive += 1
-
-        monkeypatch.setattr(bench.daemon._controller, "open", endless)
-        bench.far.device.inject_fault(FaultWindow("hang"))
-        await asyncio.wait_for(tries.wait(), 20)
-        monkeypatch.setattr(bench.daemon._manager, "alive", count)
-        await until(lambda: alive >= 3)
-
-
-async def test_a_name_that_is_no_text_is_told_all_the_same(tmp_path: Path) -> None:
-    """A line of the log with a file's name that is not UTF-8 reaches subscribers, escaped."""
+async def test_log_event_escapes_bytes_that_are_not_text(tmp_path: Path) -> None:
+    """A file name that is not UTF-8 reaches subscribers."""
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await era.subscribe("log")
-        record = logging.makeLogRecord({"msg": "written to %s", "args": ("/tmp/\udcff",)})
+        record = logging.makeLogRecord({"msg": "wrote %s", "args": ("/tmp/\udcff",)})
         record.levelno, record.levelname = logging.WARNING, "WARNING"
         bench.daemon._publisher.logged(record)
-        async with asyncio.timeout(20):
-            async for told in era.events():
-                if told.topic == "log" and "written" in told.data["message"]:
-                    assert told.data["message"] == r"written to /tmp/\udcff"
-                    break
+        while "wrote" not in (event := await next_event(era, "log")).data["message"]:
+            pass
+        assert event.data["message"] == r"wrote /tmp/\udcff"

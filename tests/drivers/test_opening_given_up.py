@@ -17,16 +17,16 @@ from virtual_loop import run_virtual
 from wires import far_side
 
 WIRES = {"serial": Wire("serial"), "modbus+rtu": Wire("modbus-rtu"), "can+slcan": Wire("slcan")}
-NOTHING = 0.1  # s; of the half second that one try takes
+AT_ONCE = 0.1  # s; one attempt takes 0.5 s
 
 
 @pytest.mark.parametrize("wire", WIRES)
 @pytest.mark.parametrize("how", ["cancelled", "closed"])
 def test_opening_ends_at_once_when_abandoned(wire: str, how: str, coarse_rig: Rig) -> None:
-    """Cancelled, as by a daemon that ends, or closed meanwhile."""
+    """Cancelled or closed meanwhile."""
 
     async def give_up(url: str, *, after: float) -> float:
-        """How long [s] it took."""
+        """Return how long [s] it takes."""
         amplifier = Amplifier(open_backend(url))
         opening = asyncio.create_task(amplifier.open())
         await asyncio.sleep(after)
@@ -44,6 +44,6 @@ def test_opening_ends_at_once_when_abandoned(wire: str, how: str, coarse_rig: Ri
         async with far_side(WIRES[wire], coarse_rig) as far:
             far.device.inject_fault(FaultWindow("hang"))
             for after in (0.001, 0.3, 0.7, 1.2, 1.4):
-                assert await give_up(far.url, after=after) < NOTHING
+                assert await give_up(far.url, after=after) < AT_ONCE
 
     run_virtual(run())

@@ -52,7 +52,7 @@ _NEVER = cast(asyncio.TimerHandle, _Never())
 
 
 class CanEnds:
-    """A node and what the host reads with; telegrams: the frames of good requests and answers."""
+    """A node and the host's readers; telegrams: frames of good requests and answers."""
 
     def __init__(self, requests: Sequence[Request]) -> None:
         self._device = FakeDevice()
@@ -67,7 +67,7 @@ class CanEnds:
         self.telegrams += [_pack(self._answer_to(telegram)) for telegram in self.telegrams]
 
     def take(self, data: bytes) -> list[object]:
-        """Give the frames of a telegram to both ends; what the far end was asked."""
+        """Feed the frames of a telegram to both ends; the far end's requests."""
         self._taken += 1
         if self._taken % _REVIVAL == 0:
             self._revive()
@@ -82,11 +82,11 @@ class CanEnds:
         return list(self._device.asked)
 
     def mend(self, data: bytes) -> bytes:
-        """A SYNC behind it, so that what came of a set takes effect."""
+        """Append a SYNC, so that a set takes effect."""
         return data + _pack([CanFrame(0x80, b"")])
 
     def _hear(self, frame: CanFrame) -> None:
-        """The host's side: every reader takes the frame, whatever it is."""
+        """Feed the frame to every reader of the host."""
         try:
             if frame.id in self._answers.ids:
                 self._answers.feed(frame)
@@ -125,7 +125,7 @@ class CanEnds:
 
 
 class CanTexts:
-    """What adapters read and write as text, in both directions; telegrams: good text."""
+    """Readers of adapters' text in both directions; telegrams: good text."""
 
     def __init__(self) -> None:
         self._bus = CanBus()
@@ -147,7 +147,7 @@ class CanTexts:
         ]
 
     def take(self, data: bytes) -> list[object]:
-        """Let every reader read a piece of text; the frames that were understood."""
+        """Feed text to every reader; the frames that were understood."""
         self.asked.clear()
         self._slcan.receive(data)
         self._slcan.receive(b"\rO\r")
@@ -162,7 +162,7 @@ class CanTexts:
         return list(self.asked)
 
     def mend(self, data: bytes) -> bytes:
-        """An end of both kinds before it, so that it is a new beginning."""
+        """Precede it with both kinds of terminators."""
         return b"\r>" + data
 
 

@@ -1,8 +1,7 @@
-"""What stands in for the machine in virtual time: serial lines, CAN adapters and workers in memory.
+"""Serial lines, CAN adapters and workers in memory, for virtual time.
 
-The bytes on these lines are those that backends and far ends write; a piece of them may arrive in
-two, and each takes a moment, by the loop's own chance. Blocking code runs in greenlets, so that
-there is no thread whose order is undefined.
+Backends and far ends write real bytes, which arrive after random delays, sometimes in two pieces.
+Blocking code runs in greenlets instead of threads, whose order would be undefined.
 """
 
 import asyncio
@@ -31,12 +30,12 @@ from virtual_loop import VirtualLoop
 T = TypeVar("T")
 
 _PASSING = (50e-6, 900e-6)  # s; through driver and adapter
-_SPLIT = 0.1  # how many pieces arrive in two
-_NOTICED = 0.002  # s; until a hang-up is
+_SPLIT = 0.1  # share of pieces that arrive in two
+_NOTICED = 0.002  # s; until the host notices a hang-up
 
 
 class MemoryMachine(HardwareProvider):
-    """Ports by their names; `make_terminal` is for far ends, the rest for backends."""
+    """Ports by name; `make_terminal` is for far ends, the rest for backends."""
 
     def __init__(self, loop: VirtualLoop) -> None:
         self._loop = loop
@@ -53,7 +52,7 @@ class MemoryMachine(HardwareProvider):
     async def open_port(
         self, name: str, *, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
     ) -> "MemoryPort":
-        """The host's side of a line; LinkError where it is unplugged or open already."""
+        """Open the host's side of a line; LinkError if it is unplugged or open already."""
         await asyncio.sleep(self._loop.dice.uniform(*_PASSING))
         terminal = self._terminals.get(name)
         if terminal is None or not terminal.is_plugged:
@@ -70,7 +69,7 @@ class MemoryMachine(HardwareProvider):
         on_frame: Callable[[CanFrame], None],
         on_loss: Callable[[str], None],
     ) -> Adapter:
-        """An adapter for text: slcan on a line in memory, socketcand over the loop's network."""
+        """Open slcan on a line in memory, or socketcand over the loop's network."""
         if url.interface == "slcan":
             slcan = _Slcan(on_frame)
             slcan.port = await self.open_port(url.channel, on_data=slcan.heard, on_loss=on_loss)
@@ -101,14 +100,14 @@ class MemoryMachine(HardwareProvider):
         self._open.pop(name, None)
 
     def deliver(self, link: str, toward: str, data: bytes, to: "_Direction") -> None:
-        """Let bytes arrive in order, a little later, and perhaps in two pieces."""
+        """Deliver bytes in order, after a delay, perhaps in two pieces."""
         loop, pieces = self._loop, [data]
         loop.seen(link, toward, data)
         if len(data) > 1 and loop.dice.random() < _SPLIT:
             at = loop.dice.randrange(1, len(data))
             pieces = [data[:at], data[at:]]
         for piece in pieces:
-            # Timers of one moment come in any order, bytes of one line do not.
+            # Timers of one moment run in any order; bytes of one line must not.
             soonest = to.arrives + 1e-9
             to.arrives = max(soonest, loop.time() + loop.dice.uniform(*_PASSING))
             loop.call_at(to.arrives, to.take, piece)
@@ -121,7 +120,7 @@ class MemoryMachine(HardwareProvider):
 
 
 def live_in_memory() -> MemoryMachine:
-    """Let backends and far ends of the running virtual loop meet in memory from now on."""
+    """Connect backends and far ends of the running virtual loop in memory."""
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualLoop)
     machine = MemoryMachine(loop)
@@ -131,7 +130,7 @@ def live_in_memory() -> MemoryMachine:
 
 
 class _Direction:
-    """One way of a line, from one plugging in to the next."""
+    """One direction of a line, until it is unplugged."""
 
     def __init__(self, take: Callable[[bytes], None]) -> None:
         self.arrives = 0.0
@@ -139,7 +138,7 @@ class _Direction:
         self._take = take
 
     def take(self, piece: bytes) -> None:
-        """A piece has arrived, unless the line was cut or closed meanwhile."""
+        """Take a piece, unless the line was cut or closed meanwhile."""
         if not self.is_cut:
             self._take(piece)
 
@@ -165,7 +164,7 @@ class MemoryTerminal(Terminal):
             self.inward = _Direction(self._on_data)
 
     def listen(self) -> None:
-        """Bytes come by themselves."""
+        """Bytes arrive without it."""
 
     def unplug(self) -> None:
         if not self.is_plugged:
@@ -180,7 +179,7 @@ class MemoryTerminal(Terminal):
         self.unplug()
 
     def write(self, data: bytes) -> None:
-        """Send to the host; unread bytes are dropped when the port is opened, so at once here."""
+        """Send to the host; without an open port, bytes are lost."""
         port = self._machine.opened(self._name)
         if self.is_plugged and port is not None:
             self._machine.deliver(self._name, "host", data, port.outward)
@@ -208,7 +207,7 @@ class MemoryPort:
         self._machine.deliver(self._terminal.port, "amplifier", data, self._terminal.inward)
 
     def hang_up(self) -> None:
-        """The line is gone; the host notices a little later."""
+        """Cut the line; the host notices a little later."""
         self._is_hung_up = self.outward.is_cut = True
         self._machine.closed(self._terminal.port)
         self._machine.later(_NOTICED, self._notice)
@@ -220,7 +219,7 @@ class MemoryPort:
                 self._machine.closed(self._terminal.port)
 
     async def wait_closed(self) -> None:
-        """It is."""
+        """Return at once."""
 
     def _notice(self) -> None:
         if not self._is_closed:
@@ -243,12 +242,12 @@ class _Slcan:
         self.port.write(b"".join(map(slcan_line, frames)))
 
     def close(self) -> None:
-        with contextlib.suppress(LinkError):  # it is gone already
+        with contextlib.suppress(LinkError):  # already lost
             self.port.write(b"C\r")
         self.port.close()
 
     async def wait_closed(self) -> None:
-        """It is."""
+        """Return at once."""
 
 
 class _Socketcand(asyncio.Protocol):
@@ -295,7 +294,7 @@ class _Socketcand(asyncio.Protocol):
             self._transport.close()
 
     async def wait_closed(self) -> None:
-        """It is."""
+        """Return at once."""
 
     def _shake_hands(self) -> None:
         said = (f"< open {self._url.channel} >", "< rawmode >")
@@ -307,7 +306,7 @@ class _Socketcand(asyncio.Protocol):
 
 
 class GreenletWorker(Worker):
-    """Runs blocking jobs in greenlets: while one waits, the event loop goes on."""
+    """Runs blocking jobs in greenlets; the event loop runs while one waits."""
 
     def __init__(self) -> None:  # without a thread
         self._turn = asyncio.Lock()
@@ -333,7 +332,7 @@ class GreenletWorker(Worker):
 
 
 class _GreenletQueue:
-    """What is used of queue.Queue."""
+    """The used part of queue.Queue."""
 
     def __init__(self) -> None:
         self._items: deque[bytes] = deque()
@@ -344,7 +343,7 @@ class _GreenletQueue:
         self._came.set()
 
     def get(self, block: bool = True, timeout: float | None = None) -> bytes:
-        """The next; queue.Empty where none comes in time [s]."""
+        """Return the next item; queue.Empty after a timeout [s]."""
         if not self._items:
             _wait_for(self._arrival(timeout))
         return self.get_nowait()
@@ -370,7 +369,7 @@ class _GreenletQueue:
 
 
 async def _in_greenlet(job: Callable[[], T]) -> T:
-    """Run blocking code; whatever it waits for by `_wait_for` is waited for here."""
+    """Run blocking code; await what it passes to `_wait_for`."""
     child = greenlet(job)
     child.gr_context = contextvars.copy_context()
     step = child.switch()

@@ -16,11 +16,11 @@ from sim.far_ends.modbus.unit import ModbusUnit
 _REVIVAL = 10  # telegrams until it is armed again: most damaged ones stop or disarm it
 _TAG = 7
 _READ_WRITE = 23
-_BLOCK = 10  # where the block begins that a request of function 23 writes; its check is second
+_BLOCK = 10  # offset of the written block of function 23; its check is second
 
 
 class ModbusEnds:
-    """Host and far end of Modbus, for which the same damaged bytes are request and answer.
+    """Host and far end of Modbus, which get the same damaged bytes.
 
     telegrams: PDUs of good requests and of their answers.
     """
@@ -34,7 +34,7 @@ class ModbusEnds:
         self._far = RtuReader() if is_rtu else TcpReader()
         self._host = ResponseReader(is_rtu=is_rtu, counters=WireCounters())
         self._taken = 0
-        self._requests_by_size: dict[int, Request] = {}  # in bytes that are read
+        self._requests_by_size: dict[int, Request] = {}  # in bytes
         self.telegrams: list[bytes] = []
         for request in requests:
             exchange = exchanges.encode_request(request, tag=_TAG, channels=4)
@@ -46,10 +46,10 @@ class ModbusEnds:
             self._requests_by_size[answer[1]] = request
 
     def mend(self, pdu: bytes) -> bytes:
-        """A frame with a right header or CRC, mostly with lengths that fit, and without a check."""
+        """Make a frame with a valid header or CRC, mostly valid lengths, and no check."""
         pdu = pdu[:200]
         block = pdu[_BLOCK : _BLOCK + (len(pdu) - _BLOCK) // 2 * 2]
-        if self._chance.random() < 0.3:  # as an answer
+        if self._chance.random() < 0.3:  # as a response
             pdu = pdu[:1] + bytes([len(pdu) - 2]) + pdu[2:4] + bytes(2) + pdu[6:]
         elif pdu[0] == _READ_WRITE and len(block) >= 4 and self._chance.random() < 0.8:
             size = bytes([0, len(block) // 2, len(block)])
@@ -61,7 +61,7 @@ class ModbusEnds:
         return tcp_frame(Asked(1, b"", _TAG), pdu)
 
     def take(self, data: bytes) -> list[object]:
-        """What the far end was asked for, and what the host understood."""
+        """Feed bytes to both; the far end's requests and the host's replies."""
         self._taken += 1
         if self._taken % _REVIVAL == 0:
             for request in (Clear(), Arm(2.0)):
@@ -81,7 +81,7 @@ class ModbusEnds:
             data = data[size:]
 
     def _serve(self, request: Asked) -> None:
-        """Let the unit answer; the answer must be one that a frame can hold."""
+        """Let the unit respond; the response must fit into a frame."""
         if request.unit == 0:
             self._unit.handle_broadcast(request.pdu)
             return
@@ -91,7 +91,7 @@ class ModbusEnds:
             assert pdu[0] & 0x7F == request.pdu[0] & 0x7F
 
     def _read(self, data: bytes) -> list[object]:
-        """What the host takes for the answer to a request, and can read."""
+        """Return the replies that the host accepts."""
         size = data[2] if self._is_rtu else data[8] if len(data) > 8 else 0
         request = self._requests_by_size.get(size, self._requests[0])
         exchange = exchanges.encode_request(request, tag=_TAG, channels=4)

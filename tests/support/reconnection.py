@@ -1,4 +1,4 @@
-"""A lost amplifier is opened again as the daemon does it: disarmed."""
+"""Reopening of a lost amplifier as by the daemon: disarmed."""
 
 import asyncio
 

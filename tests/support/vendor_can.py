@@ -41,13 +41,13 @@ def frame(*fields: tuple[int, int, int]) -> bytes:
 
 
 def _achieved(token: int, commands: dict[int, bytes]) -> bytes:
-    """Object 2006 of a set: it plays every step, so what was asked."""
+    """Pack object 2006 of a set, which plays as requested."""
     rows = [data[:7] + b"\0\0\0" for _, data in sorted(commands.items())]
     return struct.pack("<HB", token, len(rows)) + b"".join(rows)
 
 
 class Channel:
-    """What one output does: its level goes from one to another along a raised cosine."""
+    """An output, whose level changes along a raised cosine."""
 
     def __init__(self) -> None:
         self.now, self.goal, self.begin, self.ramp = 0, 0, 0.0, 0.0
@@ -62,7 +62,7 @@ class Channel:
 
 
 class VendorAmplifier:
-    """The amplifier; a context in which it is on the bus."""
+    """The amplifier, on the bus while the context lasts."""
 
     def __init__(self, channel: str) -> None:
         self._thread = threading.Thread(target=self._run, name="an amplifier from elsewhere")
@@ -108,7 +108,7 @@ class VendorAmplifier:
         self.token = 0
         self.played: deque[int] = deque(maxlen=16)
 
-    # What comes
+    # Frames received
 
     def _take(self, identifier: int, data: bytes) -> None:
         now = time.monotonic()
@@ -188,7 +188,7 @@ class VendorAmplifier:
         self._answer(sequence, action, result, now)
 
     def _take_place(self, sequence: int) -> None:
-        """An order comes: what waits for a SYNC under another number is forgotten."""
+        """Discard what waits for a SYNC under another number."""
         self.order = None
         self.commands = {
             number: data for number, data in self.commands.items() if data[7] == sequence
@@ -209,7 +209,7 @@ class VendorAmplifier:
             self._answer(sequence, action, result, now, channel=channel)
 
     def _set(self, order: bytes, commands: dict[int, bytes], now: float) -> tuple[int, int]:
-        """What comes of a set or a commit at its SYNC: the result, and the channel it is about."""
+        """Carry out a set or commit at its SYNC; its result, and the channel at fault."""
         action, token = bits(order, 48, 3), bits(order, 0, 16)
         mine = {c: data for c, data in commands.items() if data[7] == order[7]}
         if action != COMMIT and len(mine) != bits(order, 51, 5):
@@ -258,7 +258,7 @@ class VendorAmplifier:
             channel.go(bits(data, 16, 16) if data else 0, ramp, now)
         self.ends_at, self.end_ramp = (now + span if span else math.inf), ramp
 
-    # What it does by itself
+    # Changes by itself
 
     def _tick(self, now: float) -> None:
         if self.period and now >= self._beat_due:
@@ -292,7 +292,7 @@ class VendorAmplifier:
     def _is_silent(self, now: float) -> bool:
         return not any(channel.level(now) for channel in self.channels)
 
-    # What it says
+    # Frames sent
 
     def _become(self, state: int, *, tells_fault: bool = False) -> None:
         if state == self.state:

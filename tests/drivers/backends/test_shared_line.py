@@ -1,4 +1,4 @@
-"""Lines that several amplifiers are on: opened by the first, lost for all, closed by the last."""
+"""Lines of several amplifiers: opened by the first, lost for all, closed by the last."""
 
 import asyncio
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from drivers.protocol.messages import Arm, Ping
 
 
 class Line(SharedLine[Port]):
-    """One that notes what happens to it; `blocks` holds up opening and closing."""
+    """A line that records events; `blocks` delays opening and closing."""
 
     number = "place"
 
@@ -39,10 +39,10 @@ class Line(SharedLine[Port]):
         return self
 
     def write(self, data: bytes) -> None:
-        """Nobody looks."""
+        """Discard it."""
 
     def close(self) -> None:
-        """Takes its time; see `wait_closed`."""
+        """Begin to close; see `wait_closed`."""
 
     async def wait_closed(self) -> None:
         await self._note("closed")
@@ -63,12 +63,12 @@ class Line(SharedLine[Port]):
 
 
 def the_line() -> Line:
-    """The one that is in use, or a new one."""
+    """Return the line in use, or a new one."""
     return shared_line(Line, "key", Line)
 
 
 async def test_first_user_opens_and_last_user_closes() -> None:
-    """In between it is one line for all users; afterwards a new one."""
+    """One line for all users; afterwards a new one."""
     line = the_line()
     await line.join(1, lambda _: None)
     assert the_line() is line
@@ -91,7 +91,7 @@ async def test_number_in_use_is_refused() -> None:
 
 
 async def test_failed_opening_leaves_no_user() -> None:
-    """The same number may try again, on a line made anew."""
+    """The same number may try again, on a new line."""
     line = the_line()
     line.fails = True
     with pytest.raises(LinkError, match="no such line"):
@@ -104,7 +104,7 @@ async def test_failed_opening_leaves_no_user() -> None:
 
 
 async def test_join_during_close_reopens() -> None:
-    """The system gives a port out once: it is open again only after it was closed."""
+    """It is closed before it is opened again."""
     line = the_line()
     await line.join(1, lambda _: None)
     line.blocks = asyncio.Event()
@@ -162,7 +162,7 @@ async def test_loss_is_reported_once_per_user_and_ends_with_join() -> None:
 
 
 async def test_user_joining_during_a_loss_is_notified_of_the_next() -> None:
-    """It waited for its turn to open the line, and opens it anew: that is another line for it."""
+    """It reopens the line, so that the loss does not count for it."""
     line, losses = the_line(), list[str]()
     await line.join(1, lambda _: None)
     async with line._changing:
@@ -199,7 +199,7 @@ async def test_nothing_is_sent_while_reopening() -> None:
 
 
 class _Machine(HardwareProvider):
-    """A machine with a line that takes everything and says nothing, until it is lost."""
+    """A machine with a line that discards everything, until it is lost."""
 
     def __init__(self) -> None:
         self.sent: list[object] = []
@@ -234,10 +234,10 @@ class _Open:
     send = write  # type: ignore[assignment]
 
     def close(self) -> None:
-        """Nobody was there."""
+        """Do nothing."""
 
     async def wait_closed(self) -> None:
-        """Nor is anybody."""
+        """Return at once."""
 
 
 WAITING = {
@@ -274,7 +274,7 @@ async def test_request_queued_before_a_loss_is_not_sent_after_reopening(
 
 @pytest.mark.parametrize("kind", WAITING)
 async def test_request_before_opening_is_a_link_error(kind: type[WireBackend]) -> None:
-    """In the words of the wire, and what to do."""
+    """With a remedy."""
     url, _ = WAITING[kind]
     with pytest.raises(LinkError, match=r"/dev/none.* is not open; open the amplifier first"):
         await kind(url.format(1)).exchange(Ping(), timeout=0.2)

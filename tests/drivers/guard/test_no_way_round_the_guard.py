@@ -1,4 +1,4 @@
-"""The source itself: from the controller to the encoders there is no way round the guard."""
+"""The source has no path from the controller to the encoders that bypasses the guard."""
 
 import ast
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ def files(*packages: ModuleType) -> list[Path]:
 
 
 FILES = files(drivers, controller)
-ASIDE = files(era_haptics, model, sim)  # what no excitation goes through on its way to a wire
+ASIDE = files(era_haptics, model, sim)  # not between controller and wire
 GUARD = Path(drivers.__file__).parent / "guard" / "guard.py"
 ENCODERS = {"backends", "codec"}
 
@@ -32,7 +32,7 @@ CARRIERS = {"Stage", "Apply", "LoadEnvelope"}
 
 @cache
 def tree(file: Path) -> ast.Module:
-    """What stands in a file."""
+    """Parse a file."""
     return ast.parse(file.read_text(encoding="utf-8"))
 
 
@@ -76,7 +76,7 @@ def test_only_the_guard_makes_safe_sets(file: Path) -> None:
 
 
 def test_other_packages_make_no_safe_sets() -> None:
-    """Neither the simulation nor the model nor what notebooks import calls for one."""
+    """Simulation, model and notebook API."""
     made = [file for file in ASIDE for name, _ in calls(file) if name.startswith("Safe")]
     assert ASIDE
     assert made == []

@@ -1,4 +1,4 @@
-"""Turns on a link and on a line, in the moments between two steps of the event loop."""
+"""Turns on a link and on a line, between two steps of the event loop."""
 
 import asyncio
 
@@ -44,8 +44,7 @@ def users() -> Users:
 
 
 async def test_stop_class_precedes_a_request_at_its_turn(users: Users) -> None:
-    """An ordinary request that has the turn but has not run yet gives it back, keeps its place
-    before the others, and gets it next."""
+    """An ordinary request that has not run yet returns its turn and is the next."""
     tasks = [users.take(name) for name in ("first", "second", "third")]
     await settle()
     users.ends["first"].set()
@@ -60,7 +59,7 @@ async def test_stop_class_precedes_a_request_at_its_turn(users: Users) -> None:
 
 
 async def test_stop_precedes_other_stop_class_requests(users: Users) -> None:
-    """Silent sets and disarms that wait, with their longer ramps, come after it, in their order."""
+    """Waiting silent sets and disarms follow it in their order."""
     tasks = [users.take("first")]
     await settle()
     tasks += [users.take(name, RequestPriority.SILENCE) for name in ("zero", "disarm")]
@@ -74,7 +73,7 @@ async def test_stop_precedes_other_stop_class_requests(users: Users) -> None:
 
 
 async def test_apply_at_its_turn_is_superseded() -> None:
-    """It was superseded before any of it was sent; the silence comes, and what was behind it."""
+    """By a disarm, before any of it was sent; other requests follow."""
     users = Users(Turns())
     first, apply = users.take("first"), users.take("apply", RequestPriority.APPLY)
     await settle()
@@ -92,7 +91,7 @@ async def test_apply_at_its_turn_is_superseded() -> None:
 
 
 async def test_released_reservation_passes_the_turn_on(users: Users) -> None:
-    """Where what silences was given up, those who have waited meanwhile come; also the new."""
+    """Waiting and new requests follow a stop-class request that was cancelled."""
     users.turns.keep_free("west", RequestPriority.SILENCE)
     early = users.take("early")
     await settle()
@@ -107,8 +106,7 @@ async def test_released_reservation_passes_the_turn_on(users: Users) -> None:
 
 
 async def test_second_reservation_does_not_end_the_first() -> None:
-    """Who stops an amplifier that another is already stopping, and whose stop never comes, takes
-    nothing from the other's: others wait until that has come, too."""
+    """Other amplifiers wait until both have ended."""
     line = LineTurns()
     said: list[str] = []
 
@@ -128,8 +126,7 @@ async def test_second_reservation_does_not_end_the_first() -> None:
 
 
 async def test_exchange_is_refused_while_its_amplifier_is_stopped() -> None:
-    """The second half of an exchange that takes two is refused while its amplifier is about to be
-    silenced, instead of waiting for it; that of another waits."""
+    """The second of two transactions must not wait for the stop; other amplifiers wait."""
     line = LineTurns()
     said: list[str] = []
 

@@ -1,4 +1,4 @@
-"""The host's side of Modbus against a server that a test scripts, and one that is not ours."""
+"""The Modbus backend against a scripted server and an independent one."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -55,14 +55,14 @@ from vendor_pages import (
     usual_reply,
 )
 
-PATIENCE = 5.0  # s; for what is expected to come
-SHORT = 0.02  # s; for what is expected not to come
+PATIENCE = 5.0  # s; for an expected reply
+SHORT = 0.02  # s; without a reply
 MAP = PROTOCOL.modbus
 
 
 @pytest.fixture(params=["TCP", "RTU"])
 async def far(request: pytest.FixtureRequest) -> AsyncIterator[Peer]:
-    """A scripted amplifier in both kinds of frames, well-behaved until a test says otherwise."""
+    """A scripted amplifier with both kinds of frames, well-behaved by default."""
     async with peer(is_rtu=request.param == "RTU") as far:
         yield far
 
@@ -119,7 +119,7 @@ async def test_request_is_one_transaction(
 
 
 async def test_many_faults_are_read_in_two_transactions(far: Peer, backend: ModbusBackend) -> None:
-    """All of them, newest first, up to the most that fit into a read."""
+    """Newest first, as many as fit into a read."""
     records = tuple(FaultRecord(Fault.ARC, number % 4, float(number)) for number in range(32))
     for count, reads in ((4, 1), (5, 2), (30, 2)):
         far.requests.clear()
@@ -145,7 +145,7 @@ async def test_fc16_and_fc4_replace_fc23_when_unsupported(
     assert [type(request) for request in carried_out] == [Apply, Ping]
 
 
-REFUSALS = [code for code in NakCode if code is not NakCode.UNKNOWN_TYPE]  # that is a function's
+REFUSALS = [code for code in NakCode if code is not NakCode.UNKNOWN_TYPE]  # of an unknown function
 
 
 @pytest.mark.parametrize("combined", [True, False], ids=["function 23", "functions 16 and 4"])
@@ -189,7 +189,7 @@ async def test_late_response_is_not_credited_to_the_next_request(
     with pytest.raises(LinkTimeout, match="unit 1"):
         await backend.exchange(GetStatus(), timeout=SHORT)
     far.device.answer = lambda _: replace(ARMED, token=2)
-    for _ in range(3):  # and copies of it later
+    for _ in range(3):  # with copies of the late response
         status = await backend.exchange(GetStatus(), timeout=PATIENCE)
         assert status == replace(ARMED, token=2)
     assert backend.counters.unexpected_frames == 3
@@ -242,7 +242,7 @@ async def test_exception_without_a_refusal_is_a_timeout(far: Peer, backend: Modb
 
 
 def off_by(place: int, bit: int = 1) -> Callable[[bytes], bytes]:
-    """The same answer with one bit of a byte the other way round."""
+    """Flip one bit of a response."""
 
     def change(frame: bytes) -> bytes:
         changed = bytearray(frame)
@@ -268,7 +268,7 @@ async def test_damaged_response_is_discarded(far: Peer, backend: ModbusBackend, 
         assert await backend.exchange(Ping(), timeout=PATIENCE / 10) == ARMED
     except LinkTimeout:
         assert not far.is_rtu
-        assert place == 5  # a length that is longer swallows the beginning of the next frame
+        assert place == 5  # a greater length includes the begin of the next frame
     counters = backend.counters
     assert counters.crc_errors + counters.unexpected_frames >= 1
     far.answer = far.usual

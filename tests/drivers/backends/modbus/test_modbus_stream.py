@@ -1,4 +1,4 @@
-"""A Modbus TCP connection where the network or the other side does not do its part."""
+"""Modbus TCP connections with faults of the network or the server."""
 
 import asyncio
 import socket
@@ -18,7 +18,7 @@ MEGABYTE = 1 << 20
 async def test_connection_timeout_has_a_remedy(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Nobody takes the connection nor refuses it, as where a router drops what is sent there."""
+    """The connection is neither accepted nor refused."""
     monkeypatch.setattr(stream, "_CONNECT_TIMEOUT", 0.0)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
@@ -31,7 +31,7 @@ async def test_connection_timeout_has_a_remedy(
 async def test_first_address_that_accepts_is_used(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The amplifier listens on the second only, as where a name has an IPv6 address, too."""
+    """The amplifier listens on the second address only, such as IPv4."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
         found = [(0, 0, 0, "", (address, 0)) for address in ("127.0.0.2", "127.0.0.1")]
@@ -49,7 +49,7 @@ async def test_first_address_that_accepts_is_used(
 async def test_link_local_address_keeps_its_zone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """As without a router, by RFC 4007: the zone is a part of the address."""
+    """RFC 4007."""
     of_name = ("fe80::1", 0, 0, 3), ("fd00::1", 0, 0, 0), ("192.0.2.1", 0)
     found = [(0, 0, 0, "", address) for address in of_name]
     monkeypatch.setattr(stream.socket, "getaddrinfo", lambda *args, **kwargs: found)
@@ -57,7 +57,7 @@ async def test_link_local_address_keeps_its_zone(
 
 
 def test_unresolved_name_does_not_delay_the_end_of_the_program() -> None:
-    """The connection is given up after a second, and the program ends though the question hangs."""
+    """Even if the name server does not reply."""
     program = """
 import asyncio, socket, threading
 from drivers.backends.modbus import stream
@@ -79,7 +79,7 @@ except LinkError as problem:
 
 
 async def test_blocked_connection_is_a_timeout_before_memory_fills() -> None:
-    """What it does not take fills the system's buffers, then ours; closing throws it away."""
+    """Closing discards unsent data."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
         connection = await open_stream(
@@ -90,4 +90,4 @@ async def test_blocked_connection_is_a_timeout_before_memory_fills() -> None:
             connection.write(b"x")
         connection.close()
         await connection.wait_closed()
-        await asyncio.sleep(0)  # the transport says that it is gone
+        await asyncio.sleep(0)  # the transport reports the end

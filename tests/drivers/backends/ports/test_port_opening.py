@@ -1,4 +1,4 @@
-"""How a serial port is opened, whatever is spoken on it."""
+"""Opening of serial ports."""
 
 import os
 
@@ -11,7 +11,7 @@ from drivers.backends.urls.modbus import ModbusUrl
 
 
 class _Port:
-    """What pyserial would open, as far as it is looked at; nothing ever comes in."""
+    """The used part of a pyserial port, without data."""
 
     def __init__(self, port: str, **settings: object) -> None:
         self.port = port
@@ -21,13 +21,13 @@ class _Port:
         self._read, self._write = os.pipe()
 
     def open(self) -> None:
-        """It is open already."""
+        """Do nothing."""
 
     def set_low_latency_mode(self, low_latency: bool) -> None:
         self.is_low_latency = low_latency
 
     def reset_input_buffer(self) -> None:
-        """Nothing is there."""
+        """Do nothing."""
 
     def fileno(self) -> int:
         return self._read
@@ -43,7 +43,7 @@ class _Port:
 async def test_open_port_sets_low_latency_and_parity(
     monkeypatch: pytest.MonkeyPatch, device: str, parity: str
 ) -> None:
-    """USB adapters hold bytes back for 16 ms else; a pseudo-terminal has no parity."""
+    """A pseudo-terminal has no parity."""
     opened: list[_Port] = []
 
     def make(port: str, **settings: object) -> _Port:

@@ -1,4 +1,4 @@
-"""What a serial port takes, on a pseudo-terminal."""
+"""Writing to a serial port, on a pseudo-terminal."""
 
 import os
 import pty
@@ -28,7 +28,7 @@ def ends() -> Iterator[tuple[serial.Serial, int]]:
 def test_taken_bytes_are_not_a_timeout(
     ends: tuple[serial.Serial, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A process that is held up while it writes has written all the same."""
+    """Even if the process is delayed while it writes."""
     port, far = ends
     monkeypatch.setattr("serial.serialposix.Timeout.expired", lambda self: True)
     write_all(port, b"all of it")
@@ -36,7 +36,7 @@ def test_taken_bytes_are_not_a_timeout(
 
 
 def test_blocked_port_is_a_timeout(ends: tuple[serial.Serial, int]) -> None:
-    """Nobody reads at the other end, so its buffer fills up."""
+    """The other end does not read, so its buffer fills up."""
     port, _ = ends
     with pytest.raises(serial.SerialTimeoutException):
         write_all(port, bytes(1 << 20))
@@ -45,7 +45,7 @@ def test_blocked_port_is_a_timeout(ends: tuple[serial.Serial, int]) -> None:
 async def test_blocked_line_is_a_timeout_with_a_remedy(
     ends: tuple[serial.Serial, int],
 ) -> None:
-    """As a timeout, which is asked again and then counts as a loss."""
+    """Which is retried."""
     port, _ = ends
     watched = WatchedPort(port, "/dev/ttyUSB9", lambda data: None, lambda what: None)
     with pytest.raises(LinkTimeout, match=r"/dev/ttyUSB9.*check flow control"):
@@ -55,7 +55,7 @@ async def test_blocked_line_is_a_timeout_with_a_remedy(
 
 
 def test_closed_port_is_a_link_error(ends: tuple[serial.Serial, int]) -> None:
-    """As an error of the system, which is what a lost one gives, too."""
+    """Like a lost one."""
     port, _ = ends
     port.close()
     with pytest.raises(OSError, match="not open"):

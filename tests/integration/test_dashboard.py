@@ -1,7 +1,6 @@
-"""The dashboard in a real browser, before a real daemon over a simulated amplifier.
+"""The dashboard in a real browser, with a real daemon over a simulated amplifier.
 
-One browser and one daemon for all; every test opens a tab, touches it as a hand or a keyboard does,
-and asks the daemon itself what came of it.
+One browser and one daemon for all tests; each opens a tab of its own.
 """
 
 import asyncio
@@ -79,7 +78,7 @@ async def tab(browser: Browser) -> AsyncIterator[Page]:
 
 @pytest.fixture
 def era(daemon: Path) -> Iterator[Client]:
-    """The daemon itself, ready to be armed; disarmed afterwards."""
+    """A client of the daemon, ready to be armed; disarmed afterwards."""
     with Client.connect(daemon, name="test") as client:
         yield client
         if client.status().state in (STOPPED, "FAULT"):
@@ -96,7 +95,7 @@ async def page(tab: Page, gateway: GatewayProcess, era: Client) -> Page:
 
 
 async def settled(page: Page, era: Client) -> None:
-    """Wait until all is disarmed. A stop goes two ways: the second may come after a clear."""
+    """Wait until all is disarmed. A stop is sent twice: the second may arrive after a clear."""
     async with asyncio.timeout(PATIENCE):
         while await page.evaluate(STATE) != READY or era.status().state != READY:
             if era.status().state in (STOPPED, "FAULT"):
@@ -105,18 +104,18 @@ async def settled(page: Page, era: Client) -> None:
 
 
 async def until_state(era: Client, *states: str) -> None:
-    """Wait for the daemon while the browser goes on."""
+    """Wait for a state of the daemon while the browser runs."""
     await asyncio.to_thread(wait_for_state, era, *states)
 
 
 async def contacts(era: Client, count: int) -> list[tuple[float, float]]:
-    """Where the daemon sees fingers, as soon as there are so many."""
+    """The daemon's contacts [m], as soon as there are so many."""
     await asyncio.to_thread(wait_for, lambda: len(era.status().contacts) == count)
     return [(contact.x_m, contact.y_m) for contact in era.status().contacts]
 
 
 async def arm(page: Page, era: Client) -> None:
-    """By the button; once more where a machine that stood still has let the watchdog trip."""
+    """Arm by the button; again if the watchdog tripped on a busy machine."""
     for _ in range(3):
         await page.click("#arm")
         await until_state(era, ENABLED, "FAULT")
@@ -128,10 +127,8 @@ async def arm(page: Page, era: Client) -> None:
     await page.until(f"{STATE} === 'OPERATION_ENABLED'")
 
 
-async def test_the_page_shows_the_rig_without_a_complaint(page: Page) -> None:
-    """Its ERAs and regions, a banner that all is simulated, its amplifier; nothing in the console,
-    and every request goes to the gateway.
-    """
+async def test_page_shows_the_rig_without_console_messages(page: Page) -> None:
+    """ERAs, regions, the banner of a simulation, the amplifier; all requests go to the gateway."""
     assert await page.evaluate(REASON) == "simulated"
     names = await page.evaluate(
         "[...document.querySelectorAll('#overlay text')].map(e => e.textContent)"
@@ -156,8 +153,8 @@ async def test_the_page_shows_the_rig_without_a_complaint(page: Page) -> None:
     assert page.complaints == []
 
 
-async def test_the_plate_is_on_scale_on_every_screen(page: Page, gateway: GatewayProcess) -> None:
-    """As long and wide as in metres, wholly to be seen, and nothing sticks out of the screen."""
+async def test_plate_is_to_scale_on_every_screen(page: Page, gateway: GatewayProcess) -> None:
+    """Its aspect ratio is that in metres; nothing exceeds the screen."""
     for screen in SCREENS:
         await open_dashboard(page, gateway, screen)
         width, height, overflow = await page.evaluate(
@@ -169,8 +166,8 @@ async def test_the_plate_is_on_scale_on_every_screen(page: Page, gateway: Gatewa
         assert overflow <= 0, screen
 
 
-async def test_the_field_is_drawn_and_frames_go_on(page: Page, era: Client) -> None:
-    """While a finger is felt: many colours on the plate, and a frame for each of the screen's."""
+async def test_field_is_drawn_at_the_frame_rate(page: Page, era: Client) -> None:
+    """Many colours on the plate while a finger is felt, one without."""
     await arm(page, era)
     async with fingers_down(page, PLACES[1]):
         colours = f"({PROBES}).colours('#field')"
@@ -184,10 +181,8 @@ async def test_the_field_is_drawn_and_frames_go_on(page: Page, era: Client) -> N
     assert await page.until(colours, lambda count: count == 1)  # still again
 
 
-async def test_a_finger_while_nobody_has_armed_is_told_why_it_feels_nothing(
-    page: Page, era: Client
-) -> None:
-    """For as long as it is down, and what is to be done in the state that it is in by then."""
+async def test_summary_explains_silence_while_disarmed(page: Page, era: Client) -> None:
+    """While a finger is down, with the remedy for the current state."""
     summary = "document.querySelector('#summary').textContent"
     async with fingers_down(page, PLACES[0]):
         disarmed = await page.until(summary)
@@ -198,8 +193,8 @@ async def test_a_finger_while_nobody_has_armed_is_told_why_it_feels_nothing(
     await page.until(f"{summary} === ''")
 
 
-async def test_fingers_on_the_glass_are_the_daemons_contacts(page: Page, era: Client) -> None:
-    """Two at once, where they are in metres, moved and lifted; the last one is the target."""
+async def test_touches_become_contacts_of_the_daemon(page: Page, era: Client) -> None:
+    """Two at once, at their places in metres, moved and lifted; the last one is the target."""
     await arm(page, era)
     async with fingers_down(page, *PLACES):
         seen = await contacts(era, 2)
@@ -226,8 +221,8 @@ async def test_fingers_on_the_glass_are_the_daemons_contacts(page: Page, era: Cl
     assert page.complaints == []
 
 
-async def test_touches_that_the_browser_takes_away_are_lifted(page: Page, era: Client) -> None:
-    """As when a phone call comes, or another window."""
+async def test_cancelled_touches_are_lifted(page: Page, era: Client) -> None:
+    """Cancelled, or when the window loses focus."""
     for end in ("touchCancel", "blur"):
         await page.touch("touchStart", await on_plate(page, (0.5, 0.5)))
         await contacts(era, 1)
@@ -240,8 +235,8 @@ async def test_touches_that_the_browser_takes_away_are_lifted(page: Page, era: C
             await contacts(era, 0)
 
 
-async def test_a_reload_lifts_resting_fingers_and_takes_new_ones(page: Page, era: Client) -> None:
-    """Fingers that rest on the glass during a reload are gone; the next touch is felt."""
+async def test_reload_lifts_resting_fingers(page: Page, era: Client) -> None:
+    """The next touch is felt."""
     await page.touch("touchStart", await on_plate(page, *PLACES))
     await contacts(era, 2)
     await page.call("Page.reload")
@@ -254,8 +249,8 @@ async def test_a_reload_lifts_resting_fingers_and_takes_new_ones(page: Page, era
     assert await contacts(era, 0) == []
 
 
-async def test_the_mouse_is_a_finger_while_its_button_is_down(page: Page, era: Client) -> None:
-    """It hovers without effect, and is lifted wherever the button is let go."""
+async def test_mouse_is_a_finger_while_its_button_is_down(page: Page, era: Client) -> None:
+    """Hovering has no effect; it is lifted wherever the button is released."""
     ((x, y),) = await on_plate(page, (0.25, 0.5))
     await page.mouse("mouseMoved", x, y, button="none")
     assert await contacts(era, 0) == []
@@ -268,8 +263,8 @@ async def test_the_mouse_is_a_finger_while_its_button_is_down(page: Page, era: C
     assert await contacts(era, 0) == []
 
 
-async def test_the_keyboard_is_a_finger(page: Page, era: Client) -> None:
-    """Enter puts it down in the middle, arrows move it by 5 mm, Enter or leaving lifts it."""
+async def test_keyboard_is_a_finger(page: Page, era: Client) -> None:
+    """Enter puts it down in the middle, arrows move it by 5 mm, Enter or Tab lifts it."""
     await page.evaluate("document.querySelector('#plate').focus()")
     await page.press("Enter")
     assert await contacts(era, 1) == [pytest.approx((LENGTH / 2, WIDTH / 2))]
@@ -287,8 +282,8 @@ async def test_the_keyboard_is_a_finger(page: Page, era: Client) -> None:
     assert await contacts(era, 0) == []
 
 
-async def test_arm_disarm_stop_and_clear_by_their_buttons(page: Page, era: Client) -> None:
-    """Each is there when the daemon allows it; after a stop the log says what to do."""
+async def test_buttons_arm_disarm_stop_and_clear(page: Page, era: Client) -> None:
+    """Each is enabled when the daemon allows it; after a stop the log has the remedy."""
     enabled = (
         "['arm', 'disarm', 'clear', 'stop'].filter(id => !document.getElementById(id).disabled)"
     )
@@ -311,8 +306,8 @@ async def test_arm_disarm_stop_and_clear_by_their_buttons(page: Page, era: Clien
     assert page.complaints == []
 
 
-async def test_it_is_armed_while_the_page_is_open(page: Page, era: Client) -> None:
-    """The lease is renewed meanwhile; who closes the page disarms, for they could not stop."""
+async def test_lease_is_renewed_while_the_page_is_open(page: Page, era: Client) -> None:
+    """Closing the page disarms, because its user could not stop any more."""
     await arm(page, era)
 
     def left() -> float:
@@ -330,8 +325,8 @@ async def test_it_is_armed_while_the_page_is_open(page: Page, era: Client) -> No
 @pytest.mark.parametrize(
     "focus", ["body", "#disarm", "#motion", "#log", "#plate", "#effects button"]
 )
-async def test_the_space_bar_stops_from_anywhere(page: Page, era: Client, focus: str) -> None:
-    """Whatever has the focus, and it does nothing else there."""
+async def test_space_bar_stops_with_any_focus(page: Page, era: Client, focus: str) -> None:
+    """It has no other effect there."""
     await arm(page, era)
     await page.evaluate(f"document.querySelector({focus!r}).focus()")
     scrolled = await page.evaluate("scrollY")
@@ -342,10 +337,10 @@ async def test_the_space_bar_stops_from_anywhere(page: Page, era: Client, focus:
     assert await page.evaluate("scrollY") == scrolled
 
 
-async def test_stop_is_uncovered_on_every_screen_wherever_it_is_scrolled(
+async def test_stop_button_is_uncovered_on_every_screen(
     page: Page, gateway: GatewayProcess
 ) -> None:
-    """All of it within the screen, nothing before any of its corners, large enough for a thumb."""
+    """Wholly within the screen at any scroll position."""
     uncovered = f"({PROBES}).isUncovered('#stop')"
     zoomed = Screen("400 %", 320, 215)
     for screen in (*SCREENS, Screen("wide", 1920, 1080), Screen("narrow", 360, 640), zoomed):
@@ -358,7 +353,7 @@ async def test_stop_is_uncovered_on_every_screen_wherever_it_is_scrolled(
     assert await page.evaluate(uncovered)
 
 
-async def test_what_a_thumb_shall_hit_is_large_enough(page: Page, gateway: GatewayProcess) -> None:
+async def test_touch_targets_are_large_enough(page: Page, gateway: GatewayProcess) -> None:
     """Every button and switch is 44 pixels wide and high on a phone."""
     await open_dashboard(page, gateway, PHONE)
     small = await page.evaluate(
@@ -370,7 +365,7 @@ async def test_what_a_thumb_shall_hit_is_large_enough(page: Page, gateway: Gatew
 
 
 @pytest.mark.parametrize("is_dark", [False, True])
-async def test_text_stands_out_from_its_ground(page: Page, era: Client, is_dark: bool) -> None:
+async def test_text_has_enough_contrast(page: Page, era: Client, is_dark: bool) -> None:
     """By the formula of WCAG 2.2 at least 4.5 to 1, in both schemes, ready, armed and stopped."""
     await page.dark(is_dark)
     looked = 0
@@ -384,8 +379,8 @@ async def test_text_stands_out_from_its_ground(page: Page, era: Client, is_dark:
     assert looked > 60
 
 
-async def test_everything_has_a_role_and_a_name_in_a_sensible_order(page: Page) -> None:
-    """For a screen reader, and in the order of Tab: plate, buttons, stop, then beside."""
+async def test_elements_have_roles_names_and_tab_order(page: Page) -> None:
+    """For screen readers and the keyboard."""
     await page.until(
         "document.querySelector('meter')?.ariaLabel", lambda name: "ERA" in (name or "")
     )
@@ -435,10 +430,8 @@ async def test_everything_has_a_role_and_a_name_in_a_sensible_order(page: Page) 
     assert {"banner", "problem"} <= set(live)
 
 
-async def test_nothing_moves_by_itself_where_less_motion_is_asked_for(
-    page: Page, era: Client
-) -> None:
-    """No animation; the picture of a steady vibration stays as it is."""
+async def test_page_is_still_with_reduced_motion(page: Page, era: Client) -> None:
+    """No animation; the picture of a steady vibration does not change."""
     await page.call(
         "Emulation.setEmulatedMedia",
         features=[{"name": "prefers-reduced-motion", "value": "reduce"}],
@@ -454,8 +447,8 @@ async def test_nothing_moves_by_itself_where_less_motion_is_asked_for(
     assert await page.evaluate("document.getAnimations().length") == 0
 
 
-async def test_what_others_are_called_is_text(page: Page, era: Client) -> None:
-    """A name that is HTML is shown as it is, and made into nothing."""
+async def test_names_are_shown_as_text(page: Page, era: Client) -> None:
+    """HTML in a name is not interpreted."""
     name = "<img src=x onerror=alert(1)><b>bold</b>"
     era.arm(name, lease_s=5)
     await page.until(f"{STATE} === 'OPERATION_ENABLED'")
@@ -465,8 +458,8 @@ async def test_what_others_are_called_is_text(page: Page, era: Client) -> None:
     assert page.complaints == []
 
 
-async def test_no_name_of_a_region_lies_under_an_era(page: Page) -> None:
-    """Wherever ERAs stand at the edges of regions, on a large plate and on a small one."""
+async def test_region_names_lie_beside_eras(page: Page) -> None:
+    """With ERAs at the edges of regions, on a large and a small plate."""
     hidden = (
         "import('./plate.js').then(({ PlateOverlay }) => {"
         " const plate = document.body.appendChild(document.createElement('div'));"
@@ -499,10 +492,8 @@ async def test_no_name_of_a_region_lies_under_an_era(page: Page) -> None:
         assert await page.evaluate(hidden % width) == [4, 4, 0]
 
 
-async def test_no_text_on_the_plate_covers_another(page: Page) -> None:
-    """What fingers feel, where ERAs stand at their side or below them, and the names of regions, on
-    a plate as wide as on a phone: all of it is to be read.
-    """
+async def test_texts_on_the_plate_do_not_overlap(page: Page) -> None:
+    """Contacts, ERAs and names of regions, also as narrow as on a phone."""
     covered = (
         "import('./plate.js').then(({ PlateOverlay }) => {"
         " const plate = document.body.appendChild(document.createElement('div'));"
@@ -540,8 +531,8 @@ async def test_no_text_on_the_plate_covers_another(page: Page) -> None:
         assert await page.evaluate(covered % width) == []
 
 
-async def test_an_effect_plays_at_the_newest_finger(page: Page, era: Client) -> None:
-    """Its button can be pressed while armed only, and needs a finger anywhere on the plate."""
+async def test_effect_button_plays_at_the_newest_finger(page: Page, era: Client) -> None:
+    """Only while armed, and with a finger on the plate."""
     assert await page.until("document.querySelector('#effects button:disabled') !== null")
     await arm(page, era)
     async with fingers_down(page, PLACES[0]):
@@ -555,8 +546,8 @@ async def test_an_effect_plays_at_the_newest_finger(page: Page, era: Client) -> 
     await page.until("document.querySelector('#problem').innerText")
 
 
-async def test_an_event_that_is_told_again_takes_one_line(page: Page) -> None:
-    """A link that is tried every few seconds does not push out why it was lost."""
+async def test_repeated_event_takes_one_line(page: Page) -> None:
+    """So that retries do not push out why a link was lost."""
     shown = await page.evaluate(
         "import('./side.js').then(({ addEvent }) => {"
         " const log = document.createElement('ol');"
@@ -569,7 +560,7 @@ async def test_an_event_that_is_told_again_takes_one_line(page: Page) -> None:
 
 
 async def test_only_the_lost_amplifier_is_shown_as_lost(page: Page) -> None:
-    """One that was closed with it has no red frame, and what it plays is unknown all the same."""
+    """One that was closed with it has no red frame; its levels are unknown, too."""
     shown = await page.evaluate(
         "import('./side.js').then(({ showAmplifiers }) => {"
         " const unknown = { state: null, fault: null, levels: [], temperature_c: null,"
@@ -589,10 +580,8 @@ async def test_only_the_lost_amplifier_is_shown_as_lost(page: Page) -> None:
     ]
 
 
-async def test_the_door_lets_in_with_the_token_alone(
-    tab: Page, gateway: GatewayProcess, era: Client
-) -> None:
-    """Without one it asks; with a wrong one it says so; with the right one the page is there."""
+async def test_login_needs_the_token(tab: Page, gateway: GatewayProcess, era: Client) -> None:
+    """Without one it is requested; a wrong one is refused; the right one opens the page."""
     await tab.show(gateway.url)
     await tab.until("!document.querySelector('#login').hidden")
     assert await tab.evaluate("document.querySelector('#main').hidden") is True
@@ -611,8 +600,8 @@ async def test_the_door_lets_in_with_the_token_alone(
             assert await tab.evaluate(REASON) == "gateway-refused"
 
 
-async def test_it_comes_back_after_gateway_and_daemon(tab: Page, tmp_path: Path) -> None:
-    """Each is taken away and started again: the page says so, and goes on by itself."""
+async def test_page_reconnects_after_gateway_and_daemon_restarts(tab: Page, tmp_path: Path) -> None:
+    """Each loss is shown, and the page continues by itself."""
     with gateway_process(tmp_path, tmp_path / "era.sock") as first:
         with real_daemon(tmp_path):
             await open_dashboard(tab, first, DESKTOP)

@@ -1,4 +1,4 @@
-"""The dashboard in a real browser when something is lost: what it still knows, and no more."""
+"""The dashboard in a real browser after losses."""
 
 from collections.abc import AsyncIterator
 from itertools import pairwise
@@ -41,9 +41,9 @@ async def tab(browser: Browser) -> AsyncIterator[Page]:
         yield page
 
 
-async def test_a_lost_link_is_one_event_with_what_has_come_of_it(tab: Page, tmp_path: Path) -> None:
-    """The banner says since when and for how long at most the amplifier plays; how it was before is
-    not shown as how it is; attempts and the return stand below the loss.
+async def test_lost_link_is_one_event_with_its_attempts(tab: Page, tmp_path: Path) -> None:
+    """The banner has the watchdog time; outdated values are hidden; attempts and the return are
+    listed below the loss.
     """
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await until_state(era, "READY_TO_SWITCH_ON")
@@ -76,10 +76,8 @@ async def test_a_lost_link_is_one_event_with_what_has_come_of_it(tab: Page, tmp_
             assert "%" in await tab.evaluate(TILE)
 
 
-async def test_a_daemon_that_ends_without_a_link_is_not_said_to_have_it_back(
-    tab: Page, tmp_path: Path
-) -> None:
-    """What was lost stays so in the events, and the end is an event of its own."""
+async def test_end_of_the_daemon_is_no_return_of_a_lost_link(tab: Page, tmp_path: Path) -> None:
+    """The end is an event of its own."""
     states: list[tuple[DaemonStateName, str]] = [
         ("READY_TO_SWITCH_ON", ""),
         ("COMM_LOST", "amplifier main: cut"),
@@ -94,10 +92,8 @@ async def test_a_daemon_that_ends_without_a_link_is_not_said_to_have_it_back(
     assert events[1].endswith("amplifier main: cut")
 
 
-async def test_why_onsets_are_plain_is_said_for_as_long_as_they_are(
-    tab: Page, tmp_path: Path
-) -> None:
-    """Beside the latencies that it is about, in the daemon's words."""
+async def test_reason_for_plain_onsets_is_shown(tab: Page, tmp_path: Path) -> None:
+    """Beside the latencies, while it holds."""
     summary = LatencySummary(count=0, median=None, p99=None, p999=None, histogram=[])
     plain = "document.querySelector('#plain').innerText"
     with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
@@ -112,8 +108,8 @@ async def test_why_onsets_are_plain_is_said_for_as_long_as_they_are(
             )
 
 
-async def test_the_banner_says_how_it_is_with_the_gateway_now(tab: Page, tmp_path: Path) -> None:
-    """Refused for the token, gone, there with the right token again: whatever was before."""
+async def test_banner_shows_the_state_of_the_gateway(tab: Page, tmp_path: Path) -> None:
+    """Token refused, unreachable, accepted again."""
 
     async def until_shown(reason: str) -> None:
         await tab.until(f"{REASON} === '{reason}'")
@@ -134,8 +130,8 @@ async def test_the_banner_says_how_it_is_with_the_gateway_now(tab: Page, tmp_pat
     await until_shown("gateway-unreachable")
 
 
-async def test_a_gateway_without_room_is_not_said_to_be_gone(tab: Page, tmp_path: Path) -> None:
-    """The banner tells a full gateway from an unreachable one."""
+async def test_full_gateway_is_shown_as_full(tab: Page, tmp_path: Path) -> None:
+    """Not as unreachable."""
     with gateway_process(tmp_path, tmp_path / "none.sock") as gateway:
         others = [RawWebSocket(gateway) for _ in range(MAX_SESSIONS)]
         await tab.show(f"{gateway.url}#token={gateway.token}")

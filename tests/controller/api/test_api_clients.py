@@ -163,7 +163,7 @@ async def test_connect_fails_when_the_peer_is_no_compatible_daemon(
 
 
 async def test_connect_raises_an_error_without_id(tmp_path: Path) -> None:
-    """A daemon with too many clients says so before it reads anything."""
+    """As sent by a daemon with too many clients before it reads anything."""
     busy = b'{"jsonrpc":"2.0","id":null,"error":{"code":1005,"message":"too many connections"}}\n'
     for error in await connect_error(tmp_path, busy):
         assert isinstance(error, RpcError)

@@ -147,7 +147,7 @@ async def test_daemon_sends_exactly_the_documented_keys(tmp_path: Path) -> None:
 
 
 async def test_gateway_reports_a_daemon_of_another_major_version(tmp_path: Path) -> None:
-    """Its calls fail with both versions and the remedy, whatever else `hello` holds."""
+    """Its calls fail with both versions and the remedy."""
 
     def changed(content: dict[str, Any]) -> dict[str, Any]:
         return content | {"result": {"api_version": "2.0", "era": 2}}

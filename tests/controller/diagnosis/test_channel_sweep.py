@@ -1,4 +1,4 @@
-"""Driving a rig channel by channel, where an amplifier does not play what it was asked to."""
+"""A sweep over channels when an amplifier does not play what was commanded."""
 
 import asyncio
 
@@ -15,7 +15,7 @@ from virtual_loop import in_virtual_time
 
 
 class Deaf(Sensors):
-    """One sensor at a corner, which hears nothing."""
+    """One sensor at a corner, which reads zero."""
 
     def __init__(self) -> None:
         self.names = ("P1",)
@@ -36,7 +36,7 @@ class Deaf(Sensors):
 
 @in_virtual_time
 async def test_channel_sweep_ends_when_a_level_is_not_played() -> None:
-    """By half too quiet it would pass for a dead channel: told with both levels, and disarmed."""
+    """Half the level would look like a dead channel; refused with both levels, then disarmed."""
     bench = make_bench()
     far_end = bench.far_end
 

@@ -37,7 +37,7 @@ def wanted(
 
 
 def test_click_ends_after_its_duration() -> None:
-    """A click of 40 ms is felt until then; the intent says when to look again, and ends."""
+    """A click of 40 ms; the intent expires then."""
     player = EffectPlayer(Layout(effects={"click": Click(level=18.0)}, elsewhere="click"))
     here = [finger(1)]
     intent = player.intent(here, 10.0)
@@ -49,7 +49,7 @@ def test_click_ends_after_its_duration() -> None:
 
 
 def test_buzz_lasts_while_the_finger_stays() -> None:
-    """Without a duration it asks for nothing but its finger; a new finger begins anew."""
+    """Without a duration; a new finger starts it again."""
     player = EffectPlayer(Layout())
     assert wanted(player, [finger(1)], 0.0) == {1: 20.0}
     assert player.intent([finger(1)], 100.0).until is None
@@ -251,7 +251,7 @@ def test_player_ignores_plays_without_sensation() -> None:
 
 
 def test_player_plays_an_effect_by_name() -> None:
-    """What was asked for by name goes before all regions, at its level, and then is over."""
+    """A requested effect has priority over all regions, at its level, until it ends."""
     player = EffectPlayer(Layout(effects={"buzz": Buzz(), "alert": Click(duration=0.1)}))
     here, other = finger(1), finger(2)
     assert wanted(player, [here, other], 0.0) == {2: 20.0}
@@ -275,7 +275,7 @@ def test_requested_effect_ends_with_its_finger() -> None:
 
 
 def test_requested_effect_restarts_when_requested_again() -> None:
-    """An effect that never ends, asked for a thousand times, is one; it goes with its finger."""
+    """An effect without an end, requested a thousand times, runs once; it ends with its finger."""
     felt = 0
 
     class Felt(EffectRun):
@@ -406,7 +406,7 @@ def test_shapes(
 
 
 def test_effect_kinds_include_plug_ins() -> None:
-    """Whatever parameters they have, as JSON; they disturb the list of the others in nothing."""
+    """With their parameters as JSON."""
 
     class Rhythm(Buzz):
         """Beats of one's own."""

@@ -259,7 +259,7 @@ def test_read_token_refuses_unsafe_and_unreadable_files(tmp_path: Path) -> None:
 def test_read_token_refuses_a_file_of_another_user(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its owner can read it, whatever its mode."""
+    """Its owner can read it, also with mode 600."""
     file = tmp_path / "token"
     file.write_text(TOKEN)
     file.chmod(0o600)

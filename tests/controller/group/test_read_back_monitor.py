@@ -1,4 +1,4 @@
-"""The control loop sees that amplifiers play what they were told."""
+"""Comparison of commanded and reported levels."""
 
 import pytest
 
@@ -30,7 +30,7 @@ def expecting(safe: SafeCommandSet) -> ReadBackMonitor:
 
 
 def test_check_refuses_a_level_that_differs_for_100_ms() -> None:
-    """Two heartbeats later, with both levels in the message; the right one is no matter."""
+    """With both levels in the message; during a ramp, or as commanded, none is refused."""
     read_backs = expecting(tone(ramp=0.02))
     read_backs.check("main", reported(0.1, 0.0), now=10.01)  # it fades
     for moment in (10.05, 10.10):
@@ -42,7 +42,7 @@ def test_check_refuses_a_level_that_differs_for_100_ms() -> None:
 
 
 def test_check_expects_nothing_of_ending_or_forgotten_sets() -> None:
-    """valid_for may be over at any heartbeat; after a stop nobody knows."""
+    """Sets that end by themselves may be over at any heartbeat."""
     ends, forgotten = expecting(tone(valid_for=1.0)), expecting(tone())
     forgotten.forget()
     for read_backs in (ends, forgotten):

@@ -1,7 +1,4 @@
-"""Amplifiers that share a bus are stopped by one frame, whoever of them answers.
-
-In virtual time over real far ends; what is told is what the amplifiers heard, and when.
-"""
+"""Amplifiers that share a bus are stopped by one frame, in virtual time over real far ends."""
 
 import asyncio
 from collections.abc import Callable, Coroutine
@@ -36,8 +33,7 @@ def on_a_bus(
     rig: Rig,
     use: Callable[[FarSide, AmplifierGroup, list[tuple[str, float]]], Coroutine[Any, Any, None]],
 ) -> None:
-    """Use three armed amplifiers in virtual time; the last of use's arguments is who heard a Stop,
-    and when [s]."""
+    """Use three armed amplifiers; `use` also gets which received a Stop, and when [s]."""
     wiring = {era: Channel(NAMES[number % 3], number // 3) for number, era in enumerate(rig.wiring)}
     three = replace(rig, wiring=wiring, amplifiers=dict.fromkeys(NAMES, "sim://"))
     heard: list[tuple[str, float]] = []
@@ -68,8 +64,7 @@ def on_a_bus(
 
 @pytest.mark.parametrize("bus", BUSES)
 def test_stop_on_a_bus_is_not_delayed_by_a_hung_amplifier(bus: str, coarse_rig: Rig) -> None:
-    """The first is asked for its status 30 ms and more; the others are silent a frame after the
-    stop was wished all the same, and latched."""
+    """The others are stopped and latched within the duration of a frame."""
 
     async def use(far: FarSide, group: AmplifierGroup, heard: list[tuple[str, float]]) -> None:
         far.devices["first"].inject_fault(FaultWindow("hang"))
@@ -84,7 +79,7 @@ def test_stop_on_a_bus_is_not_delayed_by_a_hung_amplifier(bus: str, coarse_rig: 
 
 @pytest.mark.parametrize("bus", BUSES)
 def test_stop_on_a_bus_is_followed_by_a_stop_of_each(bus: str, coarse_rig: Rig) -> None:
-    """One frame tells all at a moment, and then each is asked for its answer."""
+    """One frame stops all at once, then each is stopped by itself."""
 
     async def use(far: FarSide, group: AmplifierGroup, heard: list[tuple[str, float]]) -> None:
         await group.stop()
@@ -97,7 +92,7 @@ def test_stop_on_a_bus_is_followed_by_a_stop_of_each(bus: str, coarse_rig: Rig) 
 
 @pytest.mark.parametrize("bus", BUSES)
 def test_stop_on_a_bus_reaches_others_when_one_is_lost(bus: str, coarse_rig: Rig) -> None:
-    """One that is there sends it: the others hear it at one moment, and are asked as well."""
+    """Sent over the link of another: the others receive it at once, then each by itself."""
 
     async def use(far: FarSide, group: AmplifierGroup, heard: list[tuple[str, float]]) -> None:
         await group._amplifiers["first"].close()  # as it is until it is opened again

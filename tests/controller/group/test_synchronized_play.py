@@ -1,4 +1,4 @@
-"""What several amplifiers are asked for a set where silence comes before it, or amid it."""
+"""Playing one set on several amplifiers."""
 
 import pytest
 
@@ -17,7 +17,7 @@ NAMES = ("a", "b")
 async def test_play_ends_when_silenced_between_steps(
     steps: int, asked: list[type[Request]]
 ) -> None:
-    """Before it nothing is asked; once all have it staged nobody commits, and none is torn."""
+    """Nothing is sent, or nothing committed once all are staged; the set is not incomplete."""
     far_ends = {name: FarEnd() for name in NAMES}
     amplifiers = {name: Amplifier(far_end) for name, far_end in far_ends.items()}
     for amplifier in amplifiers.values():
@@ -39,7 +39,7 @@ async def test_play_ends_when_silenced_between_steps(
 
 @in_virtual_time
 async def test_play_reports_when_the_last_commit_was_sent() -> None:
-    """The wire of one takes 10 ms longer, so the other is told 10 ms later; both are asked then."""
+    """The commit on the faster wire is sent 10 ms later."""
     far_ends = {name: FarEnd() for name in NAMES}
     far_ends["a"].commit_takes = 0.010
     amplifiers = {name: Amplifier(far_end) for name, far_end in far_ends.items()}

@@ -1,4 +1,4 @@
-"""Touches, arming, stopping, cancelling and slow answers in any order: nothing stays vibrating."""
+"""Touches, arming, stops, cancellations and slow replies in any order: nothing stays vibrating."""
 
 import asyncio
 import random
@@ -24,7 +24,7 @@ WATCHDOG = 0.25 + 0.005  # s; what an amplifier needs to fall silent by itself
 
 
 class Link(Backend):
-    """A simulated amplifier on the loop's clock whose answers take a while; some may be lost."""
+    """A simulated amplifier on the loop's clock with delayed replies, some of them lost."""
 
     def __init__(self, dice: random.Random, *, loss: float) -> None:
         self.amplifier = SimulatedAmplifier("any", channels=2)
@@ -33,10 +33,10 @@ class Link(Backend):
         self._last_sent = 0.0
 
     async def open(self) -> None:
-        """Always succeeds."""
+        """Do nothing."""
 
     async def close(self) -> None:
-        """Nothing is to be given back."""
+        """Do nothing."""
 
     @property
     def last_sent(self) -> float:
@@ -44,7 +44,7 @@ class Link(Backend):
         return self._last_sent
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
-        """Obey at once, answer later."""
+        """Obey at once, reply later."""
         self._last_sent = asyncio.get_running_loop().time()
         reply = self.amplifier.handle(request, self._last_sent)
         if self._dice.random() < self._loss:
@@ -54,7 +54,7 @@ class Link(Backend):
         return reply
 
     def level(self) -> float:
-        """The loudest channel now."""
+        """The highest level of all channels."""
         now = asyncio.get_running_loop().time()
         self.amplifier.tick(now)
         return max(self.amplifier.status(now).levels)
@@ -63,7 +63,7 @@ class Link(Backend):
 async def step_at_random(
     controller: Controller, table: Any, dice: random.Random, tasks: list[asyncio.Task[None]]
 ) -> bool | None:
-    """Do one thing; whether a finger is down now, or None where that has not changed."""
+    """Do one step; return whether a finger is down, None if that has not changed."""
     now = asyncio.get_running_loop().time()
     match dice.choices(["touch", "lift", "ask", "withdraw", "wait"], [9, 5, 4, 1, 2])[0]:
         case "touch":
@@ -95,9 +95,9 @@ async def step_at_random(
 async def test_controller_never_stays_vibrating_for_any_order_of_events(
     seed: int, loss: float
 ) -> None:
-    """While answers come, zero is reached 20 ms after the last finger; in the end in any case.
+    """Without loss zero is reached 20 ms after the last lift; after the end in any case.
 
-    The end is a close, or a loop that is no more: then the watchdogs do it. No task is left.
+    The end is a close, or a cancelled loop, after which the watchdogs act. No task is left.
     """
     dice = random.Random(seed)
     loop = asyncio.get_running_loop()

@@ -1,4 +1,4 @@
-"""What the opened amplifiers can play, and which envelopes their wires have the time for."""
+"""Capabilities of the open amplifiers, and envelopes that their wires load in time."""
 
 import math
 from collections.abc import Callable
@@ -79,7 +79,7 @@ def test_capabilities_choose_the_best_common_drive_mode(
 
 
 def test_capabilities_refuse_an_unplayable_drive_mode() -> None:
-    """The choice holds, or is refused with what there is."""
+    """With those that can be played."""
     plain = {name: Opened(replace(FINE, phase_step=360.0)) for name in ("left", "right")}
     assert playback_capabilities(rig(), plain, drive_mode="switched").drive_mode == "switched"
     with pytest.raises(InputError, match=r"switched, graded.*phased"):
@@ -87,7 +87,7 @@ def test_capabilities_refuse_an_unplayable_drive_mode() -> None:
 
 
 def test_capabilities_are_the_tightest_limits() -> None:
-    """Of the rig's limits and every amplifier."""
+    """Of the rig and all amplifiers."""
     left = Opened(replace(FINE, frequency_min=50.0, level_max=0.5))
     right = Opened(replace(FINE, frequency_max=300.0))
     capabilities = playback_capabilities(rig(), {"left": left, "right": right})
@@ -121,7 +121,7 @@ def test_shaping_needs_capability_and_loading_time(
 
 
 def test_shaping_is_plain_without_loading_time() -> None:
-    """Where a touch may not wait at all, ramps serve, however fast the wire is."""
+    """However fast the wire is."""
     assert not shaping_of(rig(), {"left": Opened(), "right": Opened()}, within=0.0)
 
 
@@ -152,7 +152,7 @@ def test_wire_envelopes_by_hand() -> None:
 
 
 def test_wire_envelopes_round_full_stroke_to_one() -> None:
-    """What rounding adds in the search for knots would be refused by every guard."""
+    """A rounding error above it would be refused by the guard."""
     full = complex(1e-4 * math.cos(1.0), 1e-4 * math.sin(1.0)) * (1 + 1e-12)
     pattern = Pattern({}, 0.02, 20.0, None, None, onset={"A": Envelope(110.0, 0, (full, 0))})
     ((envelope,), _) = wire_envelopes(pattern, rig()).values()

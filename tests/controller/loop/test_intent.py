@@ -1,4 +1,4 @@
-"""Who is the target where nobody gave touches another meaning."""
+"""The default intent: the newest contact buzzes."""
 
 import math
 
@@ -9,7 +9,7 @@ from controller.sources.contacts import Contact, ContactKey
 
 
 def at(id: int) -> Contact:
-    """A contact; where it is does not matter here."""
+    """A contact."""
     return Contact(ContactKey("a", id), 0.1, 0.1, since=0.0)
 
 
@@ -31,13 +31,13 @@ def wanted(source: NewestBuzzes, *ids: int) -> list[int]:
 def test_newest_buzzes_targets_the_newest_contact(
     steps: list[tuple[int, ...]], targets: list[list[int]]
 ) -> None:
-    """From contacts to target, step by step."""
+    """Step by step."""
     source = NewestBuzzes()
     assert [wanted(source, *ids) for ids in steps] == targets
 
 
 def test_newest_buzzes_keeps_its_level() -> None:
-    """None is for as strongly as the neighbours allow; nothing is to be asked again for."""
+    """None means as strong as the neighbours allow; the intent does not expire."""
     for level in (17.0, None):
         intent = NewestBuzzes(level).intent((at(1),), 0.0)
         assert intent.targets == (Target(ContactKey("a", 1), level),)
@@ -57,5 +57,5 @@ def test_newest_buzzes_gives_a_reason_for_no_target() -> None:
     ("until", "due"), [(None, None), (7.0, 7.0), (3.0, 5.001), (math.nan, 5.001)]
 )
 def test_due_of_an_expired_intent_is_later(until: float | None, due: float | None) -> None:
-    """The loop comes back when it does; one that has run out does not keep it busy."""
+    """So that it does not keep the loop busy."""
     assert HapticIntent((), until=until).due(5.0) == due

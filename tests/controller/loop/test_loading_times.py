@@ -1,4 +1,4 @@
-"""When envelopes are loaded no more, and when that is tried again."""
+"""When loading envelopes is paused, and when it is retried."""
 
 from controller.loop.loading_times import FIRST_PAUSE, MAX_PAUSE, LoadingTimes
 
@@ -6,12 +6,12 @@ SLOW, FAST = 0.031, 0.030
 
 
 def pause_after(times: LoadingTimes, now: float) -> float:
-    """How long [s] from a time on nothing is loaded, to half a second."""
+    """Duration [s] of the pause from a time on, to half a second."""
     return next(half / 2 for half in range(10_000) if times.problem(now + half / 2) is None)
 
 
 def test_three_slow_loadings_in_a_row_pause_loading() -> None:
-    """One in time between them, and it is counted anew; just as long as allowed is in time."""
+    """One in time between them resets the count; exactly the allowed time is in time."""
     times = LoadingTimes(FAST)
     for duration in (SLOW, SLOW, FAST, SLOW, SLOW):
         times.note(duration, now=5.0)
@@ -35,7 +35,7 @@ def test_pauses_double_up_to_the_maximum() -> None:
 
 
 def test_three_loadings_in_time_reset_the_pause() -> None:
-    """After three in time a slow one is a hiccup again, and the pause is the first one."""
+    """The next pause needs three slow ones again, and is the first."""
     times = LoadingTimes(FAST)
     for _ in range(3):
         times.note(SLOW, now=0.0)
@@ -47,7 +47,7 @@ def test_three_loadings_in_time_reset_the_pause() -> None:
 
 
 def test_two_loadings_in_time_keep_the_pause() -> None:
-    """A wire that is fast for a moment is left at its first slow loading, for twice as long."""
+    """The next slow loading pauses for twice as long."""
     times = LoadingTimes(FAST)
     for _ in range(3):
         times.note(SLOW, now=0.0)

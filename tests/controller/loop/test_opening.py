@@ -1,4 +1,4 @@
-"""What a controller finds out when it is opened, with a real table."""
+"""Opening a controller with a real table."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from virtual_loop import in_virtual_time
 
 @in_virtual_time
 async def test_open_refuses_a_table_without_playable_frequencies() -> None:
-    """Before anything is armed, with what both of them have; nothing stays open."""
+    """With the bands of amplifier and table; nothing stays open."""
     link = Link(channels=4)
     link.amplifier.capabilities = replace(link.amplifier.capabilities, frequency_min=400.0)
     table = small_table()

@@ -33,7 +33,7 @@ RIG = Rig(
 
 
 def test_route_by_hand() -> None:
-    """20 of 100 µm is level 0.2, 20 of 50 is 0.4; pi/2 is 90°; what is not driven is silent."""
+    """20 of 100 µm is level 0.2, 20 of 50 is 0.4; pi/2 is 90°; other channels are silent."""
     sets = route(
         {"SW": Tone(110.0, 20e-6, math.pi / 2), "SE": Tone(250.0, 20e-6)}, RIG, token=7, ramp=0.02
     )
@@ -81,7 +81,7 @@ def test_route_wraps_phases(radians: float, degrees: float) -> None:
 
 
 def test_route_applies_no_limits() -> None:
-    """More than full stroke and numbers that are none go on to the guard as they are."""
+    """More than full stroke and NaN reach the guard unchanged."""
     over = route({"SE": Tone(1e9, 1e-4, math.nan)}, RIG, token=1, ramp=0)["right"].commands[0]
     assert over.frequency == 1e9
     assert over.level == pytest.approx(2.0)
@@ -107,7 +107,7 @@ def test_route_refuses_an_unknown_era() -> None:
     ],
 )
 def test_route_keeps_phase_only_if_all_eras_continue(wanted: Excitation, kept: set[str]) -> None:
-    """A frequency runs on if only ERAs play it that do already; one that joins in restarts all."""
+    """A frequency restarts if an ERA joins it."""
     playing = {name: DriveCommand(0, 110.0, 0.5) for name in ("SW", "SE")}
     sets = route(wanted, RIG, token=1, ramp=0, playing=playing)
     drive = drive_of_eras(sets, RIG)
@@ -117,7 +117,7 @@ def test_route_keeps_phase_only_if_all_eras_continue(wanted: Excitation, kept: s
 
 
 def test_drive_of_eras_by_hand() -> None:
-    """What the amplifiers play is told by ERA, without the silent ones."""
+    """What each ERA plays, without silent ones."""
     achieved = {
         "left": Achieved(7, (DriveCommand(0, 40.0, 0.0), DriveCommand(1, 110.01, 0.1999))),
         "right": Achieved(7, (DriveCommand(0, 250.0, 0.4),)),

@@ -256,7 +256,7 @@ async def test_disarm_ends_loading_and_playing(link: Link, shapes: Shapes) -> No
 
 
 def without_envelopes(link: Link) -> None:
-    """An amplifier that plays none."""
+    """Let the amplifier play no envelopes."""
     capabilities = link.amplifier.capabilities
     link.amplifier.capabilities = replace(capabilities, envelope_knots=0, envelope_slots=0)
 

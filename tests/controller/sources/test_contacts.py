@@ -43,7 +43,7 @@ def test_tracker_maps_touches_to_the_plate(
 
 
 def test_tracker_reports_down_moved_up() -> None:
-    """A contact comes, moves and goes, each told once, and remembers when it came."""
+    """Each once; a contact keeps the time since when it is down."""
     tracker = ContactTracker(PLATE)
     change = tracker.update(frame(1.0, (7, 0.5, 0.5)))
     assert [contact.key for contact in change.down] == [ContactKey("a", 7)]
@@ -56,7 +56,7 @@ def test_tracker_reports_down_moved_up() -> None:
 
 
 def test_tracker_keeps_the_order_of_arrival() -> None:
-    """The newest contact is the last, whatever order frames name them in and however they move."""
+    """The newest contact is the last, in whatever order frames list them."""
     tracker = ContactTracker(PLATE)
     tracker.update(frame(0.0, (5, 0.1, 0.1)))
     tracker.update(frame(0.0, (1, 0.5, 0.5), source="b"))
@@ -77,7 +77,7 @@ def test_tracker_keeps_the_order_of_arrival() -> None:
     ],
 )
 def test_tracker_rejects_invalid_touches(x: float, y: float, reason: str) -> None:
-    """A place that is none makes no contact, ends the one it was of, and is reported."""
+    """An invalid position makes no contact, lifts its previous one, and is reported."""
     tracker = ContactTracker(PLATE)
     tracker.update(frame(0.0, (1, 0.5, 0.5), (2, 0.5, 0.5)))
     change = tracker.update(frame(0.01, (1, x, y), (2, 0.5, 0.5), (3, x, y)))
@@ -87,7 +87,7 @@ def test_tracker_rejects_invalid_touches(x: float, y: float, reason: str) -> Non
 
 
 def test_tracker_rejects_duplicates() -> None:
-    """Of two touches with one id in a frame the last holds, and it is counted."""
+    """Of two touches with one id in a frame the last counts; it is reported."""
     tracker = ContactTracker(PLATE)
     change = tracker.update(frame(0.0, (1, 0.1, 0.5), (1, 0.9, 0.5)))
     assert [contact.x for contact in change.down] == [pytest.approx(0.27)]
@@ -123,7 +123,7 @@ def test_tracker_lifts_contacts_after_the_timeout() -> None:
 
 @pytest.mark.parametrize("time", [math.nan, math.inf])
 def test_tracker_rejects_frames_without_a_time(time: float) -> None:
-    """Touches that no lease could end make no contact."""
+    """Touches that could not time out make no contact."""
     tracker = ContactTracker(PLATE)
     tracker.update(frame(0.0, (1, 0.5, 0.5)))
     change = tracker.update(frame(time, (1, 0.5, 0.5)))
@@ -132,7 +132,7 @@ def test_tracker_rejects_frames_without_a_time(time: float) -> None:
 
 
 def test_tracker_times_out_frames_from_the_future() -> None:
-    """A frame that claims to be of the future is leased from when it was first looked at."""
+    """A frame from the future counts from when it is first processed."""
     tracker = ContactTracker(PLATE)
     tracker.update(frame(1e6, (1, 0.5, 0.5)))
     assert not tracker.expire(10.0)
@@ -150,7 +150,7 @@ FRAMES = st.builds(
 
 @given(st.lists(FRAMES | st.floats(0, 2)))
 def test_tracker_invariants_for_any_sequence(events: list[TouchFrame | float]) -> None:
-    """Whatever comes, contacts are on the plate, bounded and each once; changes add up to them."""
+    """Contacts are on the plate, bounded and unique; changes add up to them."""
     tracker = ContactTracker(PLATE)
     told: dict[ContactKey, tuple[float, float]] = {}
     latest = 0.0

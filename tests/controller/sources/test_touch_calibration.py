@@ -69,7 +69,7 @@ def test_fitted_recovers_any_matrix(matrix: tuple[float, ...]) -> None:
 
 
 def test_fitted_refuses_a_large_residual() -> None:
-    """Of four corners one was touched 4 cm off: no fit, and the distance is told."""
+    """One of four corners was touched 4 cm off; the error has the residual."""
     touched = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)]
     with pytest.raises(InputError, match=r"point \d .*10\.0 mm"):
         # A quarter of the error stays at every corner of a parallelogram.
@@ -89,7 +89,7 @@ def test_fitted_refuses_a_large_residual() -> None:
 def test_fitted_refuses_insufficient_points(
     touched: list[tuple[float, float]], places: list[tuple[float, float]], words: str
 ) -> None:
-    """They are refused, each with its reason."""
+    """Each with its reason."""
     with pytest.raises(InputError, match=words):
         fitted(touched, places, PLATE)
 

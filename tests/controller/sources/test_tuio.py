@@ -119,7 +119,7 @@ def test_reader_drops_late_frames(reader: TuioReader) -> None:
 
 
 def test_reader_accepts_redundant_frames(reader: TuioReader) -> None:
-    """A frame numbered -1 is news whatever came before, and does not make the next one late."""
+    """A frame numbered -1 is never late, and does not make the next one late."""
     reader.read(frame((1, 0.25, 0.5), fseq=10), PEER, now=0)
     assert touches(reader.read(frame((1, 0.5, 0.5), fseq=-1), PEER, now=0.01)) == [(1, 0.5, 0.5)]
     assert touches(reader.read(frame((1, 0.75, 0.5), fseq=11), PEER, now=0.02)) == [(1, 0.75, 0.5)]
@@ -240,7 +240,7 @@ def test_reader_refuses_oversized_bundles(reader: TuioReader) -> None:
 
 @given(st.binary(max_size=200), st.integers(0, 300))
 def test_reader_never_raises(noise: bytes, cut: int) -> None:
-    """Whatever bytes come, alone or in the middle of a good bundle, nothing is raised."""
+    """For any bytes, alone or within a valid bundle."""
     reader = TuioReader(RejectCounter(logging.getLogger("test")))
     good = frame((1, 0.25, 0.5), fseq=1)
     for datagram in (noise, good[:cut], good[:cut] + noise, good[:cut] + noise + good[cut:]):
@@ -302,7 +302,7 @@ async def test_tuio_source_reports_a_taken_port() -> None:
     ],
 )
 def test_tuio_source_defaults_of_urls(url: str, host: str, port: int) -> None:
-    """What is left out of a URL is loopback and the registered port."""
+    """The loopback and the registered port."""
     source = TuioSource(url)
     assert (source.host, source.port) == (host, port)
 

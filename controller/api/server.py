@@ -47,8 +47,8 @@ _logger = logging.getLogger(__name__)
 class ApiServer:
     """Serves the methods of the API.
 
-    handlers: of all METHODS, called with the client and the parameters; on_disconnect: called with every
-    client that disconnects; is_protected: whether an idle client must not be replaced by a new one.
+    handlers: of all METHODS, called with the client and the parameters; on_disconnect: called with
+    every client that disconnects; is_protected: whether an idle client must not be replaced.
     """
 
     def __init__(

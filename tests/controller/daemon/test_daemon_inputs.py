@@ -1,4 +1,4 @@
-"""Touch sources of a daemon: whose frames arrive under which name, and what ends with whom."""
+"""Touch inputs of a daemon: names of their frames, failures, and clients that leave."""
 
 import asyncio
 from collections.abc import Callable
@@ -18,29 +18,29 @@ from model.structure.plate import Material, Plate
 PLATE = Plate(0.4, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
 
 
-def said(source: str, *places: tuple[float, float]) -> TouchParams:
-    """A frame as a client sends it."""
+def params(source: str, *places: tuple[float, float]) -> TouchParams:
+    """A frame as sent by a client."""
     touches = [TouchPoint(id=id, x_m=x, y_m=y) for id, (x, y) in enumerate(places)]
     return TouchParams(source=source, touches=touches)
 
 
-async def test_metres_become_what_touch_sources_say() -> None:
-    """x to the right, y downwards, 0..1 over the plate; the time is that of the arrival."""
+async def test_touches_of_clients_become_frames_of_sources() -> None:
+    """Metres become shares of the plate, y downwards; the time is that of the arrival."""
     frames: list[TouchFrame] = []
     touches = ApiTouches(PLATE, frames.append)
-    touches.add("client", said("me", (0.1, 0.05), (9.0, 0.0)), client_name="7", now=12.5)
+    touches.add("client", params("me", (0.1, 0.05), (9.0, 0.0)), client_name="7", now=12.5)
     assert frames == []
     await asyncio.sleep(0)
     assert frames == [TouchFrame("api:7:me", 12.5, (Touch(0, 0.25, 0.75), Touch(1, 22.5, 1.0)))]
 
 
-async def test_of_many_frames_in_a_turn_the_newest_counts() -> None:
-    """One frame of each source is delivered, however many came."""
+async def test_newest_touches_of_each_source_are_delivered() -> None:
+    """One frame of each source per iteration of the event loop, however many came."""
     frames: list[TouchFrame] = []
     touches = ApiTouches(PLATE, frames.append)
     for number in range(1000):
-        touches.add("client", said("me", (0.0004 * number, 0.0)), client_name="1", now=number)
-        touches.add("client", said("you", (0.1, 0.0)), client_name="1", now=number)
+        touches.add("client", params("me", (0.0004 * number, 0.0)), client_name="1", now=number)
+        touches.add("client", params("you", (0.1, 0.0)), client_name="1", now=number)
     await asyncio.sleep(0)
     assert [(frame.source, frame.time) for frame in frames] == [
         ("api:1:me", 999),
@@ -49,14 +49,14 @@ async def test_of_many_frames_in_a_turn_the_newest_counts() -> None:
     assert frames[0].touches[0].x == pytest.approx(0.999)
 
 
-async def test_a_client_that_leaves_lifts_its_fingers_and_no_others() -> None:
-    """An empty frame for each of its sources that has fingers down, at once."""
+async def test_touches_of_leaving_client_are_lifted() -> None:
+    """An empty frame for each of its sources with fingers down, and for no others."""
     frames: list[TouchFrame] = []
     touches = ApiTouches(PLATE, frames.append)
-    touches.add("a", said("me", (0.1, 0.1)), client_name="1", now=1)
-    touches.add("a", said("lifted", (0.1, 0.1)), client_name="1", now=1)
-    touches.add("a", said("lifted"), client_name="1", now=1)
-    touches.add("b", said("me", (0.1, 0.1)), client_name="2", now=1)
+    touches.add("a", params("me", (0.1, 0.1)), client_name="1", now=1)
+    touches.add("a", params("lifted", (0.1, 0.1)), client_name="1", now=1)
+    touches.add("a", params("lifted"), client_name="1", now=1)
+    touches.add("b", params("me", (0.1, 0.1)), client_name="2", now=1)
     await asyncio.sleep(0)
     frames.clear()
     touches.lift_all("a", now=2)
@@ -65,31 +65,27 @@ async def test_a_client_that_leaves_lifts_its_fingers_and_no_others() -> None:
     assert frames == [TouchFrame("api:1:me", 2, ())]
 
 
-def test_sources_of_a_client_are_bounded() -> None:
-    """64 with fingers down; one that lifts them makes room."""
-
-    async def scenario() -> None:
-        touches = ApiTouches(PLATE, lambda frame: None)
-        for number in range(MAX_SOURCES_PER_CLIENT):
-            touches.add("a", said(str(number), (0.1, 0.1)), client_name="1", now=1)
-        with pytest.raises(InputError, match="at most 64"):
-            touches.add("a", said("more", (0.1, 0.1)), client_name="1", now=1)
-        touches.add("a", said("0"), client_name="1", now=1)
-        touches.add("a", said("more", (0.1, 0.1)), client_name="1", now=1)
-
-    asyncio.run(scenario())
+async def test_sources_of_client_are_bounded() -> None:
+    """64 with fingers down; lifting those of one source permits another."""
+    touches = ApiTouches(PLATE, lambda frame: None)
+    for number in range(MAX_SOURCES_PER_CLIENT):
+        touches.add("a", params(str(number), (0.1, 0.1)), client_name="1", now=1)
+    with pytest.raises(InputError, match="64"):
+        touches.add("a", params("more", (0.1, 0.1)), client_name="1", now=1)
+    touches.add("a", params("0"), client_name="1", now=1)
+    touches.add("a", params("more", (0.1, 0.1)), client_name="1", now=1)
 
 
 @dataclass
 class Panel(TouchSource):
-    """Delivers one frame, then goes on or fails."""
+    """Delivers one frame, then continues or fails."""
 
     name: str
     error: Exception | None = None
     ended: list[str] = field(default_factory=list)
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
-        """As a source."""
+        """Deliver a frame."""
         deliver(TouchFrame(self.name, 0.0, ()))
         if self.error is not None:
             raise self.error
@@ -99,10 +95,10 @@ class Panel(TouchSource):
             self.ended.append(self.name)
 
 
-async def test_sources_run_under_their_names_and_are_exchanged(
+async def test_inputs_are_replaced_without_disturbing_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One that fails is told and disturbs no other; exchanging leaves those alone that stay."""
+    """Frames carry the configured name, a failure is reported, and inputs that stay run on."""
     panels = {
         "a:": Panel("x\x1b[2J"),
         "b:": Panel("y", OSError("unplugged")),
@@ -131,8 +127,10 @@ async def test_sources_run_under_their_names_and_are_exchanged(
     assert (panels["a:"].ended, panels["c:"].ended) == (["x\x1b[2J"], ["z"])
 
 
-async def test_a_source_that_fails_is_begun_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After a pause that grows, until it works; one that has come to its end is not."""
+async def test_failed_input_is_restarted_after_growing_pauses(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Until it finishes without an error."""
     errors: list[Exception | None] = [InputError("not plugged in"), OSError("gone"), None]
     runs: list[str] = []
 

@@ -1,55 +1,60 @@
+"""The arming lease: duration, owner, token."""
+
 import pytest
 
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.daemon.lease import LeaseHolder
 
 
-def test_a_lease_lasts_as_long_as_it_says_from_every_renewal() -> None:
-    """5 s from the grant, 5 s from the renewal, and not a moment more."""
-    book = LeaseHolder()
-    lease = book.grant("me", duration=5, now=100)
-    assert book.current(104.999) == lease
-    assert book.renew(lease.token, now=104).expires_at == 109
-    assert book.current(108.999) is not None
-    assert book.current(109) is None
-    with pytest.raises(RpcError, match="expired") as caught:
-        book.renew(lease.token, now=109)
+def test_lease_lasts_its_duration_from_each_renewal() -> None:
+    """5 s from the grant and 5 s from the renewal, but not from an attempt after its end."""
+    leases = LeaseHolder()
+    lease = leases.grant("me", duration=5, now=100)
+    assert leases.current(104.999) == lease
+    assert leases.renew(lease.token, now=104).expires_at == 109
+    assert leases.current(108.999) is not None
+    assert leases.current(109) is None
+    with pytest.raises(RpcError) as caught:
+        leases.renew(lease.token, now=109)
     assert caught.value.code is ErrorCode.LEASE
 
 
-def test_one_lease_at_a_time() -> None:
-    """While one runs nobody else gets one; its owner is named, its token is not."""
-    book = LeaseHolder()
-    lease = book.grant("me", duration=5, now=0)
-    with pytest.raises(RpcError, match=r"armed by 'me' for 2\.0 s more") as caught:
-        book.grant("you", duration=5, now=3)
+def test_lease_is_granted_to_one_owner_at_a_time() -> None:
+    """A refusal names the owner and the time left, not the token."""
+    leases = LeaseHolder()
+    lease = leases.grant("me", duration=5, now=0)
+    with pytest.raises(RpcError, match=r"'me'.*2\.0 s") as caught:
+        leases.grant("you", duration=5, now=3)
     assert lease.token not in str(caught.value)
-    assert book.grant("you", duration=5, now=5).owner == "you"
+    assert leases.grant("you", duration=5, now=5).owner == "you"
 
 
 @pytest.mark.parametrize("token", ["", "x", "ü" * 32])
-def test_only_the_token_renews(token: str) -> None:
-    """Whoever has not got the token cannot keep the plate armed, whatever is sent."""
-    book = LeaseHolder()
-    book.grant("me", duration=5, now=0)
-    with pytest.raises(RpcError, match="belongs to 'me'"):
-        book.renew(token, now=1)
-    assert book.expires_at == 5
+def test_lease_is_renewed_by_its_token_only(token: str) -> None:
+    """Any other token leaves its end as it is."""
+    leases = LeaseHolder()
+    leases.grant("me", duration=5, now=0)
+    with pytest.raises(RpcError) as caught:
+        leases.renew(token, now=1)
+    assert caught.value.code is ErrorCode.LEASE
+    assert leases.expires_at == 5
 
 
-def test_a_lease_that_was_ended_is_over() -> None:
-    """After a stop the old token opens nothing."""
-    book = LeaseHolder()
-    lease = book.grant("me", duration=5, now=0)
-    book.end()
-    assert (book.current(1), book.expires_at) == (None, None)
-    with pytest.raises(RpcError, match="expired"):
-        book.renew(lease.token, now=1)
+def test_lease_cannot_be_renewed_or_restarted_when_ended() -> None:
+    """After a stop the old token is of no use."""
+    leases = LeaseHolder()
+    lease = leases.grant("me", duration=5, now=0)
+    leases.end()
+    assert (leases.current(1), leases.expires_at) == (None, None)
+    for attempt in (leases.renew, leases.restart):
+        with pytest.raises(RpcError) as caught:
+            attempt(lease.token, now=1)
+        assert caught.value.code is ErrorCode.LEASE
 
 
-def test_no_two_leases_share_a_token() -> None:
-    """Tokens are 128 bits from the system's generator."""
-    book = LeaseHolder()
-    tokens = {book.grant("me", duration=1, now=2 * n).token for n in range(100)}
+def test_lease_tokens_are_random() -> None:
+    """128 bits each, no two alike."""
+    leases = LeaseHolder()
+    tokens = {leases.grant("me", duration=1, now=2 * n).token for n in range(100)}
     assert len(tokens) == 100
     assert all(len(bytes.fromhex(token)) == 16 for token in tokens)

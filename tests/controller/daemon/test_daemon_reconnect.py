@@ -1,4 +1,4 @@
-"""Coming back after a loss: attempt by attempt, each from a closed controller."""
+"""Reconnection after a loss: each attempt starts from a closed controller."""
 
 from controller.daemon.reconnect import reconnect
 from drivers.errors import LinkError
@@ -6,36 +6,36 @@ from virtual_loop import in_virtual_time
 
 
 class Controller:
-    """One whose amplifiers answer, but are lost again before the first of them is disarmed."""
+    """A controller whose amplifiers are lost again before the first is disarmed."""
 
     def __init__(self) -> None:
-        self.asked: list[str] = []
+        self.calls: list[str] = []
 
     async def open(self) -> None:
         """Always succeeds."""
-        self.asked.append("open")
+        self.calls.append("open")
 
     async def disarm(self) -> None:
         """Fails the first time."""
-        self.asked.append("disarm")
-        if self.asked.count("disarm") == 1:
-            raise LinkError("the cable is loose")
+        self.calls.append("disarm")
+        if self.calls.count("disarm") == 1:
+            raise LinkError("injected")
 
     async def close(self) -> None:
         """Always succeeds."""
-        self.asked.append("close")
+        self.calls.append("close")
 
 
 @in_virtual_time
-async def test_what_was_opened_and_not_disarmed_is_closed_before_it_is_tried_again() -> None:
-    """Nothing stays open that may be armed, and each attempt is told."""
-    controller, told = Controller(), []
+async def test_reconnect_closes_amplifiers_that_could_not_be_disarmed() -> None:
+    """None that may be armed stays open, and each attempt is reported."""
+    controller, reports = Controller(), []
     done = await reconnect(
-        controller,  # type: ignore[arg-type]
+        controller,
         is_wanted=lambda: True,
-        report=lambda event, message: told.append(event),
+        report=lambda event, message: reports.append(event),
         alive=lambda: None,
     )
     assert done
-    assert controller.asked == ["close", "open", "disarm", "close", "open", "disarm"]
-    assert told == ["retry", "reopened"]
+    assert controller.calls == ["close", "open", "disarm", "close", "open", "disarm"]
+    assert reports == ["retry", "reopened"]

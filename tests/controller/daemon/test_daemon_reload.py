@@ -1,3 +1,5 @@
+"""What a reload applies, defers and refuses."""
+
 from pathlib import Path
 
 import pytest
@@ -6,7 +8,7 @@ from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.reload import ReloadPlan, plan_reload
 from model.rig.file import example_rig_path
 
-USUAL = {
+DEFAULTS = {
     "rig": "rig.yaml",
     "level_db_sl": "20",
     "touch": '[{name: a, url: "tuio:3333"}]',
@@ -18,18 +20,23 @@ USUAL = {
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with two rigs and a table."""
+    """A folder with two rigs, two layouts and a table."""
     rig = example_rig_path().read_text("utf-8")
     (tmp_path / "rig.yaml").write_text(rig, "utf-8")
     (tmp_path / "other.yaml").write_text(rig.replace("level: 1.0", "level: 0.5"), "utf-8")
+    for level in ("10", "neighbours"):
+        layout = (
+            f"effects: {{hum: {{kind: buzz, level: {level}}}}}\nregions: {{}}\nelsewhere: hum\n"
+        )
+        (tmp_path / f"{level}.yaml").write_text(layout, "utf-8")
     (tmp_path / "t.npz").touch()
     return tmp_path
 
 
 def config(folder: Path, **changes: str) -> DaemonConfig:
-    """The usual configuration with other values at some keys."""
+    """The default configuration with other values at some keys."""
     path = folder / "daemon.yaml"
-    text = "".join(f"{key}: {value}\n" for key, value in (USUAL | changes).items())
+    text = "".join(f"{key}: {value}\n" for key, value in (DEFAULTS | changes).items())
     path.write_text(text, "utf-8")
     return load_daemon_config(path)
 
@@ -45,15 +52,16 @@ def config(folder: Path, **changes: str) -> DaemonConfig:
         ({"log": "{file: l}"}, ReloadPlan((), ("log.file",))),
         ({"dumps": "{folder: d}"}, ReloadPlan(("dumps",), ())),
         ({"level_db_sl": "19"}, ReloadPlan(("layout",), ())),
+        ({"layout": "10.yaml"}, ReloadPlan(("layout",), ())),
         ({"socket": "t", "touch": "[]"}, ReloadPlan(("touch",), ("socket",))),
         ({"metrics": "9400"}, ReloadPlan((), ("metrics",))),
         ({"dashboard": "127.0.0.1:1"}, ReloadPlan((), ("dashboard",))),
     ],
 )
-def test_what_is_safe_is_taken_over_and_the_rest_waits(
+def test_reload_applies_safe_keys_and_defers_others(
     folder: Path, changes: dict[str, str], plan: ReloadPlan, is_armed: bool
 ) -> None:
-    """Armed or not: touch sources, leases, log level, dumps and a lower level; no more."""
+    """Armed or not: touch sources, leases, log level, dumps and a lower level."""
     assert plan_reload(config(folder), config(folder, **changes), is_armed=is_armed) == plan
 
 
@@ -67,27 +75,29 @@ def test_what_is_safe_is_taken_over_and_the_rest_waits(
         ("serial_numbers", "{main: A1}"),
     ],
 )
-def test_where_the_basis_changes_nothing_is_taken_over(
+def test_reload_is_refused_when_rig_table_mode_or_amplifiers_change(
     folder: Path, key: str, value: str, is_armed: bool
 ) -> None:
-    """Neither limits nor amplifiers nor the plate, nor anything else that came with them."""
+    """Nothing else that changed with them is applied either."""
     changed = config(folder, touch="[]", **{key: value})
     plan = plan_reload(config(folder), changed, is_armed=is_armed)
     assert plan.apply == ()
     assert key in (plan.refused or "")
 
 
-def test_a_rig_that_was_edited_is_another_rig(folder: Path) -> None:
-    """The file's content counts, not its name: limits may have changed in it."""
+def test_reload_is_refused_when_rig_file_was_edited(folder: Path) -> None:
+    """The file's content counts, not its name, for limits may have changed in it."""
     old = config(folder)
     text = (folder / "rig.yaml").read_text("utf-8")
     (folder / "rig.yaml").write_text(text.replace("level: 1.0", "level: 0.9"), "utf-8")
     assert plan_reload(old, config(folder), is_armed=False).refused is not None
 
 
-def test_nothing_gets_stronger_while_it_is_armed(folder: Path) -> None:
-    """20 dB SL to 21: only once it is disarmed."""
-    old, new = config(folder), config(folder, level_db_sl="21", touch="[]")
-    assert "21" in (plan_reload(old, new, is_armed=True).refused or "")
-    assert plan_reload(old, new, is_armed=True).apply == ()
+@pytest.mark.parametrize("change", [{"level_db_sl": "21"}, {"layout": "neighbours.yaml"}])
+def test_reload_raises_no_level_while_armed(folder: Path, change: dict[str, str]) -> None:
+    """From 20 dB SL to 21, or to whatever the neighbours allow, only once disarmed."""
+    old, new = config(folder), config(folder, touch="[]", **change)
+    plan = plan_reload(old, new, is_armed=True)
+    assert plan.refused is not None
+    assert plan.apply == ()
     assert set(plan_reload(old, new, is_armed=False).apply) == {"layout", "touch"}

@@ -1,0 +1,110 @@
+"""The daemon's socket: reserved for one daemon, with permissions, in a safe place."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from controller.daemon.socket_lock import SocketLock
+from model.errors import InputError
+
+
+def test_socket_is_for_its_user_only(tmp_path: Path) -> None:
+    """Mode 0600 in a folder of mode 0700 whatever the umask, which stays; removed at the end."""
+    before = os.umask(0)
+    try:
+        lock = SocketLock(tmp_path / "new" / "era.sock")
+        with lock.bind():
+            assert lock.path.stat().st_mode & 0o777 == 0o600
+            assert lock.path.parent.stat().st_mode & 0o777 == 0o700
+        assert os.umask(0) == 0
+        lock.release()
+        assert not lock.path.exists()
+    finally:
+        os.umask(before)
+
+
+@pytest.mark.parametrize(("folder", "mode"), [(0o750, 0o660), (0o755, 0o600), (0o710, 0o660)])
+def test_socket_is_shared_with_group_of_its_folder(tmp_path: Path, folder: int, mode: int) -> None:
+    """Only where the folder is closed to others."""
+    tmp_path.chmod(folder)
+    lock = SocketLock(tmp_path / "era.sock")
+    with lock.bind():
+        assert lock.path.stat().st_mode & 0o777 == mode
+    lock.release()
+
+
+def test_socket_lock_refuses_second_daemon(tmp_path: Path) -> None:
+    """The error names the process of the first; another socket in the same folder is free."""
+    first = SocketLock(tmp_path / "a.sock")
+    with first.bind():
+        with pytest.raises(InputError, match=rf"process {os.getpid()}\b"):
+            SocketLock(first.path)
+        other = SocketLock(tmp_path / "b.sock")
+        other.bind().close()
+        other.release()
+        assert first.path.is_socket()
+    first.release()
+
+
+def test_socket_of_killed_daemon_is_replaced(tmp_path: Path) -> None:
+    """The kernel releases the lock with its process; the socket's file is left behind."""
+    path = tmp_path / "era.sock"
+    script = (
+        "import os, sys; from pathlib import Path; "
+        "from controller.daemon.socket_lock import SocketLock; "
+        "lock = SocketLock(Path(sys.argv[1])); lock.bind(); os.kill(os.getpid(), 9)"
+    )
+    done = subprocess.run([sys.executable, "-c", script, str(path)], check=False)
+    assert done.returncode == -9
+    assert path.is_socket()
+    lock = SocketLock(path)
+    lock.bind().close()
+    lock.release()
+
+
+def test_socket_lock_refuses_folder_that_others_can_write(tmp_path: Path) -> None:
+    """Another user could listen there in the daemon's place."""
+    folder = tmp_path / "open"
+    folder.mkdir()
+    folder.chmod(0o777)
+    with pytest.raises(InputError, match=str(folder)):
+        SocketLock(folder / "era.sock")
+
+
+def test_socket_lock_refuses_symbolic_link_of_another_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its owner could redirect it to another folder later; a link of the same user is allowed."""
+    (tmp_path / "ours").mkdir()
+    link = tmp_path / "link"
+    link.symlink_to("ours")
+    SocketLock(link / "era.sock").release()
+    theirs = os.stat_result((0o120777, *link.lstat()[1:4], os.getuid() + 1, *link.lstat()[5:10]))
+    monkeypatch.setattr(Path, "lstat", lambda path: theirs)
+    with pytest.raises(InputError, match=str(link)):
+        SocketLock(link / "era.sock")
+
+
+def test_socket_lock_refuses_path_too_long_for_a_socket(tmp_path: Path) -> None:
+    """The system's own error would name no length."""
+    with pytest.raises(InputError, match="107 bytes"):
+        SocketLock(tmp_path / ("x" * 120))
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "link"])
+def test_socket_lock_leaves_other_files_alone(tmp_path: Path, kind: str) -> None:
+    """Whatever is no socket is refused before anything is created."""
+    path = tmp_path / "there"
+    match kind:
+        case "file":
+            path.write_text("mine", encoding="utf-8")
+        case "folder":
+            path.mkdir()
+        case _:
+            path.symlink_to(tmp_path / "nowhere")
+    with pytest.raises(InputError, match=str(path)):
+        SocketLock(path)
+    assert [each.name for each in tmp_path.iterdir()] == ["there"]

@@ -1,12 +1,12 @@
-"""Bad company for a daemon, each a process of its own: `python tests/support/floods.py KIND ...`.
+"""Floods of a daemon, each a process: `python tests/support/floods.py KIND ...`.
 
-    tuio PORT RATE SECONDS    fingers that move, then all lifted; prints when [s] they were
-    idle SOCKET COUNT         connections that say nothing
-    unreading SOCKET COUNT    connections that ask for everything and read nothing
-    garbage SOCKET SEED       what is no request, as fast as it goes, again and again
-    asking SOCKET COUNT       as many requests as are answered, on so many connections
+    tuio PORT RATE SECONDS    moving fingers, then all lifted; prints when [s] they were lifted
+    idle SOCKET COUNT         silent connections
+    unreading SOCKET COUNT    connections that subscribe to everything and read nothing
+    garbage SOCKET SEED       invalid requests as fast as possible
+    asking SOCKET COUNT       requests as fast as they are served, on several connections
 
-All but the first go on until their standard input ends; each says `ready` when it is under way.
+All but the first run until their standard input ends; each prints `ready` once it runs.
 """
 
 import asyncio
@@ -32,7 +32,7 @@ _SUBSCRIBE = {
 
 @asynccontextmanager
 async def flood(kind: str, *arguments: object) -> AsyncIterator[asyncio.subprocess.Process]:
-    """One of them, under way; ended with the context."""
+    """Run one of them; killed with the context."""
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-P", __file__, kind, *map(str, arguments)),
         stdin=asyncio.subprocess.PIPE,
@@ -48,7 +48,7 @@ async def flood(kind: str, *arguments: object) -> AsyncIterator[asyncio.subproce
         await process.wait()
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     sys.stdout.write(f"{text}\n")
     sys.stdout.flush()
 
@@ -70,7 +70,7 @@ def _tuio(port: str, rate: str, seconds: str) -> None:
     lifted = tuio_datagram(TouchFrame("flood", 0.0, ()), -1)
     to = ("127.0.0.1", int(port))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        _say("ready")
+        _print("ready")
         begin = time.monotonic()
         sent = 0
         while (passed := time.monotonic() - begin) < float(seconds):
@@ -80,7 +80,7 @@ def _tuio(port: str, rate: str, seconds: str) -> None:
             time.sleep(0.0002)
         up = time.monotonic()
         sender.sendto(lifted, to)
-    _say(json.dumps({"up_s": up, "sent": sent}))
+    _print(json.dumps({"up_s": up, "sent": sent}))
 
 
 def _connect(path: str) -> socket.socket:
@@ -92,10 +92,10 @@ def _connect(path: str) -> socket.socket:
 def _idle(path: str, count: str) -> None:
     resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_NOFILE)[1],) * 2)
     connections = []
-    _say("ready")
+    _print("ready")
     while len(connections) < int(count):
         connections.append(_connect(path))
-    _say(str(len(connections)))
+    _print(str(len(connections)))
     sys.stdin.read()
 
 
@@ -110,7 +110,7 @@ def _unreading(path: str, count: str) -> None:
     ]
     for connection in connections:
         connection.sendall(b"".join(json.dumps(line).encode() + b"\n" for line in lines))
-    _say("ready")
+    _print("ready")
     sys.stdin.read()
 
 
@@ -139,7 +139,7 @@ def _garbage(path: str, seed: str) -> None:
         lambda: b"!!python/object/apply:os.system [exit]\n" * 10,
         lambda: b"cos\nsystem\n(S'exit'\ntR.\n",
     )
-    _say("ready")
+    _print("ready")
     while not _is_over():
         with contextlib.suppress(OSError), _connect(path) as connection:
             connection.settimeout(1.0)
@@ -152,7 +152,7 @@ def _asking(path: str, count: str) -> None:
     many = b'{"jsonrpc":"2.0","id":1,"method":"status"}\n' * 50
     for connection in connections:
         connection.setblocking(False)
-    _say("ready")
+    _print("ready")
     while not _is_over():
         readable, writable, _ = select.select(connections, connections, [], 0.1)
         with contextlib.suppress(BlockingIOError):
@@ -172,5 +172,5 @@ _KINDS = {
 
 
 if __name__ == "__main__":
-    with contextlib.suppress(KeyboardInterrupt, OSError):  # the daemon may be gone first
+    with contextlib.suppress(KeyboardInterrupt, OSError):  # the daemon may end first
         _KINDS[sys.argv[1]](*sys.argv[2:])

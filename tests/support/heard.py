@@ -1,7 +1,7 @@
-"""What a simulated plate says, over its control socket, of one situation of a touch stream.
+"""Measurements of a simulated plate, over its control socket, for one situation of a touch stream.
 
-Fingers that only feel rest at every place of the stream all the time, so that what they felt can be
-asked for any window afterwards.
+Weightless fingers rest at every place of the stream, so that what they felt can be read for any
+window afterwards.
 """
 
 import asyncio
@@ -29,13 +29,13 @@ SENSORS: Mapping[str, Place] = {
     "P5": (0.15, 0.04),
     "P6": (0.26, 0.09),
 }
-STEADY = 0.3  # s; the end of each situation, by when what began with it has died away
+STEADY = 0.3  # s; the end of each situation, when its transients have decayed
 ONSET = 0.1  # s; over which an onset is judged
 
 
 @dataclass(frozen=True)
 class Felt:
-    """What a fingertip felt: frequencies (f,) [Hz], amplitudes (f, p) and peaks (p,) [m/s²]."""
+    """Vibration of a fingertip: frequencies (f,) [Hz], amplitudes (f, p) and peaks (p,) [m/s²]."""
 
     frequencies: FloatArray
     amplitudes: FloatArray
@@ -44,7 +44,7 @@ class Felt:
 
 @dataclass(frozen=True)
 class Signals:
-    """What sensors read: times (n,) on time.monotonic() [s], samples (n, s) [m/s²]."""
+    """Readings of the sensors: times (n,) on time.monotonic() [s], samples (n, s) [m/s²]."""
 
     times: FloatArray
     samples: FloatArray
@@ -72,7 +72,7 @@ class Heard:
 
 
 class Refused(AssertionError):
-    """What was asked for cannot be had; of what was felt the last ten seconds can."""
+    """The plate refused a request; it keeps the last ten seconds."""
 
 
 class Control:
@@ -84,7 +84,7 @@ class Control:
     @classmethod
     @asynccontextmanager
     async def at(cls, path: Path) -> AsyncIterator["Control"]:
-        """Connect to a socket that is there."""
+        """Connect to an existing socket."""
         reader, writer = await asyncio.open_unix_connection(path, limit=1 << 26)
         try:
             yield cls(reader, writer)
@@ -94,7 +94,7 @@ class Control:
                 await writer.wait_closed()
 
     async def ask(self, op: str, **request: Any) -> dict[str, Any]:
-        """One line and its answer; raises Refused."""
+        """Send a request and return its reply; raises Refused."""
         self._writer.write(json.dumps({"op": op, **request}).encode() + b"\n")
         line = await asyncio.wait_for(self._reader.readline(), PATIENCE)
         answer: dict[str, Any] = json.loads(line)
@@ -111,7 +111,7 @@ async def hear(
     *,
     told: Sequence[Notification],
 ) -> Heard:
-    """What was felt of a situation that began and ended then."""
+    """Read what was felt in a situation between two times [s]."""
     heard = Heard(situation, begin, end)
     if situation.target is None:
         return replace(heard, fading=await _signals(control, begin, end))

@@ -1,1 +1,1 @@
-"""What a bug report should hold, gathered in one file."""
+"""Collect what a bug report needs in one file."""

@@ -1,4 +1,4 @@
-"""`era report`: what a bug report should hold."""
+"""`era report`: the contents of a bug report in one file."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,35 +14,34 @@ EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2}
 
 @app.callback()
 def _only_commands() -> None:
-    """Keep `report` a command, though it is the only one."""
+    """Keep `report` a command although it is the only one."""
 
 
 @app.command()
 def report(
     configs: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="[CONFIG]...", help="Rigs, layouts or daemons' files to put in."),
+        typer.Argument(metavar="[CONFIG]...", help="Rig, layout and daemon files to include."),
     ] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="The file to make.")] = Path(
+    output: Annotated[Path, typer.Option("-o", "--output", help="File to write.")] = Path(
         "era-report.zip"
     ),
     socket: Annotated[
-        Path | None, typer.Option("--socket", help="Where a daemon listens, if not as usual.")
+        Path | None, typer.Option("--socket", help="Socket of the daemon; default: the usual path.")
     ] = None,
 ) -> None:
-    """Gather in one file what a report of a bug needs.
+    """Collect versions, configuration and a running daemon's state for a bug report.
 
-    Versions, configuration, a running daemon's state and its last messages.
-
-    Passwords, tokens and the name of your home folder are taken out; look at it before you send it.
+    Passwords, tokens and the path of your home folder are removed; check the file before you
+    send it.
     """
     from controller.report.collect import collect
     from controller.report.zip_file import write_zip
 
-    gathered = collect(configs or [], socket=socket, home=Path.home())
-    write_zip(output, gathered)
-    for name, text in gathered.files.items():
+    collected = collect(configs or [], socket=socket, home=Path.home())
+    write_zip(output, collected)
+    for name, text in collected.files.items():
         print(f"  {name}: {len(text)} characters")
-    for what in gathered.missing:
-        print(f"  left out: {what}")
-    print(f"Wrote {output}\nNext: look at it, then attach it to your report")
+    for what in collected.missing:
+        print(f"  skipped: {what}")
+    print(f"Wrote {output}\nNext: check it, then attach it to your report")

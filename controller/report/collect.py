@@ -1,4 +1,4 @@
-"""What a bug report should hold: versions, configuration, the daemon, its last messages."""
+"""Collects the contents of a bug report: versions, configuration, daemon status, fault dumps."""
 
 import json
 import platform
@@ -20,31 +20,31 @@ from drivers.errors import LinkError
 from model.config.document import read_document
 from model.errors import InputError
 
-LARGEST_FILE = 1 << 20  # bytes of one file that is put in
+MAX_FILE_SIZE = 1 << 20  # bytes; of a larger file only the end is included
 MAX_DUMPS = 5
-_GROUPS = "era_haptics."  # what the groups of our entry points begin with
-_NAMED = ("rig", "layout")  # files that a daemon's file names; a table is large and can be built
+_GROUPS = "era_haptics."  # prefix of our entry point groups
+_NAMED = ("rig", "layout")  # keys of a daemon's file; a table is large and can be built again
 
 
 @dataclass(frozen=True)
 class Report:
-    """Files of a report by name, and what could not be gathered, in words."""
+    """Files of a report by name, and descriptions of what is missing."""
 
     files: Mapping[str, str]
     missing: tuple[str, ...]
 
 
 def collect(configs: Iterable[Path], *, socket: Path | None, home: Path) -> Report:
-    """Gather everything; never fails for what is not there.
+    """Collect a report; whatever is not available is listed as missing.
 
-    configs: rigs, layouts and daemons' files; what a daemon's file names is put in with it. socket:
-    the daemon's, its usual place if None. home: the folder that is shown as ~.
+    configs: rig, layout and daemon files, with the files that a daemon's file names; socket: the
+    daemon's, the default if None; home: the folder that is replaced by ~.
     """
     files: dict[str, str] = {}
     missing: list[str] = []
     for path in configs:
         for named in _with_named(path, missing):
-            _take(named, files, missing)
+            _include(named, files, missing)
     files["versions.json"] = json.dumps(versions(), indent=2)
     try:
         with Client.connect(socket, name="era report") as daemon:
@@ -58,16 +58,16 @@ def collect(configs: Iterable[Path], *, socket: Path | None, home: Path) -> Repo
 
 
 def versions() -> dict[str, Any]:
-    """Versions of Python, the system, era-haptics, what it needs, and all plug-ins."""
-    needed = {}
+    """Versions of Python, the system, era-haptics and its dependencies, and all plug-ins."""
+    dependencies = {}
     for line in requires("era-haptics") or ():
         name = Requirement(line).name
         try:
-            needed[name] = version(name)
+            dependencies[name] = version(name)
         except PackageNotFoundError:
-            needed[name] = "not installed"
+            dependencies[name] = "not installed"
     plug_ins = {
-        group.removeprefix(_GROUPS): _claimed(group)
+        group.removeprefix(_GROUPS): _entry_points(group)
         for group in sorted(entry_points().groups)
         if group.startswith(_GROUPS)
     }
@@ -77,17 +77,17 @@ def versions() -> dict[str, Any]:
         "python": sys.version,
         "system": platform.platform(),
         "machine": platform.machine(),
-        "packages": dict(sorted(needed.items())),
+        "packages": dict(sorted(dependencies.items())),
         "plug-ins": plug_ins,
     }
 
 
-def _claimed(group: str) -> dict[str, str]:
-    """Every name of a group, with all that claim it."""
-    claims: dict[str, list[str]] = {}
+def _entry_points(group: str) -> dict[str, str]:
+    """All entry points of a group by name, with their packages."""
+    found: dict[str, list[str]] = {}
     for point in sorted(entry_points(group=group)):
-        claims.setdefault(point.name, []).append(f"{point.value} ({_package(point.dist)})")
-    return {name: ", ".join(claimants) for name, claimants in claims.items()}
+        found.setdefault(point.name, []).append(f"{point.value} ({_package(point.dist)})")
+    return {name: ", ".join(points) for name, points in found.items()}
 
 
 def _package(dist: Any) -> str:
@@ -95,13 +95,13 @@ def _package(dist: Any) -> str:
 
 
 def _with_named(path: Path, missing: list[str]) -> Iterable[Path]:
-    """A configuration file, the files that it names, and the last dumps of a daemon's."""
+    """A configuration file, the files that it names, and the last dumps of a daemon."""
     yield path
     try:
         document = read_document(path)
     except InputError as error:
-        if path.is_file():  # else what is left out says it
-            missing.append(f"what this file names: {error}")
+        if path.is_file():  # a missing file is reported when it is read
+            missing.append(f"files that it names: {error}")
         return
     if not is_daemon_document(document):
         return
@@ -116,12 +116,12 @@ def _with_named(path: Path, missing: list[str]) -> Iterable[Path]:
         yield from sorted(found, key=lambda file: file.name)[-MAX_DUMPS:]
 
 
-def _take(path: Path, files: dict[str, str], missing: list[str]) -> None:
-    """Put a text file in under its name; one that is too large with its end only."""
+def _include(path: Path, files: dict[str, str], missing: list[str]) -> None:
+    """Include a text file under its name; of a large one only the end."""
     try:
         with path.open("rb") as stream:
-            stream.seek(max(0, path.stat().st_size - LARGEST_FILE))
-            text = stream.read(LARGEST_FILE).decode("utf-8", errors="replace")
+            stream.seek(max(0, path.stat().st_size - MAX_FILE_SIZE))
+            text = stream.read(MAX_FILE_SIZE).decode("utf-8", errors="replace")
     except OSError as error:
         missing.append(f"{path}: {error.strerror}")
         return

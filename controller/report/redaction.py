@@ -1,4 +1,4 @@
-"""Taking out of a text what is nobody else's business: secrets, and who works on the machine."""
+"""Removes secrets and the home folder from a text."""
 
 import re
 from pathlib import Path
@@ -16,9 +16,9 @@ _BEARER = re.compile(r"(?i)(bearer\s+)[\w.~+/=-]+")
 
 
 def redacted(text: str, *, home: Path) -> str:
-    """The text without passwords and tokens, and with ~ for the home folder."""
+    """Return a text without passwords and tokens, and with ~ for the home folder."""
     text = _USER.sub(HIDDEN, text)
     text = _SECRET.sub(rf"\g<1>{HIDDEN}", text)
     text = _BEARER.sub(rf"\g<1>{HIDDEN}", text)
-    # "/" is the home of nobody, and stands in every path.
+    # The home "/" of system users is part of every path.
     return text.replace(str(home), "~") if home != home.parent else text

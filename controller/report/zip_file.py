@@ -1,4 +1,4 @@
-"""A report as a file to send."""
+"""Writes a report as a ZIP file."""
 
 import os
 import zipfile
@@ -9,16 +9,16 @@ from model.errors import InputError
 
 
 def write_zip(path: Path, report: Report) -> None:
-    """Write a new file, for its owner only, whole or not at all.
+    """Write a new file of mode 0600, completely or not at all.
 
-    Raises InputError where there is one already, OSError.
+    Raises InputError if it exists already or cannot be created, OSError if writing fails.
     """
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError as error:
-        raise InputError(f"{path}: there is such a file; name another with -o") from error
+        raise InputError(f"{path}: file exists already; choose another with -o") from error
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+        raise InputError(f"{path}: cannot write: {error.strerror}") from error
     try:
         with (
             os.fdopen(descriptor, "wb") as stream,
@@ -26,7 +26,7 @@ def write_zip(path: Path, report: Report) -> None:
         ):
             for name, text in report.files.items():
                 archive.writestr(name, text)
-            archive.writestr("missing.txt", "".join(f"{what}\n" for what in report.missing))
+            archive.writestr("missing.txt", "".join(f"{line}\n" for line in report.missing))
     except BaseException:
         path.unlink(missing_ok=True)
         raise

@@ -1,4 +1,4 @@
-"""What a bug report holds, and what it does not."""
+"""Contents of a bug report, and what is removed from them."""
 
 import json
 import os
@@ -13,7 +13,7 @@ from controller.report.collect import MAX_DUMPS, collect, versions
 from controller.report.redaction import redacted
 from model.rig.file import example_rig_path
 
-HOME = Path("/home/somebody")
+HOME = Path("/home/user")
 
 
 @pytest.mark.parametrize(
@@ -26,27 +26,22 @@ HOME = Path("/home/somebody")
         ("http://127.0.0.1:1/#token=xyz", "http://127.0.0.1:1/#token=[hidden]"),
         ("Authorization: Bearer abc.def", "Authorization: Bearer [hidden]"),
         ("private_key: k.pem", "private_key: [hidden]"),
-        ("file: /home/somebody/rig.yaml", "file: ~/rig.yaml"),
+        ("file: /home/user/rig.yaml", "file: ~/rig.yaml"),
         ("keep_phase: true, token 7 of 9", "keep_phase: true, token 7 of 9"),
     ],
 )
-def test_redacted(text: str, expected: str) -> None:
-    """Secrets and the home folder are gone, all else stays."""
+def test_redacted_removes_secrets_and_home_folder_only(text: str, expected: str) -> None:
+    """Passwords and tokens in YAML, JSON and URLs; all else stays."""
     assert redacted(text, home=HOME) == expected
 
 
-def test_home_that_is_everywhere() -> None:
-    """A system's user may have / as home; paths stay as they are then."""
+def test_redacted_keeps_paths_when_home_is_root() -> None:
+    """System users may have / as home."""
     assert redacted("/etc/x", home=Path("/")) == "/etc/x"
 
 
-def test_everything_that_a_daemon_names(tmp_path: Path) -> None:
-    """Its rig and layout, and the last of its dumps; a table is left where it is.
-
-    So is whatever else lies where the dumps are.
-
-    What is not there is said, and nothing fails for it.
-    """
+def test_report_includes_files_of_daemon(tmp_path: Path) -> None:
+    """Its rig, layout and last dumps, but no table and no other files; missing ones are listed."""
     (tmp_path / "rig.yaml").write_text(example_rig_path().read_text("utf-8"), "utf-8")
     (tmp_path / "d.yaml").write_text(
         "rig: rig.yaml\nlayout: none.yaml\ntable: t.npz\ndumps: {folder: dumps}\n", "utf-8"
@@ -55,20 +50,22 @@ def test_everything_that_a_daemon_names(tmp_path: Path) -> None:
     (tmp_path / "dumps").mkdir()
     for number in range(MAX_DUMPS + 2):
         (tmp_path / "dumps" / f"era-fault-2026-{number}.jsonl").write_text(str(number), "utf-8")
-    (tmp_path / "dumps" / "letter.txt").write_text("dear", "utf-8")
+    (tmp_path / "dumps" / "other.txt").write_text("x", "utf-8")
     report = collect([tmp_path / "d.yaml"], socket=tmp_path / "no.sock", home=HOME)
     dumps = [f"era-fault-2026-{number}.jsonl" for number in range(2, MAX_DUMPS + 2)]
     assert set(report.files) == {"d.yaml", "rig.yaml", *dumps, "versions.json"}
     layout, daemon = report.missing
     assert "none.yaml" in layout
-    assert "no daemon runs" in daemon
-    told = json.loads(report.files["versions.json"])
-    assert told["packages"]["numpy"][0].isdigit()
-    assert "SerialBackend" in told["plug-ins"]["backends"]["serial"]
+    assert "no.sock" in daemon
+    found = json.loads(report.files["versions.json"])
+    assert found["packages"]["numpy"][0].isdigit()
+    assert "SerialBackend" in found["plug-ins"]["backends"]["serial"]
 
 
-def test_plug_ins_of_every_kind_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Packages that add a material are named with it, as of any other kind, all that claim it."""
+def test_versions_list_packages_of_plug_ins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All packages that provide the same name are listed with it."""
     for name, version in (("cork", "1.5"), ("oak", "2.0")):
         package = tmp_path / f"{name}-{version}.dist-info"
         package.mkdir()
@@ -79,15 +76,13 @@ def test_plug_ins_of_every_kind_are_told(tmp_path: Path, monkeypatch: pytest.Mon
             f"[era_haptics.materials]\ncork = {name}:CORK\n", "utf-8"
         )
     monkeypatch.syspath_prepend(tmp_path)
-    told = versions()["plug-ins"]["materials"]
-    assert told == {"cork": "cork:CORK (cork 1.5), oak:CORK (oak 2.0)"}
+    assert versions()["plug-ins"]["materials"] == {
+        "cork": "cork:CORK (cork 1.5), oak:CORK (oak 2.0)"
+    }
 
 
-def test_files_that_cannot_be_read_as_they_should(tmp_path: Path) -> None:
-    """A broken one may be what it is about: it is put in, without secrets, and nothing fails.
-
-    One that is not there, and what a broken one names, are told once.
-    """
+def test_report_includes_invalid_files(tmp_path: Path) -> None:
+    """An invalid file may be the subject: it is included without secrets and listed once."""
     (tmp_path / "broken.yaml").write_text("rig: [\napi_token: abc\n\tx", "utf-8")
     (tmp_path / "bytes.yaml").write_bytes(b"\xff\x00: \x80")
     files = [tmp_path / name for name in ("broken.yaml", "bytes.yaml", "none.yaml")]
@@ -97,8 +92,8 @@ def test_files_that_cannot_be_read_as_they_should(tmp_path: Path) -> None:
     assert [sum(path.name in each for each in report.missing) for path in files] == [1, 1, 1]
 
 
-def test_command(tmp_path: Path) -> None:
-    """It writes one file for its owner alone, and never over another."""
+def test_report_command_writes_new_file_for_owner_only(tmp_path: Path) -> None:
+    """An existing file is refused and stays."""
     era = Path(sys.executable).with_name("era")
     command = [str(era), "report", "-o", "r.zip", "--socket", "no.sock"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -108,5 +103,5 @@ def test_command(tmp_path: Path) -> None:
         assert set(archive.namelist()) == {"versions.json", "missing.txt"}
     again = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert again.returncode == 2
-    assert "there is such a file" in again.stderr
+    assert "r.zip: " in again.stderr
     assert os.listdir(tmp_path) == ["r.zip"]  # noqa: PTH208

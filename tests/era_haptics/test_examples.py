@@ -83,7 +83,6 @@ def test_hmi_engineer_example_feels_what_was_predicted() -> None:
     assert "daemon ended with status 0" in said
 
 
-@pytest.mark.alone
 def test_amplifier_vendor_example_passes_conformance() -> None:
     """Its frame is that of the wire page, it gets a reply, and all checks pass."""
     said = run("amplifier_vendor.py")

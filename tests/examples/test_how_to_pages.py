@@ -43,13 +43,7 @@ def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
     shutil.rmtree(home)
 
 
-def _run_alone(name: str) -> object:
-    """Mark pages with amplifiers, which reply in real time."""
-    has_amplifier = name in ("add-a-backend", "write-an-amplifier")
-    return pytest.param(name, marks=pytest.mark.alone) if has_amplifier else name
-
-
-@pytest.mark.parametrize("name", [_run_alone(name) for name in NAMES])
+@pytest.mark.parametrize("name", NAMES)
 def test_page_commands_print_what_is_shown(name: str, reader: Reader) -> None:
     """In order, with the output on the page."""
     steps = read_steps(PAGES / f"{name}.md")

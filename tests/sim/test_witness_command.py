@@ -46,14 +46,10 @@ def _replay(tmp_path: Path, text: str, *options: str) -> tuple[int, str]:
     return result.exit_code, result.stdout
 
 
-def test_witness_replay_passes_a_valid_session(tmp_path: Path) -> None:
-    """Four good frames break no rule: exit status 0."""
+def test_witness_replay_reports_a_damaged_frame_only(tmp_path: Path) -> None:
+    """Four good frames break no rule; a damaged one is named, with the frames before it."""
     status, out = _replay(tmp_path, SESSION)
     assert (status, json.loads(out)) == (0, {"frames": 4, "violations": []})
-
-
-def test_witness_replay_reports_a_damaged_frame(tmp_path: Path) -> None:
-    """A damaged frame of the host is named, with its time and the frames before it."""
     status, out = _replay(tmp_path, SESSION + DAMAGED)
     (found,) = json.loads(out)["violations"]
     assert status == 1
@@ -97,6 +93,7 @@ def test_witness_replay_refuses_an_invalid_capture(
         (["--slack", "-4"], "--slack"),
         (["--slack", "inf"], "--slack"),
         (["--replay", "missing.txt"], "missing.txt"),
+        (["--replay", "capture.txt", "--record", "capture.txt"], "--record"),
         (["--replay", "."], "."),
         ([f"{URL}?address=1"], f"{URL}?address=1"),
         (["modbus+rtu:///dev/ttyUSB0"], "modbus+rtu:///dev/ttyUSB0"),
@@ -112,35 +109,16 @@ def test_witness_refuses_invalid_arguments(
     assert named in str(result.exception)
 
 
-def test_witness_refuses_record_with_replay(tmp_path: Path) -> None:
-    """The capture is left as it was."""
-    status, error = _replay(tmp_path, SESSION, "--record", str(tmp_path / "capture.txt"))
-    assert (status, "--record" in error) == (2, True)
-    assert (tmp_path / "capture.txt").read_text(encoding="utf-8") == SESSION
-
-
-def test_capture_is_read_as_written(tmp_path: Path) -> None:
-    """Time, wire, direction and bytes of each line; comments and empty lines are nothing."""
-    capture = tmp_path / "capture.txt"
-    capture.write_text("# a session\n\n0.5 a > 00 04\n0.75 b < ff # back\n", encoding="utf-8")
-    assert list(read_capture(capture)) == [
-        (0.5, "a", "amplifier", b"\x00\x04"),
-        (0.75, "b", "host", b"\xff"),
-    ]
-
-
 @pytest.mark.parametrize(
     ("plan", "named"),
     [
         ({}, "wires"),
         ({"wires": {"a": "smoke"}, "amplifiers": {}}, "wires.a"),
         (CONFIG | {"amplifiers": {"m": {"wire": "b", "channels": LIMITS}}}, "amplifiers.m.wire"),
-        (CONFIG | {"amplifiers": {"m": 1}}, "amplifiers.m"),
         (
             CONFIG | {"amplifiers": {"m": {"wire": "a", "channels": {0: {}}}}},
             "channels.0.frequency_hz",
         ),
-        (CONFIG | {"x": 1}, "x:"),
         (CONFIG | {"times_s": {"lift": math.inf}}, "times_s.lift"),
     ],
 )

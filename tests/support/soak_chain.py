@@ -34,7 +34,8 @@ from sim.far_ends.wires import Wire, open_wires
 from sim.faults.fault_window import Faults
 from sim.witness.witness import OperatorCommand
 from small_table import small_table
-from soak_checks import RELEASE, Checks, TouchState
+from soak_checks import RELEASE, Checks
+from soak_contacts import SourceContacts
 from soak_plan import FaultInjection, OperatorAction, Plan, TouchSequence
 from soak_witness import SoakWitness
 from virtual_loop import START, Stuck, VirtualLoop, run_virtual
@@ -140,7 +141,7 @@ class _Run:
         self.machine = live_in_memory()
         self.rig = make_soak_rig(self.plan.amplifiers)
         self.bench = Bench(self.rig, now=loop.time())
-        self.touched = TouchState()
+        self.contacts = SourceContacts()
         self.arm_requests = 0
         self.is_ending = False
         self.stalled_for = 0.0
@@ -153,7 +154,7 @@ class _Run:
             self.plan,
             begin=loop.time(),
             release=self._release(),
-            touch_state=self.touched,
+            contacts=self.contacts,
             arming=lambda: self.arm_requests > 0,
         )
         self.checks.violations = self.violations
@@ -172,7 +173,11 @@ class _Run:
         async with open_wires(wires, [*devices.values()]) as urls:
             self.urls = urls
             self.witness = SoakWitness(
-                loop, urls, channels=_channels(self.rig), release=self._release()
+                loop,
+                urls,
+                self.contacts,
+                channels=1 + max(channel.number for channel in self.rig.wiring.values()),
+                release=self._release(),
             )
             self.checks.sense = self.witness.sense
             self.serving = asyncio.create_task(self._serve())
@@ -256,11 +261,11 @@ class _Run:
             now = self.loop.time()
             self.note("touch", sequence.source, stamp, touches)
             self.counts["touch frames"] += 1
-            was_touched = self.touched.is_touched(now)
-            self.touched.frame(sequence.source, now + stamp, touches, now)
-            is_new = not was_touched and self.touched.is_touched(now) and sequence.gesture == "hold"
+            was_touched = now < self.contacts.last
+            self.contacts.frame(sequence.source, now + stamp, touches, now)
+            is_new = not was_touched and now < self.contacts.last and sequence.gesture == "hold"
             must_be_felt = is_new and self._must_be_felt()
-            self.witness.touched(sequence.source, now + stamp, touches, must_be_felt=must_be_felt)
+            self.witness.touched(must_be_felt=must_be_felt)
             if self.controller is not None:
                 frame = TouchFrame(
                     sequence.source, now + stamp, tuple(Touch(*touch) for touch in touches)
@@ -449,11 +454,6 @@ class _Run:
     def _unhandled(self, loop: Any, context: dict[str, Any]) -> None:
         error = context.get("exception")
         self.checks.violate(f"unhandled: {context['message']} {error!r}")
-
-
-def _channels(rig: Rig) -> int:
-    """How many channels each amplifier has."""
-    return 1 + max(channel.number for channel in rig.wiring.values())
 
 
 _BACKENDS: dict[str, type[Backend]] = {}

@@ -6,7 +6,7 @@ they are the table's own.
 
 import asyncio
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 from drivers.protocol.messages import (
     AmplifierEvent,
@@ -23,10 +23,10 @@ from drivers.protocol.messages import (
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.bench.bench import Bench
 from sim.waveform import level_of
+from soak_contacts import SourceContacts
 from soak_plan import Plan
 
 AUDIBLE = 1e-3  # of full stroke; below it a ramp counts as ended
-CONTACT_TIMEOUT = 0.150  # s; a contact without news for so long counts as lifted
 WATCHDOG = 0.25 + 0.005  # s; then every channel is silent
 RELEASE = 0.020  # s; from the last finger up to zero
 # s; three unanswered requests, then the watchdog, and a heartbeat that was on its way.
@@ -47,32 +47,6 @@ _PLAYING = (
 Sense = Callable[[str, SimulatedAmplifier], None]
 
 
-class TouchState:
-    """Whether the plate is touched, by the frames alone; times [s]."""
-
-    def __init__(self) -> None:
-        self._until: dict[str, float] = {}
-        self.last = -math.inf
-        """Until when the plate was touched last, as far as it is known by now."""
-
-    def frame(
-        self, source: str, stamp: float, touches: Sequence[tuple[int, float, float]], now: float
-    ) -> None:
-        """A frame has been delivered."""
-        was_until = min(self._until.get(source, -math.inf), now)
-        valid = math.isfinite(stamp) and any(
-            0 <= x <= 1 and 0 <= y <= 1
-            for _, x, y in touches  # NaN is not
-        )
-        heard_until = min(stamp, now) + CONTACT_TIMEOUT if valid else -math.inf
-        self._until[source] = max(heard_until, was_until)
-        self.last = max(self._until.values(), default=-math.inf)
-
-    def is_touched(self, now: float) -> bool:
-        """Whether it is touched at a time."""
-        return now < self.last
-
-
 class Checks:
     """Watches a bench; `violations` is what was found, each once with its time.
 
@@ -87,7 +61,7 @@ class Checks:
         *,
         begin: float,
         release: float,
-        touch_state: TouchState,
+        contacts: SourceContacts,
         arming: Callable[[], bool],
     ) -> None:
         self.violations: list[str] = []
@@ -95,7 +69,7 @@ class Checks:
         self._plan = plan
         self._begin = begin
         self._release = release
-        self._touched = touch_state
+        self._contacts = contacts
         self._arming = arming
         self._fed = dict.fromkeys(bench.amplifiers, -math.inf)
         self.sense: Sense = lambda name, amplifier: None
@@ -135,7 +109,7 @@ class Checks:
         """The last finger has gone, or will have when its lease ends: look when zero is due."""
         if self._releasing is not None:
             self._releasing.cancel()
-        due = max(self._touched.last, self._loop.time()) + self._release + 1e-6
+        due = max(self._contacts.last, self._loop.time()) + self._release + 1e-6
         self._releasing = self._loop.call_at(due, self.look)
 
     def exchanged(self, name: str, request: Request, reply: Reply | None) -> None:
@@ -221,8 +195,8 @@ class Checks:
                 self.violate(f"{name} plays {now - at:.4f} s after the fault of {other}")
 
     def _check_touched(self, loud: Mapping[str, float], now: float) -> None:
-        since = now - self._touched.last
-        lifted, at = self._touched.last - self._begin, now - self._begin
+        since = now - self._contacts.last
+        lifted, at = self._contacts.last - self._begin, now - self._begin
         bound = self._release if self._plan.is_calm(lifted, at) else RELEASE_WITH_FAULTS
         if since > bound:
             self.violate(f"{', '.join(loud)} play {since:.4f} s after the last finger")

@@ -15,6 +15,7 @@ class SourceContacts:
 
     def __init__(self) -> None:
         self._now: dict[str, tuple[float, frozenset[tuple[str, int]]]] = {}
+        self._until: dict[str, float] = {}  # by source: end of its contacts
 
     def frame(self, source: str, stamp: float, touches: FrameTouches, now: float) -> None:
         """A frame has been delivered, and replaces what its source has said before."""
@@ -24,11 +25,15 @@ class SourceContacts:
             for number, (x, y) in last.items()
             if 0 <= x <= 1 and 0 <= y <= 1  # NaN is not
         )
-        is_heard = math.isfinite(stamp)
-        self._now[source] = (
-            min(stamp, now) + CONTACT_TIMEOUT if is_heard else -math.inf,
-            numbers if is_heard else frozenset(),
-        )
+        end = min(stamp, now) + CONTACT_TIMEOUT if math.isfinite(stamp) else -math.inf
+        self._now[source] = end, numbers
+        before = min(self._until.get(source, -math.inf), now)
+        self._until[source] = max(end if numbers else -math.inf, before)
+
+    @property
+    def last(self) -> float:
+        """When the plate is or was touched last, as far as is known."""
+        return max(self._until.values(), default=-math.inf)
 
     def at(self, now: float) -> frozenset[tuple[str, int]]:
         """All that are on the plate."""

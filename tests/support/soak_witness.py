@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.faults.fault_window import FaultWindow
 from sim.witness.witness import OperatorCommand, Witness
-from soak_contacts import FrameTouches, SourceContacts
+from soak_contacts import SourceContacts
 from virtual_loop import START, VirtualLoop
 from witness_config import sense, witness_config
 
@@ -27,7 +27,13 @@ class SoakWitness:
     """
 
     def __init__(
-        self, loop: VirtualLoop, urls: Mapping[str, str], *, channels: int, release: float
+        self,
+        loop: VirtualLoop,
+        urls: Mapping[str, str],
+        contacts: SourceContacts,
+        *,
+        channels: int,
+        release: float,
     ) -> None:
         times = {
             "lift": release,
@@ -39,7 +45,7 @@ class SoakWitness:
         self._loop = loop
         self._witness = Witness(witness_config(urls, channels=channels, times_s=times))
         self._open: set[str] = set()
-        self._contacts = SourceContacts()
+        self._contacts = contacts
         self._active_faults = 0
         self._witness.contacts(loop.time(), ())
         self.closes()
@@ -69,12 +75,9 @@ class SoakWitness:
         """The control loop stands still from now on, or goes on."""
         self._witness.set_stalled(self._loop.time(), is_stalled)
 
-    def touched(
-        self, source: str, stamp: float, touches: FrameTouches, *, must_be_felt: bool
-    ) -> None:
-        """A frame is about to be delivered; stamp [s]: of which time it says that it is."""
+    def touched(self, *, must_be_felt: bool) -> None:
+        """Show the contacts, of which a source has sent a frame."""
         now = self._loop.time()
-        self._contacts.frame(source, stamp, touches, now)
         self._witness.contacts(now, self._contacts.at(now), is_answerable=must_be_felt)
         if (end := self._contacts.next_end(now)) < math.inf:
             self._loop.call_at(end + _ENDED, self._expire_contacts)

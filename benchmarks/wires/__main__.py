@@ -168,7 +168,7 @@ def _eight(folder: Path) -> list[str]:
     )
     amplifiers = "\n".join(f'  a{number}: {{url: "sim://"}}' for number in range(8))
     head = text[: text.index("eras:")].replace("mesh: auto", "mesh: 12x9")
-    limits = text[text.index("# What no command may exceed") :]
+    limits = text[text.index("# Limits of commands") :]
     rig.write_text(f"{head}eras:\n{eras}\namplifiers:\n{amplifiers}\n{limits}", encoding="utf-8")
     rows = []
     for name, options in EIGHT.items():

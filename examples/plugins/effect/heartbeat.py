@@ -54,6 +54,6 @@ class Heartbeat(Effect):
         return Beating(now, self.period, level_db_sl)
 
     @property
-    def ends(self) -> bool:
-        """Whether it ends before the finger lifts."""
+    def has_end(self) -> bool:
+        """Whether a run ends by itself."""
         return False

@@ -5,6 +5,7 @@ import contextlib
 import shlex
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import asdict
 from typing import Any
 
 from drivers.amplifier import WATCHDOG, Amplifier
@@ -19,34 +20,23 @@ from drivers.protocol.messages import AmplifierState, Status
 from drivers.registry import open_backend
 
 _RAMP = 0.05  # s; neither start nor end of a drive clicks
+_UNITS = {
+    **dict.fromkeys(("frequency_min", "frequency_max", "frequency_step"), "_hz"),
+    **dict.fromkeys(("ramp_max", "watchdog_min", "watchdog_max"), "_s"),
+    **dict.fromkeys(("envelope_step_min", "envelope_step_max"), "_s"),
+    "phase_step": "_deg",
+}
+"""Units of capabilities, as ends of their keys."""
 
 
 async def identify(url: str) -> dict[str, Any]:
     """Read identity, capabilities and wire times."""
     async with _opened(url) as amplifier:
-        who, what = amplifier.identity, amplifier.capabilities
+        capabilities = asdict(amplifier.capabilities)
         return {
             "url": url,
-            "vendor": who.vendor,
-            "product": who.product,
-            "serial_number": who.serial_number,
-            "firmware": who.firmware,
-            "protocol_version": who.protocol_version,
-            "channels": what.channels,
-            "frequency_min_hz": what.frequency_min,
-            "frequency_max_hz": what.frequency_max,
-            "frequency_step_hz": what.frequency_step,
-            "level_max": what.level_max,
-            "level_step": what.level_step,
-            "phase_step_deg": what.phase_step,
-            "ramp_max_s": what.ramp_max,
-            "watchdog_min_s": what.watchdog_min,
-            "watchdog_max_s": what.watchdog_max,
-            "envelope_knots": what.envelope_knots,
-            "envelope_slots": what.envelope_slots,
-            "envelope_step_min_s": what.envelope_step_min,
-            "envelope_step_max_s": what.envelope_step_max,
-            "events": what.events,
+            **asdict(amplifier.identity),
+            **{f"{name}{_UNITS.get(name, '')}": value for name, value in capabilities.items()},
             **_wire_rows(amplifier),
         }
 

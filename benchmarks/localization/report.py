@@ -1,4 +1,4 @@
-"""The figures as a page of the documentation, with pictures."""
+"""Figures and pictures for the page docs/measured/localization-benchmarks.md."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,55 +7,32 @@ from matplotlib.figure import Figure
 
 from benchmarks.localization.contrast import GOALS, QUIET, Section
 from benchmarks.localization.picture import modes_figure
+from benchmarks.page import write_parts
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = "measured/localization-benchmarks.md"
 
-INTRODUCTION = """# Localization benchmarks: contrast and speed
-
-Printed by `python -m benchmarks.localization --sets {sets} --draws {draws} --seed {seed} --report`.
-The paper's plate on four corner ERAs, 27 frequencies from 40 to 500 Hz. Contact sets: fingertips
-(discs of 13 mm radius) anywhere on the plate, at least 5 cm apart, one of them the target, which
-reaches at least 1 m/s²; {sets} sets for each count. Contrast is the target's mean peak acceleration
-to the loudest quiet point. *Realised*: errors of 5 % in gain and 5 degrees in phase (standard
-deviations); for each set the median of {draws} draws. Cells show the median over the sets, in
-brackets the tenth percentile.
-
-Other methods, on the same plate and contact sets, each at the best frequency for every set: the
-paper's (one or two ERAs at full level, each at its own frequency), and two of the methods it cites.
-The inverse filter solves for 1 at the target and 0 at the centres of the other fingertips; time
-reversal plays the time-reversed response at the target, at one frequency or as a pulse of all 27
-(peaks over time).
-"""
-
-READING = """
-## Interpretation
-
-- The exact search over all 614 655 patterns of four ERAs is the optimum of `switched`, and the
-  bound of the mixture limits all amplitudes of the same sources: a goal above these lines is out of
-  reach for this plate and these contact sets.
-- `phased` is judged by its contrast under errors. Its robust score is the contrast with the
-  mean error of 10 % of each ERA's share added to every quiet point; the bound below it holds for
-  any complex weights at any one of the frequencies.
-- Two targets take two of the four amplitudes: the remaining contrast is about that of one target
-  with one more quiet finger.
-"""
-
 
 def write_report(sections: Sequence[Section], *, sets: int, draws: int, seed: int) -> None:
-    """Write the page and its pictures."""
-    page = INTRODUCTION.format(sets=sets, draws=draws, seed=seed)
-    pictures = ["localization_contrast.png", "localization_growth.png", "localization_modes.png"]
-    contrast, two, ensemble, freedom, speed, growth = sections
-    (DOCS / "pictures").mkdir(exist_ok=True)
-    _save(_contrast_figure(contrast), pictures[0])
-    _save(_growth_figure(growth), pictures[1])
-    _save(modes_figure(), pictures[2])
-    parts = [page, _markdown(contrast), f"![contrast](../pictures/{pictures[0]})", READING]
-    parts += [_markdown(each) for each in (two, ensemble, freedom, speed, growth)]
-    parts += [f"![growth](../pictures/{pictures[1]})"]
-    (DOCS / PAGE).write_text("\n\n".join(part.strip() for part in parts) + "\n", encoding="utf-8")
-    print(f"wrote {DOCS / PAGE}")
+    """Write the figures into their page, and the pictures."""
+    contrast, *_, growth = sections
+    pictures = DOCS / "pictures"
+    pictures.mkdir(exist_ok=True)
+    for name, figure in (
+        ("contrast", _contrast_figure(contrast)),
+        ("growth", _growth_figure(growth)),
+        ("modes", modes_figure()),
+    ):
+        figure.savefig(pictures / f"localization_{name}.png", dpi=110)
+    options = f"--sets {sets} --draws {draws} --seed {seed}"
+    run = f"Printed by `python -m benchmarks.localization {options} --report`."
+    write_parts(
+        DOCS / PAGE,
+        {
+            "contrast": f"{run}\n\n{_markdown(contrast)}",
+            "further": "\n\n".join(_markdown(each) for each in sections[1:]),
+        },
+    )
 
 
 def _markdown(section: Section) -> str:
@@ -67,10 +44,6 @@ def _markdown(section: Section) -> str:
         notes = " ".join(section.notes)
         lines += ["", notes[0].upper() + notes[1:]]
     return "\n".join(lines)
-
-
-def _save(figure: Figure, name: str) -> None:
-    figure.savefig(DOCS / "pictures" / name, dpi=110)
 
 
 def _contrast_figure(section: Section) -> Figure:

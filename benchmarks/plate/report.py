@@ -1,4 +1,4 @@
-"""What the plate's benchmark writes: a page with its tables, and a picture."""
+"""Tables and a picture for the page docs/measured/benchmarks.md."""
 
 import os
 import platform
@@ -10,11 +10,13 @@ from typing import Any, TypeAlias
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from benchmarks.page import write_parts
+
 OURS_COLOR, PEER_COLOR = "#d62728", "#7f7f7f"
 VERSIONS = ("numpy", "scipy", "scikit-fem", "pyfe3d", "ngsolve")
 
 Result: TypeAlias = dict[Any, Any]
-"""What one measurement printed, or several come down to."""
+"""Output of one measurement, or the median of several."""
 
 
 def write_report(
@@ -73,61 +75,26 @@ def write_report(
         + " |"
         for each in agreement
     ]
-    page = f"""# Plate model benchmarks
-
-Printed by `make bench`, which installs the peers and runs `python -m benchmarks.plate`. Medians of
-{len(loads)} runs in {len(loads)} processes, BLAS on one thread, imports not counted.
-
-Machine: {_machine()}.
-{_versions()}.
-Load average during the measurement, including the benchmark's own one to two:
-{min(loads):.1f} to {max(loads):.1f}. Other load lengthens all times, and affects the ratios less.
-
-The task is the founding paper's plate on four actuators (ERAs): 27 frequencies from 60 to 320 Hz,
-each ERA driven alone. Peers factorise the dynamic stiffness at every frequency, as their users
-would; those that solve with scipy use the options of SuperLU that are fastest
-here. NGSolve uses elements three times as large and of order 3, for the same number of unknowns.
-
-## Agreement
-
-Difference from era-haptics on its automatic mesh, relative L2 over all frequencies, drives and 221
-points on two layouts, one with the ERAs at the corners; in brackets the median over frequencies and
-drives. Near a resonance an error of 0.2 % in a natural frequency, from a coarse mesh or a theory
-without shear, causes an error of several per cent. The benchmark fails if a program differs by more
-than 10 % at 96x72.
-
-| | plate and element | 48x36 | 96x72 |
-|---|---|---|---|
-{chr(10).join(checks)}
-
-## Complete solution: mesh, matrices, reduction, sweep
-
-{chr(10).join(head + from_nothing)}
-
-The response at all nodes of the mesh is included.
-
-## Every further layout of ERAs on the same plate
-
-{chr(10).join(head + further)}
-
-A new position costs a few solves with the factors of the free plate (16
-for four ERAs, in four symmetry classes); after that a layout is a system of four equations per
-frequency. Studies use the positions of a raster, so each is solved once.
-
-## Ten thousand layouts
-
-`era study placement examples/paper_plate.yaml --layouts 10000 --workers 2`, from the start of the
-command to the ranking and its pictures, with the quartiles and extremes of peak acceleration over
-432 points for every set of active ERAs of every layout; the memory is that of the largest process:
-
-{chr(10).join([*head, row("era-haptics, two processes", study)])}
-
-Factorising every layout again, {name} would take {hours:.1f} hours on both cores, by its time
-above.
-
-![Times of era-haptics and its peers](../pictures/benchmarks.png)
-"""
-    (folder / "measured" / "benchmarks.md").write_text(page)
+    machine = (
+        f"Medians of {len(loads)} runs in {len(loads)} processes. Machine: {_machine()}.\n"
+        f"{_versions()}.\nLoad average during the measurement, including the benchmark's own one "
+        f"to two: {min(loads):.1f} to {max(loads):.1f}."
+    )
+    agreed = ["| | plate and element | 48x36 | 96x72 |", "|---|---|---|---|", *checks]
+    again = (
+        f"Factorising every layout again, {name} would take {hours:.1f} hours on both cores, by "
+        "its time above."
+    )
+    write_parts(
+        folder / "measured" / "benchmarks.md",
+        {
+            "machine": machine,
+            "agreement": "\n".join(agreed),
+            "nothing": "\n".join(head + from_nothing),
+            "layouts": "\n".join(head + further),
+            "study": "\n".join([*head, row("era-haptics, two processes", study), "", again]),
+        },
+    )
     figure = _picture(measured, peers)
     FigureCanvasAgg(figure)
     figure.savefig(folder / "pictures" / "benchmarks.png", dpi=130)

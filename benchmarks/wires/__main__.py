@@ -1,4 +1,4 @@
-"""`make bench-wires`: what the drivers cost beside the bare library of each wire.
+"""`make bench-wires`: time of an exchange by the drivers and by the bare library of each wire.
 
 Writes docs/measured/wire-benchmarks.md. A wire is one entry in WIRES.
 """
@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.page import write_parts
 from benchmarks.wires.bare import bare_modbus, bare_serial
 from benchmarks.wires.bare_can import bare_can, can_codec
 from benchmarks.wires.bench import (
@@ -71,8 +72,8 @@ def _serial_codec(safe: SafeCommandSet) -> None:
     decode_request(_READER.feed(data)[0])
 
 
-class _Taker:
-    """An amplifier that takes every set."""
+class _Accepting:
+    """An amplifier that accepts every set."""
 
     is_answering = True
 
@@ -87,13 +88,13 @@ class _Taker:
         pass
 
 
-_UNIT = ModbusUnit(_Taker())
+_UNIT = ModbusUnit(_Accepting())
 
 
 def _modbus_codec(safe: SafeCommandSet) -> None:
     exchange = exchanges.encode_request(Apply(safe), tag=1, channels=CHANNELS)
-    telegram = build_adu(exchange.read, exchange.write, unit=1, transaction=1, is_rtu=False)
-    answer = _UNIT.reply(telegram.frame[7:])
+    adu = build_adu(exchange.read, exchange.write, unit=1, transaction=1, is_rtu=False)
+    answer = _UNIT.reply(adu.frame[7:])
     assert answer is not None
 
 
@@ -118,6 +119,18 @@ EIGHT: Mapping[str, Sequence[str]] = {
 EIGHT_ROUNDS = 300
 
 
+HEAD = (
+    "| wire | median [ms] | 99th [ms] | applies/s | bare library | median [ms] | 99th [ms] "
+    "| ratio | codec [sets/s, encode and decode] |",
+    "|---|---|---|---|---|---|---|---|---|",
+)
+EIGHT_HEAD = (
+    "| arrangement | median [ms] | 99th [ms] | CPU [ms] | skew of commits, median [ms] "
+    "| 99th [ms] |",
+    "|---|---|---|---|---|---|",
+)
+
+
 def main() -> None:
     """Measure every wire and write the page."""
     names = sys.argv[1:] or list(WIRES)
@@ -125,10 +138,14 @@ def main() -> None:
         rig = _coarse_rig(Path(folder))
         rows = [_row(name, WIRES[name], rig) for name in names]
         eight = _eight(Path(folder))
-    page = _page(rows, eight)
-    PAGE.write_text(page, encoding="utf-8")
-    print(page)
-    print(f"wrote {PAGE.relative_to(ROOT)}")
+    machine = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+    run = f"{COUNT} exchanges each, in {ROUNDS} alternating rounds ({machine})."
+    parts = {
+        "wires": "\n".join([run, "", *HEAD, *rows]),
+        "eight": "\n".join([*EIGHT_HEAD, *eight]),
+    }
+    print("\n\n".join(parts.values()))
+    write_parts(PAGE, parts)
 
 
 def _row(name: str, wire: Measured, rig: Path) -> str:
@@ -158,7 +175,7 @@ def _codec_rate(wire: Measured) -> str:
 
 
 def _eight(folder: Path) -> list[str]:
-    """Eight amplifiers told at once, behind each kind of wire; a row each."""
+    """Eight amplifiers at once behind each kind of wire, a row each."""
     rig = folder / "eight.yaml"
     text = (ROOT / "examples" / "paper_plate.yaml").read_text(encoding="utf-8")
     eras = "\n".join(
@@ -186,42 +203,11 @@ def _eight(folder: Path) -> list[str]:
 
 
 def _coarse_rig(folder: Path) -> Path:
-    """The plate takes no part in this."""
+    """A rig with a coarse mesh, since the plate does not matter here."""
     text = (ROOT / "examples" / "paper_plate.yaml").read_text(encoding="utf-8")
     path = folder / "coarse.yaml"
     path.write_text(text.replace("mesh: auto", "mesh: 12x9"), encoding="utf-8")
     return path
-
-
-def _page(rows: Sequence[str], eight: Sequence[str]) -> str:
-    return "\n".join(
-        [
-            "# Wire benchmarks",
-            "",
-            "Printed by `make bench-wires` "
-            f"(Python {platform.python_version()}, {platform.system()} {platform.machine()}).",
-            f"An `Apply` of {CHANNELS} channels and its reply, over loopback, to a simulated "
-            "amplifier in a separate process; for comparison the bare library of the wire, which "
-            "sends the same bytes, pre-encoded, to the same far end and does not decode the reply. "
-            f"{COUNT} exchanges each, in {ROUNDS} alternating rounds. *Ratio* is the driver's "
-            "median over that of the bare library.",
-            "",
-            "| wire | median [ms] | 99th [ms] | applies/s | bare library | median [ms] | 99th [ms] "
-            "| ratio | codec [sets/s, encode and decode] |",
-            "|---|---|---|---|---|---|---|---|---|",
-            *rows,
-            "",
-            "Eight amplifiers simulated by one far end: one set to each at once, the processor "
-            "time of the host for it, and the skew between the commits. On one bus the controller "
-            "commits by one broadcast instead.",
-            "",
-            "| arrangement | median [ms] | 99th [ms] | CPU [ms] | skew of commits, median [ms] | "
-            "99th [ms] |",
-            "|---|---|---|---|---|---|",
-            *eight,
-            "",
-        ]
-    )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
-"""Clients that are idle, do not read, ask without end or talk nonsense, beside fingers that play.
+"""Idle, unreading, flooding and malformed clients, in processes of their own, while fingers play.
 
-The bad ones are processes of their own. The bound of each is tested on the server alone, too; here
-the whole daemon is held to it, and its control loop must not notice.
+The control loop of the whole daemon must not be affected.
 """
 
 import asyncio
@@ -18,30 +17,30 @@ from journal import Journal, loudness
 
 pytestmark = pytest.mark.alone
 
-GROWTH = 64  # MiB; 32 clients with 256 KiB each to read, and as much to be parsed, are less
+MAX_GROWTH = 64  # MiB; 32 clients with 256 KiB each to read, and as much to parse, are less
 
 
 def resident(pid: int) -> float:
-    """Memory of a process [MiB]."""
+    """Return the resident memory of a process [MiB]."""
     with open(f"/proc/{pid}/statm", encoding="ascii") as stream:  # noqa: PTH123
         return int(stream.read().split()[1]) * 4096 / 2**20
 
 
-async def stopped_by_somebody_else(daemon: DaemonProcess) -> None:
-    """A new client gets a place, and its stop is done."""
+async def stop_by_new_client(daemon: DaemonProcess) -> None:
+    """Connect a new client and stop the daemon by it."""
     async with asyncio.timeout(PATIENCE):
         while True:
             try:
                 async with await daemon.client() as other:
                     await other.stop()
                     break
-            except (RpcError, Unreachable, ConnectionError):  # all places are taken
+            except (RpcError, Unreachable, ConnectionError):  # too many clients
                 await asyncio.sleep(0.05)
     await until(lambda: loudness(daemon.far) == 0)
 
 
-async def test_two_thousand_idle_and_ten_that_do_not_read(tmp_path: Path) -> None:
-    """It plays on without a gap, memory stays bounded, and a new client can still stop it."""
+async def test_daemon_plays_on_with_idle_and_unreading_clients(tmp_path: Path) -> None:
+    """With 2000 idle and 10 unreading ones memory is bounded, and a new client can stop it."""
     async with far_end(tmp_path) as far, daemon_process(tmp_path, far) as daemon:
         journal = Journal(far)
         async with await daemon.client() as era, holding(era):
@@ -56,14 +55,14 @@ async def test_two_thousand_idle_and_ten_that_do_not_read(tmp_path: Path) -> Non
                 line = await asyncio.wait_for(idle.stdout.readline(), 3 * PATIENCE)
                 assert int(line) == 2000
                 await plays_on("2000 idle, 10 unreading", daemon, era, journal)
-                await stopped_by_somebody_else(daemon)
-                assert resident(daemon.process.pid) - before < GROWTH
+                await stop_by_new_client(daemon)
+                assert resident(daemon.process.pid) - before < MAX_GROWTH
             await play(era, far)
 
 
 @pytest.mark.parametrize("kind", ["garbage", "asking"])
-async def test_clients_that_flood(tmp_path: Path, kind: str) -> None:
-    """Nonsense of all kinds, or requests without end: it plays on, and any client can stop it."""
+async def test_daemon_plays_on_when_clients_flood(tmp_path: Path, kind: str) -> None:
+    """With malformed or endless requests any client can stop it, and the log stays short."""
     async with far_end(tmp_path) as far, daemon_process(tmp_path, far) as daemon:
         journal = Journal(far)
         async with await daemon.client() as era, holding(era):
@@ -71,9 +70,9 @@ async def test_clients_that_flood(tmp_path: Path, kind: str) -> None:
             before = resident(daemon.process.pid)
             async with flood(kind, daemon.socket, 4), flood(kind, daemon.socket, 5):
                 await plays_on(f"clients flood: {kind}", daemon, era, journal)
-                await stopped_by_somebody_else(daemon)
+                await stop_by_new_client(daemon)
             await play(era, far)
-            assert resident(daemon.process.pid) - before < GROWTH
+            assert resident(daemon.process.pid) - before < MAX_GROWTH
         assert not daemon.said("Traceback")
         assert not daemon.said("no json")
         assert len(daemon.log) < 200  # invalid requests do not fill the disk

@@ -5,7 +5,7 @@ import itertools
 import json
 import logging
 from collections.abc import Callable, Coroutine
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -23,6 +23,7 @@ from controller.api.jsonrpc import (
 from controller.api.methods import METHODS, TouchParams
 from controller.api.rate_limit import RateLimiter
 from controller.api.schema import MAX_RATE, Empty, Message, Topic
+from controller.gateway.daemon_link import DaemonLink
 from controller.gateway.outbox import Outbox
 
 MAX_REQUEST_RATE = 200.0  # 1/s; touches and stops are not counted
@@ -48,13 +49,6 @@ class SessionTopics(Message):
     rate_hz: Annotated[float, Field(ge=1, le=MAX_RATE)] | None = None
 
 
-class Daemon(Protocol):
-    """What a session needs of the connection to the daemon."""
-
-    async def call(self, method: str, params: Message) -> Any:
-        """Call a method and return its result as JSON; raises RpcError."""
-
-
 class Session:
     """An accepted WebSocket; see `run`.
 
@@ -64,7 +58,7 @@ class Session:
     def __init__(
         self,
         socket: WebSocket,
-        daemon: Daemon,
+        daemon: DaemonLink,
         *,
         current: Callable[[str], str | bytes | None],
         clock: Callable[[], float],

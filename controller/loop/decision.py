@@ -12,8 +12,8 @@ from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.envelopes import ENVELOPE_TIME, PLAIN
 from controller.loop.intent import IntentSource
 from controller.loop.loading_times import LoadingTimes
-from controller.loop.safe_sets import FADE_RAMP, PatternTiming, SafeSets, SetBuilder
-from controller.loop.selection import PatternTable, Selection, Selector
+from controller.loop.safe_sets import FADE_RAMP, SafeSets, SetBuilder
+from controller.loop.selection import Selection, Selector
 from controller.sources.contacts import Change, Contact, ContactTracker
 from controller.sources.touch import TouchFrame
 from drivers.command import DriveCommand
@@ -22,6 +22,8 @@ from drivers.guard import Guard
 from model.rig.rig import Rig
 from model.table.pattern import Pattern
 from model.table.question import Question
+from model.table.table import LocalizationTable
+from model.table.timing import Timing
 from registry.plugins import failure_text
 
 # With no finger left on the plate the end may be short: zero within 20 ms of the lift.
@@ -83,12 +85,12 @@ class Decider:
     def __init__(
         self,
         rig: Rig,
-        table: PatternTable,
+        table: LocalizationTable,
         *,
         guards: Mapping[str, Guard],
         capabilities: PlaybackCapabilities,
         intent_source: IntentSource,
-        timing: PatternTiming | None = None,
+        timing: Timing | None = None,
         envelope_time: float = ENVELOPE_TIME,
     ) -> None:
         self._table = table

@@ -15,8 +15,7 @@ from controller.loop.envelopes import ENVELOPE_TIME
 from controller.loop.intent import IntentSource, NewestBuzzes
 from controller.loop.observer import Observer, applied_by, silenced_by
 from controller.loop.routing import drive_of_eras
-from controller.loop.safe_sets import PatternTiming, SafeSets
-from controller.loop.selection import PatternTable
+from controller.loop.safe_sets import SafeSets
 from controller.sources.contacts import Change
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import TouchFrame, TouchSource
@@ -27,6 +26,8 @@ from drivers.errors import CommandError, DriverError, LinkError
 from drivers.operation.watchdog import HEARTBEAT
 from model.errors import InputError
 from model.rig.rig import Rig
+from model.table.table import LocalizationTable
+from model.table.timing import Timing
 from registry.plugins import failure_text
 
 # Closing is not urgent, so it fades out softly.
@@ -54,13 +55,13 @@ class Controller:
     def __init__(
         self,
         rig: Rig,
-        table: PatternTable,
+        table: LocalizationTable,
         *,
         amplifiers: Mapping[str, Amplifier],
         sources: Sequence[TouchSource] = (),
         observer: Observer | None = None,
         intent_source: IntentSource | None = None,
-        timing: PatternTiming | None = None,
+        timing: Timing | None = None,
         drive_mode: str | None = None,
         envelope_time: float = ENVELOPE_TIME,
     ) -> None:

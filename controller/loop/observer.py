@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from controller.loop.decision import Decision
-from controller.loop.safe_sets import PatternTiming
 from controller.loop.selection import Prediction
 from controller.sources.contacts import Change, Contact
 from drivers.command import DriveCommand
 from model.table.pattern import Pattern
 from model.table.question import Question
+from model.table.timing import Timing
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Applied:
     time: float
     from_rest: bool = True
     question: Question | None = field(default=None, repr=False)
-    timing: PatternTiming | None = field(default=None, repr=False, compare=False)
+    timing: Timing | None = field(default=None, repr=False, compare=False)
 
     @cached_property
     def transient_contrast_db(self) -> float | None:
@@ -68,7 +68,7 @@ def applied_by(
     *,
     drive: Mapping[str, DriveCommand],
     sent: float,
-    timing: PatternTiming | None,
+    timing: Timing | None,
 ) -> Applied:
     """Report a decision whose pattern plays; sent [s]: its last byte."""
     return Applied(

@@ -1,9 +1,8 @@
 """Command sets for all amplifiers of a rig: routed, shaped where possible, checked by guards."""
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 from controller.loop.envelopes import wire_envelopes
 from controller.loop.routing import goes_on, route, route_again, route_end
@@ -14,26 +13,12 @@ from drivers.protocol.definition import token_after
 from model.rig.rig import Rig
 from model.table.pattern import Pattern
 from model.table.question import Question
+from model.table.timing import Timing
 
 FADE_RAMP = 0.020
 """Fade-out [s] under fingers that stay on the plate; a shorter one would feel like a tap."""
 
 _logger = logging.getLogger(__name__)
-
-
-class PatternTiming(Protocol):
-    """The part of `model.table.timing.Timing` that the control loop needs."""
-
-    def prepare(self, frequencies: Iterable[float]) -> None:
-        """Precompute what shaping needs to know about frequencies [Hz]."""
-
-    def with_envelopes(
-        self, question: Question, pattern: Pattern, *, onset: bool, ending: bool
-    ) -> Pattern:
-        """Return the pattern with a shaped onset, ending, or both."""
-
-    def with_transient_measures(self, question: Question, pattern: Pattern) -> Pattern:
-        """Return the pattern with its contrast over the first 100 ms, from rest."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +49,7 @@ class SetBuilder:
     timing: shapes patterns; None for ramps only.
     """
 
-    def __init__(
-        self, rig: Rig, guards: Mapping[str, Guard], *, timing: PatternTiming | None
-    ) -> None:
+    def __init__(self, rig: Rig, guards: Mapping[str, Guard], *, timing: Timing | None) -> None:
         self._rig = rig
         self._guards = guards
         self._timing = timing

@@ -4,22 +4,19 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.intent import HapticIntent, Target
 from controller.sources.contacts import Contact
-from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.contrast import contrast_db, mean_level_db_sl
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import FELT_DB_SL
-from model.structure.plate import Plate
 from model.table.pattern import UNAWARE_DB_SL, Pattern
 from model.table.question import Question
-from model.vibration.excitation import Excitation
+from model.table.table import LocalizationTable
 from model.vibration.peak import peak_acceleration
 from registry.plugins import failure_text
 
@@ -32,29 +29,6 @@ MAX_DB_SL = 26.0
 without neighbours is not numbed."""
 
 _logger = logging.getLogger(__name__)
-
-
-class PatternTable(Protocol):
-    """The part of a localization table that selection needs."""
-
-    @property
-    def plate(self) -> Plate:
-        """The plate."""
-
-    @property
-    def frequencies(self) -> FloatArray:
-        """Frequencies of its patterns [Hz]."""
-
-    def prepare(self, drive_mode: str) -> None:
-        """Precompute what the first question in a drive mode needs."""
-
-    def query(self, question: Question) -> Pattern:
-        """Return the best pattern; raises InputError if there is none."""
-
-    def amplitudes(
-        self, excitation: Excitation, points: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return frequencies (f,) [Hz] and peak acceleration (f, p) [m/s²] at points (p, 2) [m]."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +67,7 @@ class Selector:
     8 mm. A quiet contact that lifts leaves it as it is: a change would be felt.
     """
 
-    def __init__(self, table: PatternTable) -> None:
+    def __init__(self, table: LocalizationTable) -> None:
         self._table = table
         self._current = Selection((), (), None, None)
 

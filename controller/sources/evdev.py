@@ -4,12 +4,11 @@ import asyncio
 import errno
 import logging
 from collections.abc import Callable
-from typing import Protocol
 from urllib.parse import parse_qsl
 
-from controller.sources.input_device import InputDevice, InputEvent
+from controller.sources.input_device import InputDevice
 from controller.sources.playing import REPEAT_INTERVAL
-from controller.sources.slots import Range, SlotReader, SlotState
+from controller.sources.slots import SlotReader
 from controller.sources.touch import Touch, TouchFrame, TouchSource
 from model.errors import InputError
 
@@ -17,29 +16,6 @@ from model.errors import InputError
 _FIRST_PAUSE, _MAX_PAUSE = 0.5, 5.0
 
 _logger = logging.getLogger(__name__)
-
-
-class Panel(Protocol):
-    """The part of `InputDevice` that the source needs."""
-
-    x_range: Range
-    y_range: Range
-
-    @property
-    def current_slot(self) -> int:
-        """The slot of the next event."""
-
-    def fileno(self) -> int:
-        """Return the descriptor for a selector."""
-
-    def slots(self) -> dict[int, SlotState]:
-        """Return the state of every slot."""
-
-    def read(self) -> list[InputEvent]:
-        """Return the pending events."""
-
-    def close(self) -> None:
-        """Close the device."""
 
 
 class EvdevSource(TouchSource):
@@ -50,7 +26,7 @@ class EvdevSource(TouchSource):
     other URL, and in `open` or `run` if there is no panel.
     """
 
-    def __init__(self, url: str, *, open_panel: Callable[..., Panel] = InputDevice) -> None:
+    def __init__(self, url: str, *, open_panel: Callable[..., InputDevice] = InputDevice) -> None:
         path, _, options = url.removeprefix("evdev:").partition("?")
         grab = dict(parse_qsl(options, keep_blank_values=True))
         if not url.startswith("evdev:") or not path or grab not in ({}, {"grab": "yes"}):
@@ -62,7 +38,7 @@ class EvdevSource(TouchSource):
         self._path = path
         self._grab = bool(grab)
         self._open = open_panel
-        self._panel: Panel | None = None
+        self._panel: InputDevice | None = None
 
     async def open(self) -> None:
         """Open the device if it is not open; `run` does so too. Raises InputError."""
@@ -94,7 +70,7 @@ class EvdevSource(TouchSource):
                 continue  # not plugged in again yet
             _logger.warning("%s: reconnected", self._name)
 
-    async def _follow(self, panel: Panel, deliver: Callable[[TouchFrame], None]) -> None:
+    async def _follow(self, panel: InputDevice, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver the frames of a panel until it is unplugged; raises OSError then."""
         loop = asyncio.get_running_loop()
         reader = SlotReader(panel.x_range, panel.y_range)

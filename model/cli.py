@@ -6,8 +6,8 @@ from model.commands.calibrate_cli import calibrate
 from model.commands.config_cli import config_app
 from model.commands.figure_cli import figure_app
 from model.commands.plate_cli import plate_app
-from model.commands.plate_element_cli import conformance, elements
-from model.commands.plate_show_cli import materials, show
+from model.commands.plate_conformance_cli import conformance
+from model.commands.plate_show_cli import elements, materials, show
 from model.commands.study_cli import study_app
 from model.commands.table_build_cli import build
 from model.commands.table_cli import query, table_app

@@ -1,4 +1,4 @@
-"""Tasks on worker processes of this machine, each with one thread for linear algebra."""
+"""Tasks on processes of this machine, each with one thread for linear algebra."""
 
 import logging
 import multiprocessing
@@ -34,10 +34,14 @@ def on_processes(
 ) -> Iterator[tuple[int, Result]]:
     """Yield numbers of tasks with their results in the order in which they are done.
 
-    solve: a function of a module; shared: its first argument, sent to each process once. After a
+    count: of processes, 1 for this one; solve: a function of a module; shared: its first argument,
+    sent to each process once. After a
     process has died, unfinished tasks are solved again by new ones. Raises InputError if they keep
     dying.
     """
+    if count == 1:
+        yield from ((number, solve(shared, task)) for number, task in tasks.items())
+        return
     for variable in _THREAD_COUNTS:
         os.environ.setdefault(variable, "1")  # read by numpy when a new process loads it
     pending = dict(tasks)

@@ -135,9 +135,9 @@ def check(
 def _from_file(rig: "Rig", path: Path, *, has_phases: bool) -> "Observation":
     from model.calibration.responses import responses_of
     from model.calibration.responses_file import read_functions
-    from model.diagnosis.observation import observation_of
+    from model.diagnosis.observation import Observation
 
-    return observation_of(responses_of(read_functions(path), rig), has_phases=has_phases)
+    return Observation(**vars(responses_of(read_functions(path), rig)), has_phases=has_phases)
 
 
 def _frequencies(rig: "Rig", text: str | None) -> list[float]:

@@ -1,4 +1,4 @@
-"""From measured responses to a rig's numbers, with what is wrong in the measurement set aside."""
+"""Calibration of a rig by measured responses, without dead channels and outliers."""
 
 import math
 from dataclasses import replace
@@ -25,21 +25,21 @@ from model.errors import InputError
 from model.rig.rig import Rig
 from model.structure.actuator import Gain
 
-_STARTS = 2  # of many, those that explain the shapes best
-_WRONG_SCALE = 0.02  # what sensors are commonly calibrated to
+_STARTS = 2  # those with the least misfit of shapes
+_WRONG_SCALE = 0.02  # common tolerance of sensors
 _SURE = 4.0  # standard errors
 _LEAST_SENSORS = 3
 
-# What the model's own idealisations do to any value, of itself, however good the data: structural
-# damping that is viscous and not hysteretic moves the loss factor by 0.15 %, the rest by less.
+# Relative error of values by idealisations of the model: viscous instead of hysteretic damping
+# changes the loss factor by 0.15 %, other values by less.
 _MODEL_ERROR = 2e-3
 
 
 def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Calibration:
     """Fit a rig to responses measured on it.
 
-    all_scales: estimate every sensor's scale, not only of those that are found to be wrong. Raises
-    InputError where fewer than three sensors are alive or nothing was driven.
+    all_scales: estimate the scale of every sensor, not only of wrong ones. Raises InputError if
+    fewer than three sensors have a signal or nothing was driven.
     """
     alive, dead_eras = ~silent_sensors(responses), silent_eras(responses)
     values = responses.values.copy()
@@ -48,7 +48,7 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
     plate = fast_plate(rig, responses.points, responses.frequencies)
     parameters = parameters_of(rig)
 
-    # First with every scale free, so that no wrong one leads astray.
+    # All scales are free at first, so that a wrong one does not bias the fit.
     problem = _problem(rig, plate, parameters, values, alive)
     fit = _best_fit(problem)
     relative = fit.scales / np.median(fit.scales)
@@ -87,12 +87,10 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
 def _check_enough(alive: NDArray[np.bool_], responses: Responses) -> None:
     if alive.sum() < _LEAST_SENSORS:
         dead = [n for n, live in zip(responses.sensors, alive, strict=True) if not live]
-        said = f" ({', '.join(dead)} without a usable signal)" if dead else ""
-        count = int(alive.sum())
+        without = f" ({', '.join(dead)} without a signal)" if dead else ""
         raise InputError(
-            f"{count} sensor{'' if count == 1 else 's'} measured{said}; at least "
-            f"{_LEAST_SENSORS} are needed, better eight or more, since gains of the ERAs take up "
-            "what one alone says"
+            f"at least {_LEAST_SENSORS} sensors must have a signal, better eight or more, got "
+            f"{alive.sum()}{without}"
         )
 
 
@@ -103,7 +101,7 @@ def _problem(
     values: ComplexArray,
     alive: NDArray[np.bool_],
 ) -> Problem:
-    """The problem of some of the sensors, everything free."""
+    """Problem of the live sensors with all parameters and scales free."""
     count = int(alive.sum())
     return Problem(
         rig,
@@ -116,20 +114,20 @@ def _problem(
 
 
 def _best_fit(problem: Problem) -> Fit:
-    """The best of fits from several starts, for a fit finds only the nearest minimum."""
-    begins = sorted(starts(problem.parameters), key=lambda x: misfit(problem, x))[:_STARTS]
+    """Fit from several starts, since a fit finds only the nearest minimum; return the best."""
+    best_starts = sorted(starts(problem.parameters), key=lambda x: misfit(problem, x))[:_STARTS]
     ones = np.ones(problem.values.shape[2])
-    fits = [solve(problem, begin, ones) for begin in begins]
+    fits = [solve(problem, start, ones) for start in best_starts]
     return min(fits, key=lambda fit: misfit(problem, fit.x))
 
 
 def _identified(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
-    """Hold parameters that the data tell less of than their prior at the rig's value, and refit."""
+    """Hold parameters that the data determine less than their prior does, and fit again."""
     prior = np.array([parameter.prior_std for parameter in problem.parameters])
     own = np.array([parameter.start for parameter in problem.parameters])
     while True:
         excess = np.where(problem.free, fit.x_error / prior, 0)
-        # No value of a plate that does not fit means anything.
+        # Values of a plate that does not fit are meaningless.
         if not excess.max() > 1 or _fit_error(problem, fit) > FITS:
             return problem, fit
         free = problem.free.copy()

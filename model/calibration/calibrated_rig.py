@@ -1,4 +1,4 @@
-"""The text of a rig file with calibrated values; comments and layout of its author stay."""
+"""Text of a rig file with calibrated values and unchanged comments and layout."""
 
 import re
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ from model.structure.plate import Material
 
 _GAINS_PER_LINE = 4
 
-# ruamel.yaml breaks long sequences anywhere, so gains are put in once it has written the rest.
+# ruamel.yaml wraps long sequences anywhere, so gains replace placeholders in its text.
 _GAINS_OF = "gains-of-"
 _PLACEHOLDER = re.compile(
     rf"^(?P<start>(?P<indent> *).*gains: ){_GAINS_OF}(?P<era>\d+)", re.MULTILINE
@@ -31,9 +31,9 @@ _PLACEHOLDER = re.compile(
 def calibrated_text(
     document: Document, before: Rig, calibration: Calibration, *, comment: str
 ) -> str:
-    """Return a rig file's text with the values of a calibration below the lines of a comment.
+    """Return a rig file's text with calibrated values, headed by a comment.
 
-    Raises ConfigError where a comment of the file cannot be kept.
+    Raises ConfigError if a comment of the file would be lost.
     """
     after = calibration.rig
 
@@ -42,7 +42,7 @@ def calibrated_text(
         _set_modulus(data["plate"], before, after.plate.material.E)
         for number, era in enumerate(after.eras):
             entry = data["eras"][era.name]
-            # A ratio would stand for another damping once the stiffness has changed.
+            # With another stiffness a ratio would be another damping.
             _rename(entry, "damping_ratio", "damping")
             _set(
                 entry,
@@ -66,7 +66,7 @@ def calibrated_text(
 
 
 def check_reads_back(rig: Rig, expected: Calibration, path: Path) -> None:
-    """Raise InputError unless a rig that was read from its new file is the calibrated one."""
+    """Raise InputError unless a rig read from its new file has the calibrated values."""
 
     def numbers(one: Rig) -> list[float]:
         plate = [one.plate.material.E, one.plate.loss_factor]
@@ -106,7 +106,7 @@ def _set_modulus(plate: CommentedMap, before: Rig, modulus: float) -> None:
 
 
 def _set_material(entry: CommentedMap, material: Material, modulus: float) -> None:
-    """Set the modulus [Pa] of a plate's or layer's material, spelled out if it goes by name."""
+    """Set the modulus [Pa] of a plate's or layer's material, writing out a named material."""
     text = f"{modulus / 1e9:.7g} GPa"
     if isinstance(entry["material"], CommentedMap):
         entry["material"]["E"] = text
@@ -119,7 +119,7 @@ def _set_material(entry: CommentedMap, material: Material, modulus: float) -> No
 
 
 def _layer_factor(rig: Rig, laminate: Laminate, *, wanted: float) -> float:
-    """Factor on every layer's modulus that gives the equivalent plate a modulus [Pa]."""
+    """Factor on the moduli of all layers for which the equivalent plate has a modulus [Pa]."""
 
     def excess(factor: float) -> float:
         layers = tuple(
@@ -142,7 +142,7 @@ def _rename(mapping: CommentedMap, old: str, new: str) -> None:
 
 
 def _set(mapping: CommentedMap, values: Mapping[str, Any]) -> None:
-    """Set keys of a mapping; new ones come first in a block, where no comment is in the way."""
+    """Set keys of a mapping; new ones come first in a block, where they separate no comment."""
     for key, value in values.items():
         if key in mapping or mapping.fa.flow_style():
             mapping[key] = value

@@ -1,4 +1,4 @@
-"""What comes out of a calibration."""
+"""Results of a calibration."""
 
 from dataclasses import dataclass
 
@@ -7,14 +7,14 @@ from model.calibration.parameters import Parameter
 from model.rig.rig import Rig
 
 FITS = 0.25
-"""Largest error of what was held out, relative to the response, of a fit to believe."""
+"""Largest relative error at held-out sensors of an acceptable fit."""
 
 
 @dataclass(frozen=True)
 class FittedParameter:
-    """A parameter with its value, standard error, and whether the data say anything of it.
+    """A parameter with its value and standard error.
 
-    One that is not identified has the rig's own value and no standard error.
+    One that is not identified has the rig's value and no standard error.
     """
 
     parameter: Parameter
@@ -24,13 +24,13 @@ class FittedParameter:
 
     @property
     def is_identified(self) -> bool:
-        """Whether the value was found in the data."""
+        """Whether the data determine the value."""
         return self.standard_error is not None
 
 
 @dataclass(frozen=True)
 class SensorScale:
-    """Reading per truth of a sensor, relative to the others' median, and its standard error."""
+    """Scale of a sensor relative to the others' median, and its standard error."""
 
     name: str
     scale: float
@@ -39,10 +39,10 @@ class SensorScale:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Prediction at sensors that the fit had not seen.
+    """Prediction at sensors held out of the fit.
 
-    Errors: root mean square over responses, each relative to all sensors' at its frequency and ERA;
-    before: of the rig as it was.
+    before, after: error of the old and the fitted rig, root mean square over responses, each
+    relative to all sensors' at its frequency and ERA.
     """
 
     sensors: tuple[str, ...]
@@ -52,12 +52,11 @@ class HeldOut:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What a measurement says of a rig.
+    """Calibrated rig with everything found about the measurement.
 
-    rig: with the new values and gains; dead_sensors, dead_eras: left out; scales: the sensors that
-    are not as the others, or all of them if asked for; held_out: None with too few sensors; error:
-    as in HeldOut, over all that was fitted; measured, before, after: responses (f, eras, s) [1/s²]
-    of the live sensors, scales taken out.
+    dead_sensors, dead_eras: left out of the fit; scales: of sensors with a wrong scale, or of all
+    if requested; held_out: None with too few sensors; error: as in HeldOut, of the fit; measured,
+    before, after: responses (f, eras, s) [1/s²] of the live sensors, divided by their scales.
     """
 
     rig: Rig
@@ -78,5 +77,5 @@ class Calibration:
 
     @property
     def is_good(self) -> bool:
-        """Whether the fitted plate is the measured one."""
+        """Whether the fit is acceptable."""
         return bool((self.held_out.after if self.held_out else self.error) <= FITS)

@@ -1,4 +1,4 @@
-"""Channels that say nothing: sensors without a usable signal, ERAs that move nothing."""
+"""Detection of sensors without a usable signal and of ERAs that do not move the plate."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +16,18 @@ _DEAD_COHERENCE = 0.5  # with what the fitted plate does at the sensor
 
 
 def silent_eras(responses: Responses) -> NDArray[np.bool_]:
-    """Which ERAs were driven and move nothing (eras,).
+    """Mask of driven ERAs without a response (eras,).
 
-    Raises InputError where no ERA moves anything.
+    Raises InputError if there is no response at all.
     """
     typical = np.array([_median(responses.values[:, e]) for e in range(responses.values.shape[1])])
     if not np.nanmax(typical) > 0:
-        raise InputError("every measured response is zero; check that the ERAs were driven")
+        raise InputError("measured responses must not all be zero; check that ERAs were driven")
     return np.asarray(typical < _SILENT_ERA * np.nanmedian(typical))
 
 
 def silent_sensors(responses: Responses) -> NDArray[np.bool_]:
-    """Which sensors hear nothing of anything (s,)."""
+    """Mask of sensors without a response to any ERA (s,)."""
     size = np.abs(responses.values)
     loudest = np.where(np.isfinite(size), size, 0).max(axis=2, keepdims=True)
     share = size / np.where(loudest > 0, loudest, np.nan)
@@ -36,13 +36,13 @@ def silent_sensors(responses: Responses) -> NDArray[np.bool_]:
 
 
 def _median(values: NDArray[np.inexact]) -> float:
-    """Median magnitude of what is there; NaN for nothing."""
+    """Median magnitude of finite values; NaN without any."""
     there = np.abs(values)[np.isfinite(values)]
     return float(np.median(there)) if len(there) else float("nan")
 
 
 def unlike_the_plate(problem: Problem, fit: Fit, relative: FloatArray) -> NDArray[np.bool_]:
-    """Which sensors do not follow the plate, whatever it is (s,)."""
+    """Mask of sensors whose response is not that of the fitted plate (s,)."""
     rig = rig_with(problem.rig, problem.parameters, fit.x)
     model = np.nan_to_num(fit.gains)[:, :, None] * problem.plate.responses(rig)
     weight = fit.used / fit.noise[:, :, None]

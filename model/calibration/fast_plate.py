@@ -1,7 +1,7 @@
-"""A rig's plate as a fit needs it: hundreds of times with other values, each in milliseconds.
+"""Responses of a rig's plate for many values of its parameters, in milliseconds each.
 
-The free plate is reduced once. Another modulus scales its natural frequencies and nothing else;
-ERAs are a correction of low rank to its receptance (Woodbury identity).
+The free plate is reduced once. The modulus only scales its natural frequencies; ERAs are a
+correction of low rank to its receptance (Woodbury identity).
 """
 
 from dataclasses import dataclass
@@ -32,9 +32,9 @@ class FastPlate:
     omega: FloatArray
 
     def responses(self, rig: Rig) -> ComplexArray:
-        """Acceleration per base displacement [1/s²] of each ERA, its gain not counted: (f, e, p).
+        """Acceleration per base displacement [1/s²] of each ERA without its gain, (f, e, p).
 
-        rig: the same plate on the same places, with other values.
+        rig: the same geometry with other values.
         """
         plate = rig.plate
         elastic = (
@@ -52,7 +52,7 @@ class FastPlate:
 def fast_plate(rig: Rig, points: FloatArray, frequencies: FloatArray) -> FastPlate:
     """Solve a rig's free plate once, for points (p, 2) [m] and frequencies (f,) [Hz].
 
-    Raises InputError for frequencies that its mesh cannot carry.
+    Raises InputError for frequencies too high for its mesh.
     """
     check_frequencies(rig.plate, rig.mesh, frequencies)
     attached = np.vstack([era_positions(rig.eras), load_positions(rig.loads)])

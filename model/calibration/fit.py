@@ -35,9 +35,9 @@ _SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong b
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is fitted to what: a rig, and values (f, e, s), NaN where there is none.
+    """A rig and the measured values (f, e, s), NaN where not measured.
 
-    free: which of the parameters are fitted; free_scales (s,): which sensors' scales are.
+    free (n,), free_scales (s,): masks of the parameters and sensor scales to be fitted.
     """
 
     rig: Rig
@@ -50,11 +50,11 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What came out.
+    """Result of a fit.
 
     x, x_error (n,); scales, scales_error (s,); gains, gains_error (f, e), NaN where unmeasured;
-    noise (f, e): standard deviation of a value; used (f, e, s): what was not left out; residual
-    (f, e, s): what is left, in standard deviations.
+    noise (f, e): standard deviation of a value; used (f, e, s): mask of values without outliers;
+    residual (f, e, s) in standard deviations.
     """
 
     x: FloatArray
@@ -69,9 +69,9 @@ class Fit:
 
 
 def solve(problem: Problem, x: FloatArray, scales: FloatArray) -> Fit:
-    """Fit from x (n,) and scales (s,) on; what is not free keeps its value."""
+    """Fit from starting values x (n,) and scales (s,), which those not free keep."""
     used = np.isfinite(problem.values)
-    # Until residuals tell more: nothing is believed that stands out of its row.
+    # Without residuals to judge by, peaks of a row are clipped at first.
     first = replace(problem, values=_without_peaks(problem.values, used))
     noise = 0.05 * row_rms(first.values, used)
     x, scales, _ = _search(first, x, scales, used / noise[:, :, None], loss="soft_l1")
@@ -109,7 +109,7 @@ def misfit(problem: Problem, x: FloatArray) -> float:
 def _search(
     problem: Problem, x: FloatArray, scales: FloatArray, weight: FloatArray, *, loss: _Loss
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """x, scales and the standard errors of the free ones among both."""
+    """Return x, scales, and standard errors of the free parameters and scales."""
     free, free_scales = problem.free, problem.free_scales
     count = int(free.sum())
 
@@ -122,7 +122,7 @@ def _search(
         left = _residual(problem, *unpack(z), weight)[weight > 0]
         parts = np.concatenate([left.real, left.imag])
         if free_scales.all():
-            # A common scale cannot be told from the gains; their mean is held at one.
+            # Gains determine a common scale; the mean is held.
             return np.append(parts, 1e3 * (unpack(z)[1].mean() - scales.mean()))
         return parts
 
@@ -153,11 +153,11 @@ def _search(
 def _standard_errors(
     jacobian: FloatArray, residual: FloatArray, group: IntArray, *, freedom: int
 ) -> FloatArray:
-    """Standard errors of the fitted (n,); infinite along what the data do not see.
+    """Standard errors of the fitted (n,); infinite where undetermined.
 
-    The larger of two: with all residuals (m,) independent, and with those of a frequency correlated
-    however they like, as they are where the model itself is a little wrong (sandwich estimate).
-    group: the number of the frequency of each residual; what has none stands at the end.
+    The larger of two: with all residuals (m,) independent, and with those of a frequency
+    correlated, as they are where the model is wrong (sandwich estimate). group: frequency index of
+    each residual, except of those at the end that have none.
     """
     size = np.linalg.norm(jacobian, axis=0)
     size[size == 0] = 1e-300

@@ -1,4 +1,4 @@
-"""A fit checked on sensors that it has not seen."""
+"""Validation of a fit at sensors held out of it."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ _LEAST_TO_HOLD_OUT = 5  # sensors
 
 
 def hold_out(problem: Problem, fit: Fit, names: tuple[str, ...]) -> HeldOut | None:
-    """Fit again without some of the sensors whose scale is known, and predict them."""
+    """Fit without some of the sensors of known scale, and predict their responses."""
     count = len(names)
     candidates = np.flatnonzero(~problem.free_scales)
     if len(candidates) == 0:
@@ -45,7 +45,7 @@ def hold_out(problem: Problem, fit: Fit, names: tuple[str, ...]) -> HeldOut | No
 
 
 def as_it_was(problem: Problem) -> ComplexArray:
-    """Responses (f, e, s) of the rig before, with the gains that it had."""
+    """Responses (f, e, s) of the rig before the fit, with its gains."""
     frequencies = problem.plate.omega / (2 * np.pi)
     gains = np.column_stack([era.gain(frequencies) for era in problem.rig.eras])
     return np.asarray(gains[:, :, None] * problem.plate.responses(problem.rig))

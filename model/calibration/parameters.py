@@ -1,4 +1,4 @@
-"""What a calibration fits: the numbers of a rig, each with how well it must be known to count."""
+"""Parameters of a rig that are fitted, with their priors and bounds."""
 
 import math
 from collections.abc import Sequence
@@ -10,8 +10,7 @@ from model.arrays import FloatArray
 from model.rig.rig import Rig
 from model.structure.actuator import Era, damping_from_ratio
 
-# Standard deviations of what the author of a rig knows: an alloy's modulus and a sheet's thickness,
-# a maker's spring, and hardly anything about losses.
+# Prior standard deviations: data sheets give moduli, thicknesses and springs, and little on losses.
 _MODULUS_STD = 0.07  # of its logarithm
 _STIFFNESS_STD = 0.10  # of its logarithm
 _LOSS_STD, _MIN_LOSS_STD = 0.7, 0.003  # of itself, and at least
@@ -21,7 +20,7 @@ _BOLT_STD = 0.05  # of the plate's mass that an ERA carries
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of a rig: its kind, its ERA ("" for the plate), its value in the rig, its unit.
+    """A parameter: kind, ERA ("" for the plate), value in the rig and unit.
 
     A fit varies x: value = prior * exp(x) if is_factor, else step * x, both in that unit.
     prior_std: standard deviation of x beforehand; lower, upper: bounds of x.
@@ -39,7 +38,7 @@ class Parameter:
 
     @property
     def start(self) -> float:
-        """x of the rig's own value."""
+        """x of the rig's value."""
         return 0.0 if self.is_factor else self.prior / self.step
 
     def value(self, x: float) -> float:
@@ -52,7 +51,7 @@ class Parameter:
 
     @property
     def name(self) -> str:
-        """As people read it."""
+        """Name in reports."""
         return f"{self.era} {self.kind}" if self.era else f"plate {self.kind}"
 
 
@@ -73,7 +72,7 @@ def parameters_of(rig: Rig) -> tuple[Parameter, ...]:
         ),
     ]
     for era in rig.eras:
-        # Bounds and steps go by the ratio to the mass that the ERA carries, and fit every ERA.
+        # Bounds and steps are relative to the mass that the ERA carries.
         unit_damping = damping_from_ratio(
             1.0, stiffness=era.stiffness, plate_mass=plate.mass, era_count=len(rig.eras)
         )
@@ -102,7 +101,7 @@ def parameters_of(rig: Rig) -> tuple[Parameter, ...]:
 
 
 def rig_with(rig: Rig, parameters: Sequence[Parameter], x: FloatArray) -> Rig:
-    """The rig with the values of x (n,); its ERAs keep their gains."""
+    """Rig with the values of x (n,) and unchanged gains."""
     values = {
         (parameter.era, parameter.kind): parameter.value(float(at))
         for parameter, at in zip(parameters, x, strict=True)
@@ -114,7 +113,7 @@ def rig_with(rig: Rig, parameters: Sequence[Parameter], x: FloatArray) -> Rig:
 
 
 def starts(parameters: Sequence[Parameter]) -> list[FloatArray]:
-    """Where to begin, x (n,) each: the rig's own, its modulus and stiffnesses scaled together."""
+    """Starting points x (n,) with modulus and stiffnesses scaled."""
     own = np.array([parameter.start for parameter in parameters])
     found = []
     for modulus in np.log(np.linspace(0.6, 1.6, 11)):

@@ -1,4 +1,4 @@
-"""Measured frequency responses, as a file gives them and as a fit takes them."""
+"""Measured frequency responses, one by one and as an array over a rig's ERAs."""
 
 import math
 from collections.abc import Sequence
@@ -11,17 +11,16 @@ from model.errors import InputError
 from model.rig.rig import Rig
 from model.structure.actuator import Era
 
-# How far [m] a bolt may be from where the rig has it, and a sensor beyond the plate's edge: what a
-# ruler gives.
-_RULER = 5e-3
-_EDGE = 1e-3
+# Tolerances of a ruler [m]: of an ERA's position, and of a sensor beyond the plate's edge.
+_ERA_TOLERANCE = 5e-3
+_EDGE_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredFunction:
     """Acceleration at one sensor per base displacement of one ERA [1/s²], complex (n,).
 
-    Of exp(+i omega t), upwards positive for both. era: its name, or "" where only its place is
+    Phases as exp(+i omega t), upwards positive for both. era: name, or "" if only its position is
     known; point, era_point: x, y [m], the latter None if unknown; frequencies (n,) [Hz]; places:
     file and line of each value, for errors.
     """
@@ -37,7 +36,7 @@ class MeasuredFunction:
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """Measured responses of a rig's plate, NaN where there is none.
+    """Measured responses of a rig's plate, NaN where not measured.
 
     sensors (s,) names; points (s, 2) [m]; frequencies (f,) [Hz]; values (f, eras, s) [1/s²].
     """
@@ -49,16 +48,15 @@ class Responses:
 
     @property
     def count(self) -> int:
-        """How many values there are."""
+        """Number of measured values."""
         return int(np.isfinite(self.values).sum())
 
 
 def responses_of(functions: Sequence[MeasuredFunction], rig: Rig) -> Responses:
-    """The functions as responses of a rig's plate.
+    """Join functions into responses of a rig's plate.
 
-    Raises InputError, with file and line, for what cannot have been measured on it: points off the
-    plate, ERAs that it does not have or elsewhere, frequencies beyond its limits, a response given
-    twice, a sensor at two places.
+    Raises InputError, with file and line, for points off the plate, unknown ERAs or positions,
+    frequencies beyond the rig's limits, a response given twice and a sensor at two positions.
     """
     names = [era.name for era in rig.eras]
     sensors: dict[str, tuple[float, float]] = {}
@@ -66,10 +64,10 @@ def responses_of(functions: Sequence[MeasuredFunction], rig: Rig) -> Responses:
         _check_point(function, rig)
         _check_frequencies(function, rig)
         known = sensors.setdefault(function.sensor, function.point)
-        if math.dist(known, function.point) > _EDGE:
+        if math.dist(known, function.point) > _EDGE_TOLERANCE:
             raise InputError(
-                f"{function.places[0]}: sensor {function.sensor} is at {_shown(function.point)} m "
-                f"here and at {_shown(known)} m before; give each place its own name"
+                f"{function.places[0]}: sensor {function.sensor} must have one position, got "
+                f"{_shown(known)} and {_shown(function.point)} m; name sensors differently"
             )
     frequencies = np.unique(np.concatenate([function.frequencies for function in functions]))
     values = np.full((len(frequencies), len(names), len(sensors)), np.nan, dtype=complex)
@@ -82,23 +80,23 @@ def responses_of(functions: Sequence[MeasuredFunction], rig: Rig) -> Responses:
         if len(repeated) or len(np.unique(rows)) < len(rows):
             first = repeated[0] if len(repeated) else 0
             raise InputError(
-                f"{function.places[first]}: the response of sensor {function.sensor} to ERA "
-                f"{era.name} at {function.frequencies[first]:g} Hz stands twice; keep one"
+                f"{function.places[first]}: response of sensor {function.sensor} to ERA {era.name} "
+                f"at {function.frequencies[first]:g} Hz must be given once, got two"
             )
         values[rows, names.index(era.name), column[function.sensor]] = function.values
-    # A point at the very edge may have been rounded off the plate.
+    # A point at the edge may have been rounded off the plate.
     points = np.clip(list(sensors.values()), 0, [rig.plate.length, rig.plate.width])
     return Responses(tuple(sensors), points, frequencies, values)
 
 
 def _check_point(function: MeasuredFunction, rig: Rig) -> None:
-    x, y = function.point
     plate = rig.plate
-    if not (-_EDGE <= x <= plate.length + _EDGE and -_EDGE <= y <= plate.width + _EDGE):
+    low, high = -_EDGE_TOLERANCE, np.add((plate.length, plate.width), _EDGE_TOLERANCE)
+    if not (np.greater_equal(function.point, low) & np.less_equal(function.point, high)).all():
         raise InputError(
-            f"{function.places[0]}: sensor {function.sensor} at {_shown(function.point)} m is off "
-            f"the rig's plate, which reaches from (0, 0) to ({plate.length:g}, {plate.width:g}) m; "
-            "was another plate measured, or is the place not in metres?"
+            f"{function.places[0]}: sensor {function.sensor} must be on the rig's plate, from "
+            f"(0, 0) to ({plate.length:g}, {plate.width:g}) m, got {_shown(function.point)} m; "
+            "check the plate and the unit"
         )
 
 
@@ -107,29 +105,30 @@ def _check_frequencies(function: MeasuredFunction, rig: Rig) -> None:
     beyond = np.flatnonzero((function.frequencies < low) | (function.frequencies > high))
     if len(beyond):
         raise InputError(
-            f"{function.places[beyond[0]]}: {function.frequencies[beyond[0]]:g} Hz is beyond the "
-            f"rig's limits.frequency, {low:g} to {high:g} Hz; leave it out, or widen the limits"
+            f"{function.places[beyond[0]]}: frequency must be within the rig's limits.frequency of "
+            f"{low:g} to {high:g} Hz, got {function.frequencies[beyond[0]]:g} Hz; leave it out or "
+            "widen the limits"
         )
 
 
 def _era_of(function: MeasuredFunction, rig: Rig) -> Era:
-    """Which of the rig's ERAs was driven, by its name or else by its place."""
+    """Find the ERA that was driven, by its name or else by its position."""
     known = ", ".join(f"{era.name} {_shown((era.x, era.y))}" for era in rig.eras)
     at = function.era_point
     for era in rig.eras:
-        near = at is not None and math.dist(at, (era.x, era.y)) <= _RULER
+        near = at is not None and math.dist(at, (era.x, era.y)) <= _ERA_TOLERANCE
         if era.name == function.era:
             if at is not None and not near:
                 raise InputError(
-                    f"{function.places[0]}: ERA {era.name} was measured at {_shown(at)} m, the rig "
-                    f"has it at {_shown((era.x, era.y))} m; was another plate measured?"
+                    f"{function.places[0]}: ERA {era.name} must be at {_shown((era.x, era.y))} m "
+                    f"as in the rig, got {_shown(at)} m; check the plate"
                 )
             return era
         if near and function.era not in {other.name for other in rig.eras}:
             return era
     raise InputError(
-        f"{function.places[0]}: the rig has no ERA {function.era or _shown(at or (0, 0))}; it has "
-        f"{known}"
+        f"{function.places[0]}: ERA must be one of {known}, got "
+        f"{function.era or _shown(at or (0, 0))}"
     )
 
 

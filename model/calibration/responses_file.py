@@ -1,8 +1,8 @@
 """Files of measured frequency responses: CSV with named columns, and UFF 58.
 
-A CSV has the columns below, one value a line, in any order of lines; further columns are refused.
-A UFF has a function of type 4 for every sensor and ERA, acceleration over displacement, with the
-nodes' places in dataset 15 or 2411; the reference node is the ERA, by its name or place.
+A CSV file has exactly the columns below and one value a line, in any order. A UFF file has a
+function of type 4 for every sensor and ERA, acceleration over displacement, with the nodes'
+positions in dataset 15 or 2411; the reference node is the ERA, by its name or position.
 """
 
 import csv
@@ -30,26 +30,26 @@ from model.files.uff import (
 from model.rig.rig import Rig
 
 COLUMNS = ("era", "sensor", "x_m", "y_m", "frequency_hz", "real_1_s2", "imag_1_s2")
-ERA_COLUMNS = ("era_x_m", "era_y_m")  # may be left out
+ERA_COLUMNS = ("era_x_m", "era_y_m")  # optional
 _UP = 3  # +z
-_NAMED = 3  # of what no column is called, at most
-# What people call m/s² and m once signs are taken off.
+_MAX_NAMED = 3  # unknown columns in an error
+# Labels of m/s² and m without punctuation.
 _ACCELERATION_UNITS = ("", "m/s2", "m/sec2", "m/ss", "ms-2", "ms2")
 _DISPLACEMENT_UNITS = ("", "m", "meter", "metre")
 
 
 def read_functions(path: Path) -> list[MeasuredFunction]:
-    """Read measured responses; raises InputError, with file and line, for what are none."""
+    """Read measured responses; raises InputError with file and line."""
     suffix = path.suffix.lower()
     if suffix == ".csv":
         return _read_csv(path)
     if suffix in (".uff", ".unv"):
         return _read_uff(path)
-    raise InputError(f"{path}: measured responses are read from .csv, .uff and .unv files only")
+    raise InputError(f"{path}: name of measured responses must end in .csv, .uff or .unv")
 
 
 def write_responses_csv(path: Path, responses: Responses, rig: Rig) -> None:
-    """Write responses as CSV, with every digit; raises OSError."""
+    """Write responses as CSV with all digits; raises OSError."""
     f, e, s = np.nonzero(np.isfinite(responses.values))
     values = responses.values[f, e, s]
     write_columns(
@@ -70,7 +70,7 @@ def write_responses_csv(path: Path, responses: Responses, rig: Rig) -> None:
 
 def write_responses_uff(path: Path, responses: Responses, rig: Rig) -> None:
     """Write responses as UFF 58: nodes 1.. are the sensors, 1001.. the ERAs; raises OSError."""
-    places = [*responses.points.tolist(), *([era.x, era.y] for era in rig.eras)]
+    positions = [*responses.points.tolist(), *([era.x, era.y] for era in rig.eras)]
     numbers = [*range(1, len(responses.sensors) + 1), *range(1001, 1001 + len(rig.eras))]
     functions = []
     for e, era in enumerate(rig.eras):
@@ -91,7 +91,7 @@ def write_responses_uff(path: Path, responses: Responses, rig: Rig) -> None:
                         ("m/s^2", "m"),
                     )
                 )
-    nodes = {n: (x, y, 0.0) for n, (x, y) in zip(numbers, places, strict=True)}
+    nodes = {n: (x, y, 0.0) for n, (x, y) in zip(numbers, positions, strict=True)}
     write_universal(path, Universal(nodes, functions))
 
 
@@ -99,7 +99,7 @@ def _read_csv(path: Path) -> list[MeasuredFunction]:
     try:
         text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is no text in UTF-8; save it as CSV in UTF-8") from error
+        raise InputError(f"{path}: text must be UTF-8; save it as CSV in UTF-8") from error
     rows = csv.reader(io.StringIO(text), strict=True)
     grouped: dict[tuple[str, str], list[tuple[tuple[float, ...], int]]] = {}
     try:
@@ -112,24 +112,25 @@ def _read_csv(path: Path) -> list[MeasuredFunction]:
             line = rows.line_num
             if len(row) != len(header):
                 raise InputError(
-                    f"{path}:{line}: {len(row)} values stand here, the first line names "
-                    f"{len(header)} columns; the file is damaged"
+                    f"{path}:{line}: line must have {len(header)} values as the first line has, "
+                    f"got {len(row)}; the file is damaged"
                 )
             cell = dict(zip(header, row, strict=True))
             numbers = tuple(_number(path, line, name, cell[name]) for name in numeric)
             key = (cell["era"].strip(), cell["sensor"].strip())
             if not all(key):
-                raise InputError(f"{path}:{line}: era or sensor has no name; name both")
+                raise InputError(f"{path}:{line}: era and sensor must have names")
             if numbers[2] <= 0:
-                raise InputError(f"{path}:{line}: frequency_hz is {numbers[2]:g}, not above zero")
+                raise InputError(
+                    f"{path}:{line}: frequency_hz must be positive, got {numbers[2]:g}"
+                )
             grouped.setdefault(key, []).append((numbers, line))
     except csv.Error as error:
         raise InputError(
-            f"{path}:{rows.line_num}: is no CSV: {error}; is a quote not closed, or "
-            "the file cut off?"
+            f"{path}:{rows.line_num}: invalid CSV ({error}); check quotes and the end of the file"
         ) from error
     if not grouped:
-        raise InputError(f"{path}:1: no measured value stands below the columns' names")
+        raise InputError(f"{path}:1: at least one line of values must follow, got none")
     return [_csv_function(path, *key, found) for key, found in grouped.items()]
 
 
@@ -141,8 +142,8 @@ def _csv_function(
     for numbers, line in rows:
         if numbers[:2] != first[0][:2] or numbers[5:] != first[0][5:]:
             raise InputError(
-                f"{path}:{line}: sensor {sensor} or ERA {era} is at another place here than on "
-                f"line {first[1]}; give each place its own name"
+                f"{path}:{line}: sensor {sensor} and ERA {era} must be at the positions of line "
+                f"{first[1]}; name others differently"
             )
     era_point = (float(table[0, 5]), float(table[0, 6])) if table.shape[1] > 5 else None
     return MeasuredFunction(
@@ -158,19 +159,19 @@ def _csv_function(
 
 def _check_header(path: Path, header: Sequence[str]) -> None:
     missing = [name for name in COLUMNS if name not in header]
-    foreign = [name for name in header if name not in (*COLUMNS, *ERA_COLUMNS)]
-    if missing or foreign or len(set(header)) < len(header):
-        said = [f"{', '.join(missing)} missing"] if missing else []
-        more = f" and {len(foreign) - _NAMED} more" if len(foreign) > _NAMED else ""
-        named = ", ".join(repr(name[:30]) for name in foreign[:_NAMED])
-        said += [f"{named}{more} unknown"] if foreign else []
-        said += ["a column stands twice"] if not said else []
+    unknown = [name for name in header if name not in (*COLUMNS, *ERA_COLUMNS)]
+    if missing or unknown or len(set(header)) < len(header):
+        problems = [f"{', '.join(missing)} missing"] if missing else []
+        more = f" and {len(unknown) - _MAX_NAMED} more" if len(unknown) > _MAX_NAMED else ""
+        named = ", ".join(repr(name[:30]) for name in unknown[:_MAX_NAMED])
+        problems += [f"{named}{more} unknown"] if unknown else []
+        problems += ["a column is repeated"] if not problems else []
         raise InputError(
-            f"{path}:1: the columns must be {', '.join(COLUMNS)}, and may be "
-            f"{', '.join(ERA_COLUMNS)}, in these units (metres, Hz, 1/s²): {'; '.join(said)}"
+            f"{path}:1: columns must be {', '.join(COLUMNS)}, optionally {', '.join(ERA_COLUMNS)}, "
+            f"got {'; '.join(problems)}"
         )
     if sum(name in header for name in ERA_COLUMNS) == 1:
-        raise InputError(f"{path}:1: {' and '.join(ERA_COLUMNS)} go together; give both or none")
+        raise InputError(f"{path}:1: {' and '.join(ERA_COLUMNS)} must be given together")
 
 
 def _number(path: Path, line: int, name: str, text: str) -> float:
@@ -179,7 +180,7 @@ def _number(path: Path, line: int, name: str, text: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise InputError(f"{path}:{line}: {name} is {text[:30]!r}, not a finite number")
+        raise InputError(f"{path}:{line}: {name} must be a finite number, got {text[:30]!r}")
     return value
 
 
@@ -188,8 +189,8 @@ def _read_uff(path: Path) -> list[MeasuredFunction]:
     functions = [f for f in content.functions if f.function_type == FREQUENCY_RESPONSE]
     if not functions:
         raise InputError(
-            f"{path}: holds no frequency response (dataset 58, function type 4); export these, "
-            "acceleration over the base displacement of an ERA"
+            f"{path}: file must have frequency responses (dataset 58, function type 4), got none; "
+            "export acceleration over the base displacement of an ERA"
         )
     named: dict[str, set[int]] = {}
     for function in functions:
@@ -201,10 +202,11 @@ def _uff_function(
     function: Function, content: Universal, named: dict[str, set[int]]
 ) -> MeasuredFunction:
     place = function.place
-    if function.kinds[1] != ACCELERATION or function.kinds[2] != DISPLACEMENT:
+    if function.data_types[1] != ACCELERATION or function.data_types[2] != DISPLACEMENT:
         raise InputError(
-            f"{place}: the record is of data type {function.kinds[1]} over {function.kinds[2]}, "
-            f"not acceleration ({ACCELERATION}) over displacement ({DISPLACEMENT}) of an ERA's base"
+            f"{place}: data types must be acceleration ({ACCELERATION}) over displacement "
+            f"({DISPLACEMENT}) of an ERA's base, got {function.data_types[1]} over "
+            f"{function.data_types[2]}"
         )
     for label, known, wanted in (
         (function.units[0], _ACCELERATION_UNITS, "m/s²"),
@@ -212,20 +214,22 @@ def _uff_function(
     ):
         plain = label.lower().translate({ord("²"): "2", ord("^"): None, ord("*"): None})
         if plain.replace(" ", "") not in known:
-            raise InputError(f"{place}: the record is in {label!r}, not in {wanted}; export it so")
+            raise InputError(f"{place}: unit must be {wanted}, got {label!r}; export it so")
     if not np.iscomplexobj(function.data):
-        raise InputError(f"{place}: the response is real; export it complex, phases are needed")
+        raise InputError(f"{place}: response must be complex, got real; export it with phases")
     if any(abs(direction) not in (0, _UP) for direction in function.directions):
         raise InputError(
-            f"{place}: the record's directions are {function.directions[0]} and "
-            f"{function.directions[1]}; only motion across the plate (3 or -3, z) can be fitted"
+            f"{place}: directions must be across the plate (3 or -3, z), got "
+            f"{function.directions[0]} and {function.directions[1]}"
         )
     if function.x[0] <= 0:
-        raise InputError(f"{place}: the record begins at {function.x[0]:g} Hz; leave 0 Hz out")
+        raise InputError(
+            f"{place}: frequencies must be positive, got {function.x[0]:g} Hz; leave it out"
+        )
     if function.response not in content.nodes:
         raise InputError(
-            f"{place}: node {function.response} has no place; export the nodes too (dataset 15 or "
-            "2411)"
+            f"{place}: node {function.response} must have a position; export nodes too (dataset 15 "
+            "or 2411)"
         )
     name, reference = function.names[0], content.nodes.get(function.reference)
     if not name or len(named[name]) > 1:

@@ -1,10 +1,10 @@
-"""Variable projection of gains, and measures of rows of responses over sensors.
+"""Variable projection of gains, and measures of responses over sensors.
 
     d_fes = g_fe a_fes + noise
 
-d measured, a of the model, g the gain of a row, at one frequency f and of one ERA e. Gains enter
-linearly: the best ones follow at once from any model, so that only its parameters are searched
-(Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
+d measured, a of the model, g the gain at frequency f of ERA e. Gains enter linearly: the best ones
+follow from any model, so that only its parameters are searched (Golub and Pereyra, SIAM J. Numer.
+Anal. 10, 1973).
 """
 
 import numpy as np
@@ -49,8 +49,7 @@ def row_rms(values: ComplexArray, used: NDArray[np.bool_] | None = None) -> Floa
 def modal_assurance(values: ComplexArray, model: ComplexArray) -> FloatArray:
     """Modal assurance criterion |a^H d|² / (|a|² |d|²) of shapes (..., s); NaN of empty ones.
 
-    1 for the same shape whatever its gain, about 1/s for noise. Values that are not finite are
-    left out.
+    1 for the same shape with any gain, about 1/s for noise. Values that are not finite are ignored.
     """
     measured = np.isfinite(values)
     values = np.where(measured, values, 0)

@@ -41,8 +41,7 @@ def calibrate(
     from model.calibration.responses import responses_of
     from model.calibration.responses_file import read_functions
     from model.files.array_file import whole_or_nothing
-    from model.files.picture_name import check_picture
-    from model.files.replacing import check_ending, check_place
+    from model.files.replacing import check_ending, check_picture, check_place
     from model.rig.file import load_rig
 
     check_place(output, example="rig2.yaml")

@@ -93,7 +93,7 @@ def plate_map(
 
     from model.commands.drive_option import beyond_limits, parse_drives
     from model.config.points import parse_pair
-    from model.files.picture_name import check_picture
+    from model.files.replacing import check_picture
     from model.rig.file import load_rig
     from model.vibration.maps import plate_map as solve
     from model.vibration.peak import G

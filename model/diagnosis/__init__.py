@@ -1,1 +1,1 @@
-"""Whether a rig is what its file says, from what sensors read while its channels are driven."""
+"""Diagnosis of a rig by the responses of sensors to its channels."""

@@ -1,7 +1,6 @@
-"""Which ERA a channel really drives: shapes over the sensors, compared with those of every ERA.
+"""Assignment of channels to ERAs by the modal assurance criterion (MAC) of shapes over sensors.
 
-The measure is the modal assurance criterion (MAC) of a row of values with what the model says of an
-ERA: 1 for the same shape, whatever gain and phase, about one over the number of sensors for noise.
+MAC is 1 for the same shape with any gain and phase, about one over the number of sensors for noise.
 """
 
 from dataclasses import dataclass
@@ -15,15 +14,15 @@ from model.calibration.parameters import parameters_of, rig_with, starts
 from model.calibration.variable_projection import modal_assurance
 from model.rig.rig import Rig
 
-_LEAST_MISFIT = 0.02  # below it sensors' errors decide and not shapes
+_LEAST_MISFIT = 0.02  # below it sensors' errors dominate
 
 
 @dataclass(frozen=True, eq=False)
 class Likeness:
-    """How alike channels and ERAs are, with the model that is alike on the whole.
+    """MAC of channels and ERAs on the most similar plate.
 
-    mac (f, e, e): of the channel that the rig wires to the first with the second, NaN where it was
-    not driven; start: logarithms of factors on modulus and stiffnesses that this takes.
+    mac (f, e, e): of the channel that the rig wires to the first ERA with the second ERA, NaN if
+    not driven; start: logarithms of that plate's factors on modulus and stiffnesses.
     """
 
     mac: FloatArray
@@ -31,7 +30,7 @@ class Likeness:
 
     @property
     def nearest(self) -> tuple[int, ...]:
-        """The ERA that each channel is most like; its own where it was not driven."""
+        """Index of the ERA most similar to each channel; its own if not driven."""
         typical = np.array(
             [
                 [_typical(self.mac[:, i, j]) for j in range(self.mac.shape[2])]
@@ -43,9 +42,9 @@ class Likeness:
         )
 
     def confidence(self, channel: int, era: int, other: int) -> float:
-        """How sure it is, 0..1, that the channel drives one ERA and not the other.
+        """Confidence 0..1 that the channel drives one ERA and not the other.
 
-        From a t-test over frequencies of how much less the shapes of the one differ.
+        By a t-test of the difference of their misfits over frequencies.
         """
         misfit = np.log(np.maximum(1 - self.mac[:, channel], _LEAST_MISFIT))
         gain = misfit[:, other] - misfit[:, era]
@@ -56,7 +55,7 @@ class Likeness:
 
 
 def likeness(rig: Rig, plate: FastPlate, values: ComplexArray) -> Likeness:
-    """The likeness of values (f, e, s) to a rig's ERAs, over plates somewhat like the rig's."""
+    """Compare values (f, e, s) with a rig's ERAs on plates of other modulus and stiffnesses."""
     parameters = parameters_of(rig)
     own = np.array([parameter.start for parameter in parameters])
     best: tuple[float, Likeness] | None = None
@@ -67,7 +66,7 @@ def likeness(rig: Rig, plate: FastPlate, values: ComplexArray) -> Likeness:
         score = float(
             sum(_typical(mac[:, i, j]) for i, j in enumerate(found.nearest) if _driven(mac, i))
         )
-        # Far from the rig's own values it must be clearly better.
+        # Values far from the rig's must be clearly better.
         score -= 0.05 * (abs(shift["modulus"]) + abs(shift["stiffness"])) * len(rig.eras)
         if best is None or score > best[0]:
             best = (score, found)
@@ -76,7 +75,7 @@ def likeness(rig: Rig, plate: FastPlate, values: ComplexArray) -> Likeness:
 
 
 def likeness_to(model: ComplexArray, values: ComplexArray) -> Likeness:
-    """The likeness of values (f, e, s) to responses of one plate (f, e, s)."""
+    """Compare values (f, e, s) with responses (f, e, s) of one plate."""
     return Likeness(_mac(values, model), (0.0, 0.0))
 
 
@@ -90,6 +89,6 @@ def _driven(mac: FloatArray, channel: int) -> bool:
 
 
 def _typical(mac: FloatArray) -> float:
-    """The median over frequencies, NaN for none."""
+    """Median over frequencies, NaN without values."""
     there = mac[np.isfinite(mac)]
     return float(np.median(there)) if len(there) else float("nan")

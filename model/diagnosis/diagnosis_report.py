@@ -11,12 +11,12 @@ from model.quantities import in_display_unit, percent
 
 _TO_DO: dict[ChannelState, str] = {
     "dead": "check its supply, its cable and the amplifier's channel",
-    "weak": "check its voltage and its fastening; `era calibrate` writes what it really does",
-    "strong": "lower its voltage, or give its true stroke in the rig",
-    "inverted": "turn its two wires round",
-    "out of phase": "measure it with `era calibrate`, which writes its gains into the rig",
+    "weak": "check its voltage and mounting, or measure its gain with `era calibrate`",
+    "strong": "lower its voltage, or correct its stroke in the rig",
+    "inverted": "swap its two wires",
+    "out of phase": "measure its gains with `era calibrate`",
 }
-_MIN_SHARE = 0.05  # what is less likely is not worth a line
+_MIN_SHARE = 0.05  # likelihood of a reported explanation
 
 
 def verdict_rows(verdict: Verdict) -> list[str]:
@@ -31,8 +31,8 @@ def verdict_rows(verdict: Verdict) -> list[str]:
             )
         else:
             rows.append(
-                f"SWAPPED in a circle: the channels of {', '.join(cycle)} each drive the next "
-                f"one's ERA ({_sure(verdict, cycle)}): put the plugs right"
+                f"SWAPPED in a cycle: the channels of {', '.join(cycle)} each drive the next "
+                f"one's ERA ({_sure(verdict, cycle)}): correct the plugs"
             )
     swapped = {era for cycle in verdict.swapped for era in cycle}
     for channel in verdict.channels:
@@ -41,43 +41,39 @@ def verdict_rows(verdict: Verdict) -> list[str]:
         ]
     inverted = [c for c in verdict.channels if "inverted" in c.states]
     if len(inverted) > 1 and len(inverted) == sum(c.drives is not None for c in verdict.channels):
-        rows.append(
-            "all of them: are the sensors upside down, or are phases of another convention?"
-        )
-    rows += [f"SENSOR {name} {why}: it was left out" for name, why in verdict.bad_sensors]
+        rows.append("all of them: check mounting of sensors and sign convention of phases")
+    rows += [f"SENSOR {name} {why}: left out" for name, why in verdict.bad_sensors]
     if not verdict.plate_matches:
         rows += plate_rows(verdict)
-    return rows or ["ALL WELL: plate and channels are what the rig says"]
+    return rows or ["ALL WELL: plate and channels match the rig"]
 
 
 def plate_rows(verdict: Verdict) -> list[str]:
-    """Lines on how the plate differs from the rig, and on what would explain it."""
+    """Lines on how the plate differs from the rig, and on possible explanations."""
     match = verdict.match
     if match is None:
         return []
     if match.error > FITS:
-        why = f"no plate like it leaves less than {percent(match.error)} unexplained"
+        why = f"{percent(match.error)} unexplained at best"
     else:
         at = int(abs(match.z).argmax())
-        why = (
-            f"it would take {match.parameters[at].name} {abs(match.z[at]):.1f} standard "
-            "deviations off"
-        )
+        parameter = match.parameters[at].name
+        why = f"{parameter} would be off by {abs(match.z[at]):.1f} standard deviations"
     rows = [f"PLATE: the rig does not match the plate: {why}"]
     good = [each for each in verdict.explanations if explains(each) and each.share >= _MIN_SHARE]
     for number, each in enumerate(good):
         unit = each.cause.unit
         rows.append(
             f"  {'or ' if number else ''}{each.cause.key} {in_display_unit(each.value, unit)} "
-            f"and not {in_display_unit(each.expected, unit)} would explain it: "
+            f"instead of {in_display_unit(each.expected, unit)} would explain it: "
             f"{percent(each.match.error)} unexplained, likelihood {percent(each.share)}"
         )
     if good:
         rows.append(f"  correct {good[0].cause.key} in the rig, or the plate; then check again")
     else:
         rows.append(
-            "  no single number of the rig would explain it: check that this is the rig's plate, "
-            "that sensors and ERAs are where the files say, and measure for `era calibrate`"
+            "  no single parameter of the rig would explain it: check plate, positions of sensors "
+            "and ERAs, and measure for `era calibrate`"
         )
     return rows
 
@@ -103,7 +99,7 @@ def channel_table(verdict: Verdict) -> list[str]:
 
 
 def as_json(verdict: Verdict) -> dict[str, Any]:
-    """The same for programs; every number's unit is in its key."""
+    """Verdict as JSON; units are in the keys."""
     match = verdict.match
     return {
         "all_well": verdict.is_well,
@@ -169,12 +165,12 @@ def _row(channel: ChannelVerdict, state: ChannelState) -> str:
     at = _at(channel)
     match state:
         case "dead":
-            return f"DEAD: {at} moves nothing: {_TO_DO[state]}"
+            return f"DEAD: {at} does not move the plate: {_TO_DO[state]}"
         case "other ERA":
             return (
-                f"WRONG ERA: {at} drives ERA {channel.drives} and not {channel.era} (shapes alike "
-                f"to {channel.likeness_found:.3f}, with its own ERA's {channel.likeness_own:.3f}; "
-                f"confidence {channel.confidence:.3f}): put the plug right, or the rig's channels"
+                f"WRONG ERA: {at} drives ERA {channel.drives} instead of {channel.era} (MAC "
+                f"{channel.likeness_found:.3f}, with its own ERA {channel.likeness_own:.3f}; "
+                f"confidence {channel.confidence:.3f}): correct the plug, or the rig's channels"
             )
         case "weak" | "strong":
             return (
@@ -182,8 +178,8 @@ def _row(channel: ChannelVerdict, state: ChannelState) -> str:
                 + (_TO_DO[state])
             )
         case "inverted":
-            even = " (or these are: half against half)" if channel.confidence <= EVEN else ""
-            return f"INVERTED: {at} pulls where the others push{even}: {_TO_DO[state]}"
+            even = " (or the other half)" if channel.confidence <= EVEN else ""
+            return f"INVERTED: {at} has the opposite sign of the others{even}: {_TO_DO[state]}"
         case _:
             return f"OUT OF PHASE: {at} is off by {channel.phase:+.0f}°: {_TO_DO['out of phase']}"
 

@@ -1,4 +1,4 @@
-"""What in a measurement says nothing of the rig's wiring: the dead and the unusable."""
+"""Detection of dead channels and unusable sensors."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ from model.errors import InputError
 from model.rig.rig import Rig
 
 _DEAD = 0.03  # of the response that the rig predicts
-_FAINT = 0.3  # of it: dead if its shape is that of no ERA either
+_FAINT = 0.3  # of it: dead if its shape is not that of an ERA either
 _NOISY = 3.0  # times the floor
 _NO_SHAPE = 0.6  # MAC
 _SENSOR_SCALE = (0.7, 1.4)
@@ -24,7 +24,7 @@ LEAST_SENSORS, _LEAST_FREQUENCIES = 3, 4
 
 
 def dead_channels(rig: Rig, observation: Observation) -> NDArray[np.bool_]:
-    """Which channels move nothing that a sensor could tell from silence (e,)."""
+    """Mask (e,) of driven channels with a response far below the model's or near the floor."""
     plate = fast_plate(rig, observation.points, observation.frequencies)
     size = np.abs(observation.values)
     share = size / np.abs(plate.responses(rig))
@@ -39,7 +39,7 @@ def dead_channels(rig: Rig, observation: Observation) -> NDArray[np.bool_]:
 
 
 def shapeless_channels(rig: Rig, plate: FastPlate, observation: Observation) -> NDArray[np.bool_]:
-    """Which channels are faint and like no ERA: what sensors read is noise (e,)."""
+    """Mask of weak channels without the shape of an ERA, whose response is noise (e,)."""
     model = plate.responses(rig)
     share = np.abs(observation.values) / np.abs(model)
     mac = likeness(rig, plate, observation.values).mac
@@ -53,7 +53,7 @@ def shapeless_channels(rig: Rig, plate: FastPlate, observation: Observation) -> 
 def usable_sensors(
     observation: Observation, dead: NDArray[np.bool_]
 ) -> tuple[Observation, tuple[tuple[str, str], ...]]:
-    """Without the sensors that read nothing, whichever live channel is driven."""
+    """Remove sensors without a signal from any live channel; return their names, too."""
     values = observation.values[:, ~dead]
     if not np.isfinite(values).any():
         return observation, ()
@@ -65,22 +65,21 @@ def usable_sensors(
 
 
 def check_enough(observation: Observation, bad: Sequence[tuple[str, str]]) -> None:
-    """Raise InputError where too little is left to tell ERAs apart; bad: what was left out."""
+    """Raise InputError if too few sensors or frequencies are left; bad: removed sensors."""
     count, frequencies = len(observation.sensors), len(observation.frequencies)
     if count < LEAST_SENSORS or frequencies < _LEAST_FREQUENCIES:
-        said = f" ({', '.join(name for name, _ in bad)} read nothing)" if bad else ""
+        without = f" ({', '.join(name for name, _ in bad)} without a signal)" if bad else ""
         raise InputError(
-            f"{count} usable sensor{'s' * (count != 1)}{said} at {frequencies} "
-            f"{'frequency' if frequencies == 1 else 'frequencies'} cannot tell ERAs apart; "
-            f"measure with {LEAST_SENSORS} at least, better eight, at {_LEAST_FREQUENCIES} "
-            "frequencies at least"
+            f"a diagnosis needs at least {LEAST_SENSORS} sensors, better eight, and "
+            f"{_LEAST_FREQUENCIES} frequencies, got {count} sensors{without} and {frequencies} "
+            "frequencies"
         )
 
 
 def off_scale(
     observation: Observation, values: ComplexArray, match: Match
 ) -> list[tuple[str, str]]:
-    """Sensors that do not read what the rest of them say, and how much of it; if the rest agree."""
+    """Sensors with a scale unlike that of the others, and why, if the plate fits."""
     if match.median_error > FITS:
         return []
     there = np.isfinite(values) & np.isfinite(match.predicted)

@@ -1,4 +1,4 @@
-"""What was measured on a rig while its channels were driven in turn, and some of them in pairs."""
+"""Responses measured on a rig while its channels were driven one by one and in pairs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,9 +12,9 @@ from model.calibration.responses import Responses
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two channels driven alike, at one frequency [Hz] and in phase: values (s,) [1/s²].
+    """Two channels driven alike at one frequency [Hz], in phase: values (s,) [1/s²].
 
-    eras: the numbers of the ERAs that the rig says they drive.
+    eras: indices of the ERAs to which the rig wires them.
     """
 
     frequency: float
@@ -23,30 +23,25 @@ class Pair:
 
 
 @dataclass(frozen=True, eq=False)
-class Observation:
-    """Acceleration per base displacement that was asked for [1/s²], NaN where there is none.
+class Observation(Responses):
+    """Responses per commanded base displacement, by the ERA to which the rig wires the channel.
 
-    sensors (s,) names; points (s, 2) [m]; frequencies (f,) [Hz]; values (f, e, s): by the ERA that
-    the rig says the driven channel is wired to. has_phases: whether phases are those of the drive;
-    if not, only those between sensors mean anything, and pairs tell polarity. floor (s,): what
-    values are where nothing is driven, for noise [1/s²]; None where nobody looked.
+    has_phases: whether phases are relative to the drive; otherwise only phases between sensors are
+    known, and polarity follows from pairs. floor (s,): values without a drive, a bound of the noise
+    [1/s²]; None if not measured.
     """
 
-    sensors: tuple[str, ...]
-    points: FloatArray
-    frequencies: FloatArray
-    values: ComplexArray
     has_phases: bool
     pairs: Sequence[Pair] = ()
     floor: FloatArray | None = None
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """Which ERAs' channels were driven (e,)."""
+        """Mask of the ERAs whose channels were driven (e,)."""
         return np.asarray(np.isfinite(self.values).any(axis=(0, 2)))
 
     def without(self, sensors: NDArray[np.bool_]) -> "Observation":
-        """The same without some of the sensors (s,)."""
+        """Remove some of the sensors (s,)."""
         kept = ~sensors
         return replace(
             self,
@@ -56,14 +51,3 @@ class Observation:
             pairs=[replace(pair, values=pair.values[kept]) for pair in self.pairs],
             floor=None if self.floor is None else self.floor[kept],
         )
-
-
-def observation_of(responses: Responses, *, has_phases: bool) -> Observation:
-    """Measured responses, by what each of the rig's channels did."""
-    return Observation(
-        responses.sensors,
-        responses.points,
-        responses.frequencies,
-        responses.values,
-        has_phases,
-    )

@@ -1,12 +1,11 @@
-"""The most likely plate behind what was measured, if the rig is right within what builders achieve.
+"""Maximum a posteriori fit of a rig's plate to responses of its channels.
 
     d_fes ~ m_fe exp(i phi_fe) a_fes(x) + noise,   m_fe near G_e
 
-d measured, a the model's, G_e the gain of a channel. Magnitudes m wander about G_e with frequency
-as those of real actuators do; phases phi are free, for they need not have been measured. Both are
-known at once for any x and G, so only these are searched (variable projection). x, the numbers of
-the rig, is held near the rig's own by how well they can be known beforehand (Gaussian priors): what
-it takes to move one far from there is evidence against the rig.
+d measured, a of the model, G_e the gain of a channel. Magnitudes m vary about G_e with frequency as
+those of real actuators do; phases phi are free, since they need not have been measured. Both follow
+from x and G, so only these are searched (variable projection). Gaussian priors hold x, the
+parameters of the rig, near its values: a large deviation is evidence against the rig.
 """
 
 import math
@@ -26,8 +25,8 @@ from model.rig.rig import Rig
 
 _GAIN_STD = 1.0  # of the logarithm of a channel's gain
 _GAIN_TOLERANCE = 0.08  # standard deviation over frequency, of itself
-FITS = 0.2  # rms error, relative to the response, of a plate to believe
-MODEL_ERROR = 0.05  # of a row's rms: sensors' scales and places, what is not modelled
+FITS = 0.2  # largest relative rms error of an acceptable plate
+MODEL_ERROR = 0.05  # of a row's rms: scales and positions of sensors, and what is not modelled
 _ROBUST = 2.0  # standard deviations
 _STEPS = 40
 
@@ -36,14 +35,13 @@ _Number = TypeVar("_Number", np.float64, np.complex128)
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """A plate that explains a measurement as well as it can.
+    """The best fit of a plate.
 
-    rig; parameters with z (n,), how many standard deviations each is from the rig's own value, and
-    known (n,), how much that is of its x;
-    gains (e,): magnitude of each channel, NaN where it was not used; cost: half the sum of squares
-    of residuals, robustly, and of the priors; error: rms of what is left, relative to each row's,
-    median_error: its median; responses (f, e, s): of its ERAs;
-    predicted (f, e, s): of those that the channels drive, with gains.
+    z (n,): deviation of each parameter from the rig's value in standard deviations of its prior;
+    gains (e,): magnitude of each channel, NaN if not used; cost: half the sum of squares of robust
+    residuals and of z; error, median_error: rms and median of residuals relative to the rms of
+    their row; responses (f, e, s) of the ERAs; predicted (f, e, s): of those that the channels
+    drive, with gains.
     """
 
     rig: Rig
@@ -72,12 +70,11 @@ def match_plate(
     model_error: float = MODEL_ERROR,
     starts: tuple[tuple[float, float], ...] = ((0.0, 0.0),),
 ) -> Match:
-    """The most likely plate for values (f, e, s) of channels.
+    """Fit the rig's plate to values (f, e, s) of channels.
 
-    drives (e,): the number of the ERA that each drives; plate: of the rig at those points and
-    frequencies; model_error: of a row's rms, what no plate of the kind explains; floor (s,): noise
-    of the values, in their unit; starts: logarithms of factors on the modulus and on all
-    stiffnesses to begin from, the best of which is taken.
+    plate: of the rig at those points and frequencies; drives (e,): index of the ERA that each
+    channel drives; model_error: relative to a row's rms; floor (s,): noise in the unit of values;
+    starts: logarithms of factors on the modulus and on all stiffnesses from which to search.
     """
     parameters = parameters_of(rig)
     center = np.array([parameter.start for parameter in parameters])
@@ -154,10 +151,7 @@ def match_plate(
 
 
 def _robust(left: NDArray[_Number]) -> NDArray[_Number]:
-    """Residuals in standard deviations whose squares grow like their size beyond a few (soft L1).
-
-    Priors are not treated so: what a rig's author knows, he knows.
-    """
+    """Residuals [standard deviations] whose squares are a soft L1 loss."""
     share = np.abs(left) / _ROBUST
     half = 2 * (np.sqrt(1 + share**2) - 1)
     return np.asarray(left * np.sqrt(half) / np.maximum(share, 1e-12))

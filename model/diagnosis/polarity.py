@@ -1,8 +1,8 @@
 """Polarity of channels.
 
-With phases of the drive the sign of a channel shows at once. Without them channels are driven in
-pairs: the shape over the sensors is that of the sum or that of the difference. Then only the signs
-of channels among each other are known, and the fewer are taken to be the wrong ones.
+With phases relative to the drive each channel's sign is known. Without them channels are driven in
+pairs: the shape over the sensors is that of the sum or of the difference. Then only relative signs
+are known, and the minority is taken to be inverted.
 """
 
 import math
@@ -17,16 +17,16 @@ from model.diagnosis.observation import Observation
 
 _LEAST_MISFIT = 0.02
 EVEN = 0.5
-"""Confidence in a sign that may as well be the others'."""
-_STEADY = 0.6  # length of the mean of unit phasors, of a phase that can be believed
-_SURE = 2.0  # logarithm of misfits, summed over a pair's frequencies
+"""Confidence in a sign of half of the channels."""
+_MIN_COHERENCE = 0.6  # length of the mean of unit phasors of a reliable phase
+_MIN_EVIDENCE = 2.0  # logarithm of misfits, summed over a pair's frequencies
 
 
 @dataclass(frozen=True)
 class ChannelPhase:
-    """How a channel's phase differs from what was asked [degrees]; None where it is not known.
+    """Phase error of a channel [degrees], None if unknown.
 
-    sign: 1 or -1 among the channels of its amplifier, 0 where it is not known; confidence 0..1.
+    sign: 1 or -1 relative to the channels of its amplifier, 0 if unknown; confidence 0..1.
     """
 
     degrees: float | None
@@ -35,7 +35,7 @@ class ChannelPhase:
 
 
 def phases_of_drive(observation: Observation, predicted: ComplexArray) -> list[ChannelPhase]:
-    """From phases of the drive; predicted (f, e, s), NaN where a channel is not to be judged."""
+    """Phases relative to the drive; predicted (f, e, s), NaN for channels to be skipped."""
     found = []
     for channel in range(predicted.shape[1]):
         measured, model = observation.values[:, channel], predicted[:, channel]
@@ -47,7 +47,7 @@ def phases_of_drive(observation: Observation, predicted: ComplexArray) -> list[C
             continue
         mean = complex(np.mean(inner / np.abs(inner)))
         angle = math.degrees(np.angle(mean))
-        if abs(mean) < _STEADY:
+        if abs(mean) < _MIN_COHERENCE:
             found.append(ChannelPhase(None, 0, abs(mean)))
         else:
             found.append(ChannelPhase(angle, 1 if abs(angle) < 90 else -1, abs(mean)))
@@ -57,9 +57,9 @@ def phases_of_drive(observation: Observation, predicted: ComplexArray) -> list[C
 def signs_of_pairs(
     observation: Observation, predicted: ComplexArray, groups: Sequence[Sequence[int]]
 ) -> list[ChannelPhase]:
-    """From pairs, by responses predicted (f, e, s).
+    """Signs from pairs and predicted responses (f, e, s).
 
-    groups: the channels of one amplifier each, whose phases begin together.
+    groups: channels of each amplifier, which start in phase.
     """
     evidence = np.zeros((predicted.shape[1], predicted.shape[1]))
     for pair in observation.pairs:
@@ -90,7 +90,7 @@ def _row(
 
 
 def _signs(group: Sequence[int], evidence: FloatArray) -> dict[int, tuple[int, float]]:
-    """Signs of the channels that pairs connect, by the surest of them first."""
+    """Signs of the channels that pairs connect, strongest evidence first."""
     best: dict[int, tuple[int, float]] = {}
     for start in group:
         reached = {start: (1, 1.0)}
@@ -99,7 +99,7 @@ def _signs(group: Sequence[int], evidence: FloatArray) -> dict[int, tuple[int, f
                 (abs(evidence[a, b]), a, b)
                 for a in reached
                 for b in group
-                if b not in reached and abs(evidence[a, b]) >= _SURE
+                if b not in reached and abs(evidence[a, b]) >= _MIN_EVIDENCE
             ]
             if not edges:
                 break
@@ -113,6 +113,6 @@ def _signs(group: Sequence[int], evidence: FloatArray) -> dict[int, tuple[int, f
     balance = sum(sign for sign, _ in best.values())
     if balance < 0:
         best = {channel: (-sign, sure) for channel, (sign, sure) in best.items()}
-    elif balance == 0:  # half against half: undecidable
+    elif balance == 0:  # as many of each sign
         best = {channel: (sign, EVEN) for channel, (sign, _) in best.items()}
     return best

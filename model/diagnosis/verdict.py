@@ -1,4 +1,4 @@
-"""What a rig is, by what was measured on it: the plate, and each channel."""
+"""Diagnosis of a rig's plate and channels by measured responses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,10 +26,10 @@ from model.errors import InputError
 from model.rig.rig import Channel, Rig
 
 WEAK, STRONG = 0.7, 1.4  # gain of a channel: 3 dB either way
-UNLIKELY = 3.0  # standard deviations from what a rig's author can know
-_CLEARLY = 0.99  # confidence in another ERA than the rig's
-_BETTER = 20.0  # of cost; what another wiring must explain beyond the rig's own
-_OFF_PHASE = 45.0  # degrees
+UNLIKELY = 3.0  # standard deviations of a parameter's prior
+_MIN_CONFIDENCE = 0.99  # in another ERA than the rig's
+_MIN_COST_REDUCTION = 20.0  # by another wiring than the rig's
+_MAX_PHASE_ERROR = 45.0  # degrees
 
 ChannelState: TypeAlias = Literal[
     "well", "dead", "weak", "strong", "other ERA", "inverted", "out of phase", "not driven"
@@ -38,12 +38,12 @@ ChannelState: TypeAlias = Literal[
 
 @dataclass(frozen=True)
 class ChannelVerdict:
-    """One channel: the ERA that the rig says it drives, the one that it drives, and how.
+    """A channel: the ERA to which the rig wires it, the one that it drives, and its states.
 
-    states: all that holds, "well" alone if nothing is wrong; drives: None for a dead one or one
-    that was not driven; gain: of what was asked for; phase [degrees], None where it is not known;
-    likeness_own, likeness_found: median MAC with the rig's ERA and with the one found; confidence:
-    0..1, in drives and states.
+    states: "well" alone if nothing is wrong; drives: None for a channel that is dead or was not
+    driven; gain: relative to the command; phase [degrees], None if unknown; likeness_own,
+    likeness_found: median MAC with the rig's ERA and with the one found; confidence 0..1 in drives
+    and states.
     """
 
     era: str
@@ -59,11 +59,11 @@ class ChannelVerdict:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """All of it.
+    """Result of a diagnosis.
 
-    plate_matches: whether a plate as the rig describes it, within what its author can know,
-    explains what was measured; match: that plate; explanations: what else would, likeliest first,
-    where it does not; bad_sensors: left out, and why; swapped: cycles of channels by their ERAs.
+    plate_matches: whether the rig's plate within its priors explains the measurement; match: that
+    plate; explanations: other plates that do, most likely first, if it does not; bad_sensors: left
+    out, and why; swapped: cycles of channels by their ERAs.
     """
 
     channels: tuple[ChannelVerdict, ...]
@@ -77,16 +77,16 @@ class Verdict:
 
     @property
     def is_well(self) -> bool:
-        """Whether nothing is wrong with the rig."""
+        """Whether no fault was found."""
         return self.plate_matches and all(
             set(channel.states) <= {"well", "not driven"} for channel in self.channels
         )
 
 
 def diagnose(rig: Rig, observation: Observation) -> Verdict:
-    """Compare what was measured with what the rig predicts.
+    """Compare a measurement with the rig's prediction.
 
-    Raises InputError for fewer than three usable sensors or four frequencies: less cannot tell.
+    Raises InputError for fewer than three usable sensors or four frequencies.
     """
     if not observation.measured.any():
         raise InputError("no channel was driven; drive each in turn and measure again")
@@ -98,7 +98,13 @@ def diagnose(rig: Rig, observation: Observation) -> Verdict:
     dead = dead | shapeless_channels(rig, plate, observation)
     values[:, dead] = np.nan
     if not np.isfinite(values).any():
-        return _nothing_moves(rig, observation, dead, bad)
+        channels = tuple(
+            _without_response(rig, number, is_dead=bool(dead[number]))
+            for number in range(len(rig.eras))
+        )
+        return Verdict(
+            channels, True, None, (), bad, (), len(observation.sensors), observation.frequencies
+        )
     alike = likeness(rig, plate, values)
     match, drives, error = _best_match(rig, plate, values, alike, observation)
     off = off_scale(observation, values, match)
@@ -148,7 +154,7 @@ def _best_match(
     alike: Likeness,
     observation: Observation,
 ) -> tuple[Match, tuple[int, ...], float]:
-    """The plate and the wiring that explain most; the rig's own wiring unless clearly not."""
+    """Best plate, wiring and model error; the rig's wiring unless another is clearly better."""
     own = tuple(range(len(rig.eras)))
     starts = tuple(dict.fromkeys([(0.0, 0.0), alike.start]))
 
@@ -164,15 +170,15 @@ def _best_match(
         )
 
     nearest = tuple(
-        era if era == i or alike.confidence(i, era, i) >= _CLEARLY else i
+        era if era == i or alike.confidence(i, era, i) >= _MIN_CONFIDENCE else i
         for i, era in enumerate(alike.nearest)
     )
     drives, match = own, matched(own, MODEL_ERROR)
     if nearest != own:
         other = matched(nearest, MODEL_ERROR)
-        if other.cost < match.cost - _BETTER:
+        if other.cost < match.cost - _MIN_COST_REDUCTION:
             drives, match = nearest, other
-    # Noise that is larger than the usual makes numbers of the rig less sure.
+    # With more noise than usual parameters are less certain.
     error = float(np.clip(1.2 * match.median_error, MODEL_ERROR, 0.3))
     if error > MODEL_ERROR:
         match = matched(drives, error)
@@ -202,13 +208,10 @@ def _channel(
     is_dead: bool,
 ) -> ChannelVerdict:
     era = rig.eras[number]
-    channel = rig.wiring[era.name]
-    if not observation.measured[number]:
-        return ChannelVerdict(era.name, channel, ("not driven",), None, None, None, None, None, 0.0)
-    if is_dead:
-        return ChannelVerdict(era.name, channel, ("dead",), None, 0.0, None, None, None, 0.99)
+    if is_dead or not observation.measured[number]:
+        return _without_response(rig, number, is_dead=is_dead)
     driven = drives[number]
-    # What was asked for was a share of the own ERA's stroke.
+    # Commands are shares of the stroke of the ERA to which the rig wires the channel.
     gain = float(match.gains[number]) * era.stroke / rig.eras[driven].stroke
     states: list[ChannelState] = []
     confidence = min(
@@ -224,14 +227,14 @@ def _channel(
         states.append("strong")
     if phase.sign < 0:
         states.append("inverted")
-    elif phase.degrees is not None and abs(phase.degrees) > _OFF_PHASE:
+    elif phase.degrees is not None and abs(phase.degrees) > _MAX_PHASE_ERROR:
         states.append("out of phase")
     if phase.sign < 0:
         confidence = min(confidence, phase.confidence)
     mac = np.nanmedian(shapes.mac[:, number], axis=0)
     return ChannelVerdict(
         era.name,
-        channel,
+        rig.wiring[era.name],
         tuple(states) or ("well",),
         rig.eras[driven].name,
         gain,
@@ -242,10 +245,20 @@ def _channel(
     )
 
 
+def _without_response(rig: Rig, number: int, *, is_dead: bool) -> ChannelVerdict:
+    """Verdict on a channel that is dead or was not driven."""
+    name = rig.eras[number].name
+    state: ChannelState = "dead" if is_dead else "not driven"
+    gain, confidence = (0.0, 0.99) if is_dead else (None, 0.0)
+    return ChannelVerdict(
+        name, rig.wiring[name], (state,), None, gain, None, None, None, confidence
+    )
+
+
 def _cycles(
     rig: Rig, drives: Sequence[int], dead: NDArray[np.bool_]
 ) -> tuple[tuple[str, ...], ...]:
-    """Channels that drive each other's ERAs, in turn."""
+    """Cycles of channels that drive each other's ERAs."""
     found: list[tuple[str, ...]] = []
     seen: set[int] = set()
     for start in range(len(drives)):
@@ -257,28 +270,3 @@ def _cycles(
             seen |= set(cycle)
             found.append(tuple(rig.eras[number].name for number in cycle))
     return tuple(found)
-
-
-def _nothing_moves(
-    rig: Rig,
-    observation: Observation,
-    dead: NDArray[np.bool_],
-    bad: tuple[tuple[str, str], ...],
-) -> Verdict:
-    channels = tuple(
-        ChannelVerdict(
-            era.name,
-            rig.wiring[era.name],
-            ("dead",) if dead[number] else ("not driven",),
-            None,
-            0.0 if dead[number] else None,
-            None,
-            None,
-            None,
-            0.99 if dead[number] else 0.0,
-        )
-        for number, era in enumerate(rig.eras)
-    )
-    return Verdict(
-        channels, True, None, (), bad, (), len(observation.sensors), observation.frequencies
-    )

@@ -1,4 +1,4 @@
-"""Pictures of the plate, as matplotlib figures; saving them is the caller's."""
+"""Pictures of the plate as matplotlib figures."""
 
 from model.figures.drawing import draw_eras, draw_field, map_figure, save_figure
 

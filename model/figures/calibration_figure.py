@@ -1,4 +1,4 @@
-"""Measured responses beside what the rig says, before and after a calibration."""
+"""Measured responses and those of the rig before and after a calibration."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -9,7 +9,7 @@ _ROWS = 2  # of sensors
 
 
 def calibration_figure(calibration: Calibration) -> Figure:
-    """One panel for an ERA and a sensor: magnitude over frequency, for up to eight pairs."""
+    """Draw magnitudes over frequency, a panel for each of up to eight pairs of ERA and sensor."""
     eras = [
         number
         for number, era in enumerate(calibration.rig.eras)
@@ -19,8 +19,7 @@ def calibration_figure(calibration: Calibration) -> Figure:
     sensors = np.linspace(0, len(calibration.sensors) - 1, _ROWS).round().astype(int)
     figure = Figure(figsize=(3.2 * len(eras), 2.6 * _ROWS + 0.6), layout="constrained")
     axes = figure.subplots(_ROWS, len(eras), sharex=True, sharey=True, squeeze=False)
-    # Per ERA base displacement of 1 µm: numbers that one meets on a bench.
-    size = 1e-6
+    size = 1e-6  # m, base displacement
     for row, sensor in enumerate(sensors):
         for column, era in enumerate(eras):
             axis = axes[row, column]

@@ -1,4 +1,4 @@
-"""What the pictures share: fields over the plate, marks for ERAs and nulls."""
+"""Fields over the plate with marks for ERAs and nulls."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from model.arrays import FloatArray
 from model.files.array_file import whole_or_nothing
-from model.files.picture_name import check_picture_name
+from model.files.replacing import check_picture_name
 from model.rig.rig import Rig
 from model.structure.actuator import Era
 from model.structure.plate import Plate
@@ -27,9 +27,9 @@ POINTS_ALONG = 97
 
 
 def raster(plate: Plate) -> tuple[int, int]:
-    """How many points along x and y a field of the plate is drawn with, evenly spaced.
+    """Numbers of evenly spaced points along x and y for drawing a field.
 
-    POINTS_ALONG the longer side: on the paper's plate 60 in the shortest wave of its figures.
+    POINTS_ALONG the longer side: on the paper's plate 60 per shortest wave of its figures.
     """
     step = max(plate.length, plate.width) / (POINTS_ALONG - 1)
     return max(2, round(plate.length / step) + 1), max(2, round(plate.width / step) + 1)
@@ -45,21 +45,21 @@ def draw_field(
     image = axes.pcolormesh(
         100 * x, 100 * y, peak / G, cmap=COLORS, shading="gouraud", vmin=0, vmax=maximum
     )
-    _label_plate(axes)
+    label_plate(axes)
     return image
 
 
 def draw_shape(axes: Axes, x: FloatArray, y: FloatArray, shape: FloatArray) -> ScalarMappable:
-    """Draw a mode shape (len(y), len(x)) scaled to 1, white where nothing moves; axes in cm."""
+    """Draw a mode shape (len(y), len(x)) scaled to 1, white at nodes; axes in cm."""
     image = axes.pcolormesh(
         100 * x, 100 * y, shape, cmap="RdBu_r", shading="gouraud", vmin=-1, vmax=1
     )
-    _label_plate(axes)
+    label_plate(axes)
     return image
 
 
 def draw_eras(axes: Axes, eras: Sequence[Era], *, active: Collection[str]) -> None:
-    """Mark where ERAs hold the plate: filled and red where driven, green where only holding."""
+    """Mark ERAs, red if driven and green if not."""
     for era in eras:
         color = ACTIVE_COLOR if era.name in active else RESTING_COLOR
         axes.plot(
@@ -74,7 +74,7 @@ def draw_nulls(axes: Axes, nulls: FloatArray) -> None:
 
 @dataclass(frozen=True)
 class MapPanel:
-    """One map of a figure: its title, and which of the ERAs under it are driven."""
+    """One map of a figure with its title and the names of driven ERAs."""
 
     title: str
     plate_map: PlateMap
@@ -88,7 +88,7 @@ def maps_figure(panels: Sequence[MapPanel], *, columns: int, caption: str | None
     width = 7.0 if columns == 1 else 3.6 * columns + 1
     ratio = panels[0].plate_map.y[-1] / panels[0].plate_map.x[-1]
     height = rows * (0.8 * width / columns * ratio + 0.8) + (0.5 if caption else 0.1)
-    # Constrained, and drawn together: maps keep their shape and would leave gaps otherwise.
+    # A constrained layout would leave gaps between maps of fixed aspect.
     figure = Figure(figsize=(width, height), layout="compressed")
     grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     maximum = max(float(panel.plate_map.peak.max()) for panel in panels) / G
@@ -111,10 +111,9 @@ def map_figure(rig: Rig, plate_map: PlateMap, *, active: Collection[str], title:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as what its file's name ends in; needs no display.
+    """Write a figure in the format of the name's ending, without a display.
 
-    Raises InputError for an ending that is not in PICTURE_ENDINGS, OSError where the file cannot be
-    written.
+    Raises InputError for an ending that is not in PICTURE_ENDINGS, and OSError.
     """
     check_picture_name(path)
     FigureCanvasAgg(figure)
@@ -122,7 +121,8 @@ def save_figure(figure: Figure, path: Path) -> None:
         figure.savefig(stream, dpi=_DPI, format=path.suffix[1:].lower())
 
 
-def _label_plate(axes: Axes) -> None:
+def label_plate(axes: Axes) -> None:
+    """Label axes in centimetres, of equal scale."""
     axes.set_aspect("equal")
     axes.set_xlabel("x / cm")
     axes.set_ylabel("y / cm")

@@ -1,4 +1,4 @@
-"""How strongly a plate would be felt all over, and the fingertips on it."""
+"""Sensation level over the plate, and the fingertips on it."""
 
 from collections.abc import Iterable
 
@@ -20,7 +20,7 @@ from model.vibration.excitation import Excitation
 
 _COLORS = "magma"
 _SCALE = Normalize(-10.0, 30.0)
-"""From what hardly anybody feels to more than strong [dB SL]."""
+"""From barely perceptible to more than strong [dB SL]."""
 
 FELT_COLOR, QUIET_COLOR = "#6dff9c", "#9fdcff"
 
@@ -28,7 +28,7 @@ _SIDE = 121  # points along a side; nulls are narrow
 
 
 def draw_levels(axes: Axes, table: LocalizationTable, excitation: Excitation) -> None:
-    """Draw the level above threshold [dB SL] over the plate, and the ERAs; axes in centimetres."""
+    """Draw the sensation level [dB SL] over the plate, and the ERAs; axes in centimetres."""
     x, y = (np.linspace(0, side, _SIDE) for side in (table.plate.length, table.plate.width))
     level = sensation_level(*table.amplitudes(excitation, lattice(x, y))).reshape(_SIDE, _SIDE)
     axes.pcolormesh(100 * x, 100 * y, level, cmap=_COLORS, shading="gouraud", norm=_SCALE)
@@ -47,7 +47,7 @@ def draw_levels(axes: Axes, table: LocalizationTable, excitation: Excitation) ->
 
 
 def draw_level_scale(figure: Figure, axes: Iterable[Axes], *, shrink: float) -> None:
-    """Draw beside axes what the colours of `draw_levels` say; shrink: to this share of them."""
+    """Draw the colour scale of `draw_levels` beside axes, shrunk to a share of their height."""
     figure.colorbar(
         ScalarMappable(_SCALE, _COLORS),
         ax=list(axes),
@@ -60,7 +60,7 @@ def draw_level_scale(figure: Figure, axes: Iterable[Axes], *, shrink: float) -> 
 def draw_fingertip(
     axes: Axes, place: Point, *, felt: bool, level_db_sl: float | None = None
 ) -> None:
-    """Draw a fingertip at x, y [m], whether it shall feel it, and what it feels [dB SL]."""
+    """Draw a target or quiet fingertip at x, y [m], with its level [dB SL]."""
     x, y = 100 * place[0], 100 * place[1]
     outline = [withStroke(linewidth=2.5, foreground="black", alpha=0.75)]
     color = FELT_COLOR if felt else QUIET_COLOR

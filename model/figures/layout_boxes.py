@@ -1,4 +1,4 @@
-"""Box plots of how strongly the plate vibrates, each with its layout above it."""
+"""Box plots of peak acceleration, each with its layout above it."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ BOX_COLOR = "#9ecae1"
 
 @dataclass(frozen=True)
 class LayoutBox:
-    """One box: its label; positions of the ERAs (n, 2) [m] and the numbers of the active ones.
+    """One box: label, positions of the ERAs (n, 2) [m], and indices of the active ones.
 
     five: minimum, quartiles and maximum of cumulative peak acceleration [m/s²].
     """
@@ -49,7 +49,7 @@ def layout_boxes_figure(
 
 
 def _draw_layout(axes: Axes, plate: Plate, box: LayoutBox) -> None:
-    """A small plate with its ERAs."""
+    """Draw a small plate with its ERAs."""
     axes.add_patch(Rectangle((0, 0), plate.length, plate.width, fc="0.93", ec="0.4"))
     for era, (x, y) in enumerate(box.positions):
         color = ACTIVE_COLOR if era in box.active else RESTING_COLOR

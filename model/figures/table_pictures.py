@@ -1,7 +1,6 @@
-"""A table in pictures: where on the plate it is weak, what level it has, how much contrast."""
+"""Pictures of a table: weak cells, levels, contrast and a pattern."""
 
 from collections.abc import Callable, Iterator
-from itertools import zip_longest
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.figures.drawing import COLORS, draw_eras
+from model.figures.drawing import COLORS, draw_eras, label_plate
 from model.figures.fingertips import draw_fingertip, draw_level_scale, draw_levels
 from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL
@@ -22,16 +21,16 @@ from model.table.summary import CONTACT_SETS, contrast_distribution
 from model.table.table import LocalizationTable
 from model.table.weak_cells import WANTED_CONTRAST_DB, WeakCells, find_weak_cells, map_grid
 
-# Where the fingers of the example are, in shares of the plate.
+# Fingers of the example, in shares of the plate.
 _EXAMPLE = ((0.3, 0.35), (0.8, 0.6), (0.45, 0.85))
 
 
 def table_figures(
     table: LocalizationTable, *, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> Iterator[tuple[str, Figure]]:
-    """Every picture with its name; progress: called with how many questions are done, of how many.
+    """Draw all pictures, with names.
 
-    Cells count as one each, though each takes up to 48 questions.
+    progress: called with the number of finished cells and contact sets, and the total.
     """
     cells = map_grid(table).cell_count
     total = cells + 3 * CONTACT_SETS
@@ -46,7 +45,7 @@ def table_figures(
 
 
 def weak_cells_figure(table: LocalizationTable, weak: WeakCells) -> Figure:
-    """Contrast from each cell to the median other finger and to one in ten, on one scale."""
+    """Draw contrast from each cell to the median other finger and to one in ten."""
     figure = Figure(figsize=(11, 4.6), layout="compressed")
     panels = (
         ("median other finger", weak.median_db, ~weak.feasible),
@@ -69,7 +68,7 @@ def weak_cells_figure(table: LocalizationTable, weak: WeakCells) -> Figure:
 
 
 def levels_figure(table: LocalizationTable) -> Figure:
-    """The highest level that any pattern of one or two ERAs reaches at each cell."""
+    """Draw the highest level of any pattern of one or two ERAs at each cell."""
     figure = Figure(figsize=(7, 5), layout="compressed")
     axes = figure.subplots()
     levels = table.available_level_db_sl
@@ -87,7 +86,7 @@ def levels_figure(table: LocalizationTable) -> Figure:
 def contrast_figure(
     table: LocalizationTable, *, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> Figure:
-    """Which share of random contact sets has at least a contrast, for 1, 2 and 3 other fingers."""
+    """Draw the distribution of contrast over random contact sets of 1, 2 and 3 other fingers."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
     rng = np.random.default_rng(0)
@@ -111,7 +110,7 @@ def contrast_figure(
 
 
 def answer_figure(table: LocalizationTable) -> Figure:
-    """An answer of the table: how strongly each place would be felt, with the fingers on it."""
+    """Draw sensation levels and fingers for an example query."""
     plate = table.plate
     target, *quiet = ((u * plate.length, v * plate.width) for u, v in _EXAMPLE)
     question = Question((target,), tuple(quiet))
@@ -119,7 +118,7 @@ def answer_figure(table: LocalizationTable) -> Figure:
     axes = figure.subplots()
     try:
         pattern = table.query(question)
-    except InputError:  # too weak a rig, or too small a plate for three fingers
+    except InputError:  # weak rig or small plate
         axes.set_title("The table has no answer to the three fingers of this picture")
         axes.axis("off")
         return figure
@@ -140,13 +139,12 @@ def answer_figure(table: LocalizationTable) -> Figure:
 
 
 def _in_words(table: LocalizationTable, pattern: Pattern) -> str:
-    """Two tones to a line, at most twelve."""
+    """Format up to twelve tones, two per line."""
     tones = [
         f"{name} {tone['frequency_hz']:g} Hz, level {tone['level']:.3f} at {tone['phase_deg']:.0f}°"
         for name, tone in table.drive_of(pattern.excitation).items()
     ]
-    lines = ["; ".join(pair) for pair in zip_longest(tones[0:12:2], tones[1:12:2], fillvalue="")]
-    return "\n".join(line.removesuffix("; ") for line in lines)
+    return "\n".join("; ".join(tones[start : start + 2]) for start in range(0, 12, 2)).strip()
 
 
 def _draw_cells(
@@ -157,24 +155,18 @@ def _draw_cells(
     *,
     limits: tuple[float, float],
 ) -> ScalarMappable:
-    """Cells in their colours with ERAs over them; what has no value stays white."""
+    """Draw cells in colour, white without a value, and ERAs."""
     x = np.linspace(0, 100 * table.plate.length, grid.nx + 1)
     y = np.linspace(0, 100 * table.plate.width, grid.ny + 1)
     shown = np.ma.masked_invalid(values.reshape(grid.ny, grid.nx))
     image = axes.pcolormesh(x, y, shown, cmap=COLORS, vmin=limits[0], vmax=limits[1])
     axes.add_patch(Rectangle((0, 0), x[-1], y[-1], fill=False, ec="0.4", clip_on=False))
     draw_eras(axes, table.eras, active=[era.name for era in table.eras])
-    _label(axes)
+    label_plate(axes)
     return image
 
 
 def _cross_out(axes: Axes, table: LocalizationTable, grid: Grid, cells: NDArray[np.bool_]) -> None:
-    """A cross on each of some cells."""
+    """Draw crosses on some cells."""
     marked = 100 * grid.centres(table.plate)[cells]
     axes.plot(*marked.T, "x", color="white", ms=6, mew=1.5)
-
-
-def _label(axes: Axes) -> None:
-    axes.set_aspect("equal")
-    axes.set_xlabel("x / cm")
-    axes.set_ylabel("y / cm")

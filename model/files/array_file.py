@@ -1,10 +1,11 @@
-"""Arrays in a file: an uncompressed .npz, written whole or not at all, checked before it is read.
+"""Arrays in an uncompressed .npz file, written atomically and checked before they are read.
 
-Reading trusts nothing: names, types and sizes must be those expected, nothing may be compressed or
-pickled, and no array may declare more than the file holds.
+Names, types and sizes must be those expected; nothing may be compressed or pickled, and no array
+may declare more than the file holds.
 """
 
 import hashlib
+import math
 import os
 import tokenize
 import uuid
@@ -20,21 +21,19 @@ from numpy.typing import NDArray
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 
 UNREADABLE = (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError)
-"""What `read_arrays` raises for a file that is not there, damaged, or not what was expected."""
-
+"""Errors of `read_arrays` for a file that is missing, damaged or unexpected."""
 
 _ENCRYPTED = 0x1  # a flag of a zip member
 
-# numpy parses a header as Python text, and not all that parsing raises is turned to ValueError.
+# numpy parses a header as Python text and does not turn all errors of that into ValueError.
 _NO_HEADER = (SyntaxError, tokenize.TokenError, TypeError, RecursionError, MemoryError)
 
 
 @contextmanager
 def whole_or_nothing(path: Path) -> Iterator[IO[bytes]]:
-    """A stream that becomes the file when the block ends well, and leaves nothing when it does not.
+    """Yield a stream that replaces the file when the block succeeds and is removed when it fails.
 
-    Raises OSError, with the file's name, where it cannot be written. One that the block raises with
-    the name of another file keeps that.
+    Raises OSError with the file's name, unless the block raised one with the name of another file.
     """
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}")
     try:
@@ -51,24 +50,26 @@ def whole_or_nothing(path: Path) -> Iterator[IO[bytes]]:
 
 
 def write_arrays(path: Path, arrays: Arrays) -> None:
-    """Write arrays by name; the file is either the old one or the whole new one, never between."""
+    """Write arrays by name, atomically."""
     with whole_or_nothing(path) as stream:
         np.savez(stream, allow_pickle=False, **arrays)
 
 
 def read_arrays(path: Path, types: Mapping[str, str], *, max_bytes: int) -> dict[str, NDArray[Any]]:
-    """Arrays of exactly these names and types (numpy's `dtype.str`); raises one of UNREADABLE."""
+    """Read arrays of exactly these names and types (`dtype.str`); raises one of UNREADABLE."""
     with zipfile.ZipFile(path) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         if sorted(members) != sorted(types) or len(archive.infolist()) != len(types):
-            raise ValueError(f"it holds {', '.join(sorted(members)) or 'nothing'}")
+            raise ValueError(
+                f"members must be {', '.join(sorted(types))}, got {', '.join(sorted(members)) or 0}"
+            )
         if any(info.compress_type != zipfile.ZIP_STORED for info in members.values()):
-            raise ValueError("it is compressed")
+            raise ValueError("members must not be compressed")
         if any(info.flag_bits & _ENCRYPTED for info in members.values()):
-            raise ValueError("it is encrypted")
+            raise ValueError("members must not be encrypted")
         declared = sum(info.file_size for info in members.values())
         if declared > min(path.stat().st_size, max_bytes):
-            raise ValueError(f"it declares {declared} bytes")
+            raise ValueError(f"size must be that of the file, got {declared} bytes")
         arrays = {}
         for name, info in members.items():
             with archive.open(info) as stream:
@@ -88,18 +89,16 @@ def digest_of(text: str, arrays: Arrays) -> str:
 
 
 def _check_npy_header(stream: IO[bytes], name: str, kind: str, *, member_bytes: int) -> None:
-    """Refuse an array whose declared type or size is not what the member can hold."""
+    """Raise ValueError unless the declared type is expected and the size is the member's."""
     version = np.lib.format.read_magic(stream)
     if version != (1, 0):
-        raise ValueError(f"{name} has .npy version {version}")
+        raise ValueError(f"{name}: .npy version must be (1, 0), got {version}")
     try:
         shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
     except _NO_HEADER as error:
-        raise ValueError(f"{name} has a header that cannot be read") from error
+        raise ValueError(f"{name}: unreadable header") from error
     if dtype.str != kind:
-        raise ValueError(f"{name} holds {dtype.str}")
-    size = dtype.itemsize
-    for length in shape:
-        size *= length  # Python integers: no overflow
+        raise ValueError(f"{name}: type must be {kind}, got {dtype.str}")
+    size = dtype.itemsize * math.prod(shape)  # Python integers: no overflow
     if size + stream.tell() != member_bytes:
-        raise ValueError(f"{name} declares {size} bytes")
+        raise ValueError(f"{name}: size must be that of the member, got {size} bytes")

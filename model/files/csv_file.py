@@ -2,7 +2,8 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TypeAlias
 
@@ -14,20 +15,23 @@ from model.files.array_file import whole_or_nothing
 Column: TypeAlias = Sequence[object] | NDArray[np.generic]
 
 Columns: TypeAlias = Mapping[str, Column]
-"""Columns of equal length by their name, which ends in their unit."""
+"""Columns of equal length by name, which ends in the unit."""
 
 
 def write_columns(path: Path, columns: Columns) -> None:
-    """Write columns with a line of names above them; floats with every digit that tells them apart.
+    """Write columns below a line of names, atomically; floats with all their digits.
 
-    The file is either the old one or the whole new one. Raises OSError where it cannot be written.
+    Raises OSError.
     """
     plain = [
         column.tolist() if isinstance(column, np.ndarray) else column for column in columns.values()
     ]
+    write_rows(path, chain([columns], zip(*plain, strict=True)), line_end="\n")
+
+
+def write_rows(path: Path, rows: Iterable[Iterable[object]], *, line_end: str = "\r\n") -> None:
+    """Write rows, atomically, by default with the line ends of RFC 4180; raises OSError."""
     with whole_or_nothing(path) as stream:
         text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(zip(*plain, strict=True))
+        csv.writer(text, lineterminator=line_end).writerows(rows)
         text.detach()

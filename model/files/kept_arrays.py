@@ -1,7 +1,6 @@
-"""Arrays kept in a folder, so that what was interrupted goes on: found again whole, or not at all.
+"""Arrays kept in files, so that interrupted work can be resumed.
 
-Each file carries a SHA-256 over its arrays and over the text that they were kept under, so that
-neither a flipped bit passes nor the arrays of something else.
+Each file has a SHA-256 over its arrays and over a text that identifies them.
 """
 
 import logging
@@ -20,26 +19,26 @@ _logger = logging.getLogger(__name__)
 
 
 def keep_arrays(path: Path, text: str, arrays: Arrays) -> None:
-    """Keep arrays; their file is whole or not there. Raises OSError if it cannot be written."""
+    """Write arrays identified by a text, atomically; raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_arrays(path, {**arrays, "sha256": _digest(text, arrays)})
 
 
 def kept_arrays(path: Path, text: str, types: Mapping[str, str]) -> dict[str, NDArray[Any]] | None:
-    """Arrays of these names and types (numpy's `dtype.str`) that were kept under a text, or None.
+    """Read arrays of these names and types (`dtype.str`), identified by a text.
 
-    A damaged file is told of and taken for none.
+    None if there are none, or, with a warning, if they are damaged.
     """
     try:
         arrays = read_arrays(path, {**types, "sha256": "|u1"}, max_bytes=MAX_BYTES)
     except FileNotFoundError:
         return None
     except UNREADABLE as error:
-        _logger.warning("%s cannot be read and is computed again: %s", path, error)
+        _logger.warning("%s: unreadable, computed again: %s", path, error)
         return None
     digest = arrays.pop("sha256")
     if not np.array_equal(digest, _digest(text, arrays)):
-        _logger.warning("%s is damaged and is computed again", path)
+        _logger.warning("%s: damaged, computed again", path)
         return None
     return arrays
 

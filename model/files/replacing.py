@@ -1,45 +1,57 @@
-"""Where a result may be written: in a folder that is there, and over nothing but its own kind."""
+"""Checks of output paths: ending, folder, and what may be replaced."""
 
 from pathlib import Path
 
 from model.errors import InputError
 
+PICTURE_ENDINGS = (".png", ".svg", ".pdf")
+
 
 def check_replaceable(path: Path, *, is_own: bool, what: str) -> None:
-    """Raise InputError where a file of another kind stands; it is somebody's work, a rig's say.
+    """Raise InputError if a file of another kind would be replaced.
 
-    is_own: whether the file there, if there is one, is of the kind that will be written; what: the
-    name of that kind.
+    is_own: whether an existing file is of the kind that will be written; what: name of that kind.
     """
     if path.is_file() and not is_own:
         raise InputError(
-            f"--output {path}: a file is there that is no {what}; it is left alone. Give another "
-            "name, or remove it first"
+            f"--output {path}: existing file must be a {what}; choose another name or remove it"
         )
 
 
 def check_ending(path: Path, *endings: str, what: str) -> None:
-    """Raise InputError for a name that ends in none of what such a file may."""
+    """Raise InputError for a name without one of the endings."""
     if path.suffix.lower() not in endings:
         ending = endings[0]
         better = path / f"new{ending}" if path.is_dir() else path.with_suffix(ending)
-        raise InputError(f"{path}: {what} ends in {ending}; try {better}")
+        raise InputError(f"{path}: name of {what} must end in {ending}; try {better}")
 
 
 def check_place(path: Path, *, example: str) -> None:
-    """Raise InputError where no file can be written: at a folder, or in one that is not there.
-
-    To be asked before whatever takes long.
-    """
+    """Raise InputError for a path that is a folder or in a missing one; call before long work."""
     if path.is_dir() or not path.absolute().parent.is_dir():
         raise InputError(
-            f"--output {path}: give the name of a file in a folder that exists, e.g. {example}"
+            f"--output {path}: must be a file in an existing folder, for instance {example}"
         )
 
 
 def begins_with(path: Path, start: bytes) -> bool:
-    """Whether a file is there that begins so, or an empty one."""
+    """Whether a file exists that is empty or begins with these bytes."""
     if not path.is_file():
         return False
     with path.open("rb") as stream:
         return stream.read(len(start)) in (start, b"")
+
+
+def check_picture_name(path: Path) -> None:
+    """Raise InputError for an ending that is not in PICTURE_ENDINGS."""
+    if path.suffix.lower() not in PICTURE_ENDINGS:
+        raise InputError(
+            f"{path}: a picture's name must end in {', '.join(PICTURE_ENDINGS[:-1])} or "
+            f"{PICTURE_ENDINGS[-1]}, for instance {path.stem}.png"
+        )
+
+
+def check_picture(path: Path) -> None:
+    """Raise InputError for a path to which no picture can be written; call before long work."""
+    check_picture_name(path)
+    check_place(path, example="map.png")

@@ -1,8 +1,7 @@
 """Universal files (UFF): functions at nodes (dataset 58), nodes (15, 2411) and units (164).
 
-The format of modal analysis since the 1970s, ASCII or binary; pyuff knows its fields. It reads over
-much that is wrong, though, so a file is first taken apart here: every dataset must be whole, and
-every number there and finite. Files are in SI units or refused.
+The format of modal analysis since the 1970s, ASCII or binary, with fields as in pyuff. pyuff skips
+over damage, so datasets and numbers are checked here first. Files must be in SI units.
 """
 
 import re
@@ -18,13 +17,13 @@ from model.arrays import FloatArray
 from model.errors import InputError
 
 TIME_RESPONSE, FREQUENCY_RESPONSE = 1, 4  # function types
-DISPLACEMENT, ACCELERATION, TIME, FREQUENCY = 8, 12, 17, 18  # kinds of data
+DISPLACEMENT, ACCELERATION, TIME, FREQUENCY = 8, 12, 17, 18  # data types
 
-_LARGEST = 512 << 20
+_MAX_BYTES = 512 << 20
 _HEADER_LINES = 13  # of dataset 58, from its opening mark on
 _SI = 1  # units code of dataset 164
-# The mark between datasets, as pyuff knows it: wherever a line ends in it. Only binary data may
-# really end so; any other that is no line of its own would shift all that comes after it.
+# The mark between datasets: for pyuff, wherever a line ends in it. Only binary data may contain it;
+# any other that is not a line of its own would shift all datasets after it.
 _MARK = re.compile(rb"    -1(?=[\r\n]|\Z| {74}.)", re.DOTALL)
 _DELIMITER = re.compile(rb"^    -1(?=[\r\n]|\Z| {74}.)", re.DOTALL | re.MULTILINE)
 
@@ -33,9 +32,9 @@ _DELIMITER = re.compile(rb"^    -1(?=[\r\n]|\Z| {74}.)", re.DOTALL | re.MULTILIN
 class Function:
     """One dataset 58.
 
-    place: file and line of it, for errors; response, reference: nodes, with a name each ("" for
-    none) and a direction, +-3 for +-z; x: abscissa, data (n,) real or complex; kinds: of abscissa,
-    ordinate and denominator, by code; units: of ordinate and denominator as labelled.
+    place: file and line, for errors; response, reference: nodes, each with a name ("" without one)
+    and a direction, +-3 for +-z; x: abscissa, data (n,) real or complex; data_types: codes of
+    abscissa, ordinate and denominator; units: labels of ordinate and denominator.
     """
 
     place: str
@@ -46,13 +45,13 @@ class Function:
     directions: tuple[int, int]
     x: FloatArray
     data: NDArray[Any]
-    kinds: tuple[int, int, int]
+    data_types: tuple[int, int, int]
     units: tuple[str, str]
 
 
 @dataclass(frozen=True, eq=False)
 class Universal:
-    """What a file holds. nodes: x, y, z [m] by number."""
+    """Content of a file. nodes: x, y, z [m] by number."""
 
     nodes: Mapping[int, tuple[float, float, float]]
     functions: Sequence[Function]
@@ -61,15 +60,13 @@ class Universal:
 def write_universal(path: Path, content: Universal) -> None:
     """Write nodes, units and functions in ASCII, double precision (12 digits).
 
-    An evenly spaced abscissa has six digits for its step. Raises OSError where it cannot be
-    written, InputError for numbers that are not finite: pyuff would write zeros in their place.
+    An evenly spaced abscissa has six digits for its step. Raises OSError, and InputError for
+    numbers that are not finite, for which pyuff would write zeros.
     """
     import pyuff
 
     if any(not np.isfinite(function.data).all() for function in content.functions):
-        raise InputError(
-            f"{path}: a universal file takes finite numbers only; leave out the others"
-        )
+        raise InputError(f"{path}: data of a universal file must be finite; leave out the others")
     count = len(content.nodes)
     x, y, z = np.array(list(content.nodes.values()), dtype=float).reshape(-1, 3).T
     zeros = np.zeros(count, dtype=int)
@@ -85,13 +82,13 @@ def write_universal(path: Path, content: Universal) -> None:
         "y": y,
         "z": z,
     }
-    path.write_bytes(b"")  # whatever is wrong with the place shows here, in the system's words
+    path.write_bytes(b"")  # raises OSError, which pyuff would hide
     sets = [units | factors, nodes, *(_as_58(function) for function in content.functions)]
     pyuff.UFF(str(path)).write_sets(sets, "overwrite")
 
 
 def read_universal(path: Path) -> Universal:
-    """Read a file; raises InputError, with file and line, for one that is none or is damaged."""
+    """Read a file; raises InputError with file and line if it is damaged or of another format."""
     import pyuff
 
     content = read_bytes(path)
@@ -118,28 +115,26 @@ def read_universal(path: Path) -> Universal:
         except InputError:
             raise
         except Exception as error:  # pyuff raises nothing narrower
-            raise InputError(
-                f"{place}: dataset {kind} is damaged and cannot be read; export it again"
-            ) from error
+            raise InputError(f"{place}: dataset {kind} cannot be read; export it again") from error
     return Universal(nodes, functions)
 
 
 def read_bytes(path: Path) -> bytes:
-    """The content of a measured file; raises InputError for none, an empty or a huge one."""
+    """Read a measured file; raises InputError if it is missing, empty or too large."""
     try:
         with path.open("rb") as stream:
-            content = stream.read(_LARGEST + 1)
+            content = stream.read(_MAX_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     if not content.strip():
-        raise InputError(f"{path}: is empty; export the measurement again")
-    if len(content) > _LARGEST:
-        raise InputError(f"{path}: is larger than {_LARGEST >> 20} MiB; export fewer records")
+        raise InputError(f"{path}: file is empty; export the measurement again")
+    if len(content) > _MAX_BYTES:
+        raise InputError(f"{path}: size must be up to {_MAX_BYTES >> 20} MiB; export fewer records")
     return content
 
 
 def _blocks(path: Path, content: bytes) -> list[tuple[int, bytes]]:
-    """Every dataset's line and content, its opening mark included and its closing one not."""
+    """Line and content of each dataset, with its opening mark and without its closing one."""
     blocks, marks, end = [], set(), 0
     while start := _DELIMITER.search(content, end):
         line = content.count(b"\n", 0, start.start()) + 1
@@ -147,23 +142,22 @@ def _blocks(path: Path, content: bytes) -> list[tuple[int, bytes]]:
         stop = mark.search(content, start.end())
         if stop is None:
             raise InputError(
-                f"{path}:{line}: the dataset that begins here has no end; the file was cut off, "
-                "export it again"
+                f"{path}:{line}: dataset has no end; the file was cut off, export it again"
             )
         blocks.append((line, content[start.start() : stop.start()]))
         marks |= {start.start(), stop.start()}
         end = stop.end()
     if not blocks:
         raise InputError(
-            f"{path}: is no universal file, for no line of it holds `    -1` alone; export the "
+            f"{path}: a universal file must have lines of `    -1` alone, got none; export the "
             "measurement as UFF, datasets 58 with 15 or 2411"
         )
     for stray in _MARK.finditer(content):
         if stray.start() not in marks:
             line = content.count(b"\n", 0, stray.start()) + 1
             raise InputError(
-                f"{path}:{line}: the line ends in `    -1`, as only the lines between datasets do; "
-                "export it again with another number there, or binary data as ASCII"
+                f"{path}:{line}: only lines between datasets may end in `    -1`; export it again "
+                "with another number there, or binary data as ASCII"
             )
     return blocks
 
@@ -175,7 +169,7 @@ def _is_binary(block: bytes) -> bool:
 
 def _as_58(function: Function) -> dict[str, Any]:
     steps = np.diff(function.x)
-    even = function.kinds[0] == TIME and len(steps) > 0 and np.ptp(steps) < 1e-6 * steps[0]
+    even = function.data_types[0] == TIME and len(steps) > 0 and np.ptp(steps) < 1e-6 * steps[0]
     return {
         "type": 58,
         "func_type": function.function_type,
@@ -187,10 +181,10 @@ def _as_58(function: Function) -> dict[str, Any]:
         "ref_ent_name": function.names[1][:10] or "NONE",
         "id1": " / ".join(name for name in function.names if name) or "NONE",
         "abscissa_spacing": int(even),
-        "abscissa_spec_data_type": function.kinds[0],
-        "ordinate_spec_data_type": function.kinds[1],
-        "orddenom_spec_data_type": function.kinds[2],
-        "abscissa_axis_units_lab": "s" if function.kinds[0] == TIME else "Hz",
+        "abscissa_spec_data_type": function.data_types[0],
+        "ordinate_spec_data_type": function.data_types[1],
+        "orddenom_spec_data_type": function.data_types[2],
+        "abscissa_axis_units_lab": "s" if function.data_types[0] == TIME else "Hz",
         "ordinate_axis_units_lab": function.units[0] or "NONE",
         "orddenom_axis_units_lab": function.units[1] or "NONE",
         "x": function.x,
@@ -202,15 +196,14 @@ def _function(place: str, found: Mapping[str, Any]) -> Function:
     x, data = np.asarray(found["x"], dtype=float), np.asarray(found["data"])
     if not len(data) == len(x) == found["num_pts"]:
         raise InputError(
-            f"{place}: the record announces {found['num_pts']} values and holds {len(data)}; the "
-            "file is damaged, export it again"
+            f"{place}: record must have {found['num_pts']} values, as its header says, got "
+            f"{len(data)}; the file is damaged, export it again"
         )
     if not (np.isfinite(x).all() and np.isfinite(data).all()):
-        raise InputError(f"{place}: the record holds values that are not finite; measure it again")
+        raise InputError(f"{place}: values of the record must be finite; measure it again")
     if len(x) == 0 or (np.diff(x) <= 0).any():
-        raise InputError(f"{place}: the record's abscissa does not ascend; export it again")
+        raise InputError(f"{place}: abscissa of the record must ascend; export it again")
     names = (_name(found["rsp_ent_name"]), _name(found["ref_ent_name"]))
-    kinds = ("abscissa", "ordinate", "orddenom")
     return Function(
         place,
         found["func_type"],
@@ -220,7 +213,7 @@ def _function(place: str, found: Mapping[str, Any]) -> Function:
         (found["rsp_dir"], found["ref_dir"]),
         x,
         data,
-        tuple(found[f"{kind}_spec_data_type"] for kind in kinds),
+        tuple(found[f"{axis}_spec_data_type"] for axis in ("abscissa", "ordinate", "orddenom")),
         (_name(found["ordinate_axis_units_lab"]), _name(found["orddenom_axis_units_lab"])),
     )
 
@@ -233,13 +226,13 @@ def _name(text: str) -> str:
 def _check_si(place: str, found: Mapping[str, Any]) -> None:
     if found["units_code"] != _SI:
         raise InputError(
-            f"{place}: the file's units (dataset 164) are of code {found['units_code']} "
-            f"{found['units_description']!r}, not 1 (SI: metre, newton); export it in SI"
+            f"{place}: units code (dataset 164) must be 1 (SI), got {found['units_code']} "
+            f"{found['units_description']!r}; export it in SI"
         )
 
 
 def _check_numbers(path: Path, line: int, block: bytes) -> None:
-    """Refuse ASCII data in which a number is none, with its line."""
+    """Raise InputError, with its line, for ASCII data that is not numbers."""
     rows = block.split(b"\n")
     for number, row in enumerate(rows[_HEADER_LINES:], start=line + _HEADER_LINES):
         try:
@@ -249,6 +242,6 @@ def _check_numbers(path: Path, line: int, block: bytes) -> None:
         except ValueError:
             shown = row.decode("ascii", "backslashreplace").strip()[:40]
             raise InputError(
-                f"{path}:{number}: {shown!r} is not the numbers that should stand here; the file "
-                "is damaged, export it again"
+                f"{path}:{number}: data must be numbers, got {shown!r}; export the "
+                "damaged file again"
             ) from None

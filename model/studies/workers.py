@@ -31,11 +31,7 @@ def on_processes(count: int) -> Workers:
 
     def solve(problem: StudyProblem, chunks: Mapping[int, Cases]) -> Solved:
         shared = problem.solve(), problem.rig.eras
-        if count == 1:
-            for number, cases in chunks.items():
-                yield number, _solve_chunk(shared, cases)
-        else:
-            yield from processes.on_processes(count, _solve_chunk, shared, chunks)
+        yield from processes.on_processes(count, _solve_chunk, shared, chunks)
 
     return solve
 

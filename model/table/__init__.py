@@ -1,1 +1,1 @@
-"""The localization table: how it is built, kept, asked, summed up and checked."""
+"""The localization table: building, files, queries, summary and verification."""

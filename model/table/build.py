@@ -4,7 +4,7 @@ The result is the same to the bit for any number of processes. Finished parts ca
 (`model.table.kept_parts`), so that an interrupted build can be resumed.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -64,35 +64,19 @@ def build_in_parts(
     if drive_mode not in DRIVE_MODES:
         raise InputError(f"drive mode must be one of {', '.join(DRIVE_MODES)}, got {drive_mode!r}")
     parts = dict(enumerate(problem.parts()))
-    done: dict[int, Arrays] = {}
-    for number, part in parts.items():
-        found = kept.load(part) if kept else None
-        if found is not None:
-            done[number] = found
+    found = {number: kept.load(part) for number, part in parts.items()} if kept else {}
+    done = {number: arrays for number, arrays in found.items() if arrays is not None}
     reused_count = len(done)
     progress(len(done), len(parts))
     missing = {number: part for number, part in parts.items() if number not in done}
-    for number, arrays in _solve(problem, missing, workers=workers):
+    # A copy without cached properties, which cannot all be sent to a process.
+    for number, arrays in on_processes(workers, solve_part, replace(problem), missing):
         if kept:
             kept.store(parts[number], arrays)
         done[number] = arrays
         progress(len(done), len(parts))
     table = _joined(problem, drive_mode, {parts[number]: done[number] for number in parts})
     return Build(table, len(parts), reused_count)
-
-
-def _solve(
-    problem: TableProblem, missing: Mapping[int, Part], *, workers: int
-) -> Iterator[tuple[int, Arrays]]:
-    """Solve the missing parts, in any order."""
-    if not missing:
-        return
-    if workers > 1 and len(missing) > 1:
-        # A copy without cached properties, which cannot all be sent to a process.
-        yield from on_processes(workers, solve_part, replace(problem), missing)
-        return
-    for number, part in missing.items():
-        yield number, solve_part(problem, part)
 
 
 def _joined(

@@ -3,8 +3,6 @@
 `docs/reference/table-file.md` lists every name with its shape and unit.
 """
 
-import csv
-import io
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -16,6 +14,7 @@ from model.drive_modes.fields import SILENT
 from model.drive_modes.sources import all_patterns
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
+from model.files.csv_file import write_rows
 from model.table.file import FORMAT_VERSION
 from model.table.table import LocalizationTable
 
@@ -80,11 +79,7 @@ def export_csv(table: LocalizationTable, path: Path, *, content: str) -> None:
     where it is silent, and the response of every cell; "fields": a row for each raster point and
     frequency, with real and imaginary acceleration by each ERA alone at full stroke.
     """
-    rows = {"patterns": _pattern_rows, "fields": _field_rows}[content](table)
-    with whole_or_nothing(path) as stream:
-        text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
-        csv.writer(text, lineterminator="\r\n").writerows(rows)  # RFC 4180
-        text.detach()
+    write_rows(path, {"patterns": _pattern_rows, "fields": _field_rows}[content](table))
 
 
 def _pattern_frequencies(table: LocalizationTable) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -148,6 +148,20 @@ class Fingertips:
         return found.reshape(-1, values.shape[1]) if whole else found[self.on_plate]
 
 
+@dataclass(frozen=True, eq=False)
+class ReducedOnRaster:
+    """As `ReducedPlate` of `model.reduction`, with shapes (points, r) on a raster."""
+
+    plate: Plate
+    omega: FloatArray
+    raster: Raster
+    shapes: NDArray[np.float32]
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """Shapes at points [m] (p, 2) of the plate, (p, r)."""
+        return self.raster.at(self.shapes, points).astype(float)
+
+
 def _powers(x: FloatArray, count: int) -> FloatArray:
     """1, x, x², ... along a new last axis of `count`."""
     powers = np.empty((*x.shape, count))

@@ -130,7 +130,6 @@ def _attached(
         omega,
     )
     bolts = dynamic_stiffness(0.0, 0.0, np.array([era.bolt_mass for era in eras]), omega)
-    masses = [PointLoad(mass.x, mass.y, mass=mass.mass) for mass in table.masses]
-    (rest,) = attached_stiffness((), [*masses, *loads], np.array([omega]))
+    (rest,) = attached_stiffness((), [*table.loads, *loads], np.array([omega]))
     stiffness = np.hstack([bases + bolts, np.broadcast_to(rest, (len(bases), len(rest)))])
     return stiffness, bases

@@ -35,8 +35,7 @@ from model.structure.point_mass import PointMass
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.pattern_choice import Candidates, OnsetContrast, choose_pattern
 from model.table.question import MIN_LEVEL_DB_SL, Point, Question
-from model.table.raster import Fingertips, Raster
-from model.table.reduced_on_raster import ReducedOnRaster
+from model.table.raster import Fingertips, Raster, ReducedOnRaster
 from model.transients.onset import RampedOnsets
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation
@@ -101,6 +100,11 @@ class LocalizationTable:
     def fingerprint(self) -> str:
         """Fingerprint of the plate on its ERAs that this table is for."""
         return physics_fingerprint(self.plate, self.eras, masses=self.masses)
+
+    @property
+    def loads(self) -> tuple[PointLoad, ...]:
+        """The masses as point loads."""
+        return tuple(PointLoad(mass.x, mass.y, mass=mass.mass) for mass in self.masses)
 
     @property
     def pattern_count(self) -> int:
@@ -223,8 +227,7 @@ class LocalizationTable:
     def in_time(self) -> PlateInTime:
         """The plate on its ERAs in time."""
         reduced = ReducedOnRaster(self.plate, self.omega, self.raster, self.shapes)
-        loads = [PointLoad(mass.x, mass.y, mass=mass.mass) for mass in self.masses]
-        return plate_in_time(reduced, self.eras, loads=loads, held=self.held)
+        return plate_in_time(reduced, self.eras, loads=self.loads, held=self.held)
 
     @cached_property
     def onsets(self) -> RampedOnsets | None:

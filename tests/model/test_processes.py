@@ -16,4 +16,4 @@ def die(shared: int, task: int) -> None:
 def test_on_processes_gives_up_after_repeated_deaths() -> None:
     """After four pools, with a remedy."""
     with pytest.raises(InputError, match=r"died 4 times.*--workers"):
-        list(on_processes(1, die, 1, {0: 8}))
+        list(on_processes(2, die, 1, {0: 8}))

@@ -51,7 +51,7 @@ def _read(path: Path) -> Recording:
         raise InputError(f"{path}: no signals (dataset 58, function type 1)")
     first = records[0]
     for record in records:
-        if record.kinds[0] != TIME or record.kinds[1] != ACCELERATION:
+        if record.data_types[0] != TIME or record.data_types[1] != ACCELERATION:
             raise InputError(f"{record.place}: must be acceleration over time")
         if record.units[0].replace(" ", "") not in ("m/s^2", "m/s2", "m/s²"):
             raise InputError(f"{record.place}: unit must be m/s^2, got {record.units[0]!r}")

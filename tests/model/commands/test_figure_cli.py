@@ -4,7 +4,6 @@ import csv
 import json
 from pathlib import Path
 
-import pytest
 from typer.testing import CliRunner
 
 from model.commands.figure_cli import figure_app
@@ -16,8 +15,8 @@ RIG = str(example_rig_path())
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def test_a_figure_is_written_with_its_numbers(tmp_path: Path) -> None:
-    """Figure 7 as PNG and CSV in a new folder; the files and one next step are told."""
+def test_figure_writes_a_picture_and_its_numbers(tmp_path: Path) -> None:
+    """Figure 7 as PNG and CSV in a new folder; files and next command are printed."""
     folder = tmp_path / "new" / "figures"
     result = RUNNER.invoke(figure_app, ["7", RIG, "-o", str(folder), "--mesh", "12x9"])
     assert result.exit_code == 0
@@ -38,8 +37,8 @@ def test_a_figure_is_written_with_its_numbers(tmp_path: Path) -> None:
     assert result.stdout.splitlines()[-1].startswith("Next: ")
 
 
-def test_as_json_the_findings_are_one_object(tmp_path: Path) -> None:
-    """Figure 13: ratio and correlation by name, and the files, and nothing else."""
+def test_figure_prints_findings_as_json(tmp_path: Path) -> None:
+    """Figure 13: ratio and correlation by name, and the files."""
     arguments = ["13", RIG, "-o", str(tmp_path), "--mesh", "12x9", "--json"]
     answer = json.loads(RUNNER.invoke(figure_app, arguments).stdout)
     assert 1.5 < answer["figures"]["figure_13_maps"]["maximum_stiff_to_soft_ratio"] < 1.8
@@ -47,17 +46,13 @@ def test_as_json_the_findings_are_one_object(tmp_path: Path) -> None:
     assert len(answer["files"]) == 4
 
 
-def test_a_folder_that_cannot_be_is_told(tmp_path: Path) -> None:
-    """A file stands where the folder should be: its name is in the error."""
-    (tmp_path / "taken").write_text("mine", encoding="utf-8")
-    result = RUNNER.invoke(figure_app, ["7", RIG, "-o", str(tmp_path / "taken")])
+def test_figure_refuses_a_file_as_folder_and_an_unknown_number(tmp_path: Path) -> None:
+    """Path and known numbers are in the errors."""
+    taken = tmp_path / "taken"
+    taken.write_text("mine", encoding="utf-8")
+    result = RUNNER.invoke(figure_app, ["7", RIG, "-o", str(taken)])
     assert isinstance(result.exception, OSError)
-    assert result.exception.filename == str(tmp_path / "taken")
-
-
-def test_an_unknown_figure_is_bad_input(tmp_path: Path) -> None:
-    """The error says which there are."""
+    assert result.exception.filename == str(taken)
     result = RUNNER.invoke(figure_app, ["5", RIG, "-o", str(tmp_path)])
     assert isinstance(result.exception, InputError)
-    with pytest.raises(InputError, match="6, 7, 10, 11, 12, 13"):
-        raise result.exception
+    assert "6, 7, 10, 11, 12, 13" in str(result.exception)

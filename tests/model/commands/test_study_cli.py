@@ -39,8 +39,8 @@ def study(what: str, folder: Path, *more: str, rig: str = RIG) -> dict[str, Any]
 
 
 @pytest.mark.parametrize("what", ["placement", "count", "stiffness"])
-def test_a_study_recommends_a_rig_that_loads(tmp_path: Path, what: str) -> None:
-    """The rig to paste holds exactly the ERAs of the recommendation, on the same plate."""
+def test_study_recommends_a_rig_that_loads(tmp_path: Path, what: str) -> None:
+    """The new rig has exactly the ERAs of the recommendation, on the same plate."""
     answer = study(what, tmp_path, "--layouts", "12")
     recommended = answer["recommended"]
     rig = load_rig(tmp_path / "recommended.yaml")
@@ -55,7 +55,7 @@ def test_a_study_recommends_a_rig_that_loads(tmp_path: Path, what: str) -> None:
 
 
 def test_study_keeps_what_it_does_not_vary(tmp_path: Path) -> None:
-    """Bolt mass, measured gains and what else a rig says of its ERAs is in the recommended one."""
+    """Bolt mass, stroke and measured gains of the ERAs are in the recommended rig."""
     data = read_document(Path(RIG)).data
     for era in data["eras"].values():
         era |= {
@@ -85,8 +85,8 @@ def test_study_of_the_recommended_rig_finds_the_same_statistics(tmp_path: Path) 
         assert own[key] == pytest.approx(first["recommended"][key], rel=1e-9)
 
 
-def test_the_csv_has_every_case_and_drive(tmp_path: Path) -> None:
-    """Three rows a layout; the best of them by median is the head of the ranking."""
+def test_study_csv_has_every_case_and_drive(tmp_path: Path) -> None:
+    """Three rows per layout; the best by median leads the ranking."""
     answer = study("placement", tmp_path, "--layouts", "20")
     with (tmp_path / "placement.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
@@ -100,7 +100,7 @@ def test_the_csv_has_every_case_and_drive(tmp_path: Path) -> None:
     assert "own" in {case["layout"] for case in answer["ranking"]}
 
 
-def test_a_second_run_takes_everything_from_the_first(tmp_path: Path) -> None:
+def test_study_reuses_the_cases_of_an_earlier_one(tmp_path: Path) -> None:
     """Nothing is solved and the answer is the same; with another seed, random layouts are new."""
     first = study("placement", tmp_path, "--layouts", "20")
     second = study("placement", tmp_path, "--layouts", "20")
@@ -112,8 +112,8 @@ def test_a_second_run_takes_everything_from_the_first(tmp_path: Path) -> None:
     assert other["ranking"] != first["ranking"]
 
 
-def test_more_eras_than_the_rig_has_get_channels_of_their_own(tmp_path: Path) -> None:
-    """Six ERAs recommended for a rig of four: loadable, so no two on one channel."""
+def test_study_gives_more_eras_than_the_rig_has_their_own_channels(tmp_path: Path) -> None:
+    """Six ERAs recommended for a rig of four: no two on one channel."""
     answer = study("count", tmp_path, "--layouts", "6", "--active", "all")
     counts = {len(case["at_m"]) for case in answer["ranking"]}
     assert counts == {1, 2, 3, 4, 5, 6}
@@ -123,42 +123,25 @@ def test_more_eras_than_the_rig_has_get_channels_of_their_own(tmp_path: Path) ->
 
 
 def test_study_prints_ranking_recommendation_and_next_command(tmp_path: Path) -> None:
-    """How long it took, the ranking with units, the recommendation in words, files, Next."""
-    result = RUNNER.invoke(
-        study_app, ["placement", RIG, "-o", str(tmp_path), "--layouts", "5", *QUICK]
-    )
+    """A softer or smaller layout within a tenth of the best is recommended, and why is said."""
+    few = ["--layouts", "24", "--seed", "2"]
+    result = RUNNER.invoke(study_app, ["count", RIG, "-o", str(tmp_path), *few, *QUICK])
     assert result.exit_code == 0
     lines = result.stdout.splitlines()
-    assert lines[0].startswith("5 cases in ")
-    assert " g " in lines[3]
-    assert any(line.startswith("Recommended") and "4 ERAs" in line for line in lines)
+    best = next(line.split() for line in lines if line.startswith("   1  "))
+    recommendation = re.search(r"^Recommended(.+?): (\d) ERAs", result.stdout, re.MULTILINE)
+    assert recommendation is not None
+    assert int(recommendation[2]) < int(best[1][0])  # a random layout is named by its count
     recommended = tmp_path / "recommended"
     assert lines[-1] == f"Next: era table build {recommended}.yaml -o {recommended}.npz"
 
 
-def test_study_says_why_the_best_is_not_recommended(tmp_path: Path) -> None:
-    """Of these layouts one of six ERAs has the highest median, by less than a tenth."""
-    few = ["--layouts", "24", "--seed", "2"]
-    answer = RUNNER.invoke(study_app, ["count", RIG, "-o", str(tmp_path), *few, *QUICK]).stdout
-    best = next(line.split() for line in answer.splitlines() if line.startswith("   1  "))
-    said = re.search(r"^Recommended(.*?): (\d) ERAs", answer, re.MULTILINE)
-    assert said is not None
-    assert said[1] == ", fewest and softest within a tenth of the best"
-    assert int(said[2]) < int(best[1][0])  # a random layout is named by its count
-
-
-def one_era_rig(folder: Path) -> str:
-    """The example's rig with its first ERA alone."""
-    data = read_document(Path(RIG)).data
-    data["eras"] = dict([next(iter(data["eras"].items()))])
-    path = folder / "one.yaml"
-    path.write_text(data_text(data), encoding="utf-8")
-    return str(path)
-
-
 def test_study_of_one_era_needs_active_1(tmp_path: Path) -> None:
     """A rig of one ERA has no pair to rank by; with --active 1 it can be studied."""
-    rig = one_era_rig(tmp_path)
+    data = read_document(Path(RIG)).data
+    data["eras"] = dict([next(iter(data["eras"].items()))])
+    rig = str(tmp_path / "one.yaml")
+    Path(rig).write_text(data_text(data), encoding="utf-8")
     with pytest.raises(InputError, match="--active 1"):
         study("placement", tmp_path / "out", rig=rig)
     answer = study("placement", tmp_path / "out", "--active", "1", "--layouts", "9", rig=rig)
@@ -170,45 +153,34 @@ def test_study_of_one_era_needs_active_1(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["loudness", RIG],
-        ["placement", RIG, "--layouts", "0"],
-        ["placement", RIG, "--layouts", "-3"],
-        ["placement", RIG, "--layouts", "many"],
-        ["placement", RIG, "--workers", "0"],
-        ["placement", RIG, "--active", "3"],
-        ["placement", RIG, "--seed", "-1"],
+        ["loudness"],
+        *(["placement", option, "0"] for option in ("--layouts", "--workers", "--active")),
     ],
-    ids=lambda arguments: " ".join(arguments[::2]) if len(arguments) > 2 else arguments[0],
+    ids=" ".join,
 )
 def test_study_refuses_bad_usage(tmp_path: Path, arguments: list[str]) -> None:
-    """An unknown study and numbers that are none or out of range end with status 2."""
-    result = RUNNER.invoke(study_app, [*arguments, "-o", str(tmp_path)])
+    """An unknown study and numbers out of range end with status 2."""
+    what, *options = arguments
+    result = RUNNER.invoke(study_app, [what, RIG, "-o", str(tmp_path), *options])
     assert result.exit_code == 2
 
 
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("more", "named"),
     [
         (["--frequencies", "0:100:10"], "LO:HI:STEP"),
-        (["--frequencies", "60,110,60"], "60 Hz twice"),
+        (["--frequencies", "60,110,60"], "60"),
         (["--frequencies", "60,9000"], "Hz"),
-        (["--candidates", "1x1"], "2x2 to 100x100"),
-        (["--candidates", "many"], "two numbers"),
+        (["--candidates", "1x1"], "1x1"),
+        (["--candidates", "many"], "many"),
         (["--workers", "2", "--cluster", "tcp://127.0.0.1:1"], "--cluster"),
         (["--cluster", "nowhere"], "--cluster"),
     ],
 )
-def test_study_refuses_bad_input(tmp_path: Path, more: list[str], message: str) -> None:
+def test_study_refuses_bad_input(tmp_path: Path, more: list[str], named: str) -> None:
     """One clear error, before anything is solved."""
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=named):
         study("placement", tmp_path, *more)
-
-
-def test_study_names_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
-    """A file is where the folder should be: its name is in the error."""
-    (tmp_path / "taken").write_text("mine", encoding="utf-8")
-    with pytest.raises(OSError, match="taken"):
-        study("placement", tmp_path / "taken", "--layouts", "2")
 
 
 def test_study_resumes_when_it_was_interrupted(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`era plate elements` and `era plate conformance`."""
+"""`era plate conformance`."""
 
 import json
 from typing import Annotated
@@ -6,27 +6,6 @@ from typing import Annotated
 import typer
 
 from model.commands.options import JsonOption
-
-
-def elements(as_json: JsonOption = False) -> None:
-    """List the elements of meshes, as in mesh: 12x9 Q3."""
-    from model.errors import InputError
-    from model.fem.elements import element_names, element_of
-
-    orders, problems = {}, []
-    for name in element_names():
-        try:
-            orders[name] = element_of(name).order
-        except InputError as error:  # of one plug-in; the others are listed
-            problems.append(str(error))
-    if as_json:
-        rows = [{"name": name, "order": order} for name, order in orders.items()]
-        print(json.dumps({"elements": rows, "problems": problems}))
-        return
-    for name, order in orders.items():
-        print(f"{name}: order {order}, {(order + 1) ** 2} nodes")
-    for problem in problems:
-        typer.echo(f"era: warning: {problem}", err=True)
 
 
 def conformance(

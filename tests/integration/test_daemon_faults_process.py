@@ -127,10 +127,9 @@ async def test_paused_for_longer_than_the_watchdog_nothing_old_is_replayed(tmp_p
             os.kill(daemon.process.pid, signal.SIGCONT)
             await until_state(era, "FAULT")
             await ready(era)
-            await asyncio.sleep(0.2)  # longer than any lease of those fingers
+            await journal.hear(5)  # for longer than any of those fingers stays without news
             await armed(era)
-            await until(lambda: len(journal.since(resumed)) > 5)
-            await asyncio.sleep(0.2)
+            await journal.hear(10)
             assert not journal.raising_since(resumed)
             assert loudness(far) == 0
 

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from itertools import pairwise
 
+from daemon_bench import until
 from drivers.protocol.messages import (
     AmplifierState,
     Apply,
@@ -57,6 +58,11 @@ class Journal:
             return reply
 
         far.bench.exchange = noted  # type: ignore[method-assign]
+
+    async def hear(self, requests: int) -> None:
+        """Wait until so many more requests have come; a heartbeat comes every 50 ms."""
+        enough = len(self.entries) + requests
+        await until(lambda: len(self.entries) >= enough)
 
     def since(self, time: float) -> list[Asked]:
         """What was asked after a time [s]."""

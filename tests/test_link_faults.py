@@ -463,8 +463,8 @@ async def test_reopening_refuses_another_serial_number(far: FarSide) -> None:
     """The serial number must not change."""
     async with Link(far) as link:
         await link.amplifier.close()
-        own = far.amplifier.identity
-        far.amplifier.identity = type(own)(own.vendor, own.product, "OTHER", own.firmware, 1)
+        assert link.amplifier._serial_number == far.amplifier.identity.serial_number
+        link.amplifier._serial_number = "OTHER"
         with pytest.raises(LinkError, match="OTHER"):
             await reconnect(link.amplifier, tries=3, pause=0.0)
         assert link.amplifier.is_lost

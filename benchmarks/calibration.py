@@ -1,8 +1,7 @@
-"""What calibration regains, and what it needs: `python -m benchmarks.calibration`.
+"""Accuracy of calibration by noise and sensors: `python -m benchmarks.calibration`.
 
-The plate of examples/make_measured.py, measured on the simulated bench with more or less noise and
-more or fewer sensors; the errors of the fitted values, and the contrast that the patterns of the
-calibrated rig's table reach on the true plate.
+The plate of examples/make_measured.py, measured on the simulated bench; errors of the fitted
+values, and contrast of the calibrated rig's patterns on the true plate.
 """
 
 import time
@@ -50,12 +49,12 @@ def errors(found: Calibration, truth: Rig) -> dict[str, float]:
 
 
 def reached(
-    truth: LocalizationTable, asked: LocalizationTable, places: np.ndarray, *, drive_mode: str
+    truth: LocalizationTable, queried: LocalizationTable, places: np.ndarray, *, drive_mode: str
 ) -> float:
-    """Contrast [dB] on the true plate of the pattern that a table gives."""
+    """Contrast [dB] of the pattern of a table on the true plate."""
     target, *quiet = [(float(x), float(y)) for x, y in places]
     question = Question((target,), tuple(quiet), level_db_sl=12.0, drive_mode=drive_mode)
-    excitation = asked.query(question).excitation
+    excitation = queried.query(question).excitation
 
     def peak(place: tuple[float, float]) -> np.ndarray:
         points = fingertip_points(*place, truth.plate)

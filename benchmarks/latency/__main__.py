@@ -1,14 +1,13 @@
-"""From a touch datagram to the last byte of the command on the wire, measured from outside.
+"""Latency from a touch datagram to the last byte of the command on the wire.
 
     python -m benchmarks.latency [--seconds 100] [--seed 1] [--report | --check WIRE]
 
-The daemon, the amplifier at the other end of a wire, the panel and whoever disturbs them are
-processes of their own (`benchmarks.latency.run`). Leave the machine alone meanwhile, some nine
-minutes; with --seconds 2 it takes one, which shows that it works. A case that is disturbed is
-tried once more; where that fails too, the others are measured all the same.
+The daemon, the amplifier, the panel and programs that load the machine are separate processes
+(`benchmarks.latency.run`). It takes nine minutes on an otherwise idle machine; a trial run with
+--seconds 2 takes one. A disturbed case is repeated once; if that fails, too, the others follow.
 
-With --report, docs/measured/latency.md and its picture are written as well. With --check only taps
-at 100 Hz are measured, over `tcp` or a `pty`, and what was measured is printed as JSON: for tests.
+--report: write docs/measured/latency.md and its picture. --check: measure taps at 100 Hz only, over
+`tcp` or a `pty`, and print the result as JSON.
 """
 
 import argparse
@@ -24,7 +23,7 @@ from pathlib import Path
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.latency", description=__doc__)
     parser.add_argument(
-        "--seconds", type=float, default=100.0, help="how long the longest cases last"
+        "--seconds", type=float, default=100.0, help="duration of the longest cases"
     )
     parser.add_argument("--seed", type=int, default=1)
     purpose = parser.add_mutually_exclusive_group()

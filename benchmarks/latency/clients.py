@@ -1,11 +1,11 @@
-"""Who else runs while latency is measured: the panel, a client that floods, and programs at work.
+"""Programs of the latency benchmark: a panel, a client that floods, and CPU load.
 
     python -m benchmarks.latency.clients panel RIG PORT KIND COUNT RATE SEED FILE
     python -m benchmarks.latency.clients flood SOCKET RIG RATE
     python -m benchmarks.latency.clients work
 
-The panel writes when it sent each datagram, on CLOCK_MONOTONIC [ns]. What is late is sent at once,
-so that the rate holds.
+The panel writes the time of each datagram, on CLOCK_MONOTONIC [ns]. Late ones are sent at once, to
+keep the rate.
 """
 
 import json
@@ -37,7 +37,7 @@ def panel(rig: str, port: str, kind: str, count: str, rate: str, seed: str, file
         sent[number] = time.monotonic_ns()
         line.send(datagram)
     print("sent", flush=True)
-    sys.stdin.readline()  # others are measured until then
+    sys.stdin.readline()  # while the others are measured
     np.save(file, sent)
 
 
@@ -67,7 +67,7 @@ def _touch(x: float, y: float) -> bytes:
 
 
 def _wait_until(moment: int) -> None:
-    """Until a time [ns]; what is past needs no waiting."""
+    """Sleep until a time [ns]."""
     left = moment - time.monotonic_ns()
     if left > 0:
         time.sleep(left * 1e-9)

@@ -2,9 +2,9 @@
 
     python -m benchmarks.latency.far_end RIG FILE WIRE
 
-WIRE: `pty`, a pseudo-terminal, or `tcp`, a connection as to a serial server. Prints the URL. On
-SIGUSR1 it writes when each frame that asks for a set had arrived whole, on CLOCK_MONOTONIC, its
-number and what it carries, a JSON line each, and prints that it has. The plate takes no part.
+WIRE: `pty`, a pseudo-terminal, or `tcp`, as to a serial server. Prints the URL. On SIGUSR1 it
+writes a JSON line for each Apply frame, with arrival on CLOCK_MONOTONIC, number and payload, and
+prints "written". There is no plate.
 """
 
 import asyncio
@@ -26,27 +26,27 @@ from sim.transport.pseudo_terminal import make_terminal
 
 
 class Wire(asyncio.Protocol):
-    """A wire to the daemon; on_data is called with what comes, `write` sends, once it is open."""
+    """A wire to the daemon; on_data: called with received bytes. `write` sends once it is open."""
 
     def __init__(self, on_data: Callable[[bytes], None]) -> None:
-        self.write: Callable[[bytes], object] = len  # nobody is there yet
+        self.write: Callable[[bytes], object] = len  # until it is open
         self._on_data = on_data
 
     async def open_terminal(self) -> str:
-        """A pseudo-terminal; its URL."""
+        """Open a pseudo-terminal and return its URL."""
         terminal = make_terminal(self._on_data)
         terminal.listen()
         self.write = terminal.write
         return f"serial://{terminal.port}?baud={PROTOCOL.serial.baud}"
 
     async def open_server(self) -> str:
-        """A TCP port on the loopback that takes one connection at a time; its URL."""
+        """Open a TCP port on the loopback for one connection and return its URL."""
         loop = asyncio.get_running_loop()
         self._server = await loop.create_server(lambda: self, "127.0.0.1", 0)
         return f"socket://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """The daemon has come."""
+        """The daemon has connected."""
         self.write = cast(asyncio.Transport, transport).write
 
     def data_received(self, data: bytes) -> None:
@@ -83,7 +83,7 @@ async def main() -> None:
     asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, write)
     gc.collect()
     gc.freeze()
-    gc.disable()  # it holds on to everything that it sees, so there is nothing to be collected
+    gc.disable()  # nothing becomes garbage
     print(url, flush=True)
     await asyncio.Event().wait()
 

@@ -1,4 +1,4 @@
-"""What else the machine did meanwhile, so that figures of a machine that was not idle show it."""
+"""Load of the machine by other programs during a measurement."""
 
 import os
 import time
@@ -10,9 +10,9 @@ _IDLE, _WAITING, _STOLEN = 3, 4, 7  # columns of /proc/stat's line of all proces
 
 
 class Others:
-    """How busy everybody else keeps the processors, from when it is made.
+    """Measures how busy other programs keep the processors, from construction on.
 
-    own: processor time [s] so far of those who belong to it.
+    own: returns the processor time [s] used by the benchmark so far.
     """
 
     def __init__(self, own: Callable[[], float]) -> None:
@@ -21,27 +21,27 @@ class Others:
         self._before = self._busy()
 
     def processors(self) -> float:
-        """How many processors others kept busy on average, the kernel's own work among them.
+        """Average number of processors kept busy by others, including the kernel.
 
-        Also those of another machine, where this one is a guest; 0 where the system does not say.
+        Includes time stolen by other guests of the host; 0 where the system does not report it.
         """
         lasted = max(time.monotonic() - self._begin, 1e-9)
         return max(0.0, self._busy() - self._before) / lasted
 
     def _busy(self) -> float:
-        """Processor time [s] of all others since the system has started."""
+        """Processor time [s] of all others since the system started."""
         return busy_time() - self._own()
 
 
 def busy_time() -> float:
-    """Processor time [s] that is neither idle nor waiting for a disk, of all, so far."""
+    """Processor time [s] of all processors so far, neither idle nor waiting for a disk."""
     if not _STAT.exists():
         return 0.0
     return busy_ticks(_STAT.read_text("ascii").splitlines()[0]) / os.sysconf("SC_CLK_TCK")
 
 
 def busy_ticks(line: str) -> int:
-    """The same from /proc/stat's line of all processors, in the system's ticks."""
+    """The same in ticks, from the first line of /proc/stat."""
     ticks = [int(word) for word in line.split()[1:]]
-    # What guests of this machine use stands in the first columns already.
+    # The time of guests is included in the first columns.
     return sum(ticks[: _STOLEN + 1]) - ticks[_IDLE] - ticks[_WAITING]

@@ -1,7 +1,6 @@
-"""Which touch each command answers, found from outside: by what was touched, and what is played.
+"""Matching of commands to touches, without data of the daemon.
 
-The table is asked again, offline, what it answers for a touch; a command that plays that answers
-it. So nothing that the daemon says of itself takes part.
+The table is queried offline for each touch; a command that plays the result belongs to it.
 """
 
 import math
@@ -23,13 +22,13 @@ from drivers.protocol.messages import Apply
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 
-LONGEST = 0.5  # s; a command answers no touch that is older
-_CLOSE = (1e-4, 2e-3)  # of full stroke, and of the level: steps on the wire, and the flood's finger
+MAX_AGE = 0.5  # s; of the touch of a command
+_TOLERANCE = (1e-4, 2e-3)  # absolute in full strokes, relative to the level
 
 
 @dataclass(frozen=True)
 class Command:
-    """A set as it arrived at the far end: when [s], its frame's number, token and what it plays."""
+    """A set at the far end: arrival [s], number of its frame, token and commands."""
 
     time: float
     sequence: int
@@ -38,7 +37,7 @@ class Command:
 
     @classmethod
     def read(cls, line: Sequence[int | str], kind: int) -> "Command":
-        """From what the far end wrote; kind: of the frame."""
+        """Read a line of the far end; kind: of the frame."""
         when, sequence, payload = line
         request = decode_request(Frame(kind, 1, int(sequence), bytes.fromhex(str(payload))))
         assert isinstance(request, Apply)
@@ -48,10 +47,10 @@ class Command:
 
 @dataclass(frozen=True)
 class Matched:
-    """Commands and the touches (by number) that they answer; unmatched: commands of no touch.
+    """Numbers of the touches of commands, and latencies; unmatched: commands without a touch.
 
-    newest [s]: from the touch that is answered; oldest [s]: from the first one that came after the
-    touch that the command before answers, and so waited the longest for this.
+    newest [s]: from the command's touch; oldest [s]: from the first touch after that of the command
+    before, which waited the longest.
     """
 
     touch: np.ndarray
@@ -66,18 +65,18 @@ def match(
     *errors: Callable[[int, Command], float],
     first: Callable[[int, int], int],
 ) -> Matched:
-    """Match commands to touches that were sent at times (n,) [s], each to a newer one.
+    """Match commands to touches sent at times (n,) [s], in ascending order.
 
-    errors: how far a command is from what answers a touch, 1 at the most where it does; the nearest
-    counts, and a later error only where no touch does by those before it. first: after which touch
-    answered last, up to the one that is answered now, a command was first due.
+    errors: distance of a command from the one expected for a touch, at most 1 for a match; the
+    nearest counts, and later functions only where earlier ones match none. first: the touch for
+    which a command was first due, after the touch before and up to that of this one.
     """
     found: list[tuple[int, float, float]] = []
     before, unmatched = -1, 0
     for command in commands:
         newest = int(np.searchsorted(sent, command.time)) - 1
-        oldest = int(np.searchsorted(sent, command.time - LONGEST))
-        # Of equal ones the newest, which no daemon can be blamed for.
+        oldest = int(np.searchsorted(sent, command.time - MAX_AGE))
+        # Of equal ones the newest, in favour of the daemon.
         touches = range(newest, max(before, oldest - 1), -1)
         touch = _nearest(touches, command, errors)
         if touch is None:
@@ -95,7 +94,7 @@ def _nearest(
     command: Command,
     errors: Sequence[Callable[[int, Command], float]],
 ) -> int | None:
-    """The touch that a command answers, by the first of the errors by which it answers any."""
+    """The touch of a command by the first error function that matches any."""
     for error in errors if touches else ():
         found = [error(touch, command) for touch in touches]
         nearest = int(np.argmin(found))
@@ -105,9 +104,9 @@ def _nearest(
 
 
 class Expected:
-    """What the daemon's table answers for each touch of some work.
+    """Commands expected by the table for each touch of some work.
 
-    flooded: how far the flood has moved its finger [m]; None where it has none.
+    flooded: displacement of the flood's finger [m]; None without one.
     """
 
     def __init__(
@@ -129,9 +128,9 @@ class Expected:
         self._known: dict[int, Mapping[int, tuple[float, complex]]] = {}
 
     def error(self, touch: int, command: Command) -> float:
-        """How far a command is from what the table answers for a touch; 1 is just that."""
+        """Distance of a command from the one expected for a touch; up to 1 it matches."""
         expected = self._expected(touch)
-        absolute, relative = _CLOSE
+        absolute, relative = _TOLERANCE
         loudest = max((abs(amplitude) for _, amplitude in expected.values()), default=0.0)
         most = 0.0
         for played in command.commands:
@@ -143,7 +142,7 @@ class Expected:
         return most
 
     def first(self, before: int, touch: int) -> int:
-        """The first touch after one that was answered that asks for something else."""
+        """The first touch after one that needs another set."""
         if self._work.kind == "taps" or before < 0:
             return before + 1 if before >= 0 else touch
         then = self._places[before]
@@ -153,7 +152,7 @@ class Expected:
         return touch
 
     def _expected(self, touch: int) -> Mapping[int, tuple[float, complex]]:
-        """By channel: frequency [Hz], and level and phase as a complex amplitude."""
+        """Frequency [Hz] and complex level by channel."""
         if touch not in self._known:
             contacts = [
                 Contact(ContactKey("bench", number), x, y, since=float(number))
@@ -177,6 +176,6 @@ class Expected:
         return self._known[touch]
 
     def _on_plate(self, x: float, y: float) -> tuple[float, float]:
-        """Where a touch is on the plate [m]; a bundle carries single precision."""
+        """Position on the plate [m] after transfer in single precision."""
         plate = self._rig.plate
         return float(np.float32(x)) * plate.length, (1 - float(np.float32(y))) * plate.width

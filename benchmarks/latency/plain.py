@@ -1,11 +1,10 @@
-"""The same exchange with asyncio alone: a datagram in, the smallest decision, the same bytes out.
+"""The baseline: the same exchange with asyncio alone.
 
     python -m benchmarks.latency.plain RIG URL SOCKET
 
-What a hub of haptic toys would do: python-osc reads the touch, the place chooses among sets that
-were encoded beforehand, and the set goes out without waiting for the answer to the one before.
-Nothing is checked, nobody is kept quiet. The flood comes in as lines of JSON that are read. Prints
-the UDP port; a set carries the number of its touch as its sequence.
+python-osc reads the touch, its position selects a pre-encoded set, and the set is sent without
+waiting for the reply to the one before. Nothing is checked, no finger is kept quiet. Lines of JSON
+from the flood are parsed. Prints the UDP port; the sequence of a set is the number of its touch.
 """
 
 import asyncio
@@ -43,7 +42,7 @@ class Panel(asyncio.DatagramProtocol):
         ]
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        """Decide and send."""
+        """Select a set and send it."""
         x = number = 0
         for timed in OscPacket(data).messages:
             match timed.message.params:
@@ -52,7 +51,7 @@ class Panel(asyncio.DatagramProtocol):
                 case ["fseq", number]:
                     pass
         chosen = replace(self._sets[int(x * SETS) % SETS], sequence=number & 0xFFFF)
-        with contextlib.suppress(BlockingIOError):  # there is no room: the touch is lost
+        with contextlib.suppress(BlockingIOError):  # no room: the touch is lost
             os.write(self._port, encode_frame(chosen))
 
 
@@ -63,14 +62,14 @@ class Flooded(asyncio.Protocol):
         self._rest = b""
 
     def data_received(self, data: bytes) -> None:
-        """Read them."""
+        """Parse them."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
             json.loads(line)
 
 
 def _opened(url: SerialUrl) -> serial.Serial | socket.socket:
-    """The wire: a port, or a connection to a serial server."""
+    """Open the wire: a port, or a connection to a serial server."""
     if url.is_local:
         return serial.Serial(url.port, url.baud, timeout=0, exclusive=True)
     place = urlsplit(url.port)

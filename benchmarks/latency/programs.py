@@ -1,8 +1,8 @@
-"""The programs that take part in the latency benchmark, each as urgent as it is in life.
+"""Processes of the latency benchmark and their priorities.
 
-A device of its own, the amplifier or the panel, shares no processor with the daemon's machine. Here
-it has to, so it comes first. The daemon is as urgent as the unit makes it that `era systemd
-install` prints. Whoever disturbs is an ordinary program.
+A real amplifier or panel does not use the daemon's processors; here it does, at the highest
+priority. The daemon has the priority of the unit that `era systemd install` prints, load programs
+the ordinary one.
 """
 
 import contextlib
@@ -16,13 +16,13 @@ from pathlib import Path
 
 from controller.deploy.files import NICE
 
-PATIENCE = 60.0  # s
+TIMEOUT = 60.0  # s
 DEVICE_NICE = -20
-_DEVICE_PRIORITY = 1  # of SCHED_RR: before whatever is no device, after the kernel's own
+_DEVICE_PRIORITY = 1  # of SCHED_RR
 
 
 class Rank(Enum):
-    """How urgent a program is."""
+    """Priority of a program."""
 
     DEVICE = auto()
     SERVICE = auto()
@@ -30,13 +30,13 @@ class Rank(Enum):
 
 
 class Ended(Exception):
-    """A part of the benchmark has ended before its time, or does not get ready."""
+    """A program of the benchmark has ended early, or does not get ready."""
 
 
 class Program:
-    """A process that ends with the stack, as urgent as its rank, as far as that is allowed.
+    """A process that ends with the stack, with the priority of its rank.
 
-    is_urgent: whether it was allowed.
+    is_urgent: whether the priority was allowed.
     """
 
     def __init__(
@@ -55,25 +55,25 @@ class Program:
         self.is_urgent = rank is Rank.ORDINARY or _is_made_urgent(self._process.pid, rank)
 
     def line(self) -> str:
-        """The next line that it prints; raises Ended."""
+        """Read the next line of its output; raises Ended."""
         assert self._process.stdout is not None
         line = self._process.stdout.readline().strip()
         if not line:
-            raise Ended(f"{self._name} has ended before its time")
+            raise Ended(f"{self._name} has ended early")
         return line
 
     def tell(self, text: str) -> None:
-        """A line for it."""
+        """Write a line to its input."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{text}\n")
         self._process.stdin.flush()
 
     def wait(self, timeout: float) -> None:
-        """Until it has ended by itself; raises Ended where it does not in time [s], or badly."""
+        """Wait until it ends; raises Ended after a timeout [s] or for another status than 0."""
         try:
             status = self._process.wait(timeout)
         except subprocess.TimeoutExpired:
-            raise Ended(f"{self._name} does not come to its end") from None
+            raise Ended(f"{self._name} does not end") from None
         if status:
             raise Ended(f"{self._name} has ended with status {status}")
 
@@ -83,23 +83,23 @@ class Program:
             raise Ended(f"{self._name} has ended; its log says why")
 
     def computed(self) -> float:
-        """Processor time [s] of all its threads so far; 0 where the system does not say."""
+        """Processor time [s] of all its threads so far; 0 where not reported."""
         total = 0
         for file in Path(f"/proc/{self._process.pid}/task").glob("*/schedstat"):
-            with contextlib.suppress(OSError):  # a thread that has ended meanwhile
+            with contextlib.suppress(OSError):  # the thread has ended
                 total += int(file.read_text("ascii").split()[0])
         return total * 1e-9
 
     def finish(self) -> None:
-        """Let it write what it has seen, and go on."""
+        """Make it write its record, and continue."""
         self._process.send_signal(signal.SIGUSR1)
         self.line()
 
     def end(self) -> None:
-        """Tell it to end, unless it has."""
+        """Terminate it unless it has ended."""
         if self._process.poll() is None:
             self._process.terminate()
-        self._process.wait(PATIENCE)
+        self._process.wait(TIMEOUT)
         for stream in (self._process.stdin, self._process.stdout):
             if stream is not None:
                 with contextlib.suppress(OSError):
@@ -115,7 +115,7 @@ ERA = Path(sys.executable).with_name("era")
 
 
 def _is_made_urgent(process: int, rank: Rank) -> bool:
-    """Make a process urgent; False where this user may not."""
+    """Set the priority of a process; False if not permitted."""
     nice = DEVICE_NICE if rank is Rank.DEVICE else NICE
     try:
         os.setpriority(os.PRIO_PROCESS, process, nice)
@@ -126,7 +126,7 @@ def _is_made_urgent(process: int, rank: Rank) -> bool:
     except PermissionError:
         return False
     if rank is Rank.DEVICE and hasattr(os, "sched_setscheduler"):
-        with contextlib.suppress(PermissionError):  # nice serves, less well
+        with contextlib.suppress(PermissionError):  # nice remains
             os.sched_setscheduler(process, os.SCHED_RR, os.sched_param(_DEVICE_PRIORITY))
     return True
 

@@ -1,4 +1,4 @@
-"""One measurement: every part a process of its own, started, armed, touched and taken apart."""
+"""One measurement: start all processes, arm, touch, and match commands to touches."""
 
 import contextlib
 import json
@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.latency.machine import Others
 from benchmarks.latency.match import Command, Expected, Matched, match
-from benchmarks.latency.programs import ERA, PATIENCE, Ended, Program, Rank, module
+from benchmarks.latency.programs import ERA, TIMEOUT, Ended, Program, Rank, module
 from benchmarks.latency.touches import WANDERS, Work
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
@@ -31,14 +31,14 @@ from sim.amplifier.amplifier import capabilities
 
 FLOOD_RATE = 10_000  # Hz
 WORKERS = 2  # programs at work in the loaded case, one for each core
-ATTEMPTS = 2  # at each case
+ATTEMPTS = 2  # per case
 _SETTLE = 1.0  # s
 
 
 @dataclass(frozen=True)
 class Case:
-    """What is measured: the work; whether others flood and work; touch_wait [ms] of the daemon,
-    None for the plain exchange beside it; wire: `tcp` or `pty`."""
+    """A case: touches; whether the machine is loaded; touch_wait [ms] of the daemon, None for the
+    baseline; wire: `tcp` or `pty`."""
 
     name: str
     work: Work
@@ -49,11 +49,10 @@ class Case:
 
 @dataclass(frozen=True)
 class Found:
-    """What came of it; own: what the daemon says itself, None for the plain exchange.
+    """Result of a case; own: latencies reported by the daemon, None for the baseline.
 
-    sent: how many datagrams; computed [s]: processor time meanwhile; others: processors that were
-    kept busy by whoever does not belong to it; is_urgent: whether all were as urgent as they should
-    be.
+    sent: number of datagrams; computed [s]: processor time of the daemon; others: processors kept
+    busy by other programs; is_urgent: whether all priorities were permitted.
     """
 
     case: Case
@@ -67,19 +66,19 @@ class Found:
 
 @dataclass(frozen=True)
 class Failed:
-    """A case that could not be measured, and why, attempt by attempt."""
+    """A case that could not be measured, with the reason of each attempt."""
 
     case: Case
     why: tuple[str, ...]
 
 
 class Disturbed(Exception):
-    """The machine was so busy with something else that nothing could be measured."""
+    """The machine was too busy to measure."""
 
 
 @dataclass(frozen=True)
 class _Open:
-    """An amplifier as far as it decides what is played."""
+    """An amplifier as far as it decides the pattern."""
 
     capabilities: Capabilities
     bus: str | None = None
@@ -92,14 +91,14 @@ def attempt(
     *,
     attempts: int = ATTEMPTS,
 ) -> Found | Failed:
-    """Measure a case, once more where that is disturbed."""
+    """Measure a case, again if it is disturbed."""
     why: list[str] = []
     while len(why) < attempts:
         try:
             return measured()
-        # A daemon that has lost its amplifier, or has too little time, answers its clients so.
+        # Errors of a daemon that has lost its amplifier or has too little time.
         except (Disturbed, Ended, RpcError, OSError) as error:
-            # What the daemon then says to whoever disarms it is no more than what follows.
+            # The error of disarming afterwards is only a consequence.
             first = error.__context__ if isinstance(error.__context__, Disturbed) else error
             why.append(f"{first} (load average {os.getloadavg()[0]:.1f})")
     return Failed(case, tuple(why))
@@ -154,7 +153,7 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
                 )
             own = status.latency_ms
         panel.tell("done")
-        panel.wait(PATIENCE)
+        panel.wait(TIMEOUT)
         far.finish()
         rig = load_rig(rig_file)
         sent = np.load(sent_file) * 1e-9
@@ -174,7 +173,7 @@ def _matched(
     rig: Rig,
     table: LocalizationTable,
 ) -> Matched:
-    """The commands from the first touch on, by the touches that they answer."""
+    """Match the commands from the first touch on."""
     since = [each for each in commands if sent[0] <= each.time <= sent[-1] + LAST]
     if case.touch_wait is None:
         return match(
@@ -184,11 +183,11 @@ def _matched(
             first=lambda before, touch: touch,
         )
     capabilities = _capabilities(rig, case.touch_wait)
-    # Of two patterns that are as good a hundredth of a millimetre may decide; and the flood's
-    # finger is lifted where the flood itself gets no processor for 150 ms.
+    # A hundredth of a millimetre may decide between equal patterns, and the flood's finger expires
+    # if the flood gets no processor for 150 ms.
     floods = (0.0, WANDERS, None) if case.is_loaded else (None,)
     expected = [Expected(case.work, rig, table, capabilities, flooded=each) for each in floods]
-    # A set whose answer was late is sent once more, under its token.
+    # A set with a late reply is sent again under its token.
     repeated = {id(each) for one, each in pairwise(since) if each.token == one.token}
     vibrating = [
         each
@@ -198,7 +197,7 @@ def _matched(
     return match(vibrating, sent, *(each.error for each in expected), first=expected[0].first)
 
 
-LAST = 0.03  # s; after the last touch fingers expire, and silence answers none
+LAST = 0.03  # s; fingers expire after the last touch, and silence has no touch
 
 
 def _capabilities(rig: Rig, touch_wait: float) -> PlaybackCapabilities:
@@ -219,8 +218,8 @@ def _daemon_file(folder: Path, url: str, table: Path, port: int, touch_wait: flo
 
 
 def _client(stack: contextlib.ExitStack, path: Path, serving: Program) -> Client:
-    """A client, until the stack ends, of a daemon that has come up and can be armed."""
-    end = time.monotonic() + PATIENCE
+    """Connect to the daemon once it is ready to be armed, until the stack ends."""
+    end = time.monotonic() + TIMEOUT
     client: Client | None = None
     while time.monotonic() < end:
         serving.check()
@@ -230,7 +229,7 @@ def _client(stack: contextlib.ExitStack, path: Path, serving: Program) -> Client
         elif client.status().state == "READY_TO_SWITCH_ON":
             return client
         time.sleep(0.05)
-    raise Disturbed(f"the daemon was not ready within {PATIENCE:g} s")
+    raise Disturbed(f"the daemon was not ready within {TIMEOUT:g} s")
 
 
 def _free_port() -> int:

@@ -1,4 +1,4 @@
-"""The touches of the latency benchmark: the same for the same seed, in every process of it."""
+"""Touches of the latency benchmark, equal for equal seeds in all its processes."""
 
 import math
 import random
@@ -9,18 +9,18 @@ from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
 from model.structure.plate import Plate
 
-APART = 0.050  # m; between a finger that is to feel it and those that are not
-HELD = (0.25, 0.3)  # of the sensor; a finger of the panel that stays
-FLOODING = (0.7, 0.75)  # of the plate, from its south-west corner; the one that the flood holds
-WANDERS = 0.00001  # m; how far the flood moves its finger, so that all of it is news
+APART = 0.050  # m; between target and quiet fingers
+HELD = (0.25, 0.3)  # of the sensor; the panel's resting finger
+FLOODING = (0.7, 0.75)  # of the plate, from its corner SW; the flood's finger
+WANDERS = 0.00001  # m; motion of the flood's finger, so that each touch is new
 SLIDE = 1.0  # m/s; a fast swipe
 EDGE = 0.06  # of the sensor
 
 
 @dataclass(frozen=True)
 class Work:
-    """What is touched: `taps`, every frame another finger somewhere else, so that each asks the
-    table anew, or `slide`, one finger that wanders at 1 m/s, so that every eighth does or so."""
+    """Touches: `taps`, a new finger in another place in every frame, each a query of the table, or
+    `slide`, one finger that moves at 1 m/s, with a query about every ninth frame."""
 
     kind: str
     count: int
@@ -29,7 +29,7 @@ class Work:
 
 
 def places(work: Work, plate: Plate) -> Iterator[tuple[int, float, float]]:
-    """Session id and place on the sensor (0..1) of the finger that feels it, frame by frame."""
+    """Session id and position on the sensor (0..1) of the target, frame by frame."""
     dice = random.Random(work.seed)
     x = y = 0.5
     goal = (x, y)
@@ -47,14 +47,14 @@ def places(work: Work, plate: Plate) -> Iterator[tuple[int, float, float]]:
 
 
 def datagrams(work: Work, plate: Plate) -> Iterator[bytes]:
-    """What a panel sends for it: TUIO bundles with the finger that stays and the one that feels."""
+    """TUIO bundles with the resting finger and the target."""
     for number, (session, x, y) in enumerate(places(work, plate)):
         touches = (Touch(1, *HELD), Touch(session, x, y))
         yield tuio_datagram(TouchFrame("bench", 0.0, touches), number + 1)
 
 
 def _anywhere(dice: random.Random, plate: Plate) -> tuple[float, float]:
-    """A place that is not near a finger that is to be kept quiet."""
+    """A random position away from the quiet fingers."""
     while True:
         place = (dice.uniform(EDGE, 1 - EDGE), dice.uniform(EDGE, 1 - EDGE))
         others = (HELD, (FLOODING[0], 1 - FLOODING[1]))

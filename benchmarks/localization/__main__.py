@@ -1,4 +1,4 @@
-"""What contrast can be had on the paper's plate, by which method, and how fast.
+"""Contrast on the paper's plate by method, and speed.
 
     python -m benchmarks.localization [--sets 200] [--draws 32] [--seed 1] [--report]
 
@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument("--report", action="store_true")
     options = parser.parse_args()
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[variable] = "1"  # before numpy loads: what is timed is one thread
+        os.environ[variable] = "1"  # before numpy loads
 
     from benchmarks.localization.contrast import (
         contrast_section,

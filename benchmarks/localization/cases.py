@@ -65,7 +65,7 @@ def question_of(
 
 
 def fields_of(places: FloatArray, *, targets: int = 1) -> Fields:
-    """Fields at the fingertips; the level asked for is an acceleration of 1 m/s²."""
+    """Fields at the fingertips; the wanted level is an acceleration of 1 m/s²."""
     fields = paper_table().fields(question_of(places, targets=targets))
     ones = np.ones_like(fields.threshold)
     return Fields(fields.targets, fields.quiet, fields.is_alone, ones, LEAST)
@@ -80,7 +80,7 @@ def quiet_centres(places: FloatArray, *, targets: int = 1) -> IntArray:
 
 @dataclass(frozen=True)
 class Errors:
-    """What amplifiers do against what they were told: complex factors (draws, eras)."""
+    """Random errors of amplifiers as complex factors (draws, eras)."""
 
     factors: ComplexArray
 

@@ -137,7 +137,7 @@ def _methods(places: FloatArray, errors: Errors) -> dict[str, tuple[float, float
 
 def _best(fields: Fields, drive_mode: str) -> Choice:
     choice = find_drives(fields, drive_mode)
-    assert choice is not None  # the level asked for is reached everywhere
+    assert choice is not None  # the wanted level is reached everywhere
     return choice
 
 

@@ -32,7 +32,7 @@ from model.table.table import LocalizationTable
 
 QUESTIONS = 400
 DRIVE_MODES = ("switched", "phased")
-MOST_ERAS = 8
+MAX_ERAS = 8
 CLOSE = 0.03  # m; ten fingers 5 cm apart hardly fit
 
 
@@ -114,7 +114,7 @@ def growth_section(seed: int) -> Section:
     """Times against the number of ERAs, of frequencies and of cells, the others as they are."""
     data: dict[Any, dict[str, float]] = {}
     for what, values in (
-        ("ERAs", range(2, MOST_ERAS + 1)),
+        ("ERAs", range(2, MAX_ERAS + 1)),
         ("frequencies", (9, 27, 54, 93, 185)),
         ("cells", (27, 108, 432, 1728)),
     ):

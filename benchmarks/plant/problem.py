@@ -1,4 +1,4 @@
-"""What is simulated when the plate in time is timed: values only, so that numpy loads later."""
+"""Cases of the plant benchmark as values, so that numpy is loaded later."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,7 @@ FINGERS = ((0.10, 0.08), (0.25, 0.17), (0.05, 0.19), (0.18, 0.03), (0.28, 0.05),
 
 @dataclass(frozen=True)
 class Case:
-    """What is simulated: so many ERAs on so many amplifiers, and who touches the plate."""
+    """A simulated case: numbers of ERAs, amplifiers and fingers."""
 
     eras: int = 4
     amplifiers: int = 1
@@ -19,5 +19,5 @@ class Case:
     loading: bool = False
     frequency_max: float = 500.0
     step: float = STEP
-    taps: int = 0  # a second
-    commands: int = 0  # a second
+    taps: int = 0  # per second
+    commands: int = 0  # per second

@@ -2,8 +2,8 @@
 
     python -m benchmarks.plate [--runs 5] [-o docs]
 
-Checks first that everybody gives the same answer, then measures, each measurement in a process of
-its own and on one thread; writes measured/benchmarks.md and its picture. Needs the extras group
+Checks first that all programs agree, then measures, each time in a process of its own and on one
+thread; writes measured/benchmarks.md and its picture. Needs the extras group
 `peers`.
 """
 
@@ -45,7 +45,7 @@ def main() -> None:
     agreement = check_answers()
     measured: dict[str, list[Result]] = {}
     loads = []
-    for run in range(options.runs):  # one after the other, so that a slow minute hits everybody
+    for run in range(options.runs):  # in turns, so that a slow minute affects all
         for program in (OURS, *PEERS):
             for task in ("nothing", "layout"):
                 measured.setdefault(f"{task} {program}", []).append(measure(program, task, MESH))
@@ -78,7 +78,7 @@ def measure(program: str, task: str, mesh: tuple[int, int]) -> Result:
 
 
 def check_answers() -> list[Result]:
-    """Everybody's distance from us, ours on the automatic mesh; SystemExit where it is too large.
+    """Difference of all programs from our automatic mesh; SystemExit where it is too large.
 
     Relative L2 over 27 frequencies, four drives and 221 points, on two layouts.
     """

@@ -40,7 +40,7 @@ class Plate:
 
 
 class Candidates:
-    """The same plate, solved for a raster of places before the first layout is asked for."""
+    """The same plate, solved for a raster of positions before the first layout."""
 
     def __init__(self, plate: Plate, places: FloatArray, observed: FloatArray) -> None:
         self.places = places

@@ -1,6 +1,6 @@
 """NGSolve: Reissner-Mindlin with order 3 on quadrilaterals, and NGSolve's own sparse solver.
 
-Elements three times as large as asked for, so that it has as many unknowns as the others.
+Elements are three times as large, for as many unknowns as the others have.
 """
 
 import netgen.meshing  # noqa: F401  # NGSolve's mesh class lives there

@@ -59,12 +59,11 @@ class SimulationContext:
             raise InputError(f"amplifier must be one of {known}, got {str(amplifier)[:40]!r}")
         return (self.devices[amplifier],)
 
-
-async def finish_recording(context: SimulationContext) -> str | None:
-    """Write the running recording; returns a message about it, None where there is none."""
-    if context.recorder is None:
-        return None
-    recorder = context.stop_recording()
-    await asyncio.to_thread(recorder.finish)
-    full = " (truncated at its maximum size)" if recorder.is_full else ""
-    return f"wrote {recorder.path}: {recorder.seconds:.1f} s{full}"
+    async def finish_recording(self) -> str | None:
+        """Write the running recording; returns a message about it, None where there is none."""
+        if self.recorder is None:
+            return None
+        recorder = self.stop_recording()
+        await asyncio.to_thread(recorder.finish)
+        full = " (truncated at its maximum size)" if recorder.is_full else ""
+        return f"wrote {recorder.path}: {recorder.seconds:.1f} s{full}"

@@ -16,7 +16,7 @@ from model.finger.load import FingerLoad
 from model.rig.rig import Rig
 from sim.bench.bench import Bench, keep_time
 from sim.bench.simulated_device import SimulatedDevice
-from sim.control.context import SimulationContext, finish_recording
+from sim.control.context import SimulationContext
 from sim.control.server import control_socket
 from sim.far_ends.wire_assignment import WireAssignment
 from sim.far_ends.wires import open_wires
@@ -86,7 +86,7 @@ async def run_simulation(
     try:
         await _serve(simulation, context, ended=ended, ready=ready, view=view)
     finally:
-        message = await finish_recording(context)
+        message = await context.finish_recording()
     return message
 
 

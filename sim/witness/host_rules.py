@@ -7,9 +7,8 @@ from collections.abc import Collection, Hashable, Mapping
 
 from sim.witness.amplifier_session import AmplifierSession
 from sim.witness.config import TimeLimits
-from sim.witness.deadlines import Deadlines
+from sim.witness.deadlines import Deadlines, KnownInputs
 from sim.witness.decoded import WATCHDOG_FEEDING, ChannelCommand, Request, RequestKind
-from sim.witness.known_inputs import KnownInputs
 from sim.witness.set_rules import ExpectedSets, check_envelope, check_set
 
 _REORDER_WINDOW = 0.020  # s; of two commands given within it the earlier may still be sent first
@@ -114,7 +113,8 @@ class HostRules:
 
     def _check_credit(self, session: AmplifierSession, time: float, request: Request) -> None:
         """Only a silencing request may be sent while another reply is pending."""
-        if self._is_silencing(request):
+        is_silent_set = request.kind is RequestKind.APPLY and not request.vibrates
+        if is_silent_set or request.kind in (RequestKind.STOP, RequestKind.DISARM):
             session.preempted_at = time
             return
         for at, other in session.pending.values():
@@ -270,7 +270,3 @@ class HostRules:
 
     def _vibrates(self, session: AmplifierSession, request: Request) -> bool:
         return any(one.vibrates for one in self._channel_commands(session, request).values())
-
-    def _is_silencing(self, request: Request) -> bool:
-        is_silent_set = request.kind is RequestKind.APPLY and not request.vibrates
-        return is_silent_set or request.kind in (RequestKind.STOP, RequestKind.DISARM)

@@ -97,3 +97,13 @@ def shaped_base(
 
     tone = ShapedTone(frequency, 0.0, start, step, knots)
     return Base(motion, tone.terms(stroke=amplitude))
+
+
+STROKE = 1e-4  # m
+BASES = (
+    faded_base(STROKE, 110.0, 0.3, rise=(0.0, 0.02), fall=(0.07, 0.08)),
+    STILL,
+    faded_base(0.6 * STROKE, 250.0, -1.0, rise=(0.005, 0.015), fall=(0.08, 0.1)),
+    shaped_base(STROKE, 110.0, start=0.0, step=0.005, knots=(0, 0.3, 0.5j, -0.8, 0.4 - 0.2j, 0)),
+)
+"""Ramps on two bases, an envelope on another, and one at rest."""

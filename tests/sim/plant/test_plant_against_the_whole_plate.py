@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfiltfilt
 
-from driven_bases import STILL, Base, faded_base, shaped_base
+from driven_bases import BASES, STILL, STROKE, Base
 from model.arrays import ComplexArray, FloatArray
 from model.fem.assembly import assemble, era_positions
 from model.fem.harmonic import direct_acceleration
@@ -22,7 +22,6 @@ from plate_in_time import apart, lock_in
 from sim.plant.plant import Plant
 from whole_plate import WholePlate, whole_plate
 
-STROKE = 1e-4
 RATE = 100_000.0
 FINGER = FingerLoad()
 FIRST, SECOND, MOVED = FINGER.at(0.11, 0.07), FINGER.at(0.25, 0.15), FINGER.at(0.19, 0.12)
@@ -33,12 +32,6 @@ COMING_AND_GOING: list[tuple[float, list[PointLoad]]] = [
     (0.085, [MOVED]),
     (0.1, []),
 ]
-BASES = (
-    faded_base(STROKE, 110.0, 0.3, rise=(0.0, 0.02), fall=(0.07, 0.08)),
-    STILL,
-    faded_base(0.6 * STROKE, 250.0, -1.0, rise=(0.005, 0.015), fall=(0.08, 0.1)),
-    shaped_base(STROKE, 110.0, start=0.0, step=0.005, knots=(0, 0.3, 0.5j, -0.8, 0.4 - 0.2j, 0)),
-)
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import simpson
 
-from driven_bases import STILL, faded_base, shaped_base
+from driven_bases import BASES
 from finger_energy import held_by_fingers
 from model.fem.assembly import era_positions
 from model.finger.load import finger_loads
@@ -18,17 +18,8 @@ from model.structure.point_load import PointLoad, load_positions
 from paper_plate import make_paper_rig
 from sim.plant.plant import Plant
 
-STROKE = 1e-4
 KNOTS_APART = 0.005  # s
 STEP = 1e-5  # s; the fastest motion of the reduced plate has some twenty of them in a period
-BASES = (
-    faded_base(STROKE, 110.0, 0.3, rise=(0.0, 0.02), fall=(0.07, 0.08)),
-    STILL,
-    faded_base(0.6 * STROKE, 250.0, -1.0, rise=(0.005, 0.015), fall=(0.08, 0.1)),
-    shaped_base(
-        STROKE, 110.0, start=0.0, step=KNOTS_APART, knots=(0, 0.3, 0.5j, -0.8, 0.4 - 0.2j, 0)
-    ),
-)
 FINGERS = finger_loads([(0.11, 0.07), (0.25, 0.15), (0.3048, 0.1)])
 PERIODS: list[tuple[float, Sequence[PointLoad]]] = [
     (0.03, []),

@@ -9,18 +9,16 @@ import pytest
 
 from drivers import clock
 from drivers.amplifier import Amplifier
-from drivers.command import CommandSet, DriveCommand
 from drivers.errors import LinkError
-from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.protocol.messages import AmplifierState, Status
 from drivers.registry import open_backend
 from memory_machine import live_in_memory
-from model.rig.rig import Channel, Rig
+from model.rig.rig import Rig
 from reconnection import reconnect
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time
-from wires import SHARED_WIRES, FarSide, far_side, patient
+from wires import SHARED_WIRES, FarSide, far_side, on_two_amplifiers, patient, tones
 
 
 @pytest.fixture(params=list(SHARED_WIRES))
@@ -32,12 +30,7 @@ def wire(request: pytest.FixtureRequest) -> Wire:
 @pytest.fixture
 def two_amplifiers(coarse_rig: Rig) -> Rig:
     """The paper's plate with its ERAs on two amplifiers."""
-    wiring = {
-        name: Channel("west" if number % 2 else "east", number // 2)
-        for number, name in enumerate(coarse_rig.wiring)
-    }
-    urls = {"east": "sim://", "west": "sim://"}
-    return replace(coarse_rig, wiring=wiring, amplifiers=urls)
+    return on_two_amplifiers(coarse_rig)
 
 
 @pytest.fixture
@@ -70,13 +63,6 @@ async def amplifiers(far: FarSide) -> AsyncIterator[dict[str, Amplifier]]:
         yield both
 
 
-def tone(amplifier: Amplifier, level: float, token: int) -> SafeCommandSet:
-    """A set on channel 0 under a token."""
-    guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifier.capabilities)
-    wanted = CommandSet(token, (DriveCommand(0, 110.0, level),), ramp=0.0, valid_for=0.0)
-    return guard.check(wanted)
-
-
 async def test_amplifiers_on_one_line_reply_for_themselves(
     amplifiers: dict[str, Amplifier],
 ) -> None:
@@ -86,8 +72,8 @@ async def test_amplifiers_on_one_line_reply_for_themselves(
     east, west = amplifiers["east"], amplifiers["west"]
     assert east.bus is not None
     assert east.bus == west.bus
-    await east.apply(tone(east, 0.2, 1))
-    await west.apply(tone(west, 0.4, 1))
+    await east.apply(tones(east, 0.2, token=1))
+    await west.apply(tones(west, 0.4, token=1))
     assert (await east.status()).levels[0] == pytest.approx(0.2)
     assert (await west.status()).levels[0] == pytest.approx(0.4)
 
@@ -143,7 +129,7 @@ async def test_broadcast_commit_starts_all_together(
 ) -> None:
     """Both play their staged sets, from moments within 5 ms."""
     for name, level in (("east", 0.2), ("west", 0.4)):
-        await amplifiers[name].stage(tone(amplifiers[name], level, 7))
+        await amplifiers[name].stage(tones(amplifiers[name], level, token=7))
     assert not any((await amplifiers["west"].status()).levels)
     begin = asyncio.get_running_loop().time()
     await amplifiers["east"].commit_on_bus(7)
@@ -182,7 +168,7 @@ async def test_stop_does_not_wait_for_a_stuck_amplifier(
 async def test_broadcast_stop_silences_all(amplifiers: dict[str, Amplifier]) -> None:
     """A broadcast stop has no reply and latches in both."""
     for amplifier in amplifiers.values():
-        await amplifier.apply(tone(amplifier, 0.3, 1))
+        await amplifier.apply(tones(amplifier, 0.3, token=1))
     await amplifiers["west"].stop_on_bus(0.0)
     for amplifier in amplifiers.values():
         status = await amplifier.status()

@@ -5,16 +5,13 @@ In virtual time, at any moment between two frames; requests are recorded in the 
 
 import asyncio
 from collections.abc import Callable, Coroutine
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import pytest
 
 from drivers.amplifier import Amplifier
-from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused
-from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.protocol.messages import (
     AmplifierState,
     Apply,
@@ -29,11 +26,11 @@ from drivers.protocol.messages import (
 )
 from drivers.registry import open_backend
 from memory_machine import live_in_memory
-from model.rig.rig import Channel, Rig
+from model.rig.rig import Rig
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import run_virtual
-from wires import FarSide, far_side
+from wires import FarSide, far_side, on_two_amplifiers, tones
 
 LINES = {
     "serial": Wire("serial", speed=115_200, shared=True),
@@ -82,25 +79,14 @@ class Chain:
             await one.clear()
             await one.arm(2.0)
 
-    def tone(self, amplifier: Amplifier, token: int, level: float = 0.3) -> SafeCommandSet:
-        guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifier.capabilities)
-        commands = (DriveCommand(0, 110.0, level),)
-        return guard.check(CommandSet(token, commands, ramp=0.0, valid_for=0.0))
-
 
 def on_a_line(line: str, rig: Rig, use: Callable[[Chain], Coroutine[Any, Any, None]]) -> None:
     """Use both amplifiers in virtual time, on a line that is silent at first."""
-    wiring = {
-        era: Channel("west" if number % 2 else "east", number // 2)
-        for number, era in enumerate(rig.wiring)
-    }
-    two = replace(rig, wiring=wiring, amplifiers={"east": "sim://", "west": "sim://"})
-
     chain = Chain()
 
     async def run() -> None:
         live_in_memory()
-        async with far_side({**LINES, **BUSES}[line], two) as far:
+        async with far_side({**LINES, **BUSES}[line], on_two_amplifiers(rig)) as far:
             for name, device in far.devices.items():
                 device.exchange = partial(  # type: ignore[method-assign]
                     note, chain.asked, name, device.exchange
@@ -138,8 +124,8 @@ async def refused(task: "asyncio.Task[Any]") -> None:
 
 SENDING: dict[str, Callable[[Chain], Coroutine[Any, Any, object]]] = {
     "clear": lambda chain: chain.east.clear(),
-    "stage": lambda chain: chain.east.stage(chain.tone(chain.east, 7)),
-    "apply": lambda chain: chain.east.apply(chain.tone(chain.east, 7)),
+    "stage": lambda chain: chain.east.stage(tones(chain.east, 0.3, token=7)),
+    "apply": lambda chain: chain.east.apply(tones(chain.east, 0.3, token=7)),
     "heartbeat": lambda chain: chain.east.heartbeat(),
     "commit for all": lambda chain: chain.east.commit_on_bus(7),
 }
@@ -193,7 +179,7 @@ def test_queued_stop_reserves_the_line(line: str, coarse_rig: Rig) -> None:
     async def use(chain: Chain) -> None:
         beat = asyncio.create_task(chain.west.heartbeat())
         await asyncio.sleep(0.0005)
-        waiting = asyncio.create_task(chain.east.apply(chain.tone(chain.east, 7)))
+        waiting = asyncio.create_task(chain.east.apply(tones(chain.east, 0.3, token=7)))
         await asyncio.sleep(0.0005)
         await chain.west.stop()
         await beat
@@ -220,15 +206,15 @@ def test_stop_class_request_is_the_next_frame_at_any_moment(
                 asyncio.create_task(one())
                 for one in (
                     chain.west.heartbeat,
-                    partial(chain.east.apply, chain.tone(chain.east, tokens["east"])),
+                    partial(chain.east.apply, tones(chain.east, 0.3, token=tokens["east"])),
                     chain.east.heartbeat,
-                    partial(chain.west.apply, chain.tone(chain.west, tokens["west"])),
+                    partial(chain.west.apply, tones(chain.west, 0.3, token=tokens["west"])),
                 )
             ]
             await asyncio.sleep(moment)
             sent = chain.frames
             if silencing is Apply:
-                await amplifier.apply(chain.tone(amplifier, 1000 + number, level=0.0))
+                await amplifier.apply(tones(amplifier, 0.0, token=1000 + number))
             else:
                 await (amplifier.stop(0.0) if silencing is Stop else amplifier.disarm(0.0))
             await asyncio.gather(*others, return_exceptions=True)
@@ -255,7 +241,7 @@ def test_stop_preempts_a_request_in_the_rtu_gap(whose: str, coarse_rig: Rig) -> 
 
     async def use(chain: Chain) -> None:
         await chain.west.heartbeat()
-        staged = asyncio.create_task(chain.east.stage(chain.tone(chain.east, 7)))
+        staged = asyncio.create_task(chain.east.stage(tones(chain.east, 0.3, token=7)))
         await asyncio.sleep(RTU_GAP / 2)
         begin = asyncio.get_running_loop().time()
         amplifier = {"east": chain.east, "west": chain.west}[whose]
@@ -282,7 +268,7 @@ def test_stop_precedes_other_stop_class_requests(line: str, what: str, coarse_ri
             chain.forget()
             beat = asyncio.create_task(chain.west.heartbeat())
             await asyncio.sleep(0.0005)
-            silent = chain.east.apply(chain.tone(chain.east, 7, 0.0))
+            silent = chain.east.apply(tones(chain.east, 0.0, token=7))
             waiting = asyncio.create_task(chain.east.disarm() if what == "disarm" else silent)
             if what == "disarm":
                 silent.close()
@@ -400,7 +386,7 @@ def test_stop_precedes_retries_of_stop_class_requests(
         silent = (
             chain.east.disarm()
             if silencing is Disarm
-            else chain.east.apply(chain.tone(chain.east, 7, 0.0))
+            else chain.east.apply(tones(chain.east, 0.0, token=7))
         )
         waiting = asyncio.create_task(silent)
         await asyncio.sleep(0.004)  # it is sent

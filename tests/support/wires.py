@@ -5,10 +5,13 @@ The far ends run in the test's own event loop, so that a test can look into the 
 
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from drivers import clock
-from model.rig.rig import Rig
+from drivers.amplifier import Amplifier
+from drivers.command import CommandSet, DriveCommand
+from drivers.guard import Guard, GuardLimits, SafeCommandSet
+from model.rig.rig import Channel, Rig
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.bench.bench import Bench
 from sim.bench.simulated_device import SimulatedDevice
@@ -98,3 +101,21 @@ PROCESS_WIRES: Mapping[str, Sequence[str]] = {
     "can+slcan": ["--slcan"],
 }
 """The same as options of `era sim`, for a far end that is a process of its own."""
+
+
+def on_two_amplifiers(rig: Rig) -> Rig:
+    """Wire the ERAs of a rig to two amplifiers, east and west, in turn."""
+    wiring = {
+        era: Channel("west" if number % 2 else "east", number // 2)
+        for number, era in enumerate(rig.wiring)
+    }
+    return replace(rig, wiring=wiring, amplifiers={"east": "sim://", "west": "sim://"})
+
+
+def tones(amplifier: Amplifier, *levels: float, token: int | None = None) -> SafeCommandSet:
+    """Make a set at 110 Hz with these levels, from channel 0 on."""
+    guard = Guard(GuardLimits(20.0, 600.0, 1.0), amplifier.capabilities)
+    commands = tuple(DriveCommand(channel, 110.0, level) for channel, level in enumerate(levels))
+    return guard.check(
+        CommandSet(token or amplifier.next_token(), commands, ramp=0.0, valid_for=0.0)
+    )

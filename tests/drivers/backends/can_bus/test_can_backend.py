@@ -24,7 +24,7 @@ from drivers.codec.can_bus.frame import CanFrame
 from drivers.codec.can_bus.objects import index_of
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout
-from drivers.guard import Guard, GuardLimits, SafeCommandSet
+from drivers.guard import Guard, GuardLimits
 from drivers.protocol.messages import AmplifierEvent, AmplifierState, Apply, Arm, Fault, Hello, Ping
 from model.rig.rig import Rig
 from sim.bench.bench import Bench
@@ -35,7 +35,7 @@ from sim.far_ends.can_bus.ends import nodes_on
 from sim.far_ends.can_bus.node import CanNode
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultWindow
-from wires import FarSide, far_side, patient
+from wires import FarSide, far_side, patient, tones
 
 PATIENCE = 5.0  # s; for a busy machine
 _NUMBERS = itertools.count()
@@ -133,17 +133,6 @@ async def opened(url: str, *, reply_timeout: float = 0.5) -> AsyncIterator[Ampli
         await amplifier.close()
 
 
-def tones(amplifier: Amplifier, *levels: float, onset: int = 0) -> SafeCommandSet:
-    """A set at 110 Hz, a level for each channel from 0 on."""
-    guard = Guard(LIMITS, amplifier.capabilities)
-    if onset:
-        guard.check_envelope(SHAPE)
-    commands = tuple(
-        DriveCommand(channel, 110.0, level, onset=onset) for channel, level in enumerate(levels)
-    )
-    return guard.check(CommandSet(amplifier.next_token(), commands, ramp=0.0, valid_for=0.0))
-
-
 SHAPE = Envelope(7, 0.005, tuple(Knot(0.01 * number, 10.0 * number) for number in range(32)))
 
 
@@ -228,8 +217,9 @@ async def test_envelope_is_loaded_in_blocks_or_segments(
         assert (kept.step, len(kept.knots)) == (0.005, 32)
         assert kept.knots[31] == Knot(0.31, -50.0)
         await amplifier.arm(2.0)
-        achieved = await amplifier.apply(tones(amplifier, 0.5, onset=7))
-        assert achieved.commands[0].onset == 7
+        command = DriveCommand(0, 110.0, 0.5, onset=7)
+        wanted = CommandSet(1, (command,), ramp=0.0, valid_for=0.0)
+        assert (await amplifier.apply(guard.check(wanted))).commands[0].onset == 7
 
 
 @pytest.mark.parametrize("ends", ["refused", "taken"])

@@ -1,8 +1,7 @@
-"""Disturbances of the daemon's process: paused, starved, without disk or descriptors, clock jumps.
+"""Faults of the daemon's process: paused, starved, no disk space or descriptors, clock jumps.
 
-Over a pseudo-terminal to a far end in the test's process, whose amplifier's clock is that of all.
-Silence is asked for each time; that it plays on, where that is meant, only of the best of some
-tries: a machine that others use can take the processor from the amplifier, too.
+The far end runs in the test's process with the same clock. Silence must be in time at each try; of
+continued playing the best of several tries counts, since a busy machine delays the amplifier, too.
 """
 
 import asyncio
@@ -24,7 +23,7 @@ from best_of import best_of
 from controller.api.async_client import AsyncClient
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
-from daemon_bench import PATIENCE, far_end, until, until_state
+from daemon_bench import PATIENCE, READY, far_end, holding, until, until_state
 from daemon_process import (
     REACTION,
     WATCHDOG,
@@ -32,7 +31,6 @@ from daemon_process import (
     armed,
     daemon_process,
     disarmed,
-    holding,
     play,
     plays_on,
     ready,
@@ -51,7 +49,7 @@ pytestmark = pytest.mark.alone
 
 @asynccontextmanager
 async def held(folder: Path, more: str = "", **options: object) -> AsyncIterator["Held"]:
-    """A daemon that plays for a finger, and a journal of what its amplifier is asked."""
+    """A daemon that plays for a finger, and a journal of its amplifier's requests."""
     async with far_end(folder) as far, daemon_process(folder, far, more, **options) as daemon:
         journal = Journal(far)
         async with await daemon.client() as era, holding(era):
@@ -60,25 +58,25 @@ async def held(folder: Path, more: str = "", **options: object) -> AsyncIterator
 
 
 class Held:
-    """What such a test needs."""
+    """A playing daemon with client and journal."""
 
     def __init__(self, daemon: DaemonProcess, era: AsyncClient, journal: Journal) -> None:
         self.daemon, self.era, self.journal = daemon, era, journal
         self.far, self.pid = daemon.far, daemon.process.pid
 
     async def plays_on(self, what: str, *, seconds: float = 0.6) -> float:
-        """The widest gap [s] between signs of life while it plays for a while."""
+        """Measure the widest gap [s] between signs of life while it plays."""
         return await plays_on(what, self.daemon, self.era, self.journal, seconds=seconds)
 
     def silent_in_time(self) -> bool:
-        """Whether all was silent within the watchdog's time of the last sign of life."""
+        """Whether all was silent within the watchdog time after the last sign of life."""
         fed = self.journal.last_fed("main")
         return silent_from(self.far) - fed <= WATCHDOG + REACTION + 1e-9
 
 
 @asynccontextmanager
 async def running(program: str) -> AsyncIterator[None]:
-    """A Python program in a process of its own, killed with the context."""
+    """Run a Python program as a process until the context ends."""
     process = await asyncio.create_subprocess_exec(sys.executable, "-c", program)
     try:
         yield
@@ -88,25 +86,24 @@ async def running(program: str) -> AsyncIterator[None]:
 
 
 def threads(pid: int) -> list[int]:
-    """Those of a process."""
+    """Return the thread ids of a process."""
     return [int(name) for name in os.listdir(f"/proc/{pid}/task")]  # noqa: PTH208
 
 
 def limited(pid: int, what: int, limit: int) -> tuple[int, int]:
-    """Set a running process a limit, which can be lifted again; the one before."""
+    """Set a soft limit of a running process; return the previous limits."""
     return resource.prlimit(pid, what, (limit, resource.prlimit(pid, what)[1]))
 
 
 def descriptors(pid: int) -> list[int]:
-    """Those that a process has open."""
+    """Return the open descriptors of a process."""
     return [int(name) for name in os.listdir(f"/proc/{pid}/fd")]  # noqa: PTH208
 
 
-async def test_paused_for_longer_than_the_watchdog_nothing_old_is_replayed(tmp_path: Path) -> None:
-    """SIGSTOP: silent in time; resumed, not one set is sent, whatever has queued up meanwhile.
+async def test_daemon_replays_nothing_when_paused_longer_than_watchdog(tmp_path: Path) -> None:
+    """SIGSTOP: silent in time; resumed it sends no set, not even after clear and arm.
 
-    Neither what was being played, nor the touches that came over UDP and the socket while none
-    was read, nor after it was acknowledged and armed again: those fingers are gone.
+    Neither the previous pattern nor one for touches that were queued meanwhile is played.
     """
     port = free_port()
     async with far_end(tmp_path) as far, daemon_process(tmp_path, far, panel(port)) as daemon:
@@ -127,15 +124,15 @@ async def test_paused_for_longer_than_the_watchdog_nothing_old_is_replayed(tmp_p
             os.kill(daemon.process.pid, signal.SIGCONT)
             await until_state(era, "FAULT")
             await ready(era)
-            await journal.hear(5)  # for longer than any of those fingers stays without news
+            await journal.hear(5)  # longer than the timeout of those contacts
             await armed(era)
             await journal.hear(10)
             assert not journal.raising_since(resumed)
             assert loudness(far) == 0
 
 
-async def test_paused_for_a_moment_a_finger_that_is_gone_is_not_felt(tmp_path: Path) -> None:
-    """SIGSTOP for 120 ms, within which a finger comes and goes: nothing is ever played for it."""
+async def test_daemon_plays_nothing_for_touch_during_short_pause(tmp_path: Path) -> None:
+    """SIGSTOP for 120 ms, within which a finger comes and goes."""
     port = free_port()
     async with far_end(tmp_path) as far, daemon_process(tmp_path, far, panel(port)) as daemon:
         journal = Journal(far)
@@ -153,8 +150,8 @@ async def test_paused_for_a_moment_a_finger_that_is_gone_is_not_felt(tmp_path: P
             assert not journal.raising_since(begin)
 
 
-async def test_a_wall_clock_that_jumps_is_not_noticed(tmp_path: Path) -> None:
-    """By a day, back, by less than a lease, by years: it plays on, and a lease lasts as it says."""
+async def test_daemon_ignores_jumps_of_wall_clock(tmp_path: Path) -> None:
+    """By a day, back, by less than a lease, by years: it plays on, and leases keep their time."""
     program = (sys.executable, "-P", jumping_clock.__file__)
     environment = {"PYTHONPATH": str(Path(jumping_clock.__file__).parent)}
     async with held(tmp_path, program=program, environment=environment) as test:
@@ -169,22 +166,22 @@ async def test_a_wall_clock_that_jumps_is_not_noticed(tmp_path: Path) -> None:
             assert 0 < 60 - status.lease_left_s <= time.monotonic() - begin + 60
             assert not status.rejected_touches
         await disarmed(test.era)
-        for _ in range(5):  # a machine that is busy may lose the link instead
+        for _ in range(5):  # a busy machine may lose the link instead
             await ready(test.era)
             begin = time.monotonic()
             await test.era.arm("test", lease_s=1)
             os.kill(test.pid, signal.SIGUSR1)
-            await until_state(test.era, "READY_TO_SWITCH_ON", "FAULT", "COMM_LOST")
+            await until_state(test.era, READY, "FAULT", "COMM_LOST")
             lasted = time.monotonic() - begin
-            if (await test.era.status()).state == "READY_TO_SWITCH_ON":
+            if (await test.era.status()).state == READY:
                 break
         assert 1.0 <= lasted < PATIENCE
 
 
-async def test_a_full_disk_costs_log_lines_and_nothing_else(tmp_path: Path) -> None:
-    """No file may grow any more: it plays on, stops at a fault, is cleared and armed again.
+async def test_daemon_loses_only_log_lines_when_disk_is_full(tmp_path: Path) -> None:
+    """It plays on, stops at a fault and can be armed again; no partial dump is left.
 
-    Not even half a dump is left; once there is room, the log goes on.
+    Once there is space, the log continues.
     """
     more = "log: {file: era.log}\ndumps: {folder: dumps}\n"
     async with far_end(tmp_path) as far, daemon_process(tmp_path, far, more, waits=False) as daemon:
@@ -209,11 +206,8 @@ async def test_a_full_disk_costs_log_lines_and_nothing_else(tmp_path: Path) -> N
             await until(lambda: (tmp_path / "era.log").stat().st_size > size)
 
 
-async def test_a_starved_daemon_plays_on_or_is_silent_but_replays_nothing(tmp_path: Path) -> None:
-    """The lowest priority on a processor that four others keep busy; its finger lifts meanwhile.
-
-    Whatever came of it, silence came, and nothing is played for that finger afterwards.
-    """
+async def test_daemon_replays_nothing_when_starved(tmp_path: Path) -> None:
+    """At the lowest priority beside four busy processes the last finger lifts: silence follows."""
     processor = max(os.sched_getaffinity(0))
     busy = f"import os; os.sched_setaffinity(0, {{{processor}}})\nwhile True: pass"
     async with far_end(tmp_path) as far, daemon_process(tmp_path, far) as daemon:
@@ -233,14 +227,14 @@ async def test_a_starved_daemon_plays_on_or_is_silent_but_replays_nothing(tmp_pa
                 await until(lambda: loudness(far) == 0)
                 silent = time.monotonic()
             await until(lambda: len(journal.since(silent)) > 5)
-            assert len(journal.raising_since(lifted)) <= 1  # which was under way
+            assert len(journal.raising_since(lifted)) <= 1  # already under way
             assert not journal.raising_since(silent)
             if far.amplifier.fault is Fault.WATCHDOG:
                 assert silent_from(far) - journal.last_fed("main") <= WATCHDOG + REACTION + 1e-9
 
 
-async def test_without_descriptors_it_plays_on_and_is_stopped(tmp_path: Path) -> None:
-    """None is left while armed, and clients queue up: it plays on, and a client stops it."""
+async def test_daemon_plays_on_and_stops_without_descriptors(tmp_path: Path) -> None:
+    """A connected client stops it; with descriptors again, new clients connect."""
     async with held(tmp_path, "dumps: {folder: dumps}\n") as test:
         limit = max(descriptors(test.pid)) + 1
         before = limited(test.pid, resource.RLIMIT_NOFILE, limit)
@@ -261,26 +255,23 @@ async def test_without_descriptors_it_plays_on_and_is_stopped(tmp_path: Path) ->
             for each in waiting:
                 each.close()
         await test.plays_on("descriptors again")
-        async with await test.daemon.client() as other:  # again, once there are some
+        async with await test.daemon.client() as other:
             await other.stop()
 
 
-async def test_hangups_in_a_loop_change_nothing(tmp_path: Path) -> None:
-    """Two hundred SIGHUPs: it plays on, reads fewer times than it is asked to, and the last counts.
-
-    What has changed just before the last one is taken over; no descriptor is left open.
-    """
+async def test_daemon_combines_reloads_when_many_are_requested(tmp_path: Path) -> None:
+    """During 200 SIGHUPs it plays on and leaks no descriptor; the last change is applied."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         environment = {"NOTIFY_SOCKET": str(tmp_path / "notify")}
-        heard: list[bytes] = []
+        notices: list[bytes] = []
 
-        def hear() -> None:
-            said = manager.recv(4096)
-            if said.startswith((b"READY", b"RELOADING")):
-                heard.append(said)
+        def receive() -> None:
+            notice = manager.recv(4096)
+            if notice.startswith((b"READY", b"RELOADING")):
+                notices.append(notice)
 
-        asyncio.get_running_loop().add_reader(manager, hear)
+        asyncio.get_running_loop().add_reader(manager, receive)
         async with held(tmp_path, environment=environment) as test:
             before = len(descriptors(test.pid))
 
@@ -297,26 +288,26 @@ async def test_hangups_in_a_loop_change_nothing(tmp_path: Path) -> None:
             await hanging_up
             await until(lambda: len(descriptors(test.pid)) <= before)
             quiet = False
-            while not quiet:  # the last reading is over
-                seen = len(heard)
+            while not quiet:  # the last reload has ended
+                count = len(notices)
                 await asyncio.sleep(0.5)
-                quiet = seen == len(heard) and heard[-1].startswith(b"READY")
+                quiet = count == len(notices) and notices[-1].startswith(b"READY")
             await disarmed(test.era)
             await armed(test.era)
             lasts = (await test.era.status()).lease_left_s
             assert lasts is not None
             assert lasts <= 5
         asyncio.get_running_loop().remove_reader(manager)
-    assert 1 <= sum(b"RELOADING=1" in each for each in heard) <= 100
+    assert 1 <= sum(b"RELOADING=1" in each for each in notices) <= 100
 
 
 @pytest.mark.parametrize(
     ("number", "changes"), [(signal.SIGTERM, ()), (signal.SIGINT, TWO_AMPLIFIERS)]
 )
-async def test_told_to_end_it_ramps_down_reads_back_and_disarms(
+async def test_daemon_ramps_down_reads_back_and_disarms_when_terminated(
     tmp_path: Path, number: signal.Signals, changes: Sequence[tuple[str, str]]
 ) -> None:
-    """SIGTERM while playing: zero along 50 ms, read back, high voltage off; exit 0 within 1 s."""
+    """While playing: zero along 50 ms, read back, high voltage off; exit status 0 within 1 s."""
     rig = load_rig(write_rig(tmp_path / "bench.yaml", *changes))
 
     async def attempt() -> float:
@@ -341,7 +332,7 @@ async def test_told_to_end_it_ramps_down_reads_back_and_disarms(
                 after = [entry for entry in asked if entry.time >= end.time][1:]
                 assert isinstance(after[0].request, GetStatus)
                 silent = next(entry for entry in after if not any(entry.levels))
-                assert isinstance(silent.request, GetStatus)  # it was read back before disarming
+                assert isinstance(silent.request, GetStatus)  # read back before disarming
                 assert isinstance(after[-1].request, Disarm)
                 assert far.devices[name].status().state is AmplifierState.SWITCH_ON_DISABLED
             return took
@@ -349,8 +340,8 @@ async def test_told_to_end_it_ramps_down_reads_back_and_disarms(
     await best_of(f"from {number.name} to the exit", attempt, 1.0)
 
 
-async def test_told_to_end_over_a_dead_link_it_ends_all_the_same(tmp_path: Path) -> None:
-    """The amplifier hangs: exit within 1 s, and the amplifier silences itself in time."""
+async def test_daemon_exits_when_terminated_over_dead_link(tmp_path: Path) -> None:
+    """Within 1 s, and the amplifier silences itself in time."""
 
     async def attempt() -> float:
         async with held(tmp_path) as test:
@@ -367,11 +358,8 @@ async def test_told_to_end_over_a_dead_link_it_ends_all_the_same(tmp_path: Path)
 
 
 @pytest.mark.parametrize("wire", ["serial", "modbus+tcp", "can+slcan"])  # links alone: all
-async def test_a_cut_cable_is_told_in_time(tmp_path: Path, wire: str) -> None:
-    """Clients hear COMM_LOST within three heartbeats of the cut; the amplifier is silent in time.
-
-    Plugged in again the daemon finds it by itself, and stays disarmed.
-    """
+async def test_cut_cable_is_reported_in_time(tmp_path: Path, wire: str) -> None:
+    """Clients get COMM_LOST within three heartbeats; reconnected, the daemon stays disarmed."""
     rig = load_rig(write_rig(tmp_path / "bench.yaml"))
     async with far_side(WIRES[wire], rig) as far, daemon_process(tmp_path, far) as daemon:
         journal = Journal(far)
@@ -383,8 +371,8 @@ async def test_a_cut_cable_is_told_in_time(tmp_path: Path, wire: str) -> None:
                 cut = time.monotonic()
                 far.device.inject_fault(FaultWindow("unplug"))
                 async with asyncio.timeout(20):
-                    async for told in era.events():
-                        if told.topic == "state" and told.data["new"] == "COMM_LOST":
+                    async for event in era.events():
+                        if event.topic == "state" and event.data["new"] == "COMM_LOST":
                             break
                 await era.unsubscribe("state")
                 await until(lambda: not energised(far))
@@ -392,6 +380,6 @@ async def test_a_cut_cable_is_told_in_time(tmp_path: Path, wire: str) -> None:
                 far.device.recover()
                 await until_state(era, "FAULT")
                 assert loudness(far) == 0
-                return told.time - cut
+                return event.time - cut
 
             await best_of(f"from the cut to COMM_LOST at a client, {wire}", attempt, 0.150)

@@ -1,8 +1,4 @@
-"""`era daemon` as users run it: a process over a pseudo-terminal, with signals, locks and its end.
-
-The far end is in the test's own process, so that its amplifier's clock can be read: it is
-time.monotonic(), the same for all processes.
-"""
+"""`era daemon` as a process over a pseudo-terminal: commands, locks, notices, children."""
 
 import asyncio
 import contextlib
@@ -27,8 +23,8 @@ from drivers.protocol.messages import AmplifierState
 from model.table.file import save_table
 
 
-async def test_a_second_daemon_is_refused_and_disturbs_nothing(tmp_path: Path) -> None:
-    """Exit status 2 and the first one's number; the first plays on all the while."""
+async def test_second_daemon_is_refused_while_first_plays_on(tmp_path: Path) -> None:
+    """Exit status 2 with the process id of the first; 3 at another socket over the same link."""
     async with (
         far_end(tmp_path) as far,
         daemon_process(tmp_path, far) as daemon,
@@ -37,7 +33,6 @@ async def test_a_second_daemon_is_refused_and_disturbs_nothing(tmp_path: Path) -
         status, _, err = await run_era("daemon", tmp_path / "daemon.yaml")
         assert status == 2
         assert f"process {daemon.process.pid}" in err
-        # At another socket the link is what they cannot share.
         text = (tmp_path / "daemon.yaml").read_text("utf-8")
         (tmp_path / "other.yaml").write_text(text.replace("era.sock", "b.sock"), "utf-8")
         status, _, err = await run_era("daemon", tmp_path / "other.yaml")
@@ -47,8 +42,8 @@ async def test_a_second_daemon_is_refused_and_disturbs_nothing(tmp_path: Path) -
         await until(lambda: any(far.device.status().levels))
 
 
-async def test_the_commands_do_what_they_say(tmp_path: Path) -> None:
-    """status, arm, touch, stop, clear, disarm from a shell, with exit statuses and JSON."""
+async def test_commands_control_daemon(tmp_path: Path) -> None:
+    """status, arm, touch, stop, clear and disarm with their exit statuses and JSON."""
     async with far_end(tmp_path) as far, daemon_process(tmp_path, far) as daemon:
         where = ("--socket", daemon.socket)
         status, out, _ = await run_era("status", *where, "--json")
@@ -94,8 +89,8 @@ async def test_the_commands_do_what_they_say(tmp_path: Path) -> None:
     assert str(daemon.socket) in err
 
 
-async def test_systemd_hears_of_it_and_metrics_are_served(tmp_path: Path) -> None:
-    """READY=1 once it serves, WATCHDOG=1 while the loop runs, STOPPING=1; companions end too."""
+async def test_daemon_notifies_systemd_and_serves_metrics(tmp_path: Path) -> None:
+    """READY=1, WATCHDOG=1, RELOADING=1 and STOPPING=1; the metrics process ends with the daemon."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -136,7 +131,7 @@ async def _get(port: int, path: str, *, host: str = "localhost") -> str:
             reader, writer = await asyncio.open_connection("127.0.0.1", port)
             break
         except OSError:
-            assert time.monotonic() < end, "the page is not served"
+            assert time.monotonic() < end, "page not served"
             await asyncio.sleep(0.05)
     writer.write(f"GET {path} HTTP/1.0\r\nHost: {host}\r\n\r\n".encode())
     text = (await asyncio.wait_for(reader.read(), PATIENCE)).decode()
@@ -145,8 +140,8 @@ async def _get(port: int, path: str, *, host: str = "localhost") -> str:
     return text
 
 
-async def test_the_dashboard_is_a_process_that_ends_with_the_daemon(tmp_path: Path) -> None:
-    """`--dashboard` prints where the page is; killed, the daemon leaves no process behind."""
+async def test_dashboard_process_ends_with_killed_daemon(tmp_path: Path) -> None:
+    """`--dashboard` prints the address of the page."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -161,7 +156,7 @@ async def test_the_dashboard_is_a_process_that_ends_with_the_daemon(tmp_path: Pa
             await daemon.process.wait()
             end = time.monotonic() + PATIENCE
             while await _serves(port):
-                assert time.monotonic() < end, "the gateway has outlived its daemon"
+                assert time.monotonic() < end, "gateway outlived its daemon"
 
 
 async def _serves(port: int) -> bool:
@@ -175,10 +170,10 @@ async def _serves(port: int) -> bool:
     return True
 
 
-async def test_check_touches_no_amplifier(
+async def test_check_reads_files_without_amplifier(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """`--check` reads everything that is named: exit status 0, or 2 with what is wrong."""
+    """Exit status 0, or 2 with the invalid file."""
 
     async def check(path: Path) -> int:
         # In a thread, for the command has an event loop of its own.

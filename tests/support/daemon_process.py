@@ -1,6 +1,6 @@
-"""`era daemon` as users run it: a process over real wires, and a client whose finger is felt.
+"""`era daemon` as a process over real wires, and clients whose fingers are felt.
 
-The far end is in the test's own process, so that its amplifier's clock can be read: it is
+The far end runs in the test's own process, so that its amplifier's clock can be read: it is
 time.monotonic(), the same for all processes.
 """
 
@@ -35,16 +35,16 @@ from wires import FarSide
 
 ERA = Path(sys.executable).with_name("era")
 STARTING = 60.0  # s; for a loaded machine
-WATCHDOG, REACTION = 0.25, 0.005  # s; what an amplifier may take to be silent
+WATCHDOG, REACTION = 0.25, 0.005  # s; the longest time of an amplifier to be silent
 
 
 class NotServing(AssertionError):
-    """A daemon has ended before it served: a bug, or no answer in time on a loaded machine."""
+    """A daemon exited before it served: a bug, or no reply in time on a loaded machine."""
 
 
 @dataclass
 class DaemonProcess:
-    """A daemon that serves, or is about to."""
+    """A serving or starting daemon."""
 
     process: asyncio.subprocess.Process
     socket: Path
@@ -52,19 +52,19 @@ class DaemonProcess:
     log: list[dict[str, object]] = field(default_factory=list)
 
     async def client(self) -> AsyncClient:
-        """A client of it."""
+        """Connect a client."""
         return await AsyncClient.connect(self.socket, name="test", timeout=PATIENCE)
 
     async def status(self) -> int:
-        """Its exit status, once it has one."""
+        """Wait for its exit status."""
         return await asyncio.wait_for(self.process.wait(), PATIENCE)
 
     def said(self, text: str) -> bool:
-        """Whether a text stands in its log."""
+        """Whether a text is in its log."""
         return any(text in json.dumps(line) for line in self.log)
 
     async def serves(self) -> None:
-        """Wait until it does; raises NotServing where it ends instead."""
+        """Wait until it serves; raises NotServing if it exits instead."""
         await until(
             lambda: self.said("serving at") or self.process.returncode is not None,
             patience=STARTING,
@@ -85,9 +85,10 @@ async def daemon_process(
     changes: Sequence[tuple[str, str]] = (),
     waits: bool = True,
 ) -> AsyncIterator[DaemonProcess]:
-    """`era daemon` of a file with these further lines; killed with the context at the latest.
+    """Run `era daemon` of a file with these further lines, at most until the context ends.
 
-    program: what stands before `daemon`; changes: of the rig's text; waits: until it serves.
+    program: the command before `daemon`; changes: replacements in the rig's text; waits: until it
+    serves.
     """
     save_table(daemon_table(), folder / "table.npz")
     config = write_daemon(folder, dict(far.urls), f"table: table.npz\n{more}", changes=changes)
@@ -121,7 +122,7 @@ async def _read_log(stream: asyncio.StreamReader, log: list[dict[str, object]]) 
 
 
 async def run_era(*arguments: object) -> tuple[int, str, str]:
-    """Another `era` command: its exit status, and both outputs."""
+    """Run another `era` command; return exit status, stdout and stderr."""
     process = await asyncio.create_subprocess_exec(
         *(ERA, *map(str, arguments)),
         stdin=asyncio.subprocess.DEVNULL,
@@ -135,7 +136,7 @@ async def run_era(*arguments: object) -> tuple[int, str, str]:
 
 @asynccontextmanager
 async def playing(daemon: DaemonProcess) -> AsyncIterator[AsyncClient]:
-    """A client whose finger is felt, for as long as the daemon lives."""
+    """A client with a finger for which the amplifier plays."""
     async with await daemon.client() as era:
         await until_state(era, READY)
         await era.arm("test", lease_s=60)
@@ -144,43 +145,43 @@ async def playing(daemon: DaemonProcess) -> AsyncIterator[AsyncClient]:
 
 
 async def ready(era: AsyncClient) -> None:
-    """Wait until it may be armed; a stop, a loss or a fault is acknowledged, whatever it was."""
+    """Wait until it can be armed; acknowledge any stop, loss or fault."""
     while await until_state(era, READY, "FAULT", "QUICK_STOP_ACTIVE") != READY:
-        with contextlib.suppress(RpcError):  # its cause may not be gone yet
+        with contextlib.suppress(RpcError):  # the cause may persist
             await era.clear()
 
 
 async def disarmed(era: AsyncClient) -> None:
-    """Disarmed and ready; where the link is lost just then, that disarms, too."""
+    """Disarm and wait until ready; a loss of the link disarms as well."""
     with contextlib.suppress(RpcError):
         await era.disarm()
     await ready(era)
 
 
 async def armed(era: AsyncClient) -> None:
-    """Armed; again where the link is lost just then, as it may be on a loaded machine."""
+    """Arm; again after a loss of the link, as may happen on a loaded machine."""
     end = time.monotonic() + STARTING
     while (await era.status()).state != ENABLED:
-        assert time.monotonic() < end, "it cannot be armed"
+        assert time.monotonic() < end, "cannot be armed"
         await ready(era)
         with contextlib.suppress(RpcError):
             await era.arm("test", lease_s=60)
 
 
 async def play(era: AsyncClient, far: FarSide) -> None:
-    """Arm and wait until a resting finger is played for; arm again after a loss."""
+    """Arm and wait until the amplifier plays for a resting finger; again after a loss."""
     end = time.monotonic() + STARTING
     while time.monotonic() < end:
         await armed(era)
         with contextlib.suppress(AssertionError):
             await until(lambda: loudness(far) > 0, patience=2.0)
             return
-    raise AssertionError("nothing is ever played")
+    raise AssertionError("nothing is played")
 
 
 @dataclass
 class Window:
-    """How the daemon did for a while; widest_gap [s]: between two signs of life on the wire."""
+    """Observation of a daemon; widest_gap [s]: between two signs of life on the wire."""
 
     widest_gap: float
     states: set[str]
@@ -189,7 +190,7 @@ class Window:
 async def watch(
     daemon: DaemonProcess, era: AsyncClient, journal: Journal, seconds: float
 ) -> Window:
-    """Look on while fingers are held down."""
+    """Observe the daemon for some seconds while fingers are held down."""
     begin = time.monotonic()
     states = set()
     while time.monotonic() < begin + seconds:
@@ -201,9 +202,9 @@ async def watch(
 async def plays_on(
     what: str, daemon: DaemonProcess, era: AsyncClient, journal: Journal, *, seconds: float = 0.6
 ) -> float:
-    """The widest gap [s] of a while without any loss; best of some, for a machine that is busy.
+    """Return the widest gap [s] of a period without a loss; the best of several tries.
 
-    what: the disturbance, named in the printed figure.
+    what: the disturbance, for the printed figure.
     """
 
     async def attempt() -> float:

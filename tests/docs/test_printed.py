@@ -1,62 +1,13 @@
-"""What counts as printed as shown, and how a page is read."""
+"""What counts as printed as shown, and which pages are refused."""
 
 import re
 from pathlib import Path
 
 import pytest
 
-from page_reader import PORTS, Reader
+from page_reader import PORTS
 from printed import difference
-from typed_page import Edited, Interrupted, PageError, Seen, Typed, Written, read_steps
-
-PAGE = """# A page
-
-Read this.
-
-```sh
-first
-```
-```text
-says 1
-```
-
-<!-- not typed: needs another machine -->
-```sh
-elsewhere
-```
-
-<!-- file: a.yaml -->
-```yaml
-a: 1
-b: 2
-```
-<!-- edit: a.yaml -->
-```diff
- a: 1
--b: 2
-+b: 3
-```
-
-```yaml
-to: read
-```
-
-<!-- terminal: one -->
-```sh
-goes on
-```
-
-<!-- seen in: one -->
-```text
-by and by
-```
-
-<!-- interrupt: one -->
-<!-- status: 2 -->
-```sh
-fails
-```
-"""
+from typed_page import PageError, read_steps
 
 
 @pytest.mark.parametrize(
@@ -101,23 +52,8 @@ def test_difference_has_its_place(shown: str, printed: str, line: str) -> None:
     assert line in (difference(shown, printed) or "")
 
 
-def test_a_page_is_what_its_reader_does(tmp_path: Path) -> None:
-    """Commands with what they print, files, edits, terminals; what is for reading is left out."""
-    page = tmp_path / "page.md"
-    page.write_text(PAGE, encoding="utf-8")
-    assert read_steps(page) == [
-        Typed(5, "first\n", None, 0, "says 1\n"),
-        Written(18, "a.yaml", "a: 1\nb: 2\n"),
-        Edited(23, "a.yaml", "a: 1\nb: 2\n", "a: 1\nb: 3\n"),
-        Typed(34, "goes on\n", "one", 0, None),
-        Seen(39, "one", "by and by\n"),
-        Interrupted(43, "one"),
-        Typed(45, "fails\n", None, 2, None),
-    ]
-
-
 @pytest.mark.parametrize("comment", ["statsu: 1", "edit: a.yaml"])
-def test_a_comment_without_a_meaning_is_refused(tmp_path: Path, comment: str) -> None:
+def test_read_steps_refuses_a_comment_without_a_meaning(tmp_path: Path, comment: str) -> None:
     """One that is misspelt, or stands over the wrong kind of fence, would else go unnoticed."""
     page = tmp_path / "page.md"
     page.write_text(f"<!-- {comment} -->\n```yaml\na: 1\n```\n", encoding="utf-8")
@@ -125,26 +61,7 @@ def test_a_comment_without_a_meaning_is_refused(tmp_path: Path, comment: str) ->
         read_steps(page)
 
 
-def test_a_reader_takes_ports_that_are_free(tmp_path: Path) -> None:
-    """In what is written, typed and shown, as whole numbers alone; all that a page says agrees."""
-    page = tmp_path / "page.md"
-    page.write_text(
-        "<!-- file: a.yaml -->\n```yaml\nurl: tcp://127.0.0.1:5020/1\nelse: 15020 0.5020\n```\n"
-        "```sh\ncat a.yaml; grep -c 127.0.0.1:5020/1 a.yaml\n```\n"
-        "```text\nurl: tcp://127.0.0.1:5020/1\nelse: 15020 0.5020\n1\n```\n",
-        encoding="utf-8",
-    )
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    with Reader(folder, home=tmp_path) as reader:
-        for step in read_steps(page):
-            reader.follow(step)
-    text = (folder / "a.yaml").read_text("utf-8")
-    assert ":5020" not in text
-    assert text.endswith("else: 15020 0.5020\n")
-
-
-def test_readers_know_every_port_that_pages_name() -> None:
+def test_ports_are_those_that_pages_name() -> None:
     """One that was not replaced could be taken by another program."""
     docs = Path(__file__).parents[2] / "docs"
     pages = [*docs.glob("tutorials/*.md"), *docs.glob("how-to/*.md")]

@@ -149,6 +149,18 @@ def test_on_a_full_disk_the_result_of_before_stays(
     assert files(home) == before
 
 
+def until_full(pid: int, limit: int) -> None:
+    """Wait until a file without a name that a process has open is as long as it may be."""
+    end = time.monotonic() + 20
+    while True:
+        for path in Path(f"/proc/{pid}/fd").iterdir():
+            with contextlib.suppress(OSError):
+                if "(deleted)" in str(path.readlink()) and path.stat().st_size >= limit:
+                    return
+        assert time.monotonic() < end, "nothing is recorded"
+        time.sleep(0.01)
+
+
 def test_a_recording_whose_disk_is_full_is_told_and_leaves_nothing(home: Path) -> None:
     """Of `era sim`, at its end: for how long there was room; the plate has vibrated on."""
     (home / "rig.yaml").write_text(RIG, encoding="utf-8")
@@ -162,12 +174,12 @@ def test_a_recording_whose_disk_is_full_is_told_and_leaves_nothing(home: Path) -
         assert process.stdout is not None
         assert "serial://" in process.stdout.readline()
         resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (1024, resource.RLIM_INFINITY))
-        deadline = time.monotonic() + 20
-        while not any(path.stat().st_size >= 1024 for path in home.glob("*run*")):
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=20)
+        try:
+            until_full(process.pid, 1024)
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=20)
+        finally:
+            process.kill()
     assert process.returncode == 2
     assert said.startswith("era: error: run.wav"), said
     assert len(said.splitlines()) == 1

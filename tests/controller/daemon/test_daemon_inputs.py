@@ -12,6 +12,7 @@ from controller.daemon.config import TouchInput
 from controller.daemon.touch_inputs import MAX_SOURCES_PER_CLIENT, ApiTouches, TouchInputs
 from controller.sources.calibration import TouchCalibration
 from controller.sources.touch import Touch, TouchFrame, TouchSource
+from daemon_bench import until
 from model.errors import InputError
 from model.structure.plate import Material, Plate
 
@@ -116,11 +117,11 @@ async def test_inputs_are_replaced_without_disturbing_others(
         for name, url in (("left", "a:"), ("right", "b:"), ("table", "c:"))
     )
     await inputs.replace([one, two])
-    await asyncio.sleep(0.01)
+    await until(lambda: len(frames) == 2 and failed)
     assert frames == ["left:'x\\x1b[2J'", "right:y"]
     assert failed == [("right", "unplugged")]
     await inputs.replace([one, three])
-    await asyncio.sleep(0.01)
+    await until(lambda: len(frames) == 3)
     assert frames[2:] == ["table:z"]
     assert panels["a:"].ended == []
     await inputs.close()

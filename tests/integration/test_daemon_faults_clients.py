@@ -50,7 +50,7 @@ async def test_daemon_plays_on_with_idle_and_unreading_clients(tmp_path: Path) -
                 flood("unreading", daemon.socket, 10),
                 flood("idle", daemon.socket, 2000) as idle,
             ):
-                await plays_on("clients pour in", daemon, era, journal)
+                await plays_on("clients connecting", daemon, era, journal)
                 assert idle.stdout is not None
                 line = await asyncio.wait_for(idle.stdout.readline(), 3 * PATIENCE)
                 assert int(line) == 2000

@@ -107,9 +107,7 @@ async def test_last_lift_is_zero_on_wire_when_touches_flood(tmp_path: Path) -> N
             await disarmed(test.era)
             return silent - float(counts["up_s"])
 
-        await best_of(
-            "from the last finger up to zero on the wire, at 10 kHz", attempt, LIFT_TO_ZERO
-        )
+        await best_of("from the last lift to zero on the wire, at 10 kHz", attempt, LIFT_TO_ZERO)
 
 
 async def test_last_lift_is_zero_on_wire(tmp_path: Path) -> None:
@@ -120,7 +118,7 @@ async def test_last_lift_is_zero_on_wire(tmp_path: Path) -> None:
             await test.played(Touch(1, 0.4, 0.5))
             return -test.send() + await test.silence()
 
-        await best_of("from the last finger up to zero on the wire", attempt, LIFT_TO_ZERO)
+        await best_of("from the last lift to zero on the wire", attempt, LIFT_TO_ZERO)
 
 
 async def test_contact_times_out_when_sender_is_gone(tmp_path: Path) -> None:
@@ -134,7 +132,9 @@ async def test_contact_times_out_when_sender_is_gone(tmp_path: Path) -> None:
             return silent - last if silent - last > CONTACT_TIMEOUT - LIFT_TO_ZERO else -1.0
 
         await best_of(
-            "from the last word of a finger to zero", attempt, CONTACT_TIMEOUT + LIFT_TO_ZERO
+            "from the last frame of a contact to zero on the wire",
+            attempt,
+            CONTACT_TIMEOUT + LIFT_TO_ZERO,
         )
 
 

@@ -36,4 +36,4 @@ def commands_for(rig: Rig, drive: Pattern | Drives) -> dict[str, tuple[DriveComm
     """
     expect_rig(rig)
     sets = route(excitation_of(drive, rig), rig, token=1, ramp=0.0)
-    return {name: asked.commands for name, asked in sets.items()}
+    return {name: command_set.commands for name, command_set in sets.items()}

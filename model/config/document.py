@@ -87,7 +87,7 @@ class Document:
 
 
 def key_name(path: KeyPath) -> str:
-    """A path as people write it: `eras.SW.at[0]`; what could garble a terminal is escaped."""
+    """Format a path as `eras.SW.at[0]`; control characters are escaped."""
     name = ""
     for part in path:
         if isinstance(part, int):
@@ -173,7 +173,7 @@ def _errors_at(source: str, text: str) -> Iterator[None]:
 
 
 class _Refused(Exception):
-    """Something in a file that is more than plain data."""
+    """A part of a file that is not plain data."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
@@ -240,9 +240,9 @@ class _PlainComposer(Composer):
 
 
 class _PlainResolver(VersionedResolver):
-    """Takes words for text unless they are decimal numbers, true, false or null."""
+    """Resolves words to text unless they are decimal numbers, true, false or null."""
 
-    processing_version = (1, 2)  # whatever a %YAML directive says
+    processing_version = (1, 2)  # ignores %YAML directives
 
     def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
         """The tag of a node by its kind and text."""
@@ -253,7 +253,7 @@ class _PlainResolver(VersionedResolver):
 
 
 _PLAIN = ("str", "map", "seq", "bool", "null")
-# A longer number stays text, and is refused as such.
+# Longer numbers stay text, and are refused as such.
 _NUMBER = re.compile(
     r"[-+]?(?:[0-9]{1,18}|(?:\.[0-9]{1,30}|[0-9]{1,30}(?:\.[0-9]{0,30})?)(?:[eE][-+]?[0-9]{1,3})?)"
     r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"

@@ -103,7 +103,7 @@ class Validation(Generic[SectionT]):
             return None
 
     def field(self, path: tuple[str, ...], section: type[Section]) -> Any:
-        """One field of a section if it is valid, whatever its neighbours are; else None."""
+        """One field of a section if it is valid by itself; else None."""
         try:
             return _field_reader(section, path[-1]).validate_python(self._document.value(path))
         except (KeyError, ValidationError):
@@ -187,7 +187,7 @@ def _in_quotes(details: ErrorDetails) -> str:
 
 
 def _no_choice(details: ErrorDetails, expected: str) -> str:
-    """Message for a value that is not among the choices, `'x', 'y' or 'z'` by pydantic."""
+    """Message for a value that is not among the choices, `'x', 'y' or 'z'` of pydantic."""
     choices = expected.replace("'", "")
     meant = did_you_mean(str(details["input"]), re.findall(r"'([^']+)'", expected))
     return f"must be {choices}, got {_shown(details)}" + (f"; {meant.strip()}" if meant else "")

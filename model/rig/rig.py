@@ -109,7 +109,7 @@ def physics_fingerprint(
 ) -> str:
     """SHA-256 over plate, ERAs and masses, which decide the plate's response; not mesh or wiring.
 
-    Rigs with the same fingerprint share localization tables, whatever their material is called.
+    Rigs with the same fingerprint share localization tables, also with other names of materials.
     """
     numbers = asdict(plate)
     del numbers["material"]["name"]

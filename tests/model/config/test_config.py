@@ -16,7 +16,7 @@ class Inner(Section):
 
 
 class Outer(Section):
-    """A section that is made up for these tests, as a daemon's would be."""
+    """A section for these tests."""
 
     parts: dict[str, Inner]
     rate: Annotated[float, Quantity(FREQUENCY, at_least=10, below=20)] = 15.0

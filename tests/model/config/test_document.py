@@ -39,7 +39,7 @@ def test_scalar_is_text_unless_decimal_number_boolean_or_null(tmp_path: Path) ->
 
 @pytest.mark.parametrize("directive", ["", "%YAML 1.1\n---\n"])
 def test_keys_are_text(tmp_path: Path, directive: str) -> None:
-    """A key such as NO stays that word, whatever version of YAML the file names."""
+    """A key such as NO stays that word, also with a directive of YAML 1.1."""
     document = read_document(write(tmp_path, f"{directive}NO: NO\n5: 2\ntrue: 3\n<<: 4\n"))
     assert document.data == {"NO": "NO", "5": 2, "true": 3, "<<": 4}
 
@@ -120,7 +120,7 @@ def test_error_escapes_control_characters_of_a_key(tmp_path: Path) -> None:
 def test_any_content_is_read_or_refused(
     tmp_path_factory: pytest.TempPathFactory, content: bytes | str
 ) -> None:
-    """No file content whatever raises anything but ConfigError."""
+    """No content raises anything but ConfigError."""
     try:
         read_document(write(tmp_path_factory.getbasetemp(), content))
     except ConfigError:

@@ -88,7 +88,7 @@ def test_quantity_refuses_what_is_not_a_value(value: object) -> None:
 
 @given(st.text(max_size=60) | st.text(alphabet="0123456789.eE+-*/^% mkgNsPainHz()", max_size=60))
 def test_quantity_raises_input_error_only(text: str) -> None:
-    """No text whatever raises anything but InputError."""
+    """No text raises anything but InputError."""
     try:
         quantity(text, LENGTH)
     except InputError:

@@ -338,7 +338,7 @@ def test_phased_optimum_is_independent_of_mounts_without_errors(monkeypatch):
 
 @pytest.mark.parametrize("mode", DRIVE_MODES)
 def test_max_sensation_is_reached_and_not_exceeded(mode):
-    """A hair below the loudest level there is a drive; a tenth above there is none."""
+    """Just below the highest level a drive is found, a tenth above none."""
     for places in contact_sets(5, fingers=2, seed=5):
         given = fields_on_plate(places)
         most = max_sensation(given, mode)

@@ -54,14 +54,14 @@ def test_modes_reproduce_table_2(coarse_rig):
 
 @pytest.mark.parametrize("support", CONVERGED)
 def test_modes_of_a_finer_mesh_approach_converged_frequencies(support):
-    """Twelve modes come within 0.5 % of converged at 96x72, whatever holds the plate."""
+    """Twelve modes come within 0.5 % of converged at 96x72, for each support."""
     solved = frequencies(make_paper_rig(96, 72), 12, support)
     np.testing.assert_allclose(solved, CONVERGED[support], rtol=0.005)
 
 
 @pytest.mark.parametrize("support", CONVERGED)
 def test_modes_of_the_auto_mesh_are_converged(support):
-    """Twelve modes of its 10x8 elements of order 5 are within 0.02 %, whatever holds the plate."""
+    """Twelve modes of its 10x8 elements of order 5 are within 0.02 %, for each support."""
     rig = make_paper_rig(12, 9)
     matrices = assemble(rig.plate, Mesh.auto(rig.plate, frequency_max=500.0))
     solved = modes(matrices, 12, support=support, eras=rig.eras).natural_frequencies

@@ -30,7 +30,7 @@ def test_supported_modes_reproduce_table_2(coarse_rig: Rig) -> None:
 
 
 def test_damping_ratio_of_a_rigid_plate_as_by_hand() -> None:
-    """Bouncing has the ratio zeta asked for, tilting nearly sqrt(3) times that.
+    """Bouncing has the ratio zeta, tilting nearly sqrt(3) times that.
 
     Mass m on four corners of k and c = 2 zeta sqrt(k m / 4): bouncing 4 c / (2 sqrt(4 k m)).
     Tilting along a side b has the inertia m (b² + h²) / 12, and k b², c b².

@@ -132,7 +132,7 @@ def test_equivalent_plate_keeps_rigidity_nu_and_mass(bond, frequency):
 
 
 def test_equivalent_plate_of_one_layer_is_that_layer():
-    """Thickness, E, rho and nu come back, whatever the bond."""
+    """Thickness, E, rho and nu of the layer, for each bond."""
     for bond in (Bond.FULL, Bond.NONE):
         plate = of_plate(Laminate((Layer(ALUMINIUM, 1.5e-3),), bond))
         assert plate.thickness == pytest.approx(1.5e-3, rel=1e-9)

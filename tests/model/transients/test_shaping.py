@@ -51,8 +51,22 @@ def robust_weights(plate, frequency, target, quiet):
     return w / np.abs(w).max()
 
 
+def era_errors(rng):
+    """Complex factors (4,) of ERAs with errors of 5 % in gain and 5 degrees in phase."""
+    gains = 1 + 0.05 * rng.standard_normal(4)
+    return gains * np.exp(1j * np.radians(5) * rng.standard_normal(4))
+
+
+def wrong_tones(excitation: Excitation, errors) -> Excitation:
+    """The tones of ERAs with errors, in the order of the names."""
+    return {
+        name: Tone(tone.frequency, tone.amplitude * abs(e), tone.phase + np.angle(e))
+        for (name, tone), e in zip(sorted(excitation.items()), errors, strict=True)
+    }
+
+
 def wrong(envelopes: Envelopes, errors) -> Envelopes:
-    """Envelopes of ERAs whose gain and phase are off, ERA by ERA in the order of the names."""
+    """The envelopes of ERAs with errors, in the order of the names."""
     return {
         name: replace(
             envelopes[name],
@@ -104,14 +118,8 @@ def test_brake_is_robust_to_gain_and_phase_errors(setup):
         for seed in range(12):
             rng = np.random.default_rng(seed)
             excitation = random_excitation(rig, frequency, rng)
-            gains = 1 + 0.05 * rng.standard_normal(4)
-            errors = gains * np.exp(1j * np.radians(5) * rng.standard_normal(4))
-            off = {
-                name: replace(
-                    tone, amplitude=tone.amplitude * abs(e), phase=tone.phase + np.angle(e)
-                )
-                for (name, tone), e in zip(sorted(excitation.items()), errors, strict=True)
-            }
+            errors = era_errors(rng)
+            off = wrong_tones(excitation, errors)
             ending = wrong(shaper.ending(excitation), errors)
             left.append(transients.residual_db(off, shaped(ending, rig.eras)))
         assert np.median(left) < wanted
@@ -149,9 +157,7 @@ def test_shaped_onset_keeps_most_of_the_steady_contrast(setup, target, quiet, fr
     names = sorted(excitation)
     order = [names.index(era.name) for era in rig.eras]
     for seed in range(12):
-        rng = np.random.default_rng(seed)
-        gains = 1 + 0.05 * rng.standard_normal(4)
-        errors = gains * np.exp(1j * np.radians(5) * rng.standard_normal(4))
+        errors = era_errors(np.random.default_rng(seed))
         realised.append(contrast(shaped(wrong(onset, errors), rig.eras)))
         steady.append(steady_contrast(weights * errors[order]))
     ramp = contrast(ramped_onset(excitation, rig.eras, ramp=0.02))
@@ -171,15 +177,10 @@ def test_shaping_includes_the_errors_of_the_eras(setup, monkeypatch):
     contrast, left = [], []
     for onset, ending in found:
         for seed in range(40):
-            rng = np.random.default_rng(seed)
-            gains = 1 + 0.05 * rng.standard_normal(4)
-            errors = gains * np.exp(1j * np.radians(5) * rng.standard_normal(4))
+            errors = era_errors(np.random.default_rng(seed))
             bases = shaped(wrong(onset, errors), rig.eras)
             contrast.append(transients.contrast_db(bases, targets=[target], quiet=[quiet]))
-            off = {
-                name: Tone(tone.frequency, tone.amplitude * abs(e), tone.phase + np.angle(e))
-                for (name, tone), e in zip(sorted(low.items()), errors, strict=True)
-            }
+            off = wrong_tones(low, errors)
             left.append(transients.residual_db(off, shaped(wrong(ending, errors), rig.eras)))
     assert np.median(contrast[:40]) > np.median(contrast[40:]) + 0.2
     assert np.median(left[:40]) < np.median(left[40:]) - 1

@@ -22,8 +22,8 @@ from soak import outcomes, shrink
 from soak_chain import run_plan
 from soak_plan import (
     AMPLIFIER_FAULTS,
+    FRAME_FAULTS,
     KINDS,
-    TELEGRAM_FAULTS,
     FaultInjection,
     Line,
     OperatorAction,
@@ -46,7 +46,7 @@ def test_soak_short_seeds_break_no_rule() -> None:
         if outcome.violations:
             broken[f"{SOAK.name} --short --seed {outcome.seed}"] = outcome.violations
     assert broken == {}
-    assert all(totals[f"fault {fault}"] for fault in (*TELEGRAM_FAULTS, *AMPLIFIER_FAULTS))
+    assert all(totals[f"fault {fault}"] for fault in (*FRAME_FAULTS, *AMPLIFIER_FAULTS))
     assert all(totals[f"on {kind}"] for kind in KINDS)
     assert totals["patterns"] > 10 * SEEDS
     assert totals["touches that must be felt"] > SEEDS / 10
@@ -133,7 +133,7 @@ BUGS: dict[str, tuple[Any, str, Any, Plan, str]] = {
         held(wire="modbus-tcp"),
         "could not be opened",
     ),
-    "a far end that stumbles": (
+    "a far end that raises an exception": (
         SerialEnd,
         "_answer",
         lambda end, frame, device: 1 / 0,

@@ -27,7 +27,7 @@ from soak_chain import Outcome, run_plan  # noqa: E402
 from soak_plan import KINDS, Plan, make_plan  # noqa: E402
 
 _AHEAD = 4  # runs that wait for a process, for each
-_TOLD_EVERY = 250  # runs
+_PROGRESS_INTERVAL = 250  # runs
 
 
 def run_seed(seed: int, wire: str | None = None, *, short: bool = False) -> Outcome:
@@ -102,7 +102,7 @@ def report(found: Iterator[tuple[Outcome, bool]], *, again: str) -> int:
                 _print(f"    {violation}")
             one = f"--seed {outcome.seed}" + " --short" * short
             _print(f"    again: {again} {one} --trace seed-{outcome.seed}.txt")
-        if sum(runs.values()) % _TOLD_EVERY == 0:
+        if sum(runs.values()) % _PROGRESS_INTERVAL == 0:
             _print(f"    {sum(runs.values())} seeds, {virtual / 3600:.1f} h, {failed} failed")
     wall = time.perf_counter() - begin
     used = resource.getrusage(resource.RUSAGE_CHILDREN)

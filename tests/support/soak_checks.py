@@ -83,7 +83,7 @@ class Checks:
         self._loop = asyncio.get_running_loop()
         self._next = self._loop.call_later(IDLE_STEP, self._watch)
         for name, amplifier in bench.amplifiers.items():
-            amplifier.listeners.append(lambda event, at, name=name: self._told(name, event, at))
+            amplifier.listeners.append(lambda event, at, name=name: self._received(name, event, at))
 
     def violate(self, what: str) -> None:
         """Something that must hold does not."""
@@ -169,7 +169,7 @@ class Checks:
         elif not self._is_closed:
             self._starving[name] = self._loop.call_at(due, self._expect_silence, name)
 
-    def _told(self, name: str, event: AmplifierEvent, at: float) -> None:
+    def _received(self, name: str, event: AmplifierEvent, at: float) -> None:
         if event.state in _FAULTED:
             self._faulted.setdefault(name, at)
         else:

@@ -1,7 +1,7 @@
 """What happens in one soak run, all of it decided before it begins, by one number.
 
 A plan is scenes one after the other: calm ones, in which everything must work, and rough ones, in
-which wires and amplifiers fail and the operator does as he likes; between some of them the plate is
+which wires and amplifiers fail and the operator does anything; between some of them the plate is
 disarmed and alone for up to an hour.
 """
 
@@ -27,7 +27,7 @@ SOURCES = ("panel", "table", "page")
 BEGIN = 0.5  # s; by then everything is open
 SETTLED = 3.0  # s; how long after a trouble everything must work again
 
-TELEGRAM_FAULTS: Sequence[FaultKind] = (
+FRAME_FAULTS: Sequence[FaultKind] = (
     "drop",
     "delay",
     "duplicate",
@@ -189,7 +189,7 @@ def _rearming(dice: random.Random, begin: float, length: float) -> list[Action]:
 def _fault_window(dice: random.Random) -> FaultWindow:
     if dice.random() < 0.6:
         return FaultWindow(
-            dice.choice(TELEGRAM_FAULTS),
+            dice.choice(FRAME_FAULTS),
             lasts=dice.choice((0.02, 0.1, 0.5, 2.0)) * dice.uniform(0.5, 1.5),
             share=dice.choice((0.05, 0.2, 0.5, 1.0)),
             toward=dice.choice((None, "host", "amplifier")),

@@ -235,7 +235,7 @@ async def slow_touch(chain: Chain) -> None:
 
 
 async def disarmed_amid(chain: Chain) -> None:
-    """Somebody disarms it while a finger is felt."""
+    """It is disarmed while a finger is felt."""
     await chain.operate("arm")
     await chain.touch(1, rest=0.06)
     await chain.operate("disarm", rest=0.1)
@@ -254,7 +254,7 @@ async def strangers_set(chain: Chain) -> None:
 
 
 async def touched_beside(chain: Chain) -> None:
-    """A sensor tells of a finger beside the plate."""
+    """A touch source reports a finger beside the plate."""
     await chain.operate("arm", rest=0.05)
     chain.touch_beside()
     await chain.rest(0.1)

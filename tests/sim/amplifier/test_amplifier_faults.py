@@ -124,7 +124,7 @@ def test_fault_silences_and_latches(fault: Fault) -> None:
 
 
 def test_fault_while_disarmed_is_only_recorded() -> None:
-    """There is nothing to silence; the list of faults tells of it."""
+    """There is nothing to silence; the fault history records it."""
     amplifier = SimulatedAmplifier("main", channels=4)
     amplifier.trip(Fault.ARC, 1.0)
     assert amplifier.state is AmplifierState.SWITCH_ON_DISABLED

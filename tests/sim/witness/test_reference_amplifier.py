@@ -129,7 +129,7 @@ def test_reference_accepts_a_reply_older_than_a_broadcast_stop(
 ) -> None:
     """Asked, then all of the bus are stopped, and only then the answer comes: of how it was before.
 
-    Nobody answers the stop, so it counts within 10 ms; after that it is stopped.
+    A broadcast stop has no reply, so it takes effect within 10 ms.
     """
     for asked_at, broken in ((1.0995, []), (1.1095, [late])):
         watched = Watched()

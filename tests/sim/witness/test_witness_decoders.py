@@ -97,7 +97,7 @@ def test_serial_decoder_decodes_the_page() -> None:
 
 @pytest.mark.parametrize("transport", ["RTU", "TCP"])
 def test_modbus_decoder_decodes_the_page(transport: str) -> None:
-    """Every telegram of the page means what stands beside it, over both transports."""
+    """Every ADU of the page decodes to what the page says, over both transports."""
     decoder = ModbusDecoder(over_tcp=transport == "TCP")
     seen = {}
     for name, toward, data in _modbus(transport):
@@ -158,7 +158,7 @@ def test_decoders_accept_any_pieces() -> None:
 
 
 def _over_tcp(number: int, pdu: str) -> bytes:
-    """A telegram of unit 1, with its header."""
+    """An ADU for unit 1, with its header."""
     body = bytes.fromhex("01" + pdu)
     return number.to_bytes(2, "big") + b"\0\0" + len(body).to_bytes(2, "big") + body
 

@@ -6,6 +6,7 @@ from drivers.blocking import BlockingAmplifier
 from drivers.command import DriveCommand
 from era_haptics.arguments import expect_rig
 from era_haptics.drive import Drives, excitation_of
+from model.arguments import shown
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.table.pattern import Pattern
@@ -25,6 +26,8 @@ def open_amplifier(
     chosen = known if name is None else tuple(each for each in known if each == name)
     if len(chosen) != 1:
         raise InputError(f"name must be an amplifier of the rig, {', '.join(known)}, got {name!r}")
+    if url is not None and not isinstance(url, str):
+        raise InputError(f"url must be text such as 'sim://', got {shown(url)}")
     return BlockingAmplifier(url or rig.amplifiers[chosen[0]], limits=guard_limits(rig.limits))
 
 

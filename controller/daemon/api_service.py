@@ -3,6 +3,7 @@
 import asyncio
 import time
 from collections.abc import Mapping
+from typing import cast
 
 from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, RpcError
@@ -19,10 +20,7 @@ from controller.api.methods import (
     TouchParams,
     UnsubscribeParams,
 )
-from controller.api.schema import (
-    Empty,
-    PhaseName,
-)
+from controller.api.schema import Empty, PhaseName
 from controller.api.server import Handler
 from controller.daemon.active_layout import ActiveLayout
 from controller.daemon.config import DaemonConfig
@@ -96,7 +94,7 @@ class ApiService:
         """End the lease when the armed state ends."""
         if new.state not in _ARMABLE:
             self._lease.end()
-            self._publisher.view.clear_pattern()
+            self._publisher.view.applied = None
 
     def client_left(self, client: Connection) -> None:
         """Release what a disconnected client holds; lift its fingers."""
@@ -119,7 +117,7 @@ class ApiService:
             state=machine.state.value,
             cause=machine.cause,
             remedy=machine.remedy,
-            phase=_phase(self._controller),
+            phase=cast("PhaseName", self._controller.phase.name.lower()),
             assume_energised=machine.assume_energised(now),
             lost_for_s=machine.lost_for(now),
             watchdog_s=WATCHDOG,
@@ -127,7 +125,7 @@ class ApiService:
             lease_left_s=lease.expires_at - now if lease else None,
             contacts=view.contact_statuses(),
             drive=view.drive(),
-            silent_because=view.silent_because if lease else None,
+            silent_because=view.silenced.reason if view.silenced and lease else None,
             plain_because=self._controller.plain_because,
             predicted_contrast_db=pattern.predicted_contrast_db if pattern else None,
             robust_contrast_db=pattern.robust_contrast_db if pattern else None,
@@ -272,13 +270,3 @@ def _wrong_state(machine: StateMachine, code: ErrorCode = ErrorCode.WRONG_STATE)
         where="state",
         remedy=machine.remedy or _REMEDIES.get(machine.state),
     )
-
-
-def _phase(controller: Controller) -> PhaseName:
-    names: dict[str, PhaseName] = {
-        "CLOSED": "closed",
-        "DISARMED": "disarmed",
-        "ARMED": "armed",
-        "LOST": "lost",
-    }
-    return names[controller.phase.name]

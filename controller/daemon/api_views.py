@@ -17,30 +17,13 @@ from drivers.errors import CommandError
 class PlateView:
     """Contacts on the plate and the pattern that plays, as last reported by the control loop.
 
-    effect_of: the effect that plays for a contact.
+    effect_of: the effect that plays for a contact; silenced: None while a pattern plays.
     """
 
     effect_of: Callable[[ContactKey], str | None]
     contacts: tuple[Contact, ...] = ()
     applied: Applied | None = None
     silenced: Silenced | None = None
-
-    def set_pattern(self, applied: Applied) -> None:
-        """Set the pattern that plays."""
-        self.applied, self.silenced = applied, None
-
-    def set_silence(self, silenced: Silenced) -> None:
-        """Set that nothing plays, with the reason."""
-        self.applied, self.silenced = None, silenced
-
-    def clear_pattern(self) -> None:
-        """Clear a pattern that was not silenced by the control loop."""
-        self.applied = None
-
-    @property
-    def silent_because(self) -> str | None:
-        """Why nothing plays; None while something plays, or before the first decision."""
-        return None if self.silenced is None else self.silenced.reason
 
     def contact_statuses(self) -> list[ContactStatus]:
         """All contacts with their roles."""

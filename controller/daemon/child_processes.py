@@ -9,8 +9,6 @@ import contextlib
 import logging
 import os
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 from drivers.operation.pauses import pauses
 
@@ -20,23 +18,15 @@ _TERMINATE_TIMEOUT = 0.3  # s
 _logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class ChildProcess:
-    """A Python module to run as a process, with its arguments."""
-
-    module: str
-    arguments: Sequence[str]
-
-
 class ChildProcesses:
-    """Starts child processes and restarts them when they exit."""
+    """Runs Python modules as processes and restarts them when they exit."""
 
     def __init__(self) -> None:
         self._tasks: list[asyncio.Task[None]] = []
 
-    def start(self, child: ChildProcess) -> None:
-        """Keep a child running until `close`."""
-        self._tasks.append(asyncio.create_task(self._keep_running(child), name=child.module))
+    def start(self, module: str, *arguments: str) -> None:
+        """Keep a module running until `close`."""
+        self._tasks.append(asyncio.create_task(self._keep_running(module, arguments), name=module))
 
     async def close(self) -> None:
         """Terminate all children; kill those that do not exit in time."""
@@ -44,22 +34,22 @@ class ChildProcesses:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    async def _keep_running(self, child: ChildProcess) -> None:
+    async def _keep_running(self, module: str, arguments: tuple[str, ...]) -> None:
         for pause in pauses(first=1.0, maximum=_MAX_PAUSE):
             try:
                 process = await asyncio.create_subprocess_exec(
                     # -P: do not import a folder named controller in the working directory
                     *(sys.executable, "-P", "-m", "controller.daemon.child_main"),
-                    *(str(os.getpid()), child.module, *child.arguments),
+                    *(str(os.getpid()), module, *arguments),
                     stdin=asyncio.subprocess.DEVNULL,
                     start_new_session=True,  # Ctrl-C is handled by the daemon
                 )
             except OSError as error:
-                _logger.warning("%s: start failed: %s", child.module, error)
+                _logger.warning("%s: start failed: %s", module, error)
             else:
                 status = await self._wait(process)
                 _logger.warning(
-                    "%s: exited with status %d, restarting in %g s", child.module, status, pause
+                    "%s: exited with status %d, restarting in %g s", module, status, pause
                 )
             await asyncio.sleep(pause)
 

@@ -80,8 +80,8 @@ def load_daemon_config(path: Path) -> DaemonConfig:
         validation.add(("table",), f"file not found: {table}; check name and folder")
     layout = _layout(validation, document, rig)
     _check_serial_numbers(validation, rig)
-    log_file = _beside(document, _named(document, "log", "file"))
-    dump_folder = _beside(document, _named(document, "dumps", "folder"))
+    log_file = _file(document, "log", "file")
+    dump_folder = _file(document, "dumps", "folder")
     _check_folders(validation, log_file, dump_folder)
     section = validation.finish()
     assert rig is not None  # noqa: S101  else a problem was reported
@@ -120,21 +120,14 @@ def _check_kind(document: Document) -> None:
         )
 
 
-def _file(document: Document, key: str) -> Path | None:
-    """The path named by a key, relative to the configuration's folder; None if absent."""
-    return _beside(document, _named(document, key))
-
-
-def _named(document: Document, *keys: str) -> str | None:
-    """The text at nested keys; None if it is absent or not a file name."""
+def _file(document: Document, *keys: str) -> Path | None:
+    """The path at nested keys, relative to the configuration's folder; None if it has none."""
     value: object = document.data
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
-    return value if isinstance(value, str) and "\0" not in value else None
-
-
-def _beside(document: Document, name: str | None) -> Path | None:
-    return None if name is None else Path(document.source).parent / Path(name).expanduser()
+    if not isinstance(value, str) or "\0" in value:
+        return None
+    return Path(document.source).parent / Path(value).expanduser()
 
 
 def _rig(validation: Validation[DaemonSection], file: Path | None) -> tuple[Rig | None, str]:

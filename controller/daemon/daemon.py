@@ -9,7 +9,7 @@ from controller.api.server import ApiServer
 from controller.daemon.active_layout import ActiveLayout
 from controller.daemon.api_service import ApiService
 from controller.daemon.api_views import amplifier_statuses
-from controller.daemon.child_processes import ChildProcess, ChildProcesses
+from controller.daemon.child_processes import ChildProcesses
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.fault_dumps import FaultDumps
 from controller.daemon.log import LogThread
@@ -235,16 +235,11 @@ class Daemon:
         socket = str(self._config.socket)
         if self._dashboard is not None:
             self._children.start(
-                ChildProcess(
-                    "controller.cli",
-                    ("gateway", "--socket", socket, "--listen", self._dashboard),
-                )
+                "controller.cli", "gateway", "--socket", socket, "--listen", self._dashboard
             )
         if self._config.section.metrics is not None:
             port = str(self._config.section.metrics)
-            self._children.start(
-                ChildProcess("controller.metrics", ("--socket", socket, "--port", port))
-            )
+            self._children.start("controller.metrics", "--socket", socket, "--port", port)
 
     def _deliver(self, frame: TouchFrame) -> None:
         """Pass touches to the control loop; ignore them while it is not running."""

@@ -87,7 +87,7 @@ class EventPublisher:
         )
         if self.view.applied is not None and new.state is not DaemonState.OPERATION_ENABLED:
             # The control loop does not report the end of what others have silenced.
-            self.view.clear_pattern()
+            self.view.applied = None
             silence = SilenceEvent(
                 contacts=self.view.contact_statuses(), reason=new.cause, latency_ms=None
             )
@@ -148,12 +148,12 @@ class EventPublisher:
         self.hub.publish("contacts", self.view.contacts_event)
 
     def _pattern_applied(self, applied: Applied) -> None:
-        self.view.set_pattern(applied)
+        self.view.applied, self.view.silenced = applied, None
         self.latencies.add(applied.latency)
         self.hub.publish("pattern", self.view.pattern_event)
 
     def _silenced(self, silenced: Silenced) -> None:
-        self.view.set_silence(silenced)
+        self.view.applied, self.view.silenced = None, silenced
         if silenced.latency is not None:
             self.latencies.add(silenced.latency)
         self.hub.publish("silence", self.view.silence_event)

@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 from controller.daemon.config import DaemonConfig, load_daemon_config
@@ -51,15 +52,12 @@ def run_daemon(path: Path, *, dashboard: str | None) -> None:
         raise InputError(f"--dashboard: {error}") from error
     config = load_daemon_config(path)
     _check_log_file(config)
-    lock = SocketLock(config.socket)
-    try:
+    with ExitStack() as stack:
+        lock = SocketLock(config.socket)
+        stack.callback(lock.release)
         log = start_log(config.log_file, level=config.section.log.level)
-        try:
-            _run(config, lock, log=log, dashboard=address or config.section.dashboard)
-        finally:
-            log.close()
-    finally:
-        lock.release()
+        stack.callback(log.close)
+        _run(config, lock, log=log, dashboard=address or config.section.dashboard)
 
 
 def _check_log_file(config: DaemonConfig) -> None:

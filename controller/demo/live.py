@@ -1,6 +1,7 @@
 """The interactive demonstration: simulated amplifiers, a daemon, and the dashboard."""
 
 import tempfile
+from contextlib import AsyncExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,24 +25,21 @@ async def run_live(rig_file: Path, table: LocalizationTable, *, wire: str, dashb
     """
     require_gateway()
     rig = load_rig(rig_file)
-    with tempfile.TemporaryDirectory(prefix="era-") as folder:
+    async with AsyncExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="era-"))
         file = Path(folder) / "daemon.yaml"
         file.write_text(f"rig: {rig_file}\nlog: {{level: warning}}\n", encoding="utf-8")
         config = load_daemon_config(file)
         lock = SocketLock(config.socket)
-        try:
-            log = start_log(None, level=config.section.log.level)
-            try:
-                async with open_far_end(rig_file, rig.amplifiers, wire=wire) as far_end:
-                    daemon = Daemon(
-                        replace(config, urls=far_end.urls),
-                        table,
-                        log=log,
-                        manager=ServiceManager(),
-                        dashboard=dashboard,
-                    )
-                    await daemon.run(lock)
-            finally:
-                log.close()
-        finally:
-            lock.release()
+        stack.callback(lock.release)
+        log = start_log(None, level=config.section.log.level)
+        stack.callback(log.close)
+        far_end = await stack.enter_async_context(open_far_end(rig_file, rig.amplifiers, wire=wire))
+        daemon = Daemon(
+            replace(config, urls=far_end.urls),
+            table,
+            log=log,
+            manager=ServiceManager(),
+            dashboard=dashboard,
+        )
+        await daemon.run(lock)

@@ -21,7 +21,7 @@ from scipy.optimize import least_squares, nnls
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.calibration.fast_plate import FastPlate
 from model.calibration.parameters import Parameter, rig_with
-from model.calibration.variable_projection import best_gains, modal_assurance, row_rms
+from model.calibration.variable_projection import modal_assurance, project_gains, row_rms
 from model.rig.rig import Rig
 
 _Loss: TypeAlias = Literal["linear", "soft_l1"]
@@ -88,7 +88,7 @@ def solve(problem: Problem, x: FloatArray, scales: FloatArray) -> Fit:
         if is_settled:
             break
     model = problem.plate.responses(rig_with(problem.rig, problem.parameters, x)) * scales
-    gains = best_gains(model, problem.values, weight)
+    gains, residual = project_gains(model, problem.values, weight)
     power = (np.abs(weight * model) ** 2).sum(axis=2)
     with np.errstate(divide="ignore"):
         gains_error = np.where(power > 0, 1 / np.sqrt(power), np.nan)
@@ -96,8 +96,7 @@ def solve(problem: Problem, x: FloatArray, scales: FloatArray) -> Fit:
     x_error[problem.free] = errors[: problem.free.sum()]
     scales_error = np.zeros(len(scales))
     scales_error[problem.free_scales] = errors[problem.free.sum() :]
-    residual = np.abs(_residual(problem, x, scales, weight))
-    return Fit(x, x_error, scales, scales_error, gains, gains_error, noise, used, residual)
+    return Fit(x, x_error, scales, scales_error, gains, gains_error, noise, used, np.abs(residual))
 
 
 def misfit(problem: Problem, x: FloatArray) -> float:
@@ -187,9 +186,7 @@ def _residual(
 ) -> ComplexArray:
     """Weighted residual (f, e, s) with the best gains; zero where nothing was measured."""
     model = problem.plate.responses(rig_with(problem.rig, problem.parameters, x)) * scales
-    gains = best_gains(model, problem.values, weight)
-    left = np.where(weight > 0, problem.values - np.nan_to_num(gains)[:, :, None] * model, 0)
-    return np.asarray(weight * left)
+    return project_gains(model, problem.values, weight)[1]
 
 
 def _without_peaks(values: ComplexArray, used: NDArray[np.bool_]) -> ComplexArray:

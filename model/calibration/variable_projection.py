@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray
 
 
-def best_gains(
+def project_gains(
     model: ComplexArray,
     values: ComplexArray,
     weight: FloatArray,
     *,
     expected: FloatArray | None = None,
     tolerance: float = 0.0,
-) -> ComplexArray:
-    """Return the gain of every row (f, e) that minimizes sum |weight (values - gain model)|².
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return gains (f, e) that minimize sum |weight (values - gain model)|², and that residual.
 
     model, values, weight (f, e, s), weight zero where nothing was measured. expected (e,):
     magnitudes known beforehand to a relative standard deviation `tolerance`; they add
@@ -32,10 +32,13 @@ def best_gains(
     inner = (weight**2 * model.conj() * values).sum(axis=2)
     power = (np.abs(weight * model) ** 2).sum(axis=2)
     if expected is None:
-        return np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan)
-    precision = 1 / (tolerance * expected) ** 2
-    magnitude = (np.abs(inner) + precision * expected) / (power + precision)
-    return np.asarray(magnitude * np.exp(1j * np.angle(inner)))
+        gains = np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan)
+    else:
+        precision = 1 / (tolerance * expected) ** 2
+        magnitude = (np.abs(inner) + precision * expected) / (power + precision)
+        gains = magnitude * np.exp(1j * np.angle(inner))
+    residual = weight * (values - np.nan_to_num(gains)[:, :, None] * model)
+    return gains, residual
 
 
 def row_rms(values: ComplexArray, used: NDArray[np.bool_] | None = None) -> FloatArray:

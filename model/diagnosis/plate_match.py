@@ -20,7 +20,7 @@ from scipy.optimize import least_squares
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.fast_plate import FastPlate
 from model.calibration.parameters import Parameter, parameters_of, rig_with
-from model.calibration.variable_projection import best_gains, row_rms
+from model.calibration.variable_projection import project_gains, row_rms
 from model.rig.rig import Rig
 
 _GAIN_STD = 1.0  # of the logarithm of a channel's gain
@@ -86,7 +86,6 @@ def match_plate(
     if floor is not None:
         noise = np.hypot(noise, floor)
     weight = np.where(np.isfinite(values), 1 / noise, 0)
-    measured = np.where(np.isfinite(values), values, 0)
     count = len(parameters)
     driven = list(drives)
 
@@ -98,8 +97,9 @@ def match_plate(
         model = responses(rig_with(rig, parameters, x))
         gains = np.ones(values.shape[1])
         gains[used] = np.exp(_GAIN_STD * z[count:])
-        projected = best_gains(model, measured, weight, expected=gains, tolerance=_GAIN_TOLERANCE)
-        left = weight * (measured - projected[:, :, None] * model)
+        projected, left = project_gains(
+            model, values, weight, expected=gains, tolerance=_GAIN_TOLERANCE
+        )
         wander = ((np.abs(projected) - gains) / (_GAIN_TOLERANCE * gains))[rows]
         left = _robust(left[weight > 0])
         return np.concatenate([left.real, left.imag, _robust(wander), z])
@@ -133,10 +133,10 @@ def match_plate(
     gains[used] = np.exp(_GAIN_STD * best.x[count:])
     fitted = rig_with(rig, parameters, x)
     model = responses(fitted)
-    projected = best_gains(
-        model, measured, weight, expected=np.nan_to_num(gains, nan=1.0), tolerance=_GAIN_TOLERANCE
+    _, residual = project_gains(
+        model, values, weight, expected=np.nan_to_num(gains, nan=1.0), tolerance=_GAIN_TOLERANCE
     )
-    share = (np.abs(projected[:, :, None] * model - measured) / size[:, :, None])[weight > 0]
+    share = (np.abs(residual) * noise / size[:, :, None])[weight > 0]
     return Match(
         fitted,
         parameters,

@@ -30,7 +30,7 @@ def report(
         Path | None, typer.Option("--socket", help="Socket of the daemon; default: the usual path.")
     ] = None,
 ) -> None:
-    """Collect versions, configuration and daemon state for a bug report.
+    """Collect versions, files and daemon state for a bug report.
 
     Passwords, tokens and the path of your home folder are removed; check the file before you
     send it.

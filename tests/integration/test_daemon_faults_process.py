@@ -321,15 +321,15 @@ async def test_daemon_ramps_down_reads_back_and_disarms_when_terminated(
                     assert await daemon.status() == 0
                     took = time.monotonic() - begin
                 assert not daemon.socket.exists()
-                assert daemon.said("OPERATION_ENABLED -> NOT_READY")
-                assert not daemon.said("no json")
+                assert daemon.has_logged("OPERATION_ENABLED -> NOT_READY")
+                assert not daemon.has_logged("no json")
             for name in far.devices:
-                asked = [entry for entry in journal.since(begin) if entry.amplifier == name]
-                ends = [entry for entry in asked if isinstance(entry.request, Apply)]
+                requests = [entry for entry in journal.since(begin) if entry.amplifier == name]
+                ends = [entry for entry in requests if isinstance(entry.request, Apply)]
                 end = ends[-1]
                 assert not end.raises
                 assert end.request.command_set.ramp == pytest.approx(0.050)
-                after = [entry for entry in asked if entry.time >= end.time][1:]
+                after = [entry for entry in requests if entry.time >= end.time][1:]
                 assert isinstance(after[0].request, GetStatus)
                 silent = next(entry for entry in after if not any(entry.levels))
                 assert isinstance(silent.request, GetStatus)  # read back before disarming

@@ -47,8 +47,8 @@ async def test_commands_control_daemon(tmp_path: Path) -> None:
     async with far_end(tmp_path) as far, daemon_process(tmp_path, far) as daemon:
         where = ("--socket", daemon.socket)
         status, out, _ = await run_era("status", *where, "--json")
-        told = json.loads(out)
-        assert (status, told["state"]) == (0, "READY_TO_SWITCH_ON")
+        shown = json.loads(out)
+        assert (status, shown["state"]) == (0, "READY_TO_SWITCH_ON")
         status, _, err = await run_era("clear", *where)
         assert (status, err) == (0, "")
         arming = await asyncio.create_subprocess_exec(
@@ -81,9 +81,9 @@ async def test_commands_control_daemon(tmp_path: Path) -> None:
         await asyncio.wait_for(arming.stdout.readline(), PATIENCE)
         async with await daemon.client() as era:
             await era.disarm()
-        _, said = await asyncio.wait_for(arming.communicate(), PATIENCE)
+        _, err_bytes = await asyncio.wait_for(arming.communicate(), PATIENCE)
         assert arming.returncode == 1
-        assert b"READY_TO_SWITCH_ON" in said or b"SWITCH_ON_DISABLED" in said
+        assert b"READY_TO_SWITCH_ON" in err_bytes or b"SWITCH_ON_DISABLED" in err_bytes
     status, _, err = await run_era("status", *where)
     assert status == 3
     assert str(daemon.socket) in err

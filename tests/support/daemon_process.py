@@ -59,14 +59,14 @@ class DaemonProcess:
         """Wait for its exit status."""
         return await asyncio.wait_for(self.process.wait(), PATIENCE)
 
-    def said(self, text: str) -> bool:
+    def has_logged(self, text: str) -> bool:
         """Whether a text is in its log."""
         return any(text in json.dumps(line) for line in self.log)
 
     async def serves(self) -> None:
         """Wait until it serves; raises NotServing if it exits instead."""
         await until(
-            lambda: self.said("serving at") or self.process.returncode is not None,
+            lambda: self.has_logged("serving at") or self.process.returncode is not None,
             patience=STARTING,
         )
         if self.process.returncode is not None:

@@ -61,7 +61,7 @@ async def test_touches_of_leaving_client_are_lifted() -> None:
     await asyncio.sleep(0)
     frames.clear()
     touches.lift_all("a", now=2)
-    touches.lift_all("nobody", now=2)
+    touches.lift_all("unknown", now=2)
     await asyncio.sleep(0)
     assert frames == [TouchFrame("api:1:me", 2, ())]
 

@@ -161,6 +161,8 @@ async def test_daemon_stays_disarmed_and_latched_after_link_loss_while_armed(
     async with ready_daemon(tmp_path) as (bench, era):
         await era.arm("me", lease_s=30)
         async with holding(era, far=bench.far):
+            await era.subscribe("state")
+            assert (await next_event(era, "state")).data["new"] == ENABLED
             await era.subscribe("link", "pattern", "silence")
             assert (await next_event(era, "pattern")).data["drive"]
             bench.far.device.inject_fault(FaultWindow("hang"))

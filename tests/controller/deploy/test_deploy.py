@@ -140,9 +140,9 @@ def test_install_writes_nothing_when_disk_is_full(
         path.write_text(text, encoding="utf-8")
     was_there = contents(tmp_path)
     with full_disk():  # the unit is longer than that, the other two are shorter
-        status, out, said = era("systemd", "install", "--root", tmp_path)
+        status, out, err = era("systemd", "install", "--root", tmp_path)
     assert (status, out) == (2, "")
-    assert said.splitlines()[-1].startswith(f"era: error: {tmp_path / UNIT.relative_to('/')}: ")
+    assert err.splitlines()[-1].startswith(f"era: error: {tmp_path / UNIT.relative_to('/')}: ")
     assert contents(tmp_path) == was_there
 
 
@@ -152,9 +152,9 @@ def test_install_writes_nothing_when_last_file_fails(
     """A folder in place of the rules is named, and no unit is written."""
     rules = tmp_path / "etc/udev/rules.d/70-era-haptics.rules"
     rules.mkdir(parents=True)
-    status, out, said = era("systemd", "install", "--root", tmp_path)
+    status, out, err = era("systemd", "install", "--root", tmp_path)
     assert (status, out) == (2, "")
-    assert f"era: error: {rules}: " in said
+    assert f"era: error: {rules}: " in err
     assert contents(tmp_path) == {}
 
 
@@ -167,7 +167,7 @@ def test_install_suggests_sudo_when_not_permitted(
         raise PermissionError(13, "Permission denied", str(path))
 
     monkeypatch.setattr(Path, "mkdir", forbidden)
-    status, out, said = era("systemd", "install", "--root", tmp_path)
+    status, out, err = era("systemd", "install", "--root", tmp_path)
     assert (status, out) == (2, "")
-    assert f"{tmp_path}/etc/systemd/system: " in said
-    assert "sudo" in said
+    assert f"{tmp_path}/etc/systemd/system: " in err
+    assert "sudo" in err

@@ -62,8 +62,8 @@ async def play(folder: Path) -> Played:
 def test_both_amplifiers_have_a_part_in_each_pattern(played: Played, truth: Truth) -> None:
     """Two tones of different frequencies, on ERAs of different amplifiers."""
     for heard in played.heard:
-        for told in heard.told:
-            drive = told["drive"]
+        for pattern in heard.patterns:
+            drive = pattern["drive"]
             assert {truth.rig.wiring[era].amplifier for era in drive} == {"main", "side"}
             assert len({tone["frequency_hz"] for tone in drive.values()}) == 2
 

@@ -46,7 +46,7 @@ from model.structure.plate import Material, Plate
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone
-from told_times import ToldTimes
+from stub_wire_times import StubWireTimes
 
 FINGER = (1, 0.5, 0.5)
 OTHER = (2, 0.9, 0.9)
@@ -86,7 +86,7 @@ class FarEnd(Backend):
     @property
     def wire_times(self) -> WireTimes:
         """A commit is said to take `commit_takes` [s]."""
-        return ToldTimes(self.commit_takes)
+        return StubWireTimes(self.commit_takes)
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Remember, wait, answer."""

@@ -1,4 +1,4 @@
-"""What must be true of a stream that was played through a whole chain, whatever wire was in it.
+"""Assertions on a touch stream played through a whole chain, the same for every wire.
 
 What is expected comes from elsewhere: the question to the table from the recorded fingers, the
 plate's answer from the direct solver of the finite-element model for what amplifiers confirmed.
@@ -26,7 +26,7 @@ from touch_stream import Situation, Stream
 from whole_chain import LEVEL_LIMIT, Played
 
 STROKE = 100e-6  # m; of every ERA in the example
-JUDGED_UP_TO = 25.0  # dB; beyond, the quiet finger feels what no model tells
+JUDGED_UP_TO = 25.0  # dB; no model predicts what a quiet finger feels beyond that
 LEVEL_STEP, PHASE_STEP = 1e-4, 0.01  # the wires' own: full strokes, degrees
 COMMANDED, RELEASE = 0.020, 0.010  # s; from the last finger's lift to a command of zero, its ramp
 BUSY = 0.150  # s; what a machine that does other work may add to one lift of several
@@ -54,8 +54,8 @@ class Truth:
         )
 
     def fields(self, heard: Heard, points: FloatArray) -> tuple[FloatArray, ComplexArray]:
-        """Frequencies (f,) [Hz] of what is said to play, and its acceleration (f, p) [m/s²]."""
-        drive = heard.told[-1]["drive"]
+        """Frequencies (f,) [Hz] of the reported pattern, and its acceleration (f, p) [m/s²]."""
+        drive = heard.patterns[-1]["drive"]
         frequencies = np.array(sorted({tone["frequency_hz"] for tone in drive.values()}))
         alone = direct_acceleration(
             assemble(self.rig.plate, self.rig.mesh), self.rig.eras, frequencies, points
@@ -76,12 +76,12 @@ class Truth:
 def patterns_are_the_tables(played: Played, truth: Truth) -> None:
     """Each situation gives one pattern: the ERAs, frequencies, levels and phases of the table."""
     for heard in _touched(played):
-        assert len(heard.told) == 1, heard.situation
-        (told,) = heard.told
+        assert len(heard.patterns) == 1, heard.situation
+        (reported,) = heard.patterns
         wanted = truth.table.query(truth.asked(heard.situation)).excitation
-        assert told["drive"].keys() == wanted.keys()
+        assert reported["drive"].keys() == wanted.keys()
         for name, tone in wanted.items():
-            got = told["drive"][name]
+            got = reported["drive"][name]
             assert got["frequency_hz"] == tone.frequency
             assert abs(got["level"] - tone.amplitude / STROKE) <= 0.51 * LEVEL_STEP
             apart = math.remainder(got["phase_deg"] - math.degrees(tone.phase), 360)
@@ -109,7 +109,7 @@ def localization_is_the_predicted_one(played: Played, truth: Truth) -> None:
     for heard in _touched(played):
         target = heard.steady[heard.situation.felt_at]
         level = mean_level_db_sl(target.frequencies, target.amplitudes)
-        (contact,) = [one for one in heard.told[-1]["contacts"] if one["role"] == "target"]
+        (contact,) = [one for one in heard.patterns[-1]["contacts"] if one["role"] == "target"]
         assert math.isclose(level, LEVEL_DB_SL, abs_tol=1)
         assert math.isclose(level, contact["level_db_sl"], abs_tol=1)
         by_model = {
@@ -118,7 +118,7 @@ def localization_is_the_predicted_one(played: Played, truth: Truth) -> None:
         }
         if not heard.situation.quiet:
             continue
-        assert contact["contrast_db"] == heard.told[-1]["predicted_contrast_db"]
+        assert contact["contrast_db"] == heard.patterns[-1]["predicted_contrast_db"]
         measured = _contrast(
             {place: felt.amplitudes.sum(axis=0) for place, felt in heard.steady.items()},
             heard.situation,
@@ -224,10 +224,10 @@ def rounding(played: Played, truth: Truth) -> list[float]:
     shares = []
     for heard in _touched(played):
         _, together = truth.fields(heard, points)
-        tones = heard.told[-1]["drive"]
+        tones = heard.patterns[-1]["drive"]
         steps = 0.0
         for name, tone in tones.items():
-            alone = replace(heard, told=({"drive": {name: {**tone, "level": 1.0}}},))
+            alone = replace(heard, patterns=({"drive": {name: {**tone, "level": 1.0}}},))
             step = 0.5 * (LEVEL_STEP + tone["level"] * math.radians(PHASE_STEP))
             steps = steps + step * np.abs(truth.fields(alone, points)[1][0])
         shares.append(float(np.max(steps) / np.abs(together).max()))

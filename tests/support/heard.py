@@ -54,7 +54,7 @@ class Signals:
 class Heard:
     """A situation as it was on the plate, from begin to end on time.monotonic() [s].
 
-    told: the patterns that the daemon said it plays, the first of them after a delay [s]; steady,
+    patterns: as the daemon reported them, the first after a delay [s]; steady,
     onset: what fingertips felt in the end and in the first 100 ms, by place; phasors (f, s) [m/s²]:
     at the sensors in the end, at the frequencies that were played; fading: what sensors read where
     nobody touched.
@@ -63,7 +63,7 @@ class Heard:
     situation: Situation
     begin: float
     end: float
-    told: tuple[Mapping[str, Any], ...] = ()
+    patterns: tuple[Mapping[str, Any], ...] = ()
     delay: float = 0.0
     steady: Mapping[str, Felt] = field(default_factory=dict)
     onset: Mapping[str, Felt] = field(default_factory=dict)
@@ -109,19 +109,19 @@ async def hear(
     begin: float,
     end: float,
     *,
-    told: Sequence[Notification],
+    events: Sequence[Notification],
 ) -> Heard:
     """Read what was felt in a situation between two times [s]."""
     heard = Heard(situation, begin, end)
     if situation.target is None:
         return replace(heard, fading=await _signals(control, begin, end))
-    patterns = [one for one in told if one.topic == "pattern" and begin < one.time < end]
+    patterns = [one for one in events if one.topic == "pattern" and begin < one.time < end]
     steady = await _felt(control, end - STEADY, end)
     signals = await _signals(control, end - STEADY, end)
     frequencies = next(iter(steady.values())).frequencies
     heard = replace(
         heard,
-        told=tuple(one.data for one in patterns),
+        patterns=tuple(one.data for one in patterns),
         delay=patterns[0].time - begin if patterns else math.inf,
         steady=steady,
         phasors=_phasors(signals, frequencies),

@@ -13,7 +13,7 @@ from model.table.pattern import Pattern
 from model.table.question import Question
 from model.transients.envelope import Envelope
 from sim.amplifier.amplifier import SimulatedAmplifier
-from told_times import ToldTimes
+from stub_wire_times import StubWireTimes
 
 
 class Shapes:
@@ -82,7 +82,7 @@ class Link(Backend):
     @property
     def wire_times(self) -> WireTimes:
         """As set."""
-        return ToldTimes(envelope_takes=self.loading)
+        return StubWireTimes(envelope_takes=self.loading)
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Obey at once, answer later."""

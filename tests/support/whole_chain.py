@@ -83,7 +83,7 @@ class Chain:
             except (RpcError, Refused):  # a link was lost, or we ask more than 10 s later
                 continue
             is_prompt = all(
-                one.told and one.delay < PROMPT for one in heard if one.situation.fingers
+                one.patterns and one.delay < PROMPT for one in heard if one.situation.fingers
             )
             if is_prompt and (await self._late() == late or not self._found(begin)):
                 break
@@ -135,7 +135,7 @@ class Chain:
             self.witness.contacts(time.monotonic(), ())
             self.witness.operator_command(time.monotonic(), "arm")
         polls: Polls = []
-        told: list[Notification] = []
+        events: list[Notification] = []
         went: list[float] = []
 
         def changed(now: float, fingers: Mapping[int, str]) -> None:
@@ -152,7 +152,7 @@ class Chain:
 
         async def listen() -> None:
             async for notification in self.daemon.client.events():
-                told.append(notification)
+                events.append(notification)
 
         listening = asyncio.create_task(listen())
         try:
@@ -164,7 +164,7 @@ class Chain:
         if self.witness is not None:
             self.witness.operator_command(time.monotonic(), "disarm")
         return [
-            await hear(self.control, situation, begin, end, told=told)
+            await hear(self.control, situation, begin, end, events=events)
             for situation, begin, end in zip(stream.situations, went, went[1:], strict=False)
         ], polls
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from controller.gateway.cli import gateway as gateway_command
 from controller.gateway.serving import listen
 from controller.gateway.settings import Settings, read_token
 from gateway_bench import (
@@ -174,16 +175,6 @@ def test_gateway_prints_an_ipv6_url(daemon: ScriptedDaemon, tmp_path: Path) -> N
         assert http(gateway, host=["evil.example"]).status == 421
 
 
-def test_gateway_prints_the_first_allowed_host(
-    daemon: ScriptedDaemon, tmp_path: Path, pair: tuple[Path, Path]
-) -> None:
-    """When listening on all addresses, and without the user's own token."""
-    options = ("--listen", "0.0.0.0:0", "--allow-host", "localhost.test")
-    options += ("--certificate", str(pair[0]), "--key", str(pair[1]))
-    with gateway_process(tmp_path, daemon.socket, *options) as gateway:
-        assert gateway.url.startswith("https://localhost.test:")
-
-
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 async def test_accepted_connections_have_no_delay(host: str, tmp_path: Path) -> None:
     """Without TCP_NODELAY a response's body waits 40 ms for the acknowledgement of its head."""
@@ -207,6 +198,13 @@ def test_gateway_refuses_a_port_in_use(tmp_path: Path) -> None:
         message = refused("--listen", f"127.0.0.1:{port}")
     assert f"port {port} (Address already in use)" in message
     assert "--listen" in message
+
+
+@pytest.mark.parametrize("listen", ["127.0.0.1", "127.0.0.1:-1"])
+def test_gateway_refuses_an_invalid_listen_option(listen: str) -> None:
+    """With the option, its form and the value."""
+    with pytest.raises(InputError, match=rf"--listen .*HOST:PORT.* got {listen}$"):
+        gateway_command(listen)
 
 
 def test_gateway_names_the_extra_to_install() -> None:
@@ -302,17 +300,10 @@ def test_settings_refuse_what_is_unsafe(name: str) -> None:
         Settings(socket=Path("era.sock"), **given)  # type: ignore[arg-type]
 
 
-def test_settings_allow_the_loopback_address_listened_on() -> None:
-    """Besides the usual names, but no other address of that network."""
+def test_settings_show_and_allow_the_address_listened_on() -> None:
+    """Besides the usual names; for all addresses the first allowed host is shown."""
     settings = Settings(socket=Path("era.sock"), host="127.0.0.2")
     assert settings.shown_host == "127.0.0.2"
+    panel = Settings(socket=Path("era.sock"), **TLS, chose_token=True, names=("panel.local",))  # type: ignore[arg-type]
+    assert panel.shown_host == "panel.local"
     assert settings.allowed_names == {"localhost", "127.0.0.1", "[::1]", "127.0.0.2"}
-
-
-@pytest.mark.parametrize("listen", ["127.0.0.1", "127.0.0.1:-1"])
-def test_gateway_refuses_an_invalid_listen_option(listen: str) -> None:
-    """With the option, its form and the value."""
-    message = refused("--listen", listen)
-    assert "--listen" in message
-    assert "HOST:PORT" in message
-    assert message.endswith(listen)

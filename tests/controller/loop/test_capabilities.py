@@ -22,7 +22,7 @@ from model.table.pattern import Pattern
 from model.transients.envelope import Envelope
 from model.vibration.excitation import Tone
 from sim.amplifier.amplifier import capabilities
-from told_times import ToldTimes
+from stub_wire_times import StubWireTimes
 
 FINE = capabilities(4)
 BOTH, ONSETS, ENDINGS = Shaping(True, True), Shaping(True, False), Shaping(False, True)
@@ -39,7 +39,7 @@ class Opened:
     @property
     def wire_times(self) -> WireTimes:
         """In proportion to the knots."""
-        return ToldTimes(knot_takes=self.knot_time)
+        return StubWireTimes(knot_takes=self.knot_time)
 
 
 def rig() -> Rig:

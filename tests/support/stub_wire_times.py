@@ -1,4 +1,4 @@
-"""What a wire is said to take, as a test wants it."""
+"""Durations on a wire, as a test sets them."""
 
 from dataclasses import dataclass
 
@@ -6,21 +6,21 @@ from drivers.protocol.wire_times import WireTimes
 
 
 @dataclass(frozen=True)
-class ToldTimes(WireTimes):
-    """A commit, an envelope and each knot of it take so long [s]; all else nothing."""
+class StubWireTimes(WireTimes):
+    """Durations [s] of a commit, an envelope and each of its knots; all others are zero."""
 
     commit_takes: float = 0.0
     envelope_takes: float = 0.0
     knot_takes: float = 0.0
 
     def round_trip(self, channels: int) -> float:
-        """Nothing."""
+        """Return zero."""
         return 0.0
 
     def commit(self) -> float:
-        """As told."""
+        """Return the set duration."""
         return self.commit_takes
 
     def loading(self, knots: int) -> float:
-        """As told."""
+        """Return the set duration."""
         return self.envelope_takes + knots * self.knot_takes

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from felt_as_asked import CHECKS, Truth, responses_apart, rounding
+from heard import Heard
 from model.finger.grid import Grid
 from model.rig.file import load_rig
 from model.table.build import build_table
@@ -169,6 +170,11 @@ def test_what_fingers_feel_is_what_was_asked_for(
     CHECKS[check](played[wire], replace(truth, is_shaped=wire not in PLAIN))
 
 
+def _drives(heard: Heard) -> list[Mapping[str, Any]]:
+    """The drive by ERA of each pattern of a situation."""
+    return [pattern["drive"] for pattern in heard.patterns]
+
+
 @pytest.mark.parametrize("wire", WIRES[1:])
 def test_the_plate_answers_the_same_through_every_wire(
     played: dict[str, Played], truth: Truth, wire: str
@@ -180,10 +186,7 @@ def test_the_plate_answers_the_same_through_every_wire(
     mine, yours = (replace(played[each], heard=played[each].heard[:2]) for each in (wire, WIRES[0]))
     for one, other in zip(mine.heard, yours.heard, strict=True):
         assert one.situation.fingers == other.situation.fingers
-        drives = [[each["drive"] for each in played.patterns] for played in (one, other)]
-        assert drives[0] == drives[1]
-            each["drive"] for each in other.patterns
-        ]
+        assert _drives(one) == _drives(other)
     apart = responses_apart(mine, yours)
     assert len(apart) == 2
     for share, limit in zip(apart, rounding(mine, truth), strict=True):

@@ -120,6 +120,20 @@ def test_build_resumes_when_it_was_ended(
     assert [left.name for left in tmp_path.iterdir()] == ["t.npz"]
 
 
+def test_build_interrupted_at_once_names_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There is none to resume from."""
+
+    def interrupted(*arguments: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("model.table.build.build_in_parts", interrupted)
+    result = CliRunner().invoke(app, ["table", "build", RIG, "-o", str(tmp_path / "t.npz"), *QUICK])
+    assert "interrupted" in result.stderr
+    assert ".parts" not in result.stderr
+
+
 def test_show_prints_summary_map_and_a_query_that_has_an_answer(
     built: Path, tmp_path: Path
 ) -> None:
@@ -220,6 +234,9 @@ def test_plot_writes_its_pictures(built: Path, tmp_path: Path) -> None:
     names = ["weak_cells", "levels", "contrast", "answer"]
     assert files == [str(folder / f"{name}.png") for name in names]
     assert all(Path(file).read_bytes().startswith(PNG) for file in files)
+    lines = table("plot", built, "-o", folder).stdout.splitlines()
+    assert {line.strip() for line in lines[1:5]} == set(files)
+    assert lines[5:] == [f"Next: era table show {built} --weak"]
 
 
 def test_export_writes_both_formats(built: Path, tmp_path: Path) -> None:

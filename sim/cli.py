@@ -120,9 +120,9 @@ def sim(
         from sim.faults.fault_file import FaultFile, load_faults
         from sim.process.simulation import Simulation
 
-        plain = Wire("serial", speed=speed, shared=shared, unpluggable=faults is not None)
+        defaults = Wire("serial", speed=speed, shared=shared, unpluggable=faults is not None)
         common = _common_wire(
-            plain,
+            defaults,
             {
                 "serial": 0 if serial else None,
                 "modbus-tcp": modbus_tcp,
@@ -137,7 +137,7 @@ def sim(
         _check_rate(rate, frequency_max=loaded.limits.frequency_max)
         simulation = Simulation(
             loaded,
-            assign_wires(loaded.amplifiers, common=common, options=wire or [], plain=plain),
+            assign_wires(loaded.amplifiers, common=common, options=wire or [], defaults=defaults),
             faults=load_faults(faults, amplifiers=loaded.amplifiers) if faults else FaultFile(()),
             fingers={
                 str(number): parse_point(text, what="--finger")
@@ -155,7 +155,7 @@ def sim(
         _run(simulation, virtual_time=virtual_time)
 
 
-def _common_wire(plain: "Wire", ports: Mapping[str, int | None]) -> "Wire | None":
+def _common_wire(defaults: "Wire", ports: Mapping[str, int | None]) -> "Wire | None":
     """The wire of all amplifiers, by the one option given; ports: None for options not given."""
     from dataclasses import replace
 
@@ -166,7 +166,7 @@ def _common_wire(plain: "Wire", ports: Mapping[str, int | None]) -> "Wire | None
             f"{named} exclude each other; give one, or the wire of each amplifier, as in "
             "--wire main=serial --wire side=slcan"
         )
-    return next((replace(plain, kind=kind, port=port) for kind, port in given.items()), None)
+    return next((replace(defaults, kind=kind, port=port) for kind, port in given.items()), None)
 
 
 def _check_rate(rate: float, *, frequency_max: float) -> None:
@@ -226,7 +226,7 @@ class _LiveView:
 
         if self._plate is None:
             self._plate = PlateView(context.bench)
-            context.bench.taps.append(self._plate)
+            context.bench.probes.append(self._plate)
             self._live.start()
         self._live.update(draw(context, self._plate), refresh=True)
 

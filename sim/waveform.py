@@ -36,8 +36,8 @@ class FadingTone:
         return self.start + self.ramp
 
     @property
-    def lasts(self) -> bool:
-        """Whether it is audible once settled."""
+    def is_lasting(self) -> bool:
+        """Whether its final amplitude is non-zero."""
         return self.gain_to > 0
 
     @property
@@ -54,8 +54,8 @@ class FadingTone:
         """Gain at a time [s] not before start."""
         if time >= self.settled:
             return self.gain_to
-        share = (1 - math.cos(math.pi * (time - self.start) / self.ramp)) / 2
-        return self.gain_from + (self.gain_to - self.gain_from) * share
+        gain = (1 - math.cos(math.pi * (time - self.start) / self.ramp)) / 2
+        return self.gain_from + (self.gain_to - self.gain_from) * gain
 
     def amplitude(self, time: float) -> complex:
         """Complex amplitude in full strokes at a time [s] not before start."""
@@ -103,8 +103,8 @@ class ShapedTone:
         return self.start + self.step * (len(self.values) - 1)
 
     @property
-    def lasts(self) -> bool:
-        """Whether it is audible once settled."""
+    def is_lasting(self) -> bool:
+        """Whether its final amplitude is non-zero."""
         return self.values[-1] != 0
 
     @property
@@ -115,7 +115,7 @@ class ShapedTone:
     @property
     def silent_from(self) -> float:
         """Time of silence [s]; infinity for a lasting tone."""
-        return math.inf if self.lasts else self.settled
+        return math.inf if self.is_lasting else self.settled
 
     def amplitude(self, time: float) -> complex:
         """Complex amplitude at a time [s] not before start."""
@@ -144,15 +144,15 @@ class ShapedTone:
             terms.append(
                 Term(since, since + self.step, omega, here * phase_factor, slope * phase_factor)
             )
-        if self.lasts:
+        if self.is_lasting:
             phase_factor = stroke * cmath.exp(1j * omega * (self.settled - self.origin))
             terms.append(Term(self.settled, math.inf, omega, self.values[-1] * phase_factor))
         return tuple(terms)
 
 
-Tone: TypeAlias = FadingTone | ShapedTone
+ToneSegment: TypeAlias = FadingTone | ShapedTone
 
-Output: TypeAlias = tuple[Tone, ...]
+Output: TypeAlias = tuple[ToneSegment, ...]
 """The output of one channel: the sum of these tones."""
 
 
@@ -176,7 +176,7 @@ def fade_to(
         return fading
     origin = time
     if keep_phase:
-        same = [tone for tone in playing if tone.lasts and tone.frequency == frequency]
+        same = [tone for tone in playing if tone.is_lasting and tone.frequency == frequency]
         origin = same[0].origin if same else time
     gain_from = 1.0 if ramp == 0 else 0.0
     return (*fading, FadingTone(frequency, amplitude, origin, time, ramp, gain_from, 1.0))
@@ -200,7 +200,11 @@ def shape_to(
     fade out within ramp.
     """
     continuing = next(
-        (tone for tone in playing if keep_phase and tone.lasts and tone.frequency == frequency),
+        (
+            tone
+            for tone in playing
+            if keep_phase and tone.is_lasting and tone.frequency == frequency
+        ),
         None,
     )
     faded = (tone.fade_out(time, ramp=ramp) for tone in playing if tone is not continuing)
@@ -214,7 +218,7 @@ def end_along(
     playing: Output, time: float, *, ramp: float, step: float, knots: tuple[complex, ...]
 ) -> Output:
     """The output after a command at a time [s] to end along an envelope; see `shape_to`."""
-    lasting = next((tone for tone in playing if tone.lasts), None)
+    lasting = next((tone for tone in playing if tone.is_lasting), None)
     if lasting is None:
         return tuple(tone for tone in playing if tone.silent_from > time)
     return shape_to(

@@ -172,7 +172,7 @@ def _replay(path: Path, checker: "Witness") -> list["Violation"]:
 
     end = None
     for piece in read_capture(path, wires=checker.wires):
-        checker.bytes(piece.wire, piece.direction, piece.time, piece.data)
+        checker.record_bytes(piece.wire, piece.direction, piece.time, piece.data)
         end = piece.time
     if end is None:
         raise InputError(

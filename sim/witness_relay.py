@@ -63,7 +63,7 @@ async def _serial_relay(endpoint: WireEndpoint, name: str, witness: Witness) -> 
     def to_amplifier(data: bytes) -> None:
         with contextlib.suppress(OSError):
             port.write(data)
-        witness.bytes(name, "amplifier", time.monotonic(), data)
+        witness.record_bytes(name, "amplifier", time.monotonic(), data)
 
     terminal = PseudoTerminal(to_amplifier)
 
@@ -79,7 +79,7 @@ async def _serial_relay(endpoint: WireEndpoint, name: str, witness: Witness) -> 
             witness.closed(name, time.monotonic())
             return
         terminal.write(data)
-        witness.bytes(name, "host", time.monotonic(), data)
+        witness.record_bytes(name, "host", time.monotonic(), data)
 
     with contextlib.closing(port), contextlib.closing(terminal):
         loop.add_reader(port.fileno(), to_host)
@@ -95,25 +95,27 @@ async def _tcp_relay(endpoint: WireEndpoint, name: str, witness: Witness) -> Asy
     """Relay a server through a port of the loopback interface."""
     loop = asyncio.get_running_loop()
     host, _, number = endpoint.location.rpartition(":")
-    open_now: set[_Half] = set()
+    open_now: set[_RelayedConnection] = set()
     opening: set[asyncio.Task[None]] = set()
 
-    def opened(half: "_Half") -> None:
-        open_now.add(half)
+    def opened(connection: "_RelayedConnection") -> None:
+        open_now.add(connection)
         witness.opened(name, time.monotonic())
 
-    def closed(half: "_Half") -> None:
-        open_now.discard(half)
+    def closed(connection: "_RelayedConnection") -> None:
+        open_now.discard(connection)
         if not open_now:
             witness.closed(name, time.monotonic())
 
-    def shown(direction: Direction, data: bytes) -> None:
-        witness.bytes(name, direction, time.monotonic(), data)
+    def on_data(direction: Direction, data: bytes) -> None:
+        witness.record_bytes(name, direction, time.monotonic(), data)
 
-    async def open_back(front: "_Half") -> None:
+    async def open_back(front: "_RelayedConnection") -> None:
         try:
             _, back = await loop.create_connection(
-                lambda: _Half("host", shown, lambda _: None, lambda _: None), host, int(number)
+                lambda: _RelayedConnection("host", on_data, lambda _: None, lambda _: None),
+                host,
+                int(number),
             )
         except OSError as problem:
             _logger.warning(
@@ -126,45 +128,45 @@ async def _tcp_relay(endpoint: WireEndpoint, name: str, witness: Witness) -> Asy
         back.connect(front)
         front.connect(back)
 
-    def make() -> "_Half":
-        half = _Half("amplifier", shown, opened, closed)
-        task = loop.create_task(open_back(half))
+    def make() -> "_RelayedConnection":
+        connection = _RelayedConnection("amplifier", on_data, opened, closed)
+        task = loop.create_task(open_back(connection))
         opening.add(task)
         task.add_done_callback(opening.discard)
-        return half
+        return connection
 
     server = await loop.create_server(make, "127.0.0.1", 0)
     try:
         yield f"127.0.0.1:{server.sockets[0].getsockname()[1]}"
     finally:
         server.close()
-        for half in tuple(open_now):
-            half.close()
+        for connection in tuple(open_now):
+            connection.close()
         await asyncio.gather(*opening, return_exceptions=True)
         await server.wait_closed()
 
 
-class _Half(asyncio.Protocol):
+class _RelayedConnection(asyncio.Protocol):
     """One of the two connections of a relay, which forwards to the other."""
 
     def __init__(
         self,
         direction: Direction,
-        shown: Callable[[Direction, bytes], None],
-        opened: Callable[["_Half"], None],
-        closed: Callable[["_Half"], None],
+        on_data: Callable[[Direction, bytes], None],
+        opened: Callable[["_RelayedConnection"], None],
+        closed: Callable[["_RelayedConnection"], None],
     ) -> None:
         self._direction: Direction = direction
-        self._shown = shown
+        self._on_data = on_data
         self._opened = opened
         self._closed = closed
-        self._other: _Half | None = None
+        self._other: _RelayedConnection | None = None
         self._early = b""
         self._transport: asyncio.Transport | None = None
         self._is_closed = False
 
-    def connect(self, other: "_Half") -> None:
-        """Connect the other half, and forward the bytes received meanwhile."""
+    def connect(self, other: "_RelayedConnection") -> None:
+        """Connect the other one, and forward the bytes received meanwhile."""
         self._other = other
         early, self._early = self._early, b""
         if early:
@@ -178,15 +180,15 @@ class _Half(asyncio.Protocol):
         self._opened(self)
 
     def data_received(self, data: bytes) -> None:
-        """Forward, then show the witness."""
+        """Forward, then pass to the witness."""
         if self._other is None or self._other._transport is None:
             self._early += data
             return
         self._other._transport.write(data)
-        self._shown(self._direction, data)
+        self._on_data(self._direction, data)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Close the other half, too."""
+        """Close the other one, too."""
         self._is_closed = True
         self._closed(self)
         if self._other is not None:

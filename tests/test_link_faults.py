@@ -132,7 +132,7 @@ async def beat_on(amplifier: Amplifier) -> None:
 
 def fed_at(far: FarSide) -> float:
     """Return when the watchdog was last fed [s], by the amplifier's clock."""
-    return far.amplifier._fed
+    return far.amplifier._last_fed
 
 
 @over_every_wire

@@ -50,11 +50,11 @@ _FAULTS_KEPT = 16
 _HIGH_VOLTAGE = 1800.0  # V
 _DISCHARGE = 0.02  # s; time constant of the supply once it is off
 _SLOTS = 63
-_NOT_FEEDING = (Hello, GetCaps, GetStatus, GetFaults)
+_NON_FEEDING_REQUESTS = (Hello, GetCaps, GetStatus, GetFaults)
 
 
 def capabilities(channels: int) -> Capabilities:
-    """Capabilities of a simulated amplifier with so many channels."""
+    """Capabilities of a simulated amplifier with the given number of channels."""
     return Capabilities(
         channels=channels,
         frequency_min=10.0,  # the guard's floor: below it a plate only rocks
@@ -101,7 +101,7 @@ class SimulatedAmplifier:
         self._channels = Channels(self.capabilities.channels)
         self._sets = SetStore(self.capabilities)
         self._watchdog = 0.0
-        self._fed = 0.0
+        self._last_fed = 0.0
         self._vibration_end = math.inf
         self._silent_from = -math.inf  # end of the last silencing ramp
         self._is_derated = False
@@ -115,7 +115,10 @@ class SimulatedAmplifier:
     def next_event(self) -> float:
         """Time of the next event [s], up to which `outputs` holds."""
         return min(
-            self._vibration_end, self._watchdog_end, self._silence_reached, self._too_warm_from
+            self._vibration_end,
+            self._watchdog_end,
+            self._silence_reached,
+            self._overtemperature_from,
         )
 
     def tick(self, now: float) -> None:
@@ -133,7 +136,7 @@ class SimulatedAmplifier:
                     AmplifierState.FAULT if silent else AmplifierState.SWITCH_ON_DISABLED, moment
                 )
             else:
-                self._too_warm(moment)
+                self._handle_overtemperature(moment)
         if self._is_derated and self._heat.at(now) < GOOD_BELOW:
             self._is_derated = False
 
@@ -147,15 +150,15 @@ class SimulatedAmplifier:
             reply = self._carry_out(request, following, now)
         except RefusedSet as refusal:
             reply = refusal.nak
-        if not isinstance(request, _NOT_FEEDING) and not isinstance(reply, Nak):
-            self._fed = now
+        if not isinstance(request, _NON_FEEDING_REQUESTS) and not isinstance(reply, Nak):
+            self._last_fed = now
         # After feeding the watchdog, so that the status shows it full.
         return self.status(now) if reply is None else reply
 
     def status(self, now: float) -> Status:
         """Status at a time [s] up to which it has been ticked."""
         levels = self._channels.levels(now)
-        left = self._fed + self._watchdog - now if self.state in ENABLED else 0.0
+        left = self._last_fed + self._watchdog - now if self.state in ENABLED else 0.0
         is_on = self.state in (AmplifierState.SWITCHED_ON, *ENABLED) or any(levels)
         decayed = math.exp(min(0.0, (self._silent_from - now) / _DISCHARGE))
         return Status(
@@ -184,9 +187,9 @@ class SimulatedAmplifier:
         """Set the temperature [°C], with its consequences."""
         self._heat = ThermalState(moment, temperature, self._heat.final)
         if temperature > DERATE_ABOVE and not self._is_derated:
-            self._too_warm(moment)
+            self._handle_overtemperature(moment)
         if temperature > FAULT_ABOVE:
-            self._too_warm(moment)
+            self._handle_overtemperature(moment)
 
     def restart(self, moment: float) -> None:
         """Power-cycle: silent at once, disarmed, without sets and envelopes."""
@@ -215,18 +218,18 @@ class SimulatedAmplifier:
                 self._enter(following, now)
                 self.tick(now)
             case Clear():
-                if self._silent_from <= now and not self._is_still_hot(now):
+                if self._silent_from <= now and self._has_cooled(now):
                     self.fault = Fault.NONE
                     self._enter(following, now)
             case LoadEnvelope(envelope=envelope):
                 return self._sets.load(envelope)
             case Stage(command_set=wanted):
-                return self._sets.stage(wanted, share=self._share)
+                return self._sets.stage(wanted, derating_factor=self._derating_factor)
             case Commit(token=token):
                 return self._commit(token, now)
             case Apply(command_set=wanted):
                 if self._sets.playing(wanted.token) is None:
-                    self._sets.stage(wanted, share=self._share)
+                    self._sets.stage(wanted, derating_factor=self._derating_factor)
                 return self._commit(wanted.token, now)
             case _:  # GetStatus, Ping
                 pass
@@ -239,7 +242,7 @@ class SimulatedAmplifier:
         # Arming starts at level zero, even if another host left it playing.
         self._silence(now, ramp=SILENCING_RAMP)
         self._watchdog = watchdog
-        self._fed = now
+        self._last_fed = now
         self._sets.forget()
         self._enter(AmplifierState.OPERATION_ENABLED, now)
         return None
@@ -256,8 +259,8 @@ class SimulatedAmplifier:
         return active.achieved
 
     @property
-    def _share(self) -> float:
-        """Share of the level that it plays."""
+    def _derating_factor(self) -> float:
+        """Factor on every level."""
         return DERATED if self._is_derated else 1.0
 
     def _stopping_ramp(self, ramp: float) -> float:
@@ -284,7 +287,7 @@ class SimulatedAmplifier:
 
     @property
     def _watchdog_end(self) -> float:
-        return self._fed + self._watchdog if self.state in ENABLED else math.inf
+        return self._last_fed + self._watchdog if self.state in ENABLED else math.inf
 
     @property
     def _silence_reached(self) -> float:
@@ -292,7 +295,7 @@ class SimulatedAmplifier:
         return self._silent_from if self.state in ending else math.inf
 
     @property
-    def _too_warm_from(self) -> float:
+    def _overtemperature_from(self) -> float:
         if self.state not in ENABLED:
             return math.inf
         return self._heat.when(FAULT_ABOVE if self._is_derated else DERATE_ABOVE)
@@ -300,7 +303,7 @@ class SimulatedAmplifier:
     def _warm(self, moment: float) -> None:
         self._heat = self._heat.driven(moment, load=self._channels.load)
 
-    def _too_warm(self, moment: float) -> None:
+    def _handle_overtemperature(self, moment: float) -> None:
         """Derate at the lower threshold, trip at the higher."""
         if self._is_derated:
             self.trip(Fault.OVER_TEMPERATURE, moment)
@@ -309,6 +312,6 @@ class SimulatedAmplifier:
         self._channels.derate(moment, DERATED)
         self._warm(moment)
 
-    def _is_still_hot(self, now: float) -> bool:
-        """Whether the cause of an over-temperature fault persists."""
-        return self.fault is Fault.OVER_TEMPERATURE and self._heat.at(now) >= GOOD_BELOW
+    def _has_cooled(self, now: float) -> bool:
+        """Whether no over-temperature fault persists."""
+        return self.fault is not Fault.OVER_TEMPERATURE or self._heat.at(now) < GOOD_BELOW

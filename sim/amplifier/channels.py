@@ -64,7 +64,7 @@ class Channels:
     def load(self) -> float:
         """Mean squared settled level of the channels."""
         levels = [
-            sum(abs(tone.settled_amplitude) for tone in output if tone.lasts)
+            sum(abs(tone.settled_amplitude) for tone in output if tone.is_lasting)
             for output in self._outputs
         ]
         return sum(level**2 for level in levels) / max(len(levels), 1)
@@ -120,7 +120,7 @@ class Channels:
     def derate(self, time: float, factor: float) -> None:
         """Scale the levels; phases continue."""
         for channel, playing in enumerate(self._outputs):
-            tone = next((tone for tone in playing if tone.lasts), None)
+            tone = next((tone for tone in playing if tone.is_lasting), None)
             if tone is not None:
                 self._outputs[channel] = fade_to(
                     playing,

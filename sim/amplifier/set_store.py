@@ -49,12 +49,12 @@ class SetStore:
             self.slots.pop(kept.slot, None)
         return Loaded(slot=kept.slot, knots=len(kept.knots))
 
-    def stage(self, wanted: CommandSet, *, share: float) -> Achieved:
-        """Stage a set with the present envelopes, at a share of its levels."""
+    def stage(self, wanted: CommandSet, *, derating_factor: float) -> Achieved:
+        """Stage a set with the present envelopes, its levels times the factor."""
         if wanted.token in self.tokens:  # a late duplicate
             raise RefusedSet(NakCode.BAD_TOKEN)
         staged = self._with_envelopes(_quantised_set(wanted, self._capabilities))
-        self.staged = staged if share == 1 else staged.derated(share)
+        self.staged = staged if derating_factor == 1 else staged.derated(derating_factor)
         return self.staged.achieved
 
     def commit(self, token: int) -> PlayableSet:

@@ -25,18 +25,18 @@ from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, load_positions
 from model.transients.base_motion import Term
 from sim.amplifier.amplifier import SimulatedAmplifier
-from sim.plant.felt import Felt, feel
+from sim.plant.felt import Felt, measure_vibration
 from sim.plant.fingers import KEPT, Fingers, Position, Record
 from sim.plant.imperfections import ChannelErrors, Imperfections, delayed, draw_noise, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
-from sim.waveform import Output, Tone
+from sim.waveform import Output, ToneSegment
 
 _TICK = 0.01  # s; of `keep_time`
 _MAX_STEP = 1.0  # s; sampled at once
 _MAX_SHAPES = 16  # sets of points
 
 
-class Tap(Protocol):
+class Probe(Protocol):
     """A listener to the plate at fixed points, by their reduced shapes (p, r)."""
 
     @property
@@ -52,7 +52,7 @@ class Tap(Protocol):
 class Bench:
     """A simulated rig at rest at time now [s]; sample_rate [Hz]: of sensors and fingers.
 
-    taps: listeners beside the fingers; finger_load: None for fingers without weight;
+    probes: listeners beside the fingers; finger_load: None for fingers without weight;
     imperfections: errors of amplifiers and channels. Raises InputError for unknown channels.
     """
 
@@ -70,7 +70,7 @@ class Bench:
         self.sample_rate = sample_rate
         self.finger_load = finger_load
         self.imperfections = imperfections
-        self.taps: list[Tap] = []
+        self.probes: list[Probe] = []
         reduced = _reduced(
             rig.plate, rig.mesh, tuple(rig.eras), tuple(rig.loads), rig.limits.frequency_max
         )
@@ -85,13 +85,13 @@ class Bench:
         # By ERA: the output of its channel, the output that moves the base, and the changes between
         # them that are delayed, each with its time [s].
         self._commanded: list[Output] = [()] * len(rig.eras)
-        self._moving: list[Output] = [()] * len(rig.eras)
+        self._applied_outputs: list[Output] = [()] * len(rig.eras)
         self._delayed: list[deque[tuple[float, Output]]] = [deque() for _ in rig.eras]
         self._noise = [draw_noise(seed=imperfections.seed, number=n) for n in range(len(rig.eras))]
         self._shapes_at = lru_cache(_MAX_SHAPES)(
             lambda points: self._plant.reduced.at(np.frombuffer(points).reshape(-1, 2))
         )
-        self._played: deque[tuple[Tone, float]] = deque()  # with the time of its end [s]
+        self._played: deque[tuple[ToneSegment, float]] = deque()  # with the time of its end [s]
 
     @property
     def time(self) -> float:
@@ -100,7 +100,7 @@ class Bench:
 
     def advance(self, now: float) -> None:
         """Advance to a time [s]; each event happens at its own time."""
-        if now - self.time > KEPT and not self.taps:  # older samples are not kept
+        if now - self.time > KEPT and not self.probes:  # older samples are not kept
             self._advance_amplifiers(now - KEPT, is_sampled=False)
         while now - self.time > _MAX_STEP:
             self._advance_amplifiers(self.time + _MAX_STEP, is_sampled=True)
@@ -149,9 +149,9 @@ class Bench:
         return self.fingers.felt(since, until), self._frequencies(since, until)
 
     def felt(self, since: float, until: float) -> dict[str, Felt]:
-        """What each finger felt in such a window, by id."""
+        """Vibration at each finger in such a window, by id."""
         records, frequencies = self.records(since, until)
-        return {name: feel(record, frequencies) for name, record in records.items()}
+        return {name: measure_vibration(record, frequencies) for name, record in records.items()}
 
     def _advance_amplifiers(self, to_time: float, *, is_sampled: bool) -> None:
         while True:
@@ -168,17 +168,17 @@ class Bench:
         if to_time <= self.time:
             return
         since, self._time = self._time, to_time
-        if not (is_sampled and (self.fingers.layout.positions or self.taps)):
+        if not (is_sampled and (self.fingers.layout.positions or self.probes)):
             return
         self._plant.skip(since)
-        shapes = [self.fingers.layout.shapes, *(tap.shapes for tap in self.taps)]
+        shapes = [self.fingers.layout.shapes, *(probe.shapes for probe in self.probes)]
         times, accelerations = self._plant.advance(
             to_time, sample_rate=self.sample_rate, shapes=np.concatenate(shapes)
         )
         parts = np.split(accelerations, np.cumsum([len(shapes) for shapes in shapes])[:-1], axis=1)
         self.fingers.record(times, parts[0])
-        for tap, part in zip(self.taps, parts[1:], strict=True):
-            tap.record(times, part)
+        for probe, part in zip(self.probes, parts[1:], strict=True):
+            probe.record(times, part)
 
     def _update_plant(self) -> None:
         """Pass changed outputs of the channels on to the plant, after their delay."""
@@ -192,11 +192,11 @@ class Bench:
                 waiting.append((self.time + delay, delayed(playing, delay)))
             while waiting and waiting[0][0] <= self.time:
                 _, playing = waiting.popleft()
-                before = self._moving[index]
+                before = self._applied_outputs[index]
                 self._plant.skip(self._time)
                 self._plant.set_input(index, self._motion(index, playing))
                 self._played.extend((tone, self.time) for tone in before if tone not in playing)
-                self._moving[index] = playing
+                self._applied_outputs[index] = playing
         while self._played and self._played[0][1] < self.time - KEPT:
             self._played.popleft()
 
@@ -215,7 +215,7 @@ class Bench:
     def _frequencies(self, since: float, until: float) -> list[float]:
         """The frequencies [Hz] that channels were commanded to play in a window."""
         ended = [(tone, min(end, tone.silent_from)) for tone, end in self._played]
-        present = [(tone, tone.silent_from) for output in self._moving for tone in output]
+        present = [(tone, tone.silent_from) for output in self._applied_outputs for tone in output]
         return sorted(
             {tone.frequency for tone, end in ended + present if tone.start < until and end > since}
         )

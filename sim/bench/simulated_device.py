@@ -31,16 +31,16 @@ _FAULTS = {
 
 
 class SimulatedDevice:
-    """An amplifier of a bench by name; number: its address on a wire, from 1.
+    """An amplifier of a bench by name; address: on its wire, from 1.
 
     Its time is that of the running event loop.
     """
 
     def __init__(
-        self, bench: Bench, name: str, *, number: int = 1, faults: Faults | None = None
+        self, bench: Bench, name: str, *, address: int = 1, faults: Faults | None = None
     ) -> None:
         self.name = name
-        self.number = number
+        self.address = address
         self.faults = Faults() if faults is None else faults
         self._bench = bench
         self._amplifier = bench.amplifiers[name]
@@ -140,7 +140,7 @@ class SimulatedDevice:
                 self._timers.append(loop.call_later(delay, self._handle_edge, window, edge))
 
     def _handle_edge(self, window: FaultWindow, edge: "_Edge") -> None:
-        """An window begins, is half over or ends."""
+        """Apply an edge (begin, half, end) of a fault window."""
         now = clock.now()
         self._bench.advance(now)
         match window.fault, edge:

@@ -13,7 +13,7 @@ from sim.control.values import (
     parse_position,
     parse_window,
 )
-from sim.plant.felt import feel
+from sim.plant.felt import measure_vibration
 from sim.plant.fingers import Position
 
 
@@ -54,7 +54,7 @@ async def _felt(context: SimulationContext, request: Request, now: float) -> Res
     records, frequencies = context.bench.records(since, until)
     felt = {
         # In a thread: a long fit must not delay the amplifiers' replies.
-        id: await asyncio.to_thread(feel, record, frequencies)
+        id: await asyncio.to_thread(measure_vibration, record, frequencies)
         for id, record in records.items()
     }
     return {

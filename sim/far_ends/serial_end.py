@@ -1,6 +1,6 @@
 """The amplifiers' side of a serial line: a pseudo-terminal in front of simulated amplifiers.
 
-Several amplifiers share a line as on RS-485, each with its address, and then send no events.
+On a shared (multi-drop) line amplifiers have one address each, and send no events.
 
 Not modelled: noise, parity, collisions.
 """
@@ -33,7 +33,7 @@ class SerialEnd:
     ) -> None:
         alone = len(devices) == 1
         self._devices = {
-            PROTOCOL.serial.address if alone else device.number: device for device in devices
+            PROTOCOL.serial.address if alone else device.address: device for device in devices
         }
         self._first = devices[0]
         self._baud = baud or PROTOCOL.serial.baud

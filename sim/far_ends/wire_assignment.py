@@ -19,55 +19,54 @@ _KIND_OF_SCHEME = {
     "can+socketcand": "socketcand",
     "can+slcan": "slcan",
 }
+_EXAMPLE = "; as in --wire main=serial"
 
 
 @dataclass(frozen=True)
 class WireAssignment:
-    """The wire of an amplifier; number: its address there, None for any."""
+    """The wire of an amplifier; address: unit, node or address there, None for any."""
 
     wire: Wire
-    number: int | None = None
+    address: int | None = None
 
 
 def assign_wires(
-    amplifiers: Mapping[str, str], *, common: Wire | None, options: Sequence[str], plain: Wire
+    amplifiers: Mapping[str, str], *, common: Wire | None, options: Sequence[str], defaults: Wire
 ) -> dict[str, WireAssignment]:
     """The wire of each amplifier, by name.
 
     amplifiers: URLs by name; options: texts like `main=modbus-tcp:5020`; common: the wire of all
-    others, None to follow their URLs; plain: speed and sharing of those wires. Equal wires are
+    others, None to follow their URLs; defaults: speed and sharing of those wires. Equal wires are
     shared. Raises InputError.
     """
     assigned: dict[str, WireAssignment] = {}
     for text in options:
         name, equals, kind = text.partition("=")
-        if not equals or name not in amplifiers or name in assigned:
-            problem = (
-                "must be NAME=WIRE"
-                if not equals
-                else "is given twice"
-                if name in assigned
-                else f"amplifier must be one of {', '.join(amplifiers)}"
-            )
-            raise InputError(f"--wire {text}: {problem}; as in --wire main=serial")
-        assigned[name] = WireAssignment(_wire_of_option(kind, text, plain))
+        if not equals:
+            raise InputError(f"--wire {text}: must be NAME=WIRE{_EXAMPLE}")
+        if name not in amplifiers:
+            known = ", ".join(amplifiers)
+            raise InputError(f"--wire {text}: amplifier must be one of {known}{_EXAMPLE}")
+        if name in assigned:
+            raise InputError(f"--wire {text}: must be given once per amplifier{_EXAMPLE}")
+        assigned[name] = WireAssignment(_wire_of_option(kind, text, defaults))
     for name, url in amplifiers.items():
         if name not in assigned:
-            assigned[name] = WireAssignment(common) if common else _wire_of_url(name, url, plain)
+            assigned[name] = WireAssignment(common) if common else _wire_of_url(name, url, defaults)
     return {name: assigned[name] for name in amplifiers}
 
 
-def _wire_of_option(text: str, option: str, plain: Wire) -> Wire:
+def _wire_of_option(text: str, option: str, defaults: Wire) -> Wire:
     kind, colon, port = text.partition(":")
     if kind in _KIND_OF_SCHEME.values() and bool(colon) <= (kind in _PORTED):
         if not colon:
-            return replace(plain, kind=kind)
+            return replace(defaults, kind=kind)
         if port.isascii() and port.isdigit() and int(port) <= 65535:
-            return replace(plain, kind=kind, port=int(port))
+            return replace(defaults, kind=kind, port=int(port))
     raise InputError(f"--wire {option}: wire must be one of {', '.join(_KINDS)}, got {text!r}")
 
 
-def _wire_of_url(name: str, url: str, plain: Wire) -> WireAssignment:
+def _wire_of_url(name: str, url: str, defaults: Wire) -> WireAssignment:
     """The wire that a URL names."""
     parts = urlsplit(url)
     kind = _KIND_OF_SCHEME.get(parts.scheme)
@@ -76,18 +75,19 @@ def _wire_of_url(name: str, url: str, plain: Wire) -> WireAssignment:
     except ValueError as error:
         raise InputError(f"amplifier {name}: {url}: invalid port: {error}") from None
     if kind is None or (kind in _PORTED and port is None):
+        schemes = ", ".join(_KIND_OF_SCHEME)
         raise InputError(
-            f"amplifier {name}: {url} names no wire that can be simulated; add --serial (a "
-            "pseudo-terminal each), --modbus-tcp PORT, --modbus-rtu, --socketcand PORT or --slcan "
-            f"for all, or --wire {name}=serial"
+            f"amplifier {name}: scheme must be one of {schemes}, with a port over TCP, got {url}; "
+            "add --serial (a pseudo-terminal each), --modbus-tcp PORT, --modbus-rtu, --socketcand "
+            f"PORT or --slcan for all, or --wire {name}=serial"
         )
-    wire = replace(plain, kind=kind, port=port or 0)
+    wire = replace(defaults, kind=kind, port=port or 0)
     if port is None:  # amplifiers whose URLs name one line share it
         wire = replace(wire, line=parts.netloc + parts.path, shared=True)
-    return WireAssignment(wire, _number(parts))
+    return WireAssignment(wire, _address(parts))
 
 
-def _number(parts: SplitResult) -> int | None:
+def _address(parts: SplitResult) -> int | None:
     """The unit, node or address in a URL."""
     if parts.scheme == "modbus+tcp":
         text = parts.path.strip("/")

@@ -76,7 +76,7 @@ class Faults:
         return any(self._is_on(window, time) for window in self.windows if window.fault == fault)
 
     def pass_on(self, frame: bytes, *, toward: Toward, time: float) -> list[tuple[float, bytes]]:
-        """What arrives of a frame sent at a time [s]: pieces, each with its delay [s]."""
+        """Delivered pieces of a frame sent at a time [s], each with its delay [s]."""
         arriving = [(0.0, frame)]
         for window in self.windows:
             is_hit = self._is_on(window, time) and window.toward in (None, toward)

@@ -19,7 +19,7 @@ class Felt:
     peak: FloatArray
 
 
-def feel(record: Record, frequencies: Sequence[float]) -> Felt:
+def measure_vibration(record: Record, frequencies: Sequence[float]) -> Felt:
     """Peak at each point, and the amplitude of each frequency [Hz] by least squares.
 
     The fit of sines and cosines assumes steady vibration: the window must exclude transients, and

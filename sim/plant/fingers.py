@@ -25,7 +25,7 @@ Position: TypeAlias = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class FingerPositions:
     """Positions of fingers, the points of their tips (p, 2) [m], and the shapes there.
 
     shapes (p, r); columns: the points of each finger.
@@ -65,7 +65,7 @@ class Fingers:
 
     def __init__(self, reduced: ReducedPlate) -> None:
         self._reduced = reduced
-        self._pieces: deque[tuple[Layout, FloatArray, FloatArray]] = deque()
+        self._pieces: deque[tuple[FingerPositions, FloatArray, FloatArray]] = deque()
         self.layout = self._lay_out({})
 
     def place(
@@ -111,7 +111,7 @@ class Fingers:
             for name, layout in last.items()
         }
 
-    def _lay_out(self, positions: Mapping[str, Position]) -> Layout:
+    def _lay_out(self, positions: Mapping[str, Position]) -> FingerPositions:
         columns, parts, start = {}, [np.zeros((0, 2))], 0
         for name, (x, y) in positions.items():
             part = fingertip_points(x, y, self._reduced.plate)
@@ -119,13 +119,13 @@ class Fingers:
             start += len(part)
             parts.append(part)
         points = np.concatenate(parts)
-        return Layout(dict(positions), points, self._reduced.at(points), columns)
+        return FingerPositions(dict(positions), points, self._reduced.at(points), columns)
 
 
 def _join(
     name: str,
-    last: Layout,
-    pieces: list[tuple[Layout, FloatArray, FloatArray]],
+    last: FingerPositions,
+    pieces: list[tuple[FingerPositions, FloatArray, FloatArray]],
     *,
     since: float,
     until: float,

@@ -41,24 +41,24 @@ class Plant:
     ) -> None:
         self.time = time
         self._plates = LoadedPlateCache(reduced, eras, loads)
-        self._now: LoadedPlate = self._plates.under((), time=time)
-        self._free = np.zeros(len(self._now.plate.decay), dtype=complex)
+        self._current: LoadedPlate = self._plates.under((), time=time)
+        self._free = np.zeros(len(self._current.plate.decay), dtype=complex)
         self._particular: list[list[ParticularSolution]] = [[] for _ in eras]
 
     @property
     def reduced(self) -> ReducedPlate:
         """The plate in its present coordinates, which depend on the contacts."""
-        return self._now.reduced
+        return self._current.reduced
 
     @property
     def contacts(self) -> tuple[PointLoad, ...]:
         """The present contacts."""
-        return self._now.contacts
+        return self._current.contacts
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
         """Present displacement and velocity, (r,) each, in the coordinates of `reduced`."""
-        x = (self._now.plate.free_state @ self._free).real
+        x = (self._current.plate.free_state @ self._free).real
         for solution in self._active():
             x = x + solution.state(self.time)
         r = len(x) // 2
@@ -69,7 +69,7 @@ class Plant:
         # Unchanged terms continue; only the others are exchanged.
         known = {solution.term: solution for solution in self._particular[era]}
         wanted = _united([term for term in terms if term.end > self.time])
-        new = self._now.plate.particular_solutions(
+        new = self._current.plate.particular_solutions(
             era, [term for term in wanted if term not in known]
         )
         gone = [solution for term, solution in known.items() if term not in wanted]
@@ -88,19 +88,19 @@ class Plant:
         if tuple(contacts) == self.contacts:
             return
         q, v = self.state
-        before = self._now.reduced
-        self._now = self._plates.under(contacts, time=self.time)
-        if self._now.reduced is not before:
-            carried = self._now.reduced.projection_from(before)
+        before = self._current.reduced
+        self._current = self._plates.under(contacts, time=self.time)
+        if self._current.reduced is not before:
+            carried = self._current.reduced.projection_from(before)
             q, v = carried @ q, carried @ v
         self._particular = [
-            self._now.plate.particular_solutions(era, [solution.term for solution in solutions])
+            self._current.plate.particular_solutions(era, [solution.term for solution in solutions])
             for era, solutions in enumerate(self._particular)
         ]
         remainder = np.concatenate([q, v])
         for solution in self._active():
             remainder = remainder - solution.state(self.time)
-        self._free = self._now.plate.to_free @ remainder
+        self._free = self._current.plate.to_free @ remainder
 
     def advance(
         self, to_time: float, *, sample_rate: float, shapes: FloatArray
@@ -121,9 +121,9 @@ class Plant:
             upto = int(np.searchsorted(times, boundary))
             self._sample(times[done:upto], samples[done:upto], sample_rate, points)
             done = upto
-            self._pass(boundary)
+            self._cross_boundary(boundary)
         self._sample(times[done:], samples[done:], sample_rate, points)
-        self._coast(to_time)
+        self._propagate_free(to_time)
         return times, samples if points is shapes else samples @ shapes.T
 
     def skip(self, to_time: float) -> None:
@@ -131,8 +131,8 @@ class Plant:
         if to_time <= self.time:
             return
         for boundary in self._boundaries(to_time):
-            self._pass(boundary)
-        self._coast(to_time)
+            self._cross_boundary(boundary)
+        self._propagate_free(to_time)
 
     def _active(self) -> list[ParticularSolution]:
         return [
@@ -160,22 +160,22 @@ class Plant:
     ) -> None:
         """Replace particular solutions; displacement and velocity stay continuous."""
         if before or after:
-            jump = np.zeros(self._now.plate.free_state.shape[0])
+            jump = np.zeros(self._current.plate.free_state.shape[0])
             for solution in before:
                 jump += solution.state(self.time)
             for solution in after:
                 jump -= solution.state(self.time)
-            self._free = self._free + self._now.plate.to_free @ jump
+            self._free = self._free + self._current.plate.to_free @ jump
 
-    def _coast(self, to_time: float) -> None:
-        self._free = self._free * np.exp(self._now.plate.decay * (to_time - self.time))
+    def _propagate_free(self, to_time: float) -> None:
+        self._free = self._free * np.exp(self._current.plate.decay * (to_time - self.time))
         self._free[np.abs(self._free) < _NEGLIGIBLE] = 0
         self.time = to_time
 
-    def _pass(self, boundary: float) -> None:
+    def _cross_boundary(self, boundary: float) -> None:
         """Advance to a time at which terms start or end."""
         before = self._active()
-        self._coast(boundary)
+        self._propagate_free(boundary)
         after = self._active()
         self._exchange(
             [solution for solution in before if solution not in after],
@@ -195,10 +195,10 @@ class Plant:
         """
         if not len(times):
             return
-        decay = self._now.plate.decay
+        decay = self._current.plate.decay
         free = self._free * np.exp(decay * (times[0] - self.time))
-        modal = ((points @ self._now.plate.free_acceleration) * free).T
-        table = self._now.exponentials(sample_rate)
+        modal = ((points @ self._current.plate.free_acceleration) * free).T
+        table = self._current.exponentials(sample_rate)
         forced = _ForcedResponse(self._active(), points)
         for start in range(0, len(times), BLOCK):
             block = times[start : start + BLOCK]

@@ -23,7 +23,7 @@ from model.transients.envelope import Envelopes, ramped_onset, shaped
 from model.transients.measures import ONSET_WINDOW
 from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes, peak_acceleration
-from sim.plant.felt import Felt, feel
+from sim.plant.felt import Felt, measure_vibration
 from sim.plant.fingers import Record
 from sim.plant.plant import SAMPLE_RATE, Plant
 
@@ -89,7 +89,8 @@ class Playback:
     def _felt(self) -> tuple[Felt, ...]:
         """Steady vibration of each finger, targets first."""
         return tuple(
-            feel(self._last(record), self.frequencies) for record in (*self.targets, *self.quiet)
+            measure_vibration(self._last(record), self.frequencies)
+            for record in (*self.targets, *self.quiet)
         )
 
     def _last(self, record: Record) -> Record:

@@ -105,7 +105,7 @@ async def _serve(
             SimulatedDevice(
                 bench,
                 name,
-                number=simulation.wires[name].number or number,
+                address=simulation.wires[name].address or number,
                 faults=simulation.faults.of(name, begin=clock.now()),
             )
             for number, name in enumerate(bench.amplifiers, start=1)

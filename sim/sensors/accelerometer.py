@@ -130,10 +130,10 @@ class Accelerometers:
                 )
         self.sensors = tuple(sensors)
         self._pieces.clear()
-        if self in self._bench.taps:
-            self._bench.taps.remove(self)
+        if self in self._bench.probes:
+            self._bench.probes.remove(self)
         if sensors:
-            self._bench.taps.append(self)
+            self._bench.probes.append(self)
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
         """Read accelerations: times (n,) [s], (n, s) [m/s²]."""

@@ -57,7 +57,7 @@ class Recorder:
         self._start = 0.0
         self._count = 0
         self._failure: OSError | None = None
-        bench.taps.append(self)
+        bench.probes.append(self)
 
     @property
     def is_full(self) -> bool:
@@ -108,8 +108,8 @@ class Recorder:
 
     def stop(self) -> None:
         """Stop recording, in the thread of the bench."""
-        if self in self._bench.taps:
-            self._bench.taps.remove(self)
+        if self in self._bench.probes:
+            self._bench.probes.remove(self)
 
     def finish(self) -> None:
         """Write the file and discard the spool, in any thread, after `stop`.

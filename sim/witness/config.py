@@ -1,4 +1,4 @@
-"""What the witness checks against: wires, amplifiers, limits of channels and time limits.
+"""Configuration of the witness: wires, amplifiers, limits of channels and time limits.
 
 A plain mapping, given independently of the controller's configuration:
 

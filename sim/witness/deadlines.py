@@ -1,4 +1,4 @@
-"""What a host must do within a time limit, by what is known beside the bytes."""
+"""Deadlines for hosts, from contacts and operator commands."""
 
 import math
 from collections.abc import Callable, Collection, Hashable, Mapping

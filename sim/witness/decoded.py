@@ -6,7 +6,7 @@ from enum import Enum
 from typing import Literal, TypeAlias
 
 Direction: TypeAlias = Literal["amplifier", "host"]
-"""Where bytes go."""
+"""Direction of transfer: toward the amplifier or the host."""
 
 ReportViolation: TypeAlias = Callable[[str, float, str], None]
 """Called with the rule, the time [s] and a sentence."""

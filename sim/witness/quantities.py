@@ -1,4 +1,4 @@
-"""What every kind of wire carries: quantities, commands, sets, envelopes and states.
+"""Content common to all kinds of wire: quantities, commands, sets, envelopes and states.
 
 Steps and bounds are copied from the table of docs/reference/wire-protocol.md.
 """

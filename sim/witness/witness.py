@@ -74,7 +74,7 @@ class Witness:
         """The names of the wires."""
         return tuple(self._wires)
 
-    def bytes(self, link: str, direction: Direction, time: float, data: Data) -> None:
+    def record_bytes(self, link: str, direction: Direction, time: float, data: Data) -> None:
         """Process bytes on a wire, toward the amplifier or the host."""
         self._advance(time)
         wire = self._wires[link]

@@ -48,4 +48,4 @@ class FakeDevice:
         for tone in (tone for output in self.amplifier.outputs for tone in output):
             assert can.frequency_min <= tone.frequency <= can.frequency_max
             assert isinstance(tone, ShapedTone) or abs(tone.full) <= can.level_max + 1e-9
-            assert is_armed or (not tone.lasts and tone.silent_from <= self.now + can.ramp_max)
+            assert is_armed or (not tone.is_lasting and tone.silent_from <= self.now + can.ramp_max)

@@ -456,7 +456,7 @@ FAR_ENDS: dict[str, Bug] = {
     ),
     "there is no watchdog": Bug("watchdog", _watchdog_ends(lambda _: math.inf), scenarios.hung),
     "a status request feeds the watchdog": Bug(
-        "watchdog", replaced(simulated, "_NOT_FEEDING", ()), scenarios.hung
+        "watchdog", replaced(simulated, "_NON_FEEDING_REQUESTS", ()), scenarios.hung
     ),
     "the time left is reported in hundredths": Bug(
         "watchdog", _reports(lambda one: replace(one, watchdog_left=one.watchdog_left / 10))

@@ -34,7 +34,7 @@ RELEASE_WITH_FAULTS = 3 * 0.15 + WATCHDOG + 0.1
 TOGETHER = 0.6  # s; until all are silent after one of them has a fault
 STEP = 0.020  # s; how often is looked while something vibrates
 IDLE_STEP = 1.0
-_NOT_FEEDING = (Hello, GetCaps, GetStatus, GetFaults)
+_NON_FEEDING_REQUESTS = (Hello, GetCaps, GetStatus, GetFaults)
 _FAULTED = (AmplifierState.FAULT, AmplifierState.FAULT_REACTION_ACTIVE)
 _PLAYING = (
     AmplifierState.OPERATION_ENABLED,
@@ -131,7 +131,7 @@ class Checks:
                 self.violate(f"{name} has played token {token} twice")
             self._tokens[name].add(token)
         self._check_limits(name)
-        if not isinstance(request, _NOT_FEEDING):
+        if not isinstance(request, _NON_FEEDING_REQUESTS):
             self._fed[name] = now
             if name not in self._starving:
                 self._expect_silence(name)

@@ -53,7 +53,7 @@ class SoakWitness:
     def seen(self, link: str, toward: str, data: bytes) -> None:
         """Pass bytes on, unless no host has the link open."""
         if link in self._open:
-            self._witness.bytes(link, toward, self._loop.time(), data)  # type: ignore[arg-type]
+            self._witness.record_bytes(link, toward, self._loop.time(), data)  # type: ignore[arg-type]
 
     def opens(self) -> None:
         """A host is about to open all wires."""

@@ -129,8 +129,8 @@ class ScriptedDevice:
 
     name = "main"
 
-    def __init__(self, *, number: int = 1) -> None:
-        self.number = number
+    def __init__(self, *, address: int = 1) -> None:
+        self.address = address
         self.faults = Faults()
         self.is_answering = True
         self.asked: list[Request] = []

@@ -82,7 +82,7 @@ async def far_side(wire: Wire, rig: Rig, *, seed: int = 0) -> AsyncIterator[FarS
     """The amplifiers of a rig behind a wire, without faults until a test injects them."""
     bench = Bench(rig, now=clock.now())
     devices: Sequence[SimulatedDevice] = [
-        SimulatedDevice(bench, name, number=number, faults=Faults(begin=clock.now(), seed=seed))
+        SimulatedDevice(bench, name, address=number, faults=Faults(begin=clock.now(), seed=seed))
         for number, name in enumerate(bench.amplifiers, start=1)
     ]
     async with open_wire(wire, devices) as urls:

@@ -36,6 +36,6 @@ def sense(witness: Witness, now: float, name: str, amplifier: SimulatedAmplifier
         channel: tone.frequency
         for channel, output in enumerate(amplifier.outputs)
         for tone in output
-        if tone.lasts
+        if tone.is_lasting
     }
     witness.levels(now, name, levels, frequencies=frequencies)

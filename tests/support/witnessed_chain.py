@@ -270,7 +270,7 @@ class _Tap:
         if self.witness is None:
             self.early.append((clock.now(), link, toward, data))
         else:
-            self.witness.bytes(link, toward, clock.now(), data)  # type: ignore[arg-type]
+            self.witness.record_bytes(link, toward, clock.now(), data)  # type: ignore[arg-type]
 
 
 async def _play(
@@ -287,7 +287,7 @@ async def _play(
     rig = make_rig(names, limits)
     bench = Bench(rig, now=loop.time())
     devices = [
-        SimulatedDevice(bench, name, number=number)
+        SimulatedDevice(bench, name, address=number)
         for number, name in enumerate(bench.amplifiers, 1)
     ]
     async with open_wire(Wire(wire), devices) as urls:

@@ -97,7 +97,7 @@ class CanNode:
             self._boot()
 
     def _leave_operation(self, state: int) -> None:
-        """Leave OPERATIONAL, in which alone requests arrive: stop first."""
+        """Stop the outputs, then leave OPERATIONAL, the only state with requests."""
         if self._device.status().state is AmplifierState.OPERATION_ENABLED:
             self._device.exchange(Stop(_SHORTEST_RAMP))
         self._state = state

@@ -72,7 +72,7 @@ class RefusedRequest(Exception):
 
 
 class SetBuffer:
-    """Frames received since the last SYNC, for an amplifier with so many channels."""
+    """Frames received since the last SYNC, for an amplifier with the given number of channels."""
 
     def __init__(self, channels: int) -> None:
         self._channels = channels

@@ -42,7 +42,7 @@ class _Units:
 
     def __init__(self, devices: Sequence[SimulatedDevice]) -> None:
         self.devices = devices
-        self.units = {device.number: ModbusUnit(device) for device in devices}
+        self.units = {device.address: ModbusUnit(device) for device in devices}
 
     def reply(self, request: RequestAdu, *, over_tcp: bool) -> bytes | None:
         """The reply PDU to a request, or None."""
@@ -128,7 +128,7 @@ class ModbusRtuEnd(_Wire):
     def urls(self) -> dict[str, str]:
         """The URL of each amplifier, by its name."""
         line = f"modbus+rtu://{self._terminal.port}?baud={self._baud}"
-        return {device.name: f"{line}#{device.number}" for device in self.units.devices}
+        return {device.name: f"{line}#{device.address}" for device in self.units.devices}
 
     def start(self) -> None:
         """Serve in the running event loop."""
@@ -199,7 +199,7 @@ class ModbusTcpEnd:
     def urls(self) -> dict[str, str]:
         """The URL of each amplifier by name, after `start`."""
         return {
-            device.name: f"modbus+tcp://{HOST}:{self._port}/{device.number}"
+            device.name: f"modbus+tcp://{HOST}:{self._port}/{device.address}"
             for device in self._units.devices
         }
 

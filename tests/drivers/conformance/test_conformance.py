@@ -152,10 +152,10 @@ def ignores_disarm(amplifier: SimulatedAmplifier, request: Request, now: float) 
 
 def does_not_beat(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
     """Feed the watchdog by arming only."""
-    fed = amplifier._fed
+    fed = amplifier._last_fed
     reply = amplifier.handle(request, now)
     if not isinstance(request, Arm) and not isinstance(reply, Nak):
-        amplifier._fed = fed
+        amplifier._last_fed = fed
     return amplifier.status(now) if isinstance(reply, Status) else reply
 
 
@@ -178,7 +178,7 @@ MISTAKES: list[tuple[str, Answer]] = [
     ("disarm", ignores_disarm),
     ("heartbeats", does_not_beat),
     ("valid_for", beside(object, after=lambda one, now: setattr(one, "_vibration_end", math.inf))),
-    ("watchdog", beside(object, after=lambda one, now: setattr(one, "_fed", now))),
+    ("watchdog", beside(object, after=lambda one, now: setattr(one, "_last_fed", now))),
     ("envelopes", beside(Apply, before=lambda one, now: setattr(one._channels, "_endings", {}))),
     ("missing_envelopes", keeps_empty_slots),
 ]

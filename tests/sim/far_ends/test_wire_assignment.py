@@ -6,7 +6,7 @@ from model.errors import InputError
 from sim.far_ends.wire_assignment import WireAssignment, assign_wires
 from sim.far_ends.wires import Wire
 
-PLAIN = Wire("serial")
+DEFAULTS = Wire("serial")
 URLS = {
     "a": "serial:///dev/ttyUSB0?baud=115200&address=3",
     "b": "serial:///dev/ttyUSB0?address=4",
@@ -19,9 +19,9 @@ URLS = {
 
 def test_assign_wires_follows_the_urls() -> None:
     """Kind, port and address are those of the URL; equal lines are shared."""
-    assigned = assign_wires(URLS, common=None, options=[], plain=PLAIN)
+    assigned = assign_wires(URLS, common=None, options=[], defaults=DEFAULTS)
     assert [
-        (choice.wire.kind, choice.wire.port, choice.number) for choice in assigned.values()
+        (choice.wire.kind, choice.wire.port, choice.address) for choice in assigned.values()
     ] == [
         ("serial", 0, 3),
         ("serial", 0, 4),
@@ -37,7 +37,9 @@ def test_assign_wires_follows_the_urls() -> None:
 def test_assign_wires_prefers_own_option_to_common_to_url() -> None:
     """The result is in the order of the rig."""
     modbus = Wire("modbus-tcp", port=1502)
-    assigned = assign_wires(URLS, common=modbus, options=["c=slcan", "a=socketcand:7"], plain=PLAIN)
+    assigned = assign_wires(
+        URLS, common=modbus, options=["c=slcan", "a=socketcand:7"], defaults=DEFAULTS
+    )
     assert list(assigned) == list(URLS)
     assert assigned["a"] == WireAssignment(Wire("socketcand", port=7))
     assert assigned["b"] == WireAssignment(modbus)
@@ -59,7 +61,7 @@ def test_assign_wires_prefers_own_option_to_common_to_url() -> None:
 def test_assign_wires_refuses_an_invalid_option(options: list[str]) -> None:
     """The error names the option as given."""
     with pytest.raises(InputError, match=f"--wire {options[-1]}"):
-        assign_wires({"main": "sim://"}, common=None, options=options, plain=PLAIN)
+        assign_wires({"main": "sim://"}, common=None, options=options, defaults=DEFAULTS)
 
 
 @pytest.mark.parametrize(
@@ -68,5 +70,5 @@ def test_assign_wires_refuses_an_invalid_option(options: list[str]) -> None:
 def test_assign_wires_refuses_a_url_without_a_wire(url: str) -> None:
     """The error names the amplifier and its URL."""
     with pytest.raises(InputError, match="amplifier main: ") as problem:
-        assign_wires({"main": url}, common=None, options=[], plain=PLAIN)
+        assign_wires({"main": url}, common=None, options=[], defaults=DEFAULTS)
     assert url in str(problem.value)

@@ -8,7 +8,7 @@ from model.fem.mesh import Mesh
 from model.finger.fingertip import fingertip_points
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
-from sim.plant.felt import feel
+from sim.plant.felt import measure_vibration
 from sim.plant.fingers import Fingers, Record
 
 
@@ -29,16 +29,18 @@ def test_feel_separates_driven_frequencies() -> None:
         + np.outer(np.cos(2 * np.pi * 170 * times - 2.0), second)
         + ringing[:, None]
     )
-    felt = feel(Record(np.zeros((2, 2)), times, samples), [110.0, 170.0])
+    felt = measure_vibration(Record(np.zeros((2, 2)), times, samples), [110.0, 170.0])
     np.testing.assert_allclose(felt.amplitude, [first, second], atol=0.03)
     np.testing.assert_allclose(felt.peak, np.abs(samples).max(axis=0))
-    clean = feel(Record(np.zeros((2, 2)), times, samples - ringing[:, None]), [110.0, 170.0])
+    clean = measure_vibration(
+        Record(np.zeros((2, 2)), times, samples - ringing[:, None]), [110.0, 170.0]
+    )
     np.testing.assert_allclose(clean.amplitude, [first, second], atol=1e-7)
 
 
 def test_feel_without_frequencies() -> None:
     """Without a frequency there is a peak only."""
-    felt = feel(Record(np.zeros((1, 2)), np.arange(5.0), np.full((5, 1), -3.0)), [])
+    felt = measure_vibration(Record(np.zeros((1, 2)), np.arange(5.0), np.full((5, 1), -3.0)), [])
     assert felt.amplitude.shape == (0, 1)
     assert felt.peak == [3.0]
 

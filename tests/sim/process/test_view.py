@@ -29,7 +29,7 @@ def test_view_shows_eras_fingers_and_peaks_in_place(coarse_rig: Rig) -> None:
     bench = Bench(coarse_rig, now=0.0)
     context = SimulationContext(bench, urls={"main": "serial:///dev/pts/7?baud=921600"})
     plate = PlateView(bench)
-    bench.taps.append(plate)
+    bench.probes.append(plate)
     untouched = shown(context, plate).splitlines()
     assert len(untouched) < 24
     assert max(map(len, untouched)) <= 80

@@ -98,7 +98,7 @@ def test_recorder_refuses_an_unusable_file_at_the_start(coarse_rig: Rig, tmp_pat
         with pytest.raises(InputError, match=path.name):
             Recorder(bench, path, sensors=sensors, fingers=[])
     assert letter.read_text() == "Dear Sir"
-    assert bench.taps == []
+    assert bench.probes == []
 
 
 def test_recorder_survives_a_full_disk(coarse_rig: Rig, tmp_path: Path) -> None:

@@ -210,7 +210,7 @@ def test_witness_reports_a_stale_refusal_unless_disturbed(are_on: bool) -> None:
         (0.005, "amplifier", again),
     )
     for time, toward, data in pieces:
-        witness.bytes("line", toward, time, data)
+        witness.record_bytes("line", toward, time, data)
     found = [violation.invariant for violation in witness.finish(0.010)]
     assert found == ([] if are_on else ["answer"])
 
@@ -230,8 +230,8 @@ def test_witness_excuses_a_frame_cut_while_disturbed(
     witness = Witness(PLAN | {"wires": {"line": kind}})
     witness.faults(0.0, "line", are_on=True)
     witness.faults(over, "line", are_on=False)
-    witness.bytes("line", "amplifier", 1.0, whole[:-3])
-    witness.bytes("line", "amplifier", 4.0, whole)
+    witness.record_bytes("line", "amplifier", 1.0, whole[:-3])
+    witness.record_bytes("line", "amplifier", 4.0, whole)
     assert [violation.invariant for violation in witness.finish(4.001)] == broken
 
 
@@ -265,7 +265,7 @@ def test_witness_excuses_a_reply_due_while_disturbed(over: float, broken: list[s
     """
     witness = Witness(PLAN)
     witness.faults(over, "line", are_on=False)
-    witness.bytes("line", "amplifier", 0.5, PING)
+    witness.record_bytes("line", "amplifier", 0.5, PING)
     assert [violation.invariant for violation in witness.finish(2.0)] == broken
 
 
@@ -285,7 +285,7 @@ def test_witness_accepts_a_late_reply_to_a_repeated_request() -> None:
             data = data[:at] + data[at:].replace(b"\2\1", token.to_bytes(2, "big"))
             check = data.index(b"\xc9\xd5" if toward == "amplifier" else b"\xe3\x48")
             data[check : check + 2] = b"\0\0"
-        witness.bytes("line", toward, time, bytes(data))
+        witness.record_bytes("line", toward, time, bytes(data))
 
     passes(1.000, "amplifier", "Arm request", 3)
     passes(1.001, "host", "Arm reply", 3)

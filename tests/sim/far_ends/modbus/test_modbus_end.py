@@ -202,7 +202,7 @@ async def test_modbus_tcp_unit_255_is_the_only_unit() -> None:
         master.send(bytes(ping))
         reply = FRAMES["Ping reply, TCP"]
         assert (await master.receive(len(reply)))[7:] == reply[7:]
-    pair = ScriptedDevice(), ScriptedDevice(number=2)
+    pair = ScriptedDevice(), ScriptedDevice(address=2)
     async with scripted("TCP", *pair) as master:
         master.send(bytes(ping))
         pair[0].follow(EXAMPLES["Ping"])
@@ -214,7 +214,7 @@ async def test_modbus_tcp_unit_255_is_the_only_unit() -> None:
 @every_wire
 async def test_modbus_broadcast_reaches_every_unit_without_reply(wire: str) -> None:
     """Commit and stop to unit 0 are executed by all, a set is ignored."""
-    pair = ScriptedDevice(), ScriptedDevice(number=2)
+    pair = ScriptedDevice(), ScriptedDevice(address=2)
     async with scripted(wire, *pair) as master:
         apply = bytearray(FRAMES[f"FC16 Apply request, {wire}"])
         apply[0 if wire == "RTU" else 6] = 0
@@ -310,7 +310,7 @@ async def test_modbus_exceptions_do_not_feed_the_watchdog(tcp: FarSide) -> None:
         await client.read_input_registers(STATUS, count=26, device_id=1)
     assert refused >= 3
     assert tcp.amplifier.fault is Fault.WATCHDOG
-    assert tcp.amplifier._fed <= armed
+    assert tcp.amplifier._last_fed <= armed
     client.close()
 
 

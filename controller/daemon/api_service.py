@@ -126,7 +126,7 @@ class ApiService:
             contacts=view.contact_statuses(),
             drive=view.drive(),
             silent_because=view.silenced.reason if view.silenced and lease else None,
-            plain_because=self._controller.plain_because,
+            plain_because=self._controller.ramp_only_reason,
             predicted_contrast_db=pattern.predicted_contrast_db if pattern else None,
             robust_contrast_db=pattern.robust_contrast_db if pattern else None,
             predicted_level_db_sl=pattern.predicted_level_db_sl if pattern else None,
@@ -211,7 +211,7 @@ class ApiService:
         if machine.state is not DaemonState.OPERATION_ENABLED:
             raise _wrong_state(machine)
         self._layout.play(params, self._publisher.view.contacts, now=clock.now())
-        self._controller.reconsider()
+        self._controller.request_update()
         return Empty()
 
     def _subscribe(self, client: Connection, params: SubscribeParams) -> Empty:

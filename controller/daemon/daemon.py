@@ -84,7 +84,7 @@ class Daemon:
             amplifiers=lambda: amplifier_statuses(amplifiers, backends, config.urls),
             effect_of=self._layout.effect_of,
             layout=config.layout,
-            plain_because=lambda: self._controller.plain_because,
+            plain_because=lambda: self._controller.ramp_only_reason,
         )
         self._controller = Controller(
             config.rig,
@@ -196,7 +196,7 @@ class Daemon:
                 case "layout":
                     self._layout.replace(new.effective_layout)
                     self._publisher.layout_changed(new.layout)
-                    self._controller.reconsider()
+                    self._controller.request_update()
                 case "longest_lease":
                     self._api.longest_lease = new.section.longest_lease
                 case "log.level":

@@ -73,12 +73,12 @@ class Supervisor:
             if not self._has_stopped_itself:  # the fault that follows reports it
                 observer.refused(reason)
 
-        def turned() -> None:
+        def cycle_completed() -> None:
             self._check_phase()
             self._alive()
-            observer.turned()
+            observer.cycle_completed()
 
-        return replace(observer, refused=refused, turned=turned)
+        return replace(observer, refused=refused, cycle_completed=cycle_completed)
 
     async def open(self, controller: Controller) -> None:
         """Open and verify the amplifiers; raises what `Controller.open` raises.

@@ -112,7 +112,8 @@ class AmplifierGroup:
     ) -> Played | None:
         """Play a set on every amplifier, by name, after loading the envelopes.
 
-        None if a disarm, stop or close came meanwhile, or after `abort_unsent`. Raises DriverError.
+        None if a disarm, stop or close came meanwhile, or after `abort_exchange`. Raises
+        DriverError.
         """
         self._read_backs.forget()
         played = await self._exchange(
@@ -130,7 +131,7 @@ class AmplifierGroup:
         """
         return await self._exchange(self._heartbeat()) is not None
 
-    def abort_unsent(self) -> None:
+    def abort_exchange(self) -> None:
         """End a `play` or `heartbeat` in progress within 8 ms, with or without its replies.
 
         Only silence is sent meanwhile, and nothing is repeated.
@@ -215,7 +216,7 @@ class AmplifierGroup:
     async def _exchange(self, exchange: Coroutine[Any, Any, _T]) -> _T | None:
         """Run an exchange of the control loop; any failure stops all amplifiers.
 
-        None after `abort_unsent`, or if it failed because of a disarm, stop or close.
+        None after `abort_exchange`, or if it failed because of a disarm, stop or close.
         """
         limit = asyncio.timeout(None)
         try:

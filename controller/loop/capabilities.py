@@ -4,7 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from controller.group.guards import guard_limits
-from controller.loop.envelopes import ENVELOPE_TIME, OpenAmplifier, Shaping, shaping_of
+from controller.loop.envelopes import (
+    ENVELOPE_TIME,
+    EnvelopeSupport,
+    OpenAmplifier,
+    envelope_support,
+)
 from drivers.guard import limits_in_force
 from model.drive_modes import DRIVE_MODES, playable_drive_modes
 from model.errors import InputError
@@ -16,15 +21,15 @@ class PlaybackCapabilities:
     """What all amplifiers of a rig can play.
 
     drive_mode: of the questions to the table; playable: the drive modes that every amplifier can
-    play; frequencies: the lowest and highest [Hz]; max_amplitudes [m] by ERA; shaping: which
-    envelopes every amplifier plays.
+    play; frequencies: the lowest and highest [Hz]; max_amplitudes [m] by ERA;
+    envelope_support: which envelopes every amplifier plays.
     """
 
     drive_mode: str
     playable: tuple[str, ...]
     frequencies: tuple[float, float]
     max_amplitudes: Mapping[str, float]
-    shaping: Shaping
+    envelope_support: EnvelopeSupport
 
 
 def playback_capabilities(
@@ -62,5 +67,5 @@ def playback_capabilities(
         max_amplitudes={
             era.name: era.stroke * limits[rig.wiring[era.name].amplifier].level for era in rig.eras
         },
-        shaping=shaping_of(rig, amplifiers, within=envelope_time),
+        envelope_support=envelope_support(rig, amplifiers, within=envelope_time),
     )

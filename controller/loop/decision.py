@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.envelopes import ENVELOPE_TIME, PLAIN
+from controller.loop.envelopes import ENVELOPE_TIME, RAMPS_ONLY
 from controller.loop.intent import IntentSource
 from controller.loop.loading_times import LoadingTimes
 from controller.loop.safe_sets import FADE_RAMP, SafeSets, SetBuilder
@@ -38,9 +38,9 @@ class Decision:
 
     from_rest: whether nothing played before; since [s]: when the change arrived that led to it.
     sets: None if all channels are silent already; pattern: with the ramp and onset of the sets,
-    None for silence; is_brake: whether the sets only add endings to what plays; refusal: why a
-    guard refused the pattern, which makes it silence; retry_at [s]: when the guard would pass it,
-    None for never.
+    None for silence; adds_endings_only: whether the sets only add endings to what plays; refusal:
+    why a guard refused the pattern, which makes it silence; retry_at [s]: when the guard would pass
+    it, None for never.
     """
 
     contacts: tuple[Contact, ...]
@@ -49,23 +49,23 @@ class Decision:
     since: float
     sets: SafeSets | None = None
     pattern: Pattern | None = None
-    is_brake: bool = False
+    adds_endings_only: bool = False
     refusal: str | None = None
     retry_at: float | None = None
 
 
 @dataclass(frozen=True)
 class _Playing:
-    """What the amplifiers do since the last decision with sets, as far as that is known.
+    """What the amplifiers have been playing since the last decision with sets, as far as known.
 
-    drive: what they confirmed, by ERA; has_brakes: whether it has endings; brake_due [s]: when
+    confirmed_commands: by ERA; has_endings: whether endings were added; endings_due [s]: when
     endings can be added; retry_at [s]: when a guard would pass what it refused.
     """
 
     decision: Decision | None = None
-    drive: Mapping[str, DriveCommand] = field(default_factory=dict)
-    has_brakes: bool = False
-    brake_due: float | None = None
+    confirmed_commands: Mapping[str, DriveCommand] = field(default_factory=dict)
+    has_endings: bool = False
+    endings_due: float | None = None
     retry_at: float | None = None
 
     @property
@@ -79,7 +79,7 @@ class Decider:
     """Contacts, intent, selection and safe sets of one plate; reads no clock and never waits.
 
     guards: one for each amplifier, by name; envelope_time [s]: longest loading of envelopes. A
-    decision never raises: any failure decides on silence.
+    decision never raises: it falls back to silence on any exception.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class Decider:
         if self._timing is None:
             return
         self._timing.prepare(self._table.frequencies.tolist())
-        plate, shaping = self._table.plate, self._capabilities.shaping
+        plate, support = self._table.plate, self._capabilities.envelope_support
         question = Question(
             ((plate.length / 2, plate.width / 2),),
             ((0.0, 0.0),),
@@ -133,10 +133,10 @@ class Decider:
             drive_mode=self._capabilities.drive_mode,
             playable=self._capabilities.playable,
             frequencies=self._capabilities.frequencies,
-            envelopes=shaping.onsets,
+            envelopes=support.onsets,
         )
         pattern = self._timing.with_envelopes(
-            question, self._table.query(question), onset=shaping.onsets, ending=shaping.endings
+            question, self._table.query(question), onset=support.onsets, ending=support.endings
         )
         self._timing.with_transient_measures(question, pattern)
 
@@ -149,7 +149,7 @@ class Decider:
         """
         moments = (
             *(self._tracker.next_expiry, self._intent_due),
-            *(self._playing.brake_due, self._playing.retry_at),
+            *(self._playing.endings_due, self._playing.retry_at),
         )
         return min((moment for moment in moments if moment is not None), default=None)
 
@@ -159,8 +159,8 @@ class Decider:
         return self._tracker.next_expiry
 
     @property
-    def owes_silence(self) -> bool:
-        """Whether the plate is free of contacts and silence is not decided yet."""
+    def is_silence_pending(self) -> bool:
+        """Whether the last contact has lifted and silence has not been commanded yet."""
         return not self._tracker.contacts and not self._playing.is_silent
 
     def take(self, frame: TouchFrame) -> Change:
@@ -180,28 +180,30 @@ class Decider:
         self._selected = None
         self._playing = _Playing()
 
-    def confirm(self, drive: Mapping[str, DriveCommand], *, now: float) -> None:
+    def confirm(self, commands: Mapping[str, DriveCommand], *, now: float) -> None:
         """Note what the amplifiers play for the last decision, by ERA, without silent ones."""
-        self._playing = replace(self._playing, drive=drive)
+        self._playing = replace(self._playing, confirmed_commands=commands)
         decision = self._playing.decision
         if decision is None or decision.sets is None or decision.pattern is None:
             return
-        if decision.is_brake:
-            self._playing = replace(self._playing, has_brakes=True)
-        elif self._capabilities_at(now).shaping.endings and self._timing is not None:
-            brake_due = now + decision.sets.settled_after
-            self._playing = replace(self._playing, brake_due=brake_due)
+        if decision.adds_endings_only:
+            self._playing = replace(self._playing, has_endings=True)
+        elif self._capabilities_at(now).envelope_support.endings and self._timing is not None:
+            endings_due = now + decision.sets.settled_after
+            self._playing = replace(self._playing, endings_due=endings_due)
 
     def note_loading_time(self, duration: float, *, now: float) -> None:
         """Note how long [s] loading envelopes took; too long means plain ramps for a while."""
         self._loading_times.note(duration, now=now)
 
-    def plain_because(self, now: float) -> str | None:
+    def ramp_only_reason(self, now: float) -> str | None:
         """Return why touches start along plain ramps though the amplifiers play envelopes."""
-        return self._loading_times.problem(now) if self._capabilities.shaping else None
+        if not self._capabilities.envelope_support:
+            return None
+        return self._loading_times.ramp_only_reason(now)
 
     def decide(self, now: float) -> Decision | None:
-        """Decide at a time [s]; None if nothing is to change."""
+        """Decide at a time [s]; None if nothing changes."""
         self.expire(now)
         contacts, playing = self._tracker.contacts, self._playing
         since = now if self._since is None else min(self._since, now)
@@ -210,19 +212,19 @@ class Decider:
         try:
             selection = self._select(contacts, now)
             is_new = selection != self._selected or _is_due(playing.retry_at, now)
-            decided = Decision(contacts, selection, not playing.drive, since)
-            decision = self._play(decided, now) if is_new else self._brake(decided, now)
+            decided = Decision(contacts, selection, not playing.confirmed_commands, since)
+            decision = self._play(decided, now) if is_new else self._add_endings(decided, now)
         except Exception as error:
             has_failed = True
             selection = Selection((), contacts, None, failure_text(error))
             is_new = selection != self._selected
-            decided = Decision(contacts, selection, not playing.drive, since)
+            decided = Decision(contacts, selection, not playing.confirmed_commands, since)
             if is_new:
                 _logger.exception("loop: decision failed, silencing all channels")
         if decision is None and is_new:
             decision = decided
             if not playing.is_silent:
-                sets = self._end(contacts, by_brakes=playing.has_brakes and not has_failed)
+                sets = self._end(contacts, along_endings=playing.has_endings and not has_failed)
                 decision = replace(decided, sets=sets)
         if decision is not None and decision.sets is not None:
             self._playing = _Playing(decision, retry_at=decision.retry_at)
@@ -230,7 +232,7 @@ class Decider:
             self._playing = replace(
                 playing,
                 retry_at=None if is_new else playing.retry_at,
-                brake_due=None if _is_due(playing.brake_due, now) else playing.brake_due,
+                endings_due=None if _is_due(playing.endings_due, now) else playing.endings_due,
             )
         self._selected = selection
         return decision
@@ -241,9 +243,9 @@ class Decider:
 
     def _capabilities_at(self, now: float) -> PlaybackCapabilities:
         """Return the capabilities at a time [s]: without envelopes while loading is too slow."""
-        if self._loading_times.problem(now) is None:
+        if self._loading_times.ramp_only_reason(now) is None:
             return self._capabilities
-        return replace(self._capabilities, shaping=PLAIN)
+        return replace(self._capabilities, envelope_support=RAMPS_ONLY)
 
     def _select(self, contacts: tuple[Contact, ...], now: float) -> Selection:
         """Query the intent, and the table for it."""
@@ -257,34 +259,34 @@ class Decider:
         pattern, question = decided.selection.pattern, decided.selection.question
         if pattern is None or question is None:
             return None
-        is_shaped = self._capabilities_at(now).shaping.onsets
+        is_shaped = self._capabilities_at(now).envelope_support.onsets
         try:
             sets, played = self._builder.play(
-                pattern, question, is_shaped=is_shaped, playing=self._playing.drive
+                pattern, question, is_shaped=is_shaped, playing=self._playing.confirmed_commands
             )
         except CommandRefused as error:
             silence = self.silence(ramp=FADE_RAMP)
             return replace(decided, sets=silence, refusal=str(error), retry_at=error.until)
         return replace(decided, sets=sets, pattern=played)
 
-    def _brake(self, decided: Decision, now: float) -> Decision | None:
+    def _add_endings(self, decided: Decision, now: float) -> Decision | None:
         """Complete a decision by the endings of what plays; None if they are not due or refused."""
         pattern, question = decided.selection.pattern, decided.selection.question
         playing = self._playing
-        if pattern is None or question is None or not playing.drive:
+        if pattern is None or question is None or not playing.confirmed_commands:
             return None
-        if not _is_due(playing.brake_due, now):
+        if not _is_due(playing.endings_due, now):
             return None
-        sets = self._builder.brake(pattern, question, playing=playing.drive)
+        sets = self._builder.add_endings(pattern, question, playing=playing.confirmed_commands)
         if sets is None:
             return None
-        return replace(decided, sets=sets, pattern=pattern, is_brake=True)
+        return replace(decided, sets=sets, pattern=pattern, adds_endings_only=True)
 
-    def _end(self, contacts: tuple[Contact, ...], *, by_brakes: bool) -> SafeSets:
+    def _end(self, contacts: tuple[Contact, ...], *, along_endings: bool) -> SafeSets:
         """Build the sets that end what plays: along endings only under fingers that stay."""
         if not contacts:
             return self.silence(ramp=RELEASE_RAMP)
-        return self._builder.end() if by_brakes else self.silence(ramp=FADE_RAMP)
+        return self._builder.end() if along_endings else self.silence(ramp=FADE_RAMP)
 
     def _note(self, change: Change, time: float) -> None:
         """Remember when the first change since the last decision arrived."""

@@ -32,7 +32,7 @@ _DIGITS = 9
 
 
 @dataclass(frozen=True, slots=True)
-class Shaping:
+class EnvelopeSupport:
     """Which envelopes are played: onsets, endings, both or none."""
 
     onsets: bool
@@ -43,7 +43,7 @@ class Shaping:
         return self.onsets or self.endings
 
 
-PLAIN = Shaping(onsets=False, endings=False)
+RAMPS_ONLY = EnvelopeSupport(onsets=False, endings=False)
 """Ramps only."""
 
 
@@ -63,11 +63,13 @@ class OpenAmplifier(Protocol):
         """Durations on its wire."""
 
 
-def shaping_of(rig: Rig, amplifiers: Mapping[str, OpenAmplifier], *, within: float) -> Shaping:
+def envelope_support(
+    rig: Rig, amplifiers: Mapping[str, OpenAmplifier], *, within: float
+) -> EnvelopeSupport:
     """Return what all amplifiers, by name, can play and load within a time [s]."""
     if within <= 0:
-        return PLAIN
-    return Shaping(
+        return RAMPS_ONLY
+    return EnvelopeSupport(
         onsets=_fits(rig, amplifiers, knots=ONSET_KNOTS - 1, slots=1, within=within),
         endings=_fits(rig, amplifiers, knots=ENDING_KNOTS - 1, slots=2, within=within),
     )

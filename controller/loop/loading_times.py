@@ -7,7 +7,7 @@ loading is retried after half a minute, and after twice the pause each time it i
 import logging
 
 MAX_SLOW = 3
-"""Slow loadings in a row until ramps take over; as many in time reset the pause."""
+"""Consecutive slow loads before falling back to ramps; as many fast ones reset the backoff."""
 
 FIRST_PAUSE, MAX_PAUSE = 30.0, 480.0
 """Until loading is retried [s]: each attempt may delay the onset of one touch."""
@@ -40,15 +40,15 @@ class LoadingTimes:
             return
         self._in_time_in_a_row = 0
         self._slow_in_a_row += 1
-        is_known_as_slow = self._pause > FIRST_PAUSE
-        if self._slow_in_a_row < MAX_SLOW and not is_known_as_slow:
+        is_backing_off = self._pause > FIRST_PAUSE
+        if self._slow_in_a_row < MAX_SLOW and not is_backing_off:
             return
         self._slow_in_a_row = 0
         self._resumes = now + self._pause
         self._pause = min(2 * self._pause, MAX_PAUSE)
-        _logger.warning("loop: plain ramps instead of envelopes: %s", self.problem(now))
+        _logger.warning("loop: plain ramps instead of envelopes: %s", self.ramp_only_reason(now))
 
-    def problem(self, now: float) -> str | None:
+    def ramp_only_reason(self, now: float) -> str | None:
         """Return why no envelopes are to be loaded at a time [s], None if they are."""
         left = self._resumes - now
         if left <= 0:

@@ -14,7 +14,7 @@ from controller.loop.decision import RELEASE_RAMP, Decider, Decision
 from controller.loop.envelopes import ENVELOPE_TIME
 from controller.loop.intent import IntentSource, NewestBuzzes
 from controller.loop.observer import Observer, applied_by, silenced_by
-from controller.loop.routing import drive_of_eras
+from controller.loop.routing import commands_by_era
 from controller.loop.safe_sets import SafeSets
 from controller.sources.contacts import Change
 from controller.sources.reject_counter import RejectCounter
@@ -97,9 +97,9 @@ class Controller:
         return self._decider.capabilities
 
     @property
-    def plain_because(self) -> str | None:
+    def ramp_only_reason(self) -> str | None:
         """Why touches start along plain ramps now though the amplifiers play envelopes."""
-        return self._decider.plain_because(clock.now()) if self._decider_if_open else None
+        return self._decider.ramp_only_reason(clock.now()) if self._decider_if_open else None
 
     @property
     def rejected_touches(self) -> Mapping[str, int]:
@@ -173,8 +173,8 @@ class Controller:
         try:
             while self.phase is not Phase.CLOSED:
                 await self.step()
-                self._report(self._observer.turned)
-                await self._next_cause()
+                self._report(self._observer.cycle_completed)
+                await self._wait_for_event()
         finally:
             if self._expiry is not None:
                 self._expiry.cancel()
@@ -190,7 +190,7 @@ class Controller:
         decision = self._decider.decide(now)
         try:
             if self.phase is Phase.ARMED and decision is not None:
-                await self._carry_out(decision)
+                await self._execute(decision)
             if self._is_heartbeat_due and await self._group.heartbeat():
                 self._heartbeat_due = clock.now() + HEARTBEAT
         except LinkError as error:
@@ -206,15 +206,15 @@ class Controller:
             self._rejects.count(reason, f"touch of {frame.source}")
         self._follow(change)
 
-    def reconsider(self) -> None:
-        """Query the intent source again, because its intent changed by itself."""
+    def request_update(self) -> None:
+        """Query the intent source again, because its intent changed without a touch."""
         self._wake.set()
 
     @property
     def _is_heartbeat_due(self) -> bool:
-        """Whether to feed the watchdogs now; silence that is owed goes first."""
+        """Whether to feed the watchdogs now; pending silence has priority."""
         is_time = self.phase is Phase.ARMED and clock.now() >= self._heartbeat_due
-        return is_time and not self._decider.owes_silence
+        return is_time and not self._decider.is_silence_pending
 
     @property
     def _decider(self) -> Decider:
@@ -227,8 +227,8 @@ class Controller:
         self._report_change(change)
         if change:
             self._wake.set()
-        if self._decider.owes_silence:
-            self._group.abort_unsent()
+        if self._decider.is_silence_pending:
+            self._group.abort_exchange()
         self._schedule_expiry()
 
     def _schedule_expiry(self) -> None:
@@ -244,25 +244,25 @@ class Controller:
     def _expire(self) -> None:
         self._follow(self._decider.expire(clock.now()))
 
-    async def _carry_out(self, decision: Decision) -> None:
+    async def _execute(self, decision: Decision) -> None:
         """Send the sets of a decision and report the outcome; raises DriverError."""
-        drive: Mapping[str, DriveCommand] = {}
+        commands: Mapping[str, DriveCommand] = {}
         sent = None
         if decision.sets is not None:
             played = await self._play(decision.sets, is_pattern=decision.pattern is not None)
             if played is None:
                 return
-            drive, sent = drive_of_eras(played.achieved, self._rig), played.sent
-            self._decider.confirm(drive, now=clock.now())
+            commands, sent = commands_by_era(played.achieved, self._rig), played.sent
+            self._decider.confirm(commands, now=clock.now())
             if played.loading_time is not None:
                 self._decider.note_loading_time(played.loading_time, now=clock.now())
         if decision.refusal is not None:
             self._report(self._observer.refused, decision.refusal)
-        if decision.is_brake:
+        if decision.adds_endings_only:
             return  # what is felt stays the same
         if decision.pattern is not None and sent is not None:
             applied = applied_by(
-                decision, decision.pattern, drive=drive, sent=sent, timing=self._timing
+                decision, decision.pattern, commands=commands, sent=sent, timing=self._timing
             )
             self._report(self._observer.pattern_applied, applied)
         else:
@@ -292,7 +292,7 @@ class Controller:
             _logger.exception("touch source: failed")
             self._report(self._observer.source_failed, failure_text(error))
 
-    async def _next_cause(self) -> None:
+    async def _wait_for_event(self) -> None:
         """Wait for a change, a heartbeat, a timeout of a source or the end of an intent."""
         now = clock.now()
         moments = [now + IDLE_INTERVAL]

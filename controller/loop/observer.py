@@ -17,7 +17,7 @@ from model.table.timing import Timing
 class Applied:
     """A pattern that the amplifiers have confirmed.
 
-    contacts: all, in order of arrival; targets: a prediction for each; quiet: who must not feel it;
+    contacts: all, in order of arrival; targets: a prediction for each; quiet: quiet contacts;
     pattern: as it is played, with its ramp and envelopes; drive: what the amplifiers play, by ERA,
     without silent ones; latency [s]: from the touch frame to the last byte of the command on the
     wire; time [s] of that byte; from_rest: whether nothing played before.
@@ -51,7 +51,7 @@ class Applied:
 class Silenced:
     """All channels are silent, for a reason; latency and time [s].
 
-    targets: contacts for which a pattern was asked for. latency: up to the last byte of the
+    targets: contacts for which a pattern was requested. latency: up to the last byte of the
     command, None if none was needed.
     """
 
@@ -66,7 +66,7 @@ def applied_by(
     decision: Decision,
     pattern: Pattern,
     *,
-    drive: Mapping[str, DriveCommand],
+    commands: Mapping[str, DriveCommand],
     sent: float,
     timing: Timing | None,
 ) -> Applied:
@@ -76,7 +76,7 @@ def applied_by(
         targets=decision.selection.predictions,
         quiet=decision.selection.quiet,
         pattern=pattern,
-        drive=drive,
+        drive=commands,
         latency=sent - decision.since,
         time=sent,
         from_rest=decision.from_rest,
@@ -113,5 +113,5 @@ class Observer:
     refused: Callable[[str], None] = _ignore
     link_lost: Callable[[str], None] = _ignore
     source_failed: Callable[[str], None] = _ignore
-    turned: Callable[[], None] = _ignore
-    """The loop has run once more: at least once a second, with or without an event."""
+    cycle_completed: Callable[[], None] = _ignore
+    """Called after each cycle of the loop, at least once a second."""

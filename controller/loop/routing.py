@@ -1,6 +1,6 @@
 """Routing: from excitations (physics) to command sets (electricity), by the wiring of the rig.
 
-`sim/plant/plant.py` translates back by the same wiring.
+`sim/bench/bench.py` translates back by the same wiring.
 """
 
 import math
@@ -29,8 +29,8 @@ def route(
 
     Every wired channel has a command: level = amplitude / stroke, phase in degrees within
     (-180, 180], level 0 for an ERA that is not driven. ramp [s]: lengthened to the rig's slew
-    limit, on all amplifiers alike. playing: what each ERA plays now (`drive_of_eras`); a frequency
-    keeps its phase if all its ERAs play it already. onset: envelopes in the slots of
+    limit, on all amplifiers alike. playing: what each ERA plays now (`commands_by_era`); a
+    frequency keeps its phase if all its ERAs play it already. onset: envelopes in the slots of
     `controller.loop.envelopes`; one may lead an ERA that is not driven to silence. All other limits
     belong to the guard. Raises InputError for an ERA that the rig does not have.
     """
@@ -52,7 +52,9 @@ def route(
     return _sets(drive, rig, token=token, ramp=ramp)
 
 
-def drive_of_eras(played: Mapping[str, Achieved | CommandSet], rig: Rig) -> dict[str, DriveCommand]:
+def commands_by_era(
+    played: Mapping[str, Achieved | CommandSet], rig: Rig
+) -> dict[str, DriveCommand]:
     """Return what each ERA plays, by name, from what amplifiers play; without silent ones."""
     playing = {
         (amplifier, command.channel): command
@@ -67,13 +69,13 @@ def drive_of_eras(played: Mapping[str, Achieved | CommandSet], rig: Rig) -> dict
     }
 
 
-def goes_on(excitation: Excitation, playing: Mapping[str, DriveCommand]) -> bool:
+def continues_any_tone(excitation: Excitation, playing: Mapping[str, DriveCommand]) -> bool:
     """Whether any tone of an excitation continues what ERAs play now."""
     restarted = _restarted(excitation, playing)
     return any(tone.frequency not in restarted for tone in excitation.values())
 
 
-def route_again(
+def route_with_endings(
     playing: Mapping[str, DriveCommand],
     rig: Rig,
     *,
@@ -90,7 +92,7 @@ def route_again(
     return _sets(drive, rig, token=token, ramp=ramp)
 
 
-def route_end(rig: Rig, *, token: int, ramp: float) -> dict[str, CommandSet]:
+def route_to_silence(rig: Rig, *, token: int, ramp: float) -> dict[str, CommandSet]:
     """Return the sets, by amplifier, that silence all ERAs along their endings.
 
     ramp [s]: for those without an ending.

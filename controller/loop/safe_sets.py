@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from controller.loop.envelopes import wire_envelopes
-from controller.loop.routing import goes_on, route, route_again, route_end
+from controller.loop.routing import continues_any_tone, route, route_to_silence, route_with_endings
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, SafeCommandSet, SafeEnvelope
@@ -69,7 +69,11 @@ class SetBuilder:
         playing: what each ERA plays now; a tone that continues needs no onset. Raises
         CommandRefused if a guard refuses any of it.
         """
-        if is_shaped and self._timing is not None and not goes_on(pattern.excitation, playing):
+        if (
+            is_shaped
+            and self._timing is not None
+            and not continues_any_tone(pattern.excitation, playing)
+        ):
             shaped = self._timing.with_envelopes(question, pattern, onset=True, ending=False)
             try:
                 envelopes = self._envelopes(shaped)
@@ -89,25 +93,25 @@ class SetBuilder:
         sets = {name: safe for name, (safe, _) in checked.items()}
         return SafeSets(sets), _with_ramp(pattern, sets)
 
-    def brake(
+    def add_endings(
         self, pattern: Pattern, question: Question, *, playing: Mapping[str, DriveCommand]
     ) -> SafeSets | None:
         """Build the sets that give shaped endings to what plays; None if a guard refuses any."""
         if self._timing is None:
             return None
-        braked = self._timing.with_envelopes(
+        shaped = self._timing.with_envelopes(
             question, replace(pattern, onset=None), onset=False, ending=True
         )
-        if braked.ending is None:
+        if shaped.ending is None:
             return None
         try:
-            envelopes = self._envelopes(braked)
-            sets = route_again(
+            envelopes = self._envelopes(shaped)
+            sets = route_with_endings(
                 playing,
                 self._rig,
                 token=self._next_token(),
                 ramp=FADE_RAMP,
-                ending=braked.ending,
+                ending=shaped.ending,
             )
             return SafeSets(self._checked(sets), envelopes)
         except CommandRefused as error:
@@ -116,7 +120,7 @@ class SetBuilder:
 
     def end(self) -> SafeSets:
         """Build the sets by which every ERA ends along its ending, or plain silence."""
-        sets = route_end(self._rig, token=self._next_token(), ramp=FADE_RAMP)
+        sets = route_to_silence(self._rig, token=self._next_token(), ramp=FADE_RAMP)
         try:
             return SafeSets(self._checked(sets))
         except Exception as error:  # silence is right for every kind of failure

@@ -48,8 +48,8 @@ class Prediction:
 class Selection:
     """The pattern for some contacts, or None and the reason for silence.
 
-    targets, quiet: contacts as they were when the pattern was chosen, targets with what is intended
-    for them; question: as the table was asked; predictions: one per target.
+    targets, quiet: contacts as they were when the pattern was chosen, targets with their
+    intents; question: the query as sent; predictions: one per target.
     """
 
     targets: tuple[tuple[Contact, Target], ...]
@@ -112,11 +112,11 @@ class Selector:
         quiet: tuple[Contact, ...],
         capabilities: PlaybackCapabilities,
     ) -> Selection:
-        """Ask the table; any failure there selects silence until the intent changes."""
+        """Query the table; any failure there selects silence until the intent changes."""
         if not targets:
             return Selection((), quiet, None, intent.reason)
         try:
-            question, pattern = self._ask(
+            question, pattern = self._query(
                 _question(targets, quiet, capabilities),
                 [target for _, target in targets],
                 max_amplitudes=capabilities.max_amplitudes,
@@ -129,7 +129,7 @@ class Selector:
             return Selection(targets, quiet, None, failure_text(error))
         return Selection(targets, quiet, pattern, None, question, predictions)
 
-    def _ask(
+    def _query(
         self,
         question: Question,
         targets: Sequence[Target],
@@ -191,7 +191,7 @@ def _question(
         drive_mode=capabilities.drive_mode,
         playable=capabilities.playable,
         frequencies=capabilities.frequencies,
-        envelopes=capabilities.shaping.onsets,
+        envelopes=capabilities.envelope_support.onsets,
     )
 
 
@@ -215,8 +215,8 @@ def strongest(
     level = pattern.level_db_sl + gain
     if level <= 0:
         raise InputError(
-            "every pattern that the target feels is also felt by another finger; lift it, or move "
-            "it away"
+            "a quiet finger must not feel the pattern, but every one that reaches the target does; "
+            "lift or move that finger away"
         )
     factor = 10 ** (gain / 20)
     return replace(

@@ -20,7 +20,7 @@ from model.transients.base_motion import Term, fade
 from model.vibration.excitation import Excitation
 
 KNOT_STEP = 0.005
-"""Time between knots [s]; five fit into the shortest decay of a plate worth braking."""
+"""Time between knots [s]; five fit into the shortest decay of a plate that needs shaped endings."""
 
 MAX_KNOTS = 32
 """More than any amplifier accepts."""

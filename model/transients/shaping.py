@@ -1,12 +1,12 @@
-"""Shaped onsets and brakes: envelopes that keep quiet fingers quiet, and that stop the plate.
+"""Shaped onsets and endings: envelopes that keep quiet fingers quiet, and that stop the plate.
 
 Onset. Least squares over the knots of every ERA: each target follows its steady vibration times a
 raised cosine, each quiet fingertip stays still, from the first millisecond until the plate has
 settled.
 
 Ending. The plate's mean square over the time after the last knot is a quadratic form of its state
-then, and so of the knots; the brake minimises it. It depends neither on the contacts nor on the
-carrier's phase at that moment. Known quiet fingers are kept quiet during the brake, too: stopping
+then, and so of the knots; the ending minimises it. It depends neither on the contacts nor on the
+carrier's phase at that moment. Known quiet fingers are kept quiet during the ending, too: stopping
 the plate takes other vibrations than the pattern's.
 
 Both are robust against errors of the ERAs (`model.transients.knots`), and no knot ever exceeds the

@@ -204,7 +204,7 @@ CONTROLLER: dict[str, Bug] = {
     ),
     "heartbeats are too rare": Bug("heartbeat", replaced(loop, "HEARTBEAT", 0.2)),
     "heartbeats wait for touches": Bug(
-        "heartbeat", wrapped(Controller, "_next_cause", _sleeps_past_heartbeats)
+        "heartbeat", wrapped(Controller, "_wait_for_event", _sleeps_past_heartbeats)
     ),
     "a stop reaches one amplifier only": Bug(
         "stop",

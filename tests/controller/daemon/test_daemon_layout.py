@@ -55,11 +55,11 @@ async def test_daemon_plays_effects_by_region_and_by_name(
                 refused = era.play(effect, place, level_db_sl=level)
                 assert await error_code(refused) is ErrorCode.REFUSED
             decided: list[bool] = []
-            reconsider = bench.daemon._controller.reconsider
+            request_update = bench.daemon._controller.request_update
             monkeypatch.setattr(
                 bench.daemon._controller,
-                "reconsider",
-                lambda: (decided.append(True), reconsider()),
+                "request_update",
+                lambda: (decided.append(True), request_update()),
             )
             await era.play("alert", ON_QUIET, level_db_sl=12)
             assert decided  # not with the next heartbeat

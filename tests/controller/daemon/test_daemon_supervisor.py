@@ -229,7 +229,7 @@ async def test_loss_is_handled_before_reopening_when_found_twice() -> None:
         await asyncio.sleep(0.4)  # it stops the others again because of the loss
         daemon.obey()
         controller.step = lost_step
-        controller.reconsider()
+        controller.request_update()
         with pytest.raises(LinkError):
             await stopping
         await asyncio.sleep(1)

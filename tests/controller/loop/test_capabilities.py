@@ -8,7 +8,13 @@ from typing import Any
 import pytest
 
 from controller.loop.capabilities import playback_capabilities
-from controller.loop.envelopes import Shaping, ending_slots, onset_slots, shaping_of, wire_envelopes
+from controller.loop.envelopes import (
+    EnvelopeSupport,
+    ending_slots,
+    envelope_support,
+    onset_slots,
+    wire_envelopes,
+)
 from drivers.command import Envelope as WireEnvelope
 from drivers.command import Knot
 from drivers.protocol.messages import Capabilities
@@ -25,7 +31,11 @@ from sim.amplifier.amplifier import capabilities
 from stub_wire_times import StubWireTimes
 
 FINE = capabilities(4)
-BOTH, ONSETS, ENDINGS = Shaping(True, True), Shaping(True, False), Shaping(False, True)
+BOTH, ONSETS, ENDINGS = (
+    EnvelopeSupport(True, True),
+    EnvelopeSupport(True, False),
+    EnvelopeSupport(False, True),
+)
 
 
 @dataclass
@@ -96,33 +106,33 @@ def test_capabilities_are_the_tightest_limits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("left", "right", "shaping"),
+    ("left", "right", "expected"),
     [
         (Opened(), Opened(), BOTH),
         # An onset has 20 knots on the wire, an ending 7; the left amplifier has two of each.
         (Opened(knot_time=0.020 / 40), Opened(), BOTH),
         (Opened(knot_time=0.021 / 40), Opened(), ENDINGS),
-        (Opened(knot_time=0.021 / 14), Opened(), Shaping(False, False)),
+        (Opened(knot_time=0.021 / 14), Opened(), EnvelopeSupport(False, False)),
         # Two amplifiers on one wire wait for each other, on two they do not.
         (Opened(knot_time=0.4e-3), Opened(knot_time=0.4e-3), BOTH),
         (Opened(FINE, "bus", 0.4e-3), Opened(FINE, "bus", 0.4e-3), ENDINGS),
         (Opened(replace(FINE, envelope_knots=19)), Opened(), ENDINGS),
-        (Opened(), Opened(replace(FINE, envelope_knots=6)), Shaping(False, False)),
+        (Opened(), Opened(replace(FINE, envelope_knots=6)), EnvelopeSupport(False, False)),
         (Opened(replace(FINE, envelope_slots=3)), Opened(), ONSETS),
-        (Opened(replace(FINE, envelope_slots=1)), Opened(), Shaping(False, False)),
-        (Opened(replace(FINE, envelope_step_min=0.01)), Opened(), Shaping(False, False)),
+        (Opened(replace(FINE, envelope_slots=1)), Opened(), EnvelopeSupport(False, False)),
+        (Opened(replace(FINE, envelope_step_min=0.01)), Opened(), EnvelopeSupport(False, False)),
     ],
 )
-def test_shaping_needs_capability_and_loading_time(
-    left: Opened, right: Opened, shaping: Shaping
+def test_envelope_support_needs_capability_and_loading_time(
+    left: Opened, right: Opened, expected: EnvelopeSupport
 ) -> None:
     """Knots, slots and steps of every amplifier, and 20 ms for every wire."""
-    assert shaping_of(rig(), {"left": left, "right": right}, within=0.020) == shaping
+    assert envelope_support(rig(), {"left": left, "right": right}, within=0.020) == expected
 
 
-def test_shaping_is_plain_without_loading_time() -> None:
+def test_envelope_support_is_empty_without_loading_time() -> None:
     """However fast the wire is."""
-    assert not shaping_of(rig(), {"left": Opened(), "right": Opened()}, within=0.0)
+    assert not envelope_support(rig(), {"left": Opened(), "right": Opened()}, within=0.0)
 
 
 def test_wire_envelopes_by_hand() -> None:

@@ -7,7 +7,9 @@ SLOW, FAST = 0.031, 0.030
 
 def pause_after(times: LoadingTimes, now: float) -> float:
     """Duration [s] of the pause from a time on, to half a second."""
-    return next(half / 2 for half in range(10_000) if times.problem(now + half / 2) is None)
+    return next(
+        half / 2 for half in range(10_000) if times.ramp_only_reason(now + half / 2) is None
+    )
 
 
 def test_three_slow_loadings_in_a_row_pause_loading() -> None:
@@ -15,10 +17,10 @@ def test_three_slow_loadings_in_a_row_pause_loading() -> None:
     times = LoadingTimes(FAST)
     for duration in (SLOW, SLOW, FAST, SLOW, SLOW):
         times.note(duration, now=5.0)
-        assert times.problem(5.0) is None
+        assert times.ramp_only_reason(5.0) is None
     times.note(SLOW, now=5.0)
-    assert times.problem(5.0) is not None
-    assert "took 31 ms" in str(times.problem(5.0))
+    assert times.ramp_only_reason(5.0) is not None
+    assert "took 31 ms" in str(times.ramp_only_reason(5.0))
     assert pause_after(times, 5.0) == FIRST_PAUSE
 
 
@@ -41,7 +43,7 @@ def test_three_loadings_in_time_reset_the_pause() -> None:
         times.note(SLOW, now=0.0)
     for duration in (FAST, FAST, FAST, SLOW, SLOW):
         times.note(duration, now=FIRST_PAUSE)
-        assert times.problem(FIRST_PAUSE) is None
+        assert times.ramp_only_reason(FIRST_PAUSE) is None
     times.note(SLOW, now=FIRST_PAUSE)
     assert pause_after(times, FIRST_PAUSE) == FIRST_PAUSE
 

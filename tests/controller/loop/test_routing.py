@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from controller.loop.routing import drive_of_eras, route
+from controller.loop.routing import commands_by_era, route
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.messages import Achieved
 from model.errors import InputError
@@ -110,7 +110,7 @@ def test_route_keeps_phase_only_if_all_eras_continue(wanted: Excitation, kept: s
     """A frequency restarts if an ERA joins it."""
     playing = {name: DriveCommand(0, 110.0, 0.5) for name in ("SW", "SE")}
     sets = route(wanted, RIG, token=1, ramp=0, playing=playing)
-    drive = drive_of_eras(sets, RIG)
+    drive = commands_by_era(sets, RIG)
     assert {name for name, command in drive.items() if command.keep_phase} == kept
     first = route(wanted, RIG, token=1, ramp=0)
     assert not any(command.keep_phase for each in first.values() for command in each.commands)
@@ -122,7 +122,7 @@ def test_drive_of_eras_by_hand() -> None:
         "left": Achieved(7, (DriveCommand(0, 40.0, 0.0), DriveCommand(1, 110.01, 0.1999))),
         "right": Achieved(7, (DriveCommand(0, 250.0, 0.4),)),
     }
-    assert drive_of_eras(achieved, RIG) == {
+    assert commands_by_era(achieved, RIG) == {
         "SW": DriveCommand(1, 110.01, 0.1999),
         "SE": DriveCommand(0, 250.0, 0.4),
     }

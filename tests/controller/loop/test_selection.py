@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.envelopes import PLAIN
+from controller.loop.envelopes import RAMPS_ONLY
 from controller.loop.intent import HapticIntent, Target
 from controller.loop.selection import Selector, strongest
 from controller.sources.contacts import Contact, ContactKey
@@ -21,7 +21,7 @@ from model.vibration.excitation import Excitation, Tone
 from small_table import small_table
 
 CAPABILITIES = PlaybackCapabilities(
-    "phased", ("switched", "phased"), (45.0, 300.0), {"SW": 1e-4}, PLAIN
+    "phased", ("switched", "phased"), (45.0, 300.0), {"SW": 1e-4}, RAMPS_ONLY
 )
 
 
@@ -81,7 +81,7 @@ def table() -> Table:
 def test_selector_keeps_other_contacts_quiet(table: Table) -> None:
     """The question has the target's level, and drive modes and band of the amplifiers."""
     contacts = (at(1, 0.1), at(2, 0.2), at(3, 0.25))
-    shaped = replace(CAPABILITIES, shaping=replace(PLAIN, onsets=True))
+    shaped = replace(CAPABILITIES, envelope_support=replace(RAMPS_ONLY, onsets=True))
     Selector(table).select(contacts, wanting(c3=17.0), shaped)
     assert table.asked.pop().envelopes
     selection = Selector(table).select(contacts, wanting(c3=17.0), CAPABILITIES)
@@ -186,7 +186,7 @@ def test_selector_saturates_a_level_or_less(table: Table) -> None:
 def test_selector_saturates_at_full_stroke_on_a_plate() -> None:
     """60 dB SL is more than the ERAs of the paper reach."""
     table, full = small_table(), dict.fromkeys(("SW", "SE", "NE", "NW"), 0.0001)
-    capabilities = PlaybackCapabilities("switched", ("switched",), (40.0, 500.0), full, PLAIN)
+    capabilities = PlaybackCapabilities("switched", ("switched",), (40.0, 500.0), full, RAMPS_ONLY)
     selection = Selector(table).select((at(1, 0.1),), or_less(60.0), capabilities)
     assert selection.pattern is not None
     assert 12 < selection.predictions[0].level_db_sl < 60

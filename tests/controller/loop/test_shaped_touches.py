@@ -158,7 +158,7 @@ async def test_last_lift_interrupts_an_ending(link: Link, shapes: Shapes) -> Non
 
 @in_virtual_time
 async def test_lift_before_the_onset_is_over_skips_the_ending(link: Link, shapes: Shapes) -> None:
-    """A brake leads from the full level; lifted half way up the target fades along 20 ms."""
+    """An ending leads from the full level; lifted half way up the target fades along 20 ms."""
     async with running(far_ends=[link], timing=shapes) as bench:
         await bench.hold(OTHER, FINGER, seconds=0.05)
         bench.touch(OTHER)
@@ -279,7 +279,7 @@ async def test_ramps_replace_envelopes_when_amplifiers_cannot_play_them(
     """None is loaded; ramp and its contrast are reported."""
     poorer(link)
     async with running(far_ends=[link], timing=shapes) as bench:
-        assert not bench.controller.capabilities.shaping
+        assert not bench.controller.capabilities.envelope_support
         await bench.hold(FINGER, OTHER, seconds=0.3)
         assert loaded(link) == []
         (applied,) = bench.reports.applied
@@ -308,13 +308,13 @@ async def test_ramps_replace_envelopes_when_loading_is_slow(
         shaped = []
         for duration in (0.021, 0.021, 0.001, 0.021, 0.021):
             shaped.append(await is_shaped(duration))
-            assert bench.controller.plain_because is None
+            assert bench.controller.ramp_only_reason is None
         for duration in (0.021, 0.001):
             shaped.append(await is_shaped(duration))
         assert shaped == [True] * 6 + [False]
-        assert "30 s" in bench.controller.plain_because
+        assert "30 s" in bench.controller.ramp_only_reason
         await asyncio.sleep(30)
-        assert bench.controller.plain_because is None
+        assert bench.controller.ramp_only_reason is None
         assert await is_shaped(0.001)
     assert "loading envelopes took 21 ms" in caplog.text
 
@@ -325,7 +325,7 @@ async def test_ramp_replaces_an_onset_that_the_guard_refuses(link: Link, shapes:
     shapes.largest = 6.0
     async with running(far_ends=[link], timing=shapes) as bench:
         await bench.hold(FINGER, OTHER, seconds=0.05)
-        assert [len(envelope.knots) for envelope in loaded(link)] == [7]  # its brake
+        assert [len(envelope.knots) for envelope in loaded(link)] == [7]  # its ending
         (applied,) = bench.reports.applied
         assert applied.pattern.onset is None
         assert applied.transient_contrast_db == 10.0
@@ -333,7 +333,7 @@ async def test_ramp_replaces_an_onset_that_the_guard_refuses(link: Link, shapes:
 
 
 @in_virtual_time
-async def test_open_prepares_table_and_shaping(link: Link, shapes: Shapes) -> None:
+async def test_open_prepares_table_and_envelopes(link: Link, shapes: Shapes) -> None:
     """Mode and frequencies, when the controller is opened."""
     bench = make_bench(far_ends=[link], timing=shapes)
     await bench.controller.open()

@@ -7,7 +7,7 @@ from drivers.backend import Backend
 from drivers.errors import CommandError, FrameError, LinkError
 from drivers.guard import SafeCommandSet, SafeEnvelope
 from drivers.link.link import REPLY_TIMEOUT, Link
-from drivers.link.refusals import NO_PROTOCOL
+from drivers.link.refusals import PROTOCOL_VIOLATION
 from drivers.link.turns import RequestPriority
 from drivers.protocol.definition import PROTOCOL, token_after
 from drivers.protocol.messages import (
@@ -98,7 +98,7 @@ class Amplifier:
 
     @property
     def statistics(self) -> LinkStatistics:
-        """Link statistics; frames since opening, retries since construction."""
+        """Link statistics; counted since opening or construction, see `LinkStatistics`."""
         return self._link.statistics
 
     @property
@@ -162,13 +162,13 @@ class Amplifier:
                 f"{watchdog:g} s"
             )
         return await self._link.ask(
-            Arm(watchdog=watchdog), expect=Status, kind=RequestPriority.APPLY
+            Arm(watchdog=watchdog), expect=Status, priority=RequestPriority.APPLY
         )
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> Status:
         """Fall silent along a ramp [s], then switch the high voltage off; overtakes the queue."""
         return await self._link.ask(
-            Disarm(ramp=self._ramp(ramp)), expect=Status, kind=RequestPriority.SILENCE
+            Disarm(ramp=self._ramp(ramp)), expect=Status, priority=RequestPriority.SILENCE
         )
 
     async def stop(self, ramp: float = STOP_RAMP) -> Status:
@@ -179,7 +179,7 @@ class Amplifier:
         on the wire yet is preempted at once.
         """
         return await self._link.ask(
-            Stop(ramp=self._ramp(ramp)), expect=Status, kind=RequestPriority.STOP
+            Stop(ramp=self._ramp(ramp)), expect=Status, priority=RequestPriority.STOP
         )
 
     async def load_envelope(self, safe: SafeEnvelope) -> None:
@@ -196,7 +196,7 @@ class Amplifier:
         if (loaded.slot, loaded.knots) != (safe.slot, len(safe.knots)):
             raise FrameError(
                 f"the amplifier must load {len(safe.knots)} knots into slot {safe.slot}, got "
-                f"{loaded.knots} in slot {loaded.slot}; {NO_PROTOCOL}"
+                f"{loaded.knots} in slot {loaded.slot}; {PROTOCOL_VIOLATION}"
             )
 
     async def stage(self, safe: SafeCommandSet) -> Achieved:
@@ -205,7 +205,7 @@ class Amplifier:
         Raises CommandRefused if a newer set, a stop or a disarm came first.
         """
         request = Stage(_safe(safe))
-        achieved = await self._link.ask(request, expect=Achieved, kind=RequestPriority.APPLY)
+        achieved = await self._link.ask(request, expect=Achieved, priority=RequestPriority.APPLY)
         return _of_token(achieved, safe.token)
 
     async def commit(self, token: int) -> Achieved:
@@ -214,7 +214,7 @@ class Amplifier:
         Raises CommandRefused if a newer set, a stop or a disarm came first.
         """
         achieved = await self._link.ask(
-            Commit(token=token), expect=Achieved, kind=RequestPriority.APPLY
+            Commit(token=token), expect=Achieved, priority=RequestPriority.APPLY
         )
         return _of_token(achieved, token)
 
@@ -225,8 +225,10 @@ class Amplifier:
         stop superseded it.
         """
         request = Apply(_safe(safe))
-        kind = RequestPriority.SILENCE if safe.is_silent else RequestPriority.APPLY
-        return _of_token(await self._link.ask(request, expect=Achieved, kind=kind), safe.token)
+        priority = RequestPriority.SILENCE if safe.is_silent else RequestPriority.APPLY
+        return _of_token(
+            await self._link.ask(request, expect=Achieved, priority=priority), safe.token
+        )
 
     async def status(self) -> Status:
         """Read the status; does not feed the watchdog."""
@@ -241,7 +243,7 @@ class Amplifier:
 
         Raises CommandRefused if another stop came first: that one is not acknowledged.
         """
-        return await self._link.ask(Clear(), expect=Status, kind=RequestPriority.CLEAR)
+        return await self._link.ask(Clear(), expect=Status, priority=RequestPriority.CLEAR)
 
     async def heartbeat(self) -> Status:
         """Feed the watchdog; called by the control loop itself, after it has run."""
@@ -250,9 +252,9 @@ class Amplifier:
         return status
 
     def abort_unsent(self) -> None:
-        """Do not send what still waits for the wire, and repeat nothing.
+        """Do not send unsent requests, and retry none.
 
-        Such requests raise Preempted; requests with stop priority are sent and repeated as usual.
+        Such requests raise Preempted; stop-class requests are sent and retried as usual.
         """
         self._link.abort_unsent()
 
@@ -291,6 +293,6 @@ def _safe(safe: SafeCommandSet) -> SafeCommandSet:
 def _of_token(achieved: Achieved, token: int) -> Achieved:
     if achieved.token != token:
         raise FrameError(
-            f"reply must be for token {token}, got token {achieved.token}; {NO_PROTOCOL}"
+            f"reply must be for token {token}, got token {achieved.token}; {PROTOCOL_VIOLATION}"
         )
     return achieved

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 class WireCounters:
     """Frames counted by a backend since its wire was opened.
 
-    crc_errors: damaged frames, by checksum, length or form; unexpected_frames: valid frames that no
+    invalid_frames: frames with a wrong checksum, length, form or version, and events that cannot be
+    decoded; unexpected_frames: valid frames that no
     request was waiting for, such as late replies; events: unsolicited messages.
     """
 
     frames_out: int = 0
     frames_in: int = 0
-    crc_errors: int = 0
+    invalid_frames: int = 0
     unexpected_frames: int = 0
     events: int = 0
 
@@ -22,6 +23,7 @@ class WireCounters:
 class LinkStatistics(WireCounters):
     """Statistics of a link at one moment.
 
+    Inherited counters restart when the link is opened, the following count since its construction.
     retries: repeated requests; timeouts: requests without a reply in time; refusals: Naks.
     last_round_trip [s]; heartbeat_age [s] since the last acknowledged heartbeat: None before the
     first.

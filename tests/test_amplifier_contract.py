@@ -102,7 +102,7 @@ async def test_backend_counts_frames_and_times_round_trips(
     after = amplifier.statistics
     assert after.frames_out - before.frames_out >= 5
     assert after.frames_in - before.frames_in >= 5
-    assert (after.crc_errors, after.retries) == (before.crc_errors, before.retries)
+    assert (after.invalid_frames, after.retries) == (before.invalid_frames, before.retries)
     assert after.last_round_trip is not None
     assert after.heartbeat_age is not None
     assert backend.wire_times.round_trip(4) >= 0

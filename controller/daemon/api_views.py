@@ -146,7 +146,7 @@ def _amplifier_status(
         statistics=LinkCounters(
             frames_out=statistics.frames_out,
             frames_in=statistics.frames_in,
-            bad=statistics.crc_errors,
+            bad=statistics.invalid_frames,
             foreign=statistics.unexpected_frames,
             events=statistics.events,
             retries=statistics.retries,

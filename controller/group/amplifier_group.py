@@ -15,7 +15,7 @@ from drivers import clock
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import SafeCommandSet, SafeEnvelope
-from drivers.link.turns import PATIENCE, Preempted
+from drivers.link.turns import PREEMPTION_GRACE, Preempted
 from drivers.operation.watchdog import check_watchdog
 from drivers.protocol.messages import AmplifierState
 
@@ -137,7 +137,7 @@ class AmplifierGroup:
         Only silence is sent meanwhile, and nothing is repeated.
         """
         if self._limit is not None and not self._is_aborting:
-            self._limit.reschedule(clock.now() + PATIENCE)
+            self._limit.reschedule(clock.now() + PREEMPTION_GRACE)
             for amplifier in self._all:
                 amplifier.abort_unsent()
 

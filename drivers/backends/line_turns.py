@@ -1,7 +1,7 @@
-"""Whose turn it is on a line that several amplifiers share, where only one may be asked at a time.
+"""Bus arbitration between amplifiers that share a half-duplex line.
 
-Each amplifier has turns of its own (`drivers.link`); these are between amplifiers. What silences
-one of them goes before all that others wait for, and what was on the line meanwhile is sent again.
+Each amplifier arbitrates its own requests in `drivers.link`. A stop-class request for one amplifier
+outranks the requests of all others, which are retried after preemption.
 """
 
 from collections.abc import Awaitable, Callable, Iterator
@@ -14,8 +14,8 @@ from drivers.protocol.messages import Apply, Disarm, Request, Stop
 _T = TypeVar("_T")
 
 
-def kind_on_line(request: Request) -> RequestPriority:
-    """How a request stands to those for others; no set takes the place of another's."""
+def priority_on_line(request: Request) -> RequestPriority:
+    """Return the priority of a request among amplifiers; sets of different ones never supersede."""
     if isinstance(request, Stop):
         return RequestPriority.STOP
     is_silent_set = isinstance(request, Apply) and request.command_set.is_silent
@@ -28,55 +28,58 @@ def kind_on_line(request: Request) -> RequestPriority:
 
 @final
 class LineTurns:
-    """The turns of a line; amplifiers are known by their addresses."""
+    """Arbitrates a line between amplifiers, identified by their addresses."""
 
     def __init__(self) -> None:
-        self._turns = Turns(lambda: self._present in self._unsent)
-        self._present: int | None = None
+        self._turns = Turns(lambda: self._current in self._unsent)
+        self._current: int | None = None
         self._unsent: set[int] = set()
 
     @property
-    def is_taken(self) -> bool:
+    def is_in_use(self) -> bool:
         """Whether an exchange is on the line."""
-        return self._turns.is_taken
+        return self._turns.is_in_use
 
     def is_unsent(self, address: int) -> bool:
-        """Whether an amplifier's exchange is here and nothing of it has gone out yet."""
+        """Whether an exchange of this amplifier is pending and nothing of it is on the wire yet."""
         return address in self._unsent
 
-    def sent(self) -> None:
-        """What has the turn has gone out; to be called then."""
-        if self._present is not None:
-            self._unsent.discard(self._present)
+    def mark_sent(self) -> None:
+        """Note that the current request is on the wire."""
+        if self._current is not None:
+            self._unsent.discard(self._current)
 
     @contextmanager
     def silencing(self, request: Request, address: int) -> Iterator[None]:
-        """See `Backend.silencing`; also between two attempts at what silences."""
-        kind = kind_on_line(request)
-        self._turns.keep_free(address, kind)
+        """See `Backend.silencing`; the reservation also holds between retries of the request."""
+        priority = priority_on_line(request)
+        self._turns.reserve(address, priority)
         try:
             yield
         finally:
-            self._turns.release(address, kind)
+            self._turns.release_reservation(address, priority)
 
     async def carry_out(
-        self, kind: RequestPriority, exchange: Callable[[], Awaitable[_T]], *, address: int | None
+        self,
+        priority: RequestPriority,
+        exchange: Callable[[], Awaitable[_T]],
+        *,
+        address: int | None,
     ) -> _T:
-        """Do an exchange when it has its turn, and again where it had to give way.
+        """Run an exchange once it has access to the line. Retry after preemption.
 
-        Repeating is safe: a token is played once, and the other requests may be repeated anyway.
-        address: whose it is; None for one to all. Raises Preempted instead of beginning where this
-        amplifier itself is being silenced: what silences it waits for this to end, so that this
-        must not wait for the line.
+        Retries are safe: a token is played once, and other requests are idempotent. address: of the
+        amplifier, None for a broadcast. Raises Preempted before a start if a stop-class request of
+        the same amplifier is pending: it waits for this call to end, so waiting would deadlock.
         """
         while True:
-            if self._turns.is_kept_from_own(address, kind):
+            if self._turns.has_own_reservation(address, priority):
                 raise Preempted(SUPERSEDED)
             if address is not None:
                 self._unsent.add(address)
             try:
-                async with self._turns.take(kind):
-                    self._present = address
+                async with self._turns.take(priority):
+                    self._current = address
                     return await exchange()
             except Preempted:
                 continue

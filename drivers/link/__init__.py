@@ -1,1 +1,1 @@
-"""The link to one amplifier: turns, retries and loss."""
+"""The link to one amplifier: priorities, retries and loss."""

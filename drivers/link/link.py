@@ -1,4 +1,4 @@
-"""One request at a time over one backend, repeated if there is no reply.
+"""One request at a time over one backend, retried if there is no reply.
 
 A lost link stays lost until it is reopened: every request raises LinkError at once.
 """
@@ -12,7 +12,7 @@ from typing import TypeVar, final
 from drivers import clock
 from drivers.backend import Backend
 from drivers.errors import FrameError, LinkError, LinkTimeout
-from drivers.link.refusals import NO_PROTOCOL, is_busy, refusal
+from drivers.link.refusals import PROTOCOL_VIOLATION, is_busy, refusal
 from drivers.link.turns import SUPERSEDED, Preempted, RequestPriority, Turns
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
@@ -54,7 +54,7 @@ def retries_on(round_trip: float, *, reply_timeout: float = REPLY_TIMEOUT) -> in
 
 @final
 class Link:
-    """A backend with its turns, retries, loss and statistics.
+    """Serialises requests to one backend: priorities, retries, loss detection, statistics.
 
     reply_timeout [s]: of one exchange, extended on slow wires. Three requests in a row without a
     reply are a loss; two on a wire too slow for three within three heartbeats, see `allow_for`.
@@ -71,11 +71,13 @@ class Link:
         self._loss: str | None = "the amplifier is not open yet; call open() first"
         self._unanswered = 0
         self._is_aborting_unsent = False  # callers cancel soon
-        self._is_stuck = False  # it stayed busy: no retries until it replies otherwise
+        self._is_persistently_busy = (
+            False  # busy after all retries: none until it replies otherwise
+        )
         self._retries = self._timeouts = self._refusals = 0
         self._last_round_trip: float | None = None
         self._last_heartbeat: float | None = None
-        backend.listen(on_event, self._found_lost)
+        backend.listen(on_event, self._on_idle_loss)
 
     @property
     def is_lost(self) -> bool:
@@ -84,7 +86,7 @@ class Link:
 
     @property
     def statistics(self) -> LinkStatistics:
-        """Link statistics; frames since opening, retries since construction."""
+        """Link statistics; counted since opening or construction, see `LinkStatistics`."""
         beat = self._last_heartbeat
         return LinkStatistics(
             **asdict(self.backend.counters),
@@ -120,10 +122,10 @@ class Link:
         request: Request,
         *,
         expect: type[_ReplyT],
-        kind: RequestPriority = RequestPriority.ORDINARY,
+        priority: RequestPriority = RequestPriority.ORDINARY,
         timeout: float | None = None,
     ) -> _ReplyT:
-        """Send a request in its turn and return its reply; timeout [s]: None for the usual one.
+        """Send a request by its priority and return its reply; timeout [s]: None for the default.
 
         Raises LinkError, CommandRefused for a refusal or if superseded, and FrameError for an
         invalid reply or one of another type.
@@ -131,47 +133,51 @@ class Link:
         self._raise_if_lost()
         timeout = timeout or self._reply_timeout
         name = type(request).__name__
-        silencing = self.backend.silencing(request) if kind.silences else nullcontext()
+        silencing = self.backend.silencing(request) if priority.is_stop_class else nullcontext()
         try:
             with silencing:
-                reply = await self._in_turn(request, kind, timeout)
+                reply = await self._retry_if_preempted(request, priority, timeout)
         except FrameError as problem:
-            raise FrameError(f"invalid reply to {name}: {problem}; {NO_PROTOCOL}") from problem
+            raise FrameError(
+                f"invalid reply to {name}: {problem}; {PROTOCOL_VIOLATION}"
+            ) from problem
         if isinstance(reply, Nak):
             self._refusals += 1
             raise refusal(name, reply)
         if not isinstance(reply, expect):
             raise FrameError(
                 f"reply to {name} must be {expect.__name__}, got {type(reply).__name__}; "
-                f"{NO_PROTOCOL}"
+                f"{PROTOCOL_VIOLATION}"
             )
         return reply
 
     def abort_unsent(self) -> None:
-        """Do not send requests that wait for the wire, and repeat none: they raise Preempted.
+        """Do not send unsent requests, and retry none: they raise Preempted.
 
         Requests of the stop class are exempt.
         """
         self._is_aborting_unsent = True
         self._turns.preempt_unsent()
 
-    async def broadcast(self, request: Broadcast, kind: RequestPriority) -> None:
-        """Broadcast in its turn; raises LinkError, CommandError."""
+    async def broadcast(self, request: Broadcast, priority: RequestPriority) -> None:
+        """Broadcast by its priority; raises LinkError, CommandError."""
         self._raise_if_lost()
-        async with self._turns.take(kind):
+        async with self._turns.take(priority):
             await self.backend.broadcast(request)
 
-    async def _in_turn(self, request: Request, kind: RequestPriority, timeout: float) -> Reply:
+    async def _retry_if_preempted(
+        self, request: Request, priority: RequestPriority, timeout: float
+    ) -> Reply:
         while True:
             try:
-                async with self._turns.take(kind):
+                async with self._turns.take(priority):
                     self._raise_if_lost()
-                    return await self._exchange(request, kind, timeout)
+                    return await self._exchange(request, priority, timeout)
             except Preempted:
-                if not kind.silences:  # a stop-class request is repeated after the stop before it
+                if not priority.is_stop_class:  # stop-class requests are retried
                     raise
 
-    async def _exchange(self, request: Request, kind: RequestPriority, timeout: float) -> Reply:
+    async def _exchange(self, request: Request, priority: RequestPriority, timeout: float) -> Reply:
         busy = 0
         self._is_aborting_unsent = False
         while True:
@@ -191,19 +197,19 @@ class Link:
                 self._unanswered = 0
                 self._last_round_trip = clock.now() - begin
                 if not is_busy(reply):
-                    self._is_stuck = False
+                    self._is_persistently_busy = False
                     return reply
-                if self._is_stuck or busy == RETRIES:
-                    self._is_stuck = True
+                if self._is_persistently_busy or busy == RETRIES:
+                    self._is_persistently_busy = True
                     return reply
                 busy += 1
                 await asyncio.sleep(BUSY_PAUSE)
-            self._turns.raise_if_overtaken(kind)
-            if self._is_aborting_unsent and not kind.silences:
+            self._turns.raise_if_overtaken(priority)
+            if self._is_aborting_unsent and not priority.is_stop_class:
                 raise Preempted(SUPERSEDED)
             self._retries += 1
 
-    def _found_lost(self, what: str) -> None:
+    def _on_idle_loss(self, what: str) -> None:
         """Note a loss found without a request."""
         if self._loss is None:
             self._lose(what)

@@ -5,18 +5,18 @@ from drivers.protocol.messages import Nak, NakCode, Reply
 
 _REASONS = {
     NakCode.UNKNOWN_TYPE: "it does not support this request",
-    NakCode.BAD_LENGTH: "it expects another length; its firmware version may differ",
+    NakCode.BAD_LENGTH: "wrong payload length; its firmware version may differ",
     NakCode.BAD_VALUE: "a value is out of its range",
     NakCode.BAD_CHANNEL: "no such channel, or the channel occurs twice",
     NakCode.WRONG_STATE: "it is not armed, or it is stopped or in a fault; read its status, then "
     "clear it",
     NakCode.BAD_TOKEN: "no set is staged under this token",
-    NakCode.BUSY: "it was busy three times in a row; try again",
+    NakCode.BUSY: "busy after 3 attempts; try again",
     NakCode.NO_ENVELOPE: "a slot of the set holds no envelope",
     NakCode.UNSUPPORTED_VERSION: "its protocol version differs",
 }
 
-NO_PROTOCOL = (
+PROTOCOL_VIOLATION = (
     "its firmware violates the protocol: update it; era amp conformance lists every violation"
 )
 """Remedy for an invalid reply."""

@@ -1,9 +1,9 @@
-"""Whose turn it is on a link that carries one request at a time.
+"""Priority queue for a link with one outstanding request.
 
-Stops come first, then what else silences, then the others in order. One apply waits at most: a
-newer one takes its place, and a request that silences drops it; a stop drops acknowledgements,
-which were not meant for it. What has its turn gives way to what comes before it: at once while none
-of it is on the wire, else after a moment; what silences is repeated then.
+Stop > stop-class (silent set, disarm) > others in order. At most one apply is queued: a newer one
+or a stop-class request supersedes it; a stop supersedes queued acknowledgements of faults, too. A
+lower-priority request in flight is preempted: at once if unsent, else after a grace period.
+Preempted stop-class requests are retried.
 """
 
 import asyncio
@@ -15,15 +15,15 @@ from typing import final
 
 from drivers.errors import CommandRefused
 
-# s; how long silence waits for the answer to something else: most answers are there by then, and
-# with a ramp of 10 ms all is silent within 20 ms.
-PATIENCE = 0.008
+# s; how long a stop-class request waits for the reply to another one: most replies arrive
+# within it, and with a ramp of 10 ms all channels are silent within 20 ms.
+PREEMPTION_GRACE = 0.008
 
 SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
 
 
 class RequestPriority(Enum):
-    """How a request stands to the others that wait."""
+    """Priority of a request on its link."""
 
     ORDINARY = auto()
     CLEAR = auto()
@@ -32,243 +32,255 @@ class RequestPriority(Enum):
     STOP = auto()
 
     @property
-    def silences(self) -> bool:
-        """Whether it goes before what does not."""
+    def is_stop_class(self) -> bool:
+        """Whether it silences the amplifier, and so outranks requests that do not."""
         return self is RequestPriority.SILENCE or self is RequestPriority.STOP
 
-    def precedes(self, other: "RequestPriority") -> bool:
-        """Whether it goes before one of another kind that came earlier."""
-        return self is RequestPriority.STOP is not other or (self.silences and not other.silences)
+    def outranks(self, other: "RequestPriority") -> bool:
+        """Whether it is sent before an earlier request of that priority."""
+        return self is RequestPriority.STOP is not other or (
+            self.is_stop_class and not other.is_stop_class
+        )
 
-    def voids(self, other: "RequestPriority") -> bool:
-        """Whether one of another kind that waits is not wanted any more once this has come."""
+    def supersedes(self, other: "RequestPriority") -> bool:
+        """Whether this request makes a queued one of that priority obsolete."""
         if other is RequestPriority.CLEAR:
             return self is RequestPriority.STOP
-        return other is RequestPriority.APPLY and (self is RequestPriority.APPLY or self.silences)
+        return other is RequestPriority.APPLY and (
+            self is RequestPriority.APPLY or self.is_stop_class
+        )
 
 
 class Preempted(CommandRefused):
-    """Something that goes before it has taken its turn, or made it void."""
+    """Raised in a request that was preempted or superseded."""
 
 
 @final
 class Turns:
-    """Hands the link from one request to the next.
+    """Grants access to the link to one request at a time.
 
-    is_unsent: whether nothing of what has the turn has gone out yet, and stays here if its task is
-    cancelled now; by default all has gone out at once.
+    is_unsent: whether nothing of the current request is on the wire yet, so that cancelling its
+    task sends nothing; by default requests are on the wire at once.
     """
 
     def __init__(self, is_unsent: Callable[[], bool] = lambda: False) -> None:
         self._is_unsent = is_unsent
-        self._taken = False
+        self._is_in_use = False
         self._stops: deque[asyncio.Future[None]] = deque()
-        self._silences: deque[asyncio.Future[None]] = deque()
+        self._stop_class: deque[asyncio.Future[None]] = deque()
         self._others: deque[asyncio.Future[None]] = deque()
-        self._voidable: dict[asyncio.Future[None], RequestPriority] = {}  # of the others
-        self._present: _Turn | None = None
-        self._awaited: list[tuple[Hashable, RequestPriority]] = []
+        self._supersedable: dict[asyncio.Future[None], RequestPriority] = {}  # in _others
+        self._current: _Access | None = None
+        self._reservations: list[tuple[Hashable, RequestPriority]] = []
 
     @property
-    def is_taken(self) -> bool:
-        """Whether somebody has the turn."""
-        return self._taken
+    def is_in_use(self) -> bool:
+        """Whether the link is in use."""
+        return self._is_in_use
 
-    def raise_if_overtaken(self, kind: RequestPriority) -> None:
-        """Raise Preempted where a request that has the turn must not be repeated in it.
+    def raise_if_overtaken(self, priority: RequestPriority) -> None:
+        """Raise Preempted if the current request must not be retried.
 
-        Something that goes before it waits, or for an apply a newer one.
+        A request that outranks it is queued, or for an apply a newer one.
         """
-        if self._is_behind(kind) or (
-            kind is RequestPriority.APPLY and kind in self._voidable.values()
+        if self._is_outranked_by_waiting(priority) or (
+            priority is RequestPriority.APPLY and priority in self._supersedable.values()
         ):
             raise Preempted(SUPERSEDED)
 
-    def take(self, kind: RequestPriority) -> "_Turn":
-        """A context: waits for the turn and holds it; Preempted for what gave way."""
-        return _Turn(self, kind)
+    def take(self, priority: RequestPriority) -> "_Access":
+        """Return a context that waits for access to the link and holds it; raises Preempted."""
+        return _Access(self, priority)
 
-    def is_kept_from_own(self, who: Hashable, kind: RequestPriority) -> bool:
-        """Whether what silences this one itself is awaited, and goes before one of a kind."""
-        return any(one == who and awaited.precedes(kind) for one, awaited in self._awaited)
+    def has_own_reservation(self, owner: Hashable, priority: RequestPriority) -> bool:
+        """Whether this owner has reserved the link for a request that outranks `priority`."""
+        return any(
+            holder == owner and reserved.outranks(priority)
+            for holder, reserved in self._reservations
+        )
 
     def preempt_unsent(self) -> None:
-        """End the present turn if nothing of it has gone out, unless it silences."""
-        turn = self._present
-        if turn is not None and not turn.kind.silences and self._is_unsent():
-            turn.preempt()
+        """Preempt the current request if it is unsent and not of the stop class."""
+        access = self._current
+        if access is not None and not access.priority.is_stop_class and self._is_unsent():
+            access.preempt()
 
-    def keep_free(self, who: Hashable, kind: RequestPriority) -> None:
-        """Give no turn to what a request of this one's that is to come, and silences, goes before.
+    def reserve(self, owner: Hashable, priority: RequestPriority) -> None:
+        """Reserve the link for a pending stop-class request of this owner.
 
-        kind: of that request; until `release`, as often.
+        Blocks lower-priority requests until `release_reservation`; reservations are counted.
         """
-        self._awaited.append((who, kind))
-        self._limit_turn()
+        self._reservations.append((owner, priority))
+        self._update_preemption()
 
-    def release(self, who: Hashable, kind: RequestPriority) -> None:
-        """It is answered, or will not come."""
-        self._awaited.remove((who, kind))
-        if not self._taken:
-            self._pass_on()
+    def release_reservation(self, owner: Hashable, priority: RequestPriority) -> None:
+        """Release one reservation: its request is complete or was cancelled."""
+        self._reservations.remove((owner, priority))
+        if not self._is_in_use:
+            self._wake_next()
 
-    async def come(self, kind: RequestPriority) -> None:
-        """Wait for the turn; for `_Turn`."""
-        self._drop_what_is_void(kind)
-        if self._taken or self._is_kept_from(kind):
-            await self._wait(kind)
-        self._taken = True
+    async def acquire(self, priority: RequestPriority) -> None:
+        """Wait for the link; used by `_Access`."""
+        self._drop_superseded(priority)
+        if self._is_in_use or self._is_outranked(priority):
+            await self._wait(priority)
+        self._is_in_use = True
 
-    def begin(self, turn: "_Turn") -> None:
-        """The turn has begun."""
-        self._present = turn
+    def started(self, access: "_Access") -> None:
+        """Note the request that uses the link now; used by `_Access`."""
+        self._current = access
 
-    def end(self) -> None:
-        """The turn is over."""
-        self._present = None
-        self._pass_on()
+    def release(self) -> None:
+        """Release the link and wake the next waiter."""
+        self._current = None
+        self._wake_next()
 
-    def _is_behind(self, kind: RequestPriority) -> bool:
-        """Whether something waits that goes before one of a kind."""
-        return (bool(self._stops) and RequestPriority.STOP.precedes(kind)) or (
-            bool(self._silences) and RequestPriority.SILENCE.precedes(kind)
+    def _is_outranked_by_waiting(self, priority: RequestPriority) -> bool:
+        """Whether a queued request outranks one of this priority."""
+        return (bool(self._stops) and RequestPriority.STOP.outranks(priority)) or (
+            bool(self._stop_class) and RequestPriority.SILENCE.outranks(priority)
         )
 
-    def _is_kept_from(self, kind: RequestPriority) -> bool:
-        """Whether something waits, or is awaited, that goes before one of a kind."""
-        return self._is_behind(kind) or any(one.precedes(kind) for _, one in self._awaited)
+    def _is_outranked(self, priority: RequestPriority) -> bool:
+        """Whether a queued request or a reservation outranks one of this priority."""
+        return self._is_outranked_by_waiting(priority) or any(
+            reserved.outranks(priority) for _, reserved in self._reservations
+        )
 
-    def _limit_turn(self) -> None:
-        """Let the present turn end now or soon if something before it waits, else when it likes."""
-        turn = self._present
-        if turn is None:
+    def _update_preemption(self) -> None:
+        """Preempt the current request, or restart or cancel its preemption timer."""
+        access = self._current
+        if access is None:
             return
-        if self._is_kept_from(turn.kind) and self._is_unsent():
-            turn.preempt()
-        elif self._is_behind(turn.kind):
-            turn.limit(PATIENCE)
+        if self._is_outranked(access.priority) and self._is_unsent():
+            access.preempt()
+        elif self._is_outranked_by_waiting(access.priority):
+            access.preempt_after(PREEMPTION_GRACE)
         else:
-            turn.let_be()
+            access.cancel_timer()
 
-    def _queue_of(self, kind: RequestPriority) -> "deque[asyncio.Future[None]]":
-        return {RequestPriority.STOP: self._stops, RequestPriority.SILENCE: self._silences}.get(
-            kind, self._others
+    def _queue_of(self, priority: RequestPriority) -> "deque[asyncio.Future[None]]":
+        return {RequestPriority.STOP: self._stops, RequestPriority.SILENCE: self._stop_class}.get(
+            priority, self._others
         )
 
-    def _queue_up(self, kind: RequestPriority, *, at_first: bool) -> "asyncio.Future[None]":
-        """What is done when the turn of a request has come."""
-        turn = asyncio.get_running_loop().create_future()
-        queue = self._queue_of(kind)
-        if at_first:
-            queue.appendleft(turn)
+    def _enqueue(self, priority: RequestPriority, *, is_first: bool) -> "asyncio.Future[None]":
+        """Enqueue a waiter."""
+        waiter = asyncio.get_running_loop().create_future()
+        queue = self._queue_of(priority)
+        if is_first:
+            queue.appendleft(waiter)
         else:
-            queue.append(turn)
-        if any(one.voids(kind) for one in RequestPriority):
-            self._voidable[turn] = kind
-        return turn
+            queue.append(waiter)
+        if any(one.supersedes(priority) for one in RequestPriority):
+            self._supersedable[waiter] = priority
+        return waiter
 
-    async def _wait(self, kind: RequestPriority) -> None:
-        turn = self._queue_up(kind, at_first=False)
-        self._limit_turn()
+    async def _wait(self, priority: RequestPriority) -> None:
+        waiter = self._enqueue(priority, is_first=False)
+        self._update_preemption()
         try:
-            await turn
-            while self._is_kept_from(kind):  # by what came while the turn was being handed over
-                before = (
+            await waiter
+            # A request may arrive between the wake-up of a waiter and its next step.
+            while self._is_outranked(priority):
+                preempting = (
                     RequestPriority.STOP
-                    if self._is_kept_from(RequestPriority.SILENCE)
+                    if self._is_outranked(RequestPriority.SILENCE)
                     else RequestPriority.SILENCE
                 )
-                if before.voids(kind):
-                    self._pass_on()
+                if preempting.supersedes(priority):
+                    self._wake_next()
                     raise Preempted(SUPERSEDED)
-                turn = self._queue_up(kind, at_first=True)
-                self._pass_on()
-                await turn
+                waiter = self._enqueue(priority, is_first=True)
+                self._wake_next()
+                await waiter
         except asyncio.CancelledError:
-            if not turn.cancelled() and turn.exception() is None:
-                # The turn was handed over in the very moment of the cancellation.
-                self._pass_on()
-            elif turn in (queue := self._queue_of(kind)):
-                queue.remove(turn)
-                self._limit_turn()
+            if not waiter.cancelled() and waiter.exception() is None:
+                # It was granted the link in the iteration in which it was cancelled.
+                self._wake_next()
+            elif waiter in (queue := self._queue_of(priority)):
+                queue.remove(waiter)
+                self._update_preemption()
             raise
         finally:
-            self._voidable.pop(turn, None)
+            self._supersedable.pop(waiter, None)
 
-    def _drop_what_is_void(self, kind: RequestPriority) -> None:
-        """Refuse what waits and is not wanted any more once one of this kind has come."""
-        for turn in [turn for turn, waiting in self._voidable.items() if kind.voids(waiting)]:
-            del self._voidable[turn]
-            self._others.remove(turn)
-            if not turn.done():  # it may have been cancelled and not run since
-                turn.set_exception(Preempted(SUPERSEDED))
+    def _drop_superseded(self, priority: RequestPriority) -> None:
+        """Raise Preempted in queued requests that one of this priority supersedes."""
+        for waiter in [
+            waiter for waiter, queued in self._supersedable.items() if priority.supersedes(queued)
+        ]:
+            del self._supersedable[waiter]
+            self._others.remove(waiter)
+            if not waiter.done():  # it may have been cancelled and not run since
+                waiter.set_exception(Preempted(SUPERSEDED))
 
-    def _next(self) -> "deque[asyncio.Future[None]]":
-        """Those of whom the first may come now."""
-        if self._is_kept_from(RequestPriority.SILENCE):
+    def _next_queue(self) -> "deque[asyncio.Future[None]]":
+        """Return the highest-priority queue that may have the link now; it may be empty."""
+        if self._is_outranked(RequestPriority.SILENCE):
             return self._stops
-        return self._silences if self._is_kept_from(RequestPriority.ORDINARY) else self._others
+        return self._stop_class if self._is_outranked(RequestPriority.ORDINARY) else self._others
 
-    def _pass_on(self) -> None:
-        """Hand the turn, which nobody has, to the next."""
-        while queue := self._next():
-            turn = queue.popleft()
-            self._voidable.pop(turn, None)
-            if not turn.done():
-                self._taken = True
-                turn.set_result(None)
+    def _wake_next(self) -> None:
+        """Grant the free link to the next waiter, if any."""
+        while queue := self._next_queue():
+            waiter = queue.popleft()
+            self._supersedable.pop(waiter, None)
+            if not waiter.done():
+                self._is_in_use = True
+                waiter.set_result(None)
                 return
-        self._taken = False
+        self._is_in_use = False
 
 
 @final
-class _Turn:
-    """A turn, from when it comes until the context ends."""
+class _Access:
+    """Access to the link, from its grant until the context ends."""
 
-    __slots__ = ("_cancelling", "_is_preempted", "_task", "_timer", "_turns", "kind")
+    __slots__ = ("_cancelling", "_is_preempted", "_task", "_timer", "_turns", "priority")
 
-    def __init__(self, turns: Turns, kind: RequestPriority) -> None:
+    def __init__(self, turns: Turns, priority: RequestPriority) -> None:
         self._turns = turns
-        self.kind = kind
+        self.priority = priority
         self._timer: asyncio.TimerHandle | None = None
         self._is_preempted = False
 
     async def __aenter__(self) -> None:
-        await self._turns.come(self.kind)
+        await self._turns.acquire(self.priority)
         task = asyncio.current_task()
-        assert task is not None  # noqa: S101  a coroutine that waits is in one
+        assert task is not None  # noqa: S101  coroutines run in tasks
         self._task = task
         self._cancelling = task.cancelling()
-        self._turns.begin(self)
+        self._turns.started(self)
 
     async def __aexit__(
         self,
-        kind: type[BaseException] | None,
+        error_type: type[BaseException] | None,
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self.let_be()
-        self._turns.end()
+        self.cancel_timer()
+        self._turns.release()
         if not self._is_preempted:
             return
-        is_ours = self._task.uncancel() <= self._cancelling  # nobody else has cancelled it as well
-        if is_ours and kind is asyncio.CancelledError:
+        is_ours = self._task.uncancel() <= self._cancelling  # not cancelled by others as well
+        if is_ours and error_type is asyncio.CancelledError:
             raise Preempted(SUPERSEDED) from error
 
     def preempt(self) -> None:
-        """End now."""
-        self.let_be()
+        """Cancel the request now; its context raises Preempted."""
+        self.cancel_timer()
         if not self._is_preempted:
             self._is_preempted = True
             self._task.cancel()
 
-    def limit(self, seconds: float) -> None:
-        """End when so long [s] has passed, unless it is limited already."""
+    def preempt_after(self, seconds: float) -> None:
+        """Start the preemption timer [s], unless it runs."""
         if self._timer is None and not self._is_preempted:
             self._timer = asyncio.get_running_loop().call_later(seconds, self.preempt)
 
-    def let_be(self) -> None:
-        """End whenever it likes."""
+    def cancel_timer(self) -> None:
+        """Cancel the preemption timer."""
         timer, self._timer = self._timer, None
         if timer is not None:
             timer.cancel()

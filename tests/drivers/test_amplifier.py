@@ -98,7 +98,7 @@ def preempt_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     """Never preempt a request on the wire, unless a test sets a time [s]."""
 
     def change(seconds: float) -> None:
-        monkeypatch.setattr(turns, "PATIENCE", seconds)
+        monkeypatch.setattr(turns, "PREEMPTION_GRACE", seconds)
 
     change(60.0)
     return change

@@ -274,8 +274,8 @@ def _credited_to_first(received: Any, backend: Any, frame: Any) -> None:
     received(backend, replace(frame, sequence=waiting))
 
 
-async def _takes_at_once(_come: Any, line: Any, _kind: Any) -> None:
-    line._taken = True
+async def _takes_at_once(_acquire: Any, line: Any, _priority: Any) -> None:
+    line._is_in_use = True
 
 
 async def _knows_already(ask: Any, link: Link, request: Any, **how: Any) -> Any:
@@ -331,12 +331,17 @@ DRIVERS: dict[str, Bug] = {
         "credit", wrapped(SerialBackend, "_received", _credited_to_first), scenarios.foreign_answer
     ),
     "two requests are on the line at once": Bug(
-        "credit", wrapped(Turns, "come", _takes_at_once), scenarios.slow_touch
+        "credit", wrapped(Turns, "acquire", _takes_at_once), scenarios.slow_touch
     ),
-    "a stop is queued behind": Bug("stop", replaced(turns, "PATIENCE", 10.0), scenarios.slow_stop),
+    "a stop is queued behind": Bug(
+        "stop", replaced(turns, "PREEMPTION_GRACE", 10.0), scenarios.slow_stop
+    ),
     "silence waits its turn": Bug(
         "lift",
-        both(replaced(turns, "PATIENCE", 10.0), replaced(amplifier_group, "PATIENCE", 10.0)),
+        both(
+            replaced(turns, "PREEMPTION_GRACE", 10.0),
+            replaced(amplifier_group, "PREEMPTION_GRACE", 10.0),
+        ),
         scenarios.slow_lift,
     ),
     "a stop is sent as a disarm": Bug("stop", replaced(Amplifier, "stop", Amplifier.disarm)),

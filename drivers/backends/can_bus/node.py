@@ -112,7 +112,7 @@ class NodeWatch:
         try:
             answer = self._reply_reader.feed(CanFrame(can_id, bytes(data)))
         except FrameError:
-            self._counters.crc_errors += 1
+            self._counters.invalid_frames += 1
             return
         if answer is not None:
             self._post(self._on_reply, answer)
@@ -123,7 +123,7 @@ class NodeWatch:
         try:
             self._post(self._on_event, decode_emergency(data))
         except FrameError:
-            self._counters.crc_errors += 1
+            self._counters.invalid_frames += 1
 
     def _heartbeat(self, state: int) -> None:
         self._heard = clock.now()

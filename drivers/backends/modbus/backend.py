@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple
 
 from drivers.backends.hardware import number_below
-from drivers.backends.line_turns import kind_on_line
+from drivers.backends.line_turns import priority_on_line
 from drivers.backends.modbus.line import ModbusLine, modbus_line
 from drivers.backends.sole_host import SoleHost
 from drivers.backends.urls.modbus import ModbusUrl
@@ -50,7 +50,7 @@ _TAGS = (1 << 16) - 1
 class _Asked(NamedTuple):
     """Priority of a request on the line, and timeout [s] of each transaction."""
 
-    kind: RequestPriority
+    priority: RequestPriority
     timeout: float
 
 
@@ -124,7 +124,7 @@ class ModbusBackend(WireBackend):
         """
         if isinstance(request, Arm) and not self._url.device:
             self._sole_host.claim()
-        asked = _Asked(kind_on_line(request), timeout)
+        asked = _Asked(priority_on_line(request), timeout)
         self._is_asking = True
         try:
             reply, registers = await self._ask(request, asked)
@@ -141,9 +141,9 @@ class ModbusBackend(WireBackend):
     async def broadcast(self, request: Broadcast) -> None:
         """Write a commit or a stop to all units of the line; a stop has priority."""
         line = self._opened()
-        kind = kind_on_line(request)
-        unit = None if kind.silences else self._url.unit
-        await line.broadcast(exchanges.encode_broadcast(request), kind, unit=unit)
+        priority = priority_on_line(request)
+        unit = None if priority.is_stop_class else self._url.unit
+        await line.broadcast(exchanges.encode_broadcast(request), priority, unit=unit)
         self._last_sent = line.last_sent
 
     async def _check_alone(self) -> None:
@@ -202,7 +202,7 @@ class ModbusBackend(WireBackend):
                 read,
                 write,
                 unit=self._url.unit,
-                kind=asked.kind,
+                priority=asked.priority,
                 timeout=asked.timeout,
                 accept=accept,
             )

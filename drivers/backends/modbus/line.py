@@ -69,13 +69,13 @@ class ModbusLine(SharedLine[Port]):
         write: Write | None,
         *,
         unit: int,
-        kind: RequestPriority = RequestPriority.ORDINARY,
+        priority: RequestPriority = RequestPriority.ORDINARY,
         timeout: float,
         accept: Callable[[ModbusResponse], bool],
     ) -> ModbusResponse:
         """Write, read, or both in one transaction, and wait for the response.
 
-        kind: priority on the line (see `kind_on_line`); accept: whether a well-formed response
+        priority: on the line, see `priority_on_line`; accept: whether a well-formed response
         matches. timeout [s]: of the whole transaction, extended on slow lines. Raises LinkTimeout,
         LinkError.
         """
@@ -104,10 +104,10 @@ class ModbusLine(SharedLine[Port]):
             finally:
                 self._answer = None
 
-        return await self._turns.carry_out(kind, exchange, address=unit)
+        return await self._turns.carry_out(priority, exchange, address=unit)
 
-    async def broadcast(self, write: Write, kind: RequestPriority, *, unit: int | None) -> None:
-        """Write to all units with the priority of this kind; there are no responses.
+    async def broadcast(self, write: Write, priority: RequestPriority, *, unit: int | None) -> None:
+        """Write to all units with this priority; there are no responses.
 
         unit: the one whose stop preempts this, or None.
         """
@@ -119,7 +119,7 @@ class ModbusLine(SharedLine[Port]):
             self._send(request.frame)
             self._free_from = self.last_sent + self._time_of(len(request.frame)) + self._gap
 
-        await self._turns.carry_out(kind, send, address=unit)
+        await self._turns.carry_out(priority, send, address=unit)
 
     def is_unsent(self, unit: int) -> bool:
         """Whether the request to a unit waits for others or for silence on the line."""
@@ -142,7 +142,7 @@ class ModbusLine(SharedLine[Port]):
         self._last_response, self.has_duplicate_responder = None, False
         self._response_received.clear()
         stream.write(frame)
-        self._turns.sent()
+        self._turns.mark_sent()
         self.last_sent = clock.now()
         self.counters.frames_out += 1
 

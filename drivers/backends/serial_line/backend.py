@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
 from drivers.backends.hardware import number_below
-from drivers.backends.line_turns import kind_on_line
+from drivers.backends.line_turns import priority_on_line
 from drivers.backends.serial_line.line import SerialLine, serial_line
 from drivers.backends.urls.serial_line import SerialUrl
 from drivers.backends.waiting import SETTLE, reply_within
@@ -48,9 +48,11 @@ class SerialBackend(WireBackend):
 
     @property
     def counters(self) -> WireCounters:
-        """Frame counters of this amplifier; damaged frames are those of the whole line."""
-        crc_errors = self._counters.crc_errors if self._line is None else self._line.crc_errors
-        return replace(self._counters, crc_errors=crc_errors)
+        """Frame counters of this amplifier; invalid frames are those of the whole line."""
+        invalid_frames = (
+            self._counters.invalid_frames if self._line is None else self._line.invalid_frames
+        )
+        return replace(self._counters, invalid_frames=invalid_frames)
 
     @property
     def bus(self) -> str:
@@ -94,7 +96,7 @@ class SerialBackend(WireBackend):
         line, self._line = self._line, None
         if line is None:
             return
-        self._counters.crc_errors = line.crc_errors
+        self._counters.invalid_frames = line.invalid_frames
         self._fail(LinkError(f"{self._url.port} was closed"))
         line.listen(self._url.address, None)
         await line.leave(self._url.address)
@@ -107,18 +109,18 @@ class SerialBackend(WireBackend):
         line = self._opened()
         # Also on a line of its own: an amplifier that joins must wait for a pending reply.
         return await line.turns.carry_out(
-            kind_on_line(request),
+            priority_on_line(request),
             lambda: self._exchange(line, request, timeout),
             address=self._url.address,
         )
 
     async def broadcast(self, request: Broadcast) -> None:
-        """Send a commit to every amplifier of the line in its turn, or a stop at once.
+        """Send a commit to every amplifier of the line by its priority, or a stop at once.
 
-        A stop is repeated in its turn if it may have collided with a reply on the wires.
+        A stop is repeated by its priority if it may have collided with a reply on the line.
         """
         line = self._opened()
-        is_stop, was_taken = isinstance(request, Stop), line.turns.is_taken
+        is_stop, was_in_use = isinstance(request, Stop), line.turns.is_in_use
         data = encode_frame(self._frame(request, PROTOCOL.serial.broadcast))
 
         async def send() -> None:
@@ -126,9 +128,9 @@ class SerialBackend(WireBackend):
 
         if is_stop:
             await send()
-        if was_taken or not is_stop:
+        if was_in_use or not is_stop:
             address = None if is_stop else self._url.address
-            await line.turns.carry_out(kind_on_line(request), send, address=address)
+            await line.turns.carry_out(priority_on_line(request), send, address=address)
 
     async def _check_alone(self) -> None:
         """Wait for a second amplifier of this address; LinkError if one replies."""
@@ -148,7 +150,7 @@ class SerialBackend(WireBackend):
         try:
             line.raise_if_lost(self._url.address)
             self._send(line, data)
-            line.turns.sent()
+            line.turns.mark_sent()
             on_line = self._times.exchange(len(data))
             reply = await reply_within(pending.reply, max(timeout, on_line + PROTOCOL.reaction))
         except LinkError:
@@ -205,7 +207,7 @@ class SerialBackend(WireBackend):
         try:
             event = decode_event(frame)
         except DriverError:
-            self._counters.crc_errors += 1
+            self._counters.invalid_frames += 1
             return
         self._counters.events += 1
         self._on_event(event)

@@ -14,7 +14,7 @@ from drivers.errors import LinkError
 class SerialLine(SharedLine[Port]):
     """A port, named as in pyserial, at a speed [baud]; see `serial_line`.
 
-    turns: of exchanges, since only one amplifier may reply at a time.
+    turns: arbitrates between amplifiers, since only one may reply at a time.
     """
 
     number = "address"
@@ -28,9 +28,9 @@ class SerialLine(SharedLine[Port]):
         self._listeners: dict[int, Callable[[Frame], None]] = {}
 
     @property
-    def crc_errors(self) -> int:
-        """Number of damaged frames received."""
-        return self._reader.counters.crc_errors
+    def invalid_frames(self) -> int:
+        """Number of invalid frames received."""
+        return self._reader.counters.invalid_frames
 
     def listen(self, address: int, on_frame: Callable[[Frame], None] | None) -> None:
         """Set the callback for frames from an address; None removes it."""

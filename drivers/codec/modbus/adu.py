@@ -99,7 +99,7 @@ class ResponseReader:
     def clear(self) -> None:
         """Discard partial data."""
         if self._buffer:
-            self._counters.crc_errors += 1
+            self._counters.invalid_frames += 1
             self._buffer.clear()
 
     def feed(self, data: bytes, to: RequestAdu | None) -> list[ModbusResponse]:
@@ -141,7 +141,7 @@ class ResponseReader:
             if size and start + size <= len(self._buffer):
                 frame = bytes(self._buffer[start : start + size])
                 if FramerRTU.check_CRC(frame[:-2], int.from_bytes(frame[-2:], "big")):
-                    self._counters.crc_errors += start > 0
+                    self._counters.invalid_frames += start > 0
                     del self._buffer[: start + size]
                     return 0, frame[0], frame[1:-2]
         if len(self._buffer) > 2 * _RTU_MAX:

@@ -52,10 +52,10 @@ class Frame:
 
 @dataclass
 class FrameCounters:
-    """Received frames: good ones, and damaged ones by checksum, length, form or version."""
+    """Received frames: good ones, and those with an invalid checksum, length, form or version."""
 
     good: int = 0
-    crc_errors: int = 0
+    invalid_frames: int = 0
 
 
 def encode_frame(frame: Frame) -> bytes:
@@ -103,7 +103,7 @@ class FrameReader:
         if self._skipping:
             return
         if len(self._stuffed) + len(piece) > _STUFFED_MAX:
-            self.counters.crc_errors += 1
+            self.counters.invalid_frames += 1
             self._skipping = True
             self._stuffed.clear()
             return
@@ -117,7 +117,7 @@ class FrameReader:
             return None
         frame = _decode_frame(stuffed)
         if frame is None:
-            self.counters.crc_errors += 1
+            self.counters.invalid_frames += 1
         else:
             self.counters.good += 1
         return frame

@@ -124,7 +124,7 @@ class LinesBackend(WireBackend):
         try:
             line = await reader.readline()
         except ValueError:  # longer than any reply
-            self._counters.crc_errors += 1
+            self._counters.invalid_frames += 1
             return None
         if not line.endswith(b"\n"):
             raise ConnectionResetError("the amplifier has hung up")
@@ -135,7 +135,7 @@ class LinesBackend(WireBackend):
                 return read(request, reply)
             self._counters.unexpected_frames += 1
         except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
-            self._counters.crc_errors += 1
+            self._counters.invalid_frames += 1
         return None
 
 

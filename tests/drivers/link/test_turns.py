@@ -1,4 +1,4 @@
-"""Turns on a link and on a line, between two steps of the event loop."""
+"""Access to a link and to a line, between two iterations of the event loop."""
 
 import asyncio
 
@@ -17,7 +17,7 @@ async def settle() -> None:
 
 
 class Users:
-    """Users of turns, and the order of their turns."""
+    """Users of a link, and the order of their access."""
 
     def __init__(self, turns: Turns) -> None:
         self.turns = turns
@@ -25,12 +25,12 @@ class Users:
         self.ends: dict[str, asyncio.Event] = {}
 
     def take(
-        self, name: str, kind: RequestPriority = RequestPriority.ORDINARY
+        self, name: str, priority: RequestPriority = RequestPriority.ORDINARY
     ) -> "asyncio.Task[None]":
         self.ends[name] = asyncio.Event()
 
         async def use() -> None:
-            async with self.turns.take(kind):
+            async with self.turns.take(priority):
                 self.order.append(name)
                 await self.ends[name].wait()
 
@@ -39,12 +39,12 @@ class Users:
 
 @pytest.fixture
 def users() -> Users:
-    """No user has the turn."""
+    """Users of a link that is free."""
     return Users(Turns())
 
 
-async def test_stop_class_precedes_a_request_at_its_turn(users: Users) -> None:
-    """An ordinary request that has not run yet returns its turn and is the next."""
+async def test_stop_class_outranks_a_request_that_was_granted_the_link(users: Users) -> None:
+    """An ordinary request that has not run yet releases the link and is the next."""
     tasks = [users.take(name) for name in ("first", "second", "third")]
     await settle()
     users.ends["first"].set()
@@ -58,8 +58,8 @@ async def test_stop_class_precedes_a_request_at_its_turn(users: Users) -> None:
     assert users.order == ["first", "stop", "second", "third"]
 
 
-async def test_stop_precedes_other_stop_class_requests(users: Users) -> None:
-    """Waiting silent sets and disarms follow it in their order."""
+async def test_stop_outranks_other_stop_class_requests(users: Users) -> None:
+    """Queued silent sets and disarms follow it in their order."""
     tasks = [users.take("first")]
     await settle()
     tasks += [users.take(name, RequestPriority.SILENCE) for name in ("zero", "disarm")]
@@ -72,7 +72,7 @@ async def test_stop_precedes_other_stop_class_requests(users: Users) -> None:
     assert users.order == ["first", "stop", "zero", "disarm"]
 
 
-async def test_apply_at_its_turn_is_superseded() -> None:
+async def test_apply_that_was_granted_the_link_is_superseded() -> None:
     """By a disarm, before any of it was sent; other requests follow."""
     users = Users(Turns())
     first, apply = users.take("first"), users.take("apply", RequestPriority.APPLY)
@@ -90,13 +90,13 @@ async def test_apply_at_its_turn_is_superseded() -> None:
     assert users.order == ["first", "stop", "behind"]
 
 
-async def test_released_reservation_passes_the_turn_on(users: Users) -> None:
+async def test_released_reservation_wakes_the_next(users: Users) -> None:
     """Waiting and new requests follow a stop-class request that was cancelled."""
-    users.turns.keep_free("west", RequestPriority.SILENCE)
+    users.turns.reserve("west", RequestPriority.SILENCE)
     early = users.take("early")
     await settle()
     assert users.order == []
-    users.turns.release("west", RequestPriority.SILENCE)
+    users.turns.release_reservation("west", RequestPriority.SILENCE)
     await settle()
     late = users.take("late")
     for end in users.ends.values():

@@ -93,7 +93,7 @@ async def test_serial_end_skips_noise(end: SerialEnd, host: Host) -> None:
     assert isinstance(status, Status)
     assert status.state is AmplifierState.SWITCH_ON_DISABLED
     assert end.counters.good == 1
-    assert end.counters.crc_errors >= 2
+    assert end.counters.invalid_frames >= 2
 
 
 @pytest.mark.parametrize(

@@ -107,7 +107,7 @@ async def test_noise_before_a_reply_is_skipped(backend: SerialBackend, far_end: 
 
     far_end.answer = answer
     assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
-    assert backend.counters.crc_errors == 2
+    assert backend.counters.invalid_frames == 2
 
 
 async def test_invalid_reply_is_a_frame_error(backend: SerialBackend, far_end: FarEnd) -> None:

@@ -100,7 +100,7 @@ def test_damaged_frames_are_counted() -> None:
     reader = FrameReader()
     for count, data in enumerate(damaged, start=1):
         assert reader.feed(data) == []
-        assert reader.counters.crc_errors == count
+        assert reader.counters.invalid_frames == count
     assert reader.feed(good) != []
     assert reader.counters.good == 1
 
@@ -110,7 +110,7 @@ def test_buffer_is_bounded() -> None:
     reader = FrameReader()
     for _ in range(256):
         reader.feed(b"\x55" * 4096)
-    assert reader.counters.crc_errors == 1
+    assert reader.counters.invalid_frames == 1
     assert len(reader._stuffed) == 0
 
 

@@ -15,7 +15,7 @@ def mixture_bound(fields: Fields, *, eras_at_most: int) -> float:
     masks = group_masks(fields.era_count, eras_at_most)
     peak = mean_target_peak([group_magnitudes(target, masks) for target in fields.targets]).ravel()
     quiet = group_magnitudes(fields.quiet, masks).reshape(len(peak), -1)
-    weights = dual_weights(peak, quiet, is_rms=fields.is_alone)
+    weights = dual_weights(peak, quiet, is_rms=fields.has_no_quiet_contacts)
     return float((peak / (quiet @ weights)).max())
 
 

@@ -68,7 +68,7 @@ def fields_of(places: FloatArray, *, targets: int = 1) -> Fields:
     """Fields at the fingertips; the wanted level is an acceleration of 1 m/s²."""
     fields = paper_table().fields(question_of(places, targets=targets))
     ones = np.ones_like(fields.threshold)
-    return Fields(fields.targets, fields.quiet, fields.is_alone, ones, LEAST)
+    return Fields(fields.targets, fields.quiet, fields.has_no_quiet_contacts, ones, LEAST)
 
 
 def quiet_centres(places: FloatArray, *, targets: int = 1) -> IntArray:

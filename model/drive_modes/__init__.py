@@ -1,13 +1,17 @@
-"""Drive modes: how freely the ERAs' frequencies, amplitudes and phases may be chosen; a file each.
+"""Drive modes: which frequencies, amplitudes and phases the ERAs may have; a file each.
 
-All but `switched` drive all ERAs at one frequency. Every mode contains the poorer ones, so that its
-drive is the best of all modes up to its own; what a richer mode can have at most at a frequency
-bounds the poorer ones and prunes most of their frequencies.
+The modes are nested: each allows every drive of the more restricted ones, and returns the best of
+all modes up to its own. All but `switched` drive all ERAs at one frequency. The upper bound of a
+mode's score at a frequency also bounds the restricted modes and prunes most of their frequencies.
 
-`phased` takes a millisecond for one target. It also tries `signed` and `graded` for several
-targets, and where the wanted level excludes its own best weights: the relaxation is then found by
-trial. Elsewhere its own search contains theirs but for unfinished iterations: 0.1 dB on average,
-0.5 dB at most.
+For a single target, `phased` takes a millisecond and is at least as good as `signed` and `graded`,
+up to 0.1 dB (mean), 0.5 dB (maximum) of unconverged iterations, so that it skips their search. It
+searches them for several targets, and where its best weights do not reach the wanted level.
+
+Symbols here and in `model.table`: f frequencies, p points under the fingers, q quiet points, r
+reduced modal coordinates; h field of an ERA at a point, R Hermitian form of the expected power at
+the quiet points, c right-hand side from the targets, w complex weights of the ERAs. In
+`model.transients`, q are the modal coordinates and z those of the eigenvectors in time.
 """
 
 from dataclasses import dataclass
@@ -41,17 +45,17 @@ __all__ = [
 class DriveMode:
     """A drive mode.
 
-    coherent: search for weights of all ERAs at one frequency, None for `switched`; poorer: the
-    modes that it contains, richest first.
+    coherent: search for weights of all ERAs at one frequency, None for `switched`; restricted: the
+    modes that it contains, least restricted first.
     """
 
     coherent: Coherent | None
-    poorer: tuple[str, ...]
+    restricted: tuple[str, ...]
 
     def max_sensation(self, fields: Fields) -> float:
-        """Return the highest amplitude to threshold found at the lesser target, in this mode alone.
+        """Return the highest amplitude to threshold found at the weakest target.
 
-        For several targets a coherent mode may reach a decibel more.
+        In this mode alone. For several targets a coherent mode may reach a decibel more.
         """
         search = self.coherent.max_sensation if self.coherent else max_sensation_switched
         return search(fields)
@@ -99,7 +103,7 @@ class Choice:
 
 
 def find_drives(fields: Fields, drive_mode: str) -> Choice | None:
-    """Find the drive of the best robust score in a mode and the poorer ones.
+    """Find the drive of the best robust score in a mode and its restricted ones.
 
     None where no drive reaches the wanted level.
     """
@@ -107,7 +111,7 @@ def find_drives(fields: Fields, drive_mode: str) -> Choice | None:
     open_ = np.arange(fields.frequency_count)
     score = np.zeros(len(open_), dtype=np.float32)
     weights = np.zeros((len(open_), fields.era_count), dtype=np.complex64)
-    for name in (drive_mode, *DRIVE_MODES[drive_mode].poorer):
+    for name in (drive_mode, *DRIVE_MODES[drive_mode].restricted):
         min_score = best[1].score if best else 0.0
         coherent = DRIVE_MODES[name].coherent
         if coherent is None:
@@ -139,8 +143,8 @@ def find_drives(fields: Fields, drive_mode: str) -> Choice | None:
 
 
 def max_sensation(fields: Fields, drive_mode: str) -> float:
-    """Return the highest amplitude to threshold found at the lesser target in a mode."""
-    names = (*DRIVE_MODES[drive_mode].poorer, drive_mode)
+    """Return the highest amplitude to threshold found at the weakest target in a mode."""
+    names = (*DRIVE_MODES[drive_mode].restricted, drive_mode)
     return max(DRIVE_MODES[name].max_sensation(fields) for name in names)
 
 

@@ -6,10 +6,10 @@ quadratic form w^H R w of the weights w,
     R = sum_p v_p (conj(h_p) h_p^T + sigma² diag |h_p|²),    sum_p v_p = 1,
 
 and the weights that reach the targets with the least of it solve R w = c, where c sums conj(h_t) of
-the targets, each times its phase factor. Where the maximum over the quiet points counts, the shares
-v_p are moved towards the loud points and the system is solved again (Lawson's algorithm for minimax
-approximation). A mean is at most the maximum: |c^H w| / sqrt(w^H R w) bounds what a frequency can
-offer, and most frequencies are pruned after one or two iterations.
+the targets, each times its phase factor. Where the maximum over the quiet points counts, the point
+weights v_p are moved towards the loud points and the system is solved again (Lawson's algorithm for
+minimax approximation). A mean is at most the maximum: |c^H w| / sqrt(w^H R w) bounds the score at a
+frequency, and most frequencies are pruned after one or two iterations.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ MAX_CANDIDATES = 12
 """Frequencies at which Lawson's iterations are done."""
 
 LAWSON_STEPS = np.array([1.0] + [0.7] * 5, dtype=np.float32)
-"""Exponents of the expected power by which shares are multiplied, one for each iteration."""
+"""Exponents of the expected power by which point weights are multiplied, one per iteration."""
 
 MANY_POINTS, MAX_STEPS_MANY_POINTS = 100, 4
 """With more quiet points (six fingers) an iteration takes longer: fewer of them."""
@@ -49,42 +49,47 @@ class Coherent:
     """How a mode's weights are found.
 
     solve: see `Solve`; phases: number of starting phases of the first target, and of every further
-    one; ascents: number of iterations from each start that align the phases with those reached.
+    one; iterations: number from each start that align the phases with those reached.
     """
 
     solve: Solve
     phases: tuple[int, int]
-    ascents: int
+    iterations: int
 
     def search(self, fields: Fields, min_score: float) -> "Search":
         """Find the best weights at each frequency that can have the best score of all.
 
         min_score: best score so far. With none, frequencies are pruned at PRUNE_MARGIN; with one,
-        only those that cannot exceed it, so that a richer mode finds what a poorer one would.
+        only those that cannot exceed it, so that a mode finds what a restricted one would.
         """
-        found = _BestOffers(fields, min_score)
+        found = _BestCandidates(fields, min_score)
         weights, bound = self._weights(fields, _even_form(fields, sigma=ERROR_SHARE))
         expected = _expected_power(fields, weights)
         every = np.arange(fields.frequency_count)
-        found.offer(every, weights, fields, expected=expected, bound=bound)
-        if not found.reaches:
+        found.add(every, weights, fields, expected=expected, bound=bound)
+        if not found.has_feasible:
             self._relax_level(fields, found)
-        elif not fields.is_alone:  # their norm is a mean already
+        elif not fields.has_no_quiet_contacts:  # their norm is a mean already
             self._lawson_iterations(fields, found, expected=expected, bound=bound)
         return found.search()
 
     def _lawson_iterations(
-        self, fields: Fields, found: "_BestOffers", *, expected: Float32Array, bound: Float32Array
+        self,
+        fields: Fields,
+        found: "_BestCandidates",
+        *,
+        expected: Float32Array,
+        bound: Float32Array,
     ) -> None:
-        """Give the loud quiet points larger shares, repeatedly, where that may find better weights.
+        """Increase the weights of the loud quiet points while that may find better drives.
 
-        expected (f, q), bound (f,): from equal shares. A touch waits for this: every avoided call
-        of numpy counts.
+        expected (f, q), bound (f,): from equal point weights. A touch waits for this: every avoided
+        call of numpy counts.
         """
         near = PRUNE_MARGIN if found.min_score == 0 else 1.0
-        chosen, shares = np.arange(fields.frequency_count), np.ones_like(expected)
+        chosen, point_weights = np.arange(fields.frequency_count), np.ones_like(expected)
         many = fields.quiet.shape[-1] > MANY_POINTS
-        for move in LAWSON_STEPS[:MAX_STEPS_MANY_POINTS] if many else LAWSON_STEPS:
+        for step in LAWSON_STEPS[:MAX_STEPS_MANY_POINTS] if many else LAWSON_STEPS:
             kept = (bound > near * found.score).nonzero()[0]
             if len(kept) == 0:
                 return
@@ -92,37 +97,37 @@ class Coherent:
                 kept = kept[np.argsort(-bound[kept])[:MAX_CANDIDATES]]
             if len(kept) < len(chosen):
                 chosen, fields = chosen[kept], fields.at(kept)
-                shares, expected = shares[kept], expected[kept]
-            shares = shares * expected**move
-            shares /= np.add.reduce(shares, axis=-1, keepdims=True)
-            weights, bound = self._weights(fields, _mean_form(fields, shares))
+                point_weights, expected = point_weights[kept], expected[kept]
+            point_weights = point_weights * expected**step
+            point_weights /= np.add.reduce(point_weights, axis=-1, keepdims=True)
+            weights, bound = self._weights(fields, _mean_form(fields, point_weights))
             expected = _expected_power(fields, weights)
-            found.offer(chosen, weights, fields, expected=expected, bound=bound)
+            found.add(chosen, weights, fields, expected=expected, bound=bound)
 
     def max_sensation(self, fields: Fields) -> float:
-        """Return the highest amplitude to threshold found at the lesser target."""
+        """Return the highest amplitude to threshold found at the weakest target."""
         sigma, gain = LEVEL_RELAXATION[-1]
         weights, _ = self._weights(fields, _even_form(fields, sigma=sigma))
         peak = _peak(fields, _saturated(weights, gain))
         return float((peak / fields.threshold).max())
 
-    def _relax_level(self, fields: Fields, found: "_BestOffers") -> None:
+    def _relax_level(self, fields: Fields, found: "_BestCandidates") -> None:
         every = np.arange(fields.frequency_count)
         unknown = np.full(len(every), np.inf, dtype=np.float32)
         for sigma, gain in LEVEL_RELAXATION:
             weights, _ = self._weights(fields, _even_form(fields, sigma=sigma))
             weights = _saturated(weights, gain)
             expected = _expected_power(fields, weights)
-            found.offer(every, weights, fields, expected=expected, bound=unknown)
-            if found.reaches:
+            found.add(every, weights, fields, expected=expected, bound=unknown)
+            if found.has_feasible:
                 break
 
     def _weights(self, fields: Fields, R: Complex64Array) -> tuple[Complex64Array, Float32Array]:
         """Weights (n, eras), and their bound |c^H w| / sqrt(w^H R w), (n,)."""
         targets = fields.mean_targets
         starts = _starts(len(targets), self.phases)
-        ascents = self.ascents if len(starts) > 1 else 1
-        return _ascend(R, targets, self.solve, starts=starts, ascents=ascents)
+        iterations = self.iterations if len(starts) > 1 else 1
+        return _optimise_target_phases(R, targets, self.solve, starts=starts, iterations=iterations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,20 +145,20 @@ class Search:
     is_level_limited: bool
 
 
-class _BestOffers:
-    """The best of the weights offered so far.
+class _BestCandidates:
+    """The best candidate weights so far.
 
-    score: the best of those that reach the level, at first min_score; reaches: whether any do;
-    refused: the best score of those that do not.
+    score: the best of those that reach the level, at first min_score; has_feasible: whether any do;
+    best_infeasible_score: the best score of those that do not.
     """
 
     def __init__(self, fields: Fields, min_score: float) -> None:
         self._shape = fields.frequency_count, fields.era_count
-        self._offers: list[tuple[IntArray, Complex64Array, Float32Array, Float32Array]] = []
+        self._candidates: list[tuple[IntArray, Complex64Array, Float32Array, Float32Array]] = []
         self.min_score = self.score = min_score
-        self.refused, self.reaches = 0.0, False
+        self.best_infeasible_score, self.has_feasible = 0.0, False
 
-    def offer(
+    def add(
         self,
         frequencies: IntArray,
         weights: Complex64Array,
@@ -162,30 +167,36 @@ class _BestOffers:
         expected: Float32Array,
         bound: Float32Array,
     ) -> None:
-        """Take weights (n, eras) with their expected power at the quiet points (n, q).
+        """Add weights (n, eras) with their expected power at the quiet points (n, q).
 
         fields: at these frequencies only; bound (n,): upper bound of the score at them.
         """
-        power = expected.mean(axis=-1) if fields.is_alone else np.maximum.reduce(expected, axis=-1)
+        power = (
+            expected.mean(axis=-1)
+            if fields.has_no_quiet_contacts
+            else np.maximum.reduce(expected, axis=-1)
+        )
         peak = _peak(fields, weights)
         reaches = peak >= fields.wanted * fields.threshold
         score = peak / np.sqrt(power + _TINY * (peak * peak))
         count = int(np.count_nonzero(reaches))
         if count < len(reaches):
-            self.refused = max(self.refused, float(score[~reaches].max()))
+            self.best_infeasible_score = max(
+                self.best_infeasible_score, float(score[~reaches].max())
+            )
             score = np.where(reaches, score, 0)
-        self._offers.append((frequencies, weights, score, bound))
+        self._candidates.append((frequencies, weights, score, bound))
         self.score = max(self.score, float(score.max()))
-        self.reaches = self.reaches or count > 0
+        self.has_feasible = self.has_feasible or count > 0
 
     def search(self) -> "Search":
         """Return the best weights at each frequency."""
-        at, weights, score, bound = map(np.concatenate, zip(*self._offers, strict=True))
+        at, weights, score, bound = map(np.concatenate, zip(*self._candidates, strict=True))
         found = Search(
             score=np.zeros(self._shape[0], dtype=np.float32),
             weights=np.zeros(self._shape, dtype=np.complex64),
             bound=np.full(self._shape[0], np.inf, dtype=np.float32),
-            is_level_limited=self.refused > self.score,
+            is_level_limited=self.best_infeasible_score > self.score,
         )
         # Written in ascending order, so that the best remains.
         order = np.argsort(-score, kind="stable")[::-1]
@@ -201,7 +212,7 @@ def _saturated(weights: Complex64Array, gain: float) -> Complex64Array:
 
 
 def _peak(fields: Fields, weights: Complex64Array) -> Float32Array:
-    """Peak acceleration (n,) at the lesser target, mean over its points, for weights (n, eras)."""
+    """Peak acceleration (n,) at the weakest target, mean over its points, for weights (n, eras)."""
     row = weights[:, None, :]
     each = [
         np.add.reduce(np.abs((row @ field)[:, 0]), axis=-1) / np.float32(field.shape[-1])
@@ -211,7 +222,7 @@ def _peak(fields: Fields, weights: Complex64Array) -> Float32Array:
 
 
 def _even_form(fields: Fields, *, sigma: float) -> Complex64Array:
-    """R (f, eras, eras) for equal shares of the quiet points."""
+    """R (f, eras, eras) for equal weights of the quiet points."""
     quiet = fields.quiet
     R = np.asarray(quiet.conj() @ quiet.transpose(0, 2, 1), dtype=np.complex64)
     R /= np.float32(quiet.shape[-1])
@@ -220,17 +231,17 @@ def _even_form(fields: Fields, *, sigma: float) -> Complex64Array:
     return R
 
 
-def _mean_form(fields: Fields, shares: Float32Array) -> Complex64Array:
-    """R (n, eras, eras) for shares (n, q) of the quiet points."""
-    mean = np.matvec(fields.quiet_forms, shares).view(np.complex64)
+def _mean_form(fields: Fields, point_weights: Float32Array) -> Complex64Array:
+    """R (n, eras, eras) for weights (n, q) of the quiet points."""
+    mean = np.matvec(fields.quiet_forms, point_weights).view(np.complex64)
     return np.asarray(mean.reshape(len(mean), fields.era_count, -1))
 
 
 def _expected_power(fields: Fields, weights: Complex64Array) -> Float32Array:
     """Expected power at the quiet points (n, q) of weights (n, eras): |w h|² + sigma² |w|² |h|²."""
-    wrong = np.vecmat(_power(weights), fields.quiet_power)
-    right = _power((weights[:, None, :] @ fields.quiet)[:, 0])
-    return np.asarray(right + np.float32(ERROR_SHARE**2) * wrong)
+    error = np.vecmat(_power(weights), fields.quiet_power)
+    nominal = _power((weights[:, None, :] @ fields.quiet)[:, 0])
+    return np.asarray(nominal + np.float32(ERROR_SHARE**2) * error)
 
 
 def _power(values: Complex64Array) -> Float32Array:
@@ -249,22 +260,22 @@ def _starts(targets: int, phases: tuple[int, int]) -> Complex64Array:
     return np.array(list(product(*circles)), dtype=np.complex64)
 
 
-def _ascend(
+def _optimise_target_phases(
     R: Complex64Array,
     targets: Complex64Array,
     solve: Solve,
     *,
     starts: Complex64Array,
-    ascents: int,
+    iterations: int,
 ) -> tuple[Complex64Array, Float32Array]:
     """Weights (n, eras), largest magnitude 1, for targets (t, n, eras), and their bound (n,).
 
     The best of all starts. Each iteration sets the targets' phase factors to the phases reached,
-    which cannot lower the bound, and gives more weight to a target that gets less.
+    which cannot lower the bound, and gives more weight to a weaker target.
     """
     _, n, eras = targets.shape
     conjugate = targets.conj()
-    if len(starts) == 1 and ascents == 1:
+    if len(starts) == 1 and iterations == 1:
         c = conjugate[0] if len(targets) == 1 else conjugate.sum(axis=0)
         w = solve(R, c)
         # At the solution w^H R w = |c^H w|.
@@ -274,7 +285,7 @@ def _ascend(
         target_factors = np.repeat(starts[:, :, None], n, axis=2)
         forms = np.broadcast_to(R, (s, *R.shape)).reshape(-1, eras, eras)
         tried, values = [], []
-        for _ in range(ascents):
+        for _ in range(iterations):
             c = np.einsum("stn,tne->sne", target_factors, conjugate)
             w = solve(forms, c.reshape(-1, eras)).reshape(s, n, eras)
             reached = np.einsum("tne,sne->stn", targets, w)

@@ -13,10 +13,10 @@ import numpy as np
 from model.arrays import FloatArray
 
 FIRST_POINTS = 30
-"""Points that the linear program begins with; louder ones are added as long as there are any."""
+"""Points that the linear program begins with; louder ones are added until there are none left."""
 
-LEVEL_TOLERANCE = 1e-3
-"""How much louder than the program's level a point must be to be added, relative."""
+PEAK_TOLERANCE = 1e-3
+"""Relative excess over the program's peak above which a point is added."""
 
 
 def dual_weights(peak: FloatArray, quiet: FloatArray, *, is_rms: bool) -> FloatArray:
@@ -42,7 +42,7 @@ def _rms_weights(relative: FloatArray) -> FloatArray:
 
 
 def _maximum_weights(relative: FloatArray) -> FloatArray:
-    """Marginals of the linear program min level, field <= level, points added while too loud."""
+    """Marginals of the linear program min peak, field <= peak, points added while too loud."""
     from scipy.optimize import linprog  # as above
 
     n, points = relative.shape
@@ -58,8 +58,8 @@ def _maximum_weights(relative: FloatArray) -> FloatArray:
             method="highs-ds",
         )
         solution = np.asarray(found.x)
-        field, level = solution[:n] @ relative, solution[n]
-        louder = np.setdiff1d(np.flatnonzero(field > level * (1 + LEVEL_TOLERANCE)), some)
+        field, peak = solution[:n] @ relative, solution[n]
+        louder = np.setdiff1d(np.flatnonzero(field > peak * (1 + PEAK_TOLERANCE)), some)
         if len(louder) == 0:
             weights = np.zeros(points)
             weights[some] = np.maximum(-found.ineqlin.marginals, 0)

@@ -56,7 +56,7 @@ class ExactSearch:
 def search_exactly(
     fields: Fields, *, eras_at_most: int, time_limit: float = math.inf
 ) -> ExactSearch:
-    """Find the pattern of highest contrast with up to so many ERAs that reaches the level.
+    """Find the pattern of highest contrast with at most `eras_at_most` ERAs that reaches the level.
 
     time_limit [s]: after it the best so far is returned, with a bound. Raises InputError for more
     than MAX_ERAS.
@@ -71,10 +71,11 @@ def search_exactly(
 
 
 def sensation_found(fields: Fields, *, eras_at_most: int) -> float:
-    """Amplitude to threshold at the lesser target that up to so many ERAs reach at least.
+    """Greedy lower bound of the sensation (amplitude to threshold) at the weakest target.
 
-    The best of one pattern for each grouping: group by group the frequency, of those left, at which
-    the lesser target feels most. On a plate it is within 1.5 dB of the true maximum.
+    With at most `eras_at_most` ERAs. The best of one pattern for each grouping: group by group the
+    unused frequency of the highest sensation at the weakest target. On a plate it is within 1.5 dB
+    of the true maximum.
     """
     masks = group_masks(fields.era_count, eras_at_most)
     powers = [
@@ -87,16 +88,17 @@ def sensation_found(fields: Fields, *, eras_at_most: int) -> float:
     for groups in groupings(fields.era_count, eras_at_most):
         if len(groups) > fields.frequency_count:
             continue
-        felt: list[FloatArray] = [np.zeros(power.shape[-1]) for power in powers]
+        power_sums: list[FloatArray] = [np.zeros(power.shape[-1]) for power in powers]
         left = np.ones(fields.frequency_count, dtype=bool)
         for place in (places[mask] for mask in groups):
-            so_far = np.array([each.mean() for each in felt])[:, None]
+            so_far = np.array([each.mean() for each in power_sums])[:, None]
             frequency = int(np.where(left, (so_far + means[:, place]).min(axis=0), -1.0).argmax())
             left[frequency] = False
-            felt = [
-                each + power[place, frequency] for each, power in zip(felt, powers, strict=True)
+            power_sums = [
+                each + power[place, frequency]
+                for each, power in zip(power_sums, powers, strict=True)
             ]
-        highest = max(highest, min(float(np.sqrt(each).mean()) for each in felt))
+        highest = max(highest, min(float(np.sqrt(each).mean()) for each in power_sums))
     return highest
 
 
@@ -130,7 +132,7 @@ def groupings(era_count: int, eras_at_most: int) -> tuple[tuple[int, ...], ...]:
 
 
 def group_masks(era_count: int, eras_at_most: int) -> list[int]:
-    """Every group of so many ERAs at the highest, as bit masks."""
+    """Every group of at most `eras_at_most` ERAs, as bit masks."""
     return [mask for mask in range(1, 1 << era_count) if mask.bit_count() <= eras_at_most]
 
 
@@ -158,11 +160,11 @@ class _Search:
         self._quiet = group_magnitudes(fields.quiet, self._masks)
         self._targets = [group_magnitudes(target, self._masks) for target in fields.targets]
         self._powers = [(target / fields.threshold[:, None]) ** 2 for target in self._targets]
-        # By group and frequency. The least of several targets is at most their mean.
+        # By group and frequency. The weakest of several targets is at most their mean.
         self._peak = mean_target_peak(self._targets)
         self._power = mean_target_peak(self._powers)
         flat = self._quiet.reshape(self._peak.size, -1)
-        weights = dual_weights(self._peak.ravel(), flat, is_rms=fields.is_alone)
+        weights = dual_weights(self._peak.ravel(), flat, is_rms=fields.has_no_quiet_contacts)
         self._loud = self._quiet @ weights
         self._decisive = self._quiet[:, :, np.argsort(-weights)[:DECISIVE_POINTS]]
         self.evaluated_count = 0
@@ -253,7 +255,7 @@ class _Search:
 
     def _screen(self, groups: tuple[int, ...], chosen: IntArray, sums: FloatArray) -> None:
         """Evaluate choices (n, groups) that the decisive points do not exclude."""
-        if not self._fields.is_alone:
+        if not self._fields.has_no_quiet_contacts:
             some = sum(
                 self._decisive[group][chosen[:, column]] for column, group in enumerate(groups)
             )
@@ -270,11 +272,11 @@ class _Search:
             )
 
         quiet = total(self._quiet)
-        rms = self._fields.is_alone
+        rms = self._fields.has_no_quiet_contacts
         loud = np.sqrt((quiet**2).mean(axis=1)) if rms else quiet.max(axis=1)
         peak = np.min([total(target).mean(axis=1) for target in self._targets], axis=0)
-        felt = np.min([np.sqrt(total(power)).mean(axis=1) for power in self._powers], axis=0)
-        contrast = np.where(felt >= self._fields.wanted, peak / loud, 0.0)
+        sensation = np.min([np.sqrt(total(power)).mean(axis=1) for power in self._powers], axis=0)
+        contrast = np.where(sensation >= self._fields.wanted, peak / loud, 0.0)
         best = int(contrast.argmax())
         if contrast[best] > self.contrast:
             self.contrast = float(contrast[best])

@@ -54,14 +54,14 @@ class DriveVector:
 class Fields:
     """Acceleration [m/s²] of each ERA alone at full stroke at the contacts, and the wanted level.
 
-    targets: (f, eras, p) each; quiet: (f, eras, q). is_alone: the quiet points are the rest of the
-    plate and count by their root mean square; else by their maximum. threshold (f,) [m/s²]; wanted:
-    amplitude to threshold for every target, mean over its points.
+    targets: (f, eras, p) each; quiet: (f, eras, q). has_no_quiet_contacts: the quiet points are the
+    rest of the plate and count by their root mean square; else by their maximum. threshold (f,)
+    [m/s²]; wanted: amplitude to threshold for every target, mean over its points.
     """
 
     targets: tuple[Complex64Array, ...]
     quiet: Complex64Array
-    is_alone: bool
+    has_no_quiet_contacts: bool
     threshold: Float32Array
     wanted: float
 
@@ -80,18 +80,18 @@ class Fields:
         some = Fields(
             targets=tuple(field.take(frequencies, axis=0) for field in self.targets),
             quiet=self.quiet.take(frequencies, axis=0),
-            is_alone=self.is_alone,
+            has_no_quiet_contacts=self.has_no_quiet_contacts,
             threshold=self.threshold.take(frequencies),
             wanted=self.wanted,
         )
         # Cached values are selected too, not computed again.
-        known, also = vars(self), vars(some)
-        if "quiet_power" in known:
-            also["quiet_power"] = self.quiet_power.take(frequencies, axis=0)
-        if "quiet_forms" in known:
-            also["quiet_forms"] = self.quiet_forms.take(frequencies, axis=0)
-        if "mean_targets" in known:
-            also["mean_targets"] = self.mean_targets.take(frequencies, axis=1)
+        cached, selected = vars(self), vars(some)
+        if "quiet_power" in cached:
+            selected["quiet_power"] = self.quiet_power.take(frequencies, axis=0)
+        if "quiet_forms" in cached:
+            selected["quiet_forms"] = self.quiet_forms.take(frequencies, axis=0)
+        if "mean_targets" in cached:
+            selected["mean_targets"] = self.mean_targets.take(frequencies, axis=1)
         return some
 
     @cached_property
@@ -134,7 +134,7 @@ def error_power(power: Float32Array, *, sigma: float) -> Float32Array:
 class Evaluation:
     """Measures of a drive at full level.
 
-    peak [m/s²], sensation (amplitude to threshold): at the lesser target; quiet_peak,
+    peak [m/s²], sensation (amplitude to threshold): at the weakest target; quiet_peak,
     quiet_sensation: at the loudest quiet point; score: the robust score.
     """
 
@@ -146,7 +146,7 @@ class Evaluation:
 
     @property
     def contrast(self) -> float:
-        """Peak acceleration at the lesser target to that at the loudest quiet point, a ratio."""
+        """Peak acceleration at the weakest target to that at the loudest quiet point, a ratio."""
         return max(self.peak, 1e-30) / max(self.quiet_peak, 1e-30)
 
 
@@ -160,11 +160,11 @@ def evaluate(fields: Fields, drive: DriveVector) -> Evaluation:
     for target in fields.targets:
         amplitudes = np.abs(rows @ target.take(at, axis=0))[:, 0]
         peaks.append(float(amplitudes.sum()) / target.shape[-1])
-        felt = np.sqrt(((amplitudes / threshold) ** 2).sum(axis=0))
-        sensations.append(float(felt.sum()) / target.shape[-1])
+        sensation = np.sqrt(((amplitudes / threshold) ** 2).sum(axis=0))
+        sensations.append(float(sensation.sum()) / target.shape[-1])
     quiet = np.abs(rows @ fields.quiet.take(at, axis=0))[:, 0]
-    wrong = (np.abs(rows) ** 2 @ fields.quiet_power.take(at, axis=0))[:, 0]
-    expected = np.sqrt(quiet**2 + ERROR_SHARE**2 * wrong).sum(axis=0)
+    error = (np.abs(rows) ** 2 @ fields.quiet_power.take(at, axis=0))[:, 0]
+    expected = np.sqrt(quiet**2 + ERROR_SHARE**2 * error).sum(axis=0)
     return Evaluation(
         peak=min(peaks),
         sensation=min(sensations),
@@ -175,7 +175,7 @@ def evaluate(fields: Fields, drive: DriveVector) -> Evaluation:
 
 
 def quiet_amplitude(magnitude: Float32Array | FloatArray, fields: Fields) -> float:
-    """Norm of the quiet points (q,): their maximum, or around a lone finger their rms."""
-    if fields.is_alone:
+    """Norm of the quiet points (q,): their maximum, or without quiet contacts their rms."""
+    if fields.has_no_quiet_contacts:
         return float(np.sqrt((magnitude.astype(float) ** 2).mean()))
     return float(magnitude.max())

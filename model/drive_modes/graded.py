@@ -46,5 +46,5 @@ def _swept(w: Float32Array, form: Float32Array, pull: Float32Array) -> Float32Ar
     return w
 
 
-GRADED = Coherent(_solve, phases=(7, 5), ascents=4)
+GRADED = Coherent(_solve, phases=(7, 5), iterations=4)
 """With several starting phases of a target, since weights cannot be negative."""

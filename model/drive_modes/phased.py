@@ -14,4 +14,4 @@ def _solve(R: Complex64Array, c: Complex64Array) -> Complex64Array:
     return np.asarray(np.linalg.solve(R, c[..., None])[..., 0])
 
 
-PHASED = Coherent(_solve, phases=(1, 5), ascents=8)
+PHASED = Coherent(_solve, phases=(1, 5), iterations=8)

@@ -20,4 +20,4 @@ def _solve(R: Complex64Array, c: Complex64Array) -> Complex64Array:
     return np.asarray(w, dtype=np.complex64)
 
 
-SIGNED = Coherent(_solve, phases=(1, 5), ascents=8)
+SIGNED = Coherent(_solve, phases=(1, 5), iterations=8)

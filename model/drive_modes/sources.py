@@ -32,7 +32,7 @@ class Patterns:
 
 @lru_cache(maxsize=8)
 def all_patterns(era_count: int, frequency_count: int) -> Patterns:
-    """List every pattern of so many ERAs and frequencies: 4482 of four ERAs and 27."""
+    """List every pattern of the given numbers of ERAs and frequencies: 4482 of 4 and 27."""
     f = np.arange(frequency_count)
     pairs = list(combinations(range(era_count), 2))
     together = era_count * frequency_count
@@ -77,7 +77,7 @@ def per_source(threshold: Float32Array | FloatArray, era_count: int) -> Float32A
 
 
 def sums_of_sources(rows: Float32Array, eras: int) -> Float32Array:
-    """From values of all sources (c, sources) those of all patterns, (c, n)."""
+    """Values of all patterns (c, n), from those of all sources (c, sources)."""
     c = len(rows)
     f = (rows.shape[1] - 1) // (eras * (eras + 1) // 2)
     alone = rows[:, : eras * f].reshape(c, eras, f)

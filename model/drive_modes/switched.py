@@ -42,16 +42,20 @@ def find_switched(fields: Fields, min_score: float) -> DriveVector | None:
     Contrast without errors, which can only lower it: at full stroke there is nothing to trade
     against them. Exact: patterns are excluded by bounds only.
     """
-    felt = [magnitudes_of_sources(field) for field in fields.targets]
-    means = np.array([_mean(rows) for rows in felt])
+    magnitudes = [magnitudes_of_sources(field) for field in fields.targets]
+    means = np.array([_mean(rows) for rows in magnitudes])
     peak = means.mean(axis=0)
-    if min_score > 0 and not fields.is_alone and not _may_be_better(fields, means, min_score):
+    if (
+        min_score > 0
+        and not fields.has_no_quiet_contacts
+        and not _may_be_better(fields, means, min_score)
+    ):
         return None
     quiet = magnitudes_of_sources(fields.quiet)
-    powers = _powers(felt, fields)
+    powers = _powers(magnitudes, fields)
     power = np.array([_mean(rows) for rows in powers])
-    shares = _even_shares(quiet) if fields.is_alone else _shares(quiet)
-    loud = quiet @ shares
+    weights = _equal_weights(quiet) if fields.has_no_quiet_contacts else _loudest_weights(quiet)
+    loud = quiet @ weights
 
     def value(
         peaks: Float32Array, at_quiet: Float32Array, powers: list[Float32Array]
@@ -60,9 +64,11 @@ def find_switched(fields: Fields, min_score: float) -> DriveVector | None:
 
         Peaks at each target (targets, n) and at the quiet points (n, q); powers: (n, p) each.
         """
-        sensed = np.min([_mean(np.sqrt(rows)) for rows in powers], axis=0)
-        loudness = np.sqrt(_mean(at_quiet**2)) if fields.is_alone else at_quiet.max(axis=1)
-        return np.asarray(np.where(sensed >= fields.wanted, peaks.min(axis=0) / loudness, 0))
+        sensation = np.min([_mean(np.sqrt(rows)) for rows in powers], axis=0)
+        quiet_peak = (
+            np.sqrt(_mean(at_quiet**2)) if fields.has_no_quiet_contacts else at_quiet.max(axis=1)
+        )
+        return np.asarray(np.where(sensation >= fields.wanted, peaks.min(axis=0) / quiet_peak, 0))
 
     nothing = len(quiet) - 1
     contrast, best = min_score, (nothing, nothing)
@@ -76,7 +82,7 @@ def find_switched(fields: Fields, min_score: float) -> DriveVector | None:
     reaches = (power[:, one] + power[:, other] >= fields.wanted**2).all(axis=0)
     one, other = one[reaches], other[reaches]
     bound = (peak[one] + peak[other]) / (loud[one] + loud[other])
-    closer = fields.is_alone
+    closer = fields.has_no_quiet_contacts
     while len(one) > 0:
         if len(one) > BATCH:
             order = np.argpartition(-bound, BATCH)
@@ -94,7 +100,7 @@ def find_switched(fields: Fields, min_score: float) -> DriveVector | None:
         one, other, bound = one[left], other[left], bound[left]
         if not closer and len(one) > 0:
             closer = True
-            few = quiet[:, np.argsort(-shares)[:BOUND_POINTS]]
+            few = quiet[:, np.argsort(-weights)[:BOUND_POINTS]]
             bound = (peak[one] + peak[other]) / (few[one] + few[other]).max(axis=1)
             left = np.flatnonzero(bound > contrast)
             one, other, bound = one[left], other[left], bound[left]
@@ -108,7 +114,7 @@ def _may_be_better(fields: Fields, means: Float32Array, min_score: float) -> boo
     """
     step = max(1, fields.quiet.shape[2] // BOUND_POINTS)
     few = magnitudes_of_sources(np.ascontiguousarray(fields.quiet[:, :, ::step]))
-    gain = means.mean(axis=0) - min_score * few @ _shares(few)
+    gain = means.mean(axis=0) - min_score * few @ _loudest_weights(few)
     if gain.max() <= 0:  # and so no two of them have a sum above zero
         return False
     if means.shape[1] < FEW_SOURCES:
@@ -153,7 +159,7 @@ def _drive(sources: tuple[int, int], fields: Fields) -> DriveVector:
 
 
 def max_sensation_switched(fields: Fields) -> float:
-    """Return the highest amplitude to threshold found at the lesser target.
+    """Return the highest amplitude to threshold found at the weakest target.
 
     Among the patterns of the largest bounds, the same pattern for all targets.
     """
@@ -163,27 +169,27 @@ def max_sensation_switched(fields: Fields) -> float:
     highest = sums_of_sources(means, fields.era_count).min(axis=0)
     loudest = np.argsort(-highest)[:BATCH]
     one, other = patterns.first[loudest], patterns.second[loudest]
-    felt = np.min([np.sqrt(rows[one] + rows[other]).mean(axis=1) for rows in powers], axis=0)
-    return float(felt.max())
+    sensation = np.min([np.sqrt(rows[one] + rows[other]).mean(axis=1) for rows in powers], axis=0)
+    return float(sensation.max())
 
 
-def _powers(felt: list[Float32Array], fields: Fields) -> list[Float32Array]:
+def _powers(magnitudes: list[Float32Array], fields: Fields) -> list[Float32Array]:
     """Squared sensation of every source from its magnitudes at each target, (sources, p)."""
     threshold = per_source(fields.threshold, fields.era_count)
-    return [(rows / threshold) ** 2 for rows in felt]
+    return [(rows / threshold) ** 2 for rows in magnitudes]
 
 
 def _mean(rows: Float32Array) -> Float32Array:
     """Mean over points of (n, p), as a product: in a fifth of the time of `mean`."""
-    return np.asarray(rows @ _even_shares(rows))
+    return np.asarray(rows @ _equal_weights(rows))
 
 
-def _even_shares(rows: Float32Array) -> Float32Array:
+def _equal_weights(rows: Float32Array) -> Float32Array:
     """Equal weights of the points of (n, p), (p,)."""
     return np.full(rows.shape[1], 1 / rows.shape[1], dtype=rows.dtype)
 
 
-def _shares(quiet: Float32Array) -> Float32Array:
+def _loudest_weights(quiet: Float32Array) -> Float32Array:
     """Weights of the quiet points: the fraction of sources of which each is the loudest."""
     often = np.bincount(quiet.argmax(axis=1), minlength=quiet.shape[1])
     return np.asarray(often / len(quiet), dtype=quiet.dtype)

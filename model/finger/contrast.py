@@ -29,12 +29,12 @@ def is_around(points: FloatArray, targets: Sequence[tuple[float, float]]) -> NDA
 
 
 def contrast_ratio(targets: Sequence[FloatArray], quiet: FloatArray) -> FloatArray:
-    """Contrast of peak amplitudes as a ratio: the least target to the loudest quiet point.
+    """Contrast of peak amplitudes as a ratio: the weakest target to the loudest quiet point.
 
     A target counts by the mean over its points. targets (..., p) each, quiet (..., q) -> (...).
     """
-    felt = np.minimum.reduce([target.mean(axis=-1) for target in targets])
-    return np.asarray(felt / quiet.max(axis=-1))
+    peak = np.minimum.reduce([target.mean(axis=-1) for target in targets])
+    return np.asarray(peak / quiet.max(axis=-1))
 
 
 def contrast_db(targets: Sequence[FloatArray], quiet: FloatArray) -> FloatArray:

@@ -42,25 +42,25 @@ PERCENTILE = 10
 class Ensemble:
     """Plates within tolerance, relative to the modelled one.
 
-    thickness, damping (m,); stiffness, drive (m, eras), drive complex: gain and phase.
+    thickness, damping (m,); stiffness (m, eras); gain (m, eras): complex factor of each ERA.
     """
 
     thickness: FloatArray
     damping: FloatArray
     stiffness: FloatArray
-    drive: ComplexArray
+    gain: ComplexArray
 
 
 def draw_ensemble(era_count: int) -> Ensemble:
-    """Draw MEMBERS plates on so many ERAs, always the same."""
+    """Draw MEMBERS plates on the given number of ERAs, always the same."""
     rng = np.random.default_rng(0)
     each = (MEMBERS, era_count)
-    drive = random_gains(rng, draws=MEMBERS, eras=era_count)
+    gain = random_gains(rng, draws=MEMBERS, eras=era_count)
     return Ensemble(
         thickness=rng.uniform(1 - THICKNESS_RANGE, 1 + THICKNESS_RANGE, MEMBERS),
         damping=DAMPING_FACTOR ** rng.uniform(-1, 1, MEMBERS),
         stiffness=rng.uniform(1 - STIFFNESS_RANGE, 1 + STIFFNESS_RANGE, each),
-        drive=drive,
+        gain=gain,
     )
 
 
@@ -80,7 +80,7 @@ def with_robust_contrast(table: LocalizationTable, question: Question, pattern: 
 def ensemble_contrast_db(
     table: LocalizationTable, question: Question, excitation: Excitation, ensemble: Ensemble
 ) -> FloatArray:
-    """Contrast [dB] of an excitation on each plate of an ensemble, (m,); of targets the least."""
+    """Contrast [dB] of an excitation at the weakest target on each plate, (m,)."""
     contacts = (*question.targets, *question.quiet)
     shapes, ends = table.shapes_at_fingertips(contacts)
     tones = zip(*base_amplitudes(excitation, table.eras), strict=True)
@@ -104,18 +104,20 @@ def _acceleration(
     motion: ComplexArray,
 ) -> ComplexArray:
     """Acceleration (m, p) [m/s²] at points of shapes (p, r) for a base motion (eras,) [m]."""
-    touch = np.vstack([table.held, table.shapes_at(contacts)])
+    attachment_shapes = np.vstack([table.held, table.shapes_at(contacts)])
     omega = 2 * np.pi * frequency
-    stiffness, base = _attached(table, finger_loads(contacts), ensemble, omega)
+    stiffness, base_stiffness = _attached(table, finger_loads(contacts), ensemble, omega)
     scale = ensemble.thickness[:, None]
     loss = 1 + 1j * table.plate.loss_factor * ensemble.damping[:, None]
     modal_receptance = 1 / ((loss * (table.omega * scale) ** 2 - omega**2) * scale)
-    receptance = np.asarray((modal_receptance[:, None, :] * touch) @ touch.T, dtype=complex)
+    receptance = np.asarray(
+        (modal_receptance[:, None, :] * attachment_shapes) @ attachment_shapes.T, dtype=complex
+    )
     applied = np.zeros((*stiffness.shape, 1), dtype=complex)
     gains = [complex(era.gain(np.array(frequency))) for era in table.eras]
-    applied[:, : len(table.eras), 0] = base * ensemble.drive * gains * motion
+    applied[:, : len(table.eras), 0] = base_stiffness * ensemble.gain * gains * motion
     forces = coupled_forces(receptance, stiffness, applied)[:, :, 0]
-    return np.asarray(-(omega**2) * ((modal_receptance * (forces @ touch)) @ shapes.T))
+    return np.asarray(-(omega**2) * ((modal_receptance * (forces @ attachment_shapes)) @ shapes.T))
 
 
 def _attached(
@@ -123,7 +125,7 @@ def _attached(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Dynamic stiffness of ERAs, masses, fingers (m, n), and of the ERAs' bases (m, eras) [N/m]."""
     eras: Sequence[Era] = table.eras
-    bases = dynamic_stiffness(
+    base_stiffness = dynamic_stiffness(
         ensemble.stiffness * [era.stiffness for era in eras],
         ensemble.damping[:, None] * [era.damping for era in eras],
         0.0,
@@ -131,5 +133,5 @@ def _attached(
     )
     bolts = dynamic_stiffness(0.0, 0.0, np.array([era.bolt_mass for era in eras]), omega)
     (rest,) = attached_stiffness((), [*table.loads, *loads], np.array([omega]))
-    stiffness = np.hstack([bases + bolts, np.broadcast_to(rest, (len(bases), len(rest)))])
-    return stiffness, bases
+    rest = np.broadcast_to(rest, (len(base_stiffness), len(rest)))
+    return np.hstack([base_stiffness + bolts, rest]), base_stiffness

@@ -169,7 +169,7 @@ class LocalizationTable:
                 for start, end, gain in zip((0, *ends), ends[:count], question.gains, strict=False)
             ),
             quiet=np.ascontiguousarray(quiet),
-            is_alone=not question.quiet,
+            has_no_quiet_contacts=not question.quiet,
             threshold=self._threshold,
             wanted=10 ** (question.level_db_sl / 20),
         )

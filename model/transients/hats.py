@@ -5,8 +5,8 @@ falls to zero in the next. An envelope linear between knots is a sum of hats, on
 the responses to hats differ only by a shift in time: one response for each ERA serves all knots.
 Responses are demodulated: without the factor exp(s t), as the envelopes are.
 
-The response to a ramp t / step from time 0 on is z(t) = a0 + a1 t - a0 exp((lambda - s) t) in the
-coordinates of `PlateInTime`; that to a hat is its second difference.
+The response to a linear ramp t / step from time 0 on is z(t) = a0 + a1 t - a0 exp((lambda - s) t)
+in the coordinates of `PlateInTime`; that to a hat is its second difference.
 """
 
 import numpy as np
@@ -28,55 +28,54 @@ def hat_accelerations(
 ) -> ComplexArray:
     """Acceleration of the reduced coordinates after a hat on each ERA began, (n, eras, r).
 
-    omega [rad/s]; step [s]: from a hat's begin to its top. n = steps * samples times, at the middle
-    of each interval, since the force jumps at knots.
+    omega [rad/s]; step [s]: from the start of a hat to its top. n = steps * samples times, at the
+    middle of each interval, since the force jumps at knots.
     """
     s = 1j * omega
     times = step * (np.arange(steps * samples) + 0.5) / samples
-    a0, a1 = _ramps(plate, s, step)
+    a0, a1 = _linear_ramps(plate, s, step)
     b0, b1 = a0 @ plate.displacement.T, a1 @ plate.displacement.T
     forced = s**2 * (b0 + times[:, None, None] * b1) + 2 * s * b1
-    table = np.exp(np.outer(times, plate.eigenvalues - s))
-    free = np.stack([table @ (plate.acceleration * row).T for row in a0], axis=1)
-    ramps = forced - free
-    hats = ramps.copy()
-    hats[samples:] -= 2 * ramps[:-samples]
-    hats[2 * samples :] += ramps[: -2 * samples]
+    exponentials = np.exp(np.outer(times, plate.eigenvalues - s))
+    free = np.stack([exponentials @ (plate.acceleration * row).T for row in a0], axis=1)
+    linear_ramps = forced - free
+    hats = linear_ramps.copy()
+    hats[samples:] -= 2 * linear_ramps[:-samples]
+    hats[2 * samples :] += linear_ramps[: -2 * samples]
     return np.asarray(hats)
 
 
 def ending_states(plate: PlateInTime, omega: float, *, step: float, steps: int) -> ComplexArray:
-    """State z at the end of an ending of so many steps, (2 r, steps, eras), ERAs at full stroke.
+    """State z at the end of an ending of the given steps, (2 r, steps, eras), at full stroke.
 
     First for the tone that was steady before and falls to zero within one step; then for a hat
     whose top is after step 1, 2, ...
     """
     s = 1j * omega
-    a0, a1 = _ramps(plate, s, step)
+    a0, a1 = _linear_ramps(plate, s, step)
     times = step * np.arange(steps + 1)
     decay = np.exp(np.outer(times, plate.eigenvalues - s))
-    ramps = a0 + times[:, None, None] * a1 - decay[:, None] * a0
+    linear_ramps = a0 + times[:, None, None] * a1 - decay[:, None] * a0
     steady = steady_states(plate, omega)
-    columns = [steady - ramps[steps] + ramps[steps - 1]]
+    columns = [steady - linear_ramps[steps] + linear_ramps[steps - 1]]
     for knot in range(1, steps):
         since = steps - knot
-        columns.append(ramps[since + 1] - 2 * ramps[since] + ramps[since - 1])
+        columns.append(linear_ramps[since + 1] - 2 * linear_ramps[since] + linear_ramps[since - 1])
     return np.stack(columns).transpose(2, 0, 1)
 
 
 def mean_square(plate: PlateInTime, duration: float) -> ComplexArray:
-    """Hermitian form (2 r, 2 r): z^H W z is a free vibration's mean square over duration [s].
+    """Hermitian form W (2 r, 2 r) of a free vibration's mean square over duration T [s].
 
-    Of the acceleration of all reduced coordinates together, which is that over the plate times its
-    mass, since the plate's own mass is the identity in them; z at the start, mean over its phase,
-    twice.
+    z0^H W z0 = 2 <(1/T) int |q''|^2 dt>, mean over the phase of the state z0 at the start. With
+    mass-normalised coordinates |q''|^2 is the plate's mass times its mean square acceleration.
     """
     rates = plate.eigenvalues.conj()[:, None] + plate.eigenvalues
     shapes = plate.acceleration.conj().T @ plate.acceleration
     return np.asarray(shapes * np.expm1(rates * duration) / (rates * duration))
 
 
-def _ramps(plate: PlateInTime, s: complex, step: float) -> tuple[ComplexArray, ComplexArray]:
+def _linear_ramps(plate: PlateInTime, s: complex, step: float) -> tuple[ComplexArray, ComplexArray]:
     """Particular solutions (eras, 2 r) for the base of each ERA rising by its stroke in a step."""
     count = len(plate.eras)
     slopes: ComplexArray = np.array([era.stroke / step + 0j for era in plate.eras])

@@ -58,15 +58,15 @@ class Carrier:
     residual_form: ComplexArray
 
 
-def solve_carrier(plate: PlateInTime, frequency: float, *, after: ComplexArray) -> Carrier:
-    """Solve one frequency [Hz]; after: `hats.mean_square` over the time after an ending."""
+def solve_carrier(plate: PlateInTime, frequency: float, *, residual_form: ComplexArray) -> Carrier:
+    """Solve one frequency [Hz]; residual_form: `hats.mean_square` for the time after an ending."""
     omega = 2 * math.pi * frequency
     steady = -(omega**2) * steady_states(plate, omega) @ plate.displacement.T
     steps = ONSET_KNOTS + _SETTLING_STEPS
     hats = hat_accelerations(plate, omega, step=KNOT_STEP, steps=steps, samples=_SAMPLES)
     states = ending_states(plate, omega, step=KNOT_STEP, steps=ENDING_KNOTS)
     flat = states.reshape(len(states), -1)
-    return Carrier(frequency, hats, steady, flat.conj().T @ after @ flat)
+    return Carrier(frequency, hats, steady, flat.conj().T @ residual_form @ flat)
 
 
 def onset_knots(
@@ -87,8 +87,8 @@ def onset_knots(
     eras = len(active)
     at_targets = _by_step(carrier.hats[:, active], target_rows)
     at_quiet = _by_step(carrier.hats[:, active], quiet_rows)
-    loud = _over_time(at_targets.conj().T @ at_targets, steps)
-    noise = _over_time(at_quiet.conj().T @ at_quiet, steps)
+    target_form = _over_time(at_targets.conj().T @ at_targets, steps)
+    quiet_form = _over_time(at_quiet.conj().T @ at_quiet, steps)
     times = KNOT_STEP * (np.arange(steps * _SAMPLES) + 0.5) / _SAMPLES
     wanted = raised_cosine(times, rise)[:, None] * (target_rows @ (amplitudes @ carrier.steady))
     wanted = wanted.reshape(steps, -1).T
@@ -101,7 +101,7 @@ def onset_knots(
         * _expected_power(quiet_rows @ steady.T)
         / _expected_power(target_rows @ steady.T)
     )
-    form = _with_errors(noise, eras) + weight * loud
+    form = _with_errors(quiet_form, eras) + weight * target_form
     free = (ONSET_KNOTS - 1) * eras
     settled = np.tile(amplitudes[active], steps - ONSET_KNOTS + 1)
     knots = _minimum(form[:free, :free], weight * aim.ravel()[:free] - form[:free, free:] @ settled)
@@ -170,17 +170,17 @@ def _with_errors(form: ComplexArray, eras: int) -> ComplexArray:
     return np.asarray(form * (1 + _ERROR_VARIANCE * own))
 
 
-def _expected_power(seen: ComplexArray) -> float:
+def _expected_power(responses: ComplexArray) -> float:
     """Expected sum of squares over rows of all ERAs together (d, eras) under their errors."""
-    together = np.linalg.norm(seen.sum(axis=1)) ** 2
-    return float(together + _ERROR_VARIANCE * np.linalg.norm(seen) ** 2)
+    together = np.linalg.norm(responses.sum(axis=1)) ** 2
+    return float(together + _ERROR_VARIANCE * np.linalg.norm(responses) ** 2)
 
 
 def _by_step(hats: ComplexArray, rows: FloatArray) -> ComplexArray:
     """Hats at rows (d, r): (samples * d, steps * eras), the steps side by side."""
-    seen = hats @ rows.T
-    count, eras, d = seen.shape
-    by_step = seen.reshape(count // _SAMPLES, _SAMPLES, eras, d).transpose(1, 3, 0, 2)
+    responses = hats @ rows.T
+    count, eras, d = responses.shape
+    by_step = responses.reshape(count // _SAMPLES, _SAMPLES, eras, d).transpose(1, 3, 0, 2)
     return by_step.reshape(_SAMPLES * d, -1)
 
 

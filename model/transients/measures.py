@@ -33,8 +33,8 @@ class Transients:
         self._plate = plate
         self._mean_square = mean_square(plate, ENDING_WINDOW)
         times = np.arange(round(ONSET_WINDOW * SAMPLE_RATE)) / SAMPLE_RATE
-        table = np.exp(np.outer(times, plate.eigenvalues))
-        self._table = np.hstack([table.real, table.imag])
+        exponentials = np.exp(np.outer(times, plate.eigenvalues))
+        self._exponentials = np.hstack([exponentials.real, exponentials.imag])
 
     def contrast_db(
         self,
@@ -45,14 +45,14 @@ class Transients:
     ) -> float:
         """Contrast [dB] of the peaks over the first 100 ms of bases that start from rest.
 
-        Mean over a target's points, at the target where it is least, to the loudest quiet point;
+        Mean over the points of the weakest target to the loudest quiet point;
         positions in m.
         """
         plate = self._plate.reduced.plate
         discs = [fingertip_points(*each, plate) for each in (*targets, *quiet)]
-        felt = self.acceleration(bases, np.concatenate(discs))
+        acceleration = self.acceleration(bases, np.concatenate(discs))
         ends = np.cumsum([len(disc) for disc in discs])[:-1]
-        peaks = np.split(np.abs(felt).max(axis=0), ends)
+        peaks = np.split(np.abs(acceleration).max(axis=0), ends)
         return float(contrast_db(peaks[: len(targets)], np.concatenate(peaks[len(targets) :])))
 
     def ending_contrast_db(
@@ -81,10 +81,14 @@ class Transients:
             (2 * math.pi * frequency) ** 2 * np.abs(field)
             for frequency, field in by_frequency.items()
         )
-        over = max((term.end for base in ending for term in base), default=0.0)
-        felt = self.acceleration(ending, at_quiet, duration=over + ENDING_WINDOW, after=excitation)
+        end_time = max((term.end for base in ending for term in base), default=0.0)
+        acceleration = self.acceleration(
+            ending, at_quiet, duration=end_time + ENDING_WINDOW, after=excitation
+        )
         ends = np.cumsum([len(disc) for disc in discs])[:-1]
-        return float(contrast_db(np.split(np.asarray(steady), ends), np.abs(felt).max(axis=0)))
+        return float(
+            contrast_db(np.split(np.asarray(steady), ends), np.abs(acceleration).max(axis=0))
+        )
 
     def acceleration(
         self,
@@ -104,20 +108,22 @@ class Transients:
         for state in self._steady(after or {}).values():
             z += state
         times = np.arange(round(duration * SAMPLE_RATE)) / SAMPLE_RATE
-        felt = np.empty((len(times), len(shapes)))
+        acceleration = np.empty((len(times), len(shapes)))
         free_shapes = (shapes @ self._plate.acceleration).T
         forced_shapes = (shapes @ self._plate.displacement).T
         for since, until in drive.pieces(duration):
             z = z + drive.change(since)
             first, last = (int(index) for index in np.searchsorted(times, [since, until]))
-            felt[first:last] = drive.forced(times[first:last], since, forced_shapes)
-            for start in range(first, last, len(self._table)):
-                stop = min(last, start + len(self._table))
+            acceleration[first:last] = drive.forced(times[first:last], since, forced_shapes)
+            for start in range(first, last, len(self._exponentials)):
+                stop = min(last, start + len(self._exponentials))
                 now = z * np.exp(self._plate.eigenvalues * (times[start] - since))
                 free = now[:, None] * free_shapes
-                felt[start:stop] += self._table[: stop - start] @ np.vstack([free.imag, free.real])
+                acceleration[start:stop] += self._exponentials[: stop - start] @ np.vstack(
+                    [free.imag, free.real]
+                )
             z = z * np.exp(self._plate.eigenvalues * (until - since))
-        return felt
+        return acceleration
 
     def residual_db(self, excitation: Excitation, ending: Bases) -> float:
         """Residual vibration [dB] in the 100 ms after an ending that begins at time 0.
@@ -126,11 +132,11 @@ class Transients:
         phase at which the ending begins. The bases must come to rest, and each ERA must keep its
         frequency.
         """
-        over = max((term.end for base in ending for term in base), default=0.0)
+        end_time = max((term.end for base in ending for term in base), default=0.0)
         frequencies = {tone.frequency for tone in excitation.values()}
         steady = self._steady(excitation)
         still = np.zeros(len(self._plate.eigenvalues), dtype=complex)
-        left: dict[float, ComplexArray] = defaultdict(lambda: still)
+        residual_states: dict[float, ComplexArray] = defaultdict(lambda: still)
         power = 0.0
         for number, (era, base) in enumerate(zip(self._plate.eras, ending, strict=True)):
             alone = tuple(base if other == number else () for other in range(len(ending)))
@@ -138,9 +144,9 @@ class Transients:
             tone = excitation.get(era.name)
             frequency = tone.frequency if tone else min(frequencies)
             z = steady.get(era.name, still)
-            for since, until in drive.pieces(over):
+            for since, until in drive.pieces(end_time):
                 z = (z + drive.change(since)) * np.exp(self._plate.eigenvalues * (until - since))
-            left[frequency] = left[frequency] + z + drive.change(over)
+            residual_states[frequency] = residual_states[frequency] + z + drive.change(end_time)
         for frequency in frequencies:
             together = sum(
                 (steady[name] for name, tone in excitation.items() if tone.frequency == frequency),
@@ -148,7 +154,9 @@ class Transients:
             )
             omega = 2 * math.pi * frequency
             power += omega**4 * float(np.linalg.norm(self._plate.displacement @ together)) ** 2
-        remaining = sum(float((z.conj() @ self._mean_square @ z).real) for z in left.values())
+        remaining = sum(
+            float((z.conj() @ self._mean_square @ z).real) for z in residual_states.values()
+        )
         return 10 * math.log10(remaining / power)
 
     def _steady(self, excitation: Excitation) -> dict[str, ComplexArray]:

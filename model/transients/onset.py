@@ -24,15 +24,15 @@ BATCH = 32  # frequencies solved together: some ten megabytes
 
 
 class RampedOnsets:
-    """Onsets of a plate at each of some frequencies, along a raised cosine."""
+    """Onsets of a plate along a raised cosine, at each of a list of frequencies."""
 
     def __init__(self, plate: PlateInTime, frequencies: FloatArray, *, ramp: float) -> None:
-        """Solve them: frequencies (f,) [Hz], ramp [s]."""
+        """Solve the onsets: frequencies (f,) [Hz], ramp [s]."""
         # Denser towards the end, where the target has its full level; the first is mid-ramp.
         times = ONSET_WINDOW - (ONSET_WINDOW - ramp / 2) * np.linspace(1, 0, TIME_COUNT) ** 1.2
         self._eras = len(plate.eras)
-        shares = np.split(2 * np.pi * frequencies, range(BATCH, len(frequencies), BATCH))
-        parts = [_ramp_responses(plate, omega, times, ramp) for omega in shares]
+        batches = np.split(2 * np.pi * frequencies, range(BATCH, len(frequencies), BATCH))
+        parts = [_ramp_responses(plate, omega, times, ramp) for omega in batches]
         self._parts = np.concatenate(parts, dtype=np.complex64, casting="same_kind")
 
     def contrast(
@@ -53,8 +53,10 @@ class RampedOnsets:
         rows = np.concatenate([responses.real, responses.imag])
         real, imaginary = (rows @ np.concatenate([*targets, quiet]).T).reshape(2, n, TIME_COUNT, -1)
         peaks = np.sqrt(np.maximum.reduce(real * real + imaginary * imaginary, axis=1))
-        *felt, loudest = np.split(peaks, np.cumsum([len(shapes) for shapes in targets]), axis=1)
-        return contrast_ratio(felt, loudest).astype(float)
+        *at_targets, at_quiet = np.split(
+            peaks, np.cumsum([len(shapes) for shapes in targets]), axis=1
+        )
+        return contrast_ratio(at_targets, at_quiet).astype(float)
 
 
 def _ramp_responses(
@@ -67,7 +69,7 @@ def _ramp_responses(
     """
     f, eras = len(omega), len(plate.eras)
     side = np.pi / ramp
-    share = np.array([0.5, -0.25, -0.25])
+    coefficients = np.array([0.5, -0.25, -0.25])
     omegas = omega[:, None] + [0, side, -side]
     rows = np.broadcast_to(np.arange(eras)[:, None], (f, eras, 3)).ravel()
     s = np.broadcast_to(1j * omegas[:, None, :], (f, eras, 3)).ravel()
@@ -76,15 +78,15 @@ def _ramp_responses(
     accelerations = states @ plate.displacement.T * (s**2).reshape(f, eras, 3, 1)
 
     rising = times < ramp
-    phase_factors = share * np.exp(1j * np.outer(times, [0, side, -side]))  # (n, 3)
+    phase_factors = coefficients * np.exp(1j * np.outer(times, [0, side, -side]))  # (n, 3)
     phase_factors[~rising] = [1, 0, 0]
     forced = phase_factors @ accelerations
-    # Free vibration from the begin of the ramp, and from its end.
-    begin = -(share @ states)
-    left = (share * [1, -1, -1]) @ states - states[:, :, 0]
+    # Free vibration from the start of the ramp, and from its end.
+    start = -(coefficients @ states)
+    end = (coefficients * [1, -1, -1]) @ states - states[:, :, 0]
     rates = plate.eigenvalues - 1j * omega[:, None]
     decay = np.exp(times[:, None] * rates[:, None, :])[:, None]
     later = np.exp((times[:, None] - ramp) * rates[:, None, :])[:, None]
-    free = begin[:, :, None] * decay
-    free[:, :, ~rising] += left[:, :, None] * later[:, :, ~rising]
+    free = start[:, :, None] * decay
+    free[:, :, ~rising] += end[:, :, None] * later[:, :, ~rising]
     return np.asarray(forced + free @ plate.acceleration.T)

@@ -46,7 +46,7 @@ class Shaper:
 
     def __init__(self, plate: PlateInTime) -> None:
         self._plate = plate
-        self._after = mean_square(plate, ENDING_WINDOW)
+        self._residual_form = mean_square(plate, ENDING_WINDOW)
         self._carriers: dict[float, Carrier] = {}
 
     def prepare(self, frequency: float) -> None:
@@ -110,7 +110,9 @@ class Shaper:
 
     def _carrier(self, frequency: float) -> Carrier:
         if frequency not in self._carriers:
-            self._carriers[frequency] = solve_carrier(self._plate, frequency, after=self._after)
+            self._carriers[frequency] = solve_carrier(
+                self._plate, frequency, residual_form=self._residual_form
+            )
         return self._carriers[frequency]
 
     def _envelopes(self, frequency: float, knots: ComplexArray, active: IntArray) -> Envelopes:

@@ -16,7 +16,7 @@ from paper_table import contact_sets, smooth_table
 F, E = 4, 3
 
 
-def random_fields(seed, *, is_alone, wanted, targets=1):
+def random_fields(seed, *, has_no_quiet_contacts, wanted, targets=1):
     """Fields without any physics in them."""
     rng = np.random.default_rng(seed)
 
@@ -25,7 +25,9 @@ def random_fields(seed, *, is_alone, wanted, targets=1):
         return (parts[0] + 1j * parts[1]).astype(np.complex64)
 
     threshold = rng.uniform(0.5, 2.0, F).astype(np.float32)
-    return Fields(tuple(field(3) for _ in range(targets)), field(8), is_alone, threshold, wanted)
+    return Fields(
+        tuple(field(3) for _ in range(targets)), field(8), has_no_quiet_contacts, threshold, wanted
+    )
 
 
 def by_brute_force(given):
@@ -57,13 +59,15 @@ def test_groupings_are_all_partitions():
     assert len(set(map(frozenset, groupings(4, 4)))) == 51
 
 
-@pytest.mark.parametrize("is_alone", [False, True])
+@pytest.mark.parametrize("has_no_quiet_contacts", [False, True])
 @pytest.mark.parametrize("wanted", [1e-6, 2.0, 3.0])
 @pytest.mark.parametrize("targets", [1, 2])
-def test_search_exactly_equals_brute_force(is_alone, wanted, targets):
+def test_search_exactly_equals_brute_force(has_no_quiet_contacts, wanted, targets):
     """Three ERAs and four frequencies: the best of all 124 patterns, proven to be."""
     for seed in range(6):
-        given = random_fields(seed, is_alone=is_alone, wanted=wanted, targets=targets)
+        given = random_fields(
+            seed, has_no_quiet_contacts=has_no_quiet_contacts, wanted=wanted, targets=targets
+        )
         found = search_exactly(given, eras_at_most=E)
         assert found.contrast == pytest.approx(by_brute_force(given), rel=1e-5)
         assert found.is_complete
@@ -81,7 +85,7 @@ def test_search_exactly_equals_brute_force_when_fronts_are_split(monkeypatch):
     """One choice at a time is extended, and still the best of all patterns is found."""
     monkeypatch.setattr("model.drive_modes.exact_search.MAX_FRONT", 1)
     for seed in range(6):
-        given = random_fields(seed, is_alone=False, wanted=2.0)
+        given = random_fields(seed, has_no_quiet_contacts=False, wanted=2.0)
         found = search_exactly(given, eras_at_most=E)
         assert found.contrast == pytest.approx(by_brute_force(given), rel=1e-5)
         assert found.is_complete
@@ -103,10 +107,10 @@ def test_sensation_found_is_within_1_5_db_of_the_maximum():
             assert 10 ** (-1.5 / 20) * most <= found <= most * (1 + 1e-5)
 
 
-@pytest.mark.parametrize("is_alone", [False, True])
-def test_mixture_bound_is_not_exceeded_by_random_mixtures(is_alone):
+@pytest.mark.parametrize("has_no_quiet_contacts", [False, True])
+def test_mixture_bound_is_not_exceeded_by_random_mixtures(has_no_quiet_contacts):
     """Amplitudes at random, on few sources or many: never above what the dual says."""
-    given = random_fields(1, is_alone=is_alone, wanted=1e-6)
+    given = random_fields(1, has_no_quiet_contacts=has_no_quiet_contacts, wanted=1e-6)
     bound = mixture_bound(given, eras_at_most=E)
     rng = np.random.default_rng(0)
     member = np.array([[m >> era & 1 for era in range(E)] for m in range(1, 1 << E)])
@@ -115,7 +119,7 @@ def test_mixture_bound_is_not_exceeded_by_random_mixtures(is_alone):
     for _ in range(300):
         amplitude = rng.exponential(size=len(peak)) ** rng.integers(1, 8)
         field = amplitude @ quiet
-        loud = np.sqrt((field**2).mean()) if is_alone else field.max()
+        loud = np.sqrt((field**2).mean()) if has_no_quiet_contacts else field.max()
         assert amplitude @ peak / loud <= bound * (1 + 1e-6)
     found = search_exactly(given, eras_at_most=E)
     assert found.contrast <= bound * (1 + 1e-6)

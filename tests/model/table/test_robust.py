@@ -22,7 +22,7 @@ MEMBERS = Ensemble(
     thickness=np.array([1.0, 1.02, 0.98]),
     damping=np.array([1.0, 2.0, 0.5]),
     stiffness=np.array([[1.0, 1.0, 1.0, 1.0], [0.9, 1.1, 1.0, 0.95], [1.1, 1.0, 0.92, 1.05]]),
-    drive=np.array(
+    gain=np.array(
         [[1, 1, 1, 1], [1.05, 0.96, 1.02, np.exp(0.1j)], [np.exp(-0.08j), 1, 0.93, 1]],
         dtype=complex,
     ),
@@ -32,7 +32,7 @@ MEMBERS = Ensemble(
 def directly(rig, pattern, member, *, targets=1):
     """Contrast [dB] by the sparse direct solve of that plate with the fingers on it.
 
-    targets: how many of the places are; the lesser one counts.
+    targets: how many of the places are; the weakest one counts.
     """
     scale, damping = MEMBERS.thickness[member], MEMBERS.damping[member]
     plate = replace(
@@ -56,7 +56,7 @@ def directly(rig, pattern, member, *, targets=1):
         np.concatenate(discs),
         loads=[*rig.loads, *fingers],
     )
-    weights = bases / [era.stroke for era in rig.eras] * MEMBERS.drive[member]
+    weights = bases / [era.stroke for era in rig.eras] * MEMBERS.gain[member]
     peak = np.abs(np.einsum("fe,fep->fp", weights, unit)).sum(axis=0)
     peaks = np.split(peak, np.cumsum([len(disc) for disc in discs])[:-1])
     felt = min(each.mean() for each in peaks[:targets])
@@ -107,8 +107,8 @@ def test_robust_contrast_is_the_tenth_percentile_of_the_same_plates():
 def test_ensemble_has_the_documented_tolerances():
     """Gains 5 %, phases 5 degrees, k_b within 10 %, thickness within 2 %, damping half to twice."""
     ensemble = draw_ensemble(1000)
-    assert np.abs(ensemble.drive).std() == pytest.approx(0.05, rel=0.05)
-    assert np.degrees(np.angle(ensemble.drive)).std() == pytest.approx(5.0, rel=0.05)
+    assert np.abs(ensemble.gain).std() == pytest.approx(0.05, rel=0.05)
+    assert np.degrees(np.angle(ensemble.gain)).std() == pytest.approx(5.0, rel=0.05)
     for values, low, high in (
         (ensemble.stiffness, 0.9, 1.1),
         (ensemble.thickness, 0.98, 1.02),

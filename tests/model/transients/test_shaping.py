@@ -1,4 +1,4 @@
-"""Shaped onsets and brakes: within the stroke, robust, and better than ramps."""
+"""Shaped onsets and endings: within the stroke, robust, and better than ramps."""
 
 from dataclasses import replace
 
@@ -79,7 +79,7 @@ def wrong(envelopes: Envelopes, errors) -> Envelopes:
 
 @pytest.mark.parametrize("frequency", FREQUENCIES)
 def test_knots_do_not_exceed_the_stroke(setup, frequency):
-    """At full stroke, resonance or not, onset and brake stay within it and join the pattern."""
+    """At full stroke, resonance or not, onset and ending stay within it and join the pattern."""
     rig, _, shaper, _ = setup
     rng = np.random.default_rng(int(frequency))
     for _ in range(3):
@@ -100,17 +100,19 @@ def test_knots_do_not_exceed_the_stroke(setup, frequency):
 
 
 @pytest.mark.parametrize("frequency", FREQUENCIES)
-def test_brake_has_less_residual_vibration_than_stop_or_ramp(setup, frequency):
+def test_ending_has_less_residual_vibration_than_stop_or_ramp(setup, frequency):
     """After 40 ms at least 6 dB less is left than after a ramp as long, and than without any."""
     rig, _, shaper, transients = setup
     excitation = random_excitation(rig, frequency, np.random.default_rng(7))
-    braked = transients.residual_db(excitation, shaped(shaper.ending(excitation), rig.eras))
+    residual_shaped = transients.residual_db(
+        excitation, shaped(shaper.ending(excitation), rig.eras)
+    )
     for ramp in (0.0, 0.04):
         left = transients.residual_db(excitation, ramped_ending(excitation, rig.eras, ramp=ramp))
-        assert braked < left - 6
+        assert residual_shaped < left - 6
 
 
-def test_brake_is_robust_to_gain_and_phase_errors(setup):
+def test_ending_is_robust_to_gain_and_phase_errors(setup):
     """With 5 % and 5 degrees off, the median over seeds is 40 dB down (30 dB below 150 Hz)."""
     rig, _, shaper, transients = setup
     for frequency, wanted in [(110.8, -30.0), (146.2, -30.0), (305.0, -40.0), (411.0, -40.0)]:
@@ -166,7 +168,7 @@ def test_shaped_onset_keeps_most_of_the_steady_contrast(setup, target, quiet, fr
 
 
 def test_shaping_includes_the_errors_of_the_eras(setup, monkeypatch):
-    """With errors the robust onset and brake do better than those that know of no errors."""
+    """With errors the robust onset and ending do better than those that know of no errors."""
     rig, plate, shaper, transients = setup
     target, quiet, frequency = PAIRS[2]
     excitation = tones(rig, frequency, robust_weights(plate, frequency, target, quiet))
@@ -285,13 +287,13 @@ def test_envelopes_keep_the_frequency_of_each_era(setup):
     ending = shaper.ending(excitation)
     assert {name: each.frequency for name, each in onset.items()} == {"SW": 110.8, "NE": 217.0}
     assert onset["NE"].knots[-1] == pytest.approx(6e-5 * np.exp(1j))
-    braked = transients.residual_db(excitation, shaped(ending, rig.eras))
+    residual_shaped = transients.residual_db(excitation, shaped(ending, rig.eras))
     stopped = transients.residual_db(excitation, ramped_ending(excitation, rig.eras, ramp=0.0))
-    assert braked < stopped - 3
+    assert residual_shaped < stopped - 3
 
 
 def test_silent_era_plays_in_onset_of_one_frequency(setup):
-    """It joins in for the onset, and is silent again at its end; the brake is the others' alone."""
+    """It plays during the onset, and is silent again at its end and during the ending."""
     rig, _, shaper, _ = setup
     excitation = {"SW": Tone(110.8, 8e-5), "NE": Tone(110.8, 6e-5, 1.0)}
     onset = shaper.onset(excitation, targets=[(0.05, 0.05)], quiet=[(0.2, 0.15)])

@@ -117,7 +117,7 @@ def test_contrast_db_equals_sampled_peaks(plate):
     assert len(at_target) == 0.1 * SAMPLE_RATE
 
 
-def test_contrast_db_is_that_of_the_lesser_target(plate):
+def test_contrast_db_is_that_of_the_weakest_target(plate):
     """Contrast of an onset and of an end is that of the target which has less, as in the steady."""
     rig, in_time = plate
     transients = Transients(in_time)

@@ -1,4 +1,4 @@
-"""A second user of an amplifier, over every wire: in this program, and in another one."""
+"""A second host of an amplifier, over every wire, in the same and in another process."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ from drivers.registry import open_backend
 from model.rig.rig import Rig
 from wires import WIRES, FarSide, far_side
 
-PATIENT = 2.0  # s
+REPLY_TIMEOUT = 2.0  # s
 
 
 @pytest.fixture(params=list(WIRES))
@@ -25,12 +25,12 @@ async def far(request: pytest.FixtureRequest, coarse_rig: Rig) -> AsyncIterator[
         yield far
 
 
-async def test_the_second_user_of_an_address_is_refused_and_the_first_undisturbed(
+async def test_second_host_is_refused_until_the_first_closes(
     far: FarSide,
 ) -> None:
-    """Within one program: told what to do, and the first goes on; once it has left, it is free."""
-    first = Amplifier(open_backend(far.url), reply_timeout=PATIENT)
-    second = Amplifier(open_backend(far.url), reply_timeout=PATIENT)
+    """Within one process a second host is refused, and the first one is undisturbed."""
+    first = Amplifier(open_backend(far.url), reply_timeout=REPLY_TIMEOUT)
+    second = Amplifier(open_backend(far.url), reply_timeout=REPLY_TIMEOUT)
     await first.open()
     await first.arm(2.0)
     with pytest.raises(LinkError):
@@ -44,7 +44,7 @@ async def test_the_second_user_of_an_address_is_refused_and_the_first_undisturbe
 
 @contextmanager
 def held_by_another_program(name: str) -> Iterator[None]:
-    """Another program has the right to arm, until it is killed at the end."""
+    """Run a process that holds the right to arm, and kill it at the end."""
     hold = (
         "import sys; from drivers.backends.sole_host import SoleHost; "
         f"host = SoleHost({name!r}); host.claim(); print('held', flush=True); sys.stdin.read()"
@@ -60,10 +60,10 @@ def held_by_another_program(name: str) -> Iterator[None]:
             other.kill()
 
 
-async def test_over_tcp_only_one_program_arms_and_any_may_stop(coarse_rig: Rig) -> None:
-    """The right to arm belongs to one process while it lives; reading and stopping need none."""
+async def test_one_process_arms_over_tcp_and_any_may_stop(coarse_rig: Rig) -> None:
+    """The right to arm belongs to one process until it ends; reading and stopping need none."""
     async with far_side(WIRES["modbus+tcp"], coarse_rig) as far:
-        amplifier = Amplifier(open_backend(far.url), reply_timeout=PATIENT)
+        amplifier = Amplifier(open_backend(far.url), reply_timeout=REPLY_TIMEOUT)
         with held_by_another_program(far.url.removeprefix("modbus+tcp://")):
             await amplifier.open()
             assert (await amplifier.status()).state is AmplifierState.SWITCH_ON_DISABLED
@@ -77,8 +77,8 @@ async def test_over_tcp_only_one_program_arms_and_any_may_stop(coarse_rig: Rig) 
         await amplifier.close()
 
 
-def test_the_right_to_arm_is_for_one_and_can_be_given_back() -> None:
-    """By name; giving it back twice is once."""
+def test_sole_host_claim_is_exclusive_until_released() -> None:
+    """Claims are by name; claim and release are idempotent."""
     one, same, other = SoleHost("here:1/1"), SoleHost("here:1/1"), SoleHost("here:1/2")
     one.claim()
     one.claim()

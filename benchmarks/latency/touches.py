@@ -30,17 +30,17 @@ class Work:
 
 def places(work: Work, plate: Plate) -> Iterator[tuple[int, float, float]]:
     """Session id and position on the sensor (0..1) of the target, frame by frame."""
-    dice = random.Random(work.seed)
+    rng = random.Random(work.seed)
     x = y = 0.5
     goal = (x, y)
     step = SLIDE / work.rate
     for number in range(work.count):
         if work.kind == "taps":
-            x, y = _anywhere(dice, plate)
+            x, y = _anywhere(rng, plate)
             yield number + 2, x, y
             continue
         while (far := _distance((x, y), goal, plate)) < step:
-            goal = _anywhere(dice, plate)
+            goal = _anywhere(rng, plate)
         x += (goal[0] - x) * step / far
         y += (goal[1] - y) * step / far
         yield 2, x, y
@@ -53,10 +53,10 @@ def datagrams(work: Work, plate: Plate) -> Iterator[bytes]:
         yield tuio_datagram(TouchFrame("bench", 0.0, touches), number + 1)
 
 
-def _anywhere(dice: random.Random, plate: Plate) -> tuple[float, float]:
+def _anywhere(rng: random.Random, plate: Plate) -> tuple[float, float]:
     """A random position away from the quiet fingers."""
     while True:
-        place = (dice.uniform(EDGE, 1 - EDGE), dice.uniform(EDGE, 1 - EDGE))
+        place = (rng.uniform(EDGE, 1 - EDGE), rng.uniform(EDGE, 1 - EDGE))
         others = (HELD, (FLOODING[0], 1 - FLOODING[1]))
         if all(_distance(place, other, plate) > APART for other in others):
             return place

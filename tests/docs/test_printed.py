@@ -1,4 +1,4 @@
-"""What counts as printed as shown, and which pages are refused."""
+"""Comparison of shown with printed output, and invalid pages."""
 
 import re
 from pathlib import Path
@@ -53,16 +53,16 @@ def test_difference_has_its_place(shown: str, printed: str, line: str) -> None:
 
 
 @pytest.mark.parametrize("comment", ["statsu: 1", "edit: a.yaml"])
-def test_read_steps_refuses_a_comment_without_a_meaning(tmp_path: Path, comment: str) -> None:
-    """One that is misspelt, or stands over the wrong kind of fence, would else go unnoticed."""
+def test_read_steps_refuses_an_unknown_comment(tmp_path: Path, comment: str) -> None:
+    """A misspelt comment, or one above the wrong kind of fence, is refused with its line."""
     page = tmp_path / "page.md"
     page.write_text(f"<!-- {comment} -->\n```yaml\na: 1\n```\n", encoding="utf-8")
     with pytest.raises(PageError, match=r"page\.md:[12]"):
         read_steps(page)
 
 
-def test_ports_are_those_that_pages_name() -> None:
-    """One that was not replaced could be taken by another program."""
+def test_ports_include_all_ports_of_pages() -> None:
+    """Every port of a page is replaced by a free one."""
     docs = Path(__file__).parents[2] / "docs"
     pages = [*docs.glob("tutorials/*.md"), *docs.glob("how-to/*.md")]
     named = {

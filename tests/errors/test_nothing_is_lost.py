@@ -1,4 +1,4 @@
-"""Commands that are interrupted, or whose disk is full, leave what was there as it was."""
+"""Interrupted commands, and those on a full disk, keep the previous output."""
 
 import contextlib
 import io
@@ -37,7 +37,7 @@ WRITING = {
     ),
     "report rig.yaml -o out.zip": "controller.report.collect.collect",
 }
-"""Commands that write a file, or several into a folder, each with what takes long in it."""
+"""Commands that write a file, or several into a folder, each with its slow function."""
 
 LONG = {
     "table plot table.npz -o plots": "model.figures.table_pictures.table_figures",
@@ -47,19 +47,19 @@ LONG = {
     "rig check rig.yaml --measured measured.csv": "model.diagnosis.verdict.diagnose",
     "demo --wire sim": "model.table.table_cache.cached_table",
 }
-"""Others that take long."""
+"""Other slow commands, with their slow function."""
 
 
 @pytest.fixture(scope="module")
 def shelf(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A table, and a measurement."""
+    """A folder with a table and a measurement."""
     folder = tmp_path_factory.mktemp("shelf")
     with filled(folder):
         yield folder
 
 
 def furnish(folder: Path, shelf: Path) -> None:
-    """A rig and what is on the shelf."""
+    """Write a rig, a table and a measurement."""
     (folder / "rig.yaml").write_text(RIG.replace("[40, 300]", "[40, 500]"), encoding="utf-8")
     for name in ("table.npz", "measured.csv"):
         (folder / name).write_bytes((shelf / name).read_bytes())
@@ -75,7 +75,7 @@ def home(shelf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """What lies in a folder, but for the cache, and what is kept so that the command goes on."""
+    """Files of a folder, without the cache and the parts kept for resuming."""
     found = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
     return {
         name: path.read_bytes()
@@ -84,8 +84,8 @@ def files(folder: Path) -> dict[str, bytes]:
     }
 
 
-def said_by(command: str) -> tuple[int, str]:
-    """A command's exit status, and what it says on standard error."""
+def outcome_of(command: str) -> tuple[int, str]:
+    """Exit status of a command, and its standard error."""
     err = io.StringIO()
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
         status = run(shlex.split(command), entry_points(group="era_haptics.commands"))
@@ -96,7 +96,7 @@ def said_by(command: str) -> tuple[int, str]:
 def endings(
     shelf: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[dict[str, tuple[int, str]], dict[str, bytes], dict[str, bytes]]:
-    """How all these commands end that are interrupted, and what lay there before and after."""
+    """Outcomes of all commands when interrupted, and the files before and after."""
     folder = tmp_path_factory.mktemp("interrupted")
     furnish(folder, shelf)
     for command in WRITING:
@@ -111,11 +111,11 @@ def endings(
 
 
 @pytest.mark.parametrize("command", WRITING | LONG)
-def test_interrupted_a_command_says_no_more_and_leaves_all_as_it_was(
+def test_interrupted_command_keeps_previous_output(
     command: str,
     endings: tuple[dict[str, tuple[int, str]], dict[str, bytes], dict[str, bytes]],
 ) -> None:
-    """130, no traceback, and the result that was there before is there still."""
+    """The exit status is 130, without a traceback, and the files are unchanged."""
     ended, before, after = endings
     status, said = ended[command]
     assert status == 130, said
@@ -125,10 +125,10 @@ def test_interrupted_a_command_says_no_more_and_leaves_all_as_it_was(
 
 
 @pytest.mark.parametrize("command", [*WRITING, "config init out.yaml"])
-def test_on_a_full_disk_the_result_of_before_stays(
+def test_command_keeps_previous_output_when_the_disk_is_full(
     command: str, home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An error in a paragraph, and neither half a result nor the old one gone."""
+    """It prints one line of error, and the files are unchanged."""
     fit, fitted = calibrate.calibrate, []
 
     def fit_once(*arguments: Any, **keywords: Any) -> Any:
@@ -138,11 +138,11 @@ def test_on_a_full_disk_the_result_of_before_stays(
 
     monkeypatch.setattr(calibrate, "calibrate", fit_once)
     if not command.startswith(("report", "config")):  # these replace nothing
-        status, said = said_by(command)
+        status, said = outcome_of(command)
         assert status == 0, said
     before = files(home)
     with full_disk():
-        status, said = said_by(command)
+        status, said = outcome_of(command)
     assert status == 2
     assert said.startswith("era: error: "), said
     assert len(said.splitlines()) == 1
@@ -150,19 +150,19 @@ def test_on_a_full_disk_the_result_of_before_stays(
 
 
 def until_full(pid: int, limit: int) -> None:
-    """Wait until a file without a name that a process has open is as long as it may be."""
+    """Wait until an unnamed file opened by a process reaches the limit [bytes]."""
     end = time.monotonic() + 20
     while True:
         for path in Path(f"/proc/{pid}/fd").iterdir():
             with contextlib.suppress(OSError):
                 if "(deleted)" in str(path.readlink()) and path.stat().st_size >= limit:
                     return
-        assert time.monotonic() < end, "nothing is recorded"
+        assert time.monotonic() < end, "no recording"
         time.sleep(0.01)
 
 
-def test_a_recording_whose_disk_is_full_is_told_and_leaves_nothing(home: Path) -> None:
-    """Of `era sim`, at its end: for how long there was room; the plate has vibrated on."""
+def test_recording_fails_without_a_file_when_the_disk_is_full(home: Path) -> None:
+    """`era sim` reports the error at its end, and leaves no partial recording."""
     (home / "rig.yaml").write_text(RIG, encoding="utf-8")
     era = Path(sys.executable).with_name("era")
     with subprocess.Popen(
@@ -193,10 +193,10 @@ def test_a_recording_whose_disk_is_full_is_told_and_leaves_nothing(home: Path) -
         ("daemon daemon.yaml", None),
     ],
 )
-def test_a_program_that_runs_ends_at_control_c(
+def test_serving_program_ends_regularly_at_control_c(
     command: str, writes: str | None, home: Path
 ) -> None:
-    """As a terminal does it, once it serves: that is how it is ended, so it is done, in order."""
+    """SIGINT while serving gives exit status 0, a complete recording and no socket."""
     (home / "daemon.yaml").write_text("rig: rig.yaml\ntable: table.npz\nsocket: era.sock\n")
     (home / "rig.yaml").write_text(RIG, encoding="utf-8")
     era = Path(sys.executable).with_name("era")

@@ -1,4 +1,4 @@
-"""The latency benchmark on a machine that is not left alone: what it does again, what it says."""
+"""Repeated attempts and the report of the latency benchmark on a disturbed machine."""
 
 import shutil
 from collections.abc import Callable
@@ -19,7 +19,7 @@ CASES = cases(0.01, 1)
 
 
 def found(case: Case, *, milliseconds: float, others: float = 0.0) -> Found:
-    """Ten touches, each answered after as long."""
+    """Ten touches with equal latency."""
     times = np.full(10, 1e-3 * milliseconds)
     own = None
     if case.touch_wait is not None:
@@ -28,7 +28,7 @@ def found(case: Case, *, milliseconds: float, others: float = 0.0) -> Found:
 
 
 def measuring(*outcomes: Found | Exception) -> Callable[[], Found]:
-    """What measures a case, attempt by attempt."""
+    """A function with these outcomes, one per attempt."""
     left = list(outcomes)
 
     def measured() -> Found:
@@ -40,8 +40,8 @@ def measuring(*outcomes: Found | Exception) -> Callable[[], Found]:
     return measured
 
 
-def test_a_disturbed_case_is_tried_once_more() -> None:
-    """Where the second attempt works it counts; where that fails as well it is told why, twice."""
+def test_attempt_repeats_a_disturbed_case_once() -> None:
+    """A second success counts; a second failure reports both causes."""
     case = CASES[0]
     good = found(case, milliseconds=1.0)
     assert attempt(case, measuring(Disturbed("FAULT"), good)) is good
@@ -50,8 +50,8 @@ def test_a_disturbed_case_is_tried_once_more() -> None:
     assert [why.partition(" (load average")[0] for why in failed.why] == ["FAULT", "the panel"]
 
 
-def test_what_disturbed_is_told_and_not_what_follows() -> None:
-    """A daemon that has lost its amplifier cannot be disarmed either: that says nothing."""
+def test_report_names_first_cause_only() -> None:
+    """An error while disarming after a lost amplifier does not replace the first."""
 
     def measured() -> Found:
         try:
@@ -64,31 +64,31 @@ def test_what_disturbed_is_told_and_not_what_follows() -> None:
     assert all(why.startswith("COMM_LOST (load average") for why in failed.why)
 
 
-def test_a_bug_is_no_disturbance() -> None:
-    """What is not known to come from a busy machine is raised."""
+def test_attempt_raises_unexpected_errors() -> None:
+    """An error that no busy machine causes is raised."""
     with pytest.raises(ZeroDivisionError):
         attempt(CASES[0], measuring(ZeroDivisionError()))
 
 
-def test_a_case_that_failed_leaves_the_rest_of_the_report(tmp_path: Path) -> None:
-    """The page tells what disturbed it, and has a full row for it and each other, and a picture."""
+def test_report_has_all_cases_when_one_failed(tmp_path: Path) -> None:
+    """The page names the cause, and has a full row for every case, and a picture."""
     (tmp_path / "pictures").mkdir()
     (tmp_path / "measured").mkdir()
     shutil.copy(DOCS / "measured" / "latency.md", tmp_path / "measured")
     outcomes: list[Found | Failed] = [found(case, milliseconds=1.0) for case in CASES]
-    outcomes[0] = Failed(CASES[0], ("COMM_LOST in a hurry", "FAULT again"))
+    outcomes[0] = Failed(CASES[0], ("COMM_LOST at arming", "FAULT again"))
     write_report(outcomes, seconds=4, seed=2, minutes=1.4, docs=tmp_path)
     page = (tmp_path / "measured" / "latency.md").read_text("utf-8")
     rows = [line for line in page.splitlines() if line.startswith("|")]
     assert {row.count("|") for row in rows} == {HEAD_CELLS + 1}
     assert [row.split("|")[1].strip() for row in rows[2:]] == [case.name for case in CASES]
-    assert "**No figures of *taps, loaded***: COMM_LOST in a hurry; then: FAULT again." in page
+    assert "**No figures of *taps, loaded***: COMM_LOST at arming; then: FAULT again." in page
     assert "--seconds 4 --seed 2" in page
     assert (tmp_path / "pictures" / "latency.png").stat().st_size > 10_000
 
 
-def test_the_verdict_holds_each_quantile_to_its_target() -> None:
-    """2 ms for the median, 5 for the 99th percentile and 10 for the 99.9th, of the first case."""
+def test_report_compares_each_quantile_with_its_target() -> None:
+    """The targets of the first case are 2 ms (median), 5 ms (99th percentile), 10 ms (99.9th)."""
     slow = [found(CASES[0], milliseconds=6.0), found(CASES[1], milliseconds=3.0)]
     page = report(slow, seconds=100, seed=1, minutes=9)
     assert "median 6.00 of 2 ms (**missed**), 99th percentile 6.00 of 5 ms (**missed**)" in page
@@ -96,8 +96,8 @@ def test_the_verdict_holds_each_quantile_to_its_target() -> None:
     assert "median 2.0, 99th percentile 2.0" in page  # times the plain exchange
 
 
-def test_what_others_did_meanwhile_is_said() -> None:
-    """Half a processor is too much for figures that shall be those of an idle machine."""
+def test_report_marks_a_case_disturbed_by_other_processes() -> None:
+    """Half a processor used by other processes marks a case as disturbed."""
     quiet = [found(case, milliseconds=1.0, others=0.1) for case in CASES[:2]]
     assert "was disturbed**" not in report(quiet, seconds=100, seed=1, minutes=9)
     busy = [found(CASES[0], milliseconds=1.0, others=0.5), quiet[1]]
@@ -106,13 +106,13 @@ def test_what_others_did_meanwhile_is_said() -> None:
     assert " 0.5 processors " in page
 
 
-def test_busy_is_neither_idle_nor_waiting() -> None:
-    """As proc(5) has it: user nice system idle iowait irq softirq steal guest guest_nice."""
+def test_busy_ticks_excludes_idle_and_iowait() -> None:
+    """The fields of proc(5) are user nice system idle iowait irq softirq steal guest guest_nice."""
     assert busy_ticks("cpu  100 20 30 4000 500 6 7 8 90 9") == 100 + 20 + 30 + 6 + 7 + 8
 
 
-def test_a_set_of_a_flood_that_fell_silent_is_matched() -> None:
-    """What answers no touch beside the flood's finger may answer one without it, and only then."""
+def test_match_falls_back_to_the_touch_without_the_flood() -> None:
+    """A set that matches no touch beside the flood's finger may match one without it."""
     sent = np.array([0.0, 0.001, 0.002])
     commands = [Command(0.0015, 1, 1, ()), Command(0.003, 2, 2, ()), Command(0.0035, 3, 3, ())]
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from felt_as_asked import CHECKS, Truth, responses_apart, rounding
+from felt_assertions import CHECKS, Truth, response_differences, rounding
 from heard import Heard
 from model.finger.grid import Grid
 from model.rig.file import load_rig
@@ -50,11 +50,11 @@ STREAM = Stream(
     ],
 )
 BRIEF = Stream(PLACES, [*STREAM.changes[:2], (1.4, {}), (1.7, {5: "A"}), (2.3, {}), (2.6, {})])
-"""Over the other wires: what the daemon decides is decided before them."""
+"""Stream for the other wires, since the daemon's decisions do not depend on the wire."""
 SHORT = Stream(PLACES, [*STREAM.changes[:1], (0.8, {}), (1.1, {})])
 
 ATTEMPTS = 3
-# On Modbus RTU at 115 200 baud envelopes take 59 ms, and a touch waits for 30 ms at most.
+# On Modbus RTU at 115 200 baud envelopes take 59 ms, and a touch waits 30 ms at most.
 PLAIN = {"modbus-rtu"}
 WIRES = ("serial", "modbus-tcp", "modbus-rtu", "slcan", "socketcand", "sim")
 
@@ -76,18 +76,18 @@ class Planted:
 
 PLANTED = {
     "channels are swapped": Planted(
-        {"plate_answers_as_the_model", "localization_is_the_predicted_one"},
+        {"plate_response_matches_model", "localization_matches_prediction"},
         options={"truth_changes": SWAPPED},
     ),
     "phases have the other sign": Planted(
-        {"patterns_are_the_tables", "localization_is_the_predicted_one"}
+        {"patterns_match_table", "localization_matches_prediction"}
     ),
     "lifts are dropped": Planted(
         {
-            "silence_comes_in_time",
-            "plate_follows",
-            "nothing_beyond_limits",
-            "witness_is_content",
+            "silence_is_on_time",
+            "plate_decays",
+            "levels_stay_within_limits",
+            "witness_reports_nothing",
         },
         wire="serial",
     ),
@@ -96,7 +96,7 @@ PLANTED = {
 
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
-    """The rig as it is meant, and its table, asked without any of the chain."""
+    """The true rig and its table, without the chain."""
     rig = load_rig(write_rig(tmp_path_factory.mktemp("truth") / "rig.yaml"))
     table = build_table(rig, frequencies=np.arange(80.0, 321.0, 40.0), grid=Grid(4, 3))
     return Truth(rig, table, STREAM)
@@ -104,7 +104,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
 
 @pytest.fixture(scope="module")
 def played(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Played]:
-    """What came of the stream, by wire: all of it over the first, brief over the others."""
+    """Results by wire: of the full stream over the first, of the brief one over the others."""
     folder = tmp_path_factory.mktemp("wires")
     chains = {wire: (wire, {}) for wire in WIRES}
     return asyncio.run(play_all(folder, truth, chains, {WIRES[0]: STREAM}, BRIEF))
@@ -112,7 +112,7 @@ def played(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
 
 @pytest.fixture(scope="module")
 def planted(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Played]:
-    """What came of its beginning with each error planted."""
+    """Results of the short stream with each planted error."""
     folder = tmp_path_factory.mktemp("errors")
     chains = {
         name: (error.wire, dict(error.options) or {"bug": name}) for name, error in PLANTED.items()
@@ -150,7 +150,7 @@ async def play_all(
             for name, chain in zip(chains, started, strict=True)
         }
     for name in chains:
-        # A daemon that found the machine too slow for envelopes stays with that; another may not.
+        # A daemon that found the machine too slow for envelopes plays plain ramps until its end.
         for attempt in range(1, ATTEMPTS):
             if not played[name].is_tired:
                 break
@@ -161,10 +161,10 @@ async def play_all(
 
 @pytest.mark.parametrize("check", CHECKS)
 @pytest.mark.parametrize("wire", WIRES)
-def test_what_fingers_feel_is_what_was_asked_for(
+def test_fingers_feel_the_commanded_pattern(
     played: dict[str, Played], truth: Truth, wire: str, check: str
 ) -> None:
-    """The same for every wire: see each check's own sentence."""
+    """Every check passes over every wire."""
     if wire != "sim":
         assert played[wire].frames > 100
     CHECKS[check](played[wire], replace(truth, is_shaped=wire not in PLAIN))
@@ -176,10 +176,10 @@ def _drives(heard: Heard) -> list[Mapping[str, Any]]:
 
 
 @pytest.mark.parametrize("wire", WIRES[1:])
-def test_the_plate_answers_the_same_through_every_wire(
+def test_plate_response_is_equal_over_all_wires(
     played: dict[str, Played], truth: Truth, wire: str
 ) -> None:
-    """Within what rounding levels to 1e-4 and phases to 0.01 degrees may change.
+    """Responses differ at most by the rounding of levels to 1e-4 and phases to 0.01 degrees.
 
     All wires round alike: drives agree to the last digit. Compared while the streams are the same.
     """
@@ -187,17 +187,15 @@ def test_the_plate_answers_the_same_through_every_wire(
     for one, other in zip(mine.heard, yours.heard, strict=True):
         assert one.situation.fingers == other.situation.fingers
         assert _drives(one) == _drives(other)
-    apart = responses_apart(mine, yours)
+    apart = response_differences(mine, yours)
     assert len(apart) == 2
     for share, limit in zip(apart, rounding(mine, truth), strict=True):
         assert share <= 2 * limit
 
 
 @pytest.mark.parametrize("error", PLANTED)
-def test_the_same_assertions_find_what_is_wrong(
-    planted: dict[str, Played], truth: Truth, error: str
-) -> None:
-    """Each error that is planted makes those of them fail that it must."""
+def test_checks_detect_planted_errors(planted: dict[str, Played], truth: Truth, error: str) -> None:
+    """Each planted error fails at least the checks that it must."""
     failed = set()
     for name, check in CHECKS.items():
         try:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from felt_as_asked import CHECKS, Truth
+from felt_assertions import CHECKS, Truth
 from model.finger.grid import Grid
 from model.rig.file import load_rig
 from model.table.build import build_table
@@ -69,6 +69,8 @@ def test_both_amplifiers_have_a_part_in_each_pattern(played: Played, truth: Trut
 
 
 @pytest.mark.parametrize("check", CHECKS)
-def test_what_fingers_feel_is_what_was_asked_for(played: Played, truth: Truth, check: str) -> None:
+def test_fingers_feel_the_commanded_pattern_over_two_wires(
+    played: Played, truth: Truth, check: str
+) -> None:
     """What holds over one wire holds where two amplifiers on two wires play together."""
     CHECKS[check](played, truth)

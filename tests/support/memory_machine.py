@@ -53,7 +53,7 @@ class MemoryMachine(HardwareProvider):
         self, name: str, *, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
     ) -> "MemoryPort":
         """Open the host's side of a line; LinkError if it is unplugged or open already."""
-        await asyncio.sleep(self._loop.dice.uniform(*_PASSING))
+        await asyncio.sleep(self._loop.rng.uniform(*_PASSING))
         terminal = self._terminals.get(name)
         if terminal is None or not terminal.is_plugged:
             raise LinkError(f"serial port {name} cannot be opened: no such port")
@@ -89,7 +89,7 @@ class MemoryMachine(HardwareProvider):
         return GreenletWorker()
 
     def below(self, limit: int) -> int:
-        return self._loop.dice.randrange(limit)
+        return self._loop.rng.randrange(limit)
 
     def kill_host(self) -> None:
         """Close the host's ports without notice, as when its process dies."""
@@ -103,13 +103,13 @@ class MemoryMachine(HardwareProvider):
         """Deliver bytes in order, after a delay, perhaps in two pieces."""
         loop, pieces = self._loop, [data]
         loop.seen(link, toward, data)
-        if len(data) > 1 and loop.dice.random() < _SPLIT:
-            at = loop.dice.randrange(1, len(data))
+        if len(data) > 1 and loop.rng.random() < _SPLIT:
+            at = loop.rng.randrange(1, len(data))
             pieces = [data[:at], data[at:]]
         for piece in pieces:
             # Timers of one moment run in any order; bytes of one line must not.
             soonest = to.arrives + 1e-9
-            to.arrives = max(soonest, loop.time() + loop.dice.uniform(*_PASSING))
+            to.arrives = max(soonest, loop.time() + loop.rng.uniform(*_PASSING))
             loop.call_at(to.arrives, to.take, piece)
 
     def later(self, delay: float, callback: Callable[..., None], *args: Any) -> None:

@@ -41,18 +41,18 @@ from soak_witness import SoakWitness
 from virtual_loop import START, Stuck, VirtualLoop, run_virtual
 
 _ON_THE_WIRE = 0.002  # s; through driver, adapter and back
-# Bytes of a silent set for four channels and what may be on the line before it, there and back.
+# Bytes of a silent set for four channels and what may precede it on the line, there and back.
 _BYTES = {"serial": 200, "modbus-rtu": 200, "slcan": 200, "socketcand": 200, "modbus-tcp": 0}
 _PATTERN = 0.25  # s; from a touch to its pattern
-_NOTICED = 0.3  # s; from a wire that is pulled out to a controller that knows
+_NOTICED = 0.3  # s; from an unplugged wire to the controller's reaction
 _TIMERS_MAX = 2_000
 _PAUSES = (0.1, 0.2, 0.4, 0.8, 1.6)  # s; between attempts to open
-_QUIET_END = 1.0  # s; after everything was closed nothing may play
+_QUIET_END = 1.0  # s; duration of the check for silence after closing
 
 
 @dataclass
 class Outcome:
-    """What came of a run; counts: of touches, faults, patterns, frames and so on, by name."""
+    """Outcome of a run; counts: of touches, faults, patterns, frames and so on, by name."""
 
     seed: int
     digest: str
@@ -63,7 +63,7 @@ class Outcome:
 
 
 class Trace:
-    """Everything that happened, a line each: hashed, and written where there is a file."""
+    """Trace of a run, one line per event: hashed, and written to a file if any."""
 
     def __init__(self, file: TextIO | None) -> None:
         self._hash = hashlib.sha256()
@@ -71,7 +71,7 @@ class Trace:
 
     @property
     def digest(self) -> str:
-        """Of all lines so far."""
+        """Hash of all lines so far."""
         return self._hash.hexdigest()
 
     def note(self, time: float, *words: object) -> None:
@@ -113,7 +113,7 @@ def run_plan(plan: Plan, *, trace: TextIO | None = None) -> Outcome:
 
     with _errors_of(run):
         try:
-            run_virtual(run.main(), dice=random.Random(plan.seed + 1), seen=seen)
+            run_virtual(run.main(), rng=random.Random(plan.seed + 1), seen=seen)
         except Stuck as problem:
             run.violations.append(str(problem))
     return Outcome(plan.seed, written.digest, run.violations, counts, plan.lasts, plan.busy)
@@ -133,7 +133,7 @@ class _Run:
         self.trace.note(self.loop.time() - START, *words)
 
     async def main(self) -> None:
-        """Everything, from the far ends' first moment to their last."""
+        """Run from the start of the far ends to their end."""
         loop = asyncio.get_running_loop()
         assert isinstance(loop, VirtualLoop)
         self.loop = loop
@@ -183,13 +183,13 @@ class _Run:
             self.serving = asyncio.create_task(self._serve())
             await self._play(devices)
             await self._end()
-            self.checks.look()
+            self.checks.check()
             self.violations += self.witness.found()
             self.counts["frames seen by the witness"] = self.witness.frames
             for device in devices.values():
                 device.close()
         self.checks.close()
-        await asyncio.sleep(2.0)  # what was still on its way has come
+        await asyncio.sleep(2.0)  # until all bytes in flight have arrived
         left = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
         if left:
             names = sorted(str(task.get_coro()) for task in left)
@@ -226,7 +226,7 @@ class _Run:
         return exchanging
 
     async def _play(self, devices: dict[str, SimulatedDevice]) -> None:
-        """Let the plan happen."""
+        """Run the actions."""
         by_number = [*devices.values()]
         for action in self.plan.actions:
             await self._until(action.at)
@@ -276,13 +276,13 @@ class _Run:
                 self._expect_pattern()
 
     def _must_be_felt(self) -> bool:
-        """Whether a finger that comes to an untouched plate now must be felt soon."""
+        """Whether a first touch now must lead to a pattern."""
         at = self.loop.time() - START
         is_armed = self.controller is not None and self.controller.phase is Phase.ARMED
         return is_armed and self.plan.is_calm(at - 0.1, at + _PATTERN)
 
     def _expect_pattern(self) -> None:
-        """A finger has come to an untouched plate: it must be felt soon."""
+        """Check that a first touch leads to a pattern in time."""
         at = self.loop.time() - START
         before = self.counts["patterns"]
         self.counts["touches that must be felt"] += 1
@@ -294,7 +294,7 @@ class _Run:
         self.loop.call_later(min(_PATTERN, 0.19), look)
 
     def _expect_loss(self, number: int) -> None:
-        """A wire was pulled out under an armed controller: it must know soon."""
+        """Check that an armed controller detects an unplugged wire in time."""
         controller = self.controller
         if controller is None or controller.phase is not Phase.ARMED:
             return
@@ -305,9 +305,9 @@ class _Run:
 
         def look() -> None:
             if running is None or self.running is not running:
-                return  # it stood still for a while, or stands
+                return  # stalled meanwhile
             if self.controller is controller and controller.phase is Phase.ARMED:
-                self.checks.violate("a wire is out and the controller still armed")
+                self.checks.violate("a wire is unplugged and the controller still armed")
 
         self.loop.call_later(_NOTICED, look)
 
@@ -319,7 +319,7 @@ class _Run:
             self._stall(action.lasts)
         elif controller is None:
             if self.plan.is_calm(action.at - 0.4, action.at):
-                self.checks.violate("could not be opened, and nothing was wrong")
+                self.checks.violate("could not be opened without a fault")
         elif action.what == "ready":
             if controller.phase is not Phase.ARMED:
                 await self._call("clear", controller.clear)
@@ -329,14 +329,14 @@ class _Run:
             if controller.phase is Phase.LOST and controller is self.controller:
                 self._reopen()
             elif is_calm and controller.phase is not Phase.ARMED:
-                self.checks.violate("could not be armed, and nothing was wrong")
+                self.checks.violate("could not be armed without a fault")
         else:
             await self._call(action.what, getattr(controller, action.what))
 
     async def _call(
         self, name: OperatorCommand, call: Callable[[], Coroutine[Any, Any, None]]
     ) -> None:
-        """What an operator asks; a refusal is an answer, too."""
+        """Run an operator command; a refusal is a valid outcome."""
         self.witness.operator_command(name)
         self.arm_requests += name == "arm"
         try:
@@ -348,7 +348,7 @@ class _Run:
             self.arm_requests -= name == "arm"
 
     async def _kill(self) -> None:
-        """The host's process dies; another comes up."""
+        """Kill the host's process, and start another."""
         self.machine.kill_host()
         self.loop.kill_hosts()
         self.witness.closes()
@@ -357,13 +357,13 @@ class _Run:
         self.serving = asyncio.create_task(self._serve())
 
     def _stall(self, lasts: float) -> None:
-        """The control loop stands still for so long [s], and goes on."""
+        """Stall the control loop for a time [s]."""
         if self.running is not None:
             self.stalled_for = lasts
             self.running.cancel()
 
     def _reopen(self) -> None:
-        """A loss while disarmed shows at the next request; the control loop continues."""
+        """Restart the control loop after a loss while disarmed."""
         if self.running is not None:
             self.note("reopen")
             self.is_reopening = True
@@ -430,7 +430,7 @@ class _Run:
         self.note("pattern", f"{applied.latency:.9f}", drive)
 
     async def _end(self) -> None:
-        """Close everything; then nothing plays and no task is left."""
+        """Close all, and check for silence and for tasks left."""
         self.is_ending = True
         self.witness.operator_command("disarm")
         if self.controller is not None:
@@ -460,18 +460,18 @@ _BACKENDS: dict[str, type[Backend]] = {}
 
 
 def _backend(url: str) -> Backend:
-    """A backend for a URL; to look among all that is installed for each run would take long."""
+    """A backend for a URL; its class is cached, since discovery of plugins is slow."""
     scheme = url.partition("://")[0]
     if scheme in _BACKENDS:
         return _BACKENDS[scheme](url)
-    first = open_backend(url)  # made once as all others are, for it throws the run's dice
+    first = open_backend(url)  # constructed once, since construction draws from the run's rng
     _BACKENDS[scheme] = type(first)
     return first
 
 
 @contextmanager
 def _errors_of(run: _Run) -> Iterator[None]:
-    """What the project logs with a traceback is a violation, too."""
+    """Count logged tracebacks as violations."""
 
     class Handler(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:

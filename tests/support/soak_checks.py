@@ -1,4 +1,4 @@
-"""What must hold in every soak run, watched at the simulated amplifiers and at the touches alone.
+"""Invariants of every soak run, checked on the simulated amplifiers and the touches alone.
 
 Bounds with faults are what the fault table and the timeouts of a link add up to; without faults
 they are the table's own.
@@ -32,7 +32,7 @@ RELEASE = 0.020  # s; from the last finger up to zero
 # s; three unanswered requests, then the watchdog, and a heartbeat that was on its way.
 RELEASE_WITH_FAULTS = 3 * 0.15 + WATCHDOG + 0.1
 TOGETHER = 0.6  # s; until all are silent after one of them has a fault
-STEP = 0.020  # s; how often is looked while something vibrates
+STEP = 0.020  # s; check interval while a channel vibrates
 IDLE_STEP = 1.0
 _NON_FEEDING_REQUESTS = (Hello, GetCaps, GetStatus, GetFaults)
 _FAULTED = (AmplifierState.FAULT, AmplifierState.FAULT_REACTION_ACTIVE)
@@ -48,10 +48,10 @@ Sense = Callable[[str, SimulatedAmplifier], None]
 
 
 class Checks:
-    """Watches a bench; `violations` is what was found, each once with its time.
+    """Checks of a bench; `violations`: those found, each with its time.
 
     release [s]: from the last finger up to silence on the plate, without faults; begin [s]: when
-    the plan's time began; arming: whether the operator wants to arm just now.
+    the plan's time began; arming: whether an arm request is in progress.
     """
 
     def __init__(
@@ -86,12 +86,12 @@ class Checks:
             amplifier.listeners.append(lambda event, at, name=name: self._received(name, event, at))
 
     def violate(self, what: str) -> None:
-        """Something that must hold does not."""
+        """Record a violation."""
         if len(self.violations) < 20:
             self.violations.append(f"{self._loop.time() - self._begin:.6f} {what}")
 
-    def look(self) -> None:
-        """Move the bench until now, and look."""
+    def check(self) -> None:
+        """Advance the bench to now, and check it."""
         now = self._loop.time()
         self._bench.advance(now)
         loud = {}
@@ -106,14 +106,14 @@ class Checks:
             self._check_touched(loud, now)
 
     def lifted(self) -> None:
-        """The last finger has gone, or will have when its lease ends: look when zero is due."""
+        """After the last lift, or the end of its lease: check when silence is due."""
         if self._releasing is not None:
             self._releasing.cancel()
         due = max(self._contacts.last, self._loop.time()) + self._release + 1e-6
-        self._releasing = self._loop.call_at(due, self.look)
+        self._releasing = self._loop.call_at(due, self.check)
 
     def exchanged(self, name: str, request: Request, reply: Reply | None) -> None:
-        """An amplifier was asked something, and answered or not."""
+        """Check after an exchange with an amplifier; reply: None for no reply."""
         if reply is None or isinstance(reply, Nak):
             return
         now = self._loop.time()
@@ -139,16 +139,16 @@ class Checks:
             self._watch()
 
     def close(self) -> None:
-        """Look no more."""
+        """Stop checking."""
         self._is_closed = True
         self._next.cancel()
         for timer in self._starving.values():
             timer.cancel()
 
     def _watch(self) -> None:
-        """Look again and again, as often as what plays makes it worth it."""
+        """Check periodically, more often while a channel vibrates."""
         self._next.cancel()
-        self.look()
+        self.check()
         self._next = self._loop.call_later(STEP if self._plays() else IDLE_STEP, self._watch)
 
     def _plays(self) -> bool:
@@ -165,7 +165,7 @@ class Checks:
         due = self._fed[name] + WATCHDOG + 1e-6
         if self._loop.time() >= due:
             self._starving.pop(name, None)
-            self.look()
+            self.check()
         elif not self._is_closed:
             self._starving[name] = self._loop.call_at(due, self._expect_silence, name)
 

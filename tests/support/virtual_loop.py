@@ -1,7 +1,7 @@
-"""An event loop without threads, files and sockets, on a clock that jumps to whatever comes next.
+"""An event loop without threads, files and sockets, on a clock that jumps to the next timer.
 
-It has a network of its own: TCP connections between those who listen and connect in it. What runs
-twice in it with the same chance runs twice the same, byte for byte.
+It has its own network: TCP connections between listeners and clients of the same loop. Runs with
+the same random seed are identical, byte for byte.
 """
 
 import asyncio
@@ -15,27 +15,27 @@ from typing import Any, ParamSpec, TypeVar
 P = ParamSpec("P")
 T = TypeVar("T")
 
-START = 1000.0  # s; a clock that begins at zero hides who takes zero for "never"
+START = 1000.0  # s; not zero, which code could take for "never"
 _FIRST_PORT = 20_000
-_TURNS_MAX = 20_000  # at one moment; nothing needs as many
-_LATENCY = (50e-6, 400e-6)  # s; of a loopback connection with something else to do
+_TURNS_MAX = 20_000  # at one moment; more are an endless loop
+_LATENCY = (50e-6, 400e-6)  # s; of a loopback connection
 
 Seen = Callable[[str, str, bytes], None]
-"""Called with a link, the direction (amplifier or host) and the bytes, when they go out."""
+"""Called with a link, the direction (amplifier or host) and the bytes, as they are sent."""
 
 
 class Stuck(Exception):
-    """Everybody waits for something that will never come."""
+    """Deadlock: no timer and no ready task, or no progress of time."""
 
 
 class VirtualLoop(BaseEventLoop):
-    """The loop; dice: by which connections take their time, seen: who watches their bytes."""
+    """The loop; rng: of the latencies of connections; seen: observer of their bytes."""
 
-    def __init__(self, dice: random.Random | None = None, seen: Seen | None = None) -> None:
+    def __init__(self, rng: random.Random | None = None, seen: Seen | None = None) -> None:
         self.now = START
         super().__init__()
         self._turns = 0
-        self.dice = dice or random.Random(0)
+        self.rng = rng or random.Random(0)
         self.seen: Seen = seen or (lambda link, toward, data: None)
         self._selector = self
         self._servers: dict[int, _Server] = {}
@@ -47,34 +47,34 @@ class VirtualLoop(BaseEventLoop):
 
     @property
     def _clock_resolution(self) -> float:
-        """The least that it can go on: no timer comes early."""
+        """The smallest step: no timer fires early."""
         return math.ulp(self.now)
 
     @_clock_resolution.setter
     def _clock_resolution(self, of_the_machine: float) -> None:
-        """What the machine's clock has does not matter."""
+        """Ignore the resolution of the machine's clock."""
 
     def select(self, timeout: float | None) -> list[Any]:
         """There is no external input: advance to the next timer."""
         self._turns += 1
         if self._turns > _TURNS_MAX:
             self._turns = 0
-            raise Stuck(f"{_TURNS_MAX} turns at one moment: something asks itself again for ever")
+            raise Stuck(f"{_TURNS_MAX} turns at one moment: a task reschedules itself endlessly")
         if timeout is None:
-            raise Stuck("nothing is ready and nothing will ever be: a task waits for ever")
+            raise Stuck("deadlock: no timer and no ready task")
         if timeout > 0:
             self._turns = 0
             self.now = max(self.now, self._scheduled[0].when())
         return []
 
     def _process_events(self, event_list: list[Any]) -> None:
-        """There are none."""
+        """No I/O events."""
 
     def _write_to_self(self) -> None:
-        """No thread has to be woken."""
+        """Do nothing: there are no other threads."""
 
     def run_in_executor(self, executor: Any, func: Callable[..., T], *args: Any) -> Any:
-        """At once: there are no threads."""
+        """Run at once: there are no threads."""
         future = self.create_future()
         try:
             future.set_result(func(*args))
@@ -94,7 +94,7 @@ class VirtualLoop(BaseEventLoop):
         self, factory: Any, host: Any = None, port: Any = 0, **_: Any
     ) -> Any:
         """Connect to a listener; raises ConnectionRefusedError without one."""
-        await asyncio.sleep(self.dice.uniform(*_LATENCY))
+        await asyncio.sleep(self.rng.uniform(*_LATENCY))
         server = self._servers.get(port)
         if server is None:
             raise ConnectionRefusedError(111, "Connection refused")
@@ -109,7 +109,7 @@ class VirtualLoop(BaseEventLoop):
         return ours, host_side
 
     def kill_hosts(self) -> None:
-        """Cut all connections off without notice, as when a process dies."""
+        """Cut all connections without notice, as when a process dies."""
         for transport in self._hosts:
             transport.die()
 
@@ -119,17 +119,17 @@ class VirtualLoop(BaseEventLoop):
 
 
 class _Socket:
-    """What is asked of a socket here."""
+    """The socket methods used here."""
 
     def __init__(self, port: int) -> None:
         self._port = port
 
     def getsockname(self) -> tuple[str, int]:
-        """Where it is."""
+        """Its address."""
         return "127.0.0.1", self._port
 
     def setsockopt(self, *_: Any) -> None:
-        """Nothing is too large for memory."""
+        """Ignore options."""
 
 
 class _Server:
@@ -142,15 +142,15 @@ class _Server:
         self._port = port
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         self._loop.forget_server(self._port)
 
     async def wait_closed(self) -> None:
-        """It is."""
+        """Already closed."""
 
 
 class MemoryTransport(asyncio.Transport):
-    """One side of a connection; toward: whom its bytes go to."""
+    """One side of a connection; toward: receiver of its bytes."""
 
     def __init__(self, loop: VirtualLoop, protocol: Any, link: str, toward: str) -> None:
         super().__init__()
@@ -159,15 +159,15 @@ class MemoryTransport(asyncio.Transport):
         self._protocol = protocol
         self._link = link
         self._toward = toward
-        self._arrives = 0.0  # of what was sent last
+        self._arrives = 0.0  # time of the last bytes sent
         self._is_closed = False
 
     def get_extra_info(self, name: str, default: Any = None) -> Any:
-        """A socket, which is all that is ever asked for."""
+        """The socket; the default for all else."""
         return _Socket(0) if name == "socket" else default
 
     def get_write_buffer_size(self) -> int:
-        """Nothing waits."""
+        """Always empty."""
         return 0
 
     def is_closing(self) -> bool:
@@ -182,48 +182,48 @@ class MemoryTransport(asyncio.Transport):
         self._later(self.peer._received, bytes(data))
 
     def close(self) -> None:
-        """Hang up, here and there."""
+        """Close both sides."""
         if not self._is_closed:
-            self._hang_up()
-            self._later(self.peer._hang_up)
+            self._disconnect()
+            self._later(self.peer._disconnect)
 
     def abort(self) -> None:
-        """As close: nothing waits to be sent."""
+        """Close; the write buffer is always empty."""
         self.close()
 
     def die(self) -> None:
-        """Hang up on the other side without notice to this one."""
+        """Close the other side without notice to this one."""
         if not self._is_closed:
             self._is_closed = True
-            self._later(self.peer._hang_up)
+            self._later(self.peer._disconnect)
 
     def _received(self, data: bytes) -> None:
         if not self._is_closed:
             self._protocol.data_received(data)
 
-    def _hang_up(self) -> None:
+    def _disconnect(self) -> None:
         if not self._is_closed:
             self._is_closed = True
             self._loop.call_soon(self._protocol.connection_lost, None)
 
     def _later(self, callback: Callable[..., None], *args: Any) -> None:
         loop = self._loop
-        # Timers of one moment come in any order, bytes of one connection do not.
+        # Timers of one moment fire in any order; bytes of one connection stay in order.
         soonest = self._arrives + 1e-9
-        self._arrives = max(soonest, loop.time() + loop.dice.uniform(*_LATENCY))
+        self._arrives = max(soonest, loop.time() + loop.rng.uniform(*_LATENCY))
         loop.call_at(self._arrives, callback, *args)
 
 
 def run_virtual(
-    main: Coroutine[Any, Any, T], *, dice: random.Random | None = None, seen: Seen | None = None
+    main: Coroutine[Any, Any, T], *, rng: random.Random | None = None, seen: Seen | None = None
 ) -> T:
-    """Run a coroutine to its end in virtual time; raises Stuck where it never ends."""
-    with asyncio.Runner(loop_factory=lambda: VirtualLoop(dice, seen)) as runner:
+    """Run a coroutine to its end in virtual time; raises Stuck for a deadlock."""
+    with asyncio.Runner(loop_factory=lambda: VirtualLoop(rng, seen)) as runner:
         return runner.run(main)
 
 
 def in_virtual_time(test: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
-    """Let a test run to its end in virtual time."""
+    """Run a test in virtual time."""
 
     @functools.wraps(test)
     def run(*args: P.args, **kwargs: P.kwargs) -> T:

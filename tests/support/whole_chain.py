@@ -1,6 +1,6 @@
 """The whole chain in processes of its own: touches over UDP, daemon, wire, far end, fingertips.
 
-The daemon knows of its amplifiers no more than a URL; a witness is in every wire.
+The daemon has only the URLs of its amplifiers; every wire has a witness.
 """
 
 import asyncio
@@ -38,9 +38,9 @@ Polls: TypeAlias = list[tuple[float, list[float]]]
 
 @dataclass(frozen=True)
 class Played:
-    """All that came of a stream.
+    """Results of a stream.
 
-    polls: time [s] and levels of all channels, as the far end says; violations, frames: of the
+    polls: time [s] and levels of all channels, as the far end reports; violations, frames: of the
     witness, which no wire within a process has; exit_status: the daemon's; is_tired: whether it has
     found envelopes to take too long, and plays plain ramps from then on.
     """
@@ -64,10 +64,10 @@ class Chain:
     witness: Witness | None
 
     async def play(self, stream: Stream) -> Played:
-        """Play a stream, and again while nothing can be said of it, for the machine was too busy.
+        """Play a stream, and repeat it while the machine is too busy for a valid result.
 
-        That is where the daemon was late, has stopped everything, or had an answer too late for it
-        and the witness complains. Ends the daemon.
+        Repeated where the daemon was late or has stopped all, or where a reply was late and the
+        witness reports a violation. Ends the daemon.
         """
         await self._place(stream)
         capture = self.folder / "touches.tuio"
@@ -80,7 +80,7 @@ class Chain:
             begin, late = time.monotonic(), await self._late()
             try:
                 heard, polls = await self._play(capture, stream)
-            except (RpcError, Refused):  # a link was lost, or we ask more than 10 s later
+            except (RpcError, Refused):  # a link was lost, or the request was more than 10 s late
                 continue
             is_prompt = all(
                 one.patterns and one.delay < PROMPT for one in heard if one.situation.fingers
@@ -101,12 +101,12 @@ class Chain:
         )
 
     def _found(self, since: float) -> list[Violation]:
-        """What the witness complains of since a time [s]."""
+        """Violations of the witness since a time [s]."""
         found = [] if self.witness is None else self.witness.finish(time.monotonic())
         return [violation for violation in found if violation.time >= since]
 
     async def _place(self, stream: Stream) -> None:
-        """Fingers that feel, and sensors."""
+        """Place fingers and sensors."""
         fingers = {name: list(at) for name, at in stream.places.items()}
         await self.control.ask("fingers", fingers=fingers)
         sensors = {name: {"at_m": list(at)} for name, at in SENSORS.items()}
@@ -114,12 +114,12 @@ class Chain:
         await self.daemon.client.subscribe("pattern")
 
     async def _late(self) -> tuple[int, ...]:
-        """How many answers came too late, or never."""
+        """Number of replies that were late or missing, by amplifier."""
         status = await self.daemon.client.status()
         return tuple(one.statistics.timeouts for one in status.amplifiers)
 
     async def _come_to_rest(self, seconds: float) -> None:
-        """Acknowledge whatever was wrong, and let the plate be for a while."""
+        """Clear faults after a pause [s]."""
         await asyncio.sleep(seconds)
         end = time.monotonic() + PATIENCE
         while (state := (await self.daemon.client.status()).state) != "READY_TO_SWITCH_ON":
@@ -130,7 +130,7 @@ class Chain:
             await asyncio.sleep(0.05)
 
     async def _play(self, capture: Path, stream: Stream) -> tuple[list[Heard], Polls]:
-        """Arm, send the stream, look on meanwhile, and ask what was felt."""
+        """Arm, send the stream, poll the far end, and query the vibration at the fingers."""
         if self.witness is not None:
             self.witness.contacts(time.monotonic(), ())
             self.witness.operator_command(time.monotonic(), "arm")
@@ -219,7 +219,7 @@ async def _started(
     drive_mode: str | None,
     bug: str | None,
 ) -> RunningDaemon:
-    """A daemon that serves; a machine that is too busy for the wire may keep it from starting."""
+    """Start a daemon; repeated where a busy machine makes its links fail."""
     for left in reversed(range(ATTEMPTS)):
         daemon = running_daemon(
             folder, urls, rig_changes, table=table, drive_mode=drive_mode, bug=bug
@@ -235,12 +235,12 @@ async def _started(
 async def _witnessed(
     stack: contextlib.AsyncExitStack, far_end: FarEndProcess
 ) -> tuple[dict[str, str], Witness]:
-    """A witness in every wire of a far end, and the URLs that lead through it."""
+    """Insert a witness in every wire of a far end; returns the URLs through it."""
     endpoints = [parse_endpoint(url) for url in far_end.urls.values()]
     config = witness_config(
         far_end.urls,
         channels=4 if len(endpoints) == 1 else 2,
-        # Times of real processes on a machine that does other work, too.
+        # Times of real processes on a shared machine.
         times_s={"slack": 0.3},
         frequency_hz=list(FREQUENCY_LIMITS),
         level=LEVEL_LIMIT,

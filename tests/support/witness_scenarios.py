@@ -271,14 +271,14 @@ async def lossy(chain: Chain) -> None:
 
 
 async def _spoilt(chain: Chain, *, flips: bool) -> None:
-    dice = random.Random(chain.loop.dice.random())
+    rng = random.Random(chain.loop.rng.random())
 
     def spoil(toward: str, data: bytes) -> bytes | None:
-        fate = dice.random()
+        fate = rng.random()
         if fate < 1 / 12:
             return None
         if flips and fate < 1 / 6:
-            at, bit = dice.randrange(len(data)), dice.randrange(8)
+            at, bit = rng.randrange(len(data)), rng.randrange(8)
             return data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :]
         return data
 

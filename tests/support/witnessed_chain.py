@@ -40,7 +40,7 @@ from witness_config import sense, witness_config
 
 STROKE = 100e-6  # m
 SENSED_EVERY = 0.001  # s
-_LONGEST = 5.0  # s; a chain with a bug in it may wait for ever
+_LONGEST = 5.0  # s; a planted bug may cause a deadlock
 ALONE: Excitation = {"SW": Tone(110.0, 20e-6, math.pi / 2), "NE": Tone(150.0, 40e-6, -math.pi)}
 SHARED: Excitation = {"SW": Tone(90.0, 30e-6, 0.0)}
 WITNESSED = ("serial", "modbus-tcp", "modbus-rtu", "socketcand", "slcan")
@@ -50,7 +50,7 @@ Mangle = Callable[[str, bytes], bytes | None]
 
 
 class OneTable:
-    """Gives one pattern for a finger that is alone and another for more; both may be replaced."""
+    """A table with one pattern for a single finger and one for more; both may be replaced."""
 
     def __init__(self, plate: Plate) -> None:
         self.plate = plate
@@ -59,14 +59,14 @@ class OneTable:
 
     @property
     def frequencies(self) -> FloatArray:
-        """Those of its tones [Hz]."""
+        """Frequencies of its tones [Hz]."""
         return np.array([90.0, 110.0, 150.0])
 
     def prepare(self, drive_mode: str) -> None:
-        """There is nothing to work out."""
+        """Nothing to prepare."""
 
     def query(self, question: Question) -> Pattern:
-        """By the number of fingers alone."""
+        """Select the pattern by the number of fingers."""
         excitation = self.shared if question.quiet else self.alone
         contrast = 12.0 if question.quiet else None
         return Pattern(excitation, 0.015, 20.0, contrast, None, question.drive_mode)
@@ -74,7 +74,7 @@ class OneTable:
     def amplitudes(
         self, excitation: Excitation, points: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """1 m/s² everywhere."""
+        """1 m/s² at every point."""
         return np.array([110.0]), np.ones((1, len(points)))
 
 
@@ -118,36 +118,36 @@ class Chain:
 
     @property
     def amplifier(self) -> Amplifier:
-        """The first."""
+        """The first amplifier."""
         return next(iter(self.amplifiers.values()))
 
     @property
     def link(self) -> str:
-        """The wire of the first."""
+        """The wire of the first amplifier."""
         return next(iter(self.links.values()))
 
     async def rest(self, seconds: float) -> None:
-        """Let time pass."""
+        """Sleep for a time [s]."""
         if seconds:
             await asyncio.sleep(seconds)
 
     async def operate(self, command: OperatorCommand, *, rest: float = 0.0) -> None:
-        """Carry out an operator's command, then let time [s] pass."""
+        """Carry out an operator's command, then sleep for `rest` [s]."""
         self.witness.operator_command(self.loop.time(), command)
         await self._try(getattr(self.controller, command)())
         await self.rest(rest)
 
     def run(self) -> None:
-        """The control loop runs from now on."""
+        """Start the control loop."""
         self.witness.set_stalled(self.loop.time(), False)
         self.running = asyncio.get_running_loop().create_task(self._try(self.controller.run()))
 
     async def hang(self) -> None:
-        """The control loop gets no further."""
+        """Stall the control loop."""
         if self.running is not None:
             self.running.cancel()
             await asyncio.gather(self.running, return_exceptions=True)
-        await self.rest(0.002)  # what was on its way is on the wire by then
+        await self.rest(0.002)  # until bytes in flight are on the wire
         self.witness.set_stalled(self.loop.time())
 
     def touch_beside(self) -> None:
@@ -156,7 +156,7 @@ class Chain:
         self.controller.deliver(TouchFrame("test", self.loop.time(), touches))
 
     async def touch(self, *fingers: int, answerable: bool = True, rest: float = 0.0) -> None:
-        """Replace the fingers on the plate, which the source repeats, then let time [s] pass."""
+        """Replace the fingers on the plate, which the source repeats, then sleep for `rest` [s]."""
         self.fingers = fingers
         self.witness.expect(self.expected())
         self.witness.contacts(self.loop.time(), fingers, is_answerable=answerable)
@@ -164,11 +164,11 @@ class Chain:
         await self.rest(rest)
 
     def disturb(self, are_on: bool = True) -> None:
-        """Tell the witness that faults of the first wire begin or end."""
+        """Notify the witness that faults of the first wire begin or end."""
         self.witness.faults(self.loop.time(), self.link, are_on=are_on)
 
     def expected(self) -> dict[str, dict[int, tuple[float, float, float]]]:
-        """What the patterns are on the wire, by hand: metres over 100 um, radians in degrees."""
+        """Expected patterns on the wire, by hand: metres over 100 um, radians in degrees."""
         alone = {0: (110.0, 0.2, 90.0)}, {1: (150.0, 0.4, 180.0)}
         parts = alone if len(self.fingers) < 2 else ({0: (90.0, 0.3, 0.0)}, {})
         names = tuple(self.amplifiers)
@@ -177,7 +177,7 @@ class Chain:
         return {names[0]: parts[0], names[1]: parts[1]}
 
     async def reopen(self) -> None:
-        """Close everything and open it again, the control loop too."""
+        """Close and reopen all, including the control loop."""
         self.witness.operator_command(self.loop.time(), "disarm")
         await self._try(self.controller.close())
         for link in {*self.links.values()}:
@@ -189,13 +189,13 @@ class Chain:
         self.run()
 
     def trip(self) -> None:
-        """The first amplifier finds an arc in itself."""
+        """Trip the first amplifier by an arc."""
         amplifier = next(iter(self.bench.amplifiers.values()))
         self.bench.advance(self.loop.time())
         amplifier.trip(Fault.ARC, self.loop.time())
 
     async def fall_silent(self) -> None:
-        """The source dies with its fingers down: after its lease of 150 ms they count as lifted."""
+        """Stop the source with fingers down: after its lease of 150 ms they count as lifted."""
         heard = self.loop.time()
         self._deliver()
         if self.holding is not None:
@@ -204,7 +204,7 @@ class Chain:
         self.witness.contacts(heard + 0.150, ())
 
     def inject(self, toward: str, data: bytes) -> None:
-        """Noise, or a late copy of something, on the first wire."""
+        """Inject noise or a late copy of a frame on the first wire."""
         terminal = self.machine._terminals[self.link]
         port = self.machine._open[self.link]
         direction = terminal.inward if toward == "amplifier" else port.outward
@@ -248,25 +248,25 @@ def play(
     limits: Limits | None = None,
     seed: int = 1,
 ) -> Outcome:
-    """Play a scenario to its end on a wire of this kind; what came of it."""
-    tap = _Tap()
-    dice = random.Random(seed)
-    main = _play(wire, scenario, tuple(amplifiers), limits or _LIMITS, tap)
-    return run_virtual(main, dice=dice, seen=tap.seen)
+    """Play a scenario to its end on a wire of this kind; returns the outcome."""
+    probe = _Probe()
+    rng = random.Random(seed)
+    main = _play(wire, scenario, tuple(amplifiers), limits or _LIMITS, probe)
+    return run_virtual(main, rng=rng, seen=probe.seen)
 
 
 _LIMITS = Limits(40.0, 500.0, 0.5)
 
 
-class _Tap:
-    """What the loop's network shows to the witness, once there is one."""
+class _Probe:
+    """Passes bytes of the loop's network to the witness, buffered until it exists."""
 
     def __init__(self) -> None:
         self.witness: Witness | None = None
         self.early: list[tuple[float, str, str, bytes]] = []
 
     def seen(self, link: str, toward: str, data: bytes) -> None:
-        """Bytes go out."""
+        """Record bytes on a link."""
         if self.witness is None:
             self.early.append((clock.now(), link, toward, data))
         else:
@@ -278,7 +278,7 @@ async def _play(
     scenario: Scenario,
     names: tuple[str, ...],
     limits: Limits,
-    tap: _Tap,
+    probe: _Probe,
 ) -> Outcome:
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualLoop)
@@ -293,7 +293,7 @@ async def _play(
     async with open_wire(Wire(wire), devices) as urls:
         config = witness_config(urls, channels=3, times_s={}, level=0.5, slew_per_s=100)
         links = {name: amplifier["wire"] for name, amplifier in config["amplifiers"].items()}
-        tap.witness = witness = Witness(config)
+        probe.witness = witness = Witness(config)
         for link in {*links.values()}:
             witness.opened(link, loop.time())
         witness.contacts(loop.time(), ())
@@ -328,7 +328,7 @@ async def _end(chain: Chain) -> None:
 
 
 class Between:
-    """What happens to the bytes of lines before they are on the wire, where the witness is.
+    """Changes bytes of lines before they reach the wire and the witness.
 
     mangle: gives other bytes, or None where they are lost; delay [s]: of what goes to the host.
     """
@@ -345,7 +345,7 @@ class Between:
         if passed is None:
             return
         if toward == "host" and self.delay:
-            # Timers of one moment come in any order, bytes of one line do not.
+            # Timers of one moment fire in any order; bytes of one line stay in order.
             self._due = max(self._due + 1e-9, clock.now() + self.delay)
             asyncio.get_running_loop().call_at(self._due, self._deliver, link, toward, passed, to)
         else:
@@ -381,7 +381,7 @@ def with_level(
     frequency: float | None = None,
     phase: float | None = None,
 ) -> Excitation:
-    """The same with another tone of one ERA."""
+    """The excitation with another tone of one ERA."""
     tone = excitation[era]
     other = Tone(
         tone.frequency if frequency is None else frequency,

@@ -26,9 +26,9 @@ WATCHDOG = 0.25 + 0.005  # s; what an amplifier needs to fall silent by itself
 class Link(Backend):
     """A simulated amplifier on the loop's clock with delayed replies, some of them lost."""
 
-    def __init__(self, dice: random.Random, *, loss: float) -> None:
+    def __init__(self, rng: random.Random, *, loss: float) -> None:
         self.amplifier = SimulatedAmplifier("any", channels=2)
-        self._dice = dice
+        self._dice = rng
         self._loss = loss
         self._last_sent = 0.0
 
@@ -61,27 +61,25 @@ class Link(Backend):
 
 
 async def step_at_random(
-    controller: Controller, table: Any, dice: random.Random, tasks: list[asyncio.Task[None]]
+    controller: Controller, table: Any, rng: random.Random, tasks: list[asyncio.Task[None]]
 ) -> bool | None:
     """Do one step; return whether a finger is down, None if that has not changed."""
     now = asyncio.get_running_loop().time()
-    match dice.choices(["touch", "lift", "ask", "withdraw", "wait"], [9, 5, 4, 1, 2])[0]:
+    match rng.choices(["touch", "lift", "ask", "withdraw", "wait"], [9, 5, 4, 1, 2])[0]:
         case "touch":
-            era, frequency = dice.choice(("SW", "NE")), dice.choice((110.0, 250.0))
-            table.excitation = {era: Tone(frequency, dice.choice((20e-6, 40e-6)))}
-            finger = Touch(1, dice.random(), dice.random())
+            era, frequency = rng.choice(("SW", "NE")), rng.choice((110.0, 250.0))
+            table.excitation = {era: Tone(frequency, rng.choice((20e-6, 40e-6)))}
+            finger = Touch(1, rng.random(), rng.random())
             controller.deliver(TouchFrame("any", now, (finger,)))
             return True
         case "lift":
             controller.deliver(TouchFrame("any", now, ()))
             return False
         case "ask":
-            call = getattr(
-                controller, dice.choice(("arm", "arm", "arm", "disarm", "stop", "clear"))
-            )
+            call = getattr(controller, rng.choice(("arm", "arm", "arm", "disarm", "stop", "clear")))
             tasks.append(asyncio.create_task(call()))
         case "withdraw":  # the loop itself is the first; another one takes over from it
-            number = dice.randrange(len(tasks))
+            number = rng.randrange(len(tasks))
             tasks[number].cancel()
             if number == 0:
                 await asyncio.gather(tasks[0], return_exceptions=True)
@@ -99,29 +97,29 @@ async def test_controller_never_stays_vibrating_for_any_order_of_events(
 
     The end is a close, or a cancelled loop, after which the watchdogs act. No task is left.
     """
-    dice = random.Random(seed)
+    rng = random.Random(seed)
     loop = asyncio.get_running_loop()
-    bench = make_bench(*("a", "b")[: dice.choice((1, 2))])
-    links = {name: Link(dice, loss=loss) for name in bench.rig.amplifiers}
+    bench = make_bench(*("a", "b")[: rng.choice((1, 2))])
+    links = {name: Link(rng, loss=loss) for name in bench.rig.amplifiers}
     controller = Controller(
         bench.rig,
         bench.table,
         amplifiers={name: Amplifier(link) for name, link in links.items()},
-        timing=dice.choice((None, Shapes())),
+        timing=rng.choice((None, Shapes())),
     )
     await controller.open()
     tasks = [asyncio.create_task(controller.run())]
     down, lifted = False, loop.time()
     for _ in range(40):
-        was, change = down, await step_at_random(controller, bench.table, dice, tasks)
+        was, change = down, await step_at_random(controller, bench.table, rng, tasks)
         down = was if change is None else change
         if was and not down:
             lifted = loop.time()
-        await asyncio.sleep(dice.choice(PAUSES))
+        await asyncio.sleep(rng.choice(PAUSES))
         if down or loop.time() - lifted < 0.0205 or controller.phase is not Phase.ARMED:
             continue
         assert loss or max(link.level() for link in links.values()) < 1e-3
-    if dice.random() < 0.5:
+    if rng.random() < 0.5:
         await controller.close()
         states = {link.amplifier.state for link in links.values()}
         assert loss or AmplifierState.OPERATION_ENABLED not in states

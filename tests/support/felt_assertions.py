@@ -29,12 +29,12 @@ STROKE = 100e-6  # m; of every ERA in the example
 JUDGED_UP_TO = 25.0  # dB; no model predicts what a quiet finger feels beyond that
 LEVEL_STEP, PHASE_STEP = 1e-4, 0.01  # the wires' own: full strokes, degrees
 COMMANDED, RELEASE = 0.020, 0.010  # s; from the last finger's lift to a command of zero, its ramp
-BUSY = 0.150  # s; what a machine that does other work may add to one lift of several
+BUSY = 0.150  # s; delay that a busy machine may add to one lift of several
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The rig as it is meant, what to ask, and whether onsets are shaped on this wire."""
+    """The true rig, its table and the stream, and whether onsets are shaped on this wire."""
 
     rig: Rig
     table: LocalizationTable
@@ -43,7 +43,7 @@ class Truth:
     is_shaped: bool = True
 
     def asked(self, situation: Situation) -> Question:
-        """What a situation asks of the table."""
+        """The query of a situation."""
         return Question(
             (self.stream.places[situation.felt_at],),
             tuple(self.stream.places[place] for place in situation.quiet),
@@ -69,12 +69,12 @@ class Truth:
         return frequencies, np.einsum("fe,fep->fp", weights, alone)
 
     def fingertip(self, place: str) -> FloatArray:
-        """Its points [m]."""
+        """Points (p, 2) [m] of the fingertip there."""
         return fingertip_points(*self.stream.places[place], self.rig.plate)
 
 
-def patterns_are_the_tables(played: Played, truth: Truth) -> None:
-    """Each situation gives one pattern: the ERAs, frequencies, levels and phases of the table."""
+def patterns_match_table(played: Played, truth: Truth) -> None:
+    """Each situation has one pattern: the ERAs, frequencies, levels and phases of the table."""
     for heard in _touched(played):
         assert len(heard.patterns) == 1, heard.situation
         (reported,) = heard.patterns
@@ -91,8 +91,8 @@ def patterns_are_the_tables(played: Played, truth: Truth) -> None:
             assert set(felt.frequencies) == played_there
 
 
-def plate_answers_as_the_model(played: Played, truth: Truth) -> None:
-    """Sensors find what the direct solver says of that drive; phases count from anywhere in time.
+def plate_response_matches_model(played: Played, truth: Truth) -> None:
+    """Sensors agree with the direct solver for that drive; phases have any common origin.
 
     Within 1 % of the largest: structural damping is viscous in time, and other modes still ring.
     """
@@ -104,8 +104,8 @@ def plate_answers_as_the_model(played: Played, truth: Truth) -> None:
         assert apart <= 0.01, (heard.situation, apart)
 
 
-def localization_is_the_predicted_one(played: Played, truth: Truth) -> None:
-    """Contrast within 1 dB up to 25 dB, level within 1 dB: of the daemon's word and the solver."""
+def localization_matches_prediction(played: Played, truth: Truth) -> None:
+    """Contrast within 1 dB up to 25 dB, level within 1 dB, of daemon and solver."""
     for heard in _touched(played):
         target = heard.steady[heard.situation.felt_at]
         level = mean_level_db_sl(target.frequencies, target.amplitudes)
@@ -128,7 +128,7 @@ def localization_is_the_predicted_one(played: Played, truth: Truth) -> None:
             assert abs(min(measured, JUDGED_UP_TO) - judged) <= 1, (measured, predicted)
 
 
-def onset_is_the_predicted_one(played: Played, truth: Truth) -> None:
+def onset_matches_prediction(played: Played, truth: Truth) -> None:
     """Contrast of the peaks over the first 100 ms from rest within 2 dB, shaped or plain."""
     timing = Timing(truth.table)
     first, *_ = _touched(played)
@@ -143,8 +143,8 @@ def onset_is_the_predicted_one(played: Played, truth: Truth) -> None:
     assert abs(min(measured, JUDGED_UP_TO) - judged) <= 2, (measured, predicted)
 
 
-def silence_comes_in_time(played: Played, truth: Truth) -> None:
-    """The last finger up: levels are zero within 20 ms and the ramp, by the amplifier's clock.
+def silence_is_on_time(played: Played, truth: Truth) -> None:
+    """After the last lift, levels are zero within 20 ms and the ramp, by the amplifier's clock.
 
     At the best of the lifts, and at none later than what a busy machine may add.
     """
@@ -158,7 +158,7 @@ def silence_comes_in_time(played: Played, truth: Truth) -> None:
     assert max(late) <= COMMANDED + RELEASE + BUSY, late
 
 
-def plate_follows(played: Played, truth: Truth) -> None:
+def plate_decays(played: Played, truth: Truth) -> None:
     """After that the plate rings on by itself, and less: by 13 dB from the steady state at once.
 
     In the last 20 ms of a pause of 0.2 s or more. Modes above 40 Hz fade by 6 /s and faster, and
@@ -173,8 +173,8 @@ def plate_follows(played: Played, truth: Truth) -> None:
     assert min(left) < 0.05, left
 
 
-def nothing_beyond_limits(played: Played, truth: Truth) -> None:
-    """Levels within limits and only while a finger is down; at last all is off, without a fault."""
+def levels_stay_within_limits(played: Played, truth: Truth) -> None:
+    """Levels within limits and only while a finger is down; the end is off, without a fault."""
     spans = [(heard.begin, heard.end + RELEASE + BUSY) for heard in _touched(played)]
     for moment, levels in played.polls:
         assert max(levels) <= LEVEL_LIMIT, levels
@@ -188,8 +188,8 @@ def nothing_beyond_limits(played: Played, truth: Truth) -> None:
     assert played.exit_status == 0, played.exit_status
 
 
-def witness_is_content(played: Played, truth: Truth) -> None:
-    """Decoders of its own saw frames, and no rule broken in them."""
+def witness_reports_nothing(played: Played, truth: Truth) -> None:
+    """The witness decoded frames and found no violation."""
     found = [str(violation) for violation in played.violations]
     assert not found, found
 
@@ -197,20 +197,20 @@ def witness_is_content(played: Played, truth: Truth) -> None:
 CHECKS: Mapping[str, Callable[[Played, Truth], None]] = {
     check.__name__: check
     for check in (
-        patterns_are_the_tables,
-        plate_answers_as_the_model,
-        localization_is_the_predicted_one,
-        onset_is_the_predicted_one,
-        silence_comes_in_time,
-        plate_follows,
-        nothing_beyond_limits,
-        witness_is_content,
+        patterns_match_table,
+        plate_response_matches_model,
+        localization_matches_prediction,
+        onset_matches_prediction,
+        silence_is_on_time,
+        plate_decays,
+        levels_stay_within_limits,
+        witness_reports_nothing,
     )
 }
 
 
-def responses_apart(one: Played, other: Played) -> list[float]:
-    """How far the plate's answers to two streams are apart, in shares of the largest."""
+def response_differences(one: Played, other: Played) -> list[float]:
+    """Differences of the plate's responses to two streams, relative to the largest."""
     return [
         _apart(mine.phasors, yours.phasors)
         for mine, yours in zip(_touched(one), _touched(other), strict=True)
@@ -219,7 +219,7 @@ def responses_apart(one: Played, other: Played) -> list[float]:
 
 
 def rounding(played: Played, truth: Truth) -> list[float]:
-    """What rounding every level and phase to the amplifier's steps may change, in such shares."""
+    """Bounds of the relative change by rounding every level and phase to the amplifier's steps."""
     points = np.array(list(SENSORS.values()))
     shares = []
     for heard in _touched(played):

@@ -206,7 +206,7 @@ class _Run:
         devices = {}
         for number, name in enumerate(self.bench.amplifiers, start=1):
             faults = Faults(begin=self.loop.time(), seed=self.plan.seed)
-            device = SimulatedDevice(self.bench, name, number=number, faults=faults)
+            device = SimulatedDevice(self.bench, name, address=number, faults=faults)
             device.exchange = self._exchanging(name, device.exchange)  # type: ignore[method-assign]
             device.listen(
                 lambda event, name=name: self.note("amplifier", name, event.state, event.fault)  # type: ignore[misc]

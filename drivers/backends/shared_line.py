@@ -13,17 +13,17 @@ _OpenT = TypeVar("_OpenT", bound=Port | Adapter)
 
 
 class SharedLine(ABC, Generic[_OpenT]):
-    """A serial line, a Modbus line or a CAN bus; its users are known by a number.
+    """A serial line, a Modbus line or a CAN bus; its users are identified by a number.
 
-    Joining waits while it is being opened or closed. A loss holds for every user until that user
-    joins again; the first one to do so reopens the line. place: its name in messages.
+    `join` blocks during open and close. After a loss each user must rejoin; the first one to do so
+    reopens the line. name: of the line, in messages.
     """
 
-    number: ClassVar[str]
-    """Name of the number on this wire."""
+    address_term: ClassVar[str]
+    """What this wire calls the number of a user: address, unit or node."""
 
-    def __init__(self, place: str) -> None:
-        self.place = place
+    def __init__(self, name: str) -> None:
+        self.name = name
         self._users: dict[int, Callable[[str], None]] = {}
         self._notified: set[int] = set()  # of the loss, and not joined since
         self._loss: str | None = None
@@ -37,8 +37,8 @@ class SharedLine(ABC, Generic[_OpenT]):
         """
         if number in self._users:
             raise LinkError(
-                f"{self.number} {number} on {self.place} is already open in this program; give "
-                f"each amplifier its own {self.number}"
+                f"{self.address_term} {number} on {self.name} is already open in this program; "
+                f"give each amplifier its own {self.address_term}"
             )
         self._users[number] = on_loss
         try:
@@ -59,7 +59,7 @@ class SharedLine(ABC, Generic[_OpenT]):
         self._notified.discard(number)
         if self._users:
             return
-        self._fail_pending(f"{self.place} was closed")
+        self._fail_pending(f"{self.name} was closed")
         async with self._changing:
             if not self._users:  # no user has joined meanwhile
                 await self._shut()
@@ -75,8 +75,8 @@ class SharedLine(ABC, Generic[_OpenT]):
             raise LinkError(self._loss)
         if number in self._notified:
             raise LinkError(
-                f"{self.place} was lost, and {self.number} {number} has not been reopened; open "
-                "that amplifier again"
+                f"{self.name} was lost, and {self.address_term} {number} has not been reopened; "
+                "open that amplifier again"
             )
 
     def _ready(self) -> _OpenT:
@@ -84,7 +84,7 @@ class SharedLine(ABC, Generic[_OpenT]):
         self.raise_if_lost()
         opened = self._opened  # a thread may call while it is being closed
         if opened is None:
-            raise LinkError(f"{self.place} is not open; open the amplifier first")
+            raise LinkError(f"{self.name} is not open; open the amplifier first")
         return opened
 
     def _lose(self, what: str) -> None:

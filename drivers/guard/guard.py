@@ -91,7 +91,7 @@ class Guard:
         return self._limits
 
     def check(self, command_set: CommandSet) -> SafeCommandSet:
-        """Check a set; CommandRefused names channel and reason.
+        """Check a set. Raises CommandRefused with channel and reason.
 
         valid_for is shortened to the on-time and duty that are left.
         """
@@ -125,7 +125,7 @@ class Guard:
         )
 
     def check_envelope(self, envelope: Envelope) -> SafeEnvelope:
-        """Check an envelope; CommandRefused names knot and reason.
+        """Check an envelope. Raises CommandRefused with knot and reason.
 
         Sets that refer to its slot are checked with it from now on: load it before them.
         """
@@ -139,10 +139,10 @@ class Guard:
         return safe
 
     def silence(self, token: int, channels: Collection[int], *, ramp: float) -> SafeCommandSet:
-        """Make a set with level zero on these channels (unnamed ones fall silent too); never fails.
+        """Make a set with level zero on these channels; never fails.
 
-        Unknown channels are skipped, a ramp [s] is clipped into range, and an invalid token becomes
-        the one after the last. Channels fall silent along the ramp, without endings.
+        Channels not listed are silenced as well; an invalid token becomes the next valid one.
+        Unknown channels are skipped, a ramp [s] is clipped into range, no endings are played.
         """
         if not is_token(token):
             token = token_after(self._last_token)

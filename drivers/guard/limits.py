@@ -67,7 +67,7 @@ def limits_in_force(configured: GuardLimits, capabilities: Capabilities) -> Guar
             "the rig file or use another amplifier"
         )
     if limits.level < 0:
-        raise CommandError(f"level limit must be between 0 and 1, got {limits.level:g}")
+        raise CommandError(f"level limit must be at least 0, got {limits.level:g}")
     return limits
 
 

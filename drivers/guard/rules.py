@@ -101,8 +101,7 @@ def _check_channels(command_set: CommandSet, context: GuardContext) -> None:
         channel = command.channel
         if not _is_integer(channel, low=0, high=highest):
             raise CommandRefused(
-                f"channel {channel!r} does not exist; channel must be 0 to {highest}",
-                channel=channel,
+                f"channel must be 0 to {highest}, got {channel!r}", channel=channel
             )
         if channel in seen:
             raise CommandRefused(f"channel {channel} occurs twice in one set", channel=channel)

@@ -36,7 +36,7 @@ class _Network(canopen.Network):
 class CanBus(SharedLine[Adapter]):
     """A bus, numbered by nodes; see `can_bus`."""
 
-    number = "node"
+    address_term = "node"
 
     def __init__(self, url: CanBusUrl) -> None:
         super().__init__(str(url))
@@ -55,7 +55,7 @@ class CanBus(SharedLine[Adapter]):
         try:
             self.network.notify(frame.id, bytearray(frame.data), clock.now())
         except Exception:  # a frame of another device must not end the reader
-            _logger.debug("%s: frame %03x raised an exception", self.place, frame.id, exc_info=True)
+            _logger.debug("%s: frame %03x raised an exception", self.name, frame.id, exc_info=True)
 
 
 def can_bus(url: CanBusUrl) -> CanBus:

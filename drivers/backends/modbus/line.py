@@ -34,7 +34,7 @@ _RTU_OVERHEAD = 3  # bytes of a response around its PDU
 class ModbusLine(SharedLine[Port]):
     """A line, numbered by units; see `modbus_line`."""
 
-    number = "unit"
+    address_term = "unit"
 
     def __init__(self, url: ModbusUrl) -> None:
         super().__init__(url.place)
@@ -97,7 +97,7 @@ class ModbusLine(SharedLine[Port]):
                 raise
             except TimeoutError:
                 raise LinkTimeout(
-                    f"no response from unit {unit} on {self.place} within {timeout * 1e3:g} ms; "
+                    f"no response from unit {unit} on {self.name} within {timeout * 1e3:g} ms; "
                     "check that the amplifier is switched on and has this unit"
                     + (f" and {self.url.baud} baud" if self.url.device else "")
                 ) from None

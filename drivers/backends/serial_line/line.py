@@ -17,7 +17,7 @@ class SerialLine(SharedLine[Port]):
     turns: arbitrates between amplifiers, since only one may reply at a time.
     """
 
-    number = "address"
+    address_term = "address"
 
     def __init__(self, port: str, *, baud: int) -> None:
         super().__init__(port)
@@ -47,7 +47,7 @@ class SerialLine(SharedLine[Port]):
     async def _open(self) -> Port:
         self._reader = FrameReader()
         return await open_port(
-            self.place, baud=self.baud, on_data=self._received, on_loss=self._lose
+            self.name, baud=self.baud, on_data=self._received, on_loss=self._lose
         )
 
     def _received(self, data: bytes) -> None:

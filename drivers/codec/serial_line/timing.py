@@ -27,24 +27,24 @@ class SerialTimes(WireTimes):
 
     def apply(self, channels: int) -> float:
         """Duration of an apply with this number of channels, without its reply."""
-        return self._of(frame_length(_SET_HEAD + _COMMAND * channels))
+        return self._duration(frame_length(_SET_HEAD + _COMMAND * channels))
 
     def round_trip(self, channels: int) -> float:
         """See `WireTimes`."""
         answer = frame_length(_ACHIEVED_HEAD + _COMMAND * channels)
-        return self.apply(channels) + self._of(answer)
+        return self.apply(channels) + self._duration(answer)
 
     def commit(self) -> float:
         """See `WireTimes`."""
-        return self._of(frame_length(_COMMIT))
+        return self._duration(frame_length(_COMMIT))
 
     def loading(self, knots: int) -> float:
         """See `WireTimes`."""
-        return self._of(frame_length(_ENVELOPE_HEAD + _KNOT * knots) + frame_length(_LOADED))
+        return self._duration(frame_length(_ENVELOPE_HEAD + _KNOT * knots) + frame_length(_LOADED))
 
     def exchange(self, request_length: int) -> float:
         """Duration of a request of this length and of a reply as long, or a Status."""
-        return self._of(request_length + max(request_length, _STATUS_LENGTH))
+        return self._duration(request_length + max(request_length, _STATUS_LENGTH))
 
-    def _of(self, length: int) -> float:
+    def _duration(self, length: int) -> float:
         return length * _BITS_PER_BYTE / self.baud

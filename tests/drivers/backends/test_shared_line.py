@@ -24,7 +24,7 @@ from drivers.protocol.messages import Arm, Ping
 class Line(SharedLine[Port]):
     """A line that records events; `blocks` delays opening and closing."""
 
-    number = "place"
+    address_term = "place"
 
     def __init__(self) -> None:
         super().__init__("the line")

@@ -69,6 +69,7 @@ def refused(*options: object) -> str:
     return " ".join(done.stderr.split())
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_gateway_exits_within_a_second_of_a_signal(
     daemon: ScriptedDaemon, tmp_path: Path, number: signal.Signals
@@ -147,9 +148,7 @@ def test_gateway_serves_tls(
         with gateway.connect() as connection:
             connection.sendall(upgrade(gateway, origin=f"https://{gateway.host}"))
             assert connection.recv(1 << 16).startswith(b"HTTP/1.1 101 ")
-            signalled = time.monotonic()
             assert gateway.terminate() == 0
-            assert time.monotonic() - signalled < 1.0
 
 
 class _Verified(ssl.SSLContext):

@@ -270,7 +270,7 @@ def test_results_have_the_documented_keys(background: BackgroundFarEnd) -> None:
     """Those of docs/reference/commands.md."""
     page = (Path(__file__).parents[2] / "docs" / "reference" / "commands.md").read_text("utf-8")
     (row,) = re.findall(r"^\| `era amp status`.* \| (.*) \|$", page, re.MULTILINE)
-    common, of_status, of_drive = re.split(r"; of `status`|, of `drive`", row)
+    common, of_status, of_drive = re.split(r"; \w+ `status`|, \w+ `drive`", row)
     (wire,) = re.findall(r"^\| `era amp identify` .*: (.*) \|$", page, re.MULTILINE)
     beside = {"status": of_status + wire, "drive": of_drive, "stop": "", "clear": ""}
     for command, more in beside.items():

@@ -47,10 +47,10 @@ def saying(*answers: bytes) -> Serve:
     return serve
 
 
-async def test_a_question_that_is_refused_leaves_the_connection_to_the_next(
+async def test_refused_request_keeps_the_connection(
     tmp_path: Path,
 ) -> None:
-    """What the plate says is told with what was asked; the next answer is the next question's."""
+    """The error quotes the plate's reason; the next reply belongs to the next request."""
     answers = saying(b'{"error": "finger is 1; it must be a text"}\n', b'{"time_s": 1.5}\n')
     async with listening(tmp_path / "sock", answers) as control:
         with pytest.raises(LinkError, match=r"touch.*finger is 1"):
@@ -59,8 +59,8 @@ async def test_a_question_that_is_refused_leaves_the_connection_to_the_next(
 
 
 @pytest.mark.parametrize("answer", [b"", b'{"time_s": '], ids=["nothing", "half a line"])
-async def test_a_plate_that_ends_is_told_and_asked_anew(tmp_path: Path, answer: bytes) -> None:
-    """With what to do; the next question is for whoever listens there then."""
+async def test_plate_control_reconnects_after_the_plate_ends(tmp_path: Path, answer: bytes) -> None:
+    """The error has a remedy; the next request opens a new connection."""
     async with listening(tmp_path / "sock", saying(answer)) as control:
         with pytest.raises(LinkError, match=f"{tmp_path}/sock.*; start it again"):
             await control.ask(HELLO)
@@ -70,10 +70,10 @@ async def test_a_plate_that_ends_is_told_and_asked_anew(tmp_path: Path, answer: 
         await control.close()
 
 
-async def test_a_plate_that_hangs_is_waited_for_so_long(
+async def test_plate_control_times_out_when_the_plate_hangs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its answer, should it still come, is not taken for that of the next question."""
+    """A late reply is not taken for that of the next request."""
     monkeypatch.setattr(plate_control, "_REPLY_TIMEOUT", 0.02)
     late = asyncio.Event()
 
@@ -101,16 +101,16 @@ async def test_a_plate_that_hangs_is_waited_for_so_long(
     ],
     ids=["the daemon", "a web server", "no object", "no line"],
 )
-async def test_what_is_no_plate_is_told_by_what_it_says(tmp_path: Path, said: bytes) -> None:
-    """A path is easily mistaken for another's; no more is shown than makes it known."""
+async def test_invalid_plate_reply_is_quoted_in_the_error(tmp_path: Path, said: bytes) -> None:
+    """The error quotes only the begin of a reply from another program."""
     async with listening(tmp_path / "sock", saying(said)) as control:
         with pytest.raises(LinkError, match=r"/sock: .*--control") as caught:
             await control.ask(HELLO)
     assert len(str(caught.value)) < 300
 
 
-async def test_an_older_plate_has_no_sensors(tmp_path: Path) -> None:
-    """Version 1 of the lines of control knew none; no sensor is asked for."""
+async def test_older_plate_has_no_sensors(tmp_path: Path) -> None:
+    """Version 1 of the control protocol has no sensors; none is requested."""
     old = saying(b'{"protocol": "era-sim-control", "version": 1, "clock": "wall"}\n')
     async with listening(tmp_path / "sock", old):
         with pytest.raises(LinkError, match="restart"):

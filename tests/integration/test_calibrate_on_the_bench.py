@@ -52,7 +52,7 @@ def run(*arguments: object) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
-def test_the_bench_measures_what_the_model_says(rig: Rig) -> None:
+def test_bench_measurement_agrees_with_the_model(rig: Rig) -> None:
     """Stepped sine in time with silent sensors against the steady state in frequency.
 
     What differs is the structural damping, viscous in time: half a percent in the median.
@@ -70,7 +70,9 @@ def test_the_bench_measures_what_the_model_says(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("ending", ["uff", "csv"])
-def test_the_truth_is_found(rig: Rig, measured: Path, tmp_path: Path, ending: str) -> None:
+def test_calibration_finds_the_true_parameters(
+    rig: Rig, measured: Path, tmp_path: Path, ending: str
+) -> None:
     """Every parameter within 2 %, faults of the measurement named, and a rig that can be used."""
     new = tmp_path / "new.yaml"
     status, said = run(

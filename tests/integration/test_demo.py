@@ -66,7 +66,7 @@ def demo(environment, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("wire", ["serial", "can", "sim"])
-def test_every_touch_is_felt_as_predicted(wire, capture, demo):
+def test_demo_contacts_feel_the_prediction(wire, capture, demo):
     """Each touch has its row; measured contrast and level are the predicted ones within 3 dB."""
     result = demo("--wire", wire, "--touches", capture)
     assert result["wire"] == wire
@@ -95,7 +95,7 @@ def test_every_touch_is_felt_as_predicted(wire, capture, demo):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_panels_recording_is_followed_over_modbus(demo, tmp_path):
+def test_demo_plays_a_panel_recording_over_modbus(demo, tmp_path):
     """An evemu recording of two fingers gives a row for each contact, by the recording's times."""
     recording = tmp_path / "panel.events"
     recording.write_text(
@@ -118,7 +118,7 @@ def test_a_panels_recording_is_followed_over_modbus(demo, tmp_path):
         assert row["measured_level_db_sl"] == pytest.approx(row["predicted_level_db_sl"], abs=3)
 
 
-def test_a_far_end_that_dies_is_reported_in_a_paragraph(capture, environment, tmp_path):
+def test_demo_reports_a_far_end_that_ended(capture, environment, tmp_path):
     """Killing the amplifiers' process midway ends the run with status 3 and one paragraph."""
     process = subprocess.Popen(
         [str(ERA), "demo", "--touches", str(capture), "--out", str(tmp_path)],
@@ -137,7 +137,7 @@ def test_a_far_end_that_dies_is_reported_in_a_paragraph(capture, environment, tm
     assert "Next:" not in first_row + rest
 
 
-def test_no_far_end_outlives_a_demonstration_that_is_killed(capture, environment, tmp_path):
+def test_far_end_ends_when_the_demo_is_killed(capture, environment, tmp_path):
     """After SIGKILL of the command, the amplifiers' process ends by itself."""
     with subprocess.Popen(
         [str(ERA), "demo", "--touches", str(capture), "--out", str(tmp_path)],

@@ -40,7 +40,7 @@ def measured() -> dict[str, Any]:
     pytest.fail("the daemon lost its amplifier every time: leave the machine alone, then try again")
 
 
-def test_every_command_answers_a_touch(measured: dict[str, Any]) -> None:
+def test_every_command_matches_a_touch(measured: dict[str, Any]) -> None:
     """Each set on the wire plays what the table answers for a touch, each for a newer one."""
     assert measured["sent"] == TOUCHES
     assert measured["unmatched"] == 0
@@ -50,7 +50,7 @@ def test_every_command_answers_a_touch(measured: dict[str, Any]) -> None:
     assert len(touches) > 1
 
 
-def test_a_touch_that_waited_longer_is_older(measured: dict[str, Any]) -> None:
+def test_latency_includes_the_wait_before_reading(measured: dict[str, Any]) -> None:
     """Where a set answers the touch after the one before, both latencies are one; else more."""
     newest, oldest = np.array(measured["newest_ms"]), np.array(measured["oldest_ms"])
     skipped = np.diff(measured["touch"], prepend=measured["touch"][0] - 1) > 1
@@ -59,7 +59,7 @@ def test_a_touch_that_waited_longer_is_older(measured: dict[str, Any]) -> None:
     assert (oldest[skipped] > newest[skipped]).all()
 
 
-def test_the_daemon_says_what_is_seen_from_outside(measured: dict[str, Any]) -> None:
+def test_daemon_latency_agrees_with_the_measured_one(measured: dict[str, Any]) -> None:
     """It counts the same commands, and never more time than passes outside around its own."""
     own = measured["own"]
     outside = np.array(measured["oldest_ms"])

@@ -134,7 +134,7 @@ def test_responses_of_a_real_plate_are_read_from_a_file(tmp_path: Path, ending: 
     assert "INVERTED" not in result.stdout
 
 
-async def test_what_cannot_be_checked_is_said(tmp_path: Path) -> None:
+async def test_rig_check_reports_skipped_checks(tmp_path: Path) -> None:
     """No sensors, both kinds, no listener, levels and frequencies out of range."""
     rig = write_rig(tmp_path / "rig.yaml", mesh=MESH)
     unserved = ("--sensors", str(tmp_path / "no"))

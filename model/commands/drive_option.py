@@ -57,8 +57,8 @@ def beyond_limits(excitation: Excitation, rig: Rig) -> str | None:
     if not beyond:
         return None
     return (
-        f"{', '.join(beyond)}: outside the rig's limits.frequency of {low:g} to {high:g} Hz, which "
-        "amplifiers are kept to"
+        f"{', '.join(beyond)}: outside the rig's limits.frequency of {low:g} to {high:g} Hz; the "
+        "guard enforces this range"
     )
 
 

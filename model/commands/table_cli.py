@@ -56,7 +56,7 @@ def query(
         return
     if not target:
         raise InputError(
-            "at least one target is needed; give --target X,Y, metres, or --batch FILE"
+            "targets must be at least one, got none; give --target X,Y, metres, or --batch FILE"
         )
     question = Question(
         targets=tuple(parse_point(text, what="--target") for text in target),

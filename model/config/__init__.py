@@ -1,1 +1,1 @@
-"""What people write: configuration files, values with units, positions and ranges."""
+"""User input: configuration files, values with units, positions and ranges."""

@@ -47,12 +47,12 @@ _KINDS: PluginRegistry[ConfigKind] = PluginRegistry(
 
 
 def kind_called(name: str) -> ConfigKind:
-    """The kind of a name; raises InputError for an unknown one."""
+    """Return the kind of a name; raises InputError for an unknown one."""
     return _KINDS.find(name)
 
 
 def kind_of(document: Document) -> ConfigKind:
-    """The kind of a document: a rig unless another kind recognises it."""
+    """Return the kind of a document: a rig unless another kind recognises it."""
     for name in _KINDS.names():
         if name != DEFAULT_KIND and (kind := kind_called(name)).recognises(document):
             return kind

@@ -24,9 +24,9 @@ class Grid:
     def __post_init__(self) -> None:
         """Refuse a grid without cells or with too many."""
         if not (is_whole(self.nx) and is_whole(self.ny)):
-            raise InputError(f"grid {self}: cells are counted in whole numbers, as in Grid(12, 9)")
+            raise InputError(f"grid: numbers of cells must be integers, got {self}")
         if not (1 <= self.nx <= 200 and 1 <= self.ny <= 200):
-            raise InputError(f"grid {self}: 1x1 to 200x200 cells are possible")
+            raise InputError(f"grid must be 1x1 to 200x200 cells, got {self}")
 
     def __str__(self) -> str:
         return f"{self.nx}x{self.ny}"

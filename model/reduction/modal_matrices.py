@@ -50,17 +50,21 @@ def modal_matrices(
     *,
     loads: Sequence[PointLoad] = (),
     contacts: Sequence[PointLoad] = (),
-    held: FloatArray | None = None,
+    attachment_shapes: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """M, C, K (r, r) of the plate on its ERAs, with what it carries and the fingers in contact.
 
-    held: shapes at the ERAs, loads and contacts (n, r) where they are known already. Raises
+    attachment_shapes: shapes at the ERAs, loads and contacts (n, r) where known already. Raises
     InputError for ERAs that do not support the plate.
     """
     check_supported(reduced.plate, eras, loads=loads)
     fixed = [PointLoad(e.x, e.y, e.stiffness, e.damping, e.bolt_mass) for e in eras]
     fixed += loads
-    phi = reduced.at(load_positions([*fixed, *contacts])) if held is None else held
+    phi = (
+        reduced.at(load_positions([*fixed, *contacts]))
+        if attachment_shapes is None
+        else attachment_shapes
+    )
     elastic = np.diag(reduced.omega**2)
     M, C, K = _contribution(phi[: len(fixed)], fixed)
     M += np.eye(len(elastic))

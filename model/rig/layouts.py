@@ -101,7 +101,7 @@ def diagonal_pair(eras: Sequence[Era]) -> tuple[int, int]:
 
 def _pairs(eras: Sequence[Era]) -> list[tuple[int, int]]:
     if len(eras) < 2:
-        raise InputError(f"driving a pair needs two ERAs, got {len(eras)} in this rig")
+        raise InputError(f"ERAs of the rig must be at least two to drive a pair, got {len(eras)}")
     return list(combinations(range(len(eras)), 2))
 
 

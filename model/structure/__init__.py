@@ -1,1 +1,1 @@
-"""What vibrates: the plate, what it is made of, the ERAs under it and what else touches it."""
+"""The vibrating structure: plate, materials, ERAs, and other attachments."""

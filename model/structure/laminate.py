@@ -61,7 +61,7 @@ class Layer:
 
     @property
     def flexural_rigidity(self) -> float:
-        """Of the layer by itself [N m]."""
+        """Flexural rigidity of the layer by itself [N m]."""
         return self.extensional_stiffness * self.thickness**2 / 12
 
 
@@ -98,7 +98,7 @@ class Laminate:
 
     @property
     def thickness(self) -> float:
-        """Of all layers together [m]."""
+        """Thickness of all layers together [m]."""
         return sum(layer.thickness for layer in self.layers)
 
     @property

@@ -70,7 +70,7 @@ _KNOWN = (
 )
 
 KNOWN_MATERIALS = {known.material.name: known for known in _KNOWN}
-"""Those that come with this package."""
+"""Materials that come with this package, by name."""
 
 _MATERIALS: PluginRegistry[KnownMaterial] = PluginRegistry(
     "material",

@@ -90,7 +90,7 @@ def empty_results(count: int) -> CaseResults:
 def study_problem(rig: Rig, cases: Cases, frequencies: FloatArray) -> StudyProblem:
     """The problem of a study; raises InputError for frequencies (f,) [Hz] out of range."""
     if len(frequencies) == 0:
-        raise InputError("a study needs at least one frequency")
+        raise InputError("frequencies of a study must be at least one, got none")
     check_frequencies(rig.plate, rig.mesh, frequencies)
     return StudyProblem(rig, cases.positions, frequencies)
 

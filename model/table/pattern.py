@@ -34,7 +34,7 @@ class Concentration:
 class Pattern:
     """An excitation with its ramp [s] and its predicted measures at the fingertips.
 
-    level_db_sl: at the target, the least of several; contrast_db: target to the loudest quiet
+    level_db_sl: at the weakest target; contrast_db: target to the loudest quiet
     point, by peak acceleration; quiet_level_db_sl: at the loudest quiet point; both None without
     quiet fingers. surroundings_contrast_db: to the plate farther than 50 mm, root mean square;
     None with quiet fingers. The rest is None unless computed: contrast_bound_db: upper bound of

@@ -88,7 +88,7 @@ def _quietest_onset(choice: Choice, onset_contrast: OnsetContrast) -> DriveVecto
 
 
 def _choose_exactly(question: Question, candidates: Candidates) -> Pattern:
-    """Choose among all `switched` patterns of up to so many ERAs, with a bound."""
+    """Choose among all `switched` patterns of at most `eras_at_most` ERAs, with a bound."""
     fields, count = candidates.fields, question.eras_at_most
     found = search_exactly(fields, eras_at_most=count, time_limit=question.search_time)
     if found.drive is None and not found.is_complete:

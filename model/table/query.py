@@ -83,7 +83,7 @@ def query_table(
 
 
 def query_as_json(table: LocalizationTable, question: Question, timing: Timing) -> dict[str, Any]:
-    """Query a table with all measures; the JSON object of `era table query`."""
+    """Query a table with all measures and return the JSON object of `era table query`."""
     pattern, elapsed = query_table(table, question, timing)
     concentration = pattern.concentration
     return {
@@ -120,7 +120,7 @@ def prepared_timing(table: LocalizationTable) -> Timing:
 def envelopes_as_json(
     envelopes: Envelopes | None, table: LocalizationTable
 ) -> dict[str, Any] | None:
-    """Level 0..1 of the stroke and phase at the start and at every knot, by ERA."""
+    """Return level 0..1 of the stroke and phase at the start and at every knot, by ERA."""
     if envelopes is None:
         return None
     strokes = {era.name: era.stroke for era in table.eras}

@@ -7,7 +7,6 @@ from typing import TypeAlias
 import numpy as np
 
 from model.config.points import in_metres
-from model.counting import counted
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.finger import MAX_CONTACTS
@@ -33,8 +32,8 @@ class Question:
     are searched exactly, up to search_time [s], with an upper bound where the search is cut short;
     this is too slow for live use. envelopes: whether amplifiers play any (`model.table.timing`).
 
-    With softer_db, level and contrast of the answer are those of the target that is least served,
-    relative to its own level.
+    With softer_db, level and contrast of the answer are those of the weakest target, relative to
+    its own level.
     """
 
     targets: tuple[Point, ...]
@@ -63,7 +62,7 @@ class Question:
             )
         if self.softer_db and len(self.softer_db) != len(self.targets):
             raise InputError(
-                f"softer_db must have a value for each of {counted(len(self.targets), 'target')}, "
+                f"softer_db must have one value per target ({len(self.targets)}), "
                 f"got {len(self.softer_db)}"
             )
         for softer in self.softer_db:
@@ -109,7 +108,7 @@ class Question:
                     )
 
     def drive_mode_on(self, own: str, *, era_count: int) -> str:
-        """Return the drive mode on a table of so many ERAs with its own default mode.
+        """Return the drive mode on a table of the given number of ERAs and default mode.
 
         Raises InputError if it is not playable, or the number of ERAs cannot be met.
         """

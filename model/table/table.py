@@ -227,7 +227,7 @@ class LocalizationTable:
     def in_time(self) -> PlateInTime:
         """The plate on its ERAs in time."""
         reduced = ReducedOnRaster(self.plate, self.omega, self.raster, self.shapes)
-        return plate_in_time(reduced, self.eras, loads=self.loads, held=self.held)
+        return plate_in_time(reduced, self.eras, loads=self.loads, attachment_shapes=self.held)
 
     @cached_property
     def onsets(self) -> RampedOnsets | None:

@@ -42,12 +42,12 @@ from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes, peak_acceleration, tone_amplitudes
 
 CONTENT_TOLERANCE = 1e-4
-"""Of content, relative L2; of the paper's plate it is some 1e-5, on its coarsest mesh 2e-5."""
+"""Relative L2 error of the content; the paper's plate has some 1e-5, on its coarsest mesh 2e-5."""
 
 ROUNDING_DB = 0.01
 
 RASTER_ERROR = 2e-4
-"""Of a field between the points of the raster, relative to its root mean square over the plate."""
+"""Interpolation error of a field on the raster, relative to its root mean square."""
 
 TIME_TOLERANCE_DB = 1.0
 MAX_CONTRAST_IN_TIME_DB = 25.0
@@ -108,7 +108,7 @@ class AnswerCheck:
 
     @property
     def time_tolerance_db(self) -> float:
-        """Of the contrast in time."""
+        """Tolerance of the contrast in time."""
         return TIME_TOLERANCE_DB + self.contrast_tolerance_db
 
 
@@ -175,10 +175,11 @@ def verify_table(
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Verification:
-    """Recompute content and so many answers to random contacts, with 1, 2, 3 quiet ones in turn.
+    """Recompute content and answers to random contacts, with 1, 2, 3 quiet ones in turn.
 
-    The rig must be the table's own: check the fingerprint when loading. progress: called with how
-    many answers are done, of how many. Raises InputError where no contacts have an answer.
+    The rig must be the table's own: check the fingerprint when loading. samples: number of answers;
+    progress: called with the numbers of answers done and of all. Raises InputError where no
+    contacts have an answer.
     """
     rng = np.random.default_rng(seed)
     matrices = assemble(rig.plate, table.mesh)

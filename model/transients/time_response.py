@@ -4,7 +4,7 @@
 
 q are the coordinates of the reduced free plate, phi its shapes at an ERA, y the motion of the
 ERA's base; M, C and K are those of `model.reduction.modal_matrices`. The first-order system is
-diagonalised once for as long as nothing comes or goes; the base moves in terms with closed-form
+diagonalised once for each set of attachments; the base moves in terms with closed-form
 particular solutions (`model.transients.base_motion`), so no step size enters and no error grows
 with time.
 
@@ -77,11 +77,11 @@ class PlateInTime:
         """Particular solutions for terms of one ERA's base, one each."""
         solutions = []
         for term in terms:
-            still, growing = self._unit_solutions(era, term.omega)
+            constant, linear = self._unit_solutions(era, term.omega)
             solutions.append(
-                ParticularSolution(term, still * term.c0 + growing * term.c1, still * term.c1)
+                ParticularSolution(term, constant * term.c0 + linear * term.c1, constant * term.c1)
                 if term.c1
-                else ParticularSolution(term, still * term.c0, np.zeros_like(still))
+                else ParticularSolution(term, constant * term.c0, np.zeros_like(constant))
             )
         return solutions
 
@@ -90,10 +90,10 @@ class PlateInTime:
         key = (era, omega)
         if key not in self._solved:
             a0, _ = self.particular([era] * 2, np.full(2, 1j * omega), [1.0, 0.0], [0.0, 1.0])
-            still, growing = a0 @ self.displacement.T
+            constant, linear = a0 @ self.displacement.T
             if len(self._solved) >= _MAX_CACHED_SOLUTIONS:
                 self._solved.clear()
-            self._solved[key] = still, growing
+            self._solved[key] = constant, linear
         return self._solved[key]
 
     @cached_property
@@ -117,15 +117,15 @@ class PlateInTime:
         k = np.array([self.eras[era].stiffness for era in eras])
         c = np.array([self.eras[era].damping for era in eras])
         c0, c1 = np.asarray(c0), np.asarray(c1)
-        push = self.participation.T[list(eras)]
+        input_vector = self.participation.T[list(eras)]
         for row, era in enumerate(eras):
             if self.eras[era].gains:
-                push[row] *= self.eras[era].gain(s[row].imag / (2 * np.pi))
-        force0 = push * (k * c0 + c * (c1 + s * c0))[:, None]
-        force1 = push * ((k + c * s) * c1)[:, None]
-        gap = s[:, None] - self.eigenvalues
-        a1 = force1 / gap
-        return (force0 - a1) / gap, a1
+                input_vector[row] *= self.eras[era].gain(s[row].imag / (2 * np.pi))
+        force0 = input_vector * (k * c0 + c * (c1 + s * c0))[:, None]
+        force1 = input_vector * ((k + c * s) * c1)[:, None]
+        denominator = s[:, None] - self.eigenvalues
+        a1 = force1 / denominator
+        return (force0 - a1) / denominator, a1
 
     @cached_property
     def acceleration(self) -> ComplexArray:
@@ -168,19 +168,21 @@ def plate_in_time(
     *,
     loads: Sequence[PointLoad] = (),
     contacts: Sequence[PointLoad] = (),
-    held: FloatArray | None = None,
+    attachment_shapes: FloatArray | None = None,
 ) -> PlateInTime:
     """Diagonalise the equations of motion of a reduced plate on its ERAs, with what it carries.
 
-    contacts: fingers that rest on it now; held: shapes at the ERAs, loads and contacts (n, r) where
-    they are known already. Raises InputError for ERAs that do not hold the plate (fewer than three,
-    or all in one line), and for a mode that is damped critically.
+    contacts: fingers that rest on it now; attachment_shapes: shapes at the ERAs, loads and contacts
+    (n, r) where known already. Raises InputError for ERAs that do not hold the plate (fewer than
+    three, or all in one line), and for a mode that is damped critically.
     """
-    if held is None:
-        held = reduced.at(
+    if attachment_shapes is None:
+        attachment_shapes = reduced.at(
             np.vstack([era_positions(eras), load_positions(loads), load_positions(contacts)])
         )
-    M, C, K = modal_matrices(reduced, eras, loads=loads, contacts=contacts, held=held)
+    M, C, K = modal_matrices(
+        reduced, eras, loads=loads, contacts=contacts, attachment_shapes=attachment_shapes
+    )
     r = len(K)
     inverse = linalg.inv(M)
     A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
@@ -192,9 +194,9 @@ def plate_in_time(
             "the plate's equations of motion cannot be separated into modes: a mode is damped "
             "critically; change an ERA's damping by a per mille"
         )
-    push = np.vstack([np.zeros((r, len(eras))), inverse @ held[: len(eras)].T])
+    input_matrix = np.vstack([np.zeros((r, len(eras))), inverse @ attachment_shapes[: len(eras)].T])
     return PlateInTime(
-        reduced, tuple(eras), eigenvalues, vectors, inverse_vectors, inverse_vectors @ push
+        reduced, tuple(eras), eigenvalues, vectors, inverse_vectors, inverse_vectors @ input_matrix
     )
 
 

@@ -1,4 +1,4 @@
-"""What drives the plate, in physics: a tone per active ERA."""
+"""Physical excitation of the plate: a tone per active ERA."""
 
 import cmath
 import math

@@ -15,7 +15,7 @@ from registry.plugins import Instance, PluginRegistry
 __all__ = ["DOF_PER_NODE", "ELEMENTS", "MITC4", "Q5", "Element", "element_names", "element_of"]
 
 ELEMENTS = {element.name: element for element in (MITC4, Q3, Q4, Q5)}
-"""Those that come with this package."""
+"""Elements that come with this package, by name."""
 
 
 def _matrix_problem(element: Element) -> str | None:

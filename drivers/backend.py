@@ -81,7 +81,7 @@ class Backend(ABC):
         return False
 
     def silencing(self, request: Request) -> AbstractContextManager[None]:
-        """A context that reserves a shared wire for a stop-class request waiting for its turn."""
+        """A context that reserves a shared wire for a pending stop-class request."""
         return nullcontext()
 
     async def broadcast(self, request: Broadcast) -> None:

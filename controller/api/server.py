@@ -31,7 +31,7 @@ from model.errors import InputError
 
 MAX_CONNECTIONS = 32
 IDLE_TIMEOUT = 1.0  # s; a client silent for this long can be replaced when there are too many
-MAX_TURN_TIME = 0.00025  # s; how long a touch waits for clients that flood
+MAX_ITERATION_TIME = 0.00025  # s; how long a touch waits for clients that flood
 MAX_PENDING = 8  # requests of one client that take long; stop is not counted
 _ACCEPT_PER_TURN = 4  # connections
 _ACCEPT_QUEUE = 64  # connections
@@ -122,7 +122,7 @@ class ApiServer:
     def _serve_turn(self) -> None:
         """Serve one line of each waiting client, round and round, until the turn's time is up."""
         self._is_turn_scheduled = False
-        end = time.perf_counter() + MAX_TURN_TIME
+        end = time.perf_counter() + MAX_ITERATION_TIME
         while self._waiting:
             connection = self._waiting.popleft()
             if connection.has_lines:

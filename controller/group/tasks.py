@@ -36,7 +36,7 @@ class CoalescedCalls:
 async def gather_all(requests: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
     """Await all, then raise the most severe error: a LinkError before any other.
 
-    A single request is awaited directly, without a further turn of the event loop.
+    A single request is awaited directly, without a further iteration of the event loop.
     """
     pending = list(requests)
     if len(pending) == 1:

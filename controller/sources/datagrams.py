@@ -1,4 +1,4 @@
-"""UDP datagrams with their times of arrival, several per turn of the event loop.
+"""UDP datagrams with their times of arrival, several per iteration of the event loop.
 
 The event loop's own endpoint reads one datagram per turn and knows only when it did so: decisions
 would use outdated touches, and waiting times would stay invisible. Here one turn reads all that has
@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, TypeAlias
 
-MAX_TURN = 0.00025  # s; longest delay of other tasks by a flood
+MAX_ITERATION_TIME = 0.00025  # s; longest delay of other tasks by a flood
 MANY = 16  # waiting datagrams: more than a panel sends per turn; superseded ones are dropped
 _MAX_WAITING = 512  # also read per turn; the oldest are dropped
 
@@ -89,7 +89,7 @@ class Datagrams:
     def _hand_on(self) -> None:
         """Hand on what waits, of many for one turn at a time."""
         self._is_due = False
-        end = time.perf_counter() + MAX_TURN
+        end = time.perf_counter() + MAX_ITERATION_TIME
         while self._waiting and self._line.fileno() >= 0:  # the callback may close it
             self._received(*self._waiting.popleft())
             if len(self._waiting) > MANY and time.perf_counter() >= end:

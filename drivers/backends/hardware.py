@@ -1,6 +1,6 @@
 """Hardware and system resources of backends, replaceable for tests in virtual time.
 
-Serial ports, CAN adapters, worker threads and random numbers. Frames, turns, retries and timeouts
+Serial ports, CAN adapters, worker threads and random numbers. Frames, retries and timeouts
 are the same with every provider. TCP connections belong to the event loop.
 """
 

@@ -253,11 +253,11 @@ async def test_touch_frame_is_superseded_by_the_next_of_its_source(served: Serve
     assert served.touches == [*before, ("a", 0.08), ("a", 0.09), ("a", 0.1)]
 
 
-async def test_control_loop_runs_between_turns(
+async def test_control_loop_runs_between_iterations(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Between two turns data is received, and what it wakes runs."""
-    monkeypatch.setattr("controller.api.server.MAX_TURN_TIME", 0.0)  # one line per turn
+    """Between two iterations data is received, and what it wakes runs."""
+    monkeypatch.setattr("controller.api.server.MAX_ITERATION_TIME", 0.0)  # one line per iteration
     loop = asyncio.get_running_loop()
     order: list[str] = []
 

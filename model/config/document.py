@@ -165,7 +165,9 @@ def _errors_at(source: str, text: str) -> Iterator[None]:
         mark = error.problem_mark or error.context_mark
         line = None if mark is None else mark.line + 1
         said = " ".join(part for part in (error.context, error.problem) if part)
-        raise ConfigError(source, [Problem(line, "", f"is not valid YAML: {said}")]) from error
+        remedy = "; indent by spaces, not by tabs" if r"'\t'" in said else ""
+        problem = Problem(line, "", f"is not valid YAML: {said}{remedy}")
+        raise ConfigError(source, [problem]) from error
     except ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         message = f"character U+{error.character:04X} is not allowed in YAML; remove it"

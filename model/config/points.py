@@ -64,8 +64,8 @@ def parse_frequencies(text: str) -> FloatArray:
         values = np.array([float(part) for part in text.split(",")])
     except (ValueError, OverflowError, ZeroDivisionError):
         raise InputError(
-            f"--frequencies must be LO:HI:STEP in Hz with LO above zero, such as 60:320:10, and "
-            f"at most {MAX_FREQUENCIES} frequencies, got {text!r}"
+            f"--frequencies must be LO:HI:STEP in Hz with LO above zero and at most HI, such as "
+            f"60:320:10, and at most {MAX_FREQUENCIES} frequencies, got {text!r}"
         ) from None
     distinct, counts = np.unique(values, return_counts=True)
     if len(distinct) < len(values):

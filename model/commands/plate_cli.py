@@ -130,7 +130,7 @@ def plate_map(
             )
         )
         return
-    print(f"{rig_file}: {', '.join(drive)} on a {rig.mesh} mesh, solved in {elapsed:.2f} s")
+    print(f"{rig_file}: {', '.join(drive)}, mesh {rig.mesh}, solved in {elapsed:.2f} s")
     print(
         f"largest  {solved.peak.max() / G:8.2f} g  ({solved.peak.max():.1f} m/s²) "
         f"at ({solved.x[column]:.4f}, {solved.y[row]:.4f}) m"

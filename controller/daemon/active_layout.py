@@ -28,7 +28,7 @@ class ActiveLayout:
 
     def replace(self, layout: Layout) -> None:
         """Replace the layout; effects of a press are not repeated for fingers that rest."""
-        self._player = EffectPlayer(layout, known=self._player.fingers)
+        self._player = EffectPlayer(layout, already_pressed=self._player.fingers)
 
     def effect_of(self, key: ContactKey) -> str | None:
         """The effect that plays for a contact, or None."""

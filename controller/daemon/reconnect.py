@@ -17,25 +17,25 @@ LinkChange = Literal["lost", "retry", "reopened"]
 
 
 def error_text(error: Exception) -> str:
-    """The text of an error without the warning that the daemon's state gives anyway."""
+    """The text of an error without the warning already implied by the state."""
     return str(error).removesuffix(ASSUME_ENERGISED)
 
 
 async def reconnect(
     controller: Controller,
     *,
-    is_wanted: Callable[[], bool],
+    should_continue: Callable[[], bool],
     report: Callable[[LinkChange, str], None],
     alive: Callable[[], None],
 ) -> bool:
-    """Reopen a controller and disarm its amplifiers; return False once not wanted any more.
+    """Reopen a controller and disarm its amplifiers; return False if cancelled.
 
     report: called with "retry" after each failed attempt and "reopened" after the successful one,
     and a message. alive: called every 50 ms meanwhile.
     """
     await _wait_alive(controller.close(), alive)  # a pending close would close it again
     for pause in pauses():
-        if not is_wanted():
+        if not should_continue():
             return False
         try:
             await _wait_alive(controller.open(), alive)
@@ -47,7 +47,7 @@ async def reconnect(
             report("reopened", "all amplifiers reply again and are disarmed")
             return True
         end = clock.now() + pause
-        while (left := end - clock.now()) > 0 and is_wanted():
+        while (left := end - clock.now()) > 0 and should_continue():
             alive()
             await asyncio.sleep(min(left, ALIVE_INTERVAL))
     raise AssertionError("pauses() must not end")

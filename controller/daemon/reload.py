@@ -4,16 +4,18 @@ from dataclasses import dataclass
 
 from controller.daemon.config import DaemonConfig
 
-NEED_RESTART = ("touch_wait", "socket", "log.file", "metrics", "dashboard")
-"""Keys that are applied at the start only."""
+DEFERRED = ("touch_wait", "socket", "log.file", "metrics", "dashboard")
+"""Keys that take effect at the next start."""
 
-REFUSED = ("rig", "table", "mode", "serial_numbers")
-"""Keys on which all others depend: a change of one of them refuses the reload."""
+BLOCKING = ("rig", "table", "mode", "serial_numbers")
+"""Keys on which all others depend: a change of any blocks the reload."""
 
 
 @dataclass(frozen=True)
 class ReloadPlan:
-    """apply: keys to apply now; restart: changed keys that need a restart.
+    """Outcome of comparing two configurations.
+
+    apply: keys to apply now; restart: changed keys that need a restart.
 
     refused: why nothing is applied at all, or None.
     """
@@ -26,7 +28,7 @@ class ReloadPlan:
 def plan_reload(old: DaemonConfig, new: DaemonConfig, *, is_armed: bool) -> ReloadPlan:
     """Plan the change from one valid configuration to another."""
     changed = _changed_keys(old, new)
-    refused = tuple(key for key in REFUSED if key in changed)
+    refused = tuple(key for key in BLOCKING if key in changed)
     if refused:
         return ReloadPlan((), refused, f"{', '.join(refused)} changed, which needs a restart")
     before, after = old.effective_layout.max_db_sl, new.effective_layout.max_db_sl
@@ -34,10 +36,10 @@ def plan_reload(old: DaemonConfig, new: DaemonConfig, *, is_armed: bool) -> Relo
         return ReloadPlan(
             (),
             (),
-            f"strongest effect must not rise while armed, got {after:g} instead of {before:g} "
-            "dB SL; disarm, then reload",
+            f"maximum level must not increase while armed, got {after:g} dB SL (was {before:g}); "
+            "disarm, then reload",
         )
-    restart = tuple(key for key in NEED_RESTART if key in changed)
+    restart = tuple(key for key in DEFERRED if key in changed)
     return ReloadPlan(tuple(key for key in changed if key not in restart), restart)
 
 

@@ -6,8 +6,8 @@ State names follow CiA 402.
   OPERATION_ENABLED.
 - QUICK_STOP_ACTIVE and FAULT lead only to SWITCH_ON_DISABLED, after an acknowledgement (CLEAR) and
   a read-back of all amplifiers without a fault and at level zero.
-- COMM_LOST is left once the amplifiers are reconnected *and* the watchdog of a lost amplifier must
-  have expired; to FAULT if anything was latched or energised before.
+- COMM_LOST ends when all amplifiers are reconnected *and* any lost amplifier's watchdog has
+  certainly expired; it leads to FAULT if anything was latched or energised before.
 - An event without an entry in the table changes nothing.
 """
 
@@ -100,7 +100,7 @@ class StateMachine:
         return now - self.lost_at if self.state is DaemonState.COMM_LOST else None
 
     def assume_energised(self, now: float) -> bool:
-        """Whether a lost amplifier may still be playing: its watchdog need not have expired."""
+        """Whether a lost amplifier may still be playing: its watchdog may not have expired yet."""
         lost_for = self.lost_for(now)
         return lost_for is not None and lost_for < WATCHDOG + _WATCHDOG_MARGIN
 

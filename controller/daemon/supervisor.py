@@ -285,7 +285,7 @@ class Supervisor:
             await self._in_background(self.handle(DaemonEvent(Trigger.TICK)))
         elif await reconnect(
             self._controller,
-            is_wanted=lambda: self.machine.state is DaemonState.COMM_LOST,
+            should_continue=lambda: self.machine.state is DaemonState.COMM_LOST,
             report=lambda change, message: self._link_changed(change, (), message),
             alive=self._alive,
         ):

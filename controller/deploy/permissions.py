@@ -1,4 +1,4 @@
-"""What the unit has to allow a daemon: devices and networks, derived from its URLs."""
+"""Devices and networks that the unit allows a daemon, derived from its URLs."""
 
 import ipaddress
 import re

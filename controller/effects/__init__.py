@@ -1,1 +1,1 @@
-"""What a touch means: surface layouts, their regions, and the effects that play in them."""
+"""Surface layouts, their regions, and the effects that play in them."""

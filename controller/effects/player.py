@@ -38,32 +38,32 @@ class _Finger:
 
 
 class EffectPlayer:
-    """Plays the effects of a layout; the intent depends on past calls and arguments only.
+    """Plays the effects of a layout. Deterministic: reads no clock.
 
-    A finger feels its newest play; when that is over, the one before continues. Of several fingers
-    those of the highest priority feel theirs, among equals the newest, as many as the layout
-    allows; all others are quiet. A play without a sensation at the moment (no detent passed, no
+    A finger feels its newest play; when that is over, the one before continues. Only the fingers of
+    highest priority are driven, as many as the layout allows; ties go to the newest. All others are
+    quiet. A play without a sensation at the moment (no detent passed, no
     movement) does not count.
 
-    known: fingers that have felt their press already, by another layout: for them only effects for
-    motion or without an end start.
+    already_pressed: fingers whose press another layout has played: for them only effects for motion
+    or without an end start.
     """
 
-    def __init__(self, layout: Layout, *, known: Iterable[ContactKey] = ()) -> None:
+    def __init__(self, layout: Layout, *, already_pressed: Iterable[ContactKey] = ()) -> None:
         self.layout = layout
-        self._known = set(known)
+        self._already_pressed = set(already_pressed)
         self._fingers: dict[ContactKey, _Finger] = {}
         self._number = 0
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
         """Return which contacts shall feel what at a time [s]."""
-        self._follow(contacts, now)
+        self._update_regions(contacts, now)
         if not contacts:
             return HapticIntent((), NO_CONTACTS)
         felt: list[tuple[int, int, Contact, Sensation]] = []
         ends: list[float] = []
         for contact in contacts:
-            play, sensation = self._feel(contact, now, ends)
+            play, sensation = self._current_sensation(contact, now, ends)
             if play is not None and sensation is not None:
                 felt.append((play.priority, play.number, contact, sensation))
         felt.sort(key=lambda one: one[:2], reverse=True)
@@ -80,7 +80,7 @@ class EffectPlayer:
     @property
     def fingers(self) -> Collection[ContactKey]:
         """Fingers on the plate at the last call of `intent`."""
-        return self._fingers.keys() | self._known
+        return self._fingers.keys() | self._already_pressed
 
     def effect_of(self, key: ContactKey) -> str | None:
         """Return the name of the effect that plays for a finger, None for none."""
@@ -103,10 +103,10 @@ class EffectPlayer:
         ]
         self._start(finger, name, contact, now, level=level, priority=REQUESTED_PRIORITY)
 
-    def _follow(self, contacts: Sequence[Contact], now: float) -> None:
-        """Start and end effects by the fingers' ways through the regions."""
+    def _update_regions(self, contacts: Sequence[Contact], now: float) -> None:
+        """Start and end effects as fingers enter and leave regions."""
         keys = {contact.key for contact in contacts}
-        self._known &= keys
+        self._already_pressed &= keys
         for key in [key for key in self._fingers if key not in keys]:
             del self._fingers[key]
         for contact in contacts:
@@ -133,8 +133,8 @@ class EffectPlayer:
         finger = _Finger(self.layout.region_at(*place), place)
         self._fingers[contact.key] = finger
         self._enter(finger, contact, now)
-        if contact.key in self._known:
-            self._known.discard(contact.key)
+        if contact.key in self._already_pressed:
+            self._already_pressed.discard(contact.key)
             effects = self.layout.effects
             finger.plays = [
                 play
@@ -182,7 +182,7 @@ class EffectPlayer:
             raise WrongResultError(effect, run, EffectRun)
         finger.plays.append(_Play(name, run, self._number, priority))
 
-    def _feel(
+    def _current_sensation(
         self, contact: Contact, now: float, ends: list[float]
     ) -> tuple[_Play | None, Sensation | None]:
         """Return the play that a finger feels now and its sensation; add all `until` to ends.

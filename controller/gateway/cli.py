@@ -63,15 +63,15 @@ def gateway(
         port=port,
         certificate=certificate,
         key=key,
-        names=tuple(allow_host or ()),
+        extra_hosts=tuple(allow_host or ()),
         origins=tuple(allow_origin or ()),
-        chose_token=token_file is not None,
+        is_token_user_supplied=token_file is not None,
         **chosen,
     )
 
     def announce(port: int) -> None:
         scheme = "https" if settings.is_encrypted else "http"
-        token = "" if settings.chose_token else f"#token={settings.token}"
+        token = "" if settings.is_token_user_supplied else f"#token={settings.token}"
         print(f"dashboard: {scheme}://{settings.shown_host}:{port}/{token}", flush=True)
 
     asyncio.run(serve(settings, announce=announce))

@@ -1,6 +1,6 @@
 """HTTP and WebSocket connections of uvicorn, with the bounds that uvicorn lacks.
 
-A client may be silent, slow, or not read; none of these keeps other clients out or fills memory.
+Silent, slow or non-reading clients cannot exhaust connections or memory.
 Timeouts count from the last complete request, so sending byte by byte gains nothing.
 """
 
@@ -39,7 +39,7 @@ class HttpConnection(H11Protocol):
         self._start_idle()
 
     def handle_events(self) -> None:
-        """End being idle at a complete request."""
+        """Stop the idle timer at a complete request."""
         try:
             super().handle_events()
         except h11.LocalProtocolError:  # invalid data in the body of a request already answered
@@ -50,7 +50,7 @@ class HttpConnection(H11Protocol):
             self._end_idle()
 
     def on_response_complete(self) -> None:
-        """Be idle until the next request."""
+        """Restart the idle timer."""
         self._start_idle()
         super().on_response_complete()
 

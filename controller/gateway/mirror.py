@@ -33,7 +33,7 @@ Publish: TypeAlias = Callable[[str, str | bytes], None]
 
 
 class DaemonMirror:
-    """Follows the daemon at a socket and publishes every change by topic.
+    """Mirrors the state of the daemon at a socket and publishes every change by topic.
 
     publish: called with a topic and its frame: the daemon's own line as text, or a binary field.
     """
@@ -61,7 +61,7 @@ class DaemonMirror:
         """Start over with a newly connected daemon, or without one."""
         self._rig_text = None if hello is None else hello["rig_text"]
         self._frames.clear()
-        self._show(HELLO, _hello_frame(hello))
+        self._store_and_publish(HELLO, _hello_frame(hello))
         self._drive = {}
         self._field_due.set()
 
@@ -81,13 +81,13 @@ class DaemonMirror:
         self._publish(topic, frame)
 
     def _replace_layout(self, layout: Mapping[str, Any] | None) -> None:
-        """Publish `hello` with the new layout, except for the one that `hello` had at first."""
+        """Publish `hello` with the new layout, but skip the initial layout, already in hello."""
         hello = self.daemon.hello
         if hello is not None and ("layout" in self._frames or layout != hello["layout"]):
             self.daemon.hello = {**hello, "layout": layout}
-            self._show(HELLO, _hello_frame(self.daemon.hello))
+            self._store_and_publish(HELLO, _hello_frame(self.daemon.hello))
 
-    def _show(self, topic: str, frame: str | bytes) -> None:
+    def _store_and_publish(self, topic: str, frame: str | bytes) -> None:
         self._frames[topic] = frame
         self._publish(topic, frame)
 
@@ -102,7 +102,7 @@ class DaemonMirror:
                 _logger.warning("field of the plate not computed: %s", error)
                 frame = _NO_FIELD
             if not self._field_due.is_set():
-                self._show(FIELD, frame)
+                self._store_and_publish(FIELD, frame)
 
     def _field(self, rig_text: str | None, drive: dict[str, PlayedTone]) -> bytes:
         if rig_text is None:

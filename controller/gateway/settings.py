@@ -24,8 +24,9 @@ class Settings:
     """Settings of the gateway; raises InputError if they are unsafe.
 
     socket: the daemon's; host: an IP address to bind; port: 0 for any free one; token: gives full
-    access to the API, random by default; names: further allowed Hosts, without port, besides those
-    of the loopback; origins: further allowed Origins; chose_token: whether the user gave the token.
+    access to the API, random by default; extra_hosts: further allowed Hosts, without port, besides
+    those of the loopback; origins: further allowed Origins; is_token_user_supplied: False for a
+    random one.
     """
 
     socket: Path
@@ -34,9 +35,9 @@ class Settings:
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
     certificate: Path | None = None
     key: Path | None = None
-    names: tuple[str, ...] = ()
+    extra_hosts: tuple[str, ...] = ()
     origins: tuple[str, ...] = ()
-    chose_token: bool = False
+    is_token_user_supplied: bool = False
 
     def __post_init__(self) -> None:
         if not 0 <= self.port < 65536:
@@ -58,17 +59,17 @@ class Settings:
         for path in (self.certificate, self.key):
             if path is not None and not path.is_file():
                 raise InputError(f"{path}: no such file; --certificate and --key must be PEM files")
-        if not address.is_loopback and not (self.certificate and self.chose_token):
+        if not address.is_loopback and not (self.certificate and self.is_token_user_supplied):
             raise InputError(
                 f"listening on {self.host}, outside the loopback, needs TLS and your own token: "
                 "give --certificate, --key and --token-file, or listen on 127.0.0.1 behind a proxy"
             )
-        if not address.is_loopback and not self.names:
+        if not address.is_loopback and not self.extra_hosts:
             raise InputError(
                 f"listening on {self.host}, outside the loopback, needs --allow-host with the name "
                 "or address that browsers use"
             )
-        for name in self.names:
+        for name in self.extra_hosts:
             if not _HOST_NAME.fullmatch(name):
                 raise InputError(
                     "--allow-host must be a host name without port and without *, such as "
@@ -89,13 +90,13 @@ class Settings:
     def allowed_names(self) -> frozenset[str]:
         """Allowed Hosts, without port and in lower case."""
         own = () if ipaddress.ip_address(self.host).is_unspecified else (self.shown_host,)
-        return frozenset(name.lower() for name in (*_LOOPBACK_NAMES, *own, *self.names))
+        return frozenset(name.lower() for name in (*_LOOPBACK_NAMES, *own, *self.extra_hosts))
 
     @property
     def shown_host(self) -> str:
         """The host for a URL that can be opened."""
         if ipaddress.ip_address(self.host).is_unspecified:
-            return self.names[0]
+            return self.extra_hosts[0]
         return f"[{self.host}]" if ":" in self.host else self.host
 
 

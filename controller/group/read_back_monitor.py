@@ -9,19 +9,19 @@ from drivers.protocol.messages import Achieved, Status
 
 
 class ReadBackMonitor:
-    """The levels that each amplifier should report, by its name; none at first."""
+    """The levels that each amplifier should report, by its name; initially empty."""
 
     def __init__(self) -> None:
         self._expected: dict[str, Expectation] = {}
 
     def forget(self) -> None:
-        """Expect nothing, because it is unknown what the amplifiers play."""
+        """Reset the expected levels: what the amplifiers play is unknown."""
         self._expected.clear()
 
     def expect(
         self, played: Mapping[str, SafeCommandSet], achieved: Mapping[str, Achieved], *, now: float
     ) -> None:
-        """Expect these levels from now [s] on; nothing of a set that ends by itself."""
+        """Expect these levels from now [s] on; sets with a time limit are not monitored."""
         self._expected = {
             name: Expectation.of(
                 achieved[name].commands, settled_from=now + played[name].settled_after

@@ -44,7 +44,7 @@ class SynchronizedPlay:
         *,
         may_play: Callable[[], bool],
     ) -> Played | None:
-        """Load the envelopes and play the sets; None once `may_play` is False between two steps.
+        """Load the envelopes and play the sets; None if `may_play` is False between steps.
 
         Raises DriverError, and leaves the amplifiers as they are then.
         """

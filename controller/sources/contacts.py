@@ -49,11 +49,12 @@ class Change:
 
 
 class ContactTracker:
-    """The contacts on one plate; a pure function of the frames and times it is given.
+    """The contacts on one plate. Deterministic: reads no clock.
 
-    x = X L and y = (1 - Y) W, since touch sensors count Y downwards. Touches are rejected
-    that are not finite, off the plate (outside 0..1), duplicated in a frame (the last one
-    counts) or beyond the tenth contact; a contact whose touch is rejected is lifted.
+    x = X L and y = (1 - Y) W, since touch sensors count Y downwards. Rejects touches that are off
+    the plate (outside 0..1), have non-finite coordinates, repeat an id within a frame (the last one
+    counts) or exceed the maximum number of contacts; a contact whose touch is rejected is
+    lifted.
     """
 
     def __init__(self, plate: Plate) -> None:
@@ -104,9 +105,10 @@ class ContactTracker:
     def expire(self, now: float) -> Change:
         """Lift the contacts of all sources that have timed out at now [s]."""
         for source, received in list(self._last_frame.items()):
-            if received + CONTACT_TIMEOUT <= now:  # the sum of next_expiry, to the last bit
+            # Same expression as next_expiry, so both round alike.
+            if received + CONTACT_TIMEOUT <= now:
                 del self._last_frame[source]
-            else:  # a frame from the future counts from now
+            else:  # clamp timestamps in the future
                 self._last_frame[source] = min(received, now)
         return Change(
             up=self._lift(key for key in self._contacts if key.source not in self._last_frame)

@@ -2,8 +2,8 @@
 
 The event loop's own endpoint reads one datagram per turn and knows only when it did so: decisions
 would use outdated touches, and waiting times would stay invisible. Here one turn reads all that has
-arrived and hands on a few at once, of many as much as a quarter of a millisecond allows. On Linux
-the kernel timestamps each. In a flood the newest are kept; the kernel would keep the oldest.
+arrived and delivers the backlog in slices of at most 0.25 ms. On Linux the kernel timestamps each.
+In a flood the newest are kept; the kernel would keep the oldest.
 """
 
 import asyncio
@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, TypeAlias
 
 MAX_ITERATION_TIME = 0.00025  # s; longest delay of other tasks by a flood
-MANY = 16  # waiting datagrams: more than a panel sends per turn; superseded ones are dropped
+BACKLOG_THRESHOLD = 16  # waiting datagrams; from here on superseded ones are dropped
 _MAX_WAITING = 512  # also read per turn; the oldest are dropped
 
 Peer: TypeAlias = tuple[str, int]
@@ -33,7 +33,7 @@ class Datagram(NamedTuple):
     arrived: float
 
 
-Thin: TypeAlias = Callable[[Sequence[Datagram]], Iterable[Datagram]]
+DropSuperseded: TypeAlias = Callable[[Sequence[Datagram]], Iterable[Datagram]]
 """Returns the waiting datagrams, in order, that no later one supersedes."""
 
 _TIMESTAMPS = 35  # SO_TIMESTAMPNS and SCM_TIMESTAMPNS of Linux, which Python does not name
@@ -46,9 +46,14 @@ class Datagrams:
     """Listens on a bound UDP socket until it is closed; see `listen`."""
 
     def __init__(
-        self, line: socket.socket, received: Received, *, max_size: int, thin: Thin
+        self,
+        endpoint: socket.socket,
+        received: Received,
+        *,
+        max_size: int,
+        thin: DropSuperseded,
     ) -> None:
-        self._line = line
+        self._socket = endpoint
         self._received = received
         self._thin = thin
         self._waiting: deque[Datagram] = deque(maxlen=_MAX_WAITING)
@@ -58,78 +63,83 @@ class Datagrams:
         self._latest = self._loop.time()
         if sys.platform == "linux":
             with contextlib.suppress(OSError):
-                line.setsockopt(socket.SOL_SOCKET, _TIMESTAMPS, 1)
-        self._loop.add_reader(line, self._readable)
+                endpoint.setsockopt(socket.SOL_SOCKET, _TIMESTAMPS, 1)
+        self._loop.add_reader(endpoint, self._readable)
 
     @property
     def port(self) -> int:
         """The port that is bound."""
-        return int(self._line.getsockname()[1])
+        return int(self._socket.getsockname()[1])
 
     def close(self) -> None:
         """Stop listening."""
-        self._loop.remove_reader(self._line)
-        self._line.close()
+        self._loop.remove_reader(self._socket)
+        self._socket.close()
 
     def _readable(self) -> None:
         """Read what has arrived; reading costs a tenth of decoding."""
-        ahead = _ahead(self._loop.time)
+        offset = _clock_offset(self._loop.time)
         for _ in range(_MAX_WAITING):
             try:
-                data, ancillary, _, peer = self._line.recvmsg(self._buffer_size, _ANCILLARY)
+                data, ancillary, _, peer = self._socket.recvmsg(self._buffer_size, _ANCILLARY)
             except OSError:  # nothing more, or an ICMP error
                 break
             at = (str(peer[0]), int(peer[1]))
-            self._waiting.append(Datagram(data, at, self._arrival(ancillary, ahead)))
-        if len(self._waiting) > MANY:
+            self._waiting.append(Datagram(data, at, self._arrival(ancillary, offset)))
+        if len(self._waiting) > BACKLOG_THRESHOLD:
             self._waiting = deque(self._thin(self._waiting), maxlen=_MAX_WAITING)
         if not self._is_due:
-            self._hand_on()
+            self._deliver_backlog()
 
-    def _hand_on(self) -> None:
-        """Hand on what waits, of many for one turn at a time."""
+    def _deliver_backlog(self) -> None:
+        """Deliver the waiting datagrams, a large backlog in slices."""
         self._is_due = False
         end = time.perf_counter() + MAX_ITERATION_TIME
-        while self._waiting and self._line.fileno() >= 0:  # the callback may close it
+        while self._waiting and self._socket.fileno() >= 0:  # the callback may close it
             self._received(*self._waiting.popleft())
-            if len(self._waiting) > MANY and time.perf_counter() >= end:
+            if len(self._waiting) > BACKLOG_THRESHOLD and time.perf_counter() >= end:
                 break
-        if self._waiting and self._line.fileno() >= 0:
+        if self._waiting and self._socket.fileno() >= 0:
             self._is_due = True
-            self._loop.call_soon(self._hand_on)
+            self._loop.call_soon(self._deliver_backlog)
 
-    def _arrival(self, ancillary: list[tuple[int, int, bytes]], ahead: float) -> float:
+    def _arrival(self, ancillary: list[tuple[int, int, bytes]], offset: float) -> float:
         """Return the arrival of a datagram, never before the previous one.
 
-        ahead [s]: offset of the loop's clock to the system clock.
+        offset [s]: offset of the loop's clock to the system clock.
         """
         now = arrived = self._loop.time()
         for level, kind, content in ancillary:
             if (level, kind) == (socket.SOL_SOCKET, _TIMESTAMPS) and len(content) == _TIMESPEC.size:
                 seconds, nanoseconds = _TIMESPEC.unpack(content)
-                arrived = seconds + nanoseconds * 1e-9 + ahead
+                arrived = seconds + nanoseconds * 1e-9 + offset
         if not now - _MAX_AGE <= arrived <= now:
             arrived = now
         self._latest = max(self._latest, arrived)
         return self._latest
 
 
-def _ahead(clock: Callable[[], float]) -> float:
+def _clock_offset(clock: Callable[[], float]) -> float:
     """Return the offset [s] of a clock to the system clock."""
-    ahead = 0.0
+    offset = 0.0
     for _ in range(_CLOCK_READS):
         before = clock()
-        ahead = before - time.time()
+        offset = before - time.time()
         if clock() - before < _MAX_READ_TIME:
             break
-    return ahead
+    return offset
 
 
 _ANCILLARY = 64  # bytes; room for a timestamp and its header
 
 
 async def listen(
-    host: str, port: int, received: Received, *, max_size: int, thin: Thin = tuple
+    host: str,
+    port: int,
+    received: Received,
+    *,
+    max_size: int,
+    thin: DropSuperseded = tuple,
 ) -> Datagrams:
     """Listen on a host and UDP port, 0 for any that is free; raises OSError.
 
@@ -139,11 +149,11 @@ async def listen(
     loop = asyncio.get_running_loop()
     found = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
     family, kind, protocol, _, address = found[0]
-    line = socket.socket(family, kind, protocol)
+    endpoint = socket.socket(family, kind, protocol)
     try:
-        line.setblocking(False)
-        line.bind(address)
-        return Datagrams(line, received, max_size=max_size, thin=thin)
+        endpoint.setblocking(False)
+        endpoint.bind(address)
+        return Datagrams(endpoint, received, max_size=max_size, thin=thin)
     except BaseException:
-        line.close()
+        endpoint.close()
         raise

@@ -28,7 +28,7 @@ DEFAULT_PORT = 3333  # registered for TUIO
 _MAX_DATAGRAM = 8 * 1024
 _MAX_NAME = 100
 _MAX_SENDERS = 16
-_SOURCE = b"source\0\0"  # as OSC writes that text
+_SOURCE = b"source\0\0"  # OSC string, NUL-padded
 # Like the reference client, a sequence number that falls by more than 100 is a restarted sender. A
 # restart within the first 100 frames shows by the pause: reordered frames are never this late.
 _LATE_FRAMES = 100
@@ -53,7 +53,7 @@ class _Sender:
 
     last_heard: float
     sequence: int = 0
-    numbered: float = -math.inf  # when that sequence number arrived
+    sequence_time: float = -math.inf  # when that sequence number arrived
     alive: tuple[int, ...] = ()
     positions: dict[int, tuple[float, float]] = field(default_factory=dict)
 
@@ -123,11 +123,11 @@ class TuioReader:
             return False
         behind = sender.sequence - sequence
         if behind > 0:
-            if behind <= _LATE_FRAMES and now - sender.numbered < _LATE_SECONDS:
+            if behind <= _LATE_FRAMES and now - sender.sequence_time < _LATE_SECONDS:
                 self.rejects.count("late", f"frame {sequence} of {name} after {sender.sequence}")
                 return True
             sender.alive, sender.positions = (), {}  # a restarted sender
-        sender.sequence, sender.numbered = sequence, now
+        sender.sequence, sender.sequence_time = sequence, now
         return False
 
 
@@ -155,7 +155,7 @@ def _read_bundle(datagram: bytes) -> _Bundle:
 def without_superseded(waiting: Sequence[Datagram]) -> list[Datagram]:
     """Return waiting datagrams without those that the newest bundle of their sender supersedes.
 
-    It does if it has the position of every cursor that is alive.
+    A bundle supersedes older ones if it is complete.
     """
     is_complete: dict[tuple[Peer, bytes], bool] = {}
     kept = []
@@ -207,32 +207,32 @@ def tuio_datagram(frame: TouchFrame, sequence: int) -> bytes:
 class TuioSource(TouchSource):
     """Listens for TUIO at `tuio:HOST:PORT`, `tuio:PORT` or `tuio:` (127.0.0.1:3333).
 
-    Port 0 is any free one. A touch table on another machine needs an explicit HOST, because TUIO
-    has no authentication. Raises InputError for any other URL.
+    Port 0 selects a free port. A touch table on another machine needs an explicit HOST, because
+    TUIO has no authentication. Raises InputError for any other URL.
     """
 
     def __init__(self, url: str) -> None:
         self.host, self._port = _host_and_port(url)
         self.rejects = RejectCounter(_logger)
         self._url = url
-        self._line: Datagrams | None = None
+        self._endpoint: Datagrams | None = None
         self._reader = TuioReader(self.rejects)
         self._deliver: Callable[[TouchFrame], None] | None = None
 
     @property
     def port(self) -> int:
         """The UDP port: the bound one, before `open` the requested one."""
-        return self._port if self._line is None else self._line.port
+        return self._port if self._endpoint is None else self._endpoint.port
 
     async def open(self) -> None:
         """Bind the port if it is not bound; `run` does so too. Raises InputError if it is taken.
 
         Datagrams are dropped until `run`.
         """
-        if self._line is not None:
+        if self._endpoint is not None:
             return
         try:
-            self._line = await listen(
+            self._endpoint = await listen(
                 self.host,
                 self._port,
                 self._received,
@@ -253,9 +253,9 @@ class TuioSource(TouchSource):
             await asyncio.get_running_loop().create_future()
         finally:
             self._deliver = None
-            if self._line is not None:
-                self._line.close()
-                self._line = None
+            if self._endpoint is not None:
+                self._endpoint.close()
+                self._endpoint = None
 
     def _received(self, datagram: bytes, peer: Peer, arrived: float) -> None:
         """Decode a datagram and deliver its frame with the time of arrival."""

@@ -32,7 +32,7 @@ async def test_reconnect_closes_amplifiers_that_could_not_be_disarmed() -> None:
     controller, reports = Controller(), []
     done = await reconnect(
         controller,
-        is_wanted=lambda: True,
+        should_continue=lambda: True,
         report=lambda event, message: reports.append(event),
         alive=lambda: None,
     )

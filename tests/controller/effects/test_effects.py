@@ -319,8 +319,10 @@ def test_new_layout_repeats_no_press() -> None:
     before = EffectPlayer(Layout((clicks,), effects))
     fingers = [finger(1, 0.05), finger(2, 0.15)]
     assert wanted(before, fingers, 0.0) == {2: 10.0}
-    after = EffectPlayer(Layout((clicks,), effects, most_at_once=2), known=before.fingers)
-    again = EffectPlayer(after.layout, known=after.fingers)  # exchanged twice before it is asked
+    after = EffectPlayer(Layout((clicks,), effects, most_at_once=2), already_pressed=before.fingers)
+    again = EffectPlayer(
+        after.layout, already_pressed=after.fingers
+    )  # exchanged twice before it is asked
     for player in (after, again):
         assert wanted(player, fingers, 1.0) == {2: 10.0}
         assert wanted(player, [finger(1, 0.056), finger(2, 0.15)], 1.1) == {1: 20.0, 2: 10.0}

@@ -279,12 +279,15 @@ SETTINGS: dict[str, tuple[dict[str, object], str]] = {
     "missing certificate": ({"certificate": Path("x"), "key": Path("x")}, "^x: .*--certificate"),
     "all addresses": ({"host": "0.0.0.0"}, "--certificate, --key and --token-file"),
     "all IPv6 addresses": ({"host": "::"}, "--certificate, --key and --token-file"),
-    "only a token": ({"host": "192.0.2.1", "chose_token": True}, "--certificate, --key and"),
-    "TLS without a token": ({**TLS, "names": ("panel.local",)}, "--token-file"),
-    "TLS without a host": ({**TLS, "chose_token": True}, "--allow-host"),
-    "any host": ({"names": ("*",)}, "--allow-host"),
-    "host with a port": ({"names": ("panel.local:80",)}, "--allow-host .*without port"),
-    "IPv6 host without brackets": ({"names": ("2001:db8::7",)}, r"\[2001:db8::7\]"),
+    "only a token": (
+        {"host": "192.0.2.1", "is_token_user_supplied": True},
+        "--certificate, --key and",
+    ),
+    "TLS without a token": ({**TLS, "extra_hosts": ("panel.local",)}, "--token-file"),
+    "TLS without a host": ({**TLS, "is_token_user_supplied": True}, "--allow-host"),
+    "any host": ({"extra_hosts": ("*",)}, "--allow-host"),
+    "host with a port": ({"extra_hosts": ("panel.local:80",)}, "--allow-host .*without port"),
+    "IPv6 host without brackets": ({"extra_hosts": ("2001:db8::7",)}, r"\[2001:db8::7\]"),
     "origin with a path": ({"origins": ("https://panel.example/x",)}, "--allow-origin"),
     "origin null": ({"origins": ("null",)}, "--allow-origin"),
     "any origin": ({"origins": ("*",)}, "--allow-origin"),
@@ -303,6 +306,8 @@ def test_settings_show_and_allow_the_address_listened_on() -> None:
     """Besides the usual names; for all addresses the first allowed host is shown."""
     settings = Settings(socket=Path("era.sock"), host="127.0.0.2")
     assert settings.shown_host == "127.0.0.2"
-    panel = Settings(socket=Path("era.sock"), **TLS, chose_token=True, names=("panel.local",))  # type: ignore[arg-type]
+    panel = Settings(
+        socket=Path("era.sock"), **TLS, is_token_user_supplied=True, extra_hosts=("panel.local",)
+    )  # type: ignore[arg-type]
     assert panel.shown_host == "panel.local"
     assert settings.allowed_names == {"localhost", "127.0.0.1", "[::1]", "127.0.0.2"}

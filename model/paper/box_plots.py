@@ -10,7 +10,7 @@ from model.figures.layout_boxes import LayoutBox, layout_boxes_figure
 from model.files.csv_file import Columns
 from model.paper.figure import PaperFigure
 from model.reduction.free_plate import FreePlate
-from model.rig.layouts import FOUR_ERA_LAYOUTS, Layout, alike
+from model.rig.layouts import FOUR_ERA_LAYOUTS, EraLayout, alike
 from model.rig.rig import Rig
 from model.structure.plate import Plate
 from model.table.table import PAPER_FREQUENCIES
@@ -30,7 +30,7 @@ from model.vibration.peak import G
 class _Drive:
     """A layout with one of its activation sets, and STATISTICS (6,) of its acceleration."""
 
-    layout: Layout
+    layout: EraLayout
     active: ActivationSet
     statistics: FloatArray
 

@@ -20,7 +20,7 @@ Place = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Layout:
+class EraLayout:
     """Places of the ERAs of a rig."""
 
     name: str
@@ -32,27 +32,29 @@ class Layout:
 
 
 FOUR_ERA_LAYOUTS = (
-    Layout("corners", ((0, 0), (1, 0), (1, 1), (0, 1))),
-    Layout("mid-edges", ((1 / 2, 0), (1, 1 / 2), (1 / 2, 1), (0, 1 / 2))),
-    Layout("long edges", ((1 / 4, 0), (3 / 4, 0), (3 / 4, 1), (1 / 4, 1))),
-    Layout("short edges", ((0, 1 / 4), (1, 1 / 4), (1, 3 / 4), (0, 3 / 4))),
-    Layout("inset corners", ((1 / 6, 1 / 6), (5 / 6, 1 / 6), (5 / 6, 5 / 6), (1 / 6, 5 / 6))),
-    Layout("trapezoid", ((0, 0), (1, 0), (3 / 4, 1), (1 / 4, 1))),
-    Layout("diagonal", ((0, 0), (1 / 3, 1 / 3), (2 / 3, 2 / 3), (1, 1))),
+    EraLayout("corners", ((0, 0), (1, 0), (1, 1), (0, 1))),
+    EraLayout("mid-edges", ((1 / 2, 0), (1, 1 / 2), (1 / 2, 1), (0, 1 / 2))),
+    EraLayout("long edges", ((1 / 4, 0), (3 / 4, 0), (3 / 4, 1), (1 / 4, 1))),
+    EraLayout("short edges", ((0, 1 / 4), (1, 1 / 4), (1, 3 / 4), (0, 3 / 4))),
+    EraLayout("inset corners", ((1 / 6, 1 / 6), (5 / 6, 1 / 6), (5 / 6, 5 / 6), (1 / 6, 5 / 6))),
+    EraLayout("trapezoid", ((0, 0), (1, 0), (3 / 4, 1), (1 / 4, 1))),
+    EraLayout("diagonal", ((0, 0), (1 / 3, 1 / 3), (2 / 3, 2 / 3), (1, 1))),
 )
 """Layouts of four ERAs; the first is that of the paper's Table 2."""
 
 _OTHERS = (
-    Layout("centre", ((1 / 2, 1 / 2),)),
-    Layout("opposite corners", ((0, 0), (1, 1))),
-    Layout("mid-short-edges", ((0, 1 / 2), (1, 1 / 2))),
-    Layout("triangle", ((0, 0), (1, 0), (1 / 2, 1))),
-    Layout("corners and centre", ((0, 0), (1, 0), (1, 1), (0, 1), (1 / 2, 1 / 2))),
-    Layout("corners and mid-long-edges", ((0, 0), (1 / 2, 0), (1, 0), (1, 1), (1 / 2, 1), (0, 1))),
+    EraLayout("centre", ((1 / 2, 1 / 2),)),
+    EraLayout("opposite corners", ((0, 0), (1, 1))),
+    EraLayout("mid-short-edges", ((0, 1 / 2), (1, 1 / 2))),
+    EraLayout("triangle", ((0, 0), (1, 0), (1 / 2, 1))),
+    EraLayout("corners and centre", ((0, 0), (1, 0), (1, 1), (0, 1), (1 / 2, 1 / 2))),
+    EraLayout(
+        "corners and mid-long-edges", ((0, 0), (1 / 2, 0), (1, 0), (1, 1), (1 / 2, 1), (0, 1))
+    ),
 )
 
 
-def named_layouts(era_count: int) -> tuple[Layout, ...]:
+def named_layouts(era_count: int) -> tuple[EraLayout, ...]:
     """The named layouts with a number of ERAs."""
     layouts = (*FOUR_ERA_LAYOUTS, *_OTHERS)
     return tuple(layout for layout in layouts if len(layout.places) == era_count)

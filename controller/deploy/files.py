@@ -48,10 +48,15 @@ def service_files(config: Path, era: Path, permissions: Permissions) -> Mapping[
         address_filter=addresses,
         device_allow="\n".join(f"DeviceAllow={device}" for device in devices) or "DeviceAllow=",
     )
+    rules = [
+        "# Written by `era systemd install`; see udev(7).\n",
+        *([_read("udev-serial.rules")] if permissions.serial else ()),
+        *([_read("udev-input.rules")] if permissions.input else ()),
+    ]
     return {
         Path(f"/etc/systemd/system/{SERVICE_NAME}.service"): unit,
         Path(f"/etc/sysusers.d/{SERVICE_NAME}.conf"): _read("sysusers.conf"),
-        Path(f"/etc/udev/rules.d/70-{SERVICE_NAME}.rules"): _read("udev.rules"),
+        Path(f"/etc/udev/rules.d/70-{SERVICE_NAME}.rules"): "\n".join(rules),
     }
 
 

@@ -33,7 +33,7 @@ def edited_text(document: Document, change: Callable[[CommentedMap], None]) -> s
     yaml.indent(**_indentation(document.text))
     stream = StringIO()
     with _refused_if_lossy(document):
-        data = yaml.load(document.text)
+        data = yaml.load(document.text.replace("\r\n", "\n"))  # or comments alone keep their CR
     change(data)
     with _refused_if_lossy(document):
         yaml.dump(data, stream)

@@ -91,7 +91,6 @@ def all_columns(ranking: Ranking) -> Columns:
         "eras": era_counts(cases)[rows],
         "stiffness_factor": cases.stiffness_factors[rows],
         "at_m": [at[case] for case in rows],
-        "supported": ["yes" if ranking.supported[case] else "no" for case in rows],
         "driven": [DRIVES[drive] for drive in drives],
         "active": [
             "+".join(str(era + 1) for era in results.active_eras(case, drive))
@@ -99,7 +98,11 @@ def all_columns(ranking: Ranking) -> Columns:
         ],
     }
     statistics = results.statistics[rows, drives]
-    return columns | {
-        f"{name.replace(' ', '_')}{'' if name == STATISTICS[-1] else '_m_s2'}": statistics[:, k]
-        for k, name in enumerate(STATISTICS)
-    }
+    return (
+        columns
+        | {
+            f"{name.replace(' ', '_')}{'' if name == STATISTICS[-1] else '_m_s2'}": statistics[:, k]
+            for k, name in enumerate(STATISTICS)
+        }
+        | {"supported": ["yes" if ranking.supported[case] else "no" for case in rows]}
+    )

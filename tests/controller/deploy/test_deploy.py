@@ -63,6 +63,9 @@ def test_unit_allows_only_what_is_needed(tmp_path: Path) -> None:
     assert "IPAddressAllow" not in everything
     assert "AF_CAN" in everything
     assert "char-ttyUSB rw" in re.findall(r"DeviceAllow=(.*)", everything)
+    rules = Path("/etc/udev/rules.d/70-era-haptics.rules")
+    assert "SUBSYSTEM" not in service_files(CONFIG, ERA, Permissions(False, False, False))[rules]
+    assert service_files(CONFIG, ERA, Permissions())[rules].count("GROUP=") == 2
 
 
 @pytest.mark.parametrize(

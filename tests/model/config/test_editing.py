@@ -28,6 +28,14 @@ def test_edited_text_keeps_what_was_not_changed() -> None:
     assert edited == expected.replace("damping: 1.5", "damping: 2.5")
 
 
+def test_edited_text_has_one_kind_of_line_end_when_the_file_has_crlf() -> None:
+    """A file with CR LF, comments included, is written with LF throughout."""
+    document = parse_document("f.yaml", "# first\r\na: 1  # one\r\n# last\r\nb: 2\r\n")
+    text = edited_text(document, lambda data: data.update(a=3))
+    assert "\r" not in text
+    assert parse_document("f.yaml", text).data == {"a": 3, "b": 2}
+
+
 def test_edited_text_refuses_comments_that_it_cannot_keep() -> None:
     """A file that would come out changed is left alone."""
     document = parse_document("rig.yaml", "a: # between\n\n  value\n\n")

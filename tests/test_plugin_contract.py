@@ -25,7 +25,8 @@ from drivers.errors import CommandError
 from drivers.registry import known_schemes, open_backend
 from model.config.kinds import kind_called
 from model.errors import InputError
-from model.fem.elements import ELEMENTS, element_names, element_of
+from model.fem.element_registry import element_names, element_of
+from model.fem.elements import ELEMENTS
 from model.rig.kind import RIG
 from model.structure.materials import KNOWN_MATERIALS, known_material, material_names
 from registry.plugins import failure_text

@@ -17,7 +17,7 @@ def conformance(
     Exit with 1 if a requirement is not met.
     """
     from model.fem.element_checks import CHECKS, COARSE, frequency_error, rate
-    from model.fem.elements import element_of
+    from model.fem.element_registry import element_of
 
     element = element_of(name)
     problems = {}

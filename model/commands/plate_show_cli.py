@@ -43,7 +43,7 @@ def materials(as_json: JsonOption = False) -> None:
 
 def elements(as_json: JsonOption = False) -> None:
     """List the elements of meshes, as in mesh: 12x9 Q3."""
-    from model.fem.elements import element_names, element_of
+    from model.fem.element_registry import element_names, element_of
 
     known, problems = _loaded(element_names(), element_of)
     if as_json:

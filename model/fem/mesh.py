@@ -1,7 +1,6 @@
 """A structured mesh of rectangles over the plate."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Self
@@ -11,7 +10,7 @@ from scipy import sparse
 
 from model.arrays import FloatArray, IntArray, lattice
 from model.errors import InputError
-from model.fem.elements import MITC4, Q5, Element, element_of
+from model.fem.elements import MITC4, Q5, Element
 from model.structure.plate import Plate
 
 PAPER_ELEMENT = MITC4
@@ -77,11 +76,6 @@ class Mesh:
         size *= 1 - 1e-9
         nx, ny = (math.ceil(side / size) for side in (plate.length, plate.width))
         return cls(nx, ny, plate.length, plate.width, element)
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Make the mesh of `to_dict`; raises InputError for an unknown element."""
-        return cls(**{**values, "element": element_of(values["element"])})
 
     def to_dict(self) -> dict[str, Any]:
         """Its fields for a file, the element by its name."""

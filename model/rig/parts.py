@@ -4,7 +4,7 @@ import math
 import re
 
 from model.errors import InputError
-from model.fem.elements import element_of
+from model.fem.element_registry import element_of
 from model.fem.mesh import PAPER_ELEMENT, Mesh
 from model.rig.rig import Limits
 from model.rig.sections import EraSection, LimitsSection, MassSection, MaterialSection, PlateSection

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from model.arguments import expect, expect_path, shown
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError, first_problem
-from model.fem.mesh import Mesh
+from model.fem.element_registry import mesh_from_dict
 from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
 from model.finger.grid import Grid
 from model.structure.actuator import Era
@@ -189,8 +189,8 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
             plate=Plate(**header.plate, material=Material(**material)),
             eras=tuple(Era(**era) for era in header.eras),
             masses=tuple(PointMass(**mass) for mass in header.masses),
-            mesh=Mesh.from_dict(header.mesh.model_dump()),
-            reference_mesh=Mesh.from_dict(header.reference_mesh.model_dump()),
+            mesh=mesh_from_dict(header.mesh.model_dump()),
+            reference_mesh=mesh_from_dict(header.reference_mesh.model_dump()),
             discretisation_error=np.array(header.discretisation_error, dtype=float),
             raster=Raster(**header.raster.model_dump()),
             grid=Grid(**header.grid),

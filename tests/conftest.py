@@ -40,12 +40,6 @@ SLOWEST = (
 """Run in this order before all others: one that started last would leave the other cores idle."""
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """One worker more than processors: some tests wait for real time or for other processes."""
-    return len(os.sched_getaffinity(0)) + 1
-
-
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Skip files without a test that runs alone: importing all takes ten seconds."""
     if config.option.markexpr != "alone" or collection_path.suffix != ".py":

@@ -62,16 +62,16 @@ def default_drive_frequencies(limits: Limits) -> FloatArray:
 class LocalizationTable:
     """Fields of one plate on its ERAs, and what choosing among patterns needs.
 
-    drive_mode: default of a question
-    frequencies: (f,) [Hz]
-    acceleration: (points, f, eras) complex [m/s²] on the raster, each ERA alone at full stroke
-    omega: (r,) [rad/s], of the reduced free plate (`model.reduction.reduced_plate`)
-    held: (eras + masses, r) [1/sqrt(kg)], its shapes at the attachments: ERAs and masses
-    shapes: (points, r) [1/sqrt(kg)], its shapes on the raster
-    cell_sources: (sources, cells) [m/s²], mean peak acceleration over each cell of the sources of
-        `switched` patterns (`model.drive_modes.sources`)
-    discretisation_error: (f,), relative L2 error of the fields over the raster against the
-        reference mesh, maximum over the ERAs
+    - drive_mode: default of a question
+    - frequencies: (f,) [Hz]
+    - acceleration: (points, f, eras) complex [m/s²] on the raster, each ERA alone at full stroke
+    - omega: (r,) [rad/s], of the reduced free plate (`model.reduction.reduced_plate`)
+    - held: (eras + masses, r) [1/sqrt(kg)], its shapes at the attachments: ERAs and masses
+    - shapes: (points, r) [1/sqrt(kg)], its shapes on the raster
+    - cell_sources: (sources, cells) [m/s²], mean peak acceleration over each cell of the sources
+      of `switched` patterns (`model.drive_modes.sources`)
+    - discretisation_error: (f,), relative L2 error of the fields over the raster against the
+      reference mesh, maximum over the ERAs
     """
 
     plate: Plate

@@ -65,6 +65,7 @@ def demo(environment, tmp_path, monkeypatch, capsys):
     return run_demo
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("wire", ["serial", "can", "sim"])
 def test_demo_contacts_feel_the_prediction(wire, capture, demo):
     """Each touch has its row; measured contrast and level are the predicted ones within 3 dB."""
@@ -95,6 +96,7 @@ def test_demo_contacts_feel_the_prediction(wire, capture, demo):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.alone
 def test_demo_plays_a_panel_recording_over_modbus(demo, tmp_path):
     """An evemu recording of two fingers gives a row for each contact, by the recording's times."""
     recording = tmp_path / "panel.events"

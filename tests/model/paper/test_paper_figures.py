@@ -150,5 +150,5 @@ def test_paper_figures_refuses_an_unknown_number(number):
 def test_figure_12_refuses_a_rig_of_one_era():
     """Figure 12 drives a diagonal pair; a rig of one ERA has none."""
     rig = make_paper_rig(12, 9)
-    with pytest.raises(InputError, match="two ERAs"):
+    with pytest.raises(InputError, match="at least two"):
         list(paper_figures(replace(rig, eras=rig.eras[:1]), "12"))

@@ -149,14 +149,25 @@ def test_command_keeps_previous_output_when_the_disk_is_full(
     assert files(home) == before
 
 
-def until_full(pid: int, limit: int) -> None:
-    """Wait until an unnamed file opened by a process reaches the limit [bytes]."""
-    end = time.monotonic() + 20
-    while True:
-        for path in Path(f"/proc/{pid}/fd").iterdir():
-            with contextlib.suppress(OSError):
-                if "(deleted)" in str(path.readlink()) and path.stat().st_size >= limit:
-                    return
+def recorded(pid: int) -> int:
+    """Size [bytes] of the unnamed file that a process writes; 0 before there is one."""
+    for path in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(OSError):
+            if "(deleted)" in str(path.readlink()):
+                return path.stat().st_size
+    return 0
+
+
+def fill_disk(pid: int) -> None:
+    """Limit the file that a process writes to a little more than it has, until that is reached.
+
+    A file that was longer than the limit at once would say nothing about a write that fails.
+    """
+    end, limit = time.monotonic() + 20, -1
+    while (size := recorded(pid)) != limit:
+        if size > limit:
+            limit = size + 7
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
         assert time.monotonic() < end, "no recording"
         time.sleep(0.01)
 
@@ -173,9 +184,8 @@ def test_recording_fails_without_a_file_when_the_disk_is_full(home: Path) -> Non
     ) as process:
         assert process.stdout is not None
         assert "serial://" in process.stdout.readline()
-        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (1024, resource.RLIM_INFINITY))
         try:
-            until_full(process.pid, 1024)
+            fill_disk(process.pid)
             process.send_signal(signal.SIGINT)
             _, said = process.communicate(timeout=20)
         finally:

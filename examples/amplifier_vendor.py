@@ -105,7 +105,7 @@ async def conform(url):
 
 outcomes = asyncio.run(conform(url))
 for outcome in outcomes:
-    print("passed" if outcome.problem is None else "FAILED", outcome.check.proves)
+    print("passed" if outcome.problem is None else "FAILED", outcome.check.requirement)
     if outcome.problem:
         print("       ", outcome.problem)
 

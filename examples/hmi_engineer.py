@@ -140,7 +140,7 @@ with client.armed("example"):
     felt = ask_plate(op="felt", since_s=now - 0.3, until_s=now - 0.05)["fingers"]
     client.touch([])
 if not status.drive:
-    sys.exit(f"nothing was played: {status.silent_because or status.cause}")
+    sys.exit(f"nothing was played: {status.silence_reason or status.cause}")
 
 # %%
 # Amplitudes of different frequencies add; a target counts by its mean, a quiet finger by its

@@ -10,7 +10,7 @@ class InputError(ValueError):
     """Invalid input; the message says what, where and the remedy."""
 
 
-def in_our_words(message: str) -> str:
+def reworded(message: str) -> str:
     """Reword a message of pydantic or typer like all other errors."""
     for theirs, ours in _WORDS.items():
         message = message.replace(theirs, ours)
@@ -20,7 +20,7 @@ def in_our_words(message: str) -> str:
 def first_problem(error: "ValidationError") -> tuple[str, str]:
     """The place of the first invalid value, "" for the whole, and what is wrong with it."""
     first = error.errors()[0]
-    return ".".join(str(part) for part in first["loc"]), in_our_words(first["msg"])
+    return ".".join(str(part) for part in first["loc"]), reworded(first["msg"])
 
 
 _WORDS = {

@@ -8,26 +8,26 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_result import (
-    FITS,
+    MAX_FIT_ERROR,
     Calibration,
     FittedParameter,
     HeldOut,
     SensorScale,
 )
-from model.calibration.calibration_screening import silent_eras, silent_sensors, unlike_the_plate
-from model.calibration.fast_plate import FastPlate, fast_plate
+from model.calibration.calibration_screening import sensors_off_model, silent_eras, silent_sensors
 from model.calibration.fit import Fit, Problem, misfit, solve
-from model.calibration.held_out import as_it_was, hold_out, relative_error
+from model.calibration.held_out import hold_out, initial_responses, relative_error
 from model.calibration.parameters import Parameter, parameters_of, rig_with, starts
 from model.calibration.responses import Responses
 from model.calibration.variable_projection import row_rms
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.structure.actuator import Gain
+from model.vibration.parametric_plate import ParametricPlate, parametric_plate
 
 _STARTS = 2  # those with the least misfit of shapes
 _WRONG_SCALE = 0.02  # common tolerance of sensors
-_SURE = 4.0  # standard errors
+_SIGNIFICANCE = 4.0  # standard errors
 _LEAST_SENSORS = 3
 
 # Relative error of values by idealisations of the model: viscous instead of hysteretic damping
@@ -45,14 +45,14 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
     values = responses.values.copy()
     values[:, dead_eras] = np.nan
     _check_enough(alive, responses)
-    plate = fast_plate(rig, responses.points, responses.frequencies)
+    plate = parametric_plate(rig, responses.points, responses.frequencies)
     parameters = parameters_of(rig)
 
     # All scales are free at first, so that a wrong one does not bias the fit.
     problem = _problem(rig, plate, parameters, values, alive)
     fit = _best_fit(problem)
     relative = fit.scales / np.median(fit.scales)
-    unlike = unlike_the_plate(problem, fit, relative)
+    unlike = sensors_off_model(problem, fit, relative)
     if unlike.any():
         alive[alive] = ~unlike
         _check_enough(alive, responses)
@@ -61,7 +61,7 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
         fit = solve(problem, fit.x, relative)
         relative = fit.scales / np.median(fit.scales)
     error = fit.scales_error / np.abs(np.median(fit.scales))
-    wrong = np.abs(relative - 1) > np.maximum(_WRONG_SCALE, _SURE * error)
+    wrong = np.abs(relative - 1) > np.maximum(_WRONG_SCALE, _SIGNIFICANCE * error)
 
     free_scales = np.ones(len(wrong), dtype=bool) if all_scales else wrong
     if not all_scales:
@@ -96,7 +96,7 @@ def _check_enough(alive: NDArray[np.bool_], responses: Responses) -> None:
 
 def _problem(
     rig: Rig,
-    plate: FastPlate,
+    plate: ParametricPlate,
     parameters: tuple[Parameter, ...],
     values: ComplexArray,
     alive: NDArray[np.bool_],
@@ -105,7 +105,7 @@ def _problem(
     count = int(alive.sum())
     return Problem(
         rig,
-        replace(plate, shapes=plate.shapes[alive]),
+        plate.at(alive),
         parameters,
         values[:, :, alive],
         np.ones(len(parameters), dtype=bool),
@@ -128,7 +128,7 @@ def _identified(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     while True:
         excess = np.where(problem.free, fit.x_error / prior, 0)
         # Values of a plate that does not fit are meaningless.
-        if not excess.max() > 1 or _fit_error(problem, fit) > FITS:
+        if not excess.max() > 1 or _fit_error(problem, fit) > MAX_FIT_ERROR:
             return problem, fit
         free = problem.free.copy()
         free[int(excess.argmax())] = False
@@ -202,7 +202,7 @@ def _report(
         sensors=names,
         frequencies=frequencies,
         measured=problem.values / fit.scales,
-        before=as_it_was(problem),
+        before=initial_responses(problem),
         after=after,
     )
 

@@ -6,7 +6,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.calibration.parameters import Parameter
 from model.rig.rig import Rig
 
-FITS = 0.25
+MAX_FIT_ERROR = 0.25
 """Largest relative error at held-out sensors of an acceptable fit."""
 
 
@@ -78,4 +78,4 @@ class Calibration:
     @property
     def is_good(self) -> bool:
         """Whether the fit is acceptable."""
-        return bool((self.held_out.after if self.held_out else self.error) <= FITS)
+        return bool((self.held_out.after if self.held_out else self.error) <= MAX_FIT_ERROR)

@@ -37,11 +37,11 @@ def silent_sensors(responses: Responses) -> NDArray[np.bool_]:
 
 def _median(values: NDArray[np.inexact]) -> float:
     """Median magnitude of finite values; NaN without any."""
-    there = np.abs(values)[np.isfinite(values)]
-    return float(np.median(there)) if len(there) else float("nan")
+    finite = np.abs(values)[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else float("nan")
 
 
-def unlike_the_plate(problem: Problem, fit: Fit, relative: FloatArray) -> NDArray[np.bool_]:
+def sensors_off_model(problem: Problem, fit: Fit, relative: FloatArray) -> NDArray[np.bool_]:
     """Mask of sensors whose response is not that of the fitted plate (s,)."""
     rig = rig_with(problem.rig, problem.parameters, fit.x)
     model = np.nan_to_num(fit.gains)[:, :, None] * problem.plate.responses(rig)

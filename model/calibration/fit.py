@@ -19,10 +19,15 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, nnls
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.calibration.fast_plate import FastPlate
-from model.calibration.parameters import Parameter, rig_with
-from model.calibration.variable_projection import modal_assurance, project_gains, row_rms
+from model.calibration.parameters import Parameter, responses_at
+from model.calibration.variable_projection import (
+    jacobian_of,
+    modal_assurance,
+    project_gains,
+    row_rms,
+)
 from model.rig.rig import Rig
+from model.vibration.parametric_plate import ParametricPlate
 
 _Loss: TypeAlias = Literal["linear", "soft_l1"]
 
@@ -41,7 +46,7 @@ class Problem:
     """
 
     rig: Rig
-    plate: FastPlate
+    plate: ParametricPlate
     parameters: tuple[Parameter, ...]
     values: ComplexArray
     free: NDArray[np.bool_]
@@ -87,7 +92,7 @@ def solve(problem: Problem, x: FloatArray, scales: FloatArray) -> Fit:
         x, scales, errors = _search(problem, x, scales, weight, loss=loss)
         if is_settled:
             break
-    model = problem.plate.responses(rig_with(problem.rig, problem.parameters, x)) * scales
+    model = _model(problem, x) * scales
     gains, residual = project_gains(model, problem.values, weight)
     power = (np.abs(weight * model) ** 2).sum(axis=2)
     with np.errstate(divide="ignore"):
@@ -101,7 +106,7 @@ def solve(problem: Problem, x: FloatArray, scales: FloatArray) -> Fit:
 
 def misfit(problem: Problem, x: FloatArray) -> float:
     """Median over rows of 1 - MAC, 0 to 1, for all parameters x (n,), free or not."""
-    model = problem.plate.responses(rig_with(problem.rig, problem.parameters, x))
+    model = _model(problem, x)
     return float(np.nanmedian(1 - modal_assurance(problem.values, model)))
 
 
@@ -113,17 +118,19 @@ def _search(
     count = int(free.sum())
 
     def unpack(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        full, sensors = x.copy(), scales.copy()
-        full[free], sensors[free_scales] = z[:count], z[count:]
+        full = np.broadcast_to(x, (*z.shape[:-1], len(x))).copy()
+        sensors = np.broadcast_to(scales, (*z.shape[:-1], len(scales))).copy()
+        full[..., free], sensors[..., free_scales] = z[..., :count], z[..., count:]
         return full, sensors
 
     def residual(z: FloatArray) -> FloatArray:
-        left = _residual(problem, *unpack(z), weight)[weight > 0]
-        parts = np.concatenate([left.real, left.imag])
+        left = _residual(problem, *unpack(z), weight)[..., weight > 0]
+        parts = [left.real, left.imag]
         if free_scales.all():
             # Gains determine a common scale; the mean is held.
-            return np.append(parts, 1e3 * (unpack(z)[1].mean() - scales.mean()))
-        return parts
+            mean = unpack(z)[1].mean(axis=-1, keepdims=True)
+            parts.append(1e3 * (mean - scales.mean()))
+        return np.concatenate(parts, axis=-1)
 
     start = np.concatenate([x[free], scales[free_scales]])
     if len(start) == 0:
@@ -132,6 +139,7 @@ def _search(
     found = least_squares(
         residual,
         np.clip(start, lower + 1e-9, upper - 1e-9),
+        jacobian_of(residual, lower, upper),
         bounds=(lower, upper),
         loss=loss,
         x_scale="jac",
@@ -184,9 +192,13 @@ def _bounds(
 def _residual(
     problem: Problem, x: FloatArray, scales: FloatArray, weight: FloatArray
 ) -> ComplexArray:
-    """Weighted residual (f, e, s) with the best gains; zero where nothing was measured."""
-    model = problem.plate.responses(rig_with(problem.rig, problem.parameters, x)) * scales
+    """Weighted residual (..., f, e, s) with the best gains; zero where nothing was measured."""
+    model = _model(problem, x) * scales[..., None, None, :]
     return project_gains(model, problem.values, weight)[1]
+
+
+def _model(problem: Problem, x: FloatArray) -> ComplexArray:
+    return responses_at(problem.plate, problem.rig, problem.parameters, x)
 
 
 def _without_peaks(values: ComplexArray, used: NDArray[np.bool_]) -> ComplexArray:

@@ -29,7 +29,7 @@ def hold_out(problem: Problem, fit: Fit, names: tuple[str, ...]) -> HeldOut | No
     unseen[candidates[evenly_spaced]] = True
     part = replace(
         problem,
-        plate=replace(problem.plate, shapes=problem.plate.shapes[~unseen]),
+        plate=problem.plate.at(~unseen),
         values=problem.values[:, :, ~unseen],
         free_scales=problem.free_scales[~unseen],
     )
@@ -39,12 +39,14 @@ def hold_out(problem: Problem, fit: Fit, names: tuple[str, ...]) -> HeldOut | No
     predicted = seen.gains[:, :, None] * problem.plate.responses(rig) * fit.scales
     return HeldOut(
         tuple(name for name, out in zip(names, unseen, strict=True) if out),
-        relative_error(problem.values, as_it_was(problem) * fit.scales, size, unseen[None, None]),
+        relative_error(
+            problem.values, initial_responses(problem) * fit.scales, size, unseen[None, None]
+        ),
         relative_error(problem.values, predicted, size, fit.used & unseen),
     )
 
 
-def as_it_was(problem: Problem) -> ComplexArray:
+def initial_responses(problem: Problem) -> ComplexArray:
     """Responses (f, e, s) of the rig before the fit, with its gains."""
     frequencies = problem.plate.omega / (2 * np.pi)
     gains = np.column_stack([era.gain(frequencies) for era in problem.rig.eras])

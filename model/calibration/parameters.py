@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig
 from model.structure.actuator import Era, damping_from_ratio
+from model.vibration.parametric_plate import ParametricPlate
 
 # Prior standard deviations: data sheets give moduli, thicknesses and springs, and little on losses.
 _MODULUS_STD = 0.07  # of its logarithm
@@ -98,6 +99,21 @@ def parameters_of(rig: Rig) -> tuple[Parameter, ...]:
             ),
         ]
     return tuple(found)
+
+
+def responses_at(
+    plate: ParametricPlate, rig: Rig, parameters: Sequence[Parameter], x: FloatArray
+) -> ComplexArray:
+    """Responses (..., f, e, p) of a rig with the values of x (..., n).
+
+    parameters: as `parameters_of` orders them.
+    """
+    prior = np.array([parameter.prior for parameter in parameters])
+    step = np.array([parameter.step for parameter in parameters])
+    is_factor = np.array([parameter.is_factor for parameter in parameters])
+    values = np.where(is_factor, prior * np.exp(np.where(is_factor, x, 0.0)), step * x)
+    eras = values[..., 2:].reshape(*values.shape[:-1], -1, 3)
+    return plate.responses_of(values[..., 0], values[..., 1], eras, rig.masses)
 
 
 def rig_with(rig: Rig, parameters: Sequence[Parameter], x: FloatArray) -> Rig:

@@ -75,8 +75,8 @@ def write_responses_uff(path: Path, responses: Responses, rig: Rig) -> None:
     functions = []
     for e, era in enumerate(rig.eras):
         for s, sensor in enumerate(responses.sensors):
-            there = np.isfinite(responses.values[:, e, s])
-            if there.any():
+            measured = np.isfinite(responses.values[:, e, s])
+            if measured.any():
                 functions.append(
                     Function(
                         str(path),
@@ -85,8 +85,8 @@ def write_responses_uff(path: Path, responses: Responses, rig: Rig) -> None:
                         1001 + e,
                         (sensor, era.name),
                         (_UP, _UP),
-                        responses.frequencies[there],
-                        responses.values[there, e, s],
+                        responses.frequencies[measured],
+                        responses.values[measured, e, s],
                         (FREQUENCY, ACCELERATION, DISPLACEMENT),
                         ("m/s^2", "m"),
                     )

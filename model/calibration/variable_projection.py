@@ -7,10 +7,14 @@ follow from any model, so that only its parameters are searched (Golub and Perey
 Anal. 10, 1973).
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
+
+_STEP = float(np.sqrt(np.finfo(float).eps))  # of a difference, relative
 
 
 def project_gains(
@@ -23,22 +27,42 @@ def project_gains(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return gains (f, e) that minimize sum |weight (values - gain model)|², and that residual.
 
-    model, values, weight (f, e, s), weight zero where nothing was measured. expected (e,):
+    model (..., f, e, s); values, weight (f, e, s), weight zero where nothing was measured; the
+    result has the leading dimensions of model. expected (..., e):
     magnitudes known beforehand to a relative standard deviation `tolerance`; they add
     ((|gain| - expected) / (tolerance expected))² to each row. Without them the gain of a row
     without values is NaN.
     """
     values = np.where(weight > 0, values, 0)
-    inner = (weight**2 * model.conj() * values).sum(axis=2)
-    power = (np.abs(weight * model) ** 2).sum(axis=2)
+    inner = (weight**2 * model.conj() * values).sum(axis=-1)
+    power = (np.abs(weight * model) ** 2).sum(axis=-1)
     if expected is None:
         gains = np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan)
     else:
+        expected = expected[..., None, :]
         precision = 1 / (tolerance * expected) ** 2
         magnitude = (np.abs(inner) + precision * expected) / (power + precision)
         gains = magnitude * np.exp(1j * np.angle(inner))
-    residual = weight * (values - np.nan_to_num(gains)[:, :, None] * model)
+    residual = weight * (values - np.nan_to_num(gains)[..., None] * model)
     return gains, residual
+
+
+def jacobian_of(
+    residuals: Callable[[FloatArray], FloatArray], lower: FloatArray, upper: FloatArray
+) -> Callable[[FloatArray], FloatArray]:
+    """Jacobian (m, n) of residuals by forward differences, all of them in one call.
+
+    residuals: from (..., n) to (..., m). Steps that would leave the bounds (n,) go backwards.
+    """
+
+    def jacobian(z: FloatArray) -> FloatArray:
+        step = _STEP * np.where(z < 0, -1.0, 1.0) * np.maximum(1.0, np.abs(z))
+        leaves = (z + step > upper) | (z + step < lower)
+        moved = z + np.diag(np.where(leaves, -step, step))
+        found = residuals(np.vstack([z, moved]))
+        return np.asarray(((found[1:] - found[0]) / (np.diagonal(moved) - z)[:, None]).T)
+
+    return jacobian
 
 
 def row_rms(values: ComplexArray, used: NDArray[np.bool_] | None = None) -> FloatArray:

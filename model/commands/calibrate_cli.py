@@ -40,9 +40,10 @@ def calibrate(
     from model.calibration.calibrate import calibrate as fit
     from model.calibration.responses import responses_of
     from model.calibration.responses_file import read_functions
+    from model.config.document import read_document
     from model.files.array_file import whole_or_nothing
     from model.files.replacing import check_ending, check_picture, check_place
-    from model.rig.file import load_rig
+    from model.rig.file import load_rig, rig_of
 
     check_place(output, example="rig2.yaml")
     check_ending(output, ".yaml", ".yml", what="a rig file")
@@ -51,7 +52,8 @@ def calibrate(
             raise InputError(f"--output must differ from {taken}; choose another name")
     if picture is not None:
         check_picture(picture)
-    rig = load_rig(rig_file, mesh=mesh)
+    document = read_document(rig_file)
+    rig = rig_of(document, mesh=mesh)
     responses = responses_of(read_functions(measured_file), rig)
     started = time.perf_counter()
     calibration = fit(rig, responses, all_scales=all_scales)
@@ -64,13 +66,12 @@ def calibrate(
     files = []
     if calibration.is_good:
         from model.calibration.calibrated_rig import calibrated_text, check_reads_back
-        from model.config.document import read_document
 
         comment = "\n".join(
             [f"{rig_file.name} calibrated with {measured_file.name} by `era calibrate`:"]
             + [f"  {row}" for row in [*rows, *notes]]
         )
-        text = calibrated_text(read_document(rig_file), rig, calibration, comment=comment)
+        text = calibrated_text(document, rig, calibration, comment=comment)
         with whole_or_nothing(output) as stream:
             stream.write(text.encode())
         check_reads_back(load_rig(output, mesh=mesh), calibration, output)

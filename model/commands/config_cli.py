@@ -48,7 +48,8 @@ def check(
     from model.config.kinds import kind_of
 
     try:
-        good = kind_of(read_document(file)).check(file)
+        document = read_document(file)
+        good = kind_of(document).check(document)
     except ConfigError as error:
         problems = [
             {"line": problem.line, "key": problem.key, "message": problem.message}

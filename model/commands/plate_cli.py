@@ -34,37 +34,36 @@ def modes(
 
     The plate is undamped; rigid modes of a free plate are left out.
     """
-    from model.fem import modal
-    from model.fem.assembly import assemble
     from model.rig.file import load_rig
+    from model.vibration.natural_modes import natural_modes
 
     rig = load_rig(rig_file, mesh=mesh)
     started = time.perf_counter()
-    matrices = assemble(rig.plate, rig.mesh)
-    solved = modal.modes(matrices, count, support=support.value, eras=rig.eras, loads=rig.loads)
+    solved = natural_modes(rig, count, support=support.value)
     elapsed = time.perf_counter() - started
-    carried = rig.mesh.highest_frequency(rig.plate)
+    carried = solved.mesh.highest_frequency(rig.plate)
     if as_json:
         print(
             json.dumps(
                 {
-                    "frequencies_hz": solved.natural_frequencies.tolist(),
+                    "frequencies_hz": solved.frequencies.tolist(),
                     "mesh_carries_up_to_hz": carried,
                     "support": support.value,
-                    "mesh": [rig.mesh.nx, rig.mesh.ny],
-                    "dof": matrices.dof,
-                    "element": rig.mesh.element.name,
+                    "mesh": [solved.mesh.nx, solved.mesh.ny],
+                    "dof": solved.mesh.dof,
+                    "element": solved.mesh.element_name,
                     "solve_time_s": elapsed,
                 }
             )
         )
         return
-    element = "" if rig.mesh.element.name in str(rig.mesh) else f" {rig.mesh.element.name}"
-    print(f"{rig_file}: {rig.mesh}{element}, {matrices.dof} dof, support: {support.value}")
-    for number, frequency in enumerate(solved.natural_frequencies, start=1):
+    name = solved.mesh.element_name
+    element = "" if name in str(solved.mesh) else f" {name}"
+    print(f"{rig_file}: {solved.mesh}{element}, {solved.mesh.dof} dof, support: {support.value}")
+    for number, frequency in enumerate(solved.frequencies, start=1):
         beyond = "  mesh too coarse" if frequency > carried else ""
         print(f"mode {number:3d}  {frequency:9.2f} Hz{beyond}")
-    if solved.natural_frequencies[-1] > carried:
+    if solved.frequencies[-1] > carried:
         print(
             f"above {carried:.0f} Hz a bending wavelength has fewer than six nodes; use a finer "
             "--mesh for those frequencies"
@@ -160,6 +159,8 @@ def convergence(
     from model.config.points import parse_frequencies
     from model.rig.file import load_rig
     from model.vibration.convergence import (
+        FOOT,
+        MOVED,
         default_frequencies,
         meshes_to_compare,
         study_convergence,
@@ -177,7 +178,7 @@ def convergence(
         rows = [
             {
                 "mesh": [error.mesh.nx, error.mesh.ny],
-                "element": error.mesh.element.name,
+                "element": error.mesh.element_name,
                 "strip_m": error.mesh.strip,
                 "dof": error.dof,
                 "is_the_rigs": error.mesh == rig.mesh,
@@ -188,11 +189,17 @@ def convergence(
         ]
         reference = {
             "mesh": [study.reference.nx, study.reference.ny],
-            "element": study.reference.element.name,
+            "element": study.reference.element_name,
             "strip_m": study.reference.strip,
             "natural_frequencies_hz": study.natural_frequencies.tolist(),
         }
-        answer = {"reference": reference, "drive_frequencies_hz": chosen.tolist(), "meshes": rows}
+        answer = {
+            "reference": reference,
+            "drive_frequencies_hz": chosen.tolist(),
+            "meshes": rows,
+            "moved_era_change_percent": (100 * study.by_place).tolist(),
+            "wider_foot_change_percent": (100 * study.by_foot).tolist(),
+        }
         print(json.dumps(answer | {"solve_time_s": elapsed}))
         return
     print(f"{rig_file}: errors against {study.reference}, solved in {elapsed:.1f} s")
@@ -207,4 +214,12 @@ def convergence(
         errors = [100 * abs(error.frequency).max(), *(100 * error.response)]
         columns = "".join(f"{value:10.3f} %" for value in errors)
         mine = "  <- the rig's" if error.mesh == rig.mesh else ""
-        print(f"{mesh_text:>9}{error.mesh.element.name:>9}{strip:>8}{error.dof:>8}{columns}{mine}")
+        print(f"{mesh_text:>9}{error.mesh.element_name:>9}{strip:>8}{error.dof:>8}{columns}{mine}")
+    print()
+    print("for comparison, what the same response changes by if every ERA")
+    changes = {
+        f"is {1000 * MOVED:g} mm nearer to the middle": study.by_place,
+        f"has a foot with {1000 * FOOT:g} mm more radius": study.by_foot,
+    }
+    for what, change in changes.items():
+        print(f"    {what:<42}" + "".join(f"{value:10.3f} %" for value in 100 * change))

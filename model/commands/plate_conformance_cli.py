@@ -24,7 +24,7 @@ def conformance(
     for check in CHECKS:
         problem = problems[check.name] = check.problem(element)
         if not as_json:
-            print(f"{'passed' if problem is None else 'FAILED'}  {check.proves}.")
+            print(f"{'passed' if problem is None else 'FAILED'}  {check.requirement}.")
             if problem is not None:
                 print(f"        {problem}")
         if problem is not None and check.name in ("nodes", "matrices"):
@@ -33,7 +33,7 @@ def conformance(
     errors = [] if failed else [frequency_error(element, count) for count in (COARSE, 2 * COARSE)]
     if as_json:
         rows = [
-            {"check": check.name, "proves": check.proves, "problem": problems[check.name]}
+            {"check": check.name, "requirement": check.requirement, "problem": problems[check.name]}
             for check in CHECKS
             if check.name in problems
         ]
@@ -41,7 +41,7 @@ def conformance(
             json.dumps(
                 {
                     "element": name,
-                    "kept": not failed,
+                    "passed": not failed,
                     "checks": rows,
                     "frequency_error": errors,
                     "rate": rate(*errors) if errors else None,

@@ -24,7 +24,7 @@ def materials(as_json: JsonOption = False) -> None:
                 "rho_kg_m3": one.material.rho,
                 "nu": one.material.nu,
                 "source": one.source,
-                "spread": one.variation,
+                "variation": one.variation,
                 "loss_factor": one.loss_factor,
             }
             for name, one in known.items()

@@ -72,23 +72,20 @@ def study(
     from model.studies.finished import FinishedCases
     from model.studies.kinds import STUDIES
     from model.studies.outcome import ranking_summary, write_outcome
-    from model.studies.ranking import rank
+    from model.studies.ranking import check_supported_cases, rank
     from model.studies.run import run_study
     from model.studies.solve import DRIVES, study_problem
     from model.studies.workers import on_cluster, on_processes
 
     document = read_document(rig_file)
     rig = rig_of(document, mesh=mesh)
-    if what is not Study.COUNT and active is Driven.TWO and len(rig.eras) < 2:
-        raise InputError(
-            f"{rig_file}: --active 2 needs at least two ERAs, got one; rank with --active 1"
-        )
     if cluster is not None and workers != 1:
         raise InputError("only one of --workers and --cluster can be given")
     started = time.perf_counter()
     cases = STUDIES[what](
         rig, layouts=layouts, seed=seed, raster=parse_pair(candidates, what="--candidates")
     )
+    check_supported_cases(rig, cases)
     problem = study_problem(rig, cases, parse_frequencies(frequencies))
     output.mkdir(parents=True, exist_ok=True)
     finished = FinishedCases(output, problem.digest)
@@ -165,6 +162,4 @@ def _show(summary: dict[str, Any]) -> None:
         )
     recommended = summary["recommended"]
     why = "" if recommended["rank"] == 1 else ", fewest and softest within a tenth of the best"
-    if not recommended["supported"]:
-        print("No layout supports the plate: put at least three ERAs under it, not in one line")
     print(f"Recommended{why}: {recommended['words']}")

@@ -86,7 +86,7 @@ def build(
             "cells": table.grid.cell_count,
             "drive_frequencies_hz": table.frequencies.tolist(),
             "mesh": [table.mesh.nx, table.mesh.ny],
-            "element": table.mesh.element.name,
+            "element": table.mesh.element_name,
             "discretisation_error_percent": error,
             "mode": table.drive_mode,
             "fingerprint": table.fingerprint,

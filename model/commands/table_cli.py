@@ -15,10 +15,14 @@ def query(
     table_file: TableArgument,
     target: Annotated[
         list[str] | None,
-        typer.Option(metavar="X,Y", help="Finger to feel it, metres; repeatable."),
+        typer.Option(metavar="X,Y", help="Position of a target finger in metres; repeatable."),
     ] = None,
     quiet: Annotated[
-        list[str] | None, typer.Option(metavar="X,Y", help="Finger not to feel it; repeatable.")
+        list[str] | None,
+        typer.Option(
+            metavar="X,Y",
+            help="Position of a finger that must not feel it, in metres; repeatable.",
+        ),
     ] = None,
     drive_mode: Annotated[
         str | None,
@@ -28,7 +32,7 @@ def query(
         float, typer.Option(metavar="DB_SL", help="Level at the target, dB SL.")
     ] = 20.0,
     eras: Annotated[
-        int, typer.Option(metavar="N", help="Maximum number of ERAs in mode switched.")
+        int, typer.Option(metavar="N", help="Maximum number of ERAs with --mode switched.")
     ] = 2,
     envelopes: Annotated[
         bool, typer.Option("--envelopes", help="Shape onset and ending by envelopes.")
@@ -83,7 +87,7 @@ def _print_answer(answer: dict[str, Any]) -> None:
         )
     rows = [("level at the target", answer["level_db_sl"], "dB SL")]
     if answer["contrast_db"] is not None:
-        awareness = "not felt" if answer["quiet_is_unaware"] else "may be felt"
+        awareness = "not felt" if answer["is_imperceptible_to_quiet"] else "may be felt"
         rows += [
             ("contrast to quiet fingers", answer["contrast_db"], "dB"),
             ("  on nine of ten plates", answer["robust_contrast_db"], "dB or more"),
@@ -93,12 +97,12 @@ def _print_answer(answer: dict[str, Any]) -> None:
         ]
     else:
         rows += [
-            ("contrast to the plate around", answer["surroundings_contrast_db"], "dB"),
-            ("  to 95 % of that plate", answer["surroundings_contrast_95_db"], "dB or more"),
+            ("contrast to the rest of the plate", answer["surroundings_contrast_db"], "dB"),
+            ("  to its 95th percentile", answer["surroundings_contrast_95_db"], "dB or more"),
             ("area above half the target", 1e4 * answer["area_above_half_m2"], "cm²"),
             ("energy within 5 cm", 100 * answer["energy_share_near"], "%"),
         ]
-    rows.append(("residual after the end", answer["left_after_db"], "dB"))
+    rows.append(("residual after the end", answer["residual_db"], "dB"))
     for name, value, unit in rows:
         print(f"{name:28s} {value:6.1f} {unit}")
     print(f"solved in {1000 * answer['solve_time_s']:.1f} ms")
@@ -107,13 +111,14 @@ def _print_answer(answer: dict[str, Any]) -> None:
 def _query_batch(table_file: Path, batch: Path) -> None:
     """Answer line by line; exit with 1 at the end if a line had no answer."""
     from model.errors import InputError
+    from model.files.regular_file import regular_file
     from model.table.file import load_table
     from model.table.query import query_batch
 
     table = load_table(table_file)
     has_failed = False
     try:
-        with batch.open(encoding="utf-8") as lines:
+        with open(batch, encoding="utf-8", opener=regular_file) as lines:
             for answer in query_batch(table, lines):
                 has_failed = has_failed or "error" in answer
                 print(json.dumps(answer))

@@ -76,10 +76,10 @@ def verify(
     else:
         _show_verification(found)
         count = len(found.content) + len(found.answer_checks)
-        print(f"{count - found.misses} of {count} passed (seed {seed}) in {elapsed:.1f} s")
-        if found.misses:
+        print(f"{count - found.failed_count} of {count} passed (seed {seed}) in {elapsed:.1f} s")
+        if found.failed_count:
             print(next_line("era", "table", "build", rig_file, "-o", table_file))
-    if found.misses:
+    if found.failed_count:
         raise typer.Exit(1)
 
 

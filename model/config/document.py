@@ -1,12 +1,13 @@
 """YAML files read strictly, with the line of every key.
 
-A file is UTF-8, at most 1 MiB, one document with a mapping at the top, without anchors, aliases
-or tags, so that nothing expands or gets constructed. No key is given twice. Words are text unless
-they are decimal numbers, true, false or null (core schema of YAML 1.2).
+A file is UTF-8, at most 1 MiB and 50 000 values in 20 levels, one document with a mapping at the
+top, without anchors, aliases or tags, so that nothing expands or gets constructed; all this is
+checked before a value is made. No key is given twice. Words are text unless they are decimal
+numbers, true, false or null (core schema of YAML 1.2).
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +22,14 @@ from ruamel.yaml.reader import ReaderError
 from ruamel.yaml.resolver import BaseResolver, VersionedResolver
 
 from model.errors import InputError
+from model.files.regular_file import regular_file
 
 MAX_SIZE = 1 << 20  # bytes
+MAX_PROBLEMS = 50
+"""Number of problems of one file that are reported; with more it is the wrong kind of file."""
+
 _MAX_DEPTH = 20
+_MAX_VALUES = 50_000
 _ZIP = b"PK\x03\x04"
 
 Scalar: TypeAlias = bool | int | float | str | None
@@ -43,13 +49,18 @@ class Problem:
 class ConfigError(InputError):
     """A configuration file that cannot be used, with every problem that was found in it."""
 
-    def __init__(self, source: str, problems: list[Problem]) -> None:
-        """Say all problems, `FILE:LINE: key: what is wrong; what to do`, one on a line."""
+    def __init__(self, source: str, problems: Sequence[Problem]) -> None:
+        """Say the problems, `FILE:LINE: key: what is wrong; what to do`, one on a line.
+
+        Of more than MAX_PROBLEMS the first ones.
+        """
         self.source = source
-        self.problems = tuple(sorted(problems, key=lambda problem: problem.line or 0))
+        in_order = sorted(problems, key=lambda problem: problem.line or 0)
+        self.problems = tuple(in_order[:MAX_PROBLEMS])
         lines = [self._sentence(problem) for problem in self.problems]
         if len(lines) > 1:
-            lines = [f"{source} has {len(lines)} errors:", *(f"  {line}" for line in lines)]
+            count = f"more than {MAX_PROBLEMS}" if len(in_order) > MAX_PROBLEMS else len(lines)
+            lines = [f"{source} has {count} errors:", *(f"  {line}" for line in lines)]
         super().__init__("\n".join(lines))
 
     def _sentence(self, problem: Problem) -> str:
@@ -102,14 +113,14 @@ def read_document(path: Path) -> Document:
     """Read a YAML file; raises ConfigError if it cannot be read, or is more than plain data."""
     source = str(path)
     try:
-        with path.open("rb") as stream:
+        with open(path, "rb", opener=regular_file) as stream:
             content = stream.read(MAX_SIZE + 1)
     except FileNotFoundError as error:
         raise _whole(source, "no such file; check its name and folder") from error
     except IsADirectoryError as error:
         raise _whole(source, "is a folder; give the file in it") from error
     except OSError as error:
-        raise _whole(source, f"cannot be read: {error.strerror}") from error
+        raise _whole(source, f"cannot be read: {error.strerror}; give a YAML file") from error
     except ValueError as error:
         raise _whole(repr(source), f"is no file name: {error}") from error
     if content.startswith(_ZIP):
@@ -160,7 +171,7 @@ def _errors_at(source: str, text: str) -> Iterator[None]:
     try:
         yield
     except _Refused as error:
-        raise ConfigError(source, [error.problem]) from None
+        raise ConfigError(source, error.problems) from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = None if mark is None else mark.line + 1
@@ -177,8 +188,8 @@ def _errors_at(source: str, text: str) -> Iterator[None]:
 class _Refused(Exception):
     """A part of a file that is not plain data."""
 
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
+    def __init__(self, *problems: Problem) -> None:
+        self.problems = problems
 
 
 class _PlainComposer(Composer):
@@ -192,6 +203,7 @@ class _PlainComposer(Composer):
         self.lines: dict[KeyPath, int] = {}
         self.repeated: list[Problem] = []
         self._path: KeyPath = ()
+        self._count = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         """Compose the next node: a list entry by its number, a value by the node of its key."""
@@ -221,6 +233,10 @@ class _PlainComposer(Composer):
         if len(self._path) > _MAX_DEPTH:
             self._path = self._path[:3]
             raise self._refused(event, f"is nested more than {_MAX_DEPTH} levels deep")
+        self._count += 1
+        if self._count > _MAX_VALUES:
+            self._path = ()
+            raise self._refused(event, f"has more than {_MAX_VALUES} values")
         if is_key and not isinstance(event, ScalarEvent):
             raise self._refused(event, "a key must be a word")
         if is_root and not isinstance(event, MappingStartEvent) and not _is_empty(event):
@@ -238,6 +254,8 @@ class _PlainComposer(Composer):
                 path = (*self._path, key.value)
                 message = f"is given twice, first on line {self.lines[path]}; remove one"
                 self.repeated.append(Problem(_line(key), key_name(path), message))
+                if len(self.repeated) > MAX_PROBLEMS:
+                    raise _Refused(*self.repeated)
             seen.add(key.value)
 
 

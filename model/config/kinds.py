@@ -6,7 +6,6 @@ keys of a file determine its kind.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from model.config.document import Document
@@ -31,7 +30,7 @@ class ConfigKind(Protocol):
     def recognises(self, document: Document) -> bool:
         """Whether a document is of this kind."""
 
-    def check(self, path: Path) -> CheckedFile:
+    def check(self, document: Document) -> CheckedFile:
         """Check a file and the files that it names; raises ConfigError."""
 
     def example(self) -> str:

@@ -10,10 +10,10 @@ from typing import Annotated, Any, Generic, TypeVar, Union, get_args, get_origin
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, TypeAdapter, ValidationError
 from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
-from model.config.document import ConfigError, Document, KeyPath, Problem, Value
+from model.config.document import MAX_PROBLEMS, ConfigError, Document, KeyPath, Problem, Value
 from model.config.units import Dimension, quantity, shown
 from model.counting import counted
-from model.errors import in_our_words
+from model.errors import reworded
 from registry.suggestions import did_you_mean
 
 
@@ -80,11 +80,10 @@ class Validation(Generic[SectionT]):
         try:
             self._section = root.model_validate(document.data)
         except ValidationError as error:
-            for details in error.errors(include_url=False):
-                self._problems.append(_problem(document, root, details))
+            self._add_errors(error, root)
 
     def part(self, path: KeyPath, section: type[PartT]) -> PartT | None:
-        """A section if it is valid by itself, for checks across sections; else None."""
+        """A section if it is valid on its own, for checks across sections; else None."""
         try:
             return section.model_validate(self._document.value(path))
         except (KeyError, ValidationError):
@@ -98,12 +97,11 @@ class Validation(Generic[SectionT]):
         try:
             return section.model_validate({k: v for k, v in value.items() if k != without})
         except ValidationError as error:
-            for details in error.errors(include_url=False):
-                self._problems.append(_problem(self._document, section, details, below=path))
+            self._add_errors(error, section, below=path)
             return None
 
     def field(self, path: tuple[str, ...], section: type[Section]) -> Any:
-        """One field of a section if it is valid by itself; else None."""
+        """One field of a section if it is valid on its own; else None."""
         try:
             return _field_reader(section, path[-1]).validate_python(self._document.value(path))
         except (KeyError, ValidationError):
@@ -120,6 +118,13 @@ class Validation(Generic[SectionT]):
     def add(self, path: KeyPath, message: str) -> None:
         """Add a problem at a key."""
         self._problems.append(self._document.problem(path, message))
+
+    def _add_errors(
+        self, error: ValidationError, section: type[Section], *, below: KeyPath = ()
+    ) -> None:
+        """Add the errors of a section below a path, as many as are reported and one more."""
+        for details in error.errors(include_url=False)[: MAX_PROBLEMS + 1]:
+            self._problems.append(_problem(self._document, section, details, below=below))
 
     def finish(self) -> SectionT:
         """Return the root section; raises ConfigError with all problems."""
@@ -176,7 +181,7 @@ def _problem(
                 f"must have {bound} {'entry' if bound.endswith(' 1') else 'entries'}, got {count}"
             )
         case _:
-            message = f"{in_our_words(details['msg'])}, got {_shown(details)}"
+            message = f"{reworded(details['msg'])}, got {_shown(details)}"
     return document.problem((*below, *path), message)
 
 

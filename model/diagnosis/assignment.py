@@ -9,16 +9,16 @@ import numpy as np
 from scipy.stats import ttest_1samp
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.fast_plate import FastPlate
-from model.calibration.parameters import parameters_of, rig_with, starts
+from model.calibration.parameters import parameters_of, responses_at, starts
 from model.calibration.variable_projection import modal_assurance
 from model.rig.rig import Rig
+from model.vibration.parametric_plate import ParametricPlate
 
 _LEAST_MISFIT = 0.02  # below it sensors' errors dominate
 
 
 @dataclass(frozen=True, eq=False)
-class Likeness:
+class ShapeMatch:
     """MAC of channels and ERAs on the most similar plate.
 
     mac (f, e, e): of the channel that the rig wires to the first ERA with the second ERA, NaN if
@@ -54,15 +54,15 @@ class Likeness:
         return float(1 - ttest_1samp(gain, 0.0, alternative="greater").pvalue)
 
 
-def likeness(rig: Rig, plate: FastPlate, values: ComplexArray) -> Likeness:
+def match_shapes(rig: Rig, plate: ParametricPlate, values: ComplexArray) -> ShapeMatch:
     """Compare values (f, e, s) with a rig's ERAs on plates of other modulus and stiffnesses."""
     parameters = parameters_of(rig)
     own = np.array([parameter.start for parameter in parameters])
-    best: tuple[float, Likeness] | None = None
+    best: tuple[float, ShapeMatch] | None = None
     for x in [own, *starts(parameters)]:
         shift = {p.kind: float(a - b) for p, a, b in zip(parameters, x, own, strict=True)}
-        mac = _mac(values, plate.responses(rig_with(rig, parameters, x)))
-        found = Likeness(mac, (shift["modulus"], shift["stiffness"]))
+        mac = _mac(values, responses_at(plate, rig, parameters, x))
+        found = ShapeMatch(mac, (shift["modulus"], shift["stiffness"]))
         score = float(
             sum(_typical(mac[:, i, j]) for i, j in enumerate(found.nearest) if _driven(mac, i))
         )
@@ -74,9 +74,9 @@ def likeness(rig: Rig, plate: FastPlate, values: ComplexArray) -> Likeness:
     return best[1]
 
 
-def likeness_to(model: ComplexArray, values: ComplexArray) -> Likeness:
+def match_responses(model: ComplexArray, values: ComplexArray) -> ShapeMatch:
     """Compare values (f, e, s) with responses (f, e, s) of one plate."""
-    return Likeness(_mac(values, model), (0.0, 0.0))
+    return ShapeMatch(_mac(values, model), (0.0, 0.0))
 
 
 def _mac(values: ComplexArray, model: ComplexArray) -> FloatArray:
@@ -90,5 +90,5 @@ def _driven(mac: FloatArray, channel: int) -> bool:
 
 def _typical(mac: FloatArray) -> float:
     """Median over frequencies, NaN without values."""
-    there = mac[np.isfinite(mac)]
-    return float(np.median(there)) if len(there) else float("nan")
+    finite = mac[np.isfinite(mac)]
+    return float(np.median(finite)) if len(finite) else float("nan")

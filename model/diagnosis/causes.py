@@ -16,11 +16,11 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.fast_plate import FastPlate, fast_plate
 from model.calibration.variable_projection import modal_assurance
 from model.diagnosis.plate_match import Match, match_plate
 from model.errors import InputError
 from model.rig.rig import Rig
+from model.vibration.parametric_plate import ParametricPlate, parametric_plate
 
 _SIZES = (0.6, 0.67, 0.75, 0.82, 0.88, 0.94, 1.06, 1.13, 1.21, 1.33, 1.5, 1.67)
 _STIFFNESSES = (0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
@@ -89,7 +89,7 @@ def causes_of(rig: Rig) -> list[Cause]:
 
 def explain(
     rig: Rig,
-    plate: FastPlate,
+    plate: ParametricPlate,
     points: FloatArray,
     frequencies: FloatArray,
     values: ComplexArray,
@@ -100,7 +100,7 @@ def explain(
 ) -> list[Explanation]:
     """Find what explains values (f, e, s) best, most likely first; see `match_plate`."""
 
-    def solved(cause: Cause, factor: float) -> tuple[Rig, FastPlate] | None:
+    def solved(cause: Cause, factor: float) -> tuple[Rig, ParametricPlate] | None:
         try:
             other = cause.scaled(rig, factor)
         except InputError:
@@ -109,7 +109,7 @@ def explain(
             return other, plate
         # A sensor that would be off the plate counts as at its edge.
         on_plate = np.clip(points, 0, [other.plate.length, other.plate.width])
-        return other, fast_plate(other, on_plate, frequencies)
+        return other, parametric_plate(other, on_plate, frequencies)
 
     def matched(cause: Cause, factor: float) -> Match | None:
         found = solved(cause, factor)
@@ -215,13 +215,7 @@ def _stretched(rig: Rig, along_x: float, along_y: float) -> Rig:
     plate = replace(rig.plate, length=rig.plate.length * along_x, width=rig.plate.width * along_y)
     eras = tuple(replace(era, x=era.x * along_x, y=era.y * along_y) for era in rig.eras)
     masses = tuple(replace(mass, x=mass.x * along_x, y=mass.y * along_y) for mass in rig.masses)
-    mesh = replace(
-        rig.mesh,
-        nx=math.ceil(rig.mesh.nx * max(along_x, 1.0)),
-        ny=math.ceil(rig.mesh.ny * max(along_y, 1.0)),
-        length=plate.length,
-        width=plate.width,
-    )
+    mesh = rig.mesh.stretched(plate)
     return replace(rig, plate=plate, eras=eras, masses=masses, mesh=mesh)
 
 

@@ -1,18 +1,18 @@
 """Report of a diagnosis, as text and as JSON."""
 
-from collections.abc import Sequence
 from typing import Any
 
 from model.diagnosis.causes import Explanation
-from model.diagnosis.plate_match import FITS
-from model.diagnosis.polarity import EVEN
-from model.diagnosis.verdict import UNLIKELY, ChannelState, ChannelVerdict, Verdict
+from model.diagnosis.plate_match import MAX_FIT_ERROR
+from model.diagnosis.polarity import UNDECIDED
+from model.diagnosis.verdict import MAX_DEVIATION, ChannelState, ChannelVerdict, Verdict
 from model.quantities import in_display_unit, percent
 
-_TO_DO: dict[ChannelState, str] = {
+_REMEDIES: dict[ChannelState, str] = {
     "dead": "check its supply, its cable and the amplifier's channel",
     "weak": "check its voltage and mounting, or measure its gain with `era calibrate`",
     "strong": "lower its voltage, or correct its stroke in the rig",
+    "other ERA": "correct the plug, or the rig's channels",
     "inverted": "swap its two wires",
     "out of phase": "measure its gains with `era calibrate`",
 }
@@ -21,39 +21,42 @@ _MIN_SHARE = 0.05  # likelihood of a reported explanation
 
 def verdict_rows(verdict: Verdict) -> list[str]:
     """Lines of findings with their remedies; one line if there are none."""
+    by_era = {channel.era: channel for channel in verdict.channels}
     rows = []
     for cycle in verdict.swapped:
+        confidence = f"(confidence {min(by_era[era].confidence for era in cycle):.3f})"
         if len(cycle) == 2:
-            one, other = (_at(_of(verdict, era)) for era in cycle)
+            one, other = (_wiring(by_era[era]) for era in cycle)
             rows.append(
                 f"SWAPPED: {one} drives ERA {cycle[1]}, and {other} drives ERA {cycle[0]} "
-                f"({_sure(verdict, cycle)}): exchange the two plugs, or the channels in the rig"
+                f"{confidence}: exchange the two plugs, or the channels in the rig"
             )
         else:
             rows.append(
                 f"SWAPPED in a cycle: the channels of {', '.join(cycle)} each drive the next "
-                f"one's ERA ({_sure(verdict, cycle)}): correct the plugs"
+                f"one's ERA {confidence}: correct the plugs"
             )
     swapped = {era for cycle in verdict.swapped for era in cycle}
     for channel in verdict.channels:
-        rows += [
-            _row(channel, state) for state in channel.states if _is_news(state, channel, swapped)
-        ]
+        reported = {*channel.states} - {"well", "not driven"}
+        if channel.era in swapped:
+            reported.discard("other ERA")
+        rows += [_row(channel, state) for state in channel.states if state in reported]
     inverted = [c for c in verdict.channels if "inverted" in c.states]
     if len(inverted) > 1 and len(inverted) == sum(c.drives is not None for c in verdict.channels):
         rows.append("all of them: check mounting of sensors and sign convention of phases")
     rows += [f"SENSOR {name} {why}: left out" for name, why in verdict.bad_sensors]
     if not verdict.plate_matches:
-        rows += plate_rows(verdict)
+        rows += _plate_rows(verdict)
     return rows or ["ALL WELL: plate and channels match the rig"]
 
 
-def plate_rows(verdict: Verdict) -> list[str]:
+def _plate_rows(verdict: Verdict) -> list[str]:
     """Lines on how the plate differs from the rig, and on possible explanations."""
     match = verdict.match
     if match is None:
         return []
-    if match.error > FITS:
+    if match.error > MAX_FIT_ERROR:
         why = f"{percent(match.error)} unexplained at best"
     else:
         at = int(abs(match.z).argmax())
@@ -80,19 +83,19 @@ def plate_rows(verdict: Verdict) -> list[str]:
 
 def explains(explanation: Explanation) -> bool:
     """Whether the rest of the rig is then within its priors."""
-    return explanation.match.error <= FITS and explanation.match.worst <= UNLIKELY
+    return explanation.match.error <= MAX_FIT_ERROR and explanation.match.worst <= MAX_DEVIATION
 
 
 def channel_table(verdict: Verdict) -> list[str]:
     """Table of the channels with a header line."""
-    rows = [f"{'ERA':8} {'channel':12} {'drives':8} {'gain':>6} {'phase':>7} {'alike':>6}  verdict"]
+    rows = [f"{'ERA':8} {'channel':12} {'drives':8} {'gain':>6} {'phase':>7} {'MAC':>6}  verdict"]
     for channel in verdict.channels:
         gain = "-" if channel.gain is None else f"{channel.gain:.2f}"
         phase = "-" if channel.phase is None else f"{channel.phase:+.0f}°"
-        alike = "-" if channel.likeness_found is None else f"{channel.likeness_found:.3f}"
+        mac = "-" if channel.mac_found is None else f"{channel.mac_found:.3f}"
         rows.append(
             f"{channel.era:8} {channel.channel.amplifier + ':' + str(channel.channel.number):12} "
-            f"{channel.drives or '-':8} {gain:>6} {phase:>7} {alike:>6}  "
+            f"{channel.drives or '-':8} {gain:>6} {phase:>7} {mac:>6}  "
             f"{', '.join(channel.states)}"
         )
     return rows
@@ -112,8 +115,8 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
                 "drives": channel.drives,
                 "gain": channel.gain,
                 "phase_deg": channel.phase,
-                "mac_of_the_rigs_era": channel.likeness_own,
-                "mac_of_the_era_found": channel.likeness_found,
+                "mac_of_the_rigs_era": channel.mac_own,
+                "mac_of_the_era_found": channel.mac_found,
                 "confidence": channel.confidence,
             }
             for channel in verdict.channels
@@ -155,43 +158,27 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
     }
 
 
-def _is_news(state: ChannelState, channel: ChannelVerdict, swapped: set[str]) -> bool:
-    return state not in ("well", "not driven") and not (
-        state == "other ERA" and channel.era in swapped
-    )
-
-
 def _row(channel: ChannelVerdict, state: ChannelState) -> str:
-    at = _at(channel)
+    wiring, remedy = _wiring(channel), _REMEDIES[state]
     match state:
         case "dead":
-            return f"DEAD: {at} does not move the plate: {_TO_DO[state]}"
+            return f"DEAD: {wiring} does not move the plate: {remedy}"
         case "other ERA":
             return (
-                f"WRONG ERA: {at} drives ERA {channel.drives} instead of {channel.era} (MAC "
-                f"{channel.likeness_found:.3f}, with its own ERA {channel.likeness_own:.3f}; "
-                f"confidence {channel.confidence:.3f}): correct the plug, or the rig's channels"
-            )
-        case "weak" | "strong":
-            return (
-                f"{state.upper()}: {at} plays {channel.gain:.2f} of the commanded amplitude: "
-                + (_TO_DO[state])
+                f"WRONG ERA: {wiring} drives ERA {channel.drives} instead of {channel.era} (MAC "
+                f"{channel.mac_found:.3f}, with its own ERA {channel.mac_own:.3f}; "
+                f"confidence {channel.confidence:.3f}): {remedy}"
             )
         case "inverted":
-            even = " (or the other half)" if channel.confidence <= EVEN else ""
-            return f"INVERTED: {at} has the opposite sign of the others{even}: {_TO_DO[state]}"
+            either = " (or the other half)" if channel.confidence <= UNDECIDED else ""
+            return f"INVERTED: {wiring} has the opposite sign of the others{either}: {remedy}"
+        case "out of phase":
+            return f"OUT OF PHASE: {wiring} is off by {channel.phase:+.0f}°: {remedy}"
         case _:
-            return f"OUT OF PHASE: {at} is off by {channel.phase:+.0f}°: {_TO_DO['out of phase']}"
+            share = f"{channel.gain:.2f} of the commanded amplitude"
+            return f"{state.upper()}: {wiring} plays {share}: {remedy}"
 
 
-def _at(channel: ChannelVerdict) -> str:
+def _wiring(channel: ChannelVerdict) -> str:
     wired = channel.channel
     return f"channel {wired.number} of amplifier {wired.amplifier} (ERA {channel.era} in the rig)"
-
-
-def _of(verdict: Verdict, era: str) -> ChannelVerdict:
-    return next(channel for channel in verdict.channels if channel.era == era)
-
-
-def _sure(verdict: Verdict, eras: Sequence[str]) -> str:
-    return f"confidence {min(_of(verdict, era).confidence for era in eras):.3f}"

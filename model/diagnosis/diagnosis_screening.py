@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray
 from model.calibration.calibration_screening import silent_sensors
-from model.calibration.fast_plate import FastPlate, fast_plate
 from model.calibration.responses import Responses
-from model.diagnosis.assignment import likeness
+from model.diagnosis.assignment import match_shapes
 from model.diagnosis.observation import Observation
-from model.diagnosis.plate_match import FITS, Match
+from model.diagnosis.plate_match import MAX_FIT_ERROR, Match
 from model.errors import InputError
 from model.rig.rig import Rig
+from model.vibration.parametric_plate import ParametricPlate
 
 _DEAD = 0.03  # of the response that the rig predicts
 _FAINT = 0.3  # of it: dead if its shape is not that of an ERA either
@@ -23,26 +23,27 @@ _SENSOR_SCALE = (0.7, 1.4)
 LEAST_SENSORS, _LEAST_FREQUENCIES = 3, 4
 
 
-def dead_channels(rig: Rig, observation: Observation) -> NDArray[np.bool_]:
+def dead_channels(rig: Rig, plate: ParametricPlate, observation: Observation) -> NDArray[np.bool_]:
     """Mask (e,) of driven channels with a response far below the model's or near the floor."""
-    plate = fast_plate(rig, observation.points, observation.frequencies)
     size = np.abs(observation.values)
     share = size / np.abs(plate.responses(rig))
     dead = np.zeros(len(rig.eras), dtype=bool)
     for channel in np.flatnonzero(observation.measured):
-        there = np.isfinite(size[:, channel])
-        dead[channel] = np.median(share[:, channel][there]) < _DEAD
+        finite = np.isfinite(size[:, channel])
+        dead[channel] = np.median(share[:, channel][finite]) < _DEAD
         if observation.floor is not None:
-            over = (size[:, channel] / np.maximum(observation.floor, 1e-300))[there]
+            over = (size[:, channel] / np.maximum(observation.floor, 1e-300))[finite]
             dead[channel] |= bool(np.median(over) < _NOISY)
     return dead
 
 
-def shapeless_channels(rig: Rig, plate: FastPlate, observation: Observation) -> NDArray[np.bool_]:
+def shapeless_channels(
+    rig: Rig, plate: ParametricPlate, observation: Observation
+) -> NDArray[np.bool_]:
     """Mask of weak channels without the shape of an ERA, whose response is noise (e,)."""
     model = plate.responses(rig)
     share = np.abs(observation.values) / np.abs(model)
-    mac = likeness(rig, plate, observation.values).mac
+    mac = match_shapes(rig, plate, observation.values).mac
     found = np.zeros(len(rig.eras), dtype=bool)
     for channel in np.flatnonzero(observation.measured):
         faint = np.nanmedian(share[:, channel]) < _FAINT
@@ -64,11 +65,11 @@ def usable_sensors(
     return observation.without(silent), tuple((name, "reads nothing") for name in names)
 
 
-def check_enough(observation: Observation, bad: Sequence[tuple[str, str]]) -> None:
-    """Raise InputError if too few sensors or frequencies are left; bad: removed sensors."""
+def check_enough(observation: Observation, removed: Sequence[tuple[str, str]]) -> None:
+    """Raise InputError if too few sensors or frequencies are left; removed: sensors."""
     count, frequencies = len(observation.sensors), len(observation.frequencies)
     if count < LEAST_SENSORS or frequencies < _LEAST_FREQUENCIES:
-        without = f" ({', '.join(name for name, _ in bad)} without a signal)" if bad else ""
+        without = f" ({', '.join(name for name, _ in removed)} without a signal)" if removed else ""
         raise InputError(
             f"a diagnosis needs at least {LEAST_SENSORS} sensors, better eight, and "
             f"{_LEAST_FREQUENCIES} frequencies, got {count} sensors{without} and {frequencies} "
@@ -80,11 +81,11 @@ def off_scale(
     observation: Observation, values: ComplexArray, match: Match
 ) -> list[tuple[str, str]]:
     """Sensors with a scale unlike that of the others, and why, if the plate fits."""
-    if match.median_error > FITS:
+    if match.median_error > MAX_FIT_ERROR:
         return []
-    there = np.isfinite(values) & np.isfinite(match.predicted)
-    model = np.where(there, match.predicted, 0)
-    measured = np.where(there, values, 0)
+    finite = np.isfinite(values) & np.isfinite(match.predicted)
+    model = np.where(finite, match.predicted, 0)
+    measured = np.where(finite, values, 0)
     phase_factor = np.exp(-1j * np.angle((model.conj() * measured).sum(axis=2, keepdims=True)))
     inner = (model.conj() * measured * phase_factor).real.sum(axis=(0, 1))
     scale = inner / np.maximum((np.abs(model) ** 2).sum(axis=(0, 1)), 1e-300)

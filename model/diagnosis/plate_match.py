@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.fast_plate import FastPlate
-from model.calibration.parameters import Parameter, parameters_of, rig_with
-from model.calibration.variable_projection import project_gains, row_rms
+from model.calibration.parameters import Parameter, parameters_of, responses_at, rig_with
+from model.calibration.variable_projection import jacobian_of, project_gains, row_rms
 from model.rig.rig import Rig
+from model.vibration.parametric_plate import ParametricPlate
 
 _GAIN_STD = 1.0  # of the logarithm of a channel's gain
 _GAIN_TOLERANCE = 0.08  # standard deviation over frequency, of itself
-FITS = 0.2  # largest relative rms error of an acceptable plate
+MAX_FIT_ERROR = 0.2  # largest relative rms error of an acceptable plate
 MODEL_ERROR = 0.05  # of a row's rms: scales and positions of sensors, and what is not modelled
 _ROBUST = 2.0  # standard deviations
 _STEPS = 40
@@ -62,7 +62,7 @@ class Match:
 
 def match_plate(
     rig: Rig,
-    plate: FastPlate,
+    plate: ParametricPlate,
     values: ComplexArray,
     *,
     drives: Sequence[int],
@@ -89,50 +89,51 @@ def match_plate(
     count = len(parameters)
     driven = list(drives)
 
-    def responses(rig: Rig) -> ComplexArray:
-        return np.asarray(plate.responses(rig)[:, driven])
+    def responses(x: FloatArray) -> ComplexArray:
+        return np.asarray(responses_at(plate, rig, parameters, x)[..., driven, :])
 
     def residuals(z: FloatArray) -> FloatArray:
-        x = center + std * z[:count]
-        model = responses(rig_with(rig, parameters, x))
-        gains = np.ones(values.shape[1])
-        gains[used] = np.exp(_GAIN_STD * z[count:])
+        model = responses(center + std * z[..., :count])
+        gains = np.ones((*z.shape[:-1], values.shape[1]))
+        gains[..., used] = np.exp(_GAIN_STD * z[..., count:])
         projected, left = project_gains(
             model, values, weight, expected=gains, tolerance=_GAIN_TOLERANCE
         )
-        wander = ((np.abs(projected) - gains) / (_GAIN_TOLERANCE * gains))[rows]
-        left = _robust(left[weight > 0])
-        return np.concatenate([left.real, left.imag, _robust(wander), z])
+        expected = gains[..., None, :]
+        wander = ((np.abs(projected) - expected) / (_GAIN_TOLERANCE * expected))[..., rows]
+        left = _robust(left[..., weight > 0])
+        return np.concatenate([left.real, left.imag, _robust(wander), z], axis=-1)
 
     bounds = np.array([[p.lower, p.upper] for p in parameters])
     bounds = (bounds - center[:, None]) / std[:, None]
     lower, upper = np.vstack([bounds, np.tile([-8.0, 8.0], (len(used), 1))]).T
-    begins = []
+    initial = []
     for modulus, stiffness in starts:
         moves = {"modulus": modulus, "stiffness": stiffness}
         shift = np.array([moves.get(parameter.kind, 0.0) for parameter in parameters])
-        model = responses(rig_with(rig, parameters, center + shift))
+        model = responses(center + shift)
         ratio = np.log(np.maximum(size / row_rms(np.where(rows[:, :, None], model, np.nan)), 1e-6))
         first = np.concatenate([shift / std, [np.median(ratio[rows[:, e], e]) for e in used]])
-        begins.append(np.clip(first, lower + 1e-6, upper - 1e-6))
+        initial.append(np.clip(first, lower + 1e-6, upper - 1e-6))
     found = [
         least_squares(
             residuals,
-            begin,
+            guess,
+            jacobian_of(residuals, lower, upper),
             bounds=(lower, upper),
             x_scale="jac",
             max_nfev=_STEPS,
             xtol=1e-5,
             ftol=1e-5,
         )
-        for begin in begins
+        for guess in initial
     ]
     best = min(found, key=lambda each: float(each.cost))
     x = center + std * best.x[:count]
     gains = np.full(values.shape[1], np.nan)
     gains[used] = np.exp(_GAIN_STD * best.x[count:])
     fitted = rig_with(rig, parameters, x)
-    model = responses(fitted)
+    model = responses(x)
     _, residual = project_gains(
         model, values, weight, expected=np.nan_to_num(gains, nan=1.0), tolerance=_GAIN_TOLERANCE
     )

@@ -16,7 +16,7 @@ from model.calibration.variable_projection import modal_assurance
 from model.diagnosis.observation import Observation
 
 _LEAST_MISFIT = 0.02
-EVEN = 0.5
+UNDECIDED = 0.5
 """Confidence in a sign of half of the channels."""
 _MIN_COHERENCE = 0.6  # length of the mean of unit phasors of a reliable phase
 _MIN_EVIDENCE = 2.0  # logarithm of misfits, summed over a pair's frequencies
@@ -39,8 +39,8 @@ def phases_of_drive(observation: Observation, predicted: ComplexArray) -> list[C
     found = []
     for channel in range(predicted.shape[1]):
         measured, model = observation.values[:, channel], predicted[:, channel]
-        there = np.isfinite(measured) & np.isfinite(model)
-        inner = (np.where(there, np.conj(model), 0) * np.where(there, measured, 0)).sum(axis=1)
+        finite = np.isfinite(measured) & np.isfinite(model)
+        inner = (np.where(finite, np.conj(model), 0) * np.where(finite, measured, 0)).sum(axis=1)
         inner = inner[np.abs(inner) > 0]
         if len(inner) == 0:
             found.append(ChannelPhase(None, 0, 0.0))
@@ -114,5 +114,5 @@ def _signs(group: Sequence[int], evidence: FloatArray) -> dict[int, tuple[int, f
     if balance < 0:
         best = {channel: (-sign, sure) for channel, (sign, sure) in best.items()}
     elif balance == 0:  # as many of each sign
-        best = {channel: (sign, EVEN) for channel, (sign, _) in best.items()}
+        best = {channel: (sign, UNDECIDED) for channel, (sign, _) in best.items()}
     return best

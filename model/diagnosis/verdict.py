@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.fast_plate import FastPlate, fast_plate
-from model.diagnosis.assignment import Likeness, likeness, likeness_to
+from model.diagnosis.assignment import ShapeMatch, match_responses, match_shapes
 from model.diagnosis.causes import Explanation, explain
 from model.diagnosis.diagnosis_screening import (
     LEAST_SENSORS,
@@ -20,13 +19,14 @@ from model.diagnosis.diagnosis_screening import (
     usable_sensors,
 )
 from model.diagnosis.observation import Observation
-from model.diagnosis.plate_match import FITS, MODEL_ERROR, Match, match_plate
+from model.diagnosis.plate_match import MAX_FIT_ERROR, MODEL_ERROR, Match, match_plate
 from model.diagnosis.polarity import ChannelPhase, phases_of_drive, signs_of_pairs
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
+from model.vibration.parametric_plate import ParametricPlate, parametric_plate
 
 WEAK, STRONG = 0.7, 1.4  # gain of a channel: 3 dB either way
-UNLIKELY = 3.0  # standard deviations of a parameter's prior
+MAX_DEVIATION = 3.0  # standard deviations of a parameter's prior
 _MIN_CONFIDENCE = 0.99  # in another ERA than the rig's
 _MIN_COST_REDUCTION = 20.0  # by another wiring than the rig's
 _MAX_PHASE_ERROR = 45.0  # degrees
@@ -41,8 +41,8 @@ class ChannelVerdict:
     """A channel: the ERA to which the rig wires it, the one that it drives, and its states.
 
     states: "well" alone if nothing is wrong; drives: None for a channel that is dead or was not
-    driven; gain: relative to the command; phase [degrees], None if unknown; likeness_own,
-    likeness_found: median MAC with the rig's ERA and with the one found; confidence 0..1 in drives
+    driven; gain: relative to the command; phase [degrees], None if unknown; mac_own,
+    mac_found: median MAC with the rig's ERA and with the one found; confidence 0..1 in drives
     and states.
     """
 
@@ -52,8 +52,8 @@ class ChannelVerdict:
     drives: str | None
     gain: float | None
     phase: float | None
-    likeness_own: float | None
-    likeness_found: float | None
+    mac_own: float | None
+    mac_found: float | None
     confidence: float
 
 
@@ -90,10 +90,12 @@ def diagnose(rig: Rig, observation: Observation) -> Verdict:
     """
     if not observation.measured.any():
         raise InputError("no channel was driven; drive each in turn and measure again")
-    dead = dead_channels(rig, observation)
-    observation, bad = usable_sensors(observation, dead)
-    check_enough(observation, bad)
-    plate = fast_plate(rig, observation.points, observation.frequencies)
+    plate = parametric_plate(rig, observation.points, observation.frequencies)
+    dead = dead_channels(rig, plate, observation)
+    sensors = observation.sensors
+    observation, removed = usable_sensors(observation, dead)
+    check_enough(observation, removed)
+    plate = plate.at(np.isin(sensors, observation.sensors))
     values = observation.values.copy()
     dead = dead | shapeless_channels(rig, plate, observation)
     values[:, dead] = np.nan
@@ -103,16 +105,16 @@ def diagnose(rig: Rig, observation: Observation) -> Verdict:
             for number in range(len(rig.eras))
         )
         return Verdict(
-            channels, True, None, (), bad, (), len(observation.sensors), observation.frequencies
+            channels, True, None, (), removed, (), len(observation.sensors), observation.frequencies
         )
-    alike = likeness(rig, plate, values)
-    match, drives, error = _best_match(rig, plate, values, alike, observation)
+    shape_match = match_shapes(rig, plate, values)
+    match, drives, error = _best_match(rig, plate, values, shape_match, observation)
     off = off_scale(observation, values, match)
     if off and len(observation.sensors) - len(off) >= LEAST_SENSORS:
         wrong = np.isin(observation.sensors, [name for name, _ in off])
         again = diagnose(rig, observation.without(wrong))
-        return replace(again, bad_sensors=(*bad, *off, *again.bad_sensors))
-    matches = match.error <= FITS and match.worst <= UNLIKELY
+        return replace(again, bad_sensors=(*removed, *off, *again.bad_sensors))
+    matches = match.error <= MAX_FIT_ERROR and match.worst <= MAX_DEVIATION
     explanations: Sequence[Explanation] = ()
     fitted = match
     if not matches:
@@ -127,7 +129,7 @@ def diagnose(rig: Rig, observation: Observation) -> Verdict:
             model_error=error,
         )
         fitted = min([match, *(each.match for each in explanations)], key=lambda each: each.cost)
-    shapes = likeness_to(fitted.responses, values)
+    shapes = match_responses(fitted.responses, values)
     phases = _phases(rig, observation, fitted, dead)
     channels = tuple(
         _channel(
@@ -140,7 +142,7 @@ def diagnose(rig: Rig, observation: Observation) -> Verdict:
         matches,
         match,
         tuple(explanations),
-        bad,
+        removed,
         _cycles(rig, drives, dead),
         len(observation.sensors),
         observation.frequencies,
@@ -149,14 +151,14 @@ def diagnose(rig: Rig, observation: Observation) -> Verdict:
 
 def _best_match(
     rig: Rig,
-    plate: FastPlate,
+    plate: ParametricPlate,
     values: ComplexArray,
-    alike: Likeness,
+    shape_match: ShapeMatch,
     observation: Observation,
 ) -> tuple[Match, tuple[int, ...], float]:
     """Best plate, wiring and model error; the rig's wiring unless another is clearly better."""
     own = tuple(range(len(rig.eras)))
-    starts = tuple(dict.fromkeys([(0.0, 0.0), alike.start]))
+    starts = tuple(dict.fromkeys([(0.0, 0.0), shape_match.start]))
 
     def matched(drives: Sequence[int], error: float) -> Match:
         return match_plate(
@@ -170,8 +172,8 @@ def _best_match(
         )
 
     nearest = tuple(
-        era if era == i or alike.confidence(i, era, i) >= _MIN_CONFIDENCE else i
-        for i, era in enumerate(alike.nearest)
+        era if era == i or shape_match.confidence(i, era, i) >= _MIN_CONFIDENCE else i
+        for i, era in enumerate(shape_match.nearest)
     )
     drives, match = own, matched(own, MODEL_ERROR)
     if nearest != own:
@@ -201,7 +203,7 @@ def _channel(
     rig: Rig,
     number: int,
     observation: Observation,
-    shapes: Likeness,
+    shapes: ShapeMatch,
     drives: Sequence[int],
     match: Match,
     phase: ChannelPhase,

@@ -20,7 +20,7 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
 from model.drive_modes.coherent import Coherent
-from model.drive_modes.fields import DriveVector, Evaluation, Fields, evaluate
+from model.drive_modes.fields import Evaluation, Fields, Weights, evaluate
 from model.drive_modes.graded import GRADED
 from model.drive_modes.phased import PHASED
 from model.drive_modes.signed import SIGNED
@@ -67,7 +67,7 @@ DRIVE_MODES: dict[str, DriveMode] = {
     "signed": DriveMode(SIGNED, ("graded", "switched")),
     "phased": DriveMode(PHASED, ("signed", "graded", "switched")),
 }
-"""By name, from the least freedom to the most."""
+"""Drive modes by name, from the least freedom to the most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class Choice:
     frequency where they reach the level; empty for `switched`.
     """
 
-    drive: DriveVector
+    drive: Weights
     evaluation: Evaluation
     frequencies: IntArray
     weights: Complex64Array
@@ -107,7 +107,7 @@ def find_drives(fields: Fields, drive_mode: str) -> Choice | None:
 
     None where no drive reaches the wanted level.
     """
-    best: tuple[DriveVector, Evaluation] | None = None
+    best: tuple[Weights, Evaluation] | None = None
     open_ = np.arange(fields.frequency_count)
     score = np.zeros(len(open_), dtype=np.float32)
     weights = np.zeros((len(open_), fields.era_count), dtype=np.complex64)
@@ -124,7 +124,7 @@ def find_drives(fields: Fields, drive_mode: str) -> Choice | None:
             at = open_[better]
             score[at], weights[at] = found.score[better], found.weights[better]
             top = int(score.argmax())
-            drive = DriveVector.at(top, weights[top]) if score[top] > min_score else None
+            drive = Weights.at(top, weights[top]) if score[top] > min_score else None
         else:
             continue
         if drive is not None:

@@ -22,8 +22,11 @@ import numpy as np
 from model.arrays import Complex64Array, Float32Array, IntArray
 from model.drive_modes.fields import ERROR_SHARE, Fields, error_power
 
-Solve = Callable[[Complex64Array, Complex64Array], Complex64Array]
-"""Weights (n, eras) for R (n, eras, eras) and c (n, eras), within what a mode allows."""
+Solve = Callable[[Complex64Array, Complex64Array, Complex64Array | None], Complex64Array]
+"""Weights (n, eras) for R (n, eras, eras) and c (n, eras), within what a mode allows.
+
+The third argument is the solution for the same R and a similar c, if there is one.
+"""
 
 MAX_CANDIDATES = 12
 """Frequencies at which Lawson's iterations are done."""
@@ -32,13 +35,13 @@ LAWSON_STEPS = np.array([1.0] + [0.7] * 5, dtype=np.float32)
 """Exponents of the expected power by which point weights are multiplied, one per iteration."""
 
 MANY_POINTS, MAX_STEPS_MANY_POINTS = 100, 4
-"""With more quiet points (six fingers) an iteration takes longer: fewer of them."""
+"""Number of quiet points above which fewer iterations are made, since each takes longer."""
 
 PRUNE_MARGIN = 1.03
 """A frequency whose bound is below this times the best score is pruned."""
 
-# Sigma and gain, tried in turn where no weights reach the level: the quiet points count less beside
-# each ERA's own power, and weights are raised up to full stroke.
+# Sigma and gain, tried in turn where no weights reach the level: the quiet points count less
+# against each ERA's own power, and weights are raised up to full stroke.
 LEVEL_RELAXATION = ((0.1, 3.0), (1.0, 1.0), (1.0, 3.0), (10.0, 1.0), (10.0, 3.0), (1000.0, 1e6))
 
 _TINY = 1e-7
@@ -46,7 +49,7 @@ _TINY = 1e-7
 
 @dataclass(frozen=True)
 class Coherent:
-    """How a mode's weights are found.
+    """Method of a drive mode for its weights.
 
     solve: see `Solve`; phases: number of starting phases of the first target, and of every further
     one; iterations: number from each start that align the phases with those reached.
@@ -56,7 +59,7 @@ class Coherent:
     phases: tuple[int, int]
     iterations: int
 
-    def search(self, fields: Fields, min_score: float) -> "Search":
+    def search(self, fields: Fields, min_score: float) -> "CoherentResult":
         """Find the best weights at each frequency that can have the best score of all.
 
         min_score: best score so far. With none, frequencies are pruned at PRUNE_MARGIN; with one,
@@ -131,7 +134,7 @@ class Coherent:
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
+class CoherentResult:
     """The best weights (f, eras) at each frequency, and their robust score (f,).
 
     The score is 0 where none were found that reach the level. bound (f,): upper bound of the score,
@@ -189,10 +192,10 @@ class _BestCandidates:
         self.score = max(self.score, float(score.max()))
         self.has_feasible = self.has_feasible or count > 0
 
-    def search(self) -> "Search":
+    def search(self) -> "CoherentResult":
         """Return the best weights at each frequency."""
         at, weights, score, bound = map(np.concatenate, zip(*self._candidates, strict=True))
-        found = Search(
+        found = CoherentResult(
             score=np.zeros(self._shape[0], dtype=np.float32),
             weights=np.zeros(self._shape, dtype=np.complex64),
             bound=np.full(self._shape[0], np.inf, dtype=np.float32),
@@ -277,7 +280,7 @@ def _optimise_target_phases(
     conjugate = targets.conj()
     if len(starts) == 1 and iterations == 1:
         c = conjugate[0] if len(targets) == 1 else conjugate.sum(axis=0)
-        w = solve(R, c)
+        w = solve(R, c, None)
         # At the solution w^H R w = |c^H w|.
         value = np.sqrt(np.abs(np.vecdot(c, w)))
     else:
@@ -285,9 +288,11 @@ def _optimise_target_phases(
         target_factors = np.repeat(starts[:, :, None], n, axis=2)
         forms = np.broadcast_to(R, (s, *R.shape)).reshape(-1, eras, eras)
         tried, values = [], []
+        solved = None
         for _ in range(iterations):
             c = np.einsum("stn,tne->sne", target_factors, conjugate)
-            w = solve(forms, c.reshape(-1, eras)).reshape(s, n, eras)
+            solved = solve(forms, c.reshape(-1, eras), solved)
+            w = solved.reshape(s, n, eras)
             reached = np.einsum("tne,sne->stn", targets, w)
             magnitude = np.maximum(np.abs(reached), 1e-20)
             cost = np.einsum("sne,nef,snf->sn", w.conj(), R, w).real

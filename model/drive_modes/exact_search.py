@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from model.arrays import FloatArray, IntArray
 from model.drive_modes.dual_weights import dual_weights
-from model.drive_modes.fields import SILENT, DriveVector, Fields, quiet_amplitude
+from model.drive_modes.fields import SILENT, Fields, Weights, quiet_amplitude
 from model.drive_modes.switched import find_switched
 from model.errors import InputError
 
@@ -33,11 +33,11 @@ DECISIVE_POINTS = 12
 """Quiet points of the largest weights, by which most patterns are excluded."""
 
 MAX_ERAS = 9
-"""With more ERAs there are so many groupings that the search would not end in a day."""
+"""Maximum number of ERAs; with more the search would not end in a day."""
 
 
 @dataclass(frozen=True)
-class ExactSearch:
+class ExactResult:
     """The best drive, its contrast, and a bound of any pattern's contrast (ratios).
 
     drive: None where no pattern reaches the level. is_complete: the drive is proven to be the best
@@ -45,7 +45,7 @@ class ExactSearch:
     evaluated_count: of those that no bound excluded.
     """
 
-    drive: DriveVector | None
+    drive: Weights | None
     contrast: float
     bound: float
     is_complete: bool
@@ -55,7 +55,7 @@ class ExactSearch:
 
 def search_exactly(
     fields: Fields, *, eras_at_most: int, time_limit: float = math.inf
-) -> ExactSearch:
+) -> ExactResult:
     """Find the pattern of highest contrast with at most `eras_at_most` ERAs that reaches the level.
 
     time_limit [s]: after it the best so far is returned, with a bound. Raises InputError for more
@@ -169,9 +169,9 @@ class _Search:
         self._decisive = self._quiet[:, :, np.argsort(-weights)[:DECISIVE_POINTS]]
         self.evaluated_count = 0
         self.contrast = 0.0
-        self.drive: DriveVector | None = None
+        self.drive: Weights | None = None
 
-    def run(self) -> ExactSearch:
+    def run(self) -> ExactResult:
         """Start from the best of two ERAs, then enumerate the groupings, largest bound first."""
         if self._eras_at_most >= 2:
             self._start()
@@ -193,7 +193,7 @@ class _Search:
                 bound = self._ratio_bound(rest[self._gain_bound(rest) > 0])
                 break
         fields = self._fields
-        return ExactSearch(
+        return ExactResult(
             drive=self.drive,
             contrast=self.contrast,
             bound=max(self.contrast, bound),
@@ -282,13 +282,13 @@ class _Search:
             self.contrast = float(contrast[best])
             self.drive = self._drive(groups, chosen[best])
 
-    def _drive(self, groups: tuple[int, ...], frequencies: IntArray) -> DriveVector:
+    def _drive(self, groups: tuple[int, ...], frequencies: IntArray) -> Weights:
         index = np.full(self._fields.era_count, SILENT)
         for group, frequency in zip(groups, frequencies, strict=True):
             for era in range(len(index)):
                 if self._masks[group] >> era & 1:
                     index[era] = frequency
-        return DriveVector(index, (index != SILENT).astype(np.complex64))
+        return Weights(index, (index != SILENT).astype(np.complex64))
 
     def _start(self) -> None:
         """Take the best drive of one or two ERAs as the first."""

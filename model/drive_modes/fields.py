@@ -27,25 +27,25 @@ _TINY, _LEAST = np.float32(1e-7), np.float32(1e-20)
 
 
 @dataclass(frozen=True, eq=False)
-class DriveVector:
-    """A tone for each ERA.
+class Weights:
+    """Complex weight of each ERA in full strokes, values (eras,), and its frequency.
 
-    index (eras,): of its frequency, or SILENT; weight (eras,): complex amplitude in full strokes.
+    frequencies (eras,): by index, or SILENT.
     """
 
-    index: NDArray[np.int64]
-    weight: Complex64Array
+    frequencies: NDArray[np.int64]
+    values: Complex64Array
 
     @classmethod
-    def at(cls, frequency: int, weight: Complex64Array) -> "DriveVector":
+    def at(cls, frequency: int, values: Complex64Array) -> "Weights":
         """Drive all ERAs at one frequency."""
-        return cls(np.where(weight == 0, SILENT, frequency), weight)
+        return cls(np.where(values == 0, SILENT, frequency), values)
 
     def tones(self) -> list[tuple[int, Complex64Array]]:
         """Index of each distinct frequency, and the weights (eras,) at it."""
-        frequencies = sorted({*self.index.tolist()} - {SILENT})
+        frequencies = sorted({*self.frequencies.tolist()} - {SILENT})
         return [
-            (index, np.where(self.index == index, self.weight, 0).astype(np.complex64))
+            (index, np.where(self.frequencies == index, self.values, 0).astype(np.complex64))
             for index in frequencies
         ]
 
@@ -150,7 +150,7 @@ class Evaluation:
         return max(self.peak, 1e-30) / max(self.quiet_peak, 1e-30)
 
 
-def evaluate(fields: Fields, drive: DriveVector) -> Evaluation:
+def evaluate(fields: Fields, drive: Weights) -> Evaluation:
     """Evaluate a drive; tones of different frequencies add as magnitudes (paper Eq. 28)."""
     tones = drive.tones()
     at = [index for index, _ in tones]

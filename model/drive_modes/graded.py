@@ -9,16 +9,17 @@ EXCHANGES = 8
 SWEEPS = 2
 
 
-def _solve(R: Complex64Array, c: Complex64Array) -> Complex64Array:
+def _solve(R: Complex64Array, c: Complex64Array, similar: Complex64Array | None) -> Complex64Array:
     """Minimise w^T Re(R) w / 2 - Re(c) w over w >= 0, for many forms at once.
 
     Block principal pivoting (Judice and Pires, Comput. Oper. Res. 21 (1994) 587-596): solve for the
     weights assumed positive, then exchange those of the wrong sign, in the forms that have any; few
-    do after three iterations. It may cycle: a few coordinate sweeps follow for the forms left.
+    do after three iterations, or one from a similar solution. It may cycle: a few coordinate sweeps
+    follow for the forms left.
     """
     w = np.empty_like(c.real)
     left, form, pull = np.arange(len(w)), np.ascontiguousarray(R.real), c.real
-    driven = pull > 0
+    driven = pull > 0 if similar is None else similar.real > 0
     # A weight outside the set is held at zero by a row of its own.
     identity = np.eye(w.shape[1], dtype=form.dtype)
     for _ in range(EXCHANGES):

@@ -10,7 +10,7 @@ from model.arrays import Complex64Array
 from model.drive_modes.coherent import Coherent
 
 
-def _solve(R: Complex64Array, c: Complex64Array) -> Complex64Array:
+def _solve(R: Complex64Array, c: Complex64Array, _: Complex64Array | None) -> Complex64Array:
     return np.asarray(np.linalg.solve(R, c[..., None])[..., 0])
 
 

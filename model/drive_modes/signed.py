@@ -6,7 +6,7 @@ from model.arrays import Complex64Array
 from model.drive_modes.coherent import Coherent
 
 
-def _solve(R: Complex64Array, c: Complex64Array) -> Complex64Array:
+def _solve(R: Complex64Array, c: Complex64Array, _: Complex64Array | None) -> Complex64Array:
     """Real weights for which |c^H w| is largest for its w^H R w, which then is w^T Re(R) w.
 
     A common phase of all targets is free; the best one follows from the top eigenvector of the form

@@ -17,7 +17,7 @@ from model.drive_modes.fields import SILENT
 
 
 @dataclass(frozen=True, eq=False)
-class Patterns:
+class Combinations:
     """All patterns of one or two ERAs, as sums of two sources.
 
     index (n, eras): of each ERA's frequency, or SILENT; first every ERA alone, then every pair,
@@ -31,7 +31,7 @@ class Patterns:
 
 
 @lru_cache(maxsize=8)
-def all_patterns(era_count: int, frequency_count: int) -> Patterns:
+def all_combinations(era_count: int, frequency_count: int) -> Combinations:
     """List every pattern of the given numbers of ERAs and frequencies: 4482 of 4 and 27."""
     f = np.arange(frequency_count)
     pairs = list(combinations(range(era_count), 2))
@@ -53,7 +53,7 @@ def all_patterns(era_count: int, frequency_count: int) -> Patterns:
         coherent = together + number * frequency_count + f_one
         first.append(np.where(same, coherent, one * frequency_count + f_one))
         second.append(np.where(same, nothing, other * frequency_count + f_other))
-    found = Patterns(np.concatenate(index), np.concatenate(first), np.concatenate(second))
+    found = Combinations(np.concatenate(index), np.concatenate(first), np.concatenate(second))
     for shared in (found.index, found.first, found.second):
         shared.setflags(write=False)  # cached, and so shared
     return found

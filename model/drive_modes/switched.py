@@ -5,8 +5,8 @@ frequencies make 4 * 27 + 6 * 27² = 4482 patterns, six and 361 two millions. Ev
 source or the sum of two: an ERA at a frequency, or a pair of ERAs at the same one
 (`model.drive_modes.exact_search` drives more of them).
 
-Patterns are not enumerated: the maximum over the quiet points is at least any weighted mean, and
-the mean of a sum of two sources is the sum of theirs. So a pattern of contrast above c needs
+Patterns are not enumerated: the maximum over the quiet points is at least any weighted mean,
+and the mean of a sum of two sources is the sum of theirs. So a pattern of contrast above c needs
 
     sum over its sources of (target - c mean of quiet) > 0,
 
@@ -18,9 +18,9 @@ from itertools import combinations
 import numpy as np
 
 from model.arrays import Float32Array, IntArray
-from model.drive_modes.fields import SILENT, DriveVector, Fields
+from model.drive_modes.fields import SILENT, Fields, Weights
 from model.drive_modes.sources import (
-    all_patterns,
+    all_combinations,
     magnitudes_of_sources,
     per_source,
     sums_of_sources,
@@ -36,7 +36,7 @@ FEW_SOURCES = 500
 """Up to this all sums are faster than a selection of them."""
 
 
-def find_switched(fields: Fields, min_score: float) -> DriveVector | None:
+def find_switched(fields: Fields, min_score: float) -> Weights | None:
     """Find the pattern of highest contrast that reaches the level; None if not above min_score.
 
     Contrast without errors, which can only lower it: at full stroke there is nothing to trade
@@ -147,7 +147,7 @@ def _pairs(gain: Float32Array, fields: Fields) -> tuple[IntArray, IntArray]:
     return np.concatenate(ones), np.concatenate(others)
 
 
-def _drive(sources: tuple[int, int], fields: Fields) -> DriveVector:
+def _drive(sources: tuple[int, int], fields: Fields) -> Weights:
     """All ERAs of two sources at full stroke; see `magnitudes_of_sources` for their order."""
     count, eras = fields.frequency_count, fields.era_count
     members = [(era,) for era in range(eras)] + list(combinations(range(eras), 2)) + [()]
@@ -155,7 +155,7 @@ def _drive(sources: tuple[int, int], fields: Fields) -> DriveVector:
     for source in sources:
         block, frequency = divmod(source, count)
         index[list(members[block])] = frequency
-    return DriveVector(index, (index != SILENT).astype(np.complex64))
+    return Weights(index, (index != SILENT).astype(np.complex64))
 
 
 def max_sensation_switched(fields: Fields) -> float:
@@ -163,7 +163,7 @@ def max_sensation_switched(fields: Fields) -> float:
 
     Among the patterns of the largest bounds, the same pattern for all targets.
     """
-    patterns = all_patterns(fields.era_count, fields.frequency_count)
+    patterns = all_combinations(fields.era_count, fields.frequency_count)
     powers = _powers([magnitudes_of_sources(field) for field in fields.targets], fields)
     means = np.array([_mean(rows) for rows in powers])
     highest = sums_of_sources(means, fields.era_count).min(axis=0)

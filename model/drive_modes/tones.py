@@ -1,11 +1,11 @@
-"""Conversion of a drive vector to physics: a tone for each ERA."""
+"""Conversion of the ERAs' weights to physics: a tone for each ERA."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from model.arrays import FloatArray
-from model.drive_modes.fields import DriveVector
+from model.drive_modes.fields import Weights
 from model.structure.actuator import Era
 from model.vibration.excitation import Excitation, Tone
 
@@ -13,7 +13,7 @@ ROUNDING = 1e-6  # of single precision
 
 
 def excitation_of(
-    drive: DriveVector, eras: Sequence[Era], frequencies: FloatArray, *, gain: float
+    drive: Weights, eras: Sequence[Era], frequencies: FloatArray, *, gain: float
 ) -> Excitation:
     """Tones by ERA, at a gain of up to 1; at each frequency the strongest has phase zero.
 

@@ -1,7 +1,6 @@
 """Assembly of the plate's sparse stiffness and mass matrices."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +10,6 @@ from model.arrays import FloatArray, IntArray
 from model.errors import InputError
 from model.fem.elements import DOF_PER_NODE
 from model.fem.mesh import Mesh
-from model.structure.actuator import Era
 from model.structure.plate import Plate
 
 
@@ -90,8 +88,3 @@ def assemble(plate: Plate, mesh: Mesh) -> PlateMatrices:
         return sparse.csc_array(sparse.coo_array((values.ravel(), places), shape=(size, size)))
 
     return PlateMatrices(plate, mesh, whole(elements.stiffness), whole(elements.mass))
-
-
-def era_positions(eras: Sequence[Era]) -> FloatArray:
-    """Positions of ERAs [m], (n, 2)."""
-    return np.array([[era.x, era.y] for era in eras], dtype=float).reshape(-1, 2)

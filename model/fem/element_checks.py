@@ -34,10 +34,10 @@ Field: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray | float]
 
 @dataclass(frozen=True)
 class ElementCheck:
-    """One check: its name, what it proves, and a function that returns the problem, if any."""
+    """One check: its name, what it requires, and a function that returns the problem, if any."""
 
     name: str
-    proves: str
+    requirement: str
     problem: Callable[[Element], str | None]
 
 
@@ -192,15 +192,15 @@ def frequency_error(element: Element, count: int) -> float:
     """Relative error of a thin plate's lowest natural frequency with count by count elements.
 
     On hard simple supports, w and the rotation along the
-    edge held, w = sin(pi x / L) sin(pi y / W) with rotations alike solves the Reissner-Mindlin
+    edge fixed, w = sin(pi x / L) sin(pi y / W) with rotations alike solves the Reissner-Mindlin
     plate exactly.
     """
     mesh = Mesh(count, count, THIN.length, THIN.width, element)
     assembled = assemble(THIN, mesh)
     node = np.arange(mesh.node_count).reshape(mesh.rows, mesh.columns)
     sides, ends = node[:, [0, -1]].ravel(), node[[0, -1]].ravel()
-    held = np.concatenate([3 * sides, 3 * sides + 2, 3 * ends, 3 * ends + 1])
-    free = np.setdiff1d(np.arange(assembled.dof), held)
+    fixed = np.concatenate([3 * sides, 3 * sides + 2, 3 * ends, 3 * ends + 1])
+    free = np.setdiff1d(np.arange(assembled.dof), fixed)
     exact = _exact_omega_squared(THIN)
     eigenvalues, _ = shift_invert_modes(
         assembled.stiffness[free][:, free], assembled.mass[free][:, free], 1, shift=exact

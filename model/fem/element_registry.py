@@ -4,14 +4,11 @@ An installed package adds one by an entry point of the group `era_haptics.elemen
 an `Element` of that name; it must pass `model.fem.element_checks`.
 """
 
-from collections.abc import Mapping
 from operator import attrgetter
-from typing import Any
 
 from model.errors import InputError
 from model.fem.element_checks import matrices, nodes
 from model.fem.elements import ELEMENTS, Element
-from model.fem.mesh import Mesh
 from registry.plugins import Instance, PluginRegistry
 
 _ELEMENTS: PluginRegistry[Element] = PluginRegistry(
@@ -33,8 +30,3 @@ def element_names() -> tuple[str, ...]:
 def element_of(name: str) -> Element:
     """Look up an element; raises InputError with a suggestion."""
     return _ELEMENTS.find(name)
-
-
-def mesh_from_dict(values: Mapping[str, Any]) -> Mesh:
-    """Make the mesh of `Mesh.to_dict`; raises InputError for an unknown element."""
-    return Mesh(**{**values, "element": element_of(values["element"])})

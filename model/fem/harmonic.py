@@ -12,36 +12,12 @@ import numpy as np
 from scipy import sparse
 
 from model.arrays import ComplexArray, FloatArray
-from model.errors import InputError
-from model.fem.assembly import PlateMatrices, era_positions
+from model.fem.assembly import PlateMatrices
 from model.fem.factorisation import factorise
-from model.fem.mesh import MIN_NODES_PER_WAVELENGTH, Mesh
+from model.fem.plate_mesh import check_frequencies
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
-from model.structure.plate import Plate
-from model.structure.point_load import PointLoad, load_positions
-
-
-def check_frequencies(plate: Plate, mesh: Mesh, frequencies: FloatArray) -> None:
-    """Raise InputError for frequencies (f,) [Hz] not above zero or too high for the mesh."""
-    for frequency in frequencies:
-        if not (np.isfinite(frequency) and frequency > 0):
-            raise InputError(f"frequency must be above zero, got {frequency} Hz")
-    highest = max(frequencies, default=0.0)
-    if highest > mesh.highest_frequency(plate):
-        elements = plate.bending_wavelength(highest) / max(mesh.element_size)
-        least = MIN_NODES_PER_WAVELENGTH / mesh.element.order
-        coarsest = Mesh.coarsest(plate, frequency=highest, element=mesh.element)
-        remedy = (
-            f"raise the upper limits.frequency to {highest:g} Hz, which mesh: auto follows"
-            if mesh.strip
-            else f"use {coarsest} or finer"
-        )
-        raise InputError(
-            f"mesh {mesh}: must have at least {least:g} elements of {mesh.element.name} in a "
-            f"bending wavelength, got {elements:.1f} elements in a bending wavelength at "
-            f"{highest:g} Hz; {remedy}"
-        )
+from model.structure.point_load import PointLoad, footprints_of
 
 
 def direct_acceleration(
@@ -59,7 +35,7 @@ def direct_acceleration(
     `check_frequencies`, and for points off the plate.
     """
     check_frequencies(matrices.plate, matrices.mesh, frequencies)
-    touch = matrices.deflection_at(np.vstack([era_positions(eras), load_positions(loads)]))
+    touch = matrices.deflection_at(footprints_of(eras, loads))
     observe = matrices.deflection_at(points)
     result = np.empty((len(frequencies), len(eras), observe.shape[0]), dtype=complex)
     omegas = 2 * np.pi * np.asarray(frequencies, dtype=float)

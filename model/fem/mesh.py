@@ -1,7 +1,7 @@
 """A structured mesh of rectangles over the plate."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -11,19 +11,20 @@ from scipy import sparse
 from model.arrays import FloatArray, IntArray, lattice
 from model.errors import InputError
 from model.fem.elements import MITC4, Q5, Element
+from model.structure.footprint import mean_over
 from model.structure.plate import Plate
 
 PAPER_ELEMENT = MITC4
 """The default element of a mesh."""
 
-# The automatic mesh. The lowest twelve natural frequencies of the paper's plate are then within
+# An accurate mesh. The lowest twelve natural frequencies of the paper's plate are then within
 # 0.01 % of converged, and its accelerations (relative L2) within 0.1 % with ERAs at the corners,
 # 0.2 % with ERAs elsewhere and 0.6 % there at a resonance: a point force bends the plate more
 # sharply than an element does.
-AUTO_ELEMENT = Q5
-AUTO_ELEMENTS_PER_WAVELENGTH = 5.5
-AUTO_MIN_ELEMENTS = 3
-AUTO_STRIP_THICKNESSES = 2.0  # the boundary layer of a free edge is about as wide as the thickness
+Q5_ELEMENT = Q5
+Q5_PER_WAVELENGTH = 5.5
+Q5_MIN_ELEMENTS = 3
+Q5_STRIP_THICKNESSES = 2.0  # the free edge's boundary layer is as wide as h
 
 MIN_NODES_PER_WAVELENGTH = 6
 """With fewer nodes to a bending wavelength a mesh is refused."""
@@ -56,17 +57,17 @@ class Mesh:
             )
 
     @classmethod
-    def auto(cls, plate: Plate, *, frequency_max: float) -> Self:
-        """Make the cheapest mesh that is accurate for bending waves up to a frequency [Hz]."""
-        size = plate.bending_wavelength(frequency_max) / AUTO_ELEMENTS_PER_WAVELENGTH
+    def accurate(cls, plate: Plate, *, frequency_max: float) -> Self:
+        """Make the cheapest mesh of Q5 that is accurate up to a frequency [Hz]."""
+        size = plate.bending_wavelength(frequency_max) / Q5_PER_WAVELENGTH
         nx, ny = (
-            max(AUTO_MIN_ELEMENTS, math.ceil(side / size)) for side in (plate.length, plate.width)
+            max(Q5_MIN_ELEMENTS, math.ceil(side / size)) for side in (plate.length, plate.width)
         )
         # On a thick plate the boundary layer is no narrower than an element: no strip needed.
-        strip = AUTO_STRIP_THICKNESSES * plate.thickness
+        strip = Q5_STRIP_THICKNESSES * plate.thickness
         if strip > min(plate.length / nx, plate.width / ny) / 2:
             strip = 0.0
-        return cls(nx, ny, plate.length, plate.width, AUTO_ELEMENT, strip)
+        return cls(nx, ny, plate.length, plate.width, Q5_ELEMENT, strip)
 
     @classmethod
     def coarsest(cls, plate: Plate, *, frequency: float, element: Element = PAPER_ELEMENT) -> Self:
@@ -176,6 +177,16 @@ class Mesh:
         return per_element * self.nx + 1, per_element * self.ny + 1
 
     @property
+    def element_name(self) -> str:
+        """Name of its element."""
+        return self.element.name
+
+    @property
+    def dof(self) -> int:
+        """Number of degrees of freedom: w, beta_x, beta_y at each node."""
+        return 3 * self.node_count
+
+    @property
     def shortest_wavelength(self) -> float:
         """The shortest bending wavelength [m] that it resolves: six elements of the first order."""
         return MIN_NODES_PER_WAVELENGTH * max(self.element_size) / self.element.order
@@ -184,13 +195,41 @@ class Mesh:
         """The highest frequency [Hz] whose bending waves in a plate it resolves."""
         return plate.bending_frequency(self.shortest_wavelength)
 
+    def resolving(self, plate: Plate, frequency: float) -> Self:
+        """The coarsest mesh of its element, without strips, that resolves a frequency [Hz]."""
+        return self.coarsest(plate, frequency=frequency, element=self.element)
+
+    def stretched(self, plate: Plate) -> Self:
+        """A mesh of elements as large, or smaller, on a plate of another size."""
+        nx, ny = (
+            math.ceil(count * max(new / old, 1.0))
+            for count, new, old in (
+                (self.nx, plate.length, self.length),
+                (self.ny, plate.width, self.width),
+            )
+        )
+        return replace(self, nx=nx, ny=ny, length=plate.length, width=plate.width)
+
+    def interpolation_error(self, plate: Plate, frequency: float) -> float:
+        """By how much its shape functions may deviate from a wave between nodes, relative to it.
+
+        A wave k between nodes a step s apart is followed by a polynomial of order p within
+        (k s)^(p + 1) / 4 (p + 1).
+        """
+        order = self.element.order
+        step = max(self.element_size) / order
+        phase = 2 * math.pi / plate.bending_wavelength(frequency) * step
+        return float(phase ** (order + 1) / (4 * (order + 1)))
+
     def interpolation(self, points: FloatArray) -> sparse.csr_array:
         """Shape functions at points [m] (n, 2): sparse (n, node_count), rows sum to 1.
 
-        The element's own shape functions for the deflection. Raises InputError for a point off the
-        plate.
+        The element's own shape functions for the deflection, their means at footprints (n, 3).
+        Raises InputError for a point off the plate.
         """
         points = np.atleast_2d(np.asarray(points, dtype=float))
+        if points.shape[1] == 3:
+            return mean_over(self.interpolation, points, length=self.length, width=self.width)
         tolerance = 1e-9 * max(self.length, self.width)
         upper = np.array([self.length, self.width])
         off = ~((points >= -tolerance) & (points <= upper + tolerance)).all(axis=1)

@@ -12,7 +12,7 @@ from model.errors import InputError
 from model.fem.assembly import PlateMatrices
 from model.fem.factorisation import factorise
 from model.structure.actuator import Era
-from model.structure.point_load import PointLoad, load_positions
+from model.structure.point_load import PointLoad, footprints_of
 
 RIGID_BODY_MODES = 3  # of a free plate: up and down, and two tilts
 
@@ -95,9 +95,9 @@ def modes(
     stiffness, mass = matrices.stiffness, matrices.mass
     attachments = [*loads]
     if support == "eras":
-        attachments += [PointLoad(era.x, era.y, era.stiffness, mass=era.bolt_mass) for era in eras]
+        attachments += [PointLoad.of_era(era) for era in eras]
     if attachments:
-        interpolation = matrices.deflection_at(load_positions(attachments))
+        interpolation = matrices.deflection_at(footprints_of(attachments))
         springs = sparse.diags_array(np.array([load.stiffness for load in attachments]))
         masses = sparse.diags_array(np.array([load.mass for load in attachments]))
         stiffness = sparse.csc_array(stiffness + interpolation.T @ springs @ interpolation)

@@ -48,6 +48,10 @@ class SymmetryClass:
         shape = (self.mesh.node_count, self.size)
         return sparse.csr_array((sign[rows] / 2, (rows, place[rows])), shape=shape)
 
+    def deflection_at(self, points: FloatArray) -> sparse.csr_array:
+        """Map of a quarter's field to the deflection at points [m] (p, 2), (p, size)."""
+        return sparse.csr_array(self.mesh.interpolation(points) @ self.expansion)
+
     def assemble(
         self, elements: ElementMatrices, shift: float
     ) -> tuple[sparse.coo_array, sparse.coo_array]:

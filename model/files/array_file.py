@@ -18,6 +18,8 @@ from typing import IO, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from model.files.regular_file import regular_file
+
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 
 UNREADABLE = (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError)
@@ -57,7 +59,7 @@ def write_arrays(path: Path, arrays: Arrays) -> None:
 
 def read_arrays(path: Path, types: Mapping[str, str], *, max_bytes: int) -> dict[str, NDArray[Any]]:
     """Read arrays of exactly these names and types (`dtype.str`); raises one of UNREADABLE."""
-    with zipfile.ZipFile(path) as archive:
+    with open(path, "rb", opener=regular_file) as file, zipfile.ZipFile(file) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         if sorted(members) != sorted(types) or len(archive.infolist()) != len(types):
             raise ValueError(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from model.arrays import FloatArray
 from model.errors import InputError
+from model.files.regular_file import regular_file
 
 TIME_RESPONSE, FREQUENCY_RESPONSE = 1, 4  # function types
 DISPLACEMENT, ACCELERATION, TIME, FREQUENCY = 8, 12, 17, 18  # data types
@@ -122,7 +123,7 @@ def read_universal(path: Path) -> Universal:
 def read_bytes(path: Path) -> bytes:
     """Read a measured file; raises InputError if it is missing, empty or too large."""
     try:
-        with path.open("rb") as stream:
+        with open(path, "rb", opener=regular_file) as stream:
             content = stream.read(_MAX_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error

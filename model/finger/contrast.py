@@ -8,19 +8,19 @@ from numpy.typing import NDArray
 from model.arrays import FloatArray
 from model.finger.perception import decibels, sensation_level
 
-# The surroundings of a lone finger begin at this distance [m], about two fingertips.
-SURROUNDINGS_RADIUS = 0.05
+# The background of a lone finger begins at this distance [m], about two fingertips.
+NEAR_RADIUS = 0.05
 
 
 def is_beyond(points: FloatArray, targets: Sequence[tuple[float, float]]) -> NDArray[np.bool_]:
-    """Which points [m] (p, 2) are farther from every target [m] than SURROUNDINGS_RADIUS, (p,)."""
+    """Return which points [m] (p, 2) are farther than NEAR_RADIUS from every target [m], (p,)."""
     apart = np.linalg.norm(points[:, None] - np.array(targets), axis=-1)
-    beyond: NDArray[np.bool_] = (apart > SURROUNDINGS_RADIUS).all(axis=1)
+    beyond: NDArray[np.bool_] = (apart > NEAR_RADIUS).all(axis=1)
     return beyond
 
 
-def is_around(points: FloatArray, targets: Sequence[tuple[float, float]]) -> NDArray[np.bool_]:
-    """Which points [m] (p, 2) are the surroundings of targets [m], (p,): those beyond, or all.
+def is_background(points: FloatArray, targets: Sequence[tuple[float, float]]) -> NDArray[np.bool_]:
+    """Return which points [m] (p, 2) are background to targets [m], (p,): those beyond, or all.
 
     All where the plate is so small that no point is beyond.
     """

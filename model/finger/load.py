@@ -17,21 +17,30 @@ from model.structure.point_load import PointLoad
 
 @dataclass(frozen=True)
 class FingerLoad:
-    """A finger's stiffness [N/m], damping [N s/m] and mass [kg]; by default it presses lightly."""
+    """A finger's stiffness [N/m], damping [N s/m] and mass [kg]; by default it presses lightly.
+
+    foot [m]: radius of its contact with the plate, 0 for a point.
+    """
 
     stiffness: float = 1000.0
     damping: float = 2.0
     mass: float = 0.0002
+    foot: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse values that are not finite or negative."""
-        for what, unit in (("stiffness", "N/m"), ("damping", "N s/m"), ("mass", "kg")):
+        for what, unit in (
+            ("stiffness", "N/m"),
+            ("damping", "N s/m"),
+            ("mass", "kg"),
+            ("foot", "m"),
+        ):
             expect_number(getattr(self, what), what=f"{what} of a finger", unit=unit)
         self.at(0.0, 0.0)
 
     def at(self, x: float, y: float) -> PointLoad:
         """The finger at x, y [m]."""
-        return PointLoad(x, y, self.stiffness, self.damping, self.mass)
+        return PointLoad(x, y, self.stiffness, self.damping, self.mass, self.foot)
 
 
 def finger_loads(contacts: Iterable[tuple[float, float]]) -> tuple[PointLoad, ...]:

@@ -14,7 +14,7 @@ STRONG_DB_SL = 20.0
 
 @cache
 def _thresholds() -> tuple[FloatArray, FloatArray]:
-    """Logarithms of frequency and of threshold, as tabled."""
+    """Logarithms of frequency and of threshold, as tabulated."""
     text = resources.files("model").joinpath("data/perception.csv").read_text(encoding="utf-8")
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     rows = list(csv.DictReader(lines))

@@ -71,7 +71,7 @@ def _drives(rig: Rig, free_plate: FreePlate, *, active_count: int) -> list[_Driv
     drives = []
     for layout in FOUR_ERA_LAYOUTS:
         eras = alike(rig.eras[0], layout.positions(rig.plate))
-        acceleration = free_plate.acceleration(eras, PAPER_FREQUENCIES, points, loads=rig.loads)
+        acceleration = free_plate.acceleration(eras, PAPER_FREQUENCIES, points, loads=rig.masses)
         statistics = cumulative_statistics(acceleration, felt=felt)
         drives += [
             _Drive(layout, active, row)

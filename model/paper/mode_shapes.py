@@ -6,9 +6,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 from model.arrays import FloatArray, lattice
-from model.fem.assembly import assemble
 from model.fem.mesh import Mesh
-from model.fem.modal import Modes, modes
 from model.figures.drawing import draw_eras, draw_shape, raster
 from model.files.csv_file import Column, Columns
 from model.paper.figure import PaperFigure
@@ -23,6 +21,7 @@ from model.paper.printed import (
 )
 from model.rig.rig import Rig
 from model.structure.plate import Plate
+from model.vibration.natural_modes import natural_modes
 
 MODE_COUNT = 5
 SHOWN_MODES = (1, 5)
@@ -80,19 +79,18 @@ def _shapes_figure(
     name: str, rig: Rig, *, support: str, caption: str, known: Columns
 ) -> PaperFigure:
     coarse_mesh = paper_mesh(rig.plate)
-    coarse = _modes(rig, coarse_mesh, support)
-    fine = _modes(rig, rig.mesh, support)
+    coarse = natural_modes(rig, MODE_COUNT, support=support, mesh=coarse_mesh)
+    fine = natural_modes(rig, MODE_COUNT, support=support)
     table: Columns = {
         **known,
-        f"model_{coarse_mesh.nx}x{coarse_mesh.ny}_hz": coarse.natural_frequencies,
-        "model_fine_hz": fine.natural_frequencies,
+        f"model_{coarse_mesh.nx}x{coarse_mesh.ny}_hz": coarse.frequencies,
+        "model_fine_hz": fine.frequencies,
     }
     columns, rows = raster(rig.plate)
     x = np.linspace(0, rig.plate.length, columns)
     y = np.linspace(0, rig.plate.width, rows)
     points = lattice(x, y)
-    shown = fine.mode_shapes[:, [mode - 1 for mode in SHOWN_MODES]]
-    shapes = [_scaled(shape) for shape in (rig.mesh.interpolation(points) @ shown).T]
+    shapes = [_scaled(shape) for shape in fine.at(points)[:, [mode - 1 for mode in SHOWN_MODES]].T]
     figure = Figure(figsize=(9, 6.2), layout="constrained")
     upper, lower = figure.subfigures(2, 1, height_ratios=(3, 1.6), squeeze=False)[:, 0]
     axes = upper.subplots(1, len(shapes), sharey=True)
@@ -100,7 +98,7 @@ def _shapes_figure(
         image = draw_shape(drawn, x, y, shape.reshape(rows, columns))
         if support == "eras":
             draw_eras(drawn, rig.eras, active=())
-        drawn.set_title(f"mode {mode}: {fine.natural_frequencies[mode - 1]:.2f} Hz")
+        drawn.set_title(f"mode {mode}: {fine.frequencies[mode - 1]:.2f} Hz")
         drawn.label_outer()
     upper.colorbar(image, ax=axes, label="deflection, largest = 1")
     upper.suptitle(caption)
@@ -120,12 +118,6 @@ def _shapes_figure(
             key: np.round(np.asarray(column, dtype=float), 2).tolist()
             for key, column in table.items()
         },
-    )
-
-
-def _modes(rig: Rig, mesh: Mesh, support: str) -> Modes:
-    return modes(
-        assemble(rig.plate, mesh), MODE_COUNT, support=support, eras=rig.eras, loads=rig.loads
     )
 
 

@@ -1,5 +1,11 @@
-"""Modes of one symmetry class of the free plate, with the factorisation used for them."""
+"""Modes of the free plate by symmetry class, each with its factorised stiffness.
 
+`finite_element_classes` solves them on a mesh. `model.reduction.free_plate` needs no more of a
+plate than its `ClassModes`.
+"""
+
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -8,25 +14,33 @@ from scipy import linalg, sparse
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from model.arrays import FloatArray
-from model.fem.assembly import ElementMatrices
+from model.fem.assembly import ElementMatrices, element_matrices
 from model.fem.factorisation import Solve, factorise_definite
-from model.fem.symmetry import SymmetryClass
+from model.fem.mesh import Mesh
+from model.fem.symmetry import CLASSES, SymmetryClass, symmetry_class
+from model.structure.plate import Plate
 
 
 @dataclass(frozen=True, eq=False)
 class ClassModes:
-    """One symmetry class: its factorised matrix, and its modes up to the cut-off.
+    """One symmetry class in n unknowns: its factorised matrix, and its lowest modes.
 
-    solve: (K + shift M) x = f; mass M (n, n); eigenvalues omega² (r,) [rad²/s²] and vectors Phi
-    (n, r) with Phi^T M Phi = I; next_eigenvalue: of the lowest truncated mode.
+    deflection_at: basis (p, n) of the deflection at points [m] (p, 2); solve: (K + shift M) x = f;
+    mass M (n, n); eigenvalues omega² (r,) [rad²/s²] and mode shapes Phi (n, r) with
+    Phi^T M Phi = I; largest_truncated: 1 / (lambda + shift) of the lowest truncated mode [s²/rad²].
     """
 
-    symmetry: SymmetryClass
+    deflection_at: Callable[[FloatArray], sparse.csr_array]
     solve: Solve
     mass: sparse.csr_array
     eigenvalues: FloatArray
     vectors: FloatArray
-    next_eigenvalue: float
+    largest_truncated: float
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns n."""
+        return int(self.mass.shape[0])
 
     @cached_property
     def _mass_weighted_modes(self) -> FloatArray:
@@ -51,29 +65,56 @@ class ClassModes:
         return result
 
 
-def solve_class(
-    symmetry: SymmetryClass, elements: ElementMatrices, *, shift: float, cut: float, count: int
-) -> ClassModes:
-    """Solve for all modes of a class below the cut [rad²/s²].
+def finite_element_classes(
+    plate: Plate, mesh: Mesh, *, shift: float, cutoff_frequency: float
+) -> tuple[ClassModes, ...]:
+    """Solve the four symmetry classes of a free plate on a mesh for their modes.
 
-    count: number of modes to compute at first; more where they do not reach the cut.
+    shift [rad²/s²]: of the factorisations; cutoff_frequency [Hz]: all modes below it are solved.
+    """
+    elements = element_matrices(plate, mesh)
+    max_eigenvalue = (2 * math.pi * cutoff_frequency) ** 2
+    count = plate.modes_below(cutoff_frequency) // 4 + 4
+    return tuple(
+        _solve_class(
+            symmetry_class(mesh, parity),
+            elements,
+            shift=shift,
+            max_eigenvalue=max_eigenvalue,
+            count=count,
+        )
+        for parity in CLASSES
+    )
+
+
+def _solve_class(
+    symmetry: SymmetryClass,
+    elements: ElementMatrices,
+    *,
+    shift: float,
+    max_eigenvalue: float,
+    count: int,
+) -> ClassModes:
+    """Solve for all modes of a class below max_eigenvalue [rad²/s²].
+
+    count: number of modes to compute at first; more where they do not reach it.
     """
     shifted, unsummed = symmetry.assemble(elements, shift)
     solve, mass = factorise_definite(shifted), sparse.csr_array(unsummed)
     while True:
         eigenvalues, vectors = _lowest(solve, mass, count, shift=shift)
-        if eigenvalues[-1] >= cut or len(eigenvalues) == symmetry.size:
+        if eigenvalues[-1] >= max_eigenvalue or len(eigenvalues) == symmetry.size:
             break
         count += count // 3 + 1
-    kept = int(np.searchsorted(eigenvalues, cut))
+    kept = int(np.searchsorted(eigenvalues, max_eigenvalue))
     eigenvalues[np.abs(eigenvalues) < 1e-6 * shift] = 0.0
     return ClassModes(
-        symmetry,
+        symmetry.deflection_at,
         solve,
         mass,
         eigenvalues[:kept],
         vectors[:, :kept],
-        float(eigenvalues[min(kept, len(eigenvalues) - 1)]),
+        1 / (float(eigenvalues[min(kept, len(eigenvalues) - 1)]) + shift),
     )
 
 

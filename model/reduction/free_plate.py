@@ -2,32 +2,32 @@
 
 Modes of the free plate up to twice the highest frequency come from one factorisation for each
 symmetry class; the contribution of the truncated modes (`model.reduction.truncation`) takes a few
-more solves with the same factors for each point of attachment, cached. Attachments are then a
-low-rank correction (`model.reduction.low_rank`): for each frequency a system as small as their
-number, independent of the mesh.
+more solves with the same factors for each point of attachment, cached. Solutions for points are
+then a low-rank correction (`model.structure.low_rank`): for each frequency a system as small as
+their number, independent of the mesh.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.fem.assembly import element_matrices, era_positions
-from model.fem.harmonic import check_frequencies
 from model.fem.mesh import Mesh
-from model.fem.symmetry import CLASSES, symmetry_class
-from model.reduction.attachments import TERMS, Attachments, AttachmentSolver
-from model.reduction.class_modes import ClassModes, solve_class
-from model.reduction.low_rank import coupled_forces, on_diagonal
+from model.fem.plate_mesh import PlateMesh, check_frequencies
+from model.reduction.finite_element_modes import finite_element_modes
+from model.reduction.free_modes import RESIDUAL_ORDER, FreeModes, PointSolutions
+from model.reduction.spectral_modes import spectral_modes
 from model.reduction.truncation import truncation_weights
+from model.spectral.mesh import SpectralMesh
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
+from model.structure.footprint import as_footprints
+from model.structure.low_rank import coupled_forces, on_diagonal
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad, load_positions
+from model.structure.point_load import PointLoad, footprints_of
 
 FREQUENCY_MARGIN = 2.0
 """Modes are kept up to this multiple of frequency_max."""
@@ -41,25 +41,10 @@ class FreePlate:
     """
 
     plate: Plate
-    mesh: Mesh
+    mesh: PlateMesh
     frequency_max: float
     shift: float
-    classes: tuple[ClassModes, ...]
-
-    @property
-    def eigenvalues(self) -> FloatArray:
-        """omega² of the modes (r,) [rad²/s²], class by class; the first of a class may be 0."""
-        return np.concatenate([part.eigenvalues for part in self.classes])
-
-    @cached_property
-    def attachments(self) -> AttachmentSolver:
-        """Solver for the points where forces act, with its cache."""
-        return AttachmentSolver(self.mesh, self.classes, scale=self.largest_truncated)
-
-    @property
-    def largest_truncated(self) -> float:
-        """1 / (lambda + shift) of the lowest truncated mode [s²/rad²]."""
-        return 1 / (min(part.next_eigenvalue for part in self.classes) + self.shift)
+    modes: FreeModes
 
     def acceleration(
         self,
@@ -76,15 +61,15 @@ class FreePlate:
         mesh carries, and for points off the plate.
         """
         omega = self._omega(frequencies)
-        attached = self.attachments.solve(np.vstack([era_positions(eras), load_positions(loads)]))
+        attached = self.modes.solve_at(footprints_of(eras, loads))
         stiffness = attached_stiffness(eras, loads, omega)
         applied = on_diagonal(drive_forces(eras, omega), rows=stiffness.shape[1])
         forces = coupled_forces(self._between(attached, omega), stiffness, applied)
-        modal_receptance, weights = self._modal_receptance(omega, TERMS)
+        modal_receptance, weights = self._modal_receptance(omega, RESIDUAL_ORDER)
         modal = modal_receptance[:, :, None] * (attached.shapes.T @ forces)
         residual = (weights[:, :, None, None] * forces[:, None]).reshape(len(omega), -1, len(eras))
         coordinates = np.concatenate([modal, residual], axis=1)
-        displacement = _apply(self.attachments.basis(attached, points), coordinates)
+        displacement = _apply(self.modes.basis(attached, points), coordinates)
         return np.asarray(-(omega**2)[:, None, None] * displacement)
 
     def receptances(
@@ -102,13 +87,15 @@ class FreePlate:
         `acceleration`.
         """
         omega = self._omega(frequencies)
-        attached = self.attachments.solve(np.vstack([places, load_positions(loads)]))
+        attached = self.modes.solve_at(np.vstack([as_footprints(places), footprints_of(loads)]))
         count = len(attached.shapes)
-        modal_receptance, weights = self._modal_receptance(omega, TERMS)
-        basis = self.attachments.basis(attached, points)
-        shapes, residual = np.split(basis, [len(self.eigenvalues)], axis=1)
+        modal_receptance, weights = self._modal_receptance(omega, RESIDUAL_ORDER)
+        basis = self.modes.basis(attached, points)
+        shapes, residual = np.split(basis, [len(self.modes.eigenvalues)], axis=1)
         to_points = _apply(shapes, modal_receptance[:, :, None] * attached.shapes.T)
-        to_points += np.tensordot(weights, residual.reshape(-1, TERMS, count).T, axes=(1, 1))
+        to_points += np.tensordot(
+            weights, residual.reshape(-1, RESIDUAL_ORDER, count).T, axes=(1, 1)
+        )
         between = self._between(attached, omega)
         if loads:
             # R - R_pl D (I + R_ll D)^-1 R_lp; places p, loads l, all receptances symmetric.
@@ -121,21 +108,21 @@ class FreePlate:
         return between, to_points
 
     def _modal_receptance(self, omega: FloatArray, terms: int) -> tuple[ComplexArray, ComplexArray]:
-        """Receptance of each mode (f, r) [m/N kg], and weights of the truncated ones, (f, terms).
+        """Receptance of each mode (f, r) [s²], and weights of the truncated ones, (f, terms).
 
         1 / ((1 + i eta) lambda - omega²) for an eigenvalue lambda at modal mass 1.
         """
         loss = 1 + 1j * self.plate.loss_factor
         shifted = np.asarray(omega**2 / loss + self.shift, dtype=complex)
-        weights = truncation_weights(shifted, self.largest_truncated, terms)
-        receptance = 1 / (loss * self.eigenvalues - (omega**2)[:, None])
+        weights = truncation_weights(shifted, self.modes.largest_truncated, terms)
+        receptance = 1 / (loss * self.modes.eigenvalues - (omega**2)[:, None])
         return np.asarray(receptance, dtype=complex), np.asarray(weights / loss, dtype=complex)
 
-    def _between(self, attached: Attachments, omega: FloatArray) -> ComplexArray:
+    def _between(self, attached: PointSolutions, omega: FloatArray) -> ComplexArray:
         """Receptance between attachments, (f, n, n)."""
-        modal_receptance, weights = self._modal_receptance(omega, 2 * TERMS)
+        modal_receptance, weights = self._modal_receptance(omega, 2 * RESIDUAL_ORDER)
         modal = (modal_receptance[:, None, :] * attached.shapes) @ attached.shapes.T
-        return np.asarray(modal + np.tensordot(weights, attached.moments, axes=1))
+        return np.asarray(modal + np.tensordot(weights, attached.truncated_terms, axes=1))
 
     def _omega(self, frequencies: FloatArray) -> FloatArray:
         """omega [rad/s] of frequencies [Hz]; raises InputError for those out of range."""
@@ -160,33 +147,22 @@ def _apply(basis: FloatArray, coordinates: ComplexArray) -> ComplexArray:
     return result
 
 
-def solve_free_plate(plate: Plate, mesh: Mesh, *, frequency_max: float = 500.0) -> FreePlate:
+def solve_free_plate(plate: Plate, mesh: PlateMesh, *, frequency_max: float = 500.0) -> FreePlate:
     """Solve the free plate on a mesh, for responses up to a frequency [Hz]."""
     if not (math.isfinite(frequency_max) and frequency_max > 0):
         raise InputError(f"frequency_max must be above zero, got {frequency_max} Hz")
     # Above zero, since K alone is singular, and well below the truncated modes, whose sum converges
     # more slowly for a larger shift.
     shift = (2 * math.pi * min(plate.lowest_bending_frequency, frequency_max / 3)) ** 2
-    cut = FREQUENCY_MARGIN * frequency_max
-    elements = element_matrices(plate, mesh)
-    classes = tuple(
-        solve_class(
-            symmetry_class(mesh, parity),
-            elements,
-            shift=shift,
-            cut=(2 * math.pi * cut) ** 2,
-            count=_class_count(plate, cut),
-        )
-        for parity in CLASSES
-    )
-    return FreePlate(plate, mesh, frequency_max, shift, classes)
-
-
-def _class_count(plate: Plate, frequency: float) -> int:
-    """Number of modes to compute for a symmetry class up to a frequency [Hz].
-
-    Area term of the mode count of a thin plate, pi S / wavelength², and a quarter more for its
-    edges; a quarter of that for each class, and four more.
-    """
-    area_term = math.pi * plate.length * plate.width / plate.bending_wavelength(frequency) ** 2
-    return math.ceil(1.25 * area_term / 4) + 4
+    cutoff_frequency = FREQUENCY_MARGIN * frequency_max
+    modes: FreeModes
+    match mesh:
+        case SpectralMesh():
+            modes = spectral_modes(plate, mesh, shift=shift, cutoff_frequency=cutoff_frequency)
+        case Mesh():
+            modes = finite_element_modes(
+                plate, mesh, shift=shift, cutoff_frequency=cutoff_frequency
+            )
+        case _:
+            raise TypeError(f"mesh must be a Mesh or SpectralMesh, got {type(mesh).__name__}")
+    return FreePlate(plate, mesh, frequency_max, shift, modes)

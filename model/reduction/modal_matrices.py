@@ -22,7 +22,7 @@ from scipy import linalg
 from model.arrays import FloatArray
 from model.structure.actuator import Era
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad, load_positions
+from model.structure.point_load import PointLoad, footprints_of
 from model.structure.support import check_supported
 
 
@@ -41,7 +41,7 @@ class Reduced(Protocol):
         """Natural frequencies [rad/s], (r,)."""
 
     def at(self, points: FloatArray) -> FloatArray:
-        """Shapes at points [m] (p, 2), (p, r)."""
+        """Shapes at points (p, 2) or footprints (p, 3) [m], (p, r)."""
 
 
 def modal_matrices(
@@ -58,10 +58,9 @@ def modal_matrices(
     InputError for ERAs that do not support the plate.
     """
     check_supported(reduced.plate, eras, loads=loads)
-    fixed = [PointLoad(e.x, e.y, e.stiffness, e.damping, e.bolt_mass) for e in eras]
-    fixed += loads
+    fixed = [*(PointLoad.of_era(era) for era in eras), *loads]
     phi = (
-        reduced.at(load_positions([*fixed, *contacts]))
+        reduced.at(footprints_of([*fixed, *contacts]))
         if attachment_shapes is None
         else attachment_shapes
     )
@@ -69,13 +68,13 @@ def modal_matrices(
     M, C, K = _contribution(phi[: len(fixed)], fixed)
     M += np.eye(len(elastic))
     K += elastic
-    squares, psi = linalg.eigh(K, M)
-    omega = np.sqrt(squares)
+    eigenvalues, psi = linalg.eigh(K, M)
+    omega = np.sqrt(eigenvalues)
     viscous = reduced.plate.loss_factor * (psi.T @ elastic @ psi) / np.sqrt(np.outer(omega, omega))
-    back = M @ psi
-    C += back @ viscous @ back.T
-    added = _contribution(phi[len(fixed) :], contacts)
-    return M + added[0], C + added[1], K + added[2]
+    mass_weighted_modes = M @ psi
+    C += mass_weighted_modes @ viscous @ mass_weighted_modes.T
+    contribution = _contribution(phi[len(fixed) :], contacts)
+    return M + contribution[0], C + contribution[1], K + contribution[2]
 
 
 def _contribution(

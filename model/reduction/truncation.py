@@ -1,6 +1,6 @@
 """Contribution of the truncated modes to a receptance, from a few static solves.
 
-A truncated mode of eigenvalue lambda has the receptance 1 / (1 + i eta)(lambda - z),
+A truncated mode of eigenvalue lambda has the receptance 1 / ((1 + i eta)(lambda - z)),
 z = omega² / (1 + i eta). A static solve with the shift sigma gives u = 1 / (lambda + sigma) in its
 place, two solves u², and so on; all truncated modes have u within (0, u_c], u_c that of the lowest.
 So u / (1 - s u), s = z + sigma, is approximated on that interval by a polynomial in u without

@@ -5,7 +5,6 @@ A check is an entry point of the group `era_haptics.rig_checks` that leads to a 
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Protocol, runtime_checkable
 from urllib.parse import quote
 
@@ -14,6 +13,7 @@ from model.errors import InputError
 from model.rig.parts import limits_of
 from model.rig.rig import Rig
 from model.rig.sections import LimitsSection
+from registry.limits import GuardLimits
 from registry.plugins import Instance, PluginRegistry
 
 
@@ -22,11 +22,11 @@ class RigCheck(Protocol):
     """Checks URLs without opening any."""
 
     def __call__(
-        self, urls: Mapping[str, str], *, channels: Mapping[str, int], limits: Mapping[str, float]
+        self, urls: Mapping[str, str], *, channels: Mapping[str, int], limits: GuardLimits
     ) -> tuple[Mapping[str, str], Sequence[str]]:
         """Errors by the amplifier's name, and warnings.
 
-        channels: number wired by amplifier; limits: of the rig, by the names of `Limits`.
+        channels: number wired by amplifier; limits: of the rig.
         """
 
 
@@ -43,7 +43,7 @@ def check_amplifiers(document: Document, rig: Rig | None) -> tuple[list[Problem]
     problems: list[Problem] = []
     warnings: list[str] = []
     for name in _CHECKS.names():
-        wrong, warned = _CHECKS.find(name)(urls, channels=wired, limits=asdict(limits))
+        wrong, warned = _CHECKS.find(name)(urls, channels=wired, limits=limits)
         problems += [
             document.problem(("amplifiers", amplifier, "url"), what)
             for amplifier, what in wrong.items()

@@ -5,8 +5,8 @@ import math
 from model.config.document import key_name
 from model.config.sections import Validation
 from model.errors import InputError
-from model.fem.mesh import MIN_NODES_PER_WAVELENGTH, Mesh
-from model.rig.parts import laminate_of, mesh_of, plate_of
+from model.rig.meshes import mesh_of
+from model.rig.parts import laminate_of, plate_of
 from model.rig.rig import SAME_POINT
 from model.rig.sections import EraSection, LimitsSection, MassSection, PlateSection, RigSection
 from model.structure.plate import Plate
@@ -76,12 +76,11 @@ def _check_mesh(validation: Validation[RigSection], plate: Plate, *, frequency_m
         validation.add(("mesh",), str(error))
         return
     if frequency_max > mesh.highest_frequency(plate):
-        coarsest = Mesh.coarsest(plate, frequency=frequency_max, element=mesh.element)
         validation.add(
             ("mesh",),
             f"{mesh} is too coarse for bending waves at {frequency_max:g} Hz (limits.frequency): "
-            f"at least {coarsest} is needed, {MIN_NODES_PER_WAVELENGTH / mesh.element.order:g} "
-            f"elements a wavelength, got {mesh}; auto chooses an accurate mesh",
+            f"at least {mesh.resolving(plate, frequency_max)} is needed; auto chooses an accurate "
+            "mesh",
         )
 
 

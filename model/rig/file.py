@@ -8,7 +8,8 @@ from model.config.document import Document, parse_document, read_document
 from model.config.sections import Validation
 from model.errors import InputError
 from model.rig.checks import check_across
-from model.rig.parts import era_of, laminate_of, limits_of, mass_of, mesh_of, plate_of
+from model.rig.meshes import mesh_of
+from model.rig.parts import era_of, laminate_of, limits_of, mass_of, plate_of
 from model.rig.rig import Channel, Rig
 from model.rig.sections import RigSection
 
@@ -36,13 +37,18 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
     section = validation.finish()
     plate = plate_of(section.plate)
     wanted = section.mesh if mesh is None else mesh
+    eras = tuple(
+        era_of(name, era, plate, era_count=len(section.eras)) for name, era in section.eras.items()
+    )
     return Rig(
         plate=plate,
-        mesh=mesh_of(wanted, plate, frequency_max=section.limits.frequency[1]),
-        eras=tuple(
-            era_of(name, era, plate, era_count=len(section.eras))
-            for name, era in section.eras.items()
+        mesh=mesh_of(
+            wanted,
+            plate,
+            frequency_max=section.limits.frequency[1],
+            stiffness=max(era.stiffness for era in eras),
         ),
+        eras=eras,
         wiring={name: Channel(era.amplifier, era.channel) for name, era in section.eras.items()},
         amplifiers={name: amplifier.url for name, amplifier in section.amplifiers.items()},
         limits=limits_of(section.limits),

@@ -1,9 +1,8 @@
 """Rig files as a kind of configuration of `era config`."""
 
-from pathlib import Path
 from typing import Any
 
-from model.config.document import ConfigError, Document, Problem, read_document
+from model.config.document import ConfigError, Document, Problem
 from model.config.kinds import CheckedFile
 from model.rig.amplifiers import check_amplifiers
 from model.rig.file import example_rig_path, rig_of, rig_schema
@@ -18,9 +17,8 @@ class RigKind:
         """A rig has a plate."""
         return "plate" in document.data
 
-    def check(self, path: Path) -> CheckedFile:
+    def check(self, document: Document) -> CheckedFile:
         """Check a rig and its amplifiers; return its values in a line, to show unlikely ones."""
-        document = read_document(path)
         problems: list[Problem] = []
         rig = None
         try:
@@ -28,7 +26,7 @@ class RigKind:
         except ConfigError as error:
             problems += error.problems
         wrong, warnings = check_amplifiers(document, rig)
-        support = None if rig is None else support_problem(rig.plate, rig.eras, loads=rig.loads)
+        support = None if rig is None else support_problem(rig.plate, rig.eras, loads=rig.masses)
         if support is not None:
             problems.append(document.problem(("eras",), support))
         known = {problem.key for problem in problems}

@@ -1,20 +1,13 @@
 """Conversion of the sections of a rig file to values of the model."""
 
 import math
-import re
 
-from model.errors import InputError
-from model.fem.element_registry import element_of
-from model.fem.mesh import PAPER_ELEMENT, Mesh
-from model.rig.rig import Limits
 from model.rig.sections import EraSection, LimitsSection, MassSection, MaterialSection, PlateSection
 from model.structure.actuator import Era, damping_from_ratio
 from model.structure.laminate import Laminate, Layer, equivalent_plate
 from model.structure.plate import Material, Plate
-from model.structure.point_mass import PointMass
-
-_MAX_ELEMENTS_PER_SIDE = 1000
-_MAX_AUTO_NODES = 300_000  # a million degrees of freedom: minutes, and most of a machine's memory
+from model.structure.point_load import PointLoad
+from registry.limits import GuardLimits
 
 
 def plate_of(section: PlateSection) -> Plate:
@@ -62,54 +55,22 @@ def era_of(name: str, section: EraSection, plate: Plate, *, era_count: int) -> E
         damping=damping,
         bolt_mass=section.bolt_mass,
         stroke=section.stroke,
+        foot=section.foot,
         gains=tuple((f, size, math.radians(phase)) for f, size, phase in section.gains or ()),
     )
 
 
-def mass_of(section: MassSection, plate: Plate) -> PointMass:
+def mass_of(section: MassSection, plate: Plate) -> PointLoad:
     """A mass on the plate."""
     x, y = _onto(plate, section.at)
-    return PointMass(x, y, section.mass)
+    return PointLoad(x, y, mass=section.mass, foot=section.foot)
 
 
-def limits_of(section: LimitsSection) -> Limits:
+def limits_of(section: LimitsSection) -> GuardLimits:
     """The limits of commands; infinite where none is given."""
     low, high = section.frequency
     given = section.model_dump(exclude={"frequency"}, exclude_none=True)
-    return Limits(frequency_min=low, frequency_max=high, **given)
-
-
-def mesh_of(text: str, plate: Plate, *, frequency_max: float) -> Mesh:
-    """The mesh `auto`, accurate up to a frequency [Hz], or that of `parse_mesh`."""
-    if text != "auto":
-        return parse_mesh(text, plate)
-    mesh = Mesh.auto(plate, frequency_max=frequency_max)
-    if mesh.node_count > _MAX_AUTO_NODES:
-        raise InputError(
-            f"auto must have at most {_MAX_AUTO_NODES} nodes, got {mesh} elements up to "
-            f"{frequency_max:g} Hz; check the plate's sizes, or lower limits.frequency"
-        )
-    return mesh
-
-
-def parse_mesh(text: str, plate: Plate) -> Mesh:
-    """The mesh `NXxNY`, or `NXxNY ELEMENT`, over a plate.
-
-    Raises InputError for other text, an unknown element, and too many elements.
-    """
-    match = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})(?:\s+(\S{1,40}))?\s*", text, re.ASCII)
-    if match is None:
-        raise InputError(
-            f"mesh must be NXxNY with an optional element, for example 48x36 or 12x9 Q3, got "
-            f"{text[:40]!r}"
-        )
-    nx, ny = int(match[1]), int(match[2])
-    if not 1 <= min(nx, ny) <= max(nx, ny) <= _MAX_ELEMENTS_PER_SIDE:
-        raise InputError(
-            f"mesh must have 1 to {_MAX_ELEMENTS_PER_SIDE} elements a side, got {nx}x{ny}"
-        )
-    element = element_of(match[3]) if match[3] else PAPER_ELEMENT
-    return Mesh(nx=nx, ny=ny, length=plate.length, width=plate.width, element=element)
+    return GuardLimits(frequency_min=low, frequency_max=high, **given)
 
 
 def _material(section: MaterialSection) -> Material:

@@ -3,8 +3,9 @@
 from dataclasses import replace
 from typing import Any
 
-from model.rig.rig import Limits, Rig
+from model.rig.rig import Rig
 from model.structure.laminate import Bond, Laminate, bending, freely_sliding, perfectly_bonded
+from registry.limits import GuardLimits
 
 
 def plate_summary(rig: Rig) -> dict[str, Any]:
@@ -36,7 +37,7 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
     }
 
 
-def _laminate(laminate: Laminate, limits: Limits) -> dict[str, Any]:
+def _laminate(laminate: Laminate, limits: GuardLimits) -> dict[str, Any]:
     summary: dict[str, Any] = {
         "layers": [
             {

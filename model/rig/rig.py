@@ -8,12 +8,12 @@ from dataclasses import asdict, dataclass
 from numbers import Real
 
 from model.errors import InputError
-from model.fem.mesh import Mesh
+from model.fem.plate_mesh import PlateMesh
 from model.structure.actuator import Era
 from model.structure.laminate import Laminate
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
-from model.structure.point_mass import PointMass
+from registry.limits import GuardLimits
 
 # m; two bolts cannot be closer
 SAME_POINT = 1e-6
@@ -28,25 +28,6 @@ class Channel:
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Limits of commands: mechanical frequency [Hz] and level (1 is full stroke).
-
-    slew [1/s]: highest rise of a level. Per amplifier: power: sum of the squared levels of its
-    channels; on_time [s]: longest vibration without a pause; duty: share of any ten seconds; rate
-    [1/s]: command sets that are not silent.
-    """
-
-    frequency_min: float
-    frequency_max: float
-    level: float
-    slew: float = math.inf
-    power: float = math.inf
-    on_time: float = math.inf
-    duty: float = 1.0
-    rate: float = math.inf
-
-
-@dataclass(frozen=True)
 class Rig:
     """A plate on its ERAs, with wiring and limits.
 
@@ -55,12 +36,12 @@ class Rig:
     """
 
     plate: Plate
-    mesh: Mesh
+    mesh: PlateMesh
     eras: tuple[Era, ...]
     wiring: Mapping[str, Channel]
     amplifiers: Mapping[str, str]
-    limits: Limits
-    masses: tuple[PointMass, ...] = ()
+    limits: GuardLimits
+    masses: tuple[PointLoad, ...] = ()
     laminate: Laminate | None = None
 
     def __post_init__(self) -> None:
@@ -94,18 +75,13 @@ class Rig:
         raise KeyError(name)
 
     @property
-    def loads(self) -> tuple[PointLoad, ...]:
-        """The masses as point loads."""
-        return tuple(PointLoad(mass.x, mass.y, mass=mass.mass) for mass in self.masses)
-
-    @property
     def fingerprint(self) -> str:
         """Fingerprint of the plate on its ERAs; see `physics_fingerprint`."""
         return physics_fingerprint(self.plate, self.eras, masses=self.masses)
 
 
 def physics_fingerprint(
-    plate: Plate, eras: Sequence[Era], *, masses: Sequence[PointMass] = ()
+    plate: Plate, eras: Sequence[Era], *, masses: Sequence[PointLoad] = ()
 ) -> str:
     """SHA-256 over plate, ERAs and masses, which decide the plate's response; not mesh or wiring.
 
@@ -121,7 +97,7 @@ def physics_fingerprint(
     physics = {
         "plate": numbers,
         "eras": held,
-        "masses": sorted((float(m.x), float(m.y), float(m.mass)) for m in masses),
+        "masses": sorted(list(map(float, mass.numbers.values())) for mass in masses),
     }
     return hashlib.sha256(canonical_json(physics).encode()).hexdigest()
 

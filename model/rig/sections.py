@@ -95,6 +95,7 @@ Identifier = Annotated[str, AfterValidator(_identifier)]
 Side = Annotated[float, Quantity(LENGTH, above=0, at_most=100)]
 Coordinate = Annotated[float, Quantity(LENGTH, at_least=-100, at_most=100)]
 Place = Annotated[tuple[Coordinate, Coordinate], Strict(strict=False)]  # a list in the file
+Foot = Annotated[float, Quantity(LENGTH, at_least=0, at_most=0.2)]
 Thickness = Annotated[float, Quantity(LENGTH, at_least=1e-6, at_most=1)]
 Frequency = Annotated[float, Quantity(FREQUENCY, at_least=1, at_most=2000)]
 
@@ -149,16 +150,18 @@ class EraSection(Section):
     damping: Annotated[float, Quantity(DAMPING, at_least=0, at_most=1e6)] | None = None
     bolt_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=10)] = 0.0
     stroke: Annotated[float, Quantity(LENGTH, above=0, at_most=0.01)] = 100e-6
+    foot: Foot = 0.0
     gains: Annotated[list[GainRow], Field(max_length=2000), AfterValidator(_gains)] | None = None
     amplifier: Identifier
     channel: Annotated[int, Field(ge=0, le=255)]
 
 
 class MassSection(Section):
-    """A point mass on the plate."""
+    """A mass on the plate, at a point or on a disc."""
 
     at: Place
     mass: Annotated[float, Quantity(MASS, at_least=0, at_most=10)]
+    foot: Foot = 0.0
 
 
 class AmplifierSection(Section):
@@ -168,9 +171,9 @@ class AmplifierSection(Section):
 
 
 class LimitsSection(Section):
-    """Limits of commands, see `Limits`; the default frequencies are those that skin feels well.
+    """Limits of commands, see `GuardLimits`; all but the frequencies are unlimited by default.
 
-    The others are unlimited by default.
+    The default frequencies are those that skin feels well.
     """
 
     frequency: Annotated[
@@ -185,7 +188,7 @@ class LimitsSection(Section):
 
 
 class RigSection(Section):
-    """A rig file. mesh: auto, NXxNY, or NXxNY ELEMENT."""
+    """A rig file. mesh: auto, auto 1 %, NXxNY, or NXxNY ELEMENT."""
 
     plate: PlateSection
     mesh: str = "auto"

@@ -20,7 +20,8 @@ class Era:
     """One ERA under the plate; its base moves y(t) = amplitude sin(omega t + phase).
 
     x, y: position of its bolt [m]; stiffness k_b [N/m]; damping c [N s/m]; bolt_mass m_b [kg];
-    stroke: the largest base amplitude [m]. An ERA that is not driven still supports and damps.
+    stroke: the largest base amplitude [m]; foot [m]: radius of the disc on which it acts, 0 for a
+    point. An ERA that is not driven still supports and damps.
     gains: measured complex gain of its base, at ascending frequencies; empty for a gain of 1.
     """
 
@@ -32,10 +33,11 @@ class Era:
     bolt_mass: float
     stroke: float
     gains: tuple[Gain, ...] = ()
+    foot: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        for key in ("x", "y", "stiffness", "damping", "bolt_mass", "stroke"):
+        for key in ("x", "y", "stiffness", "damping", "bolt_mass", "stroke", "foot"):
             if not math.isfinite(getattr(self, key)):
                 raise InputError(f"ERA {self.name}: {key} must be finite, got {getattr(self, key)}")
         for key in ("stiffness", "stroke"):
@@ -43,7 +45,7 @@ class Era:
                 raise InputError(
                     f"ERA {self.name}: {key} must be above zero, got {getattr(self, key)}"
                 )
-        for key in ("damping", "bolt_mass"):
+        for key in ("damping", "bolt_mass", "foot"):
             if getattr(self, key) < 0:
                 raise InputError(
                     f"ERA {self.name}: {key} must not be negative, got {getattr(self, key)}"

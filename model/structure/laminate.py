@@ -61,7 +61,7 @@ class Layer:
 
     @property
     def flexural_rigidity(self) -> float:
-        """Flexural rigidity of the layer by itself [N m]."""
+        """Flexural rigidity of the layer alone [N m]."""
         return self.extensional_stiffness * self.thickness**2 / 12
 
 
@@ -109,7 +109,7 @@ class Laminate:
 
 @dataclass(frozen=True)
 class Bending:
-    """How a thin plate resists bending: flexural rigidity D [N m] and Poisson's ratio."""
+    """Bending properties of a thin plate: flexural rigidity D [N m] and Poisson's ratio."""
 
     rigidity: float
     nu: float

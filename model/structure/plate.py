@@ -93,6 +93,15 @@ class Plate:
         surface_density = self.material.rho * self.thickness
         return 2 * math.pi / wavelength**2 * math.sqrt(self.flexural_rigidity / surface_density)
 
+    def modes_below(self, frequency: float) -> int:
+        """Number of modes of the free plate up to a frequency [Hz], as an estimate.
+
+        Area term of the mode count of a thin plate, pi S / wavelength², and a quarter more for its
+        edges.
+        """
+        wavelength = self.bending_wavelength(frequency)
+        return math.ceil(1.25 * math.pi * self.length * self.width / wavelength**2)
+
     def contains(self, x: float, y: float) -> bool:
         """Whether a point [m] lies on the plate, its edges included."""
         return 0 <= x <= self.length and 0 <= y <= self.width

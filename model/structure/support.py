@@ -23,8 +23,7 @@ def rigid_body_frequencies(
     Heave and two tilts: w = q0 + q1 (x - L/2) + q2 (y - W/2). K = sum k p p', M = plate + sum m
     p p' with p = (1, x - L/2, y - W/2). A mode that no spring holds has frequency 0.
     """
-    attached = [PointLoad(e.x, e.y, stiffness=e.stiffness, mass=e.bolt_mass) for e in eras]
-    attached += loads
+    attached = [*(PointLoad.of_era(era) for era in eras), *loads]
     # In units of the plate's sides both tilts have the size of the heave.
     p = np.array([[1.0, at.x / plate.length - 0.5, at.y / plate.width - 0.5] for at in attached])
     p = p.reshape(-1, 3)

@@ -37,7 +37,7 @@ class FinishedCases:
             self._rows = dict(zip(keys, rows, strict=True))
 
     def find(self, cases: Cases) -> tuple[NDArray[np.bool_], CaseResults]:
-        """Which cases (n,) are finished, and results with their rows filled in."""
+        """Return which cases (n,) are finished, and results with their rows filled in."""
         results = empty_results(len(cases))
         done = np.zeros(len(cases), dtype=bool)
         for case in range(len(cases)):

@@ -30,7 +30,7 @@ def count_cases(rig: Rig, *, layouts: int, seed: int, raster: tuple[int, int]) -
     if not all_alike(rig.eras):
         raise InputError(
             "ERAs must be alike for a study of their count; give all of them the same stiffness, "
-            "damping, bolt_mass and stroke"
+            "damping, bolt_mass, stroke and foot"
         )
     max_count = max(MAX_ERAS, len(rig.eras))
     if layouts < max_count:

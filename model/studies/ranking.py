@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import FloatArray, IntArray
+from model.counting import counted
+from model.errors import InputError
 from model.rig.rig import Rig
 from model.structure.support import support_problem
 from model.studies.cases import OWN, VACANT, Cases
@@ -60,14 +62,13 @@ class Ranking:
 
     @property
     def recommended(self) -> int:
-        """Of the cases that reach GOOD_ENOUGH of the best, the best with fewest and softest ERAs.
+        """The case with fewest and softest ERAs among those that reach GOOD_ENOUGH of the best.
 
         In a study of placement that is the best case. Cases that do not support the plate are
-        passed over, unless none does.
+        passed over.
         """
         counts = era_counts(self.cases)
         order = self.order[self.supported[self.order]]
-        order = order if len(order) else self.order
         good = [
             int(case)
             for case in order
@@ -89,12 +90,23 @@ def rank(rig: Rig, cases: Cases, results: CaseResults, *, drive: int) -> Ranking
     ranked = np.flatnonzero(~np.isnan(medians))
     # Rounded, so that cases equal by symmetry stay in their order.
     rounded = np.array([float(f"{median:.9g}") for median in medians[ranked]])
-    supported = [
-        support_problem(rig.plate, cases.eras_of(case, rig.eras), loads=rig.loads) is None
-        for case in range(len(cases))
-    ]
     order = ranked[np.argsort(-rounded, kind="stable")]
-    return Ranking(cases, results, drive, order, np.array(supported))
+    supported = np.array([is_supported(rig, cases, case) for case in range(len(cases))])
+    return Ranking(cases, results, drive, order, supported)
+
+
+def is_supported(rig: Rig, cases: Cases, case: int) -> bool:
+    """Whether the ERAs of a case support the plate."""
+    return support_problem(rig.plate, cases.eras_of(case, rig.eras), loads=rig.masses) is None
+
+
+def check_supported_cases(rig: Rig, cases: Cases) -> None:
+    """Raise InputError if no case supports the plate, so that none could be recommended."""
+    if not any(is_supported(rig, cases, case) for case in range(len(cases))):
+        raise InputError(
+            f"none of {counted(len(cases), 'layout')} supports the plate; give the rig at least "
+            "three ERAs, stiff enough, or allow more --layouts"
+        )
 
 
 def era_counts(cases: Cases) -> IntArray:

@@ -10,10 +10,10 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
-from model.reduction.low_rank import coupled_forces, on_diagonal
 from model.rig.rig import Rig
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
+from model.structure.low_rank import coupled_forces, on_diagonal
 
 # More than this [bytes] and the machine is likely to run out of memory.
 _MAX_BYTES = 2 << 30
@@ -60,8 +60,16 @@ def solve_receptances(
 ) -> Receptances:
     """Solve a rig's plate without its ERAs for positions (c, 2) and points (p, 2) [m].
 
-    Raises InputError for frequencies [Hz] too high for the mesh, and a result too large for memory.
+    Raises InputError for frequencies [Hz] too high for the mesh, a result too large for memory, and
+    ERAs on feet of several sizes.
     """
+    feet = {era.foot for era in rig.eras}
+    if len(feet) > 1:
+        raise InputError(
+            f"eras: foot must be the same for all ERAs of a study, got {min(feet):g} to "
+            f"{max(feet):g} m"
+        )
+    footprints = np.column_stack([positions, np.full(len(positions), feet.pop())])
     count = len(positions)
     size = 16 * len(frequencies) * count * (count + len(points))
     if size > _MAX_BYTES:
@@ -70,5 +78,5 @@ def solve_receptances(
             f"{size / 1e9:.1f} GB; take fewer --candidates or fewer --frequencies"
         )
     free_plate = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(frequencies.max()))
-    between, to_points = free_plate.receptances(positions, points, frequencies, loads=rig.loads)
+    between, to_points = free_plate.receptances(footprints, points, frequencies, loads=rig.masses)
     return Receptances(frequencies, between, to_points)

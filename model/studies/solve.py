@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.fem.harmonic import check_frequencies
+from model.fem.plate_mesh import check_frequencies
 from model.rig.rig import Rig
 from model.structure.actuator import Era
 from model.studies.cases import Cases
@@ -33,7 +33,7 @@ DRIVE_NAMES = {"1": "best single ERA", "2": "best pair of ERAs", "all": "all ERA
 
 @dataclass(frozen=True)
 class StudyProblem:
-    """What the statistics of all cases depend on.
+    """Inputs of the statistics of all cases.
 
     positions (c, 2) [m]: possible places of ERAs; frequencies (f,) [Hz].
     """

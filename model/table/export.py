@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from model.drive_modes.fields import SILENT
-from model.drive_modes.sources import all_patterns
+from model.drive_modes.sources import all_combinations
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_rows
@@ -46,7 +46,7 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
         "mode": table.drive_mode,
         "plate": _plate(table),
         "eras": _structs([asdict(era) for era in table.eras]),
-        "masses": _structs([asdict(mass) for mass in table.masses]),
+        "masses": _structs([mass.numbers for mass in table.masses]),
         "mesh": str(table.mesh),
         "reference_mesh": str(table.reference_mesh),
         "discretisation_error": table.discretisation_error,
@@ -56,7 +56,7 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
         "acceleration_m_s2": table.acceleration,
         "mode_omega_rad_s": table.omega,
         "mode_shape": table.shapes,
-        "mode_shape_held": table.held,
+        "mode_shape_attachments": table.attachment_shapes,
         "cell_centre_m": table.cell_centres,
         "cells_along_x": float(table.grid.nx),
         "cells_along_y": float(table.grid.ny),
@@ -84,7 +84,7 @@ def export_csv(table: LocalizationTable, path: Path, *, content: str) -> None:
 
 def _pattern_frequencies(table: LocalizationTable) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Frequency [Hz] of each ERA in each pattern, 0 where it is silent, (n, eras)."""
-    index = all_patterns(len(table.eras), len(table.frequencies)).index
+    index = all_combinations(len(table.eras), len(table.frequencies)).index
     return np.where(index == SILENT, 0.0, table.frequencies[index])
 
 
@@ -131,6 +131,7 @@ _UNITS = {
     "mass": "mass_kg",
     "stroke": "stroke_m",
     "gains": "gain_hz_ratio_rad",
+    "foot": "foot_m",
 }
 
 

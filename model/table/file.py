@@ -18,12 +18,12 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from model.arguments import expect, expect_path, shown
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError, first_problem
-from model.fem.element_registry import mesh_from_dict
 from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
 from model.finger.grid import Grid
+from model.rig.meshes import mesh_from_dict
 from model.structure.actuator import Era
-from model.structure.plate import Material, Plate
-from model.structure.point_mass import PointMass
+from model.structure.plate import Plate
+from model.structure.point_load import PointLoad
 from model.table.raster import Raster
 from model.table.table import LocalizationTable
 
@@ -31,7 +31,7 @@ FORMAT = "era-haptics localization table"
 ZIP = b"PK\x03\x04"
 """Magic number of .npz files."""
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 
 # A table of the paper's plate has 1.4 MB, one of eight ERAs and a fine grid about 100 MB.
 MAX_BYTES = 2 << 30
@@ -41,7 +41,7 @@ _DTYPES = {
     "frequencies": "<f8",
     "acceleration": "<c8",
     "omega": "<f8",
-    "held": "<f8",
+    "attachment_shapes": "<f8",
     "shapes": "<f4",
     "cell_sources": "<f4",
 }
@@ -52,8 +52,8 @@ _DTYPES = {
 MAX_VALUE = 1e9
 
 
-class _Raster(BaseModel):
-    """Header entry of the raster."""
+class _Mesh(BaseModel):
+    """Header entry of a mesh."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
@@ -61,13 +61,8 @@ class _Raster(BaseModel):
     ny: int
     length: float
     width: float
-
-
-class _Mesh(_Raster):
-    """Header entry of a mesh."""
-
     element: str
-    strip: float
+    strip: float = 0.0
 
 
 class _Header(BaseModel):
@@ -81,15 +76,15 @@ class _Header(BaseModel):
     fingerprint: str
     sha256: str
     mode: str
-    plate: dict[str, Any]
-    eras: list[dict[str, Any]]
-    masses: list[dict[str, Any]]
+    plate: Plate
+    eras: tuple[Era, ...]
+    masses: tuple[PointLoad, ...]
     mesh: _Mesh
     reference_mesh: _Mesh
     discretisation_error: list[float]
     frequencies_hz: list[float]
-    raster: _Raster
-    grid: dict[str, int]
+    raster: Raster
+    grid: Grid
 
 
 def save_table(table: LocalizationTable, path: Path | str) -> None:
@@ -105,7 +100,7 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
         "mode": table.drive_mode,
         "plate": asdict(table.plate),
         "eras": [asdict(era) for era in table.eras],
-        "masses": [asdict(mass) for mass in table.masses],
+        "masses": [mass.numbers for mass in table.masses],
         "mesh": table.mesh.to_dict(),
         "reference_mesh": table.reference_mesh.to_dict(),
         "discretisation_error": table.discretisation_error.tolist(),
@@ -138,12 +133,15 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
         ) from None
     except UNREADABLE as error:
         why = "not a .npz file" if isinstance(error, BadZipFile) else error
+        if isinstance(error, OSError):
+            why = error.strerror or error
         raise InputError(
             f"{path}: not a readable localization table ({why}); give a file of era table build, "
             "or build it again"
         ) from error
     try:
-        header = _Header.model_validate_json(content.pop("header").tobytes())
+        text = content.pop("header").tobytes()
+        header = _Header.model_validate_json(text)
     except ValidationError as error:
         where, said = first_problem(error)
         raise InputError(f"{path}: bad header ({where or 'header'}: {said}); {rebuild}") from error
@@ -152,7 +150,7 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
             f"{path}: format must be {FORMAT!r} version {FORMAT_VERSION}, got {header.format!r} "
             f"version {header.format_version}; {rebuild}"
         )
-    if _digest(header.model_dump(exclude={"sha256"}), content) != header.sha256:
+    if _digest(json.loads(text), content) != header.sha256:
         raise InputError(f"{path}: content does not match its checksum; {rebuild}")
     try:
         table = _assemble(header, content, path)
@@ -178,28 +176,25 @@ def _arrays(table: LocalizationTable) -> dict[str, NDArray[Any]]:
 
 def _digest(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
     """SHA-256 over the header without its checksum, and over every array with its shape."""
-    return digest_of(json.dumps(header, sort_keys=True), arrays)
+    hashed = {key: value for key, value in header.items() if key != "sha256"}
+    return digest_of(json.dumps(hashed, sort_keys=True), arrays)
 
 
 def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> LocalizationTable:
     """Build a table from checked entries; sizes must match and all numbers be finite."""
-    try:
-        material = header.plate.pop("material")
-        table = LocalizationTable(
-            plate=Plate(**header.plate, material=Material(**material)),
-            eras=tuple(Era(**era) for era in header.eras),
-            masses=tuple(PointMass(**mass) for mass in header.masses),
-            mesh=mesh_from_dict(header.mesh.model_dump()),
-            reference_mesh=mesh_from_dict(header.reference_mesh.model_dump()),
-            discretisation_error=np.array(header.discretisation_error, dtype=float),
-            raster=Raster(**header.raster.model_dump()),
-            grid=Grid(**header.grid),
-            drive_mode=header.mode,
-            code_version=header.code_version,
-            **arrays,
-        )
-    except (TypeError, KeyError, ValueError) as error:
-        raise InputError(f"{path}: header does not describe a plate ({error})") from error
+    table = LocalizationTable(
+        plate=header.plate,
+        eras=header.eras,
+        masses=header.masses,
+        mesh=mesh_from_dict(header.mesh.model_dump()),
+        reference_mesh=mesh_from_dict(header.reference_mesh.model_dump()),
+        discretisation_error=np.array(header.discretisation_error, dtype=float),
+        raster=header.raster,
+        grid=header.grid,
+        drive_mode=header.mode,
+        code_version=header.code_version,
+        **arrays,
+    )
     if table.drive_mode not in DRIVE_MODES:
         raise InputError(f"{path}: unknown drive mode {table.drive_mode!r}")
     count, era_count, coordinates = len(table.frequencies), len(table.eras), len(table.omega)
@@ -209,7 +204,7 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
         "discretisation_error": (count,),
         "acceleration": (table.raster.point_count, count, era_count),
         "omega": (coordinates,),
-        "held": (era_count + len(table.masses), coordinates),
+        "attachment_shapes": (era_count + len(table.masses), coordinates),
         "shapes": (table.raster.point_count, coordinates),
         "cell_sources": (sources, table.grid.cell_count),
     }

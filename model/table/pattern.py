@@ -12,7 +12,7 @@ Twice what just avoids a click: the slower start gains 4 dB of contrast over the
 at 20 dB SL the target still feels it after a fifth of it (docs/concepts/transients.md).
 """
 
-UNAWARE_DB_SL = -10.0
+IMPERCEPTIBLE_DB_SL = -10.0
 """Level up to which even the most sensitive quiet finger feels nothing."""
 
 
@@ -40,7 +40,7 @@ class Pattern:
     None with quiet fingers. The rest is None unless computed: contrast_bound_db: upper bound of
     contrast from `model.drive_modes.exact_search`; robust_contrast_db: tenth percentile over
     plates within tolerance (`model.table.robust`); transient_contrast_db: over the first 100 ms;
-    left_after_db: residual vibration in the 100 ms after the end, relative to the steady one
+    residual_db: residual vibration in the 100 ms after the end, relative to the steady one
     (`model.table.timing`). onset, ending: envelopes that replace the ramp.
     """
 
@@ -54,24 +54,28 @@ class Pattern:
     contrast_bound_db: float | None = None
     robust_contrast_db: float | None = None
     transient_contrast_db: float | None = None
-    left_after_db: float | None = None
+    residual_db: float | None = None
     concentration: Concentration | None = None
     onset: Envelopes | None = None
     ending: Envelopes | None = None
 
     @property
-    def contrast_db_sl(self) -> float | None:
+    def felt_contrast_db(self) -> float | None:
         """Level of the target above that of the loudest quiet point [dB]."""
         return None if self.quiet_level_db_sl is None else self.level_db_sl - self.quiet_level_db_sl
 
     @property
-    def quiet_is_unaware(self) -> bool | None:
+    def is_imperceptible_to_quiet(self) -> bool | None:
         """Whether every quiet finger stays 10 dB below threshold."""
-        return None if self.quiet_level_db_sl is None else self.quiet_level_db_sl <= UNAWARE_DB_SL
+        return (
+            None
+            if self.quiet_level_db_sl is None
+            else self.quiet_level_db_sl <= IMPERCEPTIBLE_DB_SL
+        )
 
     @property
     def usable_level_db_sl(self) -> float:
-        """Highest level at the target, up to this one, that leaves quiet fingers unaware."""
-        if self.contrast_db_sl is None:
+        """Highest level at the target, up to this one, that quiet fingers do not feel."""
+        if self.felt_contrast_db is None:
             return self.level_db_sl
-        return min(self.level_db_sl, self.contrast_db_sl + UNAWARE_DB_SL)
+        return min(self.level_db_sl, self.felt_contrast_db + IMPERCEPTIBLE_DB_SL)

@@ -9,9 +9,10 @@ from model.arrays import Complex64Array, FloatArray, IntArray
 from model.counting import counted
 from model.drive_modes import Choice, find_drives, max_sensation
 from model.drive_modes.exact_search import search_exactly, sensation_found
-from model.drive_modes.fields import DriveVector, Evaluation, Fields, evaluate
+from model.drive_modes.fields import Evaluation, Fields, Weights, evaluate
 from model.drive_modes.tones import excitation_of
 from model.errors import InputError
+from model.finger.perception import decibels
 from model.structure.actuator import Era
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.question import Question
@@ -75,7 +76,7 @@ def choose_pattern(question: Question, drive_mode: str, candidates: Candidates) 
     return _pattern(question, drive_mode, candidates, drive, evaluation)
 
 
-def _quietest_onset(choice: Choice, onset_contrast: OnsetContrast) -> DriveVector | None:
+def _quietest_onset(choice: Choice, onset_contrast: OnsetContrast) -> Weights | None:
     """Find a drive near the best score whose plain ramp disturbs less, if there is one."""
     near = choice.alternatives()
     if len(near.frequencies) < 2:
@@ -84,7 +85,7 @@ def _quietest_onset(choice: Choice, onset_contrast: OnsetContrast) -> DriveVecto
     if contrast is None:
         return None
     best = int((near.score * contrast**ONSET_WEIGHT).argmax())
-    return DriveVector.at(int(near.frequencies[best]), near.weights[best]) if best > 0 else None
+    return Weights.at(int(near.frequencies[best]), near.weights[best]) if best > 0 else None
 
 
 def _choose_exactly(question: Question, candidates: Candidates) -> Pattern:
@@ -101,7 +102,7 @@ def _choose_exactly(question: Question, candidates: Candidates) -> Pattern:
         raise _level_error(question, "switched", sensation_found(fields, eras_at_most=count))
     evaluation = evaluate(fields, found.drive)
     pattern = _pattern(question, "switched", candidates, found.drive, evaluation)
-    return replace(pattern, contrast_bound_db=20 * math.log10(found.bound))
+    return replace(pattern, contrast_bound_db=float(decibels(found.bound)))
 
 
 def _level_error(question: Question, drive_mode: str, reachable: float) -> UnreachableLevel:
@@ -114,7 +115,7 @@ def _level_error(question: Question, drive_mode: str, reachable: float) -> Unrea
         else is_single and drive_mode != "graded"
     )
     # Rounded down, so that the level named can be reached.
-    level = math.floor(200 * math.log10(reachable)) / 10
+    level = math.floor(10 * float(decibels(reachable))) / 10
     return UnreachableLevel(question, drive_mode, level, is_exhaustive=is_exhaustive)
 
 
@@ -122,12 +123,12 @@ def _pattern(
     question: Question,
     drive_mode: str,
     candidates: Candidates,
-    drive: DriveVector,
+    drive: Weights,
     evaluation: Evaluation,
 ) -> Pattern:
     gain = min(1.0, candidates.fields.wanted / evaluation.sensation)
-    contrast = 20 * math.log10(max(evaluation.peak, 1e-30) / max(evaluation.quiet_peak, 1e-30))
-    quiet_level = 20 * math.log10(max(gain * evaluation.quiet_sensation, 1e-30))
+    contrast = float(decibels(evaluation.contrast))
+    quiet_level = float(decibels(max(gain * evaluation.quiet_sensation, 1e-30)))
     return Pattern(
         excitation=excitation_of(drive, candidates.eras, candidates.frequencies, gain=gain),
         ramp=ONSET_RAMP,

@@ -7,7 +7,7 @@ product, whatever the mesh.
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from model.arrays import FloatArray, IntArray, lattice
 from model.errors import InputError
 from model.finger.fingertip import FINGERTIP_RADIUS, UNIT_DISC
+from model.structure.footprint import mean_over
 from model.structure.plate import Plate
 
 POINTS_PER_WAVELENGTH = 20
@@ -76,7 +77,13 @@ class Raster:
         return Fingertips(index, weights, (within == discs).all(axis=2))
 
     def at(self, values: NDArray[np.float32], points: FloatArray) -> NDArray[np.float32]:
-        """Values (point_count, c) at points [m] (n, 2) of the plate: (n, c)."""
+        """Values (point_count, c) at points [m] (n, 2) of the plate: (n, c).
+
+        At footprints (n, 3) their means.
+        """
+        if points.shape[1] == 3:
+            each = partial(self.at, values)
+            return mean_over(each, points, length=self.length, width=self.width).astype(np.float32)
         index, weights = self._patches(points, points[:, None, :])
         return np.asarray((weights @ values[index])[:, 0])
 

@@ -20,9 +20,9 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray
 from model.finger.contrast import contrast_db
 from model.finger.load import finger_loads
-from model.reduction.low_rank import coupled_forces
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, dynamic_stiffness
+from model.structure.low_rank import coupled_forces
 from model.structure.point_load import PointLoad
 from model.table.pattern import Pattern
 from model.table.question import Point, Question
@@ -104,7 +104,7 @@ def _acceleration(
     motion: ComplexArray,
 ) -> ComplexArray:
     """Acceleration (m, p) [m/s²] at points of shapes (p, r) for a base motion (eras,) [m]."""
-    attachment_shapes = np.vstack([table.held, table.shapes_at(contacts)])
+    attachment_shapes = np.vstack([table.attachment_shapes, table.shapes_at(contacts)])
     omega = 2 * np.pi * frequency
     stiffness, base_stiffness = _attached(table, finger_loads(contacts), ensemble, omega)
     scale = ensemble.thickness[:, None]
@@ -132,6 +132,6 @@ def _attached(
         omega,
     )
     bolts = dynamic_stiffness(0.0, 0.0, np.array([era.bolt_mass for era in eras]), omega)
-    (rest,) = attached_stiffness((), [*table.loads, *loads], np.array([omega]))
+    (rest,) = attached_stiffness((), [*table.masses, *loads], np.array([omega]))
     rest = np.broadcast_to(rest, (len(base_stiffness), len(rest)))
     return np.hstack([base_stiffness + bolts, rest]), base_stiffness

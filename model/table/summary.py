@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from model.arrays import FloatArray, IntArray
-from model.drive_modes.sources import all_patterns
+from model.drive_modes.sources import all_combinations
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL
 from model.table.question import Question
@@ -98,7 +98,7 @@ def similar_share(table: LocalizationTable) -> float | None:
 
     None for a single pattern or cell.
     """
-    patterns = all_patterns(len(table.eras), len(table.frequencies))
+    patterns = all_combinations(len(table.eras), len(table.frequencies))
     count = len(patterns.first)
     if min(count, table.grid.cell_count) < 2:
         return None

@@ -23,15 +23,14 @@ from model.drive_modes.sources import (
     sums_of_sources,
 )
 from model.errors import InputError
-from model.fem.mesh import Mesh
-from model.finger.contrast import is_around
+from model.fem.plate_mesh import PlateMesh
+from model.finger.contrast import is_background
 from model.finger.grid import Grid
 from model.finger.perception import decibels, detection_threshold
-from model.rig.rig import Limits, physics_fingerprint
+from model.rig.rig import physics_fingerprint
 from model.structure.actuator import Era
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
-from model.structure.point_mass import PointMass
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.pattern_choice import Candidates, OnsetContrast, choose_pattern
 from model.table.question import MIN_LEVEL_DB_SL, Point, Question
@@ -40,6 +39,7 @@ from model.transients.onset import RampedOnsets
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes
+from registry.limits import GuardLimits
 
 PAPER_FREQUENCIES = np.arange(60.0, 321.0, 10.0)
 """The 27 excitation frequencies [Hz]: 60 to 320 in steps of 10 holds every one the paper names."""
@@ -47,7 +47,7 @@ PAPER_FREQUENCIES = np.arange(60.0, 321.0, 10.0)
 PAPER_GRID = Grid(12, 9)
 
 
-def default_drive_frequencies(limits: Limits) -> FloatArray:
+def default_drive_frequencies(limits: GuardLimits) -> FloatArray:
     """Drive frequencies of a table by default: the paper's within the rig's limits, (f,) [Hz].
 
     Steps of 10 Hz from the lowest limit where that leaves none.
@@ -66,7 +66,7 @@ class LocalizationTable:
     - frequencies: (f,) [Hz]
     - acceleration: (points, f, eras) complex [m/s²] on the raster, each ERA alone at full stroke
     - omega: (r,) [rad/s], of the reduced free plate (`model.reduction.reduced_plate`)
-    - held: (eras + masses, r) [1/sqrt(kg)], its shapes at the attachments: ERAs and masses
+    - attachment_shapes: (eras + masses, r) [1/sqrt(kg)], its shapes at ERAs and masses
     - shapes: (points, r) [1/sqrt(kg)], its shapes on the raster
     - cell_sources: (sources, cells) [m/s²], mean peak acceleration over each cell of the sources
       of `switched` patterns (`model.drive_modes.sources`)
@@ -76,8 +76,8 @@ class LocalizationTable:
 
     plate: Plate
     eras: tuple[Era, ...]
-    masses: tuple[PointMass, ...]
-    mesh: Mesh
+    masses: tuple[PointLoad, ...]
+    mesh: PlateMesh
     raster: Raster
     grid: Grid
     drive_mode: str
@@ -85,10 +85,10 @@ class LocalizationTable:
     frequencies: FloatArray
     acceleration: Complex64Array
     omega: FloatArray
-    held: FloatArray
+    attachment_shapes: FloatArray
     shapes: NDArray[np.float32]
     cell_sources: NDArray[np.float32]
-    reference_mesh: Mesh
+    reference_mesh: PlateMesh
     discretisation_error: FloatArray
 
     def __repr__(self) -> str:
@@ -103,11 +103,6 @@ class LocalizationTable:
     def fingerprint(self) -> str:
         """Fingerprint of the plate on its ERAs that this table is for."""
         return physics_fingerprint(self.plate, self.eras, masses=self.masses)
-
-    @property
-    def loads(self) -> tuple[PointLoad, ...]:
-        """The masses as point loads."""
-        return tuple(PointLoad(mass.x, mass.y, mass=mass.mass) for mass in self.masses)
 
     @property
     def pattern_count(self) -> int:
@@ -165,7 +160,7 @@ class LocalizationTable:
         if question.quiet:
             quiet = found[:, :, ends[count - 1] :]
         else:
-            quiet = self._cell_fields[:, :, is_around(self.cell_centres, question.targets)]
+            quiet = self._cell_fields[:, :, is_background(self.cell_centres, question.targets)]
         return Fields(
             targets=tuple(
                 np.ascontiguousarray(found[:, :, start:end] * gain)
@@ -230,7 +225,9 @@ class LocalizationTable:
     def in_time(self) -> PlateInTime:
         """The plate on its ERAs in time."""
         reduced = ReducedOnRaster(self.plate, self.omega, self.raster, self.shapes)
-        return plate_in_time(reduced, self.eras, loads=self.loads, attachment_shapes=self.held)
+        return plate_in_time(
+            reduced, self.eras, loads=self.masses, attachment_shapes=self.attachment_shapes
+        )
 
     @cached_property
     def onsets(self) -> RampedOnsets | None:

@@ -10,14 +10,14 @@ import numpy as np
 from model.arrays import FloatArray
 from model.drive_modes.sources import magnitudes_of_sources
 from model.errors import InputError
-from model.fem.assembly import era_positions
-from model.fem.mesh import Mesh
+from model.fem.plate_mesh import PlateMesh
 from model.files.array_file import Arrays
 from model.finger.grid import CELL_SAMPLES, Grid
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig, canonical_json
-from model.structure.point_load import load_positions
+from model.spectral.mesh import SpectralMesh
+from model.structure.point_load import footprints_of
 from model.structure.support import check_supported
 from model.table.file import FORMAT_VERSION, MAX_BYTES
 from model.table.raster import Raster
@@ -53,7 +53,7 @@ class TableProblem:
     def __post_init__(self) -> None:
         """Refuse frequencies that make no table, and a table that would be too large to be read."""
         _check_frequencies(self.frequencies, self.rig)
-        check_supported(self.rig.plate, self.rig.eras, loads=self.rig.loads)
+        check_supported(self.rig.plate, self.rig.eras, loads=self.rig.masses)
         eras, f = len(self.rig.eras), len(self.frequencies)
         sources = eras * (eras + 1) // 2 * f + 1
         size = 8 * self.raster.point_count * eras * f + 4 * sources * self.grid.cell_count
@@ -75,10 +75,12 @@ class TableProblem:
         return solve_free_plate(self.rig.plate, self.rig.mesh, frequency_max=highest)
 
     @property
-    def reference_mesh(self) -> Mesh:
+    def reference_mesh(self) -> PlateMesh:
         """Finer mesh for the discretisation error."""
-        limit = self.rig.limits.frequency_max
-        return reference_mesh(self.rig.plate, frequency_max=limit)
+        mesh = self.rig.mesh
+        if isinstance(mesh, SpectralMesh):
+            return mesh.finer()
+        return reference_mesh(self.rig.plate, frequency_max=self.rig.limits.frequency_max)
 
     @cached_property
     def digest(self) -> str:
@@ -115,10 +117,10 @@ def _fields(problem: TableProblem, part: Part) -> Arrays:
     frequencies = problem.frequencies[part.start : part.stop]
     rig = problem.rig
     fields = problem.free_plate.acceleration(
-        rig.eras, frequencies, problem.raster.points, loads=rig.loads
+        rig.eras, frequencies, problem.raster.points, loads=rig.masses
     )
-    turned = np.ascontiguousarray(fields.transpose(2, 0, 1), dtype=np.complex64)
-    return {"acceleration": turned}
+    by_point = np.ascontiguousarray(fields.transpose(2, 0, 1), dtype=np.complex64)
+    return {"acceleration": by_point}
 
 
 def _cells(problem: TableProblem, part: Part) -> Arrays:
@@ -126,7 +128,9 @@ def _cells(problem: TableProblem, part: Part) -> Arrays:
     rig = problem.rig
     each = CELL_SAMPLES**2
     points = problem.grid.samples(rig.plate)[each * part.start : each * part.stop]
-    fields = problem.free_plate.acceleration(rig.eras, problem.frequencies, points, loads=rig.loads)
+    fields = problem.free_plate.acceleration(
+        rig.eras, problem.frequencies, points, loads=rig.masses
+    )
     sources = magnitudes_of_sources(fields.astype(np.complex64))
     return {"cell_sources": sources.reshape(len(sources), -1, each).mean(axis=-1)}
 
@@ -134,11 +138,11 @@ def _cells(problem: TableProblem, part: Part) -> Arrays:
 def _modes(problem: TableProblem, part: Part) -> Arrays:
     """Reduced plate at ERAs and loads, and on the raster."""
     rig, highest = problem.rig, float(problem.frequencies[-1])
-    attached = np.vstack([era_positions(rig.eras), load_positions(rig.loads)])
+    attached = footprints_of(rig.eras, rig.masses)
     reduced = reduce_plate(rig.plate, rig.mesh, attached, frequency_max=highest)
     return {
         "omega": reduced.omega,
-        "held": reduced.at(attached),
+        "attachment_shapes": reduced.at(attached),
         "shapes": reduced.at(problem.raster.points).astype(np.float32),
     }
 
@@ -148,7 +152,7 @@ def _discretisation(problem: TableProblem, part: Part) -> Arrays:
     rig, highest = problem.rig, float(problem.frequencies[-1])
     finer = solve_free_plate(rig.plate, problem.reference_mesh, frequency_max=highest)
     own, exact = (
-        plate.acceleration(rig.eras, problem.frequencies, problem.raster.points, loads=rig.loads)
+        plate.acceleration(rig.eras, problem.frequencies, problem.raster.points, loads=rig.masses)
         for plate in (problem.free_plate, finer)
     )
     error = np.linalg.norm(own - exact, axis=2) / np.linalg.norm(exact, axis=2)
@@ -165,7 +169,7 @@ PARTS: dict[str, Callable[[TableProblem, Part], Arrays]] = {
 
 PART_TYPES: dict[str, dict[str, str]] = {
     "discretisation": {"discretisation_error": "<f8"},
-    "modes": {"omega": "<f8", "held": "<f8", "shapes": "<f4"},
+    "modes": {"omega": "<f8", "attachment_shapes": "<f8", "shapes": "<f4"},
     "fields": {"acceleration": "<c8"},
     "cells": {"cell_sources": "<f4"},
 }

@@ -31,7 +31,7 @@ class Timing:
     ) -> Pattern:
         """Add a shaped onset and ending, or one of them; takes some milliseconds.
 
-        Without quiet fingers the onset keeps the plate around the targets quiet.
+        Without quiet fingers the onset keeps the rest of the plate quiet.
         """
         targets, quiet, tones = question.targets, question.quiet, pattern.excitation
         if onset:
@@ -53,7 +53,7 @@ class Timing:
                 self._onset(pattern), targets=question.targets, quiet=question.quiet
             )
         left = self._transients.residual_db(pattern.excitation, self._ending(pattern))
-        return replace(pattern, transient_contrast_db=contrast, left_after_db=left)
+        return replace(pattern, transient_contrast_db=contrast, residual_db=left)
 
     def _onset(self, pattern: Pattern) -> Bases:
         if pattern.onset is None:

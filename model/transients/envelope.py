@@ -27,11 +27,12 @@ MAX_KNOTS = 32
 
 
 @dataclass(frozen=True)
-class Envelope:
-    """y(t) = Im[a(t) exp(2 pi i f t)] [m], with a(t) linear between knots.
+class BaseEnvelope:
+    """Motion of an ERA's base, y(t) = Im[a(t) exp(2 pi i f t)] [m], with a(t) linear between knots.
 
     a is `start` [m] at time 0, knots[k] [m] after k + 1 steps [s], and constant after the last
-    knot. frequency f [Hz].
+    knot. frequency f [Hz]. The last knot is the final amplitude, unlike in the amplifier's
+    `drivers.command.Envelope`, where the command is.
     """
 
     frequency: float
@@ -83,7 +84,7 @@ class Envelope:
         return tuple(pieces)
 
 
-Envelopes: TypeAlias = Mapping[str, Envelope]
+Envelopes: TypeAlias = Mapping[str, BaseEnvelope]
 """An envelope per ERA, by the ERA's name."""
 
 Bases: TypeAlias = tuple[tuple[Term, ...], ...]

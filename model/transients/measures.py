@@ -55,41 +55,6 @@ class Transients:
         peaks = np.split(np.abs(acceleration).max(axis=0), ends)
         return float(contrast_db(peaks[: len(targets)], np.concatenate(peaks[len(targets) :])))
 
-    def ending_contrast_db(
-        self,
-        excitation: Excitation,
-        ending: Bases,
-        *,
-        targets: Sequence[tuple[float, float]],
-        quiet: Sequence[tuple[float, float]],
-    ) -> float:
-        """Contrast [dB] of the targets' steady vibration to the ending at quiet fingers.
-
-        Steady peak acceleration at the targets to the loudest peak at a quiet point from time 0,
-        when the bases begin the ending, until 100 ms after it; positions in m.
-        """
-        plate = self._plate.reduced.plate
-        discs = [fingertip_points(*each, plate) for each in targets]
-        at_targets = np.concatenate(discs)
-        at_quiet = np.concatenate([fingertip_points(*each, plate) for each in quiet])
-        shapes = self._plate.reduced.at(at_targets) @ self._plate.displacement
-        by_frequency: dict[float, ComplexArray] = {}
-        for name, state in self._steady(excitation).items():
-            frequency = excitation[name].frequency
-            by_frequency[frequency] = by_frequency.get(frequency, 0) + shapes @ state
-        steady = sum(
-            (2 * math.pi * frequency) ** 2 * np.abs(field)
-            for frequency, field in by_frequency.items()
-        )
-        end_time = max((term.end for base in ending for term in base), default=0.0)
-        acceleration = self.acceleration(
-            ending, at_quiet, duration=end_time + ENDING_WINDOW, after=excitation
-        )
-        ends = np.cumsum([len(disc) for disc in discs])[:-1]
-        return float(
-            contrast_db(np.split(np.asarray(steady), ends), np.abs(acceleration).max(axis=0))
-        )
-
     def acceleration(
         self,
         bases: Bases,

@@ -19,10 +19,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.finger.contrast import is_around
+from model.finger.contrast import is_background
 from model.finger.fingertip import FINGERTIP_RADIUS, fingertip_points
 from model.finger.grid import Grid
-from model.transients.envelope import Envelope, Envelopes
+from model.transients.envelope import BaseEnvelope, Envelopes
 from model.transients.hats import mean_square
 from model.transients.knots import Carrier, ending_knots, onset_knots, solve_carrier
 from model.transients.measures import ENDING_WINDOW
@@ -68,7 +68,7 @@ class Shaper:
         """
         target_rows = self._fingertips(targets)
         quiet_rows = self._fingertips(quiet) if quiet else self._surroundings(targets)
-        envelopes: dict[str, Envelope] = {}
+        envelopes: dict[str, BaseEnvelope] = {}
         for frequency, amplitudes, active in self._groups(excitation, helped=True):
             knots = onset_knots(
                 self._carrier(frequency),
@@ -96,7 +96,7 @@ class Shaper:
         both = bool(targets and quiet)
         target_rows = self._fingertips(targets) if both else None
         quiet_rows = self._fingertips(quiet) if both else None
-        envelopes: dict[str, Envelope] = {}
+        envelopes: dict[str, BaseEnvelope] = {}
         for frequency, amplitudes, active in self._groups(excitation, helped=False):
             knots = ending_knots(
                 self._carrier(frequency),
@@ -120,7 +120,7 @@ class Shaper:
         envelopes = {}
         for era, column in zip(active, knots.T, strict=True):
             start, *rest = (column * self._plate.eras[era].stroke).tolist()
-            envelopes[self._plate.eras[era].name] = Envelope(frequency, start, tuple(rest))
+            envelopes[self._plate.eras[era].name] = BaseEnvelope(frequency, start, tuple(rest))
         return envelopes
 
     def _groups(
@@ -157,5 +157,5 @@ class Shaper:
     def _surroundings(self, targets: Sequence[Position]) -> FloatArray:
         """The same for the plate beyond 50 mm of all targets; all of a plate too small for it."""
         centres = _SURROUNDINGS.centres(self._plate.reduced.plate)
-        shapes = self._plate.reduced.at(centres[is_around(centres, targets)])
+        shapes = self._plate.reduced.at(centres[is_background(centres, targets)])
         return np.asarray(np.linalg.qr(shapes, mode="r")) / math.sqrt(len(shapes))

@@ -23,10 +23,9 @@ from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.fem.assembly import era_positions
 from model.reduction.modal_matrices import Reduced, modal_matrices
 from model.structure.actuator import Era
-from model.structure.point_load import PointLoad, load_positions
+from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import Term
 
 _MAX_CACHED_SOLUTIONS = 1024  # unit solutions that are kept, some kilobytes each
@@ -177,9 +176,7 @@ def plate_in_time(
     three, or all in one line), and for a mode that is damped critically.
     """
     if attachment_shapes is None:
-        attachment_shapes = reduced.at(
-            np.vstack([era_positions(eras), load_positions(loads), load_positions(contacts)])
-        )
+        attachment_shapes = reduced.at(footprints_of(eras, loads, contacts))
     M, C, K = modal_matrices(
         reduced, eras, loads=loads, contacts=contacts, attachment_shapes=attachment_shapes
     )

@@ -15,7 +15,7 @@ from model.finger.perception import FELT_DB_SL, detection_threshold
 from model.structure.plate import Plate
 
 STATISTICS = ("minimum", "lower quartile", "median", "upper quartile", "maximum", "unfelt share")
-"""What `cumulative_statistics` gives: five of cumulative peak acceleration [m/s²], and a share."""
+"""Names of `cumulative_statistics`: five of cumulative peak acceleration [m/s²], and a share."""
 
 MEDIAN = STATISTICS.index("median")
 

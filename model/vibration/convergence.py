@@ -2,23 +2,31 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, lattice
 from model.errors import InputError
-from model.fem.assembly import assemble
 from model.fem.mesh import Mesh
-from model.fem.modal import modes
+from model.fem.plate_mesh import PlateMesh
 from model.reduction.free_plate import solve_free_plate
+from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
+from model.structure.actuator import Era
 from model.structure.plate import Plate
+from model.vibration.natural_modes import natural_modes
 
 MAP_FREQUENCIES = (110.0, 250.0)
 """Where the founding paper shows maps [Hz]."""
 
 MODE_COUNT = 12
+
+MOVED = 0.1e-3
+"""How far an ERA may be from where it should be [m]; few are mounted better."""
+
+FOOT = 5e-3
+"""Radius of a foot [m] that a point stands for."""
 
 # The coarsest MITC4 mesh of a study; on the paper's plate up to 500 Hz it is the paper's 12x9. Each
 # next one has twice as many elements along both sides.
@@ -41,7 +49,7 @@ class MeshError:
     acceleration field at each frequency, relative L2 over the plate, the worst driven ERA, (f,).
     """
 
-    mesh: Mesh
+    mesh: PlateMesh
     dof: int
     frequency: FloatArray
     response: FloatArray
@@ -51,28 +59,34 @@ class MeshError:
 class Convergence:
     """Errors of several meshes against a reference mesh, response at frequencies (f,) [Hz].
 
-    natural_frequencies: the lowest on the ERAs [Hz] without unsupported motion, (n,).
+    natural_frequencies: the lowest on the ERAs [Hz] without unsupported motion, (n,). For
+    comparison, by how much the response changes, as `MeshError.response`, where every ERA stands
+    MOVED nearer to the middle, and where it stands on a disc FOOT wider in radius.
     """
 
     reference: Mesh
     frequencies: FloatArray
     natural_frequencies: FloatArray
     errors: tuple[MeshError, ...]
+    by_place: FloatArray
+    by_foot: FloatArray
 
 
-def meshes_to_compare(rig: Rig) -> tuple[Mesh, ...]:
-    """List four MITC4 meshes, the automatic one, and the rig's own."""
+def meshes_to_compare(rig: Rig) -> tuple[PlateMesh, ...]:
+    """List four MITC4 meshes, one of Q5 with strips, the automatic one, and the rig's own."""
     plate, high = rig.plate, rig.limits.frequency_max
     size = plate.bending_wavelength(high) / _COARSEST_PER_WAVELENGTH
     nx, ny = (max(1, math.ceil(side / size)) for side in (plate.length, plate.width))
     plain = [Mesh(nx << n, ny << n, plate.length, plate.width) for n in range(_DOUBLINGS + 1)]
-    chosen = [*plain, Mesh.auto(plate, frequency_max=high), rig.mesh]
+    stiffness = max(era.stiffness for era in rig.eras)
+    automatic = mesh_of("auto 1 %", plate, frequency_max=high, stiffness=stiffness)
+    chosen = [*plain, automatic, Mesh.accurate(plate, frequency_max=high), rig.mesh]
     return tuple(dict.fromkeys(chosen))
 
 
 def reference_mesh(plate: Plate, *, frequency_max: float) -> Mesh:
-    """Half as many elements again along both sides as the automatic one, in strips half as wide."""
-    auto = Mesh.auto(plate, frequency_max=frequency_max)
+    """Half as many elements again along both sides as an accurate mesh, in strips half as wide."""
+    auto = Mesh.accurate(plate, frequency_max=frequency_max)
     nx, ny = (math.ceil(1.5 * count) for count in (auto.nx, auto.ny))
     return Mesh(nx, ny, auto.length, auto.width, auto.element, auto.strip / 2)
 
@@ -86,7 +100,7 @@ def default_frequencies(rig: Rig) -> FloatArray:
 
 def study_convergence(
     rig: Rig,
-    meshes: Sequence[Mesh],
+    meshes: Sequence[PlateMesh],
     *,
     frequencies: Sequence[float] | FloatArray,
     progress: Callable[[int, int], None] = lambda done, of: None,
@@ -115,24 +129,47 @@ def study_convergence(
         errors.append(
             MeshError(
                 mesh,
-                dof=3 * mesh.node_count,
+                dof=mesh.dof,
                 frequency=_natural_frequencies(rig, mesh)[supported] / exact[supported] - 1,
                 response=(difference / size).max(axis=1),
             )
         )
     progress(1 + len(meshes), 1 + len(meshes))
-    return Convergence(reference, checked, exact[supported], tuple(errors))
+    return Convergence(
+        reference,
+        checked,
+        exact[supported],
+        tuple(errors),
+        by_place=_change(rig, [_nearer_the_middle(era, rig.plate) for era in rig.eras], checked),
+        by_foot=_change(rig, [replace(era, foot=era.foot + FOOT) for era in rig.eras], checked),
+    )
 
 
-def _natural_frequencies(rig: Rig, mesh: Mesh) -> FloatArray:
-    matrices = assemble(rig.plate, mesh)
-    solved = modes(matrices, MODE_COUNT, support="eras", eras=rig.eras, loads=rig.loads)
-    return solved.natural_frequencies
+def _nearer_the_middle(era: Era, plate: Plate) -> Era:
+    """An ERA moved by MOVED along both sides."""
+    x, y = (
+        at + MOVED * np.sign(side / 2 - at)
+        for at, side in ((era.x, plate.length), (era.y, plate.width))
+    )
+    return replace(era, x=float(x), y=float(y))
 
 
-def _response(rig: Rig, mesh: Mesh, frequencies: FloatArray) -> ComplexArray:
+def _change(rig: Rig, eras: Sequence[Era], frequencies: FloatArray) -> FloatArray:
+    """Change of the response by other ERAs, relative L2, the worst driven ERA, (f,)."""
+    mesh = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)
+    before = _response(rig, mesh, frequencies)
+    after = _response(replace(rig, eras=tuple(eras)), mesh, frequencies)
+    change = np.linalg.norm(after - before, axis=2) / np.linalg.norm(before, axis=2)
+    return np.asarray(change.max(axis=1))
+
+
+def _natural_frequencies(rig: Rig, mesh: PlateMesh) -> FloatArray:
+    return natural_modes(rig, MODE_COUNT, support="eras", mesh=mesh).frequencies
+
+
+def _response(rig: Rig, mesh: PlateMesh, frequencies: FloatArray) -> ComplexArray:
     x = np.linspace(0, rig.plate.length, _RASTER[0])
     y = np.linspace(0, rig.plate.width, _RASTER[1])
     points = lattice(x, y)
     free = solve_free_plate(rig.plate, mesh, frequency_max=rig.limits.frequency_max)
-    return free.acceleration(rig.eras, frequencies, points, loads=rig.loads)
+    return free.acceleration(rig.eras, frequencies, points, loads=rig.masses)

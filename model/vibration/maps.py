@@ -1,17 +1,15 @@
 """A map of the plate: peak acceleration on a regular raster, for any drive."""
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from model.arrays import FloatArray, lattice
 from model.counting import counted
 from model.errors import InputError
-from model.fem.assembly import assemble
-from model.fem.harmonic import direct_acceleration
 from model.reduction.free_plate import FreePlate
 from model.rig.rig import Rig
+from model.vibration.direct import direct_responder
 from model.vibration.excitation import Excitation
 from model.vibration.peak import find_nulls, peak_acceleration, tone_amplitudes
 
@@ -62,9 +60,9 @@ def plate_map(
     x = np.linspace(0, rig.plate.length, columns)
     y = np.linspace(0, rig.plate.width, rows)
     points = lattice(x, y)
-    respond = free.acceleration if free else partial(direct_acceleration, assemble(rig.plate, mesh))
+    respond = free.acceleration if free else direct_responder(rig.plate, mesh)
     _, amplitudes = tone_amplitudes(
-        excitation, rig.eras, lambda f: respond(rig.eras, f, points, loads=rig.loads)
+        excitation, rig.eras, lambda f: respond(rig.eras, f, points, loads=rig.masses)
     )
     peak = peak_acceleration(amplitudes).reshape(rows, columns)
     return PlateMap(x, y, peak, find_nulls(x, y, peak))

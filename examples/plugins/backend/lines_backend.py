@@ -107,7 +107,7 @@ class LinesBackend(WireBackend):
         try:
             async with asyncio.timeout(timeout):
                 writer.write(json.dumps({"id": self._number, **question}).encode() + b"\n")
-                self._last_sent = now()
+                self._last_sent_at = now()
                 self._counters.frames_out += 1
                 await writer.drain()
                 while True:

@@ -96,7 +96,7 @@ def calibration(rig: Rig) -> Calibration:
 
 @pytest.mark.parametrize("text", [FLOW, BLOCK], ids=["flow", "block"])
 def test_calibrated_text_keeps_comments_and_reads_back(tmp_path: Path, text: str) -> None:
-    """Every value is read back, and every comment and line of the author's stands."""
+    """Every value is read back, and every comment is kept."""
     path = tmp_path / "rig.yaml"
     path.write_text(text, encoding="utf-8")
     rig = load_rig(path)

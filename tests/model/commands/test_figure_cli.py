@@ -7,7 +7,6 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from model.commands.figure_cli import figure_app
-from model.errors import InputError
 from model.rig.file import example_rig_path
 
 RUNNER = CliRunner()
@@ -44,15 +43,3 @@ def test_figure_prints_findings_as_json(tmp_path: Path) -> None:
     assert 1.5 < answer["figures"]["figure_13_maps"]["maximum_stiff_to_soft_ratio"] < 1.8
     assert all(Path(name).is_file() for name in answer["files"])
     assert len(answer["files"]) == 4
-
-
-def test_figure_refuses_a_file_as_folder_and_an_unknown_number(tmp_path: Path) -> None:
-    """Path and known numbers are in the errors."""
-    taken = tmp_path / "taken"
-    taken.write_text("mine", encoding="utf-8")
-    result = RUNNER.invoke(figure_app, ["7", RIG, "-o", str(taken)])
-    assert isinstance(result.exception, OSError)
-    assert result.exception.filename == str(taken)
-    result = RUNNER.invoke(figure_app, ["5", RIG, "-o", str(tmp_path)])
-    assert isinstance(result.exception, InputError)
-    assert "6, 7, 10, 11, 12, 13" in str(result.exception)

@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from click.testing import Result
 from typer.testing import CliRunner
@@ -64,28 +63,6 @@ def test_build_writes_a_table_and_what_made_it(tmp_path: Path) -> None:
     assert answer["files"] == [str(path)]
     assert load_table(path).fingerprint == answer["fingerprint"]
     assert list(tmp_path.iterdir()) == [path]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (["-o", "{tmp}/none/t.npz"], "--output"),
-        (["-o", "{tmp}"], "--output"),
-        (["-o", "{tmp}/t.yaml"], "t.npz"),
-        (["-o", "{tmp}/t.npz", "--mode", "loud"], "--mode"),
-        (["-o", "{tmp}/t.npz", "--grid", "many"], "--grid"),
-        (["-o", "{tmp}/t.npz", "--grid", "0x3"], "grid"),
-        (["-o", "{tmp}/t.npz", "--mesh", "big"], "mesh"),
-        (["-o", "{tmp}/t.npz", "--frequencies", "600:700:10"], "limits"),
-        (["-o", "{tmp}/t.npz", "--frequencies", "60:320:1e-9"], "--frequencies"),
-        (["-o", "{tmp}/t.npz", "--frequencies", "sixty"], "--frequencies"),
-    ],
-)
-def test_build_refuses_bad_options(tmp_path: Path, arguments: list[str], named: str) -> None:
-    """The option is named, and nothing is left behind."""
-    with pytest.raises(InputError, match=named):
-        table("build", RIG, "--mesh", "12x9", *(each.format(tmp=tmp_path) for each in arguments))
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -155,18 +132,6 @@ def test_show_prints_summary_map_and_a_query_that_has_an_answer(
     assert as_json(*words)["contrast_db"] > 0
 
 
-def test_show_json_has_shares_and_map(built: Path) -> None:
-    """Shares, and the map with its centres."""
-    answer = as_json("show", built)
-    assert (answer["cells"], answer["patterns"], answer["mesh_name"]) == (12, 66, "12x9")
-    assert answer["frequency_range_hz"] == [60.0, 250.0]
-    assert 0 <= answer["feasible_share"] <= 1
-    assert 0 <= answer["alike_pattern_pairs_share"] < 0.5
-    assert len(answer["map"]["centres_m"]) == len(answer["map"]["is_weak"]) == 12
-    assert np.mean(answer["map"]["is_weak"]) == answer["weak_share"]
-    assert answer["code_version"]
-
-
 def test_verify_passes_a_true_table_and_fails_a_false_one(built: Path, tmp_path: Path) -> None:
     """One ERA's field a tenth stronger, its checksum right: status 1, as text and as JSON."""
     result = table("verify", built, RIG, "--samples", "3")
@@ -182,37 +147,7 @@ def test_verify_passes_a_true_table_and_fails_a_false_one(built: Path, tmp_path:
     assert result.stdout.splitlines()[-1].startswith("Next: era table build")
     result = table("verify", false, RIG, "--samples", "3", "--json")
     assert result.exit_code == 1
-    assert json.loads(result.stdout)["misses"] > 0
-
-
-def test_verify_refuses_another_plate_and_swapped_files(built: Path, tmp_path: Path) -> None:
-    """A rig of another thickness; the rig in the table's place."""
-    other = tmp_path / "other.yaml"
-    other.write_text(Path(RIG).read_text().replace("1.5 mm", "1.6 mm"))
-    with pytest.raises(InputError, match="fingerprint"):
-        table("verify", built, other)
-    with pytest.raises(InputError, match=f"era table verify {built} {RIG}"):
-        table("verify", RIG, built)
-
-
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        (["--quiet", "0.1,0.1"], "--target"),
-        (["--target", "9cm,8cm"], "--target"),
-        (["--target", "0.1"], "--target"),
-        (["--target", "0.1,nan"], "--target"),
-        (["--target", "0.9,0.1"], "target"),
-        (["--target", "0.1,0.1", "--quiet", "0.1,0.1"], "quiet"),
-        (["--target", "0.1,0.1", "--mode", "loud"], "mode"),
-        (["--batch", "b.jsonl", "--target", "0.1,0.1"], "--batch"),
-        (["--batch", "b.jsonl"], "--batch"),
-    ],
-)
-def test_query_names_the_option_that_is_wrong(built: Path, options: list[str], named: str) -> None:
-    """Contacts that cannot be read or are off the plate, unknown modes, files that are missing."""
-    with pytest.raises(InputError, match=named):
-        table("query", built, *options)
+    assert json.loads(result.stdout)["failed"] > 0
 
 
 def test_query_prints_levels_and_contrast(built: Path) -> None:
@@ -228,14 +163,13 @@ def test_query_prints_levels_and_contrast(built: Path) -> None:
 
 
 def test_plot_writes_its_pictures(built: Path, tmp_path: Path) -> None:
-    """Four of them in a new folder, named in the answer; a command comes last."""
+    """Four of them in a new folder, named; a command comes last."""
     folder = tmp_path / "new" / "pictures"
-    files = as_json("plot", built, "-o", folder)["files"]
+    lines = table("plot", built, "-o", folder).stdout.splitlines()
+    files = [line.strip() for line in lines[1:5]]
     names = ["weak_cells", "levels", "contrast", "answer"]
     assert files == [str(folder / f"{name}.png") for name in names]
     assert all(Path(file).read_bytes().startswith(PNG) for file in files)
-    lines = table("plot", built, "-o", folder).stdout.splitlines()
-    assert {line.strip() for line in lines[1:5]} == set(files)
     assert lines[5:] == [f"Next: era table show {built} --weak"]
 
 
@@ -249,21 +183,3 @@ def test_export_writes_both_formats(built: Path, tmp_path: Path) -> None:
     assert (tmp_path / "t.mat").read_bytes().startswith(b"MATLAB 5.0")
     with pytest.raises(InputError, match="--content"):
         table("export", built, "--format", "mat", "--content", "fields", "-o", tmp_path / "t.mat")
-
-
-def test_table_commands_do_not_replace_or_read_other_files(built: Path, tmp_path: Path) -> None:
-    """Neither build nor export overwrites a file of another kind; a rig cannot be queried."""
-    rig = tmp_path / "rig.yaml"
-    rig.write_bytes(Path(RIG).read_bytes())
-    disguised = tmp_path / "rig.npz"
-    disguised.write_bytes(rig.read_bytes())
-    for arguments in (
-        ("build", RIG, "-o", rig, *QUICK),
-        ("build", RIG, "-o", disguised, *QUICK),
-        ("export", built, "--format", "csv", "-o", rig),
-        ("export", built, "--format", "mat", "-o", tmp_path / "t.csv"),
-        ("query", rig, "--target", "0.1,0.1"),
-    ):
-        with pytest.raises(InputError):
-            table(*arguments)
-    assert rig.read_bytes() == disguised.read_bytes() == Path(RIG).read_bytes()

@@ -38,13 +38,13 @@ def problems(validation: Validation[Outer]) -> list[tuple[int | None, str, str]]
 
 
 def test_validation_returns_the_section_of_a_valid_file(tmp_path: Path) -> None:
-    """With units converted."""
+    """Values with units are converted."""
     validation = read(tmp_path, "parts:\n  a: {size: 2 mm}\nrate: 10\narmed: true\n")
     assert validation.finish() == Outer(parts={"a": Inner(size=0.002)}, rate=10, armed=True)
 
 
 def test_validation_reports_all_problems_in_the_order_of_lines(tmp_path: Path) -> None:
-    """Unknown, missing, of the wrong type and out of range; suggestions and bounds are there."""
+    """Unknown and missing keys, wrong types and bounds are reported, with suggestions."""
     text = "rate: 20\nparst: 1\narmed: yes\nparts:\n  a: {sise: 1, size: 0}\n  b: {word: 5}\n  c:\n"
     found = problems(read(tmp_path, text))
     assert [(line, key) for line, key, _ in found] == [
@@ -74,8 +74,22 @@ def test_validation_reports_all_problems_in_the_order_of_lines(tmp_path: Path) -
         assert part in message
 
 
+def test_validation_reports_no_more_than_the_first_problems(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fifty of a thousand unknown keys are reported, and no suggestion made for the others."""
+    suggested: list[str] = []
+    monkeypatch.setattr(
+        "model.config.sections.did_you_mean", lambda name, known: suggested.append(name) or ""
+    )
+    text = "parts: {}\n" + "".join(f"key{number}: 1\n" for number in range(1000))
+    found = problems(read(tmp_path, text))
+    assert [line for line, _, _ in found] == list(range(2, 52))
+    assert len(suggested) == 51
+
+
 def test_validation_reports_problems_of_the_caller_with_its_own(tmp_path: Path) -> None:
-    """In the order of lines."""
+    """All are in the order of lines."""
     validation = read(tmp_path, "parts:\n  a: {size: 1}\nrate: 5 m\n")
     validation.add(("parts", "a", "size"), "odd")
     found = [(line, key) for line, key, _ in problems(validation)]
@@ -83,7 +97,7 @@ def test_validation_reports_problems_of_the_caller_with_its_own(tmp_path: Path) 
 
 
 def test_validation_returns_valid_parts_of_an_invalid_file(tmp_path: Path) -> None:
-    """Sections and fields by themselves; None for invalid or missing ones."""
+    """Sections and fields are returned by themselves; invalid or missing ones are None."""
     validation = read(tmp_path, "parts:\n  a: {size: 1 cm, word: 5}\n  b: {size: 2 cm}\n")
     assert validation.part(("parts", "a"), Inner) is None
     assert validation.part(("parts", "b"), Inner) == Inner(size=0.02)

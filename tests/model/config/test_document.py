@@ -24,7 +24,7 @@ def test_document_keeps_the_line_of_every_key(tmp_path: Path) -> None:
 
 
 def test_scalar_is_text_unless_decimal_number_boolean_or_null(tmp_path: Path) -> None:
-    """The core schema of YAML 1.2, section 10.3, with decimal numbers only."""
+    """Words follow the core schema of YAML 1.2, section 10.3, with decimal numbers only."""
     values = {
         "1": 1, "-7": -7, "007": 7, "1.5": 1.5, "70e9": 70e9, ".5": 0.5, ".inf": float("inf"),
         "true": True, "False": False, "null": None, "~": None, "": None, "'1'": "1",
@@ -71,7 +71,8 @@ def test_byte_order_mark_is_skipped(tmp_path: Path) -> None:
         (b"a: !!int '3'\n", 1, "a"),
         (b"a: ! 3\n", 1, "a"),
         (b"? [1, 2]\n: 3\n", 1, ""),
-        (b"a: " + b"[" * 100_000, 1, "a[0][0]"),
+        (b"a: " + b"[" * 20_000, 1, "a[0][0]"),
+        (b"a: " + b"{a: " * 20_000, 1, "a.a.a"),
         (b"a: 1\n" + b"#" * (1 << 20), None, ""),
         (b"PK\x03\x04" + bytes(1 << 20), None, ""),
     ],
@@ -89,16 +90,26 @@ def test_document_refuses_what_is_not_plain_data(
     assert str(caught.value).startswith(f"{place}: ")
 
 
+def test_document_refuses_too_many_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More than the limit, lowered here from 50 000, is refused as a whole."""
+    monkeypatch.setattr("model.config.document._MAX_VALUES", 100)
+    path = write(tmp_path, "a: [" + "1," * 200 + "1]")
+    with pytest.raises(ConfigError) as caught:
+        read_document(path)
+    (problem,) = caught.value.problems
+    assert (problem.line, problem.key) == (1, "")
+
+
 @pytest.mark.parametrize("name", ["none.yaml", ".", "a\0b"])
 def test_document_refuses_what_is_not_a_file(tmp_path: Path, name: str) -> None:
-    """A missing file, a folder, and a name that no file can have."""
+    """A missing file, a folder, and a name that no file can have are refused as a whole."""
     with pytest.raises(ConfigError) as caught:
         read_document(tmp_path / name)
     assert caught.value.problems[0].line is None
 
 
 def test_document_reports_all_repeated_keys_in_order_of_lines(tmp_path: Path) -> None:
-    """Each with its own line, also where one is nested in another."""
+    """Each has its own line, also where one is nested in another."""
     path = write(tmp_path, "a: 1\nb:\n  c: 1\n  c: 2\na: 2\n")
     with pytest.raises(ConfigError) as caught:
         read_document(path)
@@ -107,6 +118,14 @@ def test_document_reports_all_repeated_keys_in_order_of_lines(tmp_path: Path) ->
         f"  {path}:4",
         f"  {path}:5",
     ]
+
+
+def test_document_reports_no_more_than_the_first_problems(tmp_path: Path) -> None:
+    """Fifty of two thousand repeated keys are reported."""
+    with pytest.raises(ConfigError) as caught:
+        read_document(write(tmp_path, "k: 1\n" * 2_000))
+    assert [each.line for each in caught.value.problems] == list(range(2, 52))
+    assert "more than 50 errors" in str(caught.value)
 
 
 def test_error_escapes_control_characters_of_a_key(tmp_path: Path) -> None:

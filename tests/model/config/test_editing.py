@@ -16,7 +16,7 @@ eras: {SW: {at: [0, 0], damping: 1.5}} # one
 
 
 def test_edited_text_keeps_what_was_not_changed() -> None:
-    """Comments, indentation, order and numbers as they were written."""
+    """Comments, indentation, order and numbers stay as they were written."""
 
     def change(data: CommentedMap) -> None:
         data["plate"].insert(0, "width", 0.2)
@@ -45,7 +45,7 @@ def test_edited_text_refuses_comments_that_it_cannot_keep() -> None:
 
 
 def test_data_text_is_read_back_as_it_was() -> None:
-    """Words of YAML 1.1 and numbers among text included."""
+    """Words of YAML 1.1 and numbers among text come back too."""
     data = {"z": ["NO", "0x10", "1", 1, 1.5, None, True], "a": {"b": "12 in", "c": "1:30"}}
     assert parse_document("new", data_text(data)).data == data
     assert list(parse_document("new", data_text(data)).data) == ["z", "a"]

@@ -41,7 +41,7 @@ SI = {
 
 @pytest.mark.parametrize("dimension", SI, ids=lambda dimension: dimension.name)
 def test_quantity_converts_to_si_exactly(dimension: Dimension) -> None:
-    """Common units and spellings, to the last bit; a bare number is in SI."""
+    """Common units and spellings are exact to the last bit; a bare number is in SI."""
     expected = SI[dimension]
     assert {value: quantity(value, dimension) for value in expected} == expected
 
@@ -111,6 +111,6 @@ def test_quantity_of_bare_numbers_does_not_load_pint() -> None:
     ("si", "unit"), [(si, unit) for si, factors in COMMON_FACTORS.items() for unit in factors]
 )
 def test_common_factors_are_those_of_pint(si: str, unit: str) -> None:
-    """To the last digit, so that it does not matter which of the two is used."""
+    """They agree to the last digit, so that it does not matter which of the two is used."""
     factor = unit_factor(f"1 {unit}", unit, Dimension("a value", si, ""))
     assert factor == Decimal(COMMON_FACTORS[si][unit])

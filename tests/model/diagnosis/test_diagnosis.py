@@ -20,6 +20,7 @@ from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
 from model.fem.mesh import Mesh
 from model.rig.rig import Rig
+from model.vibration.parametric_plate import parametric_plate
 
 FREQUENCIES = np.linspace(57.0, 487.0, 10)
 NX, NY = 4, 2
@@ -83,6 +84,22 @@ def states(verdict: Verdict) -> dict[str, tuple[str, ...]]:
     return {c.era: c.states for c in verdict.channels if c.states != ("well",)}
 
 
+@pytest.fixture(autouse=True, scope="module")
+def solved_once():
+    """Free plates of the causes that are tried are those of one rig in all tests."""
+    solved = {}
+
+    def solve(rig, points, frequencies):
+        key = (rig.plate, rig.mesh, points.tobytes(), frequencies.tobytes())
+        if key not in solved:
+            solved[key] = parametric_plate(rig, points, frequencies)
+        return solved[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("model.diagnosis.causes.parametric_plate", solve)
+        yield
+
+
 @pytest.fixture(scope="module")
 def built(coarse_rig: Rig) -> tuple[np.ndarray, np.ndarray]:
     """Places, and responses of one plate within tolerance."""
@@ -91,7 +108,7 @@ def built(coarse_rig: Rig) -> tuple[np.ndarray, np.ndarray]:
     return places, respond(within_tolerance(coarse_rig, rng), places, rng)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_diagnose_passes_a_plate_within_tolerance_and_finds_a_swap(coarse_rig, seed):
     """No false alarm, and none missed, whichever two channels are exchanged."""
     rng = np.random.default_rng(1000 + seed)
@@ -105,6 +122,8 @@ def test_diagnose_passes_a_plate_within_tolerance_and_finds_a_swap(coarse_rig, s
     swapped = diagnose(coarse_rig, observe(places, values))
     names = {coarse_rig.eras[one].name, coarse_rig.eras[other].name}
     assert [set(cycle) for cycle in swapped.swapped] == [names]
+    (row,) = verdict_rows(swapped)
+    assert row.startswith("SWAPPED: ")
     assert states(swapped).keys() == names
     assert swapped.plate_matches
     assert min(c.confidence for c in swapped.channels) > 0.95
@@ -131,6 +150,7 @@ def test_diagnose_finds_a_cycle_of_three_channels(coarse_rig, built):
     places, values = built
     verdict = diagnose(coarse_rig, observe(places, values[:, [1, 2, 0, 3]]))
     assert verdict.swapped == (("SW", "SE", "NE"),)
+    assert verdict_rows(verdict)[0].startswith("SWAPPED in a cycle")
     assert [c.drives for c in verdict.channels] == ["SE", "NE", "SW", "NW"]
 
 
@@ -144,6 +164,8 @@ def test_diagnose_finds_dead_weak_and_inverted_channels(coarse_rig, built):
     broken[:, 3] *= -1
     verdict = diagnose(coarse_rig, observe(places, broken))
     assert states(verdict) == {"SW": ("dead",), "SE": ("weak",), "NW": ("inverted",)}
+    found = [row.partition(":")[0] for row in verdict_rows(verdict)]
+    assert found == ["DEAD", "WEAK", "INVERTED"]
     assert verdict.channels[1].gain == pytest.approx(0.4, rel=0.1)
     assert abs(verdict.channels[3].phase or 0) == pytest.approx(180, abs=10)
     assert verdict.plate_matches
@@ -221,7 +243,6 @@ def changed(rig: Rig, what: str) -> Rig:
     [
         ("plate.thickness", 0.002, 0.04),
         ("plate.length", 1.2 * 0.3048, 0.04),
-        ("eras.stiffness", 2.2 * 17000, 0.12),
         ("eras.NE.stiffness", 200.0, 0.12),
     ],
 )
@@ -250,6 +271,7 @@ def test_diagnose_finds_a_swap_on_another_plate(coarse_rig):
     verdict = diagnose(coarse_rig, observe(places, values))
     assert verdict.swapped == (("SE", "NE"),)
     assert verdict.explanations[0].cause.key == "eras.stiffness"
+    assert verdict.explanations[0].value == pytest.approx(2.2 * 17000, rel=0.12)
 
 
 def test_diagnose_finds_all_channels_dead_when_nothing_moves(coarse_rig, built):
@@ -275,7 +297,7 @@ def test_diagnose_refuses_too_few_sensors_or_frequencies(coarse_rig, built):
 
 
 def test_diagnose_skips_channels_that_were_not_driven(coarse_rig, built):
-    """The others are judged."""
+    """A channel without values is reported as such, the others are judged."""
     places, values = built
     part = values.copy()
     part[:, 1:3] = np.nan

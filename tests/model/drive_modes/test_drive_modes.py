@@ -11,40 +11,18 @@ from scipy.optimize import minimize
 from model.drive_modes import (
     DRIVE_MODES,
     Choice,
-    coherent,
-    fields,
     find_drives,
     max_sensation,
     playable_drive_modes,
 )
 from model.drive_modes import switched as switched_mode
-from model.drive_modes.fields import ERROR_SHARE, SILENT, DriveVector, Evaluation, Fields, evaluate
+from model.drive_modes.fields import ERROR_SHARE, SILENT, Evaluation, Fields, Weights, evaluate
 from model.drive_modes.phased import PHASED
-from model.table.build import build_table
 from model.table.question import Question
-from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
+from paper_table import contact_sets, smooth_table
+from random_fields import random_fields
 
 F, E = 5, 3
-
-
-def random_fields(
-    seed, *, targets=1, quiet=6, points=3, has_no_quiet_contacts=False, wanted=1e-6, eras=E
-):
-    """Fields without any physics in them."""
-    rng = np.random.default_rng(seed)
-
-    def field(count):
-        parts = rng.standard_normal((2, F, eras, count))
-        return (parts[0] + 1j * parts[1]).astype(np.complex64)
-
-    threshold = rng.uniform(0.5, 2.0, F).astype(np.float32)
-    return Fields(
-        tuple(field(points) for _ in range(targets)),
-        field(quiet),
-        has_no_quiet_contacts,
-        threshold,
-        wanted,
-    )
 
 
 def fields_on_plate(places, *, targets=1, level=12.0):
@@ -61,7 +39,7 @@ def found_alone(mode, given, least):
         return switched_mode.find_switched(given, least)
     search = coherent.search(given, least)
     best = int(search.score.argmax())
-    return DriveVector.at(best, search.weights[best])
+    return Weights.at(best, search.weights[best])
 
 
 def contrast_by_hand(given, drive_index, weights):
@@ -107,7 +85,7 @@ def test_find_switched_equals_brute_force(has_no_quiet_contacts, targets, wanted
                 best = max(best, contrast if felt >= wanted else 0.0)
         drive = found_alone("switched", given, 0.0)
         assert drive is not None
-        found, felt = contrast_by_hand(given, drive.index.tolist(), drive.weight)
+        found, felt = contrast_by_hand(given, drive.frequencies.tolist(), drive.values)
         assert felt >= wanted * (1 - 1e-5)
         assert found == pytest.approx(best, rel=1e-5)
 
@@ -127,16 +105,6 @@ def test_find_switched_returns_only_better_patterns(few, targets, monkeypatch):
         assert found_alone("switched", given, 1.001 * contrast) is None
 
 
-def test_evaluate_follows_equation_28():
-    """Peak, level and contrast of a drive at two frequencies, by hand."""
-    given = random_fields(1)
-    drive = DriveVector(np.array([2, 0, 2]), np.array([0.5j, 1.0, -0.25], dtype=np.complex64))
-    evaluation = evaluate(given, drive)
-    contrast, felt = contrast_by_hand(given, [2, 0, 2], [0.5j, 1.0, -0.25])
-    assert evaluation.peak / evaluation.quiet_peak == pytest.approx(contrast, rel=1e-5)
-    assert evaluation.sensation == pytest.approx(felt, rel=1e-5)
-
-
 def test_evaluate_adds_sensations_of_tones_as_squares():
     """Multiples of threshold add as squares: 3 at one frequency and 4 at another are felt as 5."""
     quiet = np.zeros((2, 2, 1), dtype=np.complex64)
@@ -144,7 +112,7 @@ def test_evaluate_adds_sensations_of_tones_as_squares():
     given = Fields(
         (np.ones((2, 2, 1), dtype=np.complex64),), quiet, False, np.array([1.0, 10.0]), 1e-6
     )
-    evaluation = evaluate(given, DriveVector(np.array([0, 1]), np.ones(2, dtype=np.complex64)))
+    evaluation = evaluate(given, Weights(np.array([0, 1]), np.ones(2, dtype=np.complex64)))
     assert evaluation.quiet_sensation == pytest.approx(5.0)
     assert evaluation.quiet_peak == pytest.approx(43.0)
 
@@ -154,14 +122,14 @@ def test_evaluate_adds_sensations_of_tones_as_squares():
     [
         ([1.2, 2.0, 1.9, 1.41, 1.42], [1, 2, 4]),  # 3 dB below 2 is 1.416
         ([1.9, 1.7, 2.0, 1.8, 1.6, 1.5], [2, 0, 3, 1]),
-        ([1.99, 1.9], []),  # the best is none of them: it has several frequencies
+        ([1.99, 1.9], []),  # the best has several frequencies and is not among them
     ],
 )
 def test_alternatives_are_within_three_decibels(scores, near):
     """The best first, four at the most; none where the best drive is not among them."""
     frequencies = np.arange(10, 10 + len(scores))
     choice = Choice(
-        DriveVector(np.array([0, 1]), np.ones(2, dtype=np.complex64)),
+        Weights(np.array([0, 1]), np.ones(2, dtype=np.complex64)),
         Evaluation(peak=1.0, sensation=1.0, quiet_peak=0.4, quiet_sensation=0.4, score=2.0),
         frequencies,
         np.repeat(frequencies[:, None], 2, axis=1).astype(np.complex64),
@@ -171,21 +139,6 @@ def test_alternatives_are_within_three_decibels(scores, near):
     assert (found.frequencies - 10).tolist() == near
     assert found.weights[:, 0].tolist() == found.frequencies.tolist()
     assert found.score == pytest.approx([scores[place] for place in near])
-
-
-def test_quiet_forms_are_the_expected_power():
-    """For any weights: |w h|² and a hundredth of each ERA's own, at some of the frequencies too."""
-    given = random_fields(3)
-    assert given.quiet_forms.dtype == np.float32
-    chosen = np.array([4, 1])
-    rng = np.random.default_rng(3)
-    w = rng.standard_normal(E) + 1j * rng.standard_normal(E)
-    for f, forms in zip(chosen, given.at(chosen).quiet_forms, strict=True):
-        for q in range(given.quiet.shape[2]):
-            h = given.quiet[f, :, q].astype(complex)
-            power = abs(w @ h) ** 2 + 0.01 * (abs(w) ** 2 @ abs(h) ** 2)
-            R = np.ascontiguousarray(forms[:, q]).view(np.complex64).reshape(E, E)
-            assert (w.conj() @ R @ w).real == pytest.approx(power, rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -255,12 +208,12 @@ def refined(given, frequency, start, free):
 )
 def test_weights_are_not_improved_by_nelder_mead(mode, count, free):
     """On the plate, from several starts, Nelder-Mead gains no more than 2 % (0.17 dB)."""
-    for number, places in enumerate(contact_sets(3, fingers=3, seed=4)):
+    for number, places in enumerate(contact_sets(2, fingers=3, seed=4)):
         given = fields_on_plate(places, level=-60.0).at(np.array([2, 9, 16]))
         score = evaluate(given, found_alone(mode, given, 0.0)).score
         rng = np.random.default_rng(number)
         best = max(
-            refined(given, f, rng.standard_normal(count), free) for f in range(3) for _ in range(4)
+            refined(given, f, rng.standard_normal(count), free) for f in range(3) for _ in range(2)
         )
         assert score >= 0.98 * best
 
@@ -270,12 +223,12 @@ def test_weights_satisfy_the_constraints_of_their_mode(seed):
     """Switched: full stroke; graded: real and not below zero; signed: real; none above 1."""
     given = random_fields(seed)
     switched, graded, signed, phased = (found_alone(mode, given, 0.0) for mode in DRIVE_MODES)
-    assert set(np.abs(switched.weight).tolist()) <= {0.0, 1.0}
-    assert (graded.weight.imag == 0).all()
-    assert (graded.weight.real >= 0).all()
-    assert (signed.weight.imag == 0).all()
+    assert set(np.abs(switched.values).tolist()) <= {0.0, 1.0}
+    assert (graded.values.imag == 0).all()
+    assert (graded.values.real >= 0).all()
+    assert (signed.values.imag == 0).all()
     for drive in (graded, signed, phased):
-        assert np.abs(drive.weight).max() == pytest.approx(1.0, rel=1e-5)
+        assert np.abs(drive.values).max() == pytest.approx(1.0, rel=1e-5)
 
 
 @pytest.mark.parametrize("level", [12.0, 60.0])
@@ -287,7 +240,7 @@ def test_find_drives_is_never_worse_in_a_less_restricted_mode(level):
     """
     held_back = 0
     for quiet, targets in ((1, 1), (3, 1), (7, 1), (2, 2), (3, 2)):
-        for places in contact_sets(10, fingers=quiet + targets, seed=quiet):
+        for places in contact_sets(5, fingers=quiet + targets, seed=quiet):
             given = fields_on_plate(places, targets=targets, level=level)
             found = [find_drives(given, mode) for mode in DRIVE_MODES]
             scores = [one.evaluation.score if one else 1e-3 for one in found]
@@ -299,51 +252,7 @@ def test_find_drives_is_never_worse_in_a_less_restricted_mode(level):
             held_back += is_level_limited
             strict = is_level_limited or targets > 1
             assert phased >= signed - (1e-4 if strict else 0.5)
-    assert (held_back > 10) == (level > 50.0)
-
-
-def test_find_drives_is_never_worse_with_more_frequencies_or_eras():
-    """Every second frequency, or one ERA less, has no better best; phased to half a decibel."""
-    for places in contact_sets(10, fingers=3, seed=3):
-        given = fields_on_plate(places)
-        fewer = given.at(np.arange(0, len(FREQUENCIES), 2))
-        without = Fields(
-            tuple(field[:, :3] for field in given.targets),
-            given.quiet[:, :3],
-            False,
-            given.threshold,
-            given.wanted,
-        )
-        for mode, slack in (("switched", 1e-9), ("phased", 0.5)):
-            most = 20 * np.log10(find_drives(given, mode).evaluation.score)
-            for less in (fewer, without):
-                evaluation = find_drives(less, mode).evaluation
-                if mode == "switched":  # goes by contrast, not by the score
-                    whole = find_drives(given, mode).evaluation
-                    assert evaluation.peak / evaluation.quiet_peak <= whole.peak / whole.quiet_peak
-                else:
-                    assert 20 * np.log10(evaluation.score) <= most + slack
-
-
-def test_phased_optimum_is_independent_of_mounts_without_errors(monkeypatch):
-    """Without errors: half the stiffness and four times the damping, the same best contrast."""
-    monkeypatch.setattr(coherent, "ERROR_SHARE", 1e-3)
-    monkeypatch.setattr(fields, "ERROR_SHARE", 1e-3)
-    rig = smooth_rig()
-    other = replace(
-        rig,
-        eras=tuple(
-            replace(era, stiffness=era.stiffness / 2, damping=era.damping * 4) for era in rig.eras
-        ),
-    )
-    tables = [build_table(each, frequencies=FREQUENCIES[::4]) for each in (rig, other)]
-    for places in contact_sets(8, fingers=2, seed=8):
-        question = Question((places[0],), (places[1],), level_db_sl=-60.0)
-        scores = [
-            20 * np.log10(evaluate(given, found_alone("phased", given, 0.0)).score)
-            for given in (table.fields(question) for table in tables)
-        ]
-        assert scores[0] == pytest.approx(scores[1], abs=0.1)
+    assert (held_back > 5) == (level > 50.0)
 
 
 @pytest.mark.parametrize("mode", DRIVE_MODES)
@@ -412,6 +321,6 @@ def test_find_drives_reaches_two_targets():
     ],
 )
 def test_playable_drive_modes_follow_from_steps(level_step, phase_step, richest):
-    """On and off only; levels; signs; phases; phases too coarse to cancel with."""
+    """Coarse phases allow signs only, no levels allow switching only."""
     modes = playable_drive_modes(level_step=level_step, phase_step=phase_step)
     assert modes == tuple(DRIVE_MODES)[: list(DRIVE_MODES).index(richest) + 1]

@@ -32,7 +32,7 @@ def test_rigidities_equal_hand_calculation():
 
 
 def test_shape_functions_are_nodal(element):
-    """And everywhere they add up to one."""
+    """They are 1 at their own node, 0 at the others, and add up to 1 everywhere."""
     nodes = np.array(element.side)
     np.testing.assert_allclose(element.shape(nodes), np.eye(len(nodes)), atol=1e-12)
     between = element.shape(np.linspace(-1, 1, 17))

@@ -16,7 +16,7 @@ RUNNER = CliRunner()
 
 
 def test_own_elements_pass_all_checks() -> None:
-    """Of each element not one check finds anything."""
+    """No check finds a problem in any element."""
     found = {
         (name, check.name): check.problem(element)
         for name, element in ELEMENTS.items()
@@ -90,7 +90,7 @@ def test_check_finds_its_fault(fault: tuple[str, Element]) -> None:
     assert problem is not None
     result = RUNNER.invoke(app, ["plate", "conformance", element.name])
     assert result.exit_code == 1
-    assert f"{check.proves}.\n        {problem}\n" in result.stdout
+    assert f"{check.requirement}.\n        {problem}\n" in result.stdout
 
 
 def test_every_check_has_a_fault() -> None:

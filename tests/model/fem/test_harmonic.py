@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.fem.assembly import assemble, era_positions
+from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
 from model.reduction.free_plate import solve_free_plate
 from model.structure.actuator import Era
+from model.structure.point_load import footprints_of
 
 
 def test_direct_acceleration_is_rigid_far_below_resonance(coarse_rig):
@@ -34,7 +35,7 @@ def test_direct_acceleration_of_a_rigid_plate_equals_mass_on_springs(coarse_rig)
 
 def test_direct_acceleration_is_reciprocal(fine_rig):
     """What SW's force does at NE, NE's does at SW; with equal ERAs the matrix is symmetric."""
-    points = era_positions(fine_rig.eras)
+    points = footprints_of(fine_rig.eras)
     free = solve_free_plate(fine_rig.plate, fine_rig.mesh)
     at_eras = free.acceleration(fine_rig.eras, np.array([110.0, 250.0]), points)
     np.testing.assert_allclose(at_eras, at_eras.transpose(0, 2, 1), rtol=1e-9)

@@ -1,14 +1,12 @@
 """Meshes: nodes, interpolation, automatic choice and refused values."""
 
-import json
-
 import numpy as np
 import pytest
 
 from model.errors import InputError
-from model.fem.element_registry import mesh_from_dict
 from model.fem.elements import ELEMENTS
 from model.fem.mesh import Mesh
+from model.rig.meshes import mesh_from_dict
 from model.structure.plate import Plate
 from paper_plate import ALUMINIUM, LENGTH, WIDTH
 
@@ -51,16 +49,10 @@ def test_mesh_strips_lie_along_every_edge():
     np.testing.assert_allclose(y, [0, 0.003, 0.003 + 0.194 / 3, 0.003 + 2 * 0.194 / 3, 0.197, 0.2])
 
 
-@pytest.mark.parametrize("mesh", MESHES, ids=str)
-def test_mesh_round_trips_through_json(mesh):
-    """Its fields, through JSON, make the same mesh."""
-    assert mesh_from_dict(json.loads(json.dumps(mesh.to_dict()))) == mesh
-
-
 def test_auto_mesh_follows_the_bending_wavelength():
     """At twice the frequency the wave is 1.41 times shorter, at four times half as long."""
     plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
-    low, high = (Mesh.auto(plate, frequency_max=f) for f in (500.0, 2000.0))
+    low, high = (Mesh.accurate(plate, frequency_max=f) for f in (500.0, 2000.0))
     # 0.3048 m and 0.2286 m of waves 0.1704 m and 0.0852 m long, 5.5 elements each
     assert [(mesh.nx, mesh.ny) for mesh in (low, high)] == [(10, 8), (20, 15)]
     assert low.strip == high.strip == 0.003
@@ -68,7 +60,7 @@ def test_auto_mesh_follows_the_bending_wavelength():
 
 def test_auto_mesh_has_no_strips_when_plate_is_thick():
     """Where the edge's layer is as wide as an element, the element follows it already."""
-    assert Mesh.auto(Plate(0.2, 0.1, 0.02, ALUMINIUM), frequency_max=500.0).strip == 0
+    assert Mesh.accurate(Plate(0.2, 0.1, 0.02, ALUMINIUM), frequency_max=500.0).strip == 0
 
 
 @pytest.mark.parametrize("kind", [("MITC4", 12, 9), ("Q3", 4, 3)])

@@ -7,7 +7,6 @@ import pytest
 
 from model.figures.table_pictures import (
     answer_figure,
-    contrast_figure,
     levels_figure,
     weak_cells_figure,
 )
@@ -52,17 +51,6 @@ def test_weak_cells_figure_crosses_out_weak_cells(table):
     assert crosses[0] == pytest.approx([22.86])
     assert crosses[1] == pytest.approx([7.62, 22.86])
     assert right.collections[0].get_array().mask.tolist() == [[False, True]]
-
-
-def test_contrast_figure_falls_with_every_finger(table):
-    """Three curves from all contact sets down; at each share more fingers have less contrast."""
-    curves = [line for line in contrast_figure(table).axes[0].lines if len(line.get_xdata()) > 2]
-    medians = [np.median(curve.get_xdata()) for curve in curves]
-    assert len(curves) == 3
-    assert medians[0] > medians[1] > medians[2]
-    for curve in curves:
-        assert curve.get_ydata()[0] == 100
-        assert (np.diff(curve.get_ydata()) < 0).all()
 
 
 def test_answer_figure_shows_field_and_fingers(table):

@@ -31,7 +31,7 @@ def peaks(figure: PaperFigure) -> dict[str, np.ndarray]:
 
 
 def test_figure_6_reproduces_table_1(figures):
-    """On the paper's mesh its five frequencies to the last digit; Eq. 29 beside them."""
+    """Five frequencies on the paper's mesh are the printed ones, beside Eq. 29."""
     table = figures["figure_6"].tables[""]
     # Half up, as the paper rounds: 110.945 is 110.95.
     ours = [np.floor(100 * value + 0.5) / 100 for value in table["model_12x9_hz"]]
@@ -43,7 +43,7 @@ def test_figure_6_reproduces_table_1(figures):
 
 
 def test_figure_7_reproduces_table_2(figures):
-    """On its ERAs too; the fine mesh comes to the COMSOL column within 0.5 %."""
+    """Frequencies on ERAs are the printed ones; the fine mesh is within 0.5 % of COMSOL."""
     table = figures["figure_7"].tables[""]
     assert [f"{value:.2f}" for value in table["model_12x9_hz"]] == [
         "31.98", "68.50", "76.62", "107.84", "160.77",

@@ -118,7 +118,7 @@ def test_acceleration_equals_direct_solve_for_extreme_plates(plate, mesh, eras):
         (float("nan"), 0.1, (12, 9), "^frequency must be"),
         (501.0, 0.1, (12, 9), "^frequency must be"),
         # The wave at 450 Hz is 180 mm, an element 51 mm; six nodes to a wavelength are needed.
-        (450.0, 0.1, (6, 5), r"3\.6 elements .* 450 Hz; use"),
+        (450.0, 0.1, (6, 5), "resolves, got 450 Hz"),
         (100.0, LENGTH + 0.01, (12, 9), "not on the plate"),
         (100.0, -0.01, (12, 9), "not on the plate"),
     ],
@@ -134,7 +134,7 @@ def test_acceleration_refuses_values_out_of_range(frequency, x, mesh, message):
 
 
 def test_solve_free_plate_refuses_the_mesh_of_another_plate():
-    """As `assemble` does."""
+    """The error names both sizes, as that of `assemble`."""
     mesh = Mesh(12, 9, LENGTH, WIDTH)
     for solve in (solve_free_plate, assemble):
         with pytest.raises(InputError, match=r"^mesh: .*0\.3148 x.*0\.3048 x"):
@@ -144,7 +144,7 @@ def test_solve_free_plate_refuses_the_mesh_of_another_plate():
 def test_symmetry_classes_contain_every_mode(free):
     """The four quarters' modes are those of the whole plate, found without its symmetry."""
     whole = modes(assemble(free.plate, free.mesh), 15, support="free").natural_frequencies
-    quarters = np.sort(np.sqrt(free.eigenvalues)) / (2 * np.pi)
+    quarters = np.sort(np.sqrt(free.modes.eigenvalues)) / (2 * np.pi)
     assert (quarters[:3] == 0).all()
     np.testing.assert_allclose(quarters[3:18], whole, rtol=1e-8)
 
@@ -160,9 +160,9 @@ def test_receptances_equal_direct_solve(free):
     touch = matrices.deflection_at(places)
     carry = matrices.deflection_at(np.array([[load.x, load.y] for load in loads]))
     for row, omega in enumerate(2 * np.pi * frequencies):
-        hold = [-(omega**2) * 0.02, 1000.0 + 2j * omega - omega**2 * 2e-4]
+        attached = [-(omega**2) * 0.02, 1000.0 + 2j * omega - omega**2 * 2e-4]
         dynamic = (1 + 0.01j) * matrices.stiffness - omega**2 * matrices.mass
-        dynamic = dynamic + carry.T @ sparse.diags_array(hold) @ carry
+        dynamic = dynamic + carry.T @ sparse.diags_array(attached) @ carry
         field = splu(dynamic.tocsc()).solve(touch.T.toarray().astype(complex))
         for quick, exact in (
             (between[row], touch @ field),
@@ -177,8 +177,8 @@ def test_acceleration_is_independent_of_the_cache_size(monkeypatch):
     layouts = [random_eras(np.random.default_rng(seed), 4) for seed in (0, 1, 0)]
     plates = [solve_free_plate(PAPER, MESHES["19x15"]) for _ in range(2)]
     keeping = [plates[0].acceleration(eras, frequencies, plates[0].mesh.nodes) for eras in layouts]
-    monkeypatch.setattr("model.reduction.attachments.MAX_CACHE_BYTES", 0)
-    monkeypatch.setattr("model.reduction.attachments.MAX_CACHED_RASTERS", 1)
+    monkeypatch.setattr("model.reduction.finite_element_modes.MAX_CACHE_BYTES", 0)
+    monkeypatch.setattr("model.reduction.finite_element_modes.MAX_CACHED_RASTERS", 1)
     for eras, kept in zip(layouts, keeping, strict=True):
         again = plates[1].acceleration(eras, frequencies, plates[1].mesh.nodes)
         np.testing.assert_allclose(again, kept, rtol=1e-9)

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.fem.assembly import era_positions
 from model.fem.mesh import Mesh
 from model.reduction.reduced_plate import reduce_plate
 from model.reduction.supported_modes import SupportedModes, supported_modes
 from model.rig.rig import Rig
 from model.structure.actuator import damping_from_ratio
+from model.structure.point_load import footprints_of
 from paper_plate import make_paper_rig
 
 # Founding paper, in-house column of Table 2 [Hz].
@@ -18,7 +18,7 @@ TABLE_2 = ["31.98", "68.50", "76.62", "107.84", "160.77"]
 
 def modes_of(rig: Rig, *, frequency_max: float) -> SupportedModes:
     """Those of a rig's plate on its mesh."""
-    attached = era_positions(rig.eras)
+    attached = footprints_of(rig.eras)
     reduced = reduce_plate(rig.plate, rig.mesh, attached, frequency_max=frequency_max)
     return supported_modes(reduced, rig.eras, frequency_max=frequency_max)
 
@@ -39,7 +39,7 @@ def test_damping_ratio_of_a_rigid_plate_as_by_hand() -> None:
     plate = replace(rig.plate, thickness=0.03, loss_factor=0.0)  # bends at a thousand hertz
     damping = damping_from_ratio(0.05, stiffness=17000.0, plate_mass=plate.mass, era_count=4)
     eras = tuple(replace(era, damping=damping) for era in rig.eras)
-    mesh = Mesh.auto(plate, frequency_max=100.0)
+    mesh = Mesh.accurate(plate, frequency_max=100.0)
     found = modes_of(replace(rig, plate=plate, eras=eras, mesh=mesh), frequency_max=100.0)
     tilting = [
         0.05 * np.sqrt(3 / (1 + (plate.thickness / side) ** 2))
@@ -54,7 +54,7 @@ def test_supported_mode_shapes_have_unit_modal_mass() -> None:
     """Of a rigid plate that bounces, mass 1 is a deflection of 1 / sqrt(m) everywhere."""
     rig = make_paper_rig(12, 9)
     plate = replace(rig.plate, thickness=0.03)
-    mesh = Mesh.auto(plate, frequency_max=100.0)
+    mesh = Mesh.accurate(plate, frequency_max=100.0)
     found = modes_of(replace(rig, plate=plate, mesh=mesh), frequency_max=100.0)
     bouncing = found.at(np.array([[0.0, 0.0], [0.1, 0.05], [0.3, 0.2]]))[:, 0]
     np.testing.assert_allclose(np.abs(bouncing), 1 / np.sqrt(plate.mass), rtol=5e-3)

@@ -1,4 +1,4 @@
-"""The polynomial that stands for all truncated modes, against the function that it stands for."""
+"""The polynomial for all truncated modes, against the exact function."""
 
 import numpy as np
 import pytest

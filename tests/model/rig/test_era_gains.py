@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
-from model.fem.assembly import assemble, era_positions
+from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.structure.point_load import footprints_of
 from model.table.build import build_table
 from model.table.file import load_table, save_table
 from model.transients.base_motion import Term
@@ -31,14 +32,14 @@ def uneven(coarse_rig: Rig) -> Rig:
 
 
 def test_era_gain_is_interpolated_and_held_beyond_its_frequencies(uneven: Rig) -> None:
-    """On the line between two complex gains, and the last one beyond."""
+    """It lies on the line between two complex gains, and is the last one beyond."""
     low, high = 0.9 * np.exp(0.2j), 1.3 * np.exp(-0.4j)
     found = uneven.eras[1].gain(np.array([50.0, 100.0, 125.0, 300.0]))
     np.testing.assert_allclose(found, [low, low, 0.75 * low + 0.25 * high, high])
 
 
 def test_acceleration_is_scaled_by_the_gain_of_its_era(coarse_rig: Rig, uneven: Rig) -> None:
-    """Direct solve and free plate: the ERA's own response times its gain, its neighbours' not."""
+    """In direct solve and free plate the ERA's own response is multiplied, not its neighbours'."""
     points = np.array([[0.1, 0.05], [0.2, 0.2]])
     frequencies = np.array([100.0, 150.0, 200.0])
     factor = np.ones((3, 4, 1), dtype=complex)
@@ -57,7 +58,7 @@ def test_acceleration_is_scaled_by_the_gain_of_its_era(coarse_rig: Rig, uneven: 
 
 def test_particular_solution_is_scaled_by_the_gain_of_its_era(coarse_rig: Rig, uneven: Rig) -> None:
     """A steady tone's particular solution is the ungained one times the gain at its frequency."""
-    reduced = reduce_plate(coarse_rig.plate, coarse_rig.mesh, era_positions(coarse_rig.eras))
+    reduced = reduce_plate(coarse_rig.plate, coarse_rig.mesh, footprints_of(coarse_rig.eras))
     s = np.array([2j * math.pi * 125.0])
     plain, _ = plate_in_time(reduced, coarse_rig.eras).particular([1], s, [1e-4], [0j])
     gained, _ = plate_in_time(reduced, uneven.eras).particular([1], s, [1e-4], [0j])
@@ -69,7 +70,7 @@ def test_particular_solution_is_the_same_for_negative_frequency(
     coarse_rig: Rig, uneven: Rig
 ) -> None:
     """Im[c exp(i w t)] is Im[-conj(c) exp(-i w t)]: quick ramps of low tones are made of both."""
-    reduced = reduce_plate(coarse_rig.plate, coarse_rig.mesh, era_positions(coarse_rig.eras))
+    reduced = reduce_plate(coarse_rig.plate, coarse_rig.mesh, footprints_of(coarse_rig.eras))
     plate, omega, c = plate_in_time(reduced, uneven.eras), 2 * math.pi * 150.0, 6e-5 + 3e-5j
     forwards, back = plate.particular_solutions(
         1, [Term(0.0, math.inf, omega, c), Term(0.0, math.inf, -omega, -c.conjugate())]
@@ -91,7 +92,7 @@ def test_table_file_keeps_gains_and_fingerprint(
 
 
 def test_load_rig_reads_gains_and_refuses_invalid_rows(tmp_path: Path) -> None:
-    """Rows of frequency, magnitude and degrees; an invalid row with its line."""
+    """Rows are frequency, magnitude and degrees; an invalid one is refused with its line."""
     text = """\
 plate: {length: 0.3, width: 0.2, thickness: 1.5 mm, material: steel}
 mesh: 12x9
@@ -114,7 +115,7 @@ amplifiers: {m: {url: "sim://"}}
 
 
 def test_era_refuses_invalid_gains(coarse_rig: Rig) -> None:
-    """No magnitude, no number, or frequencies that do not ascend."""
+    """A magnitude of zero, NaN and frequencies that do not ascend are refused."""
     for gains in (
         ((50.0, 0.0, 0.0),),
         ((50.0, 1.0, math.nan),),

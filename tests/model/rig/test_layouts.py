@@ -17,7 +17,7 @@ from paper_plate import LENGTH, WIDTH, make_paper_rig
 
 
 def test_four_era_layouts_are_distinct_and_on_the_plate():
-    """Five or more, no two alike, no two ERAs of one at the same place, all on the plate."""
+    """No two layouts are alike, no two ERAs of one share a place, and all are on the plate."""
     assert len(FOUR_ERA_LAYOUTS) >= 5
     assert len({layout.name for layout in FOUR_ERA_LAYOUTS}) == len(FOUR_ERA_LAYOUTS)
     assert len({frozenset(layout.places) for layout in FOUR_ERA_LAYOUTS}) == len(FOUR_ERA_LAYOUTS)

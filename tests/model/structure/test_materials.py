@@ -11,7 +11,6 @@ from model.structure.laminate import Layer
 from model.structure.materials import KNOWN_MATERIALS, material
 from model.structure.plate import Material, Plate
 from model.structure.point_load import PointLoad
-from model.structure.point_mass import PointMass
 from paper_plate import make_paper_rig
 
 GLASS = Material("glass", 70e9, 2500.0, 0.2)
@@ -69,10 +68,15 @@ def test_material_refuses_an_unknown_name_with_a_suggestion(name, message):
         (material("steel"), {"E": [0.0, math.nan], "rho": [-1.0], "nu": [0.5, -1.0, math.nan]}),
         (PLATE, {key: [0.0, -0.1, math.nan, math.inf] for key in ("length", "width", "thickness")}),
         (Layer(GLASS, 1e-3), {"thickness": [0.0, -1e-3, math.nan, math.inf]}),
-        (PointMass(0.1, 0.1, 0.01), {"x": [math.nan], "y": [math.inf], "mass": [math.nan, -0.01]}),
         (
             PointLoad(0.1, 0.1),
-            {"x": [math.nan], "mass": [-0.1], "stiffness": [-1.0], "damping": [math.inf]},
+            {
+                "x": [math.nan],
+                "y": [math.inf],
+                "mass": [math.nan, -0.1],
+                "stiffness": [-1.0],
+                "damping": [math.inf],
+            },
         ),
     ],
     ids=lambda value: type(value).__name__,
@@ -92,7 +96,7 @@ def test_rig_refuses_eras_and_masses_off_the_plate():
     with pytest.raises(InputError, match=r"ERA out .*\(0.31, 0.1\)"):
         replace(rig, eras=(*rig.eras, outside))
     with pytest.raises(InputError, match=r"mass.*\(0.1, -0.01\)"):
-        replace(rig, masses=(PointMass(0.1, -0.01, 0.005),))
+        replace(rig, masses=(PointLoad(0.1, -0.01, mass=0.005),))
 
 
 def test_rig_refuses_eras_of_one_position_or_name():

@@ -13,12 +13,11 @@ from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
 from model.structure.actuator import Era
 from model.structure.point_load import PointLoad
-from model.structure.point_mass import PointMass
 from model.studies import solve
 from model.studies.finished import FinishedCases
 from model.studies.kinds import count_cases, placement_cases, stiffness_cases
 from model.studies.outcome import ranking_summary
-from model.studies.ranking import era_counts, rank
+from model.studies.ranking import check_supported_cases, era_counts, rank
 from model.studies.run import CHUNK, run_study
 from model.studies.solve import DRIVES, CaseResults, solve_cases, study_problem
 from model.studies.workers import on_processes
@@ -63,7 +62,7 @@ def counting(solved):
 
 
 def test_statistics_equal_the_direct_solve(study, results):
-    """For the rig itself and random layouts, against one sparse factorisation per frequency."""
+    """The rig itself and random layouts agree with one sparse factorisation per frequency."""
     problem, cases = study
     matrices = assemble(problem.rig.plate, problem.rig.mesh)
     for case in (0, 3, 20, 120):
@@ -98,7 +97,7 @@ def test_acceleration_of_unequal_eras_equals_the_direct_solve():
 def test_statistics_include_point_masses(study):
     """A point mass of the rig is there in every layout, as in the direct solve."""
     problem, cases = study
-    mass = PointMass(0.1, 0.08, 0.05)
+    mass = PointLoad(0.1, 0.08, mass=0.05)
     loaded = replace(problem.rig, masses=(mass,))
     carried = study_problem(loaded, cases, FREQUENCIES)
     assert carried.digest != problem.digest
@@ -129,7 +128,7 @@ def test_pairs_are_skipped_for_one_era_and_all_for_two():
 
 
 def test_run_study_orders_chunks_and_counts_progress(study, results, tmp_path):
-    """In any order of completion; each case counts once as progress."""
+    """Results are in order however chunks complete; each case counts once as progress."""
     problem, cases = study
 
     def backwards(problem, chunks):
@@ -171,7 +170,7 @@ def test_run_study_resumes_after_an_interrupt(study, results, tmp_path):
 
 @pytest.mark.parametrize("harm", ["cut", "flipped", "emptied", "foreign", "an array"])
 def test_finished_cases_ignore_and_log_a_damaged_file(study, results, tmp_path, caplog, harm):
-    """Cut short, a bit flipped, empty, or not such a file at all: one warning, right numbers."""
+    """A file that is cut, altered, empty or another leads to one warning, and is written anew."""
     problem, cases = study
     finished = FinishedCases(tmp_path, problem.digest)
     finished.add(cases, results)
@@ -190,8 +189,7 @@ def test_finished_cases_ignore_and_log_a_damaged_file(study, results, tmp_path, 
         again = FinishedCases(tmp_path, problem.digest)
     assert [record.args[0] for record in caplog.records] == [finished.path]
     assert not again.find(cases)[0].any()
-    run = run_study(problem, cases, workers=on_processes(1), finished=again)
-    assert same_to_the_bit({0: run.results}, {0: results})
+    again.add(cases, results)
     assert finished.path.read_bytes() == content
 
 
@@ -236,7 +234,7 @@ def test_finished_cases_are_found_by_layout_and_stiffness(study, results, tmp_pa
 
 
 def test_on_processes_replaces_workers_that_die(study, results, caplog):
-    """All workers killed after the first chunk: a warning, and all results."""
+    """When all workers are killed after the first chunk, all results come, with a warning."""
     problem, cases = study
     chunks = chunks_of(cases, 2)
     others = multiprocessing.active_children()
@@ -252,7 +250,7 @@ def test_on_processes_replaces_workers_that_die(study, results, caplog):
 
 
 def test_rank_orders_by_median(study, results):
-    """Best first, the middle in the middle, the worst last; the rig has its place in it."""
+    """The best is first, the worst last, and the rig has its place between."""
     problem, cases = study
     ranking = rank(problem.rig, cases, results, drive=DRIVES.index("2"))
     medians = results.statistics[:, 1, MEDIAN]
@@ -264,7 +262,7 @@ def test_rank_orders_by_median(study, results):
 
 
 def test_ranking_summary_includes_the_own_rig(study):
-    """Ten cases and, where it is not among them, the rig's own with its rank."""
+    """Ten cases are listed and, where it is not among them, the rig's own with its rank."""
     problem, cases = study
     part = cases.take(range(0, 30))
     statistics = np.ones((30, 3, 6))
@@ -289,14 +287,19 @@ def test_rank_marks_unsupported_layouts_and_recommends_a_supported_one() -> None
     assert ranking.supported[ranking.recommended]
     summary = ranking_summary(rig, ranking)
     assert [case["supported"] for case in summary["ranking"]] == ranking.supported.tolist()
-    nothing = rank(
-        rig, cases.take(range(0, 2)), CaseResults(statistics[:2], results.active[:2]), drive=1
-    )
-    assert nothing.recommended == 0
+
+
+def test_check_supported_cases_refuses_a_study_without_any() -> None:
+    """One and two ERAs tip over; with a case of three the study has something to recommend."""
+    rig = make_paper_rig(12, 9)
+    cases = count_cases(rig, layouts=6, seed=0, raster=(7, 5))
+    check_supported_cases(rig, cases)
+    with pytest.raises(InputError):
+        check_supported_cases(rig, cases.take(range(0, 2)))
 
 
 def test_rank_recommends_the_softest_of_nearly_equal_eras():
-    """Of those within a tenth of the best median: the fewest, then the softest."""
+    """Among those within a tenth of the best median the fewest ERAs, then the softest, count."""
     rig = make_paper_rig(12, 9)
     cases = stiffness_cases(rig, layouts=1, seed=0, raster=(7, 5))
     statistics = np.zeros((9, 3, 6))
@@ -309,7 +312,7 @@ def test_rank_recommends_the_softest_of_nearly_equal_eras():
 
 @pytest.mark.parametrize("frequencies", [[], [0.0], [-60.0], [np.nan], [60.0, 5000.0]])
 def test_study_problem_refuses_invalid_frequencies(study, frequencies):
-    """None, nought, no number, or more than the mesh carries."""
+    """No frequency, zero, NaN, and more than the mesh carries are refused."""
     problem, cases = study
     with pytest.raises(InputError, match=r"frequenc|Hz"):
         study_problem(problem.rig, cases, np.array(frequencies))

@@ -64,7 +64,7 @@ def test_placement_cases_of_a_longer_study_start_with_the_same(rig, raster):
 
 
 def test_placement_cases_are_distinct(rig):
-    """Thousands of layouts, all different, four ERAs at four places in each."""
+    """Thousands of layouts all differ, and each has four ERAs at four places."""
     cases = placement_cases(rig, layouts=5000, seed=0, raster=(13, 13))
     layouts = layouts_of(cases)
     assert len(set(layouts)) == len(layouts) == 5000
@@ -109,7 +109,7 @@ def test_count_cases_keep_the_damping_ratio(rig):
 
 
 def test_stiffness_cases_scale_all_eras_and_keep_the_damping_ratio(rig):
-    """Each layout nine times, from a sixteenth to sixteen times as stiff."""
+    """Each layout comes nine times, from a sixteenth to sixteen times as stiff."""
     cases = stiffness_cases(rig, layouts=4, seed=0, raster=(13, 13))
     assert len(cases) == 4 * len(STIFFNESS_FACTORS) == 36
     eras = cases.eras_of(8, rig.eras)
@@ -120,7 +120,7 @@ def test_stiffness_cases_scale_all_eras_and_keep_the_damping_ratio(rig):
 
 @pytest.mark.parametrize("study", STUDIES)
 def test_cases_refuse_too_few_layouts(rig, study):
-    """None; of a count study, fewer than one for each of 1 to 6 ERAs, and ERAs that differ."""
+    """A count study needs a layout for each of 1 to 6 ERAs, and equal ERAs; others need one."""
     with pytest.raises(InputError, match="layouts"):
         STUDIES[study](rig, layouts=5 if study == "count" else 0, seed=0, raster=(13, 13))
     unequal = replace(rig, eras=(replace(rig.eras[0], stroke=50e-6), *rig.eras[1:]))

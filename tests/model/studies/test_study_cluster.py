@@ -93,7 +93,7 @@ def _allow_failures(count, dask_scheduler):
 
 
 def test_cluster_without_dask_names_the_extra(monkeypatch):
-    """The extra to install, by its name."""
+    """The error names the extra to install."""
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"\[cluster\]"):
         dict(on_cluster("tcp://127.0.0.1:1")(None, {}))
@@ -115,7 +115,7 @@ def test_on_cluster_refuses_an_invalid_address(text):
 
 
 def test_every_worker_checks_its_code():
-    """Not only the one that solves the plate: another may join later, with other code."""
+    """A worker that joins later, with other code, is refused like the one that solves the plate."""
     problem, cases = small_study(layouts=4)
     with pytest.raises(InputError, match="same era-haptics"):
         workers._solve_plate(OTHER, problem)

@@ -5,11 +5,11 @@ import pytest
 
 from model.errors import InputError
 from model.finger.grid import Grid
-from model.rig.rig import Limits
 from model.table.build import build_table
 from model.table.table import default_drive_frequencies
 from model.table.table_parts import TableProblem
 from paper_plate import make_paper_rig
+from registry.limits import GuardLimits
 
 
 @pytest.mark.parametrize(
@@ -24,7 +24,7 @@ from paper_plate import make_paper_rig
 )
 def test_default_drive_frequencies_are_the_papers_within_the_limits(low, high, expected):
     """60 to 320 Hz in steps of 10 (the paper's section 4) within the limits; at least one."""
-    found = default_drive_frequencies(Limits(frequency_min=low, frequency_max=high, level=1.0))
+    found = default_drive_frequencies(GuardLimits(frequency_min=low, frequency_max=high, level=1.0))
     np.testing.assert_array_equal(found, list(expected))
 
 

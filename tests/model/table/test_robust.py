@@ -9,7 +9,6 @@ from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
 from model.finger.fingertip import fingertip_points
 from model.structure.point_load import PointLoad
-from model.structure.point_mass import PointMass
 from model.table.build import build_table
 from model.table.question import Question
 from model.table.robust import Ensemble, draw_ensemble, ensemble_contrast_db, with_robust_contrast
@@ -54,7 +53,7 @@ def directly(rig, pattern, member, *, targets=1):
         eras,
         frequencies,
         np.concatenate(discs),
-        loads=[*rig.loads, *fingers],
+        loads=[*rig.masses, *fingers],
     )
     weights = bases / [era.stroke for era in rig.eras] * MEMBERS.gain[member]
     peak = np.abs(np.einsum("fe,fep->fp", weights, unit)).sum(axis=0)
@@ -76,14 +75,14 @@ def test_ensemble_contrast_agrees_with_the_direct_solve(targets, mode):
 
 
 def test_ensemble_contrast_includes_measured_gains_bolts_and_masses():
-    """On each plate as solved directly."""
+    """Contrast on each plate is that of the direct solve."""
     rig = smooth_rig()
     measured = ((1.0, 0.0), (0.6, 0.8), (1.3, -0.5), (0.8, 0.2))
     eras = tuple(
         replace(era, gains=((100.0, *gain),), bolt_mass=0.012)
         for era, gain in zip(rig.eras, measured, strict=True)
     )
-    rig = replace(rig, eras=eras, masses=(PointMass(0.2, 0.05, 0.03),))
+    rig = replace(rig, eras=eras, masses=(PointLoad(0.2, 0.05, mass=0.03),))
     table = build_table(rig, frequencies=np.array([110.0, 250.0]))
     question = Question((TARGET,), QUIET, drive_mode="phased")
     pattern = table.query(question)

@@ -1,6 +1,7 @@
 """Building a table in parts: by several processes, interrupted, resumed."""
 
 import logging
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -15,104 +16,113 @@ from model.table.kept_parts import KeptParts
 from model.table.table_parts import TableProblem
 from model.vibration.convergence import study_convergence
 from paper_plate import make_paper_rig
-from small_table import FREQUENCIES, small_problem
 
-PARTS = 4  # discretisation, modes, fields and cells of a small table
+FREQUENCIES = np.array([60.0, 90.0, 110.0])
+PARTS = 6  # discretisation, modes, fields and three shares of twelve cells
+
+
+def quick_rig(nx=12, ny=9):
+    """The paper's plate with frequencies up to 120 Hz, so that its reference mesh is coarse."""
+    rig = make_paper_rig(nx, ny)
+    return replace(rig, limits=replace(rig.limits, frequency_max=120.0))
 
 
 @pytest.fixture(scope="module")
 def problem():
-    """A small table's."""
-    return small_problem()
+    """A small table's, with five cells to a part."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(table_parts, "CELLS_PER_PART", 5)
+        yield TableProblem(quick_rig(), FREQUENCIES, Grid(4, 3))
 
 
 @pytest.fixture(scope="module")
 def whole(problem, tmp_path_factory):
-    """The file of an uninterrupted build by one process."""
-    return file_of(build_in_parts(problem, drive_mode="switched"), tmp_path_factory.mktemp("whole"))
+    """Folder with the file of an uninterrupted build by one process, and with its parts."""
+    folder = tmp_path_factory.mktemp("whole")
+    kept = KeptParts.beside(folder / "t.npz", problem.digest)
+    save_table(build_in_parts(problem, drive_mode="switched", kept=kept).table, folder / "t.npz")
+    return folder
+
+
+@pytest.fixture
+def kept(problem, whole, tmp_path):
+    """A copy of the parts, those of an interrupted build."""
+    shutil.copytree(whole / "t.npz.parts", tmp_path / "t.npz.parts")
+    return KeptParts.beside(tmp_path / "t.npz", problem.digest)
 
 
 def file_of(build, folder):
     """The bytes of a build's table."""
-    save_table(build.table, folder / "t.npz")
-    return (folder / "t.npz").read_bytes()
+    save_table(build.table, folder / "again.npz")
+    return (folder / "again.npz").read_bytes()
 
 
-def interrupted(problem, folder, *, after):
-    """Parts left by a build that was interrupted after so many."""
+def test_build_is_the_same_to_the_bit_by_two_processes(problem, whole, tmp_path):
+    """Whichever process solves a part."""
+    build = build_in_parts(problem, drive_mode="switched", workers=2)
+    assert file_of(build, tmp_path) == (whole / "t.npz").read_bytes()
+
+
+def test_build_keeps_the_parts_that_were_finished_when_it_was_interrupted(problem, tmp_path):
+    """Two of six, and no other file."""
 
     def progress(done, of):
         assert of == PARTS
-        if done == after:
+        if done == 2:
             raise KeyboardInterrupt
 
-    kept = KeptParts.beside(folder / "t.npz", problem.digest)
+    kept = KeptParts.beside(tmp_path / "t.npz", problem.digest)
     with pytest.raises(KeyboardInterrupt):
         build_in_parts(problem, drive_mode="switched", kept=kept, progress=progress)
-    assert len(list(kept.folder.iterdir())) == after
-    return kept
+    assert len(list(kept.folder.iterdir())) == 2
 
 
-def test_build_is_the_same_by_two_processes_and_resumed(problem, whole, tmp_path):
-    """To the bit; finished parts are reused, for any drive mode, and then removed."""
-    assert file_of(build_in_parts(problem, drive_mode="switched", workers=2), tmp_path) == whole
-    kept = interrupted(problem, tmp_path, after=3)
-    phased = build_in_parts(problem, drive_mode="phased", kept=KeptParts(**vars(kept)))
-    assert (phased.reused_count, phased.table.drive_mode) == (3, "phased")
-    progress: list[int] = []
-    (kept.folder / min(path.name for path in kept.folder.iterdir())).unlink()
-    build = build_in_parts(
-        problem, drive_mode="switched", kept=kept, progress=lambda done, of: progress.append(done)
-    )
-    assert (build.reused_count, build.part_count) == (3, PARTS)
-    assert progress == [3, PARTS]
-    assert file_of(build, tmp_path) == whole
+@pytest.mark.parametrize("kind", ["fields", "cells"])
+def test_resumed_build_is_the_same_to_the_bit(problem, whole, kept, tmp_path, kind):
+    """Each missing part is put in its place; a resumed build may have another drive mode."""
+    parts = sorted(kept.folder.glob(f"{kind}-*"))
+    assert len(parts) == {"fields": 1, "cells": 3}[kind]
+    for part in parts:
+        part.unlink()
+        build = build_in_parts(problem, drive_mode="switched", kept=kept)
+        assert (build.reused_count, build.part_count) == (PARTS - 1, PARTS)
+        assert file_of(build, tmp_path) == (whole / "t.npz").read_bytes()
+    phased = build_in_parts(problem, drive_mode="phased", kept=kept)
+    assert (phased.reused_count, phased.table.drive_mode) == (PARTS, "phased")
+
+
+def test_clear_removes_parts_only(kept):
+    """Half-written ones too; the folder goes with them if it is then empty."""
     (kept.folder / ".cells-0123.part.npz.4567").write_text("half-written by a killed build")
     (kept.folder / "notes.txt").write_text("not a part")
     kept.clear()
     assert [path.name for path in kept.folder.iterdir()] == ["notes.txt"]
 
 
-def test_build_puts_each_missing_part_in_its_place(problem, tmp_path, monkeypatch):
-    """Twelve cells in shares of five: one share lost, the table is that of a build in one go."""
-    monkeypatch.setattr(table_parts, "CELLS_PER_PART", 5)
-    whole = file_of(build_in_parts(problem, drive_mode="switched"), tmp_path)
-    kept = KeptParts.beside(tmp_path / "t.npz", problem.digest)
-    build_in_parts(problem, drive_mode="switched", kept=kept)
-    shares = sorted(kept.folder.glob("cells-*"))
-    assert len(shares) == 3
-    for share in shares:
-        share.unlink()
-        build = build_in_parts(problem, drive_mode="switched", kept=kept)
-        assert (build.reused_count, build.part_count) == (5, 6)
-        assert file_of(build, tmp_path) == whole
-
-
 @pytest.mark.parametrize("what", ["frequencies", "plate", "grid", "mesh", "numerics"])
-def test_parts_of_another_table_are_not_used(problem, tmp_path, caplog, monkeypatch, what):
+def test_parts_of_another_table_are_not_used(problem, kept, caplog, monkeypatch, what):
     """Anything that changes the numbers changes what is looked for; none counts as damaged."""
-    interrupted(problem, tmp_path, after=3)
-    thinner = replace(problem.rig, plate=replace(problem.rig.plate, loss_factor=0.02))
+    softer = replace(problem.rig, plate=replace(problem.rig.plate, loss_factor=0.02))
     changes = {
         "frequencies": {"frequencies": FREQUENCIES + 1},
-        "plate": {"rig": thinner},
+        "plate": {"rig": softer},
         "grid": {"grid": Grid(3, 4)},
-        "mesh": {"rig": make_paper_rig(14, 9)},
+        "mesh": {"rig": quick_rig(14, 9)},
         "numerics": {},
     }
+    assert all(kept.load(part) is not None for part in problem.parts())
     if what == "numerics":
         monkeypatch.setattr(table_parts, "NUMERICS_VERSION", 0)
     other = replace(problem, **changes[what])
-    kept = KeptParts.beside(tmp_path / "t.npz", other.digest)
+    kept = replace(kept, problem_digest=other.digest)
     with caplog.at_level(logging.WARNING):
         assert [part for part in other.parts() if kept.load(part) is not None] == []
     assert caplog.text == ""
 
 
-@pytest.mark.parametrize("harm", ["flip", "cut", "swap", "stray", "edit"])
-def test_build_solves_a_damaged_part_again(problem, whole, tmp_path, caplog, harm):
-    """A flipped bit, a cut file, another part's or table's, an edited one: not used, named."""
-    kept = interrupted(problem, tmp_path, after=3)
+@pytest.mark.parametrize("harm", ["flip", "cut", "swap", "edit"])
+def test_build_solves_a_damaged_part_again(problem, whole, kept, tmp_path, caplog, harm):
+    """A flipped bit, a cut file, another part, an edited one: not used, named."""
     (path,) = kept.folder.glob("fields-*")
     data = bytearray(path.read_bytes())
     match harm:
@@ -126,11 +136,6 @@ def test_build_solves_a_damaged_part_again(problem, whole, tmp_path, caplog, har
             arrays["acceleration"][0] = 1
             np.savez(path, **arrays)
             data = bytearray(path.read_bytes())
-        case "stray":
-            (tmp_path / "other").mkdir()
-            elsewhere = replace(problem, frequencies=FREQUENCIES + 1)
-            (other,) = interrupted(elsewhere, tmp_path / "other", after=3).folder.glob("fields-*")
-            data = bytearray(other.read_bytes())
         case "swap":
             (other,) = kept.folder.glob("modes-*")
             data = bytearray(other.read_bytes())
@@ -138,17 +143,16 @@ def test_build_solves_a_damaged_part_again(problem, whole, tmp_path, caplog, har
     with caplog.at_level(logging.WARNING):
         build = build_in_parts(problem, drive_mode="switched", kept=kept)
     assert path.name in caplog.text
-    assert build.reused_count == 2
-    assert file_of(build, tmp_path) == whole
+    assert build.reused_count == PARTS - 1
+    assert file_of(build, tmp_path) == (whole / "t.npz").read_bytes()
 
 
 def test_build_states_the_discretisation_error_of_the_worst_era():
-    """That of a convergence study, which compares on another raster; one ERA stands inside."""
-    rig = make_paper_rig(24, 18)
+    """It is that of a convergence study on another raster, with one ERA inside the plate."""
+    rig = quick_rig()
     rig = replace(rig, eras=(replace(rig.eras[0], x=0.11, y=0.09), *rig.eras[1:]))
-    frequencies = np.array([110.0, 165.0, 250.0])
-    table = build_in_parts(TableProblem(rig, frequencies, Grid(2, 2)), drive_mode="switched").table
-    study = study_convergence(rig, [rig.mesh], frequencies=frequencies.tolist())
+    table = build_in_parts(TableProblem(rig, FREQUENCIES, Grid(2, 2)), drive_mode="switched").table
+    study = study_convergence(rig, [rig.mesh], frequencies=FREQUENCIES.tolist())
     assert table.reference_mesh == study.reference
     np.testing.assert_allclose(table.discretisation_error, study.errors[0].response, rtol=0.1)
 

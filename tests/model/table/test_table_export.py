@@ -10,7 +10,7 @@ import pytest
 from scipy.io import loadmat
 
 from model.errors import InputError
-from model.structure.point_mass import PointMass
+from model.structure.point_load import PointLoad
 from model.table import export
 from model.table.export import export_csv, export_mat
 from model.table.file import save_table
@@ -71,8 +71,10 @@ def test_export_mat_patterns_match_their_frequencies(table, struct):
 
 def test_export_mat_holds_masses(table, tmp_path):
     """One mass is a struct of one, none is empty."""
-    held = np.vstack([table.held, table.held[:1]])
-    laden = replace(table, masses=(PointMass(0.1, 0.15, 0.06),), held=held)
+    attachment_shapes = np.vstack([table.attachment_shapes, table.attachment_shapes[:1]])
+    laden = replace(
+        table, masses=(PointLoad(0.1, 0.15, mass=0.06),), attachment_shapes=attachment_shapes
+    )
     export_mat(laden, tmp_path / "t.mat")
     struct = loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"]
     assert struct.masses.mass_kg == 0.06
@@ -128,19 +130,3 @@ def test_format_page_names_everything_exported(struct, tmp_path, table):
     with np.load(tmp_path / "t.npz") as content:
         names += [*content, *json.loads(content["header"].tobytes())]
     assert [name for name in names if f"`{name}`" not in page] == []
-
-
-@pytest.mark.parametrize("write", [export_mat, lambda t, p: export_csv(t, p, content="patterns")])
-def test_export_leaves_the_old_file_when_it_fails(table, tmp_path, monkeypatch, write):
-    """When the disk fails at the end, nothing else is left."""
-    path = tmp_path / "t.out"
-    path.write_text("before")
-
-    def full_disk(descriptor):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("model.files.array_file.os.fsync", full_disk)
-    with pytest.raises(OSError, match="No space"):
-        write(table, path)
-    assert path.read_text() == "before"
-    assert list(tmp_path.iterdir()) == [path]

@@ -8,7 +8,7 @@ import pytest
 
 from model.errors import InputError
 from model.transients.base_motion import Term
-from model.transients.envelope import Envelope, ramped_ending, ramped_onset
+from model.transients.envelope import BaseEnvelope, ramped_ending, ramped_onset
 from model.vibration.excitation import Tone
 from paper_plate import make_paper_rig
 
@@ -27,7 +27,7 @@ def motion(terms: tuple[Term, ...], time: float) -> float:
 
 def test_envelope_terms_are_linear_between_knots():
     """Half way between knots the complex amplitude is their mean, at its carrier's phase."""
-    envelope = Envelope(100.0, 0j, (2e-5 + 1e-5j, -4e-5j), step=0.005)
+    envelope = BaseEnvelope(100.0, 0j, (2e-5 + 1e-5j, -4e-5j), step=0.005)
     terms = envelope.terms()
     for time, amplitude in [
         (0.0025, 1e-5 + 0.5e-5j),
@@ -66,4 +66,4 @@ def test_ramped_onset_and_ending_are_raised_cosines():
 def test_envelope_refuses_values_no_amplifier_plays(frequency, knots, step, place):
     """No knots, too many, not finite ones, no frequency and no step."""
     with pytest.raises(InputError, match=place):
-        Envelope(frequency, 0j, knots, step)
+        BaseEnvelope(frequency, 0j, knots, step)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from model.transients.envelope import Envelope, shaped
+from model.transients.envelope import BaseEnvelope, shaped
 from model.transients.hats import mean_square
 from model.transients.knots import ENDING_KNOTS, solve_carrier, while_ending
 from model.transients.measures import Transients
@@ -32,7 +32,7 @@ def test_while_ending_is_the_mean_square_of_the_response():
             envelopes, tones = {}, {}
             for number, era in enumerate(rig.eras):
                 start, *rest = (turned[:, number] * era.stroke).tolist()
-                envelopes[era.name] = Envelope(frequency, start, (*rest, 0j))
+                envelopes[era.name] = BaseEnvelope(frequency, start, (*rest, 0j))
                 tones[era.name] = Tone(frequency, abs(start), float(np.angle(start)))
             felt = transients.acceleration(
                 shaped(envelopes, rig.eras), point, duration=0.005 * ENDING_KNOTS, after=tones

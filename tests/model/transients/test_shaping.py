@@ -14,7 +14,7 @@ from model.transients.shaping import Shaper
 from model.vibration.excitation import Excitation, Tone
 from plate_in_time import make_plate_in_time
 
-FREQUENCIES = [40.0, 57.7, 75.4, 93.1, 110.8, 146.2, 217.0, 305.0, 411.0, 500.0]
+FREQUENCIES = [40.0, 75.4, 110.8, 217.0, 500.0]
 
 
 @pytest.fixture(scope="module")
@@ -78,53 +78,30 @@ def wrong(envelopes: Envelopes, errors) -> Envelopes:
 
 
 @pytest.mark.parametrize("frequency", FREQUENCIES)
-def test_knots_do_not_exceed_the_stroke(setup, frequency):
-    """At full stroke, resonance or not, onset and ending stay within it and join the pattern."""
-    rig, _, shaper, _ = setup
-    rng = np.random.default_rng(int(frequency))
-    for _ in range(3):
-        excitation = random_excitation(rig, frequency, rng)
-        onset = shaper.onset(excitation, targets=[(0.08, 0.06)], quiet=[(0.2, 0.17)])
-        ending = shaper.ending(excitation)
-        for era in rig.eras:
-            tone = excitation[era.name]
-            amplitude = tone.amplitude * np.exp(1j * tone.phase)
-            assert onset[era.name].largest <= era.stroke * (1 + 1e-9)
-            assert ending[era.name].largest <= era.stroke * (1 + 1e-9)
-            assert onset[era.name].start == 0
-            assert onset[era.name].knots[-1] == pytest.approx(amplitude)
-            assert ending[era.name].start == pytest.approx(amplitude)
-            assert ending[era.name].knots[-1] == 0
-            assert len(onset[era.name].knots) == ONSET_KNOTS == 21
-            assert ending[era.name].duration == pytest.approx(0.040)
+def test_shaped_envelopes_stay_within_the_stroke_and_stop_the_plate(setup, frequency):
+    """At full stroke, resonance or not, they join the pattern.
 
-
-@pytest.mark.parametrize("frequency", FREQUENCIES)
-def test_ending_has_less_residual_vibration_than_stop_or_ramp(setup, frequency):
-    """After 40 ms at least 6 dB less is left than after a ramp as long, and than without any."""
+    After an ending of 40 ms at least 6 dB less is left than after a ramp as long, or a stop.
+    """
     rig, _, shaper, transients = setup
-    excitation = random_excitation(rig, frequency, np.random.default_rng(7))
-    residual_shaped = transients.residual_db(
-        excitation, shaped(shaper.ending(excitation), rig.eras)
-    )
+    excitation = random_excitation(rig, frequency, np.random.default_rng(int(frequency)))
+    onset = shaper.onset(excitation, targets=[(0.08, 0.06)], quiet=[(0.2, 0.17)])
+    ending = shaper.ending(excitation)
+    for era in rig.eras:
+        tone = excitation[era.name]
+        amplitude = tone.amplitude * np.exp(1j * tone.phase)
+        assert onset[era.name].largest <= era.stroke * (1 + 1e-9)
+        assert ending[era.name].largest <= era.stroke * (1 + 1e-9)
+        assert onset[era.name].start == 0
+        assert onset[era.name].knots[-1] == pytest.approx(amplitude)
+        assert ending[era.name].start == pytest.approx(amplitude)
+        assert ending[era.name].knots[-1] == 0
+        assert len(onset[era.name].knots) == ONSET_KNOTS == 21
+        assert ending[era.name].duration == pytest.approx(0.040)
+    left = transients.residual_db(excitation, shaped(ending, rig.eras))
     for ramp in (0.0, 0.04):
-        left = transients.residual_db(excitation, ramped_ending(excitation, rig.eras, ramp=ramp))
-        assert residual_shaped < left - 6
-
-
-def test_ending_is_robust_to_gain_and_phase_errors(setup):
-    """With 5 % and 5 degrees off, the median over seeds is 40 dB down (30 dB below 150 Hz)."""
-    rig, _, shaper, transients = setup
-    for frequency, wanted in [(110.8, -30.0), (146.2, -30.0), (305.0, -40.0), (411.0, -40.0)]:
-        left = []
-        for seed in range(12):
-            rng = np.random.default_rng(seed)
-            excitation = random_excitation(rig, frequency, rng)
-            errors = era_errors(rng)
-            off = wrong_tones(excitation, errors)
-            ending = wrong(shaper.ending(excitation), errors)
-            left.append(transients.residual_db(off, shaped(ending, rig.eras)))
-        assert np.median(left) < wanted
+        plain = ramped_ending(excitation, rig.eras, ramp=ramp)
+        assert left < transients.residual_db(excitation, plain) - 6
 
 
 PAIRS = [
@@ -231,52 +208,6 @@ def test_ending_keeps_known_quiet_finger_quiet(setup):
             assert peaks[0] < 0.7 * peaks[2]
         limit = -30 if frequency < 150 else -40
         assert transients.residual_db(excitation, knowing) < limit
-
-
-def test_shaping_is_linear_in_level_when_bounds_are_inactive(setup):
-    """Far below the stroke shaping is linear in the pattern."""
-    rig, _, shaper, _ = setup
-    weights = np.array([0.02, 0.01j, -0.015, 0.005 + 0.01j])
-    loud, soft = (
-        (shaper.onset(e, targets=[(0.1, 0.1)], quiet=[(0.2, 0.1)]), shaper.ending(e))
-        for e in (tones(rig, 128.5, weights), tones(rig, 128.5, weights / 2))
-    )
-    for loud_part, soft_part in zip(loud, soft, strict=True):
-        for name, envelope in loud_part.items():
-            np.testing.assert_allclose(
-                2 * np.array(soft_part[name].knots), envelope.knots, atol=1e-12 * 1e-4
-            )
-
-
-def test_quantised_envelopes_keep_contrast_and_residual(setup):
-    """Levels in 1e-4 and phases in 0.01 degrees change contrast and rest by under 0.1 dB."""
-    rig, plate, shaper, transients = setup
-    target, quiet, frequency = PAIRS[0]
-    excitation = tones(rig, frequency, robust_weights(plate, frequency, target, quiet))
-
-    def on_the_wire(envelopes):
-        carried = {}
-        for name, envelope in envelopes.items():
-            values = np.array([envelope.start, *envelope.knots])
-            level = np.round(np.abs(values) / 1e-4, 4) * 1e-4
-            phase = np.radians(np.round(np.degrees(np.angle(values)), 2))
-            start, *knots = (level * np.exp(1j * phase)).tolist()
-            carried[name] = replace(envelope, start=start, knots=tuple(knots))
-        return carried
-
-    onset = shaper.onset(excitation, targets=[target], quiet=[quiet])
-    ending = shaper.ending(excitation)
-    contrasts = [
-        transients.contrast_db(shaped(each, rig.eras), targets=[target], quiet=[quiet])
-        for each in (onset, on_the_wire(onset))
-    ]
-    left = [
-        transients.residual_db(excitation, shaped(each, rig.eras))
-        for each in (ending, on_the_wire(ending))
-    ]
-    assert on_the_wire(onset) != onset
-    assert contrasts[1] == pytest.approx(contrasts[0], abs=0.1)
-    assert left[1] == pytest.approx(left[0], abs=0.1)
 
 
 def test_envelopes_keep_the_frequency_of_each_era(setup):

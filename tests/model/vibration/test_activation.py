@@ -22,7 +22,7 @@ from paper_plate import make_paper_rig
 def free_plate():
     """The paper's plate on its automatic mesh, up to the highest of the 27 frequencies."""
     plate = make_paper_rig(12, 9).plate
-    return solve_free_plate(plate, Mesh.auto(plate, frequency_max=500.0), frequency_max=320.0)
+    return solve_free_plate(plate, Mesh.accurate(plate, frequency_max=500.0), frequency_max=320.0)
 
 
 def test_cumulative_statistics_add_eras_as_complex_numbers():

@@ -1,4 +1,4 @@
-"""Contribution of the truncated modes at points of attachment, solved on demand and cached."""
+"""Modes of the free plate on a mesh, and its truncated ones at points, solved on demand."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,13 +8,10 @@ from scipy import sparse
 
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
-from model.reduction.class_modes import ClassModes
-
-TERMS = 4
-"""Solves for each point.
-
-A field has this many terms, a receptance between attachments twice as many, from inner products.
-"""
+from model.reduction.class_modes import ClassModes, finite_element_classes
+from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
+from model.structure.footprint import as_footprints
+from model.structure.plate import Plate
 
 MAX_CACHE_BYTES = 512 << 20
 """Memory for solved points; beyond it the oldest are dropped."""
@@ -23,24 +20,12 @@ MAX_CACHED_RASTERS = 4
 """Sets of observed points whose interpolation is cached."""
 
 
-@dataclass(frozen=True, eq=False)
-class Attachments:
-    """Points where forces act on a free plate, with their residual vectors.
-
-    shapes: (n, r) of the modes; residuals: by symmetry class, (n, TERMS, size); moments: (2 TERMS,
-    n, n) receptances of all truncated modes together with their u / u_c to the power 1, 2, ...
-    """
-
-    shapes: FloatArray
-    residuals: tuple[FloatArray, ...]
-    moments: FloatArray
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Solved:
-    """One point in one class: its force (size,), and sums of phi (u / u_c)^j, (TERMS, size).
+    """One point in one class: its force (size,), and residual vectors (RESIDUAL_ORDER, size).
 
-    mass_weighted: the same sums times the mass.
+    Those are sums of phi (u / u_c)^j over the truncated modes. mass_weighted: the same sums times
+    the mass.
     """
 
     force: FloatArray
@@ -48,20 +33,17 @@ class _Solved:
     mass_weighted: FloatArray
 
 
-class AttachmentSolver:
-    """Solver for points of attachment on one plate, with a cache.
+class FiniteElementModes:
+    """Modes of a free plate on a mesh, with a cache of solved points; see `FreeModes`."""
 
-    scale: u_c, 1 / (lambda + shift) of the lowest truncated mode [s²/rad²].
-    """
-
-    def __init__(self, mesh: Mesh, classes: Sequence[ClassModes], *, scale: float) -> None:
-        self._mesh = mesh
+    def __init__(self, classes: Sequence[ClassModes]) -> None:
         self._classes = tuple(classes)
-        self._scale = scale
-        self._solved: dict[tuple[float, float], tuple[_Solved, ...]] = {}
+        self.eigenvalues = np.concatenate([part.eigenvalues for part in classes])
+        self.largest_truncated = max(part.largest_truncated for part in classes)
+        self._solved: dict[tuple[float, ...], tuple[_Solved, ...]] = {}
         self._observed: dict[bytes, tuple[FloatArray, tuple[sparse.csr_array, ...]]] = {}
 
-    def solve(self, points: FloatArray) -> Attachments:
+    def solve_at(self, points: FloatArray) -> PointSolutions:
         """Solve for forces at points [m] (n, 2), from the cache where possible."""
         known = self._solutions(points)
         shapes = [
@@ -70,21 +52,21 @@ class AttachmentSolver:
         ]
         residuals = tuple(
             np.array([each[number].residual for each in known]).reshape(
-                len(known), TERMS, part.symmetry.size
+                len(known), RESIDUAL_ORDER, part.size
             )
             for number, part in enumerate(self._classes)
         )
-        moments = self._between(known, known)
+        truncated_terms = self._between(known, known)
         self._trim_cache()
-        return Attachments(np.hstack(shapes), residuals, moments)
+        return PointSolutions(points, np.hstack(shapes), residuals, truncated_terms)
 
-    def moments(self, points: FloatArray, others: FloatArray) -> FloatArray:
-        """Moments between points (n, 2) and others (m, 2), (2 TERMS, n, m)."""
+    def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
+        """Sums between points (n, 2) and others (m, 2), as in `PointSolutions`."""
         return self._between(self._solutions(points), self._solutions(others))
 
     def _solutions(self, points: FloatArray) -> "list[tuple[_Solved, ...]]":
         """Solutions for points [m] (n, 2), by point and class."""
-        keys = [(float(x), float(y)) for x, y in np.asarray(points, dtype=float).reshape(-1, 2)]
+        keys = [tuple(place) for place in as_footprints(points).tolist()]
         unknown = [key for key in dict.fromkeys(keys) if key not in self._solved]
         if unknown:
             self._solve_for(unknown)
@@ -94,28 +76,30 @@ class AttachmentSolver:
         self, points: "list[tuple[_Solved, ...]]", others: "list[tuple[_Solved, ...]]"
     ) -> FloatArray:
         rows, columns = len(points), len(others)
-        moments = np.zeros((2 * TERMS, rows, columns))
+        truncated_terms = np.zeros((2 * RESIDUAL_ORDER, rows, columns))
         for number, part in enumerate(self._classes):
-            size = part.symmetry.size
+            size = part.size
             force = np.array([each[number].force for each in points]).reshape(rows, size)
             residual = np.array([each[number].residual for each in points]).reshape(-1, size)
             mass_weighted = np.array([each[number].mass_weighted for each in others]).reshape(
                 -1, size
             )
             first = np.array([each[number].residual[0] for each in others]).reshape(columns, size)
-            moments[0] += force @ first.T
-            inner = (residual @ mass_weighted.T).reshape(rows, TERMS, columns, TERMS)
-            for power in range(2, 2 * TERMS + 1):
-                moments[power - 1] += inner[:, power // 2 - 1, :, (power + 1) // 2 - 1]
-        return moments
+            truncated_terms[0] += force @ first.T
+            inner = (residual @ mass_weighted.T).reshape(
+                rows, RESIDUAL_ORDER, columns, RESIDUAL_ORDER
+            )
+            for power in range(2, 2 * RESIDUAL_ORDER + 1):
+                truncated_terms[power - 1] += inner[:, power // 2 - 1, :, (power + 1) // 2 - 1]
+        return truncated_terms
 
-    def basis(self, attached: Attachments, points: FloatArray) -> FloatArray:
-        """Deflection at points of modes and residual vectors, (p, r + TERMS n).
+    def basis(self, attached: PointSolutions, points: FloatArray) -> FloatArray:
+        """Deflection at points of modes and residual vectors, (p, r + RESIDUAL_ORDER n).
 
         Residual vectors come term by term, each for all attachments.
         """
         shapes, maps = self._observe(np.asarray(points, dtype=float))
-        extra = np.zeros((len(shapes), TERMS * len(attached.shapes)))
+        extra = np.zeros((len(shapes), RESIDUAL_ORDER * len(attached.shapes)))
         for each, residual in zip(maps, attached.residuals, strict=True):
             extra += each @ residual.transpose(2, 1, 0).reshape(residual.shape[2], -1)
         return np.hstack([shapes, extra])
@@ -124,10 +108,7 @@ class AttachmentSolver:
         """Mode shapes at points (p, r), and by class the map to deflections there; cached."""
         key = points.tobytes()
         if key not in self._observed:
-            interpolation = self._mesh.interpolation(points)
-            maps = tuple(
-                sparse.csr_array(interpolation @ part.symmetry.expansion) for part in self._classes
-            )
+            maps = tuple(part.deflection_at(points) for part in self._classes)
             pairs = zip(maps, self._classes, strict=True)
             shapes = np.hstack([each @ part.vectors for each, part in pairs])
             if len(self._observed) >= MAX_CACHED_RASTERS:
@@ -135,11 +116,10 @@ class AttachmentSolver:
             self._observed[key] = shapes, maps
         return self._observed[key]
 
-    def _solve_for(self, points: list[tuple[float, float]]) -> None:
-        interpolation = self._mesh.interpolation(np.array(points))
-        forces = [(interpolation @ part.symmetry.expansion).toarray() for part in self._classes]
+    def _solve_for(self, points: list[tuple[float, ...]]) -> None:
+        forces = [part.deflection_at(np.array(points)).toarray() for part in self._classes]
         solved = [
-            part.residuals(force, terms=TERMS, scale=self._scale)
+            part.residuals(force, terms=RESIDUAL_ORDER, scale=self.largest_truncated)
             for part, force in zip(self._classes, forces, strict=True)
         ]
         for number, point in enumerate(points):
@@ -152,6 +132,18 @@ class AttachmentSolver:
 
     def _trim_cache(self) -> None:
         """Drop the oldest solved points beyond MAX_CACHE_BYTES."""
-        size = 8 * (2 * TERMS + 1) * sum(part.symmetry.size for part in self._classes)
+        size = 8 * (2 * RESIDUAL_ORDER + 1) * sum(part.size for part in self._classes)
         while len(self._solved) * size > MAX_CACHE_BYTES:
             del self._solved[next(iter(self._solved))]
+
+
+def finite_element_modes(
+    plate: Plate, mesh: Mesh, *, shift: float, cutoff_frequency: float
+) -> FiniteElementModes:
+    """Solve a free plate on a mesh for all modes below cutoff_frequency [Hz].
+
+    shift [rad²/s²]: of the factorisations.
+    """
+    return FiniteElementModes(
+        finite_element_classes(plate, mesh, shift=shift, cutoff_frequency=cutoff_frequency)
+    )

@@ -1,0 +1,1 @@
+"""The plate in Legendre polynomials over its whole length and width, without elements."""

@@ -1,0 +1,58 @@
+"""Steady-state response solved directly at each frequency: the check of the reduction."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.fem.plate_mesh import check_frequencies
+from model.fem.symmetry import CLASSES
+from model.spectral.local_compliance import local_compliance
+from model.spectral.mesh import SpectralMesh
+from model.spectral.modes import deflection_at
+from model.spectral.stiffness import class_stiffness
+from model.structure.actuator import Era
+from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
+from model.structure.footprint import as_footprints
+from model.structure.low_rank import coupled_forces, on_diagonal
+from model.structure.plate import Plate
+from model.structure.point_load import PointLoad, footprints_of
+
+
+def direct_spectral_acceleration(
+    plate: Plate,
+    mesh: SpectralMesh,
+    eras: Sequence[Era],
+    frequencies: FloatArray,
+    points: FloatArray,
+    *,
+    loads: Sequence[PointLoad] = (),
+) -> ComplexArray:
+    """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and driven ERA: (f, eras, p).
+
+    As `direct_acceleration` on finite elements: ((1 + i eta) K - omega² M) u = F in all unknowns,
+    plus the compliance that the polynomials do not resolve.
+    """
+    check_frequencies(plate, mesh, frequencies)
+    attached = footprints_of(eras, loads)
+    x, y = mesh.directions(plate)
+    loss = 1 + 1j * plate.loss_factor
+    omega = 2 * np.pi * np.asarray(frequencies, dtype=float)
+    everywhere = np.concatenate([attached, as_footprints(points)])
+    degrees = (mesh.nx, mesh.ny)
+    receptance = np.empty((len(omega), len(everywhere), len(attached)), dtype=complex)
+    receptance[:] = local_compliance(plate, degrees, everywhere, attached) / loss
+    for parity in CLASSES:
+        K = class_stiffness(plate, x, y, parity)
+        shapes = deflection_at(plate, x, y, parity, everywhere)
+        forces = np.zeros((len(K), len(attached)))
+        forces[: shapes.shape[1]] = shapes[: len(attached)].T
+        for number, each in enumerate(omega):
+            moved = np.linalg.solve(loss * K - each**2 * np.eye(len(K)), forces)
+            receptance[number] += shapes @ moved[: shapes.shape[1]]
+    between, to_points = np.split(receptance, [len(attached)], axis=1)
+    stiffness = attached_stiffness(eras, loads, omega)
+    applied = on_diagonal(drive_forces(eras, omega), rows=len(attached))
+    forces_on_plate = coupled_forces(between, stiffness, applied)
+    displacement = (to_points @ forces_on_plate).transpose(0, 2, 1)
+    return np.asarray(-(omega**2)[:, None, None] * displacement)

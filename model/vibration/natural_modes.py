@@ -1,0 +1,95 @@
+"""Natural frequencies and mode shapes of a rig's plate, for any support and mesh."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from scipy import linalg
+
+from model.arrays import FloatArray
+from model.errors import InputError
+from model.fem.assembly import assemble
+from model.fem.mesh import Mesh
+from model.fem.modal import RIGID_BODY_MODES, modes
+from model.fem.plate_mesh import PlateMesh
+from model.reduction.reduced_plate import ReducedPlate, reduce_plate
+from model.rig.rig import Rig
+from model.spectral.mesh import SpectralMesh
+from model.structure.point_load import PointLoad, footprints_of
+
+
+@dataclass(frozen=True, eq=False)
+class NaturalModes:
+    """Undamped modes: frequencies (n,) [Hz], ascending, and shapes (p, n) [1/sqrt(kg)] at points.
+
+    mesh: that they were solved on.
+    """
+
+    frequencies: FloatArray
+    at: Callable[[FloatArray], FloatArray]
+    mesh: PlateMesh
+
+
+def natural_modes(
+    rig: Rig, count: int, *, support: str, mesh: PlateMesh | None = None
+) -> NaturalModes:
+    """Solve for the lowest modes of a rig, on a mesh, by default its own.
+
+    support: free (elastic modes only), eras or simply-supported, for which polynomials over the
+    plate give way to finite elements. Raises InputError for a count below 1 or above what the mesh
+    has.
+    """
+    chosen = rig.mesh if mesh is None else mesh
+    if isinstance(chosen, SpectralMesh):
+        if support != "simply-supported":
+            return _on_polynomials(rig, count, support=support, mesh=chosen)
+        chosen = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)
+    if not isinstance(chosen, Mesh):
+        raise TypeError(f"mesh must be a Mesh or SpectralMesh, got {type(chosen).__name__}")
+    matrices = assemble(rig.plate, chosen)
+    solved = modes(matrices, count, support=support, eras=rig.eras, loads=rig.masses)
+
+    def shapes_at(points: FloatArray) -> FloatArray:
+        return np.asarray(chosen.interpolation(points) @ solved.mode_shapes)
+
+    return NaturalModes(solved.natural_frequencies, shapes_at, chosen)
+
+
+def _on_polynomials(rig: Rig, count: int, *, support: str, mesh: SpectralMesh) -> NaturalModes:
+    if count < 1:
+        raise InputError(f"modes must be 1 or more, got {count}")
+    attached = list(rig.masses)
+    if support == "eras":
+        attached += [PointLoad.of_era(era) for era in rig.eras]
+    rigid = RIGID_BODY_MODES if support == "free" else 0
+    highest = rig.limits.frequency_max
+    while True:
+        reduced = reduce_plate(rig.plate, mesh, footprints_of(attached), frequency_max=highest)
+        frequencies, coordinates = _modes_with(reduced, attached)
+        found = int((frequencies <= highest).sum()) - rigid
+        if found >= count:
+            break
+        if highest > mesh.highest_frequency(rig.plate):
+            raise InputError(
+                f"modes must be at most {found} with mesh {mesh}, got {count}; take fewer modes or "
+                "higher degrees"
+            )
+        highest *= 1.5
+    chosen = slice(rigid, rigid + count)
+    return NaturalModes(
+        frequencies[chosen], partial(_shapes, reduced, coordinates[:, chosen]), mesh
+    )
+
+
+def _modes_with(reduced: ReducedPlate, attached: list[PointLoad]) -> tuple[FloatArray, FloatArray]:
+    """Frequencies [Hz] (r,) and coordinates (r, r) of the undamped plate with attachments."""
+    phi = reduced.at(footprints_of(attached)).T
+    K = np.diag(reduced.omega**2) + (phi * [load.stiffness for load in attached]) @ phi.T
+    M = np.eye(len(K)) + (phi * [load.mass for load in attached]) @ phi.T
+    squares, coordinates = linalg.eigh(K, M)
+    return np.sqrt(np.maximum(squares, 0)) / (2 * np.pi), coordinates
+
+
+def _shapes(reduced: ReducedPlate, coordinates: FloatArray, points: FloatArray) -> FloatArray:
+    return np.asarray(reduced.at(points) @ coordinates)

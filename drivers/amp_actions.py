@@ -8,17 +8,21 @@ from contextlib import asynccontextmanager
 from dataclasses import asdict
 from typing import Any
 
+from drivers import clock
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.conformance import Check, CheckResult, run_check
-from drivers.errors import CommandError, CommandRefused, DriverError
+from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, Guard, GuardLimits
+from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.operation.keep_alive import keep_alive
+from drivers.operation.silence import stop_and_confirm, stop_outcome
 from drivers.operation.watchdog import check_watchdog, shortest_watchdog
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import AmplifierState, Status
 from drivers.registry import open_backend
 
+_STOP_TIMEOUT = 2.0  # s; for boards that restart when their port is opened
 _RAMP = 0.05  # s; neither start nor end of a drive clicks
 _UNITS = {
     **dict.fromkeys(("frequency_min", "frequency_max", "frequency_step"), "_hz"),
@@ -59,9 +63,24 @@ async def status(url: str) -> dict[str, Any]:
 
 
 async def stop(url: str) -> dict[str, Any]:
-    """Stop all channels."""
-    async with _opened(url) as amplifier:
-        return {"url": url, **_status_rows(await amplifier.stop())}
+    """Stop all channels, and identify the amplifier afterwards."""
+    amplifier = Amplifier(open_backend(url))
+    rows: dict[str, Any] = {}
+    try:
+        try:
+            await amplifier.connect()
+        except LinkError as error:
+            outcome = stop_outcome(
+                None, last_fed_at=None, watchdog=None, now=clock.now(), cause=str(error)
+            )
+        else:
+            outcome = await stop_and_confirm(amplifier, timeout=_STOP_TIMEOUT)
+            with contextlib.suppress(DriverError):
+                await amplifier.identify()
+                rows = _status_rows(await amplifier.status())
+    finally:
+        await amplifier.close()
+    return {"url": url, **outcome.to_json(clock.now()), **rows}
 
 
 async def clear(url: str) -> dict[str, Any]:
@@ -80,7 +99,7 @@ async def drive(
             f"--for must be above 0 and at most {max_duration:g} s, got {duration:g} s"
         )
     ceiling = GuardLimits(FREQUENCY_FLOOR, FREQUENCY_CEILING, LEVEL_CEILING)
-    async with _opened(url) as amplifier:
+    async with _opened(url, take_over=True) as amplifier:
         guard = Guard(ceiling, amplifier.capabilities)
         wanted = DriveCommand(channel=channel, frequency=frequency, level=level)
         asked = CommandSet(
@@ -96,9 +115,10 @@ async def drive(
         watchdog = max(WATCHDOG, amplifier.capabilities.watchdog_min)
         check_watchdog(watchdog, amplifier.round_trip())
         try:
-            await _arm(amplifier, watchdog, url)
-            achieved = await amplifier.apply(safe)
-            await keep_alive(amplifier, duration, interval=watchdog / 5)
+            checked = CheckedAmplifier(amplifier)
+            await _arm(checked, watchdog, url)
+            achieved = await checked.apply(safe)
+            await keep_alive(checked, duration, interval=watchdog / 5)
         finally:
             # An amplifier that cannot be reached is stopped by its watchdog.
             with contextlib.suppress(DriverError):
@@ -125,21 +145,21 @@ async def conform(url: str, checks: tuple[Check, ...]) -> AsyncIterator[CheckRes
 
 
 @asynccontextmanager
-async def _opened(url: str) -> AsyncIterator[Amplifier]:
+async def _opened(url: str, *, take_over: bool = False) -> AsyncIterator[Amplifier]:
     amplifier = Amplifier(open_backend(url))
-    await amplifier.open()
+    await amplifier.open(take_over=take_over)
     try:
         yield amplifier
     finally:
         await amplifier.close()
 
 
-async def _arm(amplifier: Amplifier, watchdog: float, url: str) -> None:
+async def _arm(checked: CheckedAmplifier, watchdog: float, url: str) -> None:
     """Arm with a watchdog [s]; a refusal after a stop or fault names the remedy."""
     try:
-        await amplifier.arm(watchdog)
+        await checked.arm(watchdog)
     except CommandRefused as refused:
-        now = await amplifier.status()
+        now = await checked.amplifier.status()
         if now.state not in (
             AmplifierState.QUICK_STOP_ACTIVE,
             AmplifierState.FAULT_REACTION_ACTIVE,

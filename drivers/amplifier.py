@@ -1,18 +1,24 @@
 """An amplifier: arm, play, stop, whatever its wire."""
 
-from collections.abc import Callable
+import asyncio
+import logging
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from typing import final
 
+from drivers import clock, trace
 from drivers.backend import Backend
-from drivers.errors import CommandError, FrameError, LinkError
-from drivers.guard import SafeCommandSet, SafeEnvelope
-from drivers.link.link import REPLY_TIMEOUT, Link
+from drivers.errors import CommandError, DriverError, FrameError, LinkError
+from drivers.guard import SafeCommandSet, SafeEnvelope, require_safe
+from drivers.guard.recorder import Recorder
+from drivers.link.link import REPLY_TIMEOUT, Link, ReplyT
 from drivers.link.refusals import PROTOCOL_VIOLATION
-from drivers.link.turns import RequestPriority
-from drivers.protocol.definition import PROTOCOL, token_after
+from drivers.protocol.definition import PROTOCOL, random_token, token_after
 from drivers.protocol.messages import (
     Achieved,
     AmplifierEvent,
+    AmplifierState,
     Apply,
     Arm,
     Capabilities,
@@ -29,6 +35,7 @@ from drivers.protocol.messages import (
     Loaded,
     LoadEnvelope,
     Ping,
+    Request,
     Stage,
     Status,
     Stop,
@@ -40,6 +47,13 @@ WATCHDOG = 0.25  # s; five heartbeats of 50 ms
 OPEN_TIMEOUT = 0.5  # s; for boards that restart when their port is opened
 DISARM_RAMP = 0.05  # s; long enough to avoid a click
 STOP_RAMP = 0.005  # s; the shortest without a step
+# s; from the expiry of a watchdog until the outputs are silent, by the protocol
+WATCHDOG_REACTION = 0.005 + PROTOCOL.reaction
+
+_logger = logging.getLogger(__name__)
+
+# Requests that do not feed the watchdog, or silence the amplifier where they arrive.
+_NOT_FEEDING = (Hello, GetCaps, GetStatus, GetFaults, Stop, Disarm)
 
 
 @final
@@ -60,10 +74,19 @@ class Amplifier:
         reply_timeout: float = REPLY_TIMEOUT,
         serial_number: str | None = None,
     ) -> None:
-        self._link = Link(backend, reply_timeout=reply_timeout, on_event=self._notify)
+        self._link = Link(
+            backend,
+            reply_timeout=reply_timeout,
+            on_event=self._notify,
+            silent_from=self._silent_from,
+        )
+        self._recorder = Recorder()
         self._serial_number = serial_number
         self._listeners: list[Callable[[AmplifierEvent], None]] = []
         self._token = 0
+        self._watchdog: float | None = None
+        self._last_fed_at: float | None = None
+        self._feeding_count = 0  # requests in progress that feed the watchdog
         self._identity: Identity | None = None
         self._capabilities: Capabilities | None = None
 
@@ -76,20 +99,42 @@ class Amplifier:
 
     @property
     def capabilities(self) -> Capabilities:
-        """What it can play; known once open."""
+        """Its capabilities; known once open."""
         if self._capabilities is None:
             raise CommandError("capabilities are known only after opening; call open() first")
         return self._capabilities
 
     @property
-    def last_sent(self) -> float:
+    def last_sent_at(self) -> float:
         """Time [s] when the last byte of the last request went out, by the event loop's clock."""
-        return self._link.backend.last_sent
+        return self._link.backend.last_sent_at
+
+    @property
+    def last_fed_at(self) -> float | None:
+        """Latest time [s] at which a request of this host may have fed the watchdog.
+
+        By the event loop's clock; None before the first such request.
+        """
+        return clock.now() if self._feeding_count else self._last_fed_at
+
+    @property
+    def watchdog(self) -> float | None:
+        """The longest watchdog [s] that may be in force since it was armed; None before."""
+        return self._watchdog
 
     @property
     def is_lost(self) -> bool:
-        """Whether every further call raises LinkError."""
+        """Whether every further call but `stop` raises LinkError."""
         return self._link.is_lost
+
+    @property
+    def is_degraded(self) -> bool:
+        """Whether several requests in a row had no reply and it may still play its last set.
+
+        Calls that would play or arm raise LinkDegraded then. Any reply ends it: the caller checks
+        the token of the status.
+        """
+        return self._link.is_degraded
 
     @property
     def bus(self) -> str | None:
@@ -115,35 +160,48 @@ class Amplifier:
         self._listeners.append(on_event)
 
     def next_token(self) -> int:
-        """Return a token for the next command set: 1..65535, then 1 again."""
+        """Return a token for the next command set: from a random one to 65535, then 1."""
         self._token = token_after(self._token)
         return self._token
 
-    async def open(self) -> None:
-        """Open the wire and read identity and capabilities; its state does not change."""
-        await self._link.open()
+    async def open(self, *, take_over: bool = True) -> None:
+        """Open the wire, read identity and capabilities, and leave the amplifier disarmed.
+
+        take_over: whether to disarm it; False for callers that only look. A latched stop or fault
+        stays.
+        """
+        await self.connect()
         try:
-            identity = await self._link.ask(Hello(), expect=Identity, timeout=OPEN_TIMEOUT)
-            if identity.protocol_version != PROTOCOL.version:
-                raise LinkError(
-                    f"protocol version must be {PROTOCOL.version}, got {identity.protocol_version} "
-                    f"from {identity.vendor} {identity.product} {identity.serial_number}; update "
-                    "the older side"
-                )
-            if self._serial_number not in (None, identity.serial_number):
-                raise LinkError(
-                    f"serial number must be {self._serial_number}, got {identity.serial_number}; "
-                    "connect the expected amplifier, or restart with this one"
-                )
-            self._capabilities = await self._link.ask(
-                GetCaps(), expect=Capabilities, timeout=OPEN_TIMEOUT
-            )
-            self._identity = identity
-            self._serial_number = identity.serial_number
-            self._link.allow_for(self.round_trip())
+            await self.identify()
+            if take_over:
+                await self._disarm_inherited()
         except BaseException:
             await self.close()
             raise
+
+    async def connect(self) -> None:
+        """Open the wire and send nothing: enough for a stop."""
+        self._token = random_token()  # a set of an earlier host must not be taken for a new one
+        await self._link.open()
+
+    async def identify(self) -> None:
+        """Read identity and capabilities; raises LinkError for another amplifier or version."""
+        identity = await self._ask(Hello(), expect=Identity, timeout=OPEN_TIMEOUT)
+        if identity.protocol_version != PROTOCOL.version:
+            raise LinkError(
+                f"protocol version must be {PROTOCOL.version}, got {identity.protocol_version} "
+                f"from {identity.vendor} {identity.product} {identity.serial_number}; update "
+                "the older side"
+            )
+        if self._serial_number not in (None, identity.serial_number):
+            raise LinkError(
+                f"serial number must be {self._serial_number}, got {identity.serial_number}; "
+                "connect the expected amplifier, or restart with this one"
+            )
+        self._capabilities = await self._ask(GetCaps(), expect=Capabilities, timeout=OPEN_TIMEOUT)
+        self._identity = identity
+        self._serial_number = identity.serial_number
+        self._link.allow_longest_exchange(self.round_trip())
 
     async def close(self) -> None:
         """Close the wire; disarm before, or the vibration lasts until the watchdog trips."""
@@ -161,38 +219,31 @@ class Amplifier:
                 f"watchdog must be {low:g} to {high:g} s, as the amplifier reports, got "
                 f"{watchdog:g} s"
             )
-        return await self._link.ask(
-            Arm(watchdog=watchdog), expect=Status, priority=RequestPriority.APPLY
-        )
+        self._watchdog = max(watchdog, self._watchdog or 0.0)
+        status = await self._ask(Arm(watchdog=watchdog), expect=Status)
+        self._watchdog = watchdog
+        return status
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> Status:
         """Fall silent along a ramp [s], then switch the high voltage off; overtakes the queue."""
-        return await self._link.ask(
-            Disarm(ramp=self._ramp(ramp)), expect=Status, priority=RequestPriority.SILENCE
-        )
+        return await self._ask(Disarm(ramp=self._ramp(ramp)), expect=Status)
 
     async def stop(self, ramp: float = STOP_RAMP) -> Status:
         """Quick stop along a ramp [s], latched until clear; overtakes the queue.
 
-        Like disarm it is on the wire within 8 ms: a pending request is preempted and raises
+        Like disarm it waits for the exchange on the line for at most PREEMPTION_GRACE, over Modbus
+        RTU until the line is free (docs/measured/wire-benchmarks.md). A pending request raises
         CommandRefused, or is repeated afterwards if it is of the stop class. A request that is not
         on the wire yet is preempted at once.
         """
-        return await self._link.ask(
-            Stop(ramp=self._ramp(ramp)), expect=Status, priority=RequestPriority.STOP
-        )
+        return await self._ask(Stop(ramp=self._ramp(ramp)), expect=Status)
 
     async def load_envelope(self, safe: SafeEnvelope) -> None:
         """Load an envelope into its slot, for later sets; at any time, armed or not.
 
         Raises CommandRefused if the amplifier does not support envelopes.
         """
-        if type(safe) is not SafeEnvelope:
-            raise TypeError(
-                "envelope must be a SafeEnvelope made by Guard.check_envelope, got "
-                f"{type(safe).__name__}"
-            )
-        loaded = await self._link.ask(LoadEnvelope(safe), expect=Loaded)
+        loaded = await self._ask(LoadEnvelope(safe), expect=Loaded)
         if (loaded.slot, loaded.knots) != (safe.slot, len(safe.knots)):
             raise FrameError(
                 f"the amplifier must load {len(safe.knots)} knots into slot {safe.slot}, got "
@@ -204,8 +255,7 @@ class Amplifier:
 
         Raises CommandRefused if a newer set, a stop or a disarm came first.
         """
-        request = Stage(_safe(safe))
-        achieved = await self._link.ask(request, expect=Achieved, priority=RequestPriority.APPLY)
+        achieved = await self._ask(Stage(safe), expect=Achieved)
         return _of_token(achieved, safe.token)
 
     async def commit(self, token: int) -> Achieved:
@@ -213,9 +263,7 @@ class Amplifier:
 
         Raises CommandRefused if a newer set, a stop or a disarm came first.
         """
-        achieved = await self._link.ask(
-            Commit(token=token), expect=Achieved, priority=RequestPriority.APPLY
-        )
+        achieved = await self._ask(Commit(token=token), expect=Achieved)
         return _of_token(achieved, token)
 
     async def apply(self, safe: SafeCommandSet) -> Achieved:
@@ -224,32 +272,30 @@ class Amplifier:
         A silent set overtakes the queue as a stop does. Raises CommandRefused if a newer set or a
         stop superseded it.
         """
-        request = Apply(_safe(safe))
-        priority = RequestPriority.SILENCE if safe.is_silent else RequestPriority.APPLY
-        return _of_token(
-            await self._link.ask(request, expect=Achieved, priority=priority), safe.token
-        )
+        return _of_token(await self._ask(Apply(safe), expect=Achieved), safe.token)
 
     async def status(self) -> Status:
         """Read the status; does not feed the watchdog."""
-        return await self._link.ask(GetStatus(), expect=Status)
+        return await self._ask(GetStatus(), expect=Status)
 
     async def faults(self) -> tuple[FaultRecord, ...]:
         """Read latched and past faults, newest first."""
-        return (await self._link.ask(GetFaults(), expect=FaultList)).faults
+        return (await self._ask(GetFaults(), expect=FaultList)).faults
 
     async def clear(self) -> Status:
         """Acknowledge a stop, or faults whose cause is gone; the amplifier stays disarmed.
 
         Raises CommandRefused if another stop came first: that one is not acknowledged.
         """
-        return await self._link.ask(Clear(), expect=Status, priority=RequestPriority.CLEAR)
+        return await self._ask(Clear(), expect=Status)
 
     async def heartbeat(self) -> Status:
-        """Feed the watchdog; called by the control loop itself, after it has run."""
-        status = await self._link.ask(Ping(), expect=Status)
-        self._link.heartbeat_acknowledged()
-        return status
+        """Feed the watchdog; called by the control loop itself, after it has run.
+
+        On a degraded link it only reads the status, so that the watchdog expires without replies.
+        """
+        request = GetStatus() if self.is_degraded else Ping()
+        return await self._ask(request, expect=Status)
 
     def abort_unsent(self) -> None:
         """Do not send unsent requests, and retry none.
@@ -264,11 +310,72 @@ class Amplifier:
         There are no replies: read the status of each. Raises CommandError if the bus does not
         support broadcasts.
         """
-        await self._link.broadcast(Commit(token=token), RequestPriority.APPLY)
+        self._recorder.sending(Commit(token=token))
+        with self._feeding():
+            await self._link.broadcast(Commit(token=token))
 
     async def stop_on_bus(self, ramp: float = STOP_RAMP) -> None:
         """Stop every amplifier of the bus, before all queued requests; there are no replies."""
-        await self._link.backend.broadcast(Stop(ramp=self._ramp(ramp)))
+        request = Stop(ramp=self._ramp(ramp))
+        with _errors_logged_for_stop(request):
+            self._recorder.sending(request)
+        await self._link.broadcast(request)
+
+    async def _disarm_inherited(self) -> None:
+        """Disarm an amplifier that an earlier host may have left playing."""
+        status = await self.disarm()
+        if status.state is AmplifierState.OPERATION_ENABLED:
+            raise LinkError(
+                f"amplifier must be disarmed by Disarm, got {status.state.name}; switch it off"
+            )
+        if status.state is AmplifierState.SWITCHED_ON:
+            await asyncio.sleep(DISARM_RAMP)
+
+    async def _ask(
+        self,
+        request: Request,
+        *,
+        expect: type[ReplyT],
+        timeout: float | None = None,
+    ) -> ReplyT:
+        require_safe(request)
+        feeding = nullcontext() if isinstance(request, _NOT_FEEDING) else self._feeding()
+        with _errors_logged_for_stop(request):
+            self._recorder.sending(request)
+        begin = clock.now()
+        outcome: object = "cancelled"
+        try:
+            with feeding:
+                reply = await self._link.ask(request, expect=expect, timeout=timeout)
+            outcome = reply
+        except DriverError as error:
+            outcome = error
+            raise
+        finally:
+            with _errors_logged_for_stop(request):
+                trace.request(request, outcome, clock.now() - begin)
+        with _errors_logged_for_stop(request):
+            self._recorder.replied(request, reply)
+        return reply
+
+    @contextmanager
+    def _feeding(self) -> Iterator[None]:
+        """Note that until the end of the context a request may feed the watchdog."""
+        if self.is_lost or self.is_degraded:  # nothing is sent that feeds it and may play
+            yield
+            return
+        self._feeding_count += 1
+        try:
+            yield
+        finally:
+            self._feeding_count -= 1
+            self._last_fed_at = clock.now()
+
+    def _silent_from(self) -> float:
+        """Return the time [s] by which its watchdog must have expired, if nothing feeds it."""
+        if self._watchdog is None or self.last_fed_at is None:
+            return -math.inf
+        return self.last_fed_at + self._watchdog + WATCHDOG_REACTION
 
     def _notify(self, event: AmplifierEvent) -> None:
         for listener in self._listeners:
@@ -282,12 +389,18 @@ class Amplifier:
         return min(ramp, max_ramp) if ramp > 0 else 0.0
 
 
-def _safe(safe: SafeCommandSet) -> SafeCommandSet:
-    if type(safe) is not SafeCommandSet:
-        raise TypeError(
-            f"set must be a SafeCommandSet made by Guard.check, got {type(safe).__name__}"
-        )
-    return safe
+@contextmanager
+def _errors_logged_for_stop(request: Request) -> Iterator[None]:
+    """Log errors in the block instead of raising them if the request is a Stop or Disarm.
+
+    So no bookkeeping can prevent it.
+    """
+    try:
+        yield
+    except Exception:
+        if not isinstance(request, Stop | Disarm):
+            raise
+        _logger.exception("amplifier: %s is not recorded", type(request).__name__)
 
 
 def _of_token(achieved: Achieved, token: int) -> Achieved:

@@ -1,13 +1,13 @@
 """The backend interface: carry one request to an amplifier and return its reply.
 
 A backend is registered as an entry point of `era_haptics.backends` under the scheme of its URLs and
-checked by `drivers.conformance`. The first five members are abstract; the defaults of the others
-suit a wire with one amplifier that sends nothing unsolicited.
+checked by `drivers.conformance`. What it must have is `open`, `close`, `exchange` and
+`last_sent_at`; the defaults of the others suit a wire with one amplifier that sends nothing
+unsolicited.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 
 from drivers.errors import CommandError
 from drivers.protocol.messages import AmplifierEvent, Broadcast, Reply, Request
@@ -37,6 +37,9 @@ class Backend(ABC):
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send one request and wait for its reply; late replies to others are discarded.
 
+        Called for one request at a time on a line (see `drivers.line`). A Stop is sent as long as
+        the wire is open, even if the amplifier counts as lost.
+
         timeout [s]: of the whole exchange, extended if the wire is slower. Raises LinkTimeout,
         LinkError; TypeError for a set or envelope that has not passed a guard (`require_safe`). A
         Nak is returned, not raised. Cancelling leaves the wire usable.
@@ -44,8 +47,11 @@ class Backend(ABC):
 
     @property
     @abstractmethod
-    def last_sent(self) -> float:
-        """Time [s] when the last byte of the last request went out, by the event loop's clock."""
+    def last_sent_at(self) -> float:
+        """Time [s] when the last byte of the last request went out, by the event loop's clock.
+
+        Until it has advanced, a request counts as unsent and is cancelled at once for a stop.
+        """
 
     @property
     def counters(self) -> WireCounters:
@@ -67,27 +73,11 @@ class Backend(ABC):
         """Identifier of what one broadcast reaches; None without broadcasts."""
         return None
 
-    @property
-    def takes_turns(self) -> bool:
-        """Whether amplifiers on its bus are addressed one after the other."""
-        return False
-
-    @property
-    def is_unsent(self) -> bool:
-        """Whether the request being exchanged still waits for the wire.
-
-        Nothing is sent if it is cancelled then.
-        """
-        return False
-
-    def silencing(self, request: Request) -> AbstractContextManager[None]:
-        """A context that reserves a shared wire for a pending stop-class request."""
-        return nullcontext()
-
     async def broadcast(self, request: Broadcast) -> None:
         """Send a commit or a stop to every amplifier of the bus; there are no replies.
 
-        Raises LinkError, and CommandError if there is no bus.
+        A stop may be broadcast during an exchange. Raises LinkError, also for a stop that the wire
+        cannot send during an exchange, and CommandError if there is no bus.
         """
         raise CommandError(
             f"this wire does not support broadcasts, got {type(request).__name__}; send it to each "

@@ -17,6 +17,7 @@ from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.errors import CommandError
 from drivers.guard import Guard, GuardLimits
+from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.operation.keep_alive import keep_alive
 from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import Achieved, Capabilities, FaultRecord, Identity, Status
@@ -44,6 +45,7 @@ class BlockingAmplifier:
         try:
             self._amplifier = Amplifier(open_backend(self._url))
             self._wait(self._amplifier.open())
+            self._checked = CheckedAmplifier(self._amplifier)
             self._guard = Guard(self._limits, self._amplifier.capabilities)
         except BaseException:
             self._end()
@@ -72,12 +74,12 @@ class BlockingAmplifier:
 
     @property
     def capabilities(self) -> Capabilities:
-        """What it can play."""
+        """Frequency range, steps and channels."""
         return self._amplifier.capabilities
 
     def arm(self, watchdog: float = WATCHDOG) -> Status:
         """Switch the high voltage on, level zero; watchdog [s]."""
-        return self._wait(self._amplifier.arm(watchdog))
+        return self._wait(self._checked.arm(watchdog))
 
     def disarm(self) -> Status:
         """Fall silent, then switch the high voltage off."""
@@ -118,17 +120,17 @@ class BlockingAmplifier:
             ramp=ramp,
             valid_for=valid_for,
         )
-        return self._wait(self._amplifier.apply(self._guard.check(command_set)))
+        return self._wait(self._checked.apply(self._guard.check(command_set)))
 
     def play(
         self, commands: Sequence[DriveCommand], *, duration: float, ramp: float = _RAMP
     ) -> Achieved:
         """Play these commands for a time [s], feed the watchdog and wait for the end.
 
-        Raises CommandRefused if the amplifier stops by itself.
+        Raises CommandRefused if the amplifier stops by itself, or contradicts what was asked.
         """
         achieved = self.apply(commands, ramp=ramp, valid_for=duration)
-        self._wait(keep_alive(self._amplifier, duration, interval=HEARTBEAT))
+        self._wait(keep_alive(self._checked, duration, interval=HEARTBEAT))
         return achieved
 
     def _wait(self, work: Coroutine[Any, Any, _T]) -> _T:

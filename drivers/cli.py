@@ -4,7 +4,9 @@ import json
 import shlex
 import sys
 from collections.abc import Coroutine
-from typing import TYPE_CHECKING, Annotated, Any
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -12,6 +14,8 @@ from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
 
 if TYPE_CHECKING:
     from drivers.conformance import Check, CheckResult
+
+_T = TypeVar("_T")
 
 EXIT_STATUS: dict[type[BaseException], int] = {
     CommandError: 2,
@@ -56,6 +60,16 @@ Url = Annotated[
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Trace = Annotated[
+    Path | None,
+    typer.Option(
+        "--trace",
+        metavar="FILE",
+        dir_okay=False,
+        help="Append every frame and request to FILE, with time and meaning.",
+        show_default=False,
+    ),
+]
 
 
 @amp.command()
@@ -75,17 +89,16 @@ def discover(
             "take for a command; then listen to their bus at 500 kbit/s.",
         ),
     ] = False,
+    trace: Trace = None,
     json_: Json = False,
 ) -> None:
     """List serial ports, CAN interfaces and the amplifiers on them."""
-    import asyncio
-
     from drivers.discovery.search import ask, candidates, with_slcan
 
     places = [with_slcan(place) if slcan else place for place in candidates()]
     asked = [place for place in places if place.remedy is None and not place.is_slcan]
     usable = [one for place in asked for one in place.urls]
-    found = asyncio.run(ask([*(url or []), *(usable if probe else [])]))
+    found = _run(ask([*(url or []), *(usable if probe else [])]), trace)
     who = {one.url: one.identity for one in found if one.identity is not None}
     unusable = {one.url: one.problem for one in found if not one.was_asked}
     rows = [
@@ -133,19 +146,19 @@ def discover(
 
 
 @amp.command()
-def identify(url: Url, json_: Json = False) -> None:
+def identify(url: Url, trace: Trace = None, json_: Json = False) -> None:
     """Show identity, capabilities and wire times."""
     from drivers import amp_actions
 
-    _show(_run(amp_actions.identify(url)), as_json=json_)
+    _show(_run(amp_actions.identify(url), trace), as_json=json_)
 
 
 @amp.command()
-def status(url: Url, json_: Json = False) -> None:
+def status(url: Url, trace: Trace = None, json_: Json = False) -> None:
     """Show state, levels and faults."""
     from drivers import amp_actions
 
-    _show(_run(amp_actions.status(url)), as_json=json_)
+    _show(_run(amp_actions.status(url), trace), as_json=json_)
 
 
 @amp.command()
@@ -155,6 +168,7 @@ def drive(
     frequency: Annotated[float, typer.Option(help="Mechanical frequency [Hz].")] = 110.0,
     level: Annotated[float, typer.Option(help="Level, 0 to 1 of full stroke.")] = 0.2,
     duration: Annotated[float, typer.Option("--for", help="Duration [s].")] = 0.5,
+    trace: Trace = None,
     json_: Json = False,
 ) -> None:
     """Drive one channel, then disarm."""
@@ -163,25 +177,32 @@ def drive(
     driven = amp_actions.drive(
         url, channel=channel, frequency=frequency, level=level, duration=duration
     )
-    _show(_run(driven), as_json=json_)
+    _show(_run(driven, trace), as_json=json_)
 
 
 @amp.command()
-def stop(url: Url, json_: Json = False) -> None:
-    """Stop all channels at once. Latched until cleared."""
-    from drivers import amp_actions
+def stop(url: Url, trace: Trace = None, json_: Json = False) -> None:
+    """Stop all channels at once. Latched until cleared.
 
-    _show(_run(amp_actions.stop(url)), as_json=json_)
+    Exit status 0 only if the amplifier confirms that it is silent, else 3.
+    """
+    from drivers import amp_actions
+    from drivers.operation.silence import Silence
+
+    result = _run(amp_actions.stop(url), trace, needs_trace=False)
+    _show(result, as_json=json_)
+    if result["silence"] != Silence.CONFIRMED:
+        raise typer.Exit(EXIT_STATUS[LinkError])
     if not json_:
         print(f"Next: era amp clear {shlex.quote(url)}")
 
 
 @amp.command()
-def clear(url: Url, json_: Json = False) -> None:
+def clear(url: Url, trace: Trace = None, json_: Json = False) -> None:
     """Acknowledge a stop or fault. Leaves the amplifier disarmed."""
     from drivers import amp_actions
 
-    _show(_run(amp_actions.clear(url)), as_json=json_)
+    _show(_run(amp_actions.clear(url), trace), as_json=json_)
 
 
 @amp.command()
@@ -190,31 +211,30 @@ def conformance(
     write: Annotated[
         bool, typer.Option("--write", help="Drive the outputs too, without confirmation.")
     ] = False,
+    trace: Trace = None,
     json_: Json = False,
 ) -> None:
     """Check that an amplifier fulfils the contract. Reads only, unless --write is given."""
-    import asyncio
-
     from drivers.conformance import CHECKS, LEVEL
 
     reading = tuple(check for check in CHECKS if not check.drives)
     driving = tuple(check for check in CHECKS if check.drives)
-    outcomes = asyncio.run(_conform(url, reading, quiet=json_))
+    outcomes = _run(_conform(url, reading, quiet=json_), trace)
     if not write and not json_ and sys.stdin.isatty():
         write = typer.confirm(
             f"{len(driving)} more checks arm the amplifier and drive its channels at {LEVEL:.0%} "
             "of full stroke. Continue?"
         )
     if write and all(outcome.problem is None for outcome in outcomes):
-        outcomes += asyncio.run(_conform(url, driving, quiet=json_))
+        outcomes += _run(_conform(url, driving, quiet=json_), trace)
     failed = [outcome for outcome in outcomes if outcome.problem is not None]
     skipped = len(CHECKS) - len(outcomes)
     if json_:
         rows = [
-            {"check": one.check.name, "proves": one.check.proves, "problem": one.problem}
+            {"check": one.check.name, "requirement": one.check.requirement, "problem": one.problem}
             for one in outcomes
         ]
-        print(json.dumps({"url": url, "kept": not failed, "left_out": skipped, "checks": rows}))
+        print(json.dumps({"url": url, "passed": not failed, "skipped": skipped, "checks": rows}))
     else:
         print(f"{len(outcomes) - len(failed)} passed, {len(failed)} failed, {skipped} skipped")
         if skipped:
@@ -231,16 +251,27 @@ async def _conform(url: str, checks: "tuple[Check, ...]", *, quiet: bool) -> "li
         outcomes.append(outcome)
         if not quiet:
             mark = "passed" if outcome.problem is None else "FAILED"
-            print(f"{mark}  It {outcome.check.proves}.")
+            print(f"{mark}  It {outcome.check.requirement}.")
             if outcome.problem is not None:
                 print(f"        {outcome.problem}")
     return outcomes
 
 
-def _run(result: Coroutine[Any, Any, dict[str, Any]]) -> dict[str, Any]:
+def _run(work: Coroutine[Any, Any, _T], trace: Path | None, *, needs_trace: bool = True) -> _T:
     import asyncio
 
-    return asyncio.run(result)
+    from drivers.trace import tracing
+
+    with ExitStack() as stack:
+        try:
+            if trace is not None:
+                stack.enter_context(tracing(trace))
+        except CommandError as error:
+            if needs_trace:
+                work.close()
+                raise
+            print(f"era: warning: {error}; not traced", file=sys.stderr)
+        return asyncio.run(work)
 
 
 def _show(result: dict[str, Any], *, as_json: bool) -> None:

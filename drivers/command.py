@@ -13,11 +13,12 @@ one step after the last knot. So the output never jumps.
 import cmath
 import math
 from dataclasses import dataclass
+from typing import Self
 
 
 @dataclass(frozen=True, slots=True)
 class DriveCommand:
-    """What one channel plays, in electrical terms.
+    """Tone of one channel, in electrical terms.
 
     frequency: mechanical frequency [Hz]; level: 0..1 of full stroke; phase [degrees] of
     level * sin(2 pi f t + phase), with t = 0 at the commit for every channel of a set, unless
@@ -39,7 +40,7 @@ class DriveCommand:
     @property
     def phasor(self) -> complex:
         """Complex amplitude in full strokes, level exp(i phase)."""
-        return cmath.rect(self.level, math.radians(self.phase))
+        return Knot(self.level, self.phase).phasor
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +49,12 @@ class Knot:
 
     level: float
     phase: float
+
+    @classmethod
+    def from_phasor(cls, phasor: complex) -> Self:
+        """Make the knot of a complex amplitude in full strokes."""
+        degrees = math.degrees(cmath.phase(phasor))
+        return cls(abs(phasor), 180.0 if degrees == -180.0 else degrees)
 
     @property
     def phasor(self) -> complex:
@@ -59,11 +66,12 @@ class Knot:
 class Envelope:
     """A transition of a channel, stored by the amplifier in a slot, 1..63.
 
-    step [s] between knots; no knots empty the slot. An onset begins at the commit: at the present
-    amplitude if the channel plays this frequency and keep_phase is set, else at zero. An ending
-    leads to silence: when the next set silences the channel, or at the end of valid_for. Stop,
-    disarm and faults skip endings. Staging a set copies its envelopes: a slot may be reloaded at
-    any time.
+    step [s] between knots; no knots empty the slot. The final amplitude is not a knot: that of the
+    command, or zero for an ending, follows one step after the last knot. An onset begins at the
+    commit: at the present amplitude if the channel plays this frequency and keep_phase is set, else
+    at zero. An ending leads to silence: when the next set silences the channel, or at the end of
+    valid_for. Stop, disarm and faults skip endings. Staging a set copies its envelopes: a slot may
+    be reloaded at any time.
     """
 
     slot: int

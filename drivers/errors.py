@@ -3,8 +3,10 @@
     DriverError
     ├── LinkError (ConnectionError)       the wire or the amplifier on it cannot be reached
     │   └── LinkTimeout (TimeoutError)    no reply in time
+    │       └── LinkDegraded              no reply to several requests; the link may recover
     ├── FrameError                        bytes that are not a valid message; the amplifier's fault
     ├── CommandRefused                    refused by the amplifier or the guard
+    │   └── Preempted                     not sent or not repeated: another request came first
     └── CommandError (ValueError)         an invalid request; the caller's fault
 
 Backends translate exceptions of their libraries into these and keep the cause.
@@ -25,6 +27,13 @@ class LinkTimeout(LinkError, TimeoutError):
     """The amplifier did not reply in time."""
 
 
+class LinkDegraded(LinkTimeout):
+    """No reply to several requests in a row; the amplifier may still play its last set.
+
+    It is lost once its watchdog must have expired, and usable again as soon as it replies.
+    """
+
+
 class FrameError(DriverError):
     """Bytes that are not a valid message."""
 
@@ -42,6 +51,10 @@ class CommandRefused(DriverError):
         super().__init__(reason)
         self.channel = channel
         self.until = until
+
+
+class Preempted(CommandRefused):
+    """A request that was preempted or superseded by another one."""
 
 
 class CommandError(DriverError, ValueError):

@@ -9,14 +9,14 @@ from collections.abc import Mapping, Sequence
 from drivers.amplifier import WATCHDOG
 from drivers.backend import Backend
 from drivers.errors import CommandError
-from drivers.guard.limits import FREQUENCY_CEILING, FREQUENCY_FLOOR, GuardLimits
+from drivers.guard.limits import FREQUENCY_CEILING, FREQUENCY_FLOOR
 from drivers.operation.watchdog import (
-    HEARTBEAT,
-    MAX_MISSED_HEARTBEATS,
+    MAX_LOSS_DETECTION_TIME,
     check_watchdog,
     loss_detection_time,
 )
 from drivers.registry import open_backend
+from registry.limits import GuardLimits
 
 # s; skew of simultaneous commits on two links: USB adapters send in frames of 1 ms, networks and
 # operating systems are no better. See docs/reference/several-amplifiers.md.
@@ -24,12 +24,12 @@ COMMIT_SKEW = 0.001
 
 
 def check_links(
-    urls: Mapping[str, str], *, channels: Mapping[str, int], limits: Mapping[str, float]
+    urls: Mapping[str, str], *, channels: Mapping[str, int], limits: GuardLimits
 ) -> tuple[dict[str, str], list[str]]:
     """Return errors by amplifier name, and warnings.
 
-    urls by name; channels: number of wired channels by name, missing if none; limits: those of
-    the rig, by the names of `GuardLimits`.
+    urls by name; channels: number of wired channels by name, missing if none; limits: of the
+    rig.
     """
     errors: dict[str, str] = {}
     backends: dict[str, Backend] = {}
@@ -53,8 +53,8 @@ def check_links(
         if not urls[name].startswith("sim://")
     }
     warnings = [
-        *_ceiling_warnings(GuardLimits(**limits)),
-        *_skew_warnings(sorted(links), limits["frequency_max"]),
+        *_ceiling_warnings(limits),
+        *_skew_warnings(sorted(links), limits.frequency_max),
         *_late_loss_warnings(used, channels),
     ]
     return errors, warnings
@@ -86,11 +86,12 @@ def _ceiling_warnings(limits: GuardLimits) -> list[str]:
 
 
 def _late_loss_warnings(backends: Mapping[str, Backend], channels: Mapping[str, int]) -> list[str]:
-    """Warn of lines on which a loss may be detected later than after three heartbeats."""
+    """Warn of lines on which a loss may be detected later than MAX_LOSS_DETECTION_TIME."""
     lines: dict[str, list[str]] = {}
     for name, backend in backends.items():
-        lines.setdefault((backend.takes_turns and backend.bus) or name, []).append(name)
-    limit = MAX_MISSED_HEARTBEATS * HEARTBEAT
+        shared = None if backend.wire_times.is_multi_master else backend.bus
+        lines.setdefault(shared or name, []).append(name)
+    limit = MAX_LOSS_DETECTION_TIME
     warnings = []
     for names in lines.values():
         took = loss_detection_time(
@@ -99,9 +100,9 @@ def _late_loss_warnings(backends: Mapping[str, Backend], channels: Mapping[str, 
         if took > limit:
             warnings.append(
                 f"{', '.join(names)}: loss of the amplifiers may be detected only after "
-                f"{took * 1e3:.0f} ms, later than {MAX_MISSED_HEARTBEATS} heartbeats, "
-                f"{limit * 1e3:.0f} ms; the watchdog stops them regardless: use a faster line, or "
-                "one line per amplifier, if that is too late"
+                f"{took * 1e3:.0f} ms, later than {limit * 1e3:.0f} ms; the watchdog "
+                "stops them regardless: use a faster line, or one line per amplifier, if that is "
+                "too late"
             )
     return warnings
 

@@ -8,8 +8,8 @@ class WireCounters:
     """Frames counted by a backend since its wire was opened.
 
     invalid_frames: frames with a wrong checksum, length, form or version, and events that cannot be
-    decoded; unexpected_frames: valid frames that no
-    request was waiting for, such as late replies; events: unsolicited messages.
+    decoded; unexpected_frames: valid frames that no request was waiting for, such as late replies;
+    events: unsolicited messages.
     """
 
     frames_out: int = 0
@@ -25,12 +25,10 @@ class LinkStatistics(WireCounters):
 
     Inherited counters restart when the link is opened, the following count since its construction.
     retries: repeated requests; timeouts: requests without a reply in time; refusals: Naks.
-    last_round_trip [s]; heartbeat_age [s] since the last acknowledged heartbeat: None before the
-    first.
+    last_round_trip [s].
     """
 
     retries: int = 0
     timeouts: int = 0
     refusals: int = 0
     last_round_trip: float | None = None
-    heartbeat_age: float | None = None

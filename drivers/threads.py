@@ -1,7 +1,7 @@
 """Blocking work in daemon threads, which delay neither a cancellation nor the end of the program.
 
-A program waits for the threads of asyncio's own pool before it ends, which may take for ever if a
-connection or a disk hangs.
+A program waits for the threads of asyncio's own pool before it ends, which may take indefinitely if
+a connection or a disk hangs.
 """
 
 import asyncio

@@ -16,8 +16,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from controller.api.async_client import AsyncClient as AsyncClient
     from controller.api.client import Client as Client
+    from controller.api.client_protocol import LeaseLost as LeaseLost
     from controller.api.client_protocol import Notification as Notification
     from controller.api.client_protocol import Unreachable as Unreachable
+    from controller.api.jsonrpc import NotSilent as NotSilent
     from controller.api.jsonrpc import RpcError as RpcError
     from drivers.blocking import BlockingAmplifier as BlockingAmplifier
     from drivers.command import DriveCommand as DriveCommand
@@ -52,8 +54,8 @@ if TYPE_CHECKING:
 _NAMES = {
     "controller.api.async_client": "AsyncClient",
     "controller.api.client": "Client",
-    "controller.api.client_protocol": "Notification Unreachable",
-    "controller.api.jsonrpc": "RpcError",
+    "controller.api.client_protocol": "LeaseLost Notification Unreachable",
+    "controller.api.jsonrpc": "NotSilent RpcError",
     "drivers.blocking": "BlockingAmplifier",
     "drivers.command": "DriveCommand",
     "drivers.errors": "CommandRefused DriverError LinkError",

@@ -1,6 +1,5 @@
 """Amplifiers of a rig for scripts: opened by the rig's URLs and limits."""
 
-from controller.group.guards import guard_limits
 from controller.loop.routing import route
 from drivers.blocking import BlockingAmplifier
 from drivers.command import DriveCommand
@@ -28,7 +27,7 @@ def open_amplifier(
         raise InputError(f"name must be an amplifier of the rig, {', '.join(known)}, got {name!r}")
     if url is not None and not isinstance(url, str):
         raise InputError(f"url must be text such as 'sim://', got {shown(url)}")
-    return BlockingAmplifier(url or rig.amplifiers[chosen[0]], limits=guard_limits(rig.limits))
+    return BlockingAmplifier(url or rig.amplifiers[chosen[0]], limits=rig.limits)
 
 
 def commands_for(rig: Rig, drive: Pattern | Drives) -> dict[str, tuple[DriveCommand, ...]]:

@@ -47,7 +47,7 @@ class Drive:
 _UNITS_OF_A_TONE = {"frequency": "hertz", "amplitude": "metres", "phase": "radians"}
 
 Drives: TypeAlias = Mapping[str, "float | Drive | Tone"]
-"""By name of the ERA: a frequency [Hz] at full stroke, a `Drive`, or a `Tone` [Hz, m, rad]."""
+"""By ERA name: a frequency [Hz] at full stroke, a `Drive`, or a `Tone` [Hz, m, rad]."""
 
 
 def excitation_of(drive: Pattern | Drives, rig: Rig) -> Excitation:

@@ -10,13 +10,12 @@ from era_haptics.drive import Drives, excitation_of
 from era_haptics.places import Places, as_points
 from model.arguments import expect, expect_number, is_whole, shown
 from model.errors import InputError
-from model.fem.assembly import era_positions
 from model.finger.load import FingerLoad
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import ReducedPlate, reduce_free_plate
 from model.reduction.supported_modes import SupportedModes, supported_modes
 from model.rig.rig import Rig
-from model.structure.point_load import load_positions
+from model.structure.point_load import footprints_of
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation
@@ -48,7 +47,7 @@ class SolvedPlate:
         """
         rig = self.rig
         return supported_modes(
-            self._reduced, rig.eras, loads=rig.loads, frequency_max=rig.limits.frequency_max
+            self._reduced, rig.eras, loads=rig.masses, frequency_max=rig.limits.frequency_max
         )
 
     def map(self, drive: Pattern | Drives, *, raster: tuple[int, int] | None = None) -> PlateMap:
@@ -111,7 +110,7 @@ class SolvedPlate:
 
     @cached_property
     def _reduced(self) -> ReducedPlate:
-        attached = np.vstack([era_positions(self.rig.eras), load_positions(self.rig.loads)])
+        attached = footprints_of(self.rig.eras, self.rig.masses)
         return reduce_free_plate(self._free, attached)
 
 

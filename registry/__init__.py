@@ -1,1 +1,1 @@
-"""Look-up by name: plug-ins of installed packages, and suggestions for mistyped names."""
+"""Shared by drivers and model: plug-ins by name, suggestions for mistyped names, and limits."""

@@ -42,7 +42,7 @@ class SimulatedBackend(Backend):
         self._open: contextlib.AsyncExitStack | None = None
         self._bench: Bench | None = None
         self._name = ""
-        self._last_sent = 0.0
+        self._last_sent_at = 0.0
         self._counters = WireCounters()
         self._on_event: Callable[[AmplifierEvent], None] = lambda event: None
 
@@ -58,9 +58,9 @@ class SimulatedBackend(Backend):
         self._on_event = on_event
 
     @property
-    def last_sent(self) -> float:
+    def last_sent_at(self) -> float:
         """Time of the last request, by time.monotonic() [s]."""
-        return self._last_sent
+        return self._last_sent_at
 
     async def open(self) -> None:
         """Load the rig, its plate at rest; raises CommandError."""
@@ -95,10 +95,10 @@ class SimulatedBackend(Backend):
         require_safe(request)
         if self._bench is None:
             raise LinkError(f"{self._url} is not open")
-        self._last_sent = clock.now()
+        self._last_sent_at = clock.now()
         self._counters.frames_out += 1
         self._counters.frames_in += 1
-        return self._bench.exchange(self._name, request, now=self._last_sent)
+        return self._bench.exchange(self._name, request, now=self._last_sent_at)
 
     def _forward(self, event: AmplifierEvent, moment: float) -> None:
         self._counters.events += 1

@@ -11,6 +11,7 @@ import typer
 
 from model.counting import counted
 from model.errors import InputError
+from model.files.regular_file import regular_file
 
 if TYPE_CHECKING:
     from sim.witness.endpoint import WireEndpoint
@@ -139,7 +140,9 @@ class _Capture:
         self._path = path
         self._problem: OSError | None = None
         try:
-            self._file = path.open("w", encoding="utf-8")
+            self._file = open(  # noqa: SIM115  closed in close
+                path, "w", encoding="utf-8", opener=regular_file
+            )
         except OSError as problem:
             raise InputError(f"--record {path}: cannot be written: {problem.strerror}") from problem
 

@@ -1,50 +1,83 @@
 """What all tests share: one thread for linear algebra, the paper's plate, the order of files."""
 
+import fcntl
 import os
+import signal
+from functools import lru_cache
 from pathlib import Path
 
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"  # before numpy loads: two threads are slower here, and erratic
 
-import pytest  # noqa: E402
+# Programs under test are interrupted, also where a shell has started the suite in the background.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
+import pytest  # noqa: E402
+from hypothesis import settings  # noqa: E402
+
+import preloaded  # noqa: E402
+from model.reduction import finite_element_modes  # noqa: E402
+from model.reduction.class_modes import finite_element_classes  # noqa: E402
+from model.rig.file import example_rig_path, load_rig  # noqa: E402
 from model.rig.rig import Rig  # noqa: E402
+from model.table.table_cache import cached_table  # noqa: E402
 from paper_plate import make_paper_rig  # noqa: E402
 
 SLOWEST = (
     "test_tutorials.py",
     "test_dashboard.py",
+    "test_touch_to_finger.py",
     "test_demo.py",
-    "test_soak.py",
-    "test_amplifier_contract.py",
-    "test_table_commands.py",
-    "test_daemon_over_a_wire.py",
-    "test_daemon_process.py",
-    "test_table_build.py",
-    "test_nothing_is_lost.py",
     "test_how_to_pages.py",
-    "test_rig_check_over_wires.py",
-    "test_diagnosis.py",
-    "test_calibration.py",
-    "test_docs_site.py",
-    "test_study_cli.py",
-    "test_dashboard_losses.py",
-    "test_gateway_api.py",
-    "test_wheel.py",
-    "test_calibrate_on_the_bench.py",
-    "test_gateway_process.py",
-    "test_live_demo.py",
-    "test_convergence.py",
+    "test_daemon_faults_process.py",
+    "test_examples.py",
+    "test_latency_measured.py",
+    "test_touch_to_finger_two_wires.py",
+    "test_daemon_faults_killed.py",
+    "test_table_commands.py",
+    "test_nothing_is_lost.py",
     "test_errors.py",
+    "test_rig_check_over_wires.py",
+    "test_witness_planted_bugs.py",
+    "test_convergence.py",
+    "test_wheel.py",
+    "test_study_cluster.py",
+    "test_soak.py",
+    "test_link_faults.py",
+    "test_diagnosis.py",
+    "test_stops.py",
+    "test_studies.py",
+    "test_calibration.py",
+    "test_daemon_over_a_wire.py",
+    "test_amplifier_contract.py",
+    "test_gateway_api.py",
+    "test_dashboard_losses.py",
+    "test_live_demo.py",
+    "test_daemon_process.py",
 )
 """Run in this order before all others: one that started last would leave the other cores idle."""
 
 
+settings.register_profile("short", max_examples=40)  # of each property; a hundred without it
+settings.load_profile("short")
+
+
+finite_element_modes.finite_element_classes = lru_cache(24)(finite_element_classes)
+"""Free plates are solved once in a process: hundreds of tests are of the same ones."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Start `era` without loading it anew each time."""
+    config.add_cleanup(preloaded.install().close)
+
+
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Skip files without a test that runs alone: importing all takes ten seconds."""
-    if config.option.markexpr != "alone" or collection_path.suffix != ".py":
+    """Skip files without a test that is asked for by its mark: importing all takes seconds."""
+    asked = config.option.markexpr.partition(" ")[0]
+    if asked not in ("alone", "real_time") or collection_path.suffix != ".py":
         return None
-    return True if "mark.alone" not in collection_path.read_text("utf-8") else None
+    return True if f"mark.{asked}" not in collection_path.read_text("utf-8") else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -63,3 +96,16 @@ def coarse_rig() -> Rig:
 def fine_rig() -> Rig:
     """A mesh whose answers are near converged and still cheap, 48x36."""
     return make_paper_rig(48, 36)
+
+
+@pytest.fixture(scope="session")
+def table_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache folder of all workers, in which one of them has built the example's table."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "table-cache"
+    folder.mkdir(exist_ok=True)
+    with (folder / "lock").open("w") as lock, pytest.MonkeyPatch.context() as patch:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        cached_table(load_rig(example_rig_path()))
+    return folder

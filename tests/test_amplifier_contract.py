@@ -104,5 +104,4 @@ async def test_backend_counts_frames_and_times_round_trips(
     assert after.frames_in - before.frames_in >= 5
     assert (after.invalid_frames, after.retries) == (before.invalid_frames, before.retries)
     assert after.last_round_trip is not None
-    assert after.heartbeat_age is not None
     assert backend.wire_times.round_trip(4) >= 0

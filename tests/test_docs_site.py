@@ -1,42 +1,11 @@
-"""The pages as a site."""
+"""Pages and what leads to them; `make docs` builds them."""
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-
-
-def test_site(tmp_path: Path) -> None:
-    """It builds without a warning, holds every page, and loads nothing from elsewhere."""
-    built = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "sphinx",
-            "-b",
-            "html",
-            "-W",
-            "--keep-going",
-            "-q",
-            "docs",
-            tmp_path,
-        ],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (built.returncode, built.stderr) == (0, "")
-    pages = {path.relative_to(ROOT / "docs") for path in (ROOT / "docs").rglob("*.md")}
-    pages = {page for page in pages if "_build" not in page.parts}
-    assert [page for page in pages if not (tmp_path / page.with_suffix(".html")).is_file()] == []
-    loads = re.compile(r"<(?:script|link|img|iframe)[^>]+(?:src|href)=\"(?:https?:)?//[^\"]*")
-    for page in tmp_path.rglob("*.html"):
-        assert loads.findall(page.read_text("utf-8")) == [], page.name
 
 
 def test_every_page_can_be_found() -> None:

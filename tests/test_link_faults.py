@@ -18,10 +18,10 @@ import pytest
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
-from drivers.errors import CommandRefused, DriverError, LinkError
+from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkError
 from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.link.link import REPLY_TIMEOUT as USUAL_TIMEOUT
-from drivers.operation.watchdog import HEARTBEAT, MAX_MISSED_HEARTBEATS, loss_detection_time
+from drivers.operation.watchdog import HEARTBEAT, MIN_HEARTBEATS_PER_WATCHDOG, loss_detection_time
 from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault
 from drivers.registry import open_backend
 from memory_machine import live_in_memory
@@ -152,7 +152,7 @@ async def test_amplifier_falls_silent_when_the_host_is_gone(far: FarSide) -> Non
 @pytest.mark.parametrize("kind", ["unplug", "hang", "drop"])
 @over_every_wire
 async def test_cut_link_is_silent_and_detected(far: FarSide, kind: FaultKind) -> None:
-    """Silent as above; the host detects it within three heartbeats and refuses requests."""
+    """Silent as above; degraded after three heartbeats and lost after the watchdog; no new sets."""
     async with Link(far, reply_timeout=HEARTBEAT, watched=True) as link:
         await link.amplifier.arm(WATCHDOG)
         await link.amplifier.apply(link.tone())
@@ -160,14 +160,16 @@ async def test_cut_link_is_silent_and_detected(far: FarSide, kind: FaultKind) ->
         fed = fed_at(far)
         far.device.inject_fault(FaultWindow(kind))
         with pytest.raises(LinkError):
-            await beat(link.amplifier, MAX_MISSED_HEARTBEATS)
-        asked = link.amplifier.statistics
-        assert link.amplifier.is_lost
-        # Three requests of one heartbeat each; a busy machine adds to the time.
-        assert asked.timeouts <= MAX_MISSED_HEARTBEATS
-        assert clock.now() - cut < 10
-        with pytest.raises(LinkError, match="watchdog"):
-            await link.amplifier.apply(link.tone())
+            await beat(link.amplifier, MIN_HEARTBEATS_PER_WATCHDOG)
+        assert link.amplifier.is_lost or link.amplifier.is_degraded
+        assert link.amplifier.statistics.timeouts <= MIN_HEARTBEATS_PER_WATCHDOG
+        assert clock.now() - cut <= MIN_HEARTBEATS_PER_WATCHDOG * HEARTBEAT + 0.05
+        while not link.amplifier.is_lost:
+            with pytest.raises(LinkError, match="watchdog"):
+                await link.amplifier.apply(link.tone())
+            with pytest.raises(LinkError):
+                await link.amplifier.heartbeat()
+        assert clock.now() >= fed_at(far) + WATCHDOG * (kind != "unplug")
         await eventually(lambda: far.silent_from() < math.inf)
         assert far.silent_from() - max(fed, fed_at(far)) <= WATCHDOG + REACTION + 1e-9
         await eventually(lambda: far.device.status().state is AmplifierState.FAULT)
@@ -177,22 +179,81 @@ async def test_cut_link_is_silent_and_detected(far: FarSide, kind: FaultKind) ->
         assert (status.state, status.levels) == (AmplifierState.FAULT, (0.0,) * 4)
 
 
+@pytest.mark.parametrize("kind", ["drop", "hang"])
+@over_every_wire
+async def test_short_stall_degrades_the_link_and_recovers(far: FarSide, kind: FaultKind) -> None:
+    """A stall of 100 ms, a watchdog of 250 ms: no new set meanwhile, and the last one plays on."""
+    async with Link(far, reply_timeout=USUAL_TIMEOUT, watched=True) as link:
+        await link.amplifier.arm(0.25)
+        playing = link.tone()
+        await link.amplifier.apply(playing)
+        far.device.inject_fault(FaultWindow(kind, lasts=0.1))
+        with pytest.raises(LinkDegraded):
+            await link.amplifier.heartbeat()
+        assert link.amplifier.is_degraded
+        for refused in (
+            lambda: link.amplifier.apply(link.tone(0.1)),
+            lambda: link.amplifier.commit(playing.token),
+            lambda: link.amplifier.arm(0.25),
+        ):
+            with pytest.raises(LinkDegraded, match="until it replies"):
+                await refused()
+        async with asyncio.timeout(0.2):
+            while link.amplifier.is_degraded:
+                with contextlib.suppress(LinkDegraded):
+                    status = await link.amplifier.heartbeat()
+                await asyncio.sleep(0.005)
+        assert (status.state, status.token) == (AmplifierState.OPERATION_ENABLED, playing.token)
+        await link.amplifier.apply(link.tone(0.1))
+
+
+@over_every_wire
+async def test_amplifier_without_replies_is_not_fed_for_ever(far: FarSide) -> None:
+    """It hears the host, which hears nothing: its watchdog still ends what it plays."""
+    async with Link(far, reply_timeout=USUAL_TIMEOUT, watched=True) as link:
+        await link.amplifier.arm(WATCHDOG)
+        await link.amplifier.apply(link.tone())
+        far.device.inject_fault(FaultWindow("drop", toward="host"))
+        unheard = clock.now()
+        while not link.amplifier.is_lost:
+            with pytest.raises(LinkError):
+                await link.amplifier.heartbeat()
+            await asyncio.sleep(HEARTBEAT)
+        assert far.silent_from() - unheard <= MIN_HEARTBEATS_PER_WATCHDOG * HEARTBEAT + WATCHDOG
+        assert clock.now() >= far.silent_from()
+
+
+@pytest.mark.parametrize("kind", ["drop", "hang"])
+@over_every_wire
+async def test_lost_amplifier_is_stopped_over_its_open_wire(far: FarSide, kind: FaultKind) -> None:
+    """Without reopening; nothing else is sent, and it stays lost."""
+    async with Link(far, reply_timeout=USUAL_TIMEOUT, watched=True) as link:
+        await link.amplifier.arm(2.0)
+        await link.amplifier.apply(link.tone())
+        link.amplifier._watchdog = 0.0  # it is lost although it plays
+        far.device.inject_fault(FaultWindow(kind))
+        while not link.amplifier.is_lost:
+            with pytest.raises(LinkError):
+                await link.amplifier.heartbeat()
+        far.device.recover()
+        assert far.silent_from() == math.inf
+        with pytest.raises(LinkError):
+            await link.amplifier.apply(link.tone())
+        assert (await link.amplifier.stop()).state is AmplifierState.QUICK_STOP_ACTIVE
+        assert link.amplifier.is_lost
+
+
 @over_every_wire
 async def test_unplugged_wire_is_detected_within_60_ms(far: FarSide) -> None:
-    """Also without a request; a busy machine only adds to it, so the best try counts."""
-    now = asyncio.get_running_loop().time
-    took = []
+    """Also without a request, every time."""
     async with Link(far) as host:
-        for _ in range(10):
-            pulled = now()
+        for _ in range(3):
+            pulled = clock.now()
             far.device.inject_fault(FaultWindow("unplug"))
             await eventually(lambda: host.amplifier.is_lost)
-            took.append(now() - pulled)
-            if took[-1] <= 0.060:
-                return
+            assert clock.now() - pulled <= 0.060
             far.device.recover()
             await reconnect(host.amplifier, tries=200)
-    raise AssertionError(f"detected after {', '.join(f'{1e3 * one:.0f} ms' for one in took)}")
 
 
 @pytest.mark.parametrize("name", WIRES)
@@ -260,7 +321,7 @@ def test_silent_amplifier_is_detected_within_three_heartbeats(
             hung = clock.now()
             with pytest.raises(LinkError):
                 await beat_on(host.amplifier)
-            assert clock.now() - hung <= MAX_MISSED_HEARTBEATS * HEARTBEAT
+            assert clock.now() - hung <= MIN_HEARTBEATS_PER_WATCHDOG * HEARTBEAT
 
     in_virtual_time(name, coarse_rig, use)
 
@@ -274,7 +335,7 @@ def test_loss_during_a_set_is_detected_within_loss_detection_time(
     async def use(host: Link) -> None:
         bound = loss_detection_time([host.amplifier.round_trip()])
         is_late = name == "modbus+rtu, 19 200 baud"
-        assert (bound > MAX_MISSED_HEARTBEATS * HEARTBEAT) == is_late
+        assert (bound > MIN_HEARTBEATS_PER_WATCHDOG * HEARTBEAT) == is_late
         for _ in range(5):
             await host.again()
             host.far.device.inject_fault(FaultWindow("hang"))
@@ -283,7 +344,7 @@ def test_loss_during_a_set_is_detected_within_loss_detection_time(
             with pytest.raises(LinkError):
                 await host.amplifier.apply(host.tone(*FOUR))
             assert clock.now() - hung <= bound
-            assert (clock.now() - hung > MAX_MISSED_HEARTBEATS * HEARTBEAT) == is_late
+            assert (clock.now() - hung > MIN_HEARTBEATS_PER_WATCHDOG * HEARTBEAT) == is_late
 
     in_virtual_time(name, coarse_rig, use)
 
@@ -340,7 +401,7 @@ async def test_token_is_applied_once_under_frame_loss(far: FarSide) -> None:
     assert len(confirmed) >= 15
     assert len(played) == len(set(played))
     assert set(confirmed) <= set(played)
-    assert played == sorted(played)
+    assert [token for token in played if token in confirmed] == confirmed
 
 
 @pytest.mark.parametrize("kind", ["corrupt", "truncate", "duplicate", "delay"])
@@ -521,13 +582,13 @@ async def test_replugging_leaks_nothing(far: FarSide) -> None:
     """Unplug, plug in, reopen: descriptors, threads and tasks stay constant."""
     async with Link(far) as link:
         before: tuple[int, int, int] | None = None
-        for number in range(30):
+        for number in range(10):
             far.device.inject_fault(FaultWindow("unplug"))
             with pytest.raises(LinkError):
-                await beat(link.amplifier, MAX_MISSED_HEARTBEATS)
+                await beat(link.amplifier, MIN_HEARTBEATS_PER_WATCHDOG)
             far.device.recover()
             await reconnect(link.amplifier, tries=200)
-            if number == 4:
+            if number == 2:
                 before = in_use()
         after = in_use()
         assert before is not None

@@ -18,7 +18,7 @@ from reconnection import reconnect
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time
-from wires import SHARED_WIRES, FarSide, far_side, on_two_amplifiers, patient, tones
+from wires import SHARED_WIRES, FarSide, far_side, on_two_amplifiers, tones
 
 
 @pytest.fixture(params=list(SHARED_WIRES))
@@ -33,73 +33,63 @@ def two_amplifiers(coarse_rig: Rig) -> Rig:
     return on_two_amplifiers(coarse_rig)
 
 
-@pytest.fixture
-async def far(wire: Wire, two_amplifiers: Rig) -> AsyncIterator[FarSide]:
-    """Both amplifiers behind one wire."""
-    async with far_side(wire, two_amplifiers) as far:
-        yield far
-
-
 @contextlib.asynccontextmanager
-async def armed(far: FarSide) -> AsyncIterator[dict[str, Amplifier]]:
-    """Both amplifiers, armed."""
-    both = {
-        name: Amplifier(open_backend(patient(url)), reply_timeout=1.0)
-        for name, url in far.urls.items()
-    }
-    for amplifier in both.values():
-        await amplifier.open()
-    for amplifier in both.values():  # after opening, which may outlast a watchdog
-        await amplifier.arm(2.0)
-    yield both
-    for amplifier in both.values():
-        await amplifier.close()
+async def armed(wire: Wire, rig: Rig) -> AsyncIterator[tuple[FarSide, dict[str, Amplifier]]]:
+    """Both amplifiers behind one wire in memory, armed."""
+    live_in_memory()
+    async with far_side(wire, rig) as far:
+        both = {
+            name: Amplifier(open_backend(url), reply_timeout=1.0) for name, url in far.urls.items()
+        }
+        for amplifier in both.values():
+            await amplifier.open()
+        for amplifier in both.values():  # after opening, which may outlast a watchdog
+            await amplifier.arm(2.0)
+        yield far, both
+        for amplifier in both.values():
+            await amplifier.close()
 
 
-@pytest.fixture
-async def amplifiers(far: FarSide) -> AsyncIterator[dict[str, Amplifier]]:
-    """Both amplifiers, armed, in real time."""
-    async with armed(far) as both:
-        yield both
-
-
-async def test_amplifiers_on_one_line_reply_for_themselves(
-    amplifiers: dict[str, Amplifier],
-) -> None:
+@in_virtual_time
+async def test_amplifiers_on_one_line_reply_for_themselves(wire: Wire, two_amplifiers: Rig) -> None:
     """Each has its own identity and level; they share a bus."""
-    found = {name: one.identity.serial_number for name, one in amplifiers.items()}
-    assert found == {"east": "SIM-east", "west": "SIM-west"}
-    east, west = amplifiers["east"], amplifiers["west"]
-    assert east.bus is not None
-    assert east.bus == west.bus
-    await east.apply(tones(east, 0.2, token=1))
-    await west.apply(tones(west, 0.4, token=1))
-    assert (await east.status()).levels[0] == pytest.approx(0.2)
-    assert (await west.status()).levels[0] == pytest.approx(0.4)
+    async with armed(wire, two_amplifiers) as (_, amplifiers):
+        found = {name: one.identity.serial_number for name, one in amplifiers.items()}
+        assert found == {"east": "SIM-east", "west": "SIM-west"}
+        east, west = amplifiers["east"], amplifiers["west"]
+        assert east.bus is not None
+        assert east.bus == west.bus
+        await east.apply(tones(east, 0.2, token=1))
+        await west.apply(tones(west, 0.4, token=1))
+        assert (await east.status()).levels[0] == pytest.approx(0.2)
+        assert (await west.status()).levels[0] == pytest.approx(0.4)
 
 
-async def test_cancelled_close_closes(far: FarSide) -> None:
+@in_virtual_time
+async def test_cancelled_close_closes(wire: Wire, two_amplifiers: Rig) -> None:
     """A cancelled close still releases the wire and the amplifier's number."""
-    amplifier = Amplifier(open_backend(patient(far.url)), reply_timeout=1.0)
-    await amplifier.open()
-    closing = asyncio.create_task(amplifier.close())
-    await asyncio.sleep(0)
-    closing.cancel()
-    with contextlib.suppress(asyncio.CancelledError):
-        await closing
-    other = Amplifier(open_backend(patient(far.url)), reply_timeout=1.0)
-    await reconnect(other, tries=200)
-    await other.close()
+    live_in_memory()
+    async with far_side(wire, two_amplifiers) as far:
+        amplifier = Amplifier(open_backend(far.url), reply_timeout=1.0)
+        await amplifier.open()
+        closing = asyncio.create_task(amplifier.close())
+        await asyncio.sleep(0)
+        closing.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await closing
+        other = Amplifier(open_backend(far.url), reply_timeout=1.0)
+        await reconnect(other, tries=200)
+        await other.close()
 
 
+@in_virtual_time
 async def test_one_amplifier_reopens_while_the_other_stays_lost(
     wire: Wire, two_amplifiers: Rig
 ) -> None:
     """After a loss of the wire each amplifier is lost until it is reopened itself."""
+    live_in_memory()
     async with far_side(replace(wire, unpluggable=True), two_amplifiers) as far:
-        east, west = (
-            Amplifier(open_backend(patient(url)), reply_timeout=1.0) for url in far.urls.values()
-        )
+        east, west = (Amplifier(open_backend(url), reply_timeout=1.0) for url in far.urls.values())
         await east.open()
         await west.open()
         for device in far.devices.values():
@@ -124,21 +114,21 @@ async def test_one_amplifier_reopens_while_the_other_stays_lost(
         await west.close()
 
 
-async def test_broadcast_commit_starts_all_together(
-    far: FarSide, amplifiers: dict[str, Amplifier]
-) -> None:
+@in_virtual_time
+async def test_broadcast_commit_starts_all_together(wire: Wire, two_amplifiers: Rig) -> None:
     """Both play their staged sets, from moments within 5 ms."""
-    for name, level in (("east", 0.2), ("west", 0.4)):
-        await amplifiers[name].stage(tones(amplifiers[name], level, token=7))
-    assert not any((await amplifiers["west"].status()).levels)
-    begin = asyncio.get_running_loop().time()
-    await amplifiers["east"].commit_on_bus(7)
-    assert begin <= amplifiers["east"].last_sent
-    for name, level in (("east", 0.2), ("west", 0.4)):
-        status = await amplifiers[name].status()
-        assert (status.token, status.levels[0]) == (7, pytest.approx(level))
-    origins = [one.outputs[0][0].origin for one in far.bench.amplifiers.values()]
-    assert max(origins) - min(origins) < 0.005
+    async with armed(wire, two_amplifiers) as (far, amplifiers):
+        for name, level in (("east", 0.2), ("west", 0.4)):
+            await amplifiers[name].stage(tones(amplifiers[name], level, token=7))
+        assert not any((await amplifiers["west"].status()).levels)
+        begin = asyncio.get_running_loop().time()
+        await amplifiers["east"].commit_on_bus(7)
+        assert begin <= amplifiers["east"].last_sent_at
+        for name, level in (("east", 0.2), ("west", 0.4)):
+            status = await amplifiers[name].status()
+            assert (status.token, status.levels[0]) == (7, pytest.approx(level))
+        origins = [one.outputs[0][0].origin for one in far.bench.amplifiers.values()]
+        assert max(origins) - min(origins) < 0.005
 
 
 @pytest.mark.parametrize("silence", [Amplifier.stop, Amplifier.disarm])
@@ -149,8 +139,7 @@ async def test_stop_does_not_wait_for_a_stuck_amplifier(
     silence: Callable[[Amplifier, float], Awaitable[Status]],
 ) -> None:
     """It waits 8 ms, 10 ms more where a reply could collide; requests are repeated then."""
-    live_in_memory()
-    async with far_side(wire, two_amplifiers) as far, armed(far) as amplifiers:
+    async with armed(wire, two_amplifiers) as (far, amplifiers):
         east, west = amplifiers["east"], amplifiers["west"]
         for _ in range(10):
             far.devices["west"].inject_fault(FaultWindow("hang"))
@@ -165,12 +154,14 @@ async def test_stop_does_not_wait_for_a_stuck_amplifier(
             await east.arm(2.0)
 
 
-async def test_broadcast_stop_silences_all(amplifiers: dict[str, Amplifier]) -> None:
+@in_virtual_time
+async def test_broadcast_stop_silences_all(wire: Wire, two_amplifiers: Rig) -> None:
     """A broadcast stop has no reply and latches in both."""
-    for amplifier in amplifiers.values():
-        await amplifier.apply(tones(amplifier, 0.3, token=1))
-    await amplifiers["west"].stop_on_bus(0.0)
-    for amplifier in amplifiers.values():
-        status = await amplifier.status()
-        assert status.state is AmplifierState.QUICK_STOP_ACTIVE
-        assert not any(status.levels)
+    async with armed(wire, two_amplifiers) as (_, amplifiers):
+        for amplifier in amplifiers.values():
+            await amplifier.apply(tones(amplifier, 0.3, token=1))
+        await amplifiers["west"].stop_on_bus(0.0)
+        for amplifier in amplifiers.values():
+            status = await amplifier.status()
+            assert status.state is AmplifierState.QUICK_STOP_ACTIVE
+            assert not any(status.levels)

@@ -7,71 +7,77 @@ async with await AsyncClient.connect() as era:
 """
 
 import asyncio
-import contextlib
+from collections import deque
 from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
+from controller.api.channel import Channel
 from controller.api.client_protocol import (
     DEFAULT_LEASE,
-    MAX_QUEUED_EVENTS,
-    READ_SIZE,
     RESPONSE_TIMEOUT,
-    ClientProtocol,
+    LeaseLost,
     Notification,
-    Response,
     Unreachable,
-    check_version,
     make_params,
     position,
     read_result,
     touch_params,
 )
-from controller.api.jsonrpc import RpcError
+from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import (
     ArmParams,
     ArmResult,
+    DisarmParams,
     EffectsResult,
     HelloParams,
     HelloResult,
     PlayParams,
     RenewParams,
     RenewResult,
+    RequestedBy,
     StatusResult,
+    StopResult,
     SubscribeParams,
     UnsubscribeParams,
 )
 from controller.api.schema import Empty, Message, Topic
 from controller.api.socket_path import find_socket
+from drivers.operation.pauses import pauses
+
+MAX_QUEUED_EVENTS = 1000  # not yet taken; the oldest is dropped
+_MIN_RETRY_INTERVAL, _MAX_RETRY_INTERVAL = 0.05, 0.5  # s
+_RENEWAL_INTERVAL = 0.25  # s; within it a lost lease is noticed, however long it was
+_NOT_REPEATED = ("arm", "play")  # a request that was lost may have been carried out
 
 _ResultT = TypeVar("_ResultT", bound=Message)
 
 
 class AsyncClient:
-    """A connection to a daemon, made by `connect`; any number of calls may be pending.
+    """A client of the daemon, made by `connect`; any number of calls may be pending.
 
-    Every method raises RpcError for an error of the daemon, and Unreachable, a LinkError, without a
-    response.
+    A lost connection is made again by the next call, with all subscriptions. Every method ends
+    within the timeout and raises RpcError for an error of the daemon, Unreachable (a LinkError)
+    without a response, and LeaseLost, except for `stop` and `disarm`, once the lease of `armed` is
+    lost.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        reader: asyncio.StreamReader,
-        writer: asyncio.StreamWriter,
-        *,
-        timeout: float,
-    ) -> None:
+    def __init__(self, path: Path, *, name: str, timeout: float) -> None:
         self.path = path
-        self._reader = reader
-        self._writer = writer
+        self._name = name
         self._timeout = timeout
-        self._protocol = ClientProtocol()
-        self._pending: dict[int, asyncio.Future[Response]] = {}
-        self._events: asyncio.Queue[Notification | None] = asyncio.Queue()
-        self._lost: Unreachable | None = None
-        self._receiving = asyncio.create_task(self._receive(), name="API client")
+        self._channel: Channel | None = None
+        self._connecting = asyncio.Lock()
+        self._is_closed = False
+        self._topics: dict[Topic, None] = {}
+        self._rate: float | None = None
+        self._events: deque[Notification] = deque(maxlen=MAX_QUEUED_EVENTS)
+        self._changed = asyncio.Event()  # an event arrived, or the connection was lost
+        self._lease: ArmResult | None = None  # of `armed`
+        self._lease_lost: LeaseLost | None = None
+        self._renewing: asyncio.Task[None] | None = None
 
     @classmethod
     async def connect(
@@ -81,19 +87,13 @@ class AsyncClient:
         name: str = "python",
         timeout: float = RESPONSE_TIMEOUT,
     ) -> Self:
-        """Connect and introduce this client, like `Client.connect`."""
-        params = make_params(HelloParams, client=name)
-        socket = find_socket(path)
-        try:
-            reader, writer = await asyncio.open_unix_connection(str(socket))
-        except OSError as error:
-            raise Unreachable.at(socket, error) from error
-        client = cls(socket, reader, writer, timeout=timeout)
-        try:
-            check_version(await client.request("hello", params), socket)
-        except BaseException:
-            await client.close()
-            raise
+        """Connect to the daemon at a socket (default: the usual one) and introduce this client.
+
+        Raises Unreachable if no daemon answers, one of another major version, or a process that is
+        not to be believed.
+        """
+        client = cls(find_socket(path), name=name, timeout=timeout)
+        await client._within_timeout(client._connected())
         return client
 
     async def __aenter__(self) -> Self:
@@ -109,15 +109,19 @@ class AsyncClient:
 
     async def close(self) -> None:
         """Close the connection; the daemon lifts this client's fingers."""
-        self._writer.close()
-        self._receiving.cancel()
-        await asyncio.gather(self._receiving, return_exceptions=True)
-        with contextlib.suppress(OSError):
-            await self._writer.wait_closed()
+        self._is_closed = True
+        self._changed.set()
+        if self._renewing is not None:
+            self._renewing.cancel()
+        if self._channel is not None:
+            self._channel.close()
+        await asyncio.sleep(0)
 
     async def hello(self, client: str) -> HelloResult:
         """Introduce this client by another name; return what the daemon drives."""
-        return await self.call("hello", make_params(HelloParams, client=client), HelloResult)
+        params = make_params(HelloParams, client=client)
+        self._name = client
+        return await self.call("hello", params, HelloResult)
 
     async def status(self) -> StatusResult:
         """Return the state of the daemon, the amplifiers and the plate."""
@@ -134,15 +138,20 @@ class AsyncClient:
 
     async def disarm(self) -> None:
         """Ramp to silence and switch high voltage off."""
-        await self.call("disarm", Empty(), Empty)
+        await self.call("disarm", DisarmParams(lease=None), Empty)
+        self._release()
 
-    async def stop(self) -> None:
-        """Quick stop, latched until `clear`."""
-        await self.call("stop", Empty(), Empty)
+    async def stop(self) -> StopResult:
+        """Quick stop, latched until `clear`.
+
+        Raises NotSilent unless every amplifier is confirmed silent.
+        """
+        self._release()
+        return await self.call("stop", RequestedBy(), StopResult)
 
     async def clear(self) -> None:
         """Acknowledge a stop, or a fault whose cause is gone."""
-        await self.call("clear", Empty(), Empty)
+        await self.call("clear", RequestedBy(), Empty)
 
     async def touch(self, places: Sequence[tuple[float, float]], *, source: str = "python") -> None:
         """Report all fingers of a source, at x, y [m]; valid for 150 ms, so repeat it."""
@@ -164,35 +173,80 @@ class AsyncClient:
         """Receive notifications of topics; see `events`."""
         params = make_params(SubscribeParams, topics=list(topics), rate_hz=rate_hz)
         await self.call("subscribe", params, Empty)
+        self._topics |= dict.fromkeys(topics)
+        self._rate = rate_hz
 
     async def unsubscribe(self, *topics: Topic) -> None:
         """Receive no more notifications of topics."""
         await self.call("unsubscribe", make_params(UnsubscribeParams, topics=list(topics)), Empty)
+        for topic in topics:
+            self._topics.pop(topic, None)
 
-    @contextlib.asynccontextmanager
-    async def armed(self, owner: str, *, lease_s: float = DEFAULT_LEASE) -> AsyncIterator[None]:
-        """Armed within the block, disarmed after it; a task renews the lease meanwhile."""
+    @asynccontextmanager
+    async def armed(
+        self, owner: str, *, lease_s: float = DEFAULT_LEASE
+    ) -> AsyncIterator[ArmResult]:
+        """Armed within the block, disarmed after it; the lease is renewed meanwhile.
+
+        Raises LeaseLost at the next call and at the end of the block once the lease is lost.
+        """
+        lease = await self.begin_armed(owner, lease_s=lease_s)
+        try:
+            yield lease
+        except BaseException:
+            with suppress(RpcError, Unreachable):
+                await self.end_armed()
+            raise
+        await self.end_armed()
+
+    async def begin_armed(self, owner: str, *, lease_s: float = DEFAULT_LEASE) -> ArmResult:
+        """Arm, and renew the lease until `end_armed`: the beginning of `armed`."""
         arming = asyncio.ensure_future(self.arm(owner, lease_s=lease_s))
         try:
             lease = await asyncio.shield(arming)
         except asyncio.CancelledError:
-            with contextlib.suppress(RpcError, Unreachable):  # if refused, another client's lease
-                await arming
-                await self.disarm()
+            with suppress(RpcError, Unreachable):  # if refused, another client's lease
+                await self._disarm((await arming).lease)
             raise
-        renewing = asyncio.create_task(self._keep_renewing(lease))
+        self._lease, self._lease_lost = lease, None
+        self._renewing = asyncio.create_task(self._keep_renewing(lease), name="lease")
+        return lease
+
+    async def end_armed(self) -> None:
+        """Disarm: the end of `armed`; raises LeaseLost if the lease was lost before."""
+        lease, lost = self._lease, self._lease_lost
+        self._release()
+        self._lease_lost = None
+        if lost is not None:
+            raise lost
+        if lease is None:  # ended by a call of this client
+            return
         try:
-            yield
-        finally:
-            renewing.cancel()
-            await asyncio.gather(renewing, return_exceptions=True)
-            await self.disarm()
+            await self._disarm(lease.lease)
+        except RpcError as error:
+            if error.code not in (ErrorCode.LEASE, ErrorCode.WRONG_STATE):
+                raise
+            raise await self._why_lost(error) from error
 
     async def events(self) -> AsyncIterator[Notification]:
-        """Yield notifications as they arrive; end with the connection."""
-        while (event := await self._events.get()) is not None:
+        """Yield notifications as they arrive, until `close`; raises Unreachable."""
+        while (event := await self.next_event()) is not None:
             yield event
-        self._events.put_nowait(None)  # for later iterators
+
+    async def next_event(self, *, timeout: float | None = None) -> Notification | None:
+        """Wait for a notification; None after a timeout [s] or `close`; raises Unreachable.
+
+        A lost connection is made again, for which the client's timeout holds.
+        """
+        with suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                while not self._events and not self._is_closed:
+                    self._changed.clear()
+                    if self._channel is None or self._channel.lost is not None:
+                        await self._within_timeout(self._reconnected())
+                    else:
+                        await self._changed.wait()
+        return self._events.popleft() if self._events else None
 
     async def call(self, method: str, params: Message, result: type[_ResultT]) -> _ResultT:
         """Call any method and return its result."""
@@ -200,57 +254,106 @@ class AsyncClient:
 
     async def request(self, method: str, params: Message) -> Any:
         """Call any method and return its result as parsed JSON."""
-        if self._lost is not None:
-            raise self._lost
-        id, line = self._protocol.request(method, params)
-        response = self._pending[id] = asyncio.get_running_loop().create_future()
+        if self._lease_lost is not None and method not in ("stop", "disarm"):
+            raise self._lease_lost.with_traceback(None)
+        return await self._within_timeout(self._send(method, params))
+
+    async def _send(self, method: str, params: Message) -> Any:
+        """Send a request, once more over a new connection if that is harmless."""
+        channel = await self._connected()
         try:
-            self._writer.write(line)
-            async with asyncio.timeout(self._timeout):
-                await self._writer.drain()
-                return (await response).result()
+            return await channel.request(method, params)
         except Unreachable:
-            raise
-        except OSError as error:
-            raise Unreachable.at(self.path, error) from error
-        finally:
-            del self._pending[id]
+            if method in _NOT_REPEATED or self._is_closed:
+                raise
+            channel = await self._connected()
+            return await channel.request(method, params)
 
-    async def _receive(self) -> None:
-        """Hand out responses and notifications until the connection ends."""
-        lost = Unreachable.at(self.path, ConnectionResetError("closed by the daemon"))
+    async def _within_timeout(self, work: Any) -> Any:
         try:
-            while data := await self._reader.read(READ_SIZE):
-                for received in self._protocol.receive(data):
-                    if isinstance(received, Notification):
-                        self._queue(received)
-                    else:
-                        self._resolve(received)
-        except Unreachable as error:
-            lost = error
-        except OSError as error:
-            lost = Unreachable.at(self.path, error)
-        finally:
-            self._lost = lost
-            for pending in self._pending.values():
-                if not pending.done():
-                    pending.set_exception(lost)
-            self._events.put_nowait(None)
+            async with asyncio.timeout(self._timeout):
+                return await work
+        except TimeoutError as error:
+            raise Unreachable.at(self.path, error) from error
 
-    def _queue(self, event: Notification) -> None:
-        """Queue a notification for `events`, dropping the oldest of too many."""
-        if self._events.qsize() >= MAX_QUEUED_EVENTS:
-            self._events.get_nowait()
-        self._events.put_nowait(event)
+    async def _connected(self) -> Channel:
+        """The connection, made again if it was lost; raises RpcError and Unreachable."""
+        async with self._connecting:
+            if self._is_closed:
+                raise Unreachable(f"this client of the daemon at {self.path} is closed")
+            if self._channel is None or self._channel.lost is not None:
+                channel = await Channel.open(
+                    self.path, name=self._name, on_event=self._received, on_lost=self._changed.set
+                )
+                try:
+                    if self._topics:
+                        topics = SubscribeParams(topics=list(self._topics), rate_hz=self._rate)
+                        await channel.request("subscribe", topics)
+                except BaseException:
+                    channel.close()
+                    raise
+                self._channel = channel
+            return self._channel
 
-    def _resolve(self, response: Response) -> None:
-        """Resolve the call that a response is for; without an id, all of them."""
-        for id, pending in self._pending.items():
-            if response.id in (id, None) and not pending.done():
-                pending.set_result(response)
+    async def _reconnected(self) -> None:
+        """Connect again, trying until cancelled at the timeout; raises the last error."""
+        end = asyncio.get_running_loop().time() + 0.9 * self._timeout
+        for pause in pauses(first=_MIN_RETRY_INTERVAL, maximum=_MAX_RETRY_INTERVAL):
+            try:
+                await self._connected()
+            except (RpcError, Unreachable):
+                if self._is_closed or asyncio.get_running_loop().time() + pause >= end:
+                    raise
+                await asyncio.sleep(pause)
+            else:
+                return
+
+    def _received(self, event: Notification) -> None:
+        self._events.append(event)
+        self._changed.set()
+
+    def _release(self) -> None:
+        """Stop renewing the lease."""
+        self._lease = None
+        if self._renewing is not None:
+            self._renewing.cancel()
+            self._renewing = None
+
+    async def _disarm(self, lease: str) -> None:
+        params = DisarmParams(lease=lease)
+        await self._within_timeout(self._send("disarm", params))
 
     async def _keep_renewing(self, lease: ArmResult) -> None:
-        with contextlib.suppress(RpcError, Unreachable):
-            while True:
-                await asyncio.sleep(lease.lease_s / 3)
-                await self.renew(lease.lease)
+        """Renew a lease until it is lost, over a new connection if need be."""
+        loop = asyncio.get_running_loop()
+        params = RenewParams(lease=lease.lease)
+        expires_at = loop.time() + lease.lease_s
+        pause = _RENEWAL_INTERVAL
+        reason: RpcError | Unreachable | None = None
+        while loop.time() < expires_at:
+            await asyncio.sleep(min(pause, expires_at - loop.time()))
+            sent_at = loop.time()
+            try:
+                async with asyncio.timeout_at(expires_at):
+                    await self._send("renew", params)
+            except TimeoutError as error:
+                reason = reason or Unreachable.at(self.path, error)
+                pause = _MIN_RETRY_INTERVAL
+            except RpcError as error:
+                reason = error
+                if error.code is not ErrorCode.BUSY:
+                    break
+                pause = _MAX_RETRY_INTERVAL
+            else:
+                expires_at, pause = sent_at + lease.lease_s, _RENEWAL_INTERVAL
+        if self._lease is lease:
+            self._lease_lost = await self._why_lost(reason)
+
+    async def _why_lost(self, reason: RpcError | Unreachable | None) -> LeaseLost:
+        """The loss of the lease with the daemon's cause, if available."""
+        try:
+            found = await self._within_timeout(self._send("status", Empty()))
+            status = read_result(found, StatusResult)
+        except (RpcError, Unreachable):
+            return LeaseLost(str(reason))
+        return LeaseLost(f"{status.state}: {status.cause}")

@@ -1,4 +1,4 @@
-"""The client's side of the API without I/O: calls to lines, lines to responses and events.
+"""The client's side of the API without I/O: arguments to parameters, lines to responses and events.
 
 A daemon of a later minor version sends keys that this program does not know: they are ignored here,
 whereas the server is strict about every request.
@@ -12,7 +12,7 @@ from typing import Any, TypeVar, cast
 
 from pydantic import ValidationError
 
-from controller.api.jsonrpc import ErrorCode, RpcError, request_line
+from controller.api.jsonrpc import ErrorCode, RpcError, read_error
 from controller.api.methods import TouchParams
 from controller.api.schema import API_VERSION, Message, TouchPoint
 from drivers.errors import LinkError
@@ -21,8 +21,6 @@ from model.errors import InputError, first_problem
 
 RESPONSE_TIMEOUT = 5.0  # s; arming takes longest, some tenths of a second
 DEFAULT_LEASE = 10.0  # s
-MAX_QUEUED_EVENTS = 1000  # not yet taken from `events`; the oldest is dropped
-READ_SIZE = 1 << 16  # bytes
 
 _MessageT = TypeVar("_MessageT", bound=Message)
 
@@ -50,6 +48,13 @@ class Unreachable(LinkError):
         )
 
 
+class LeaseLost(RpcError):
+    """The lease of `armed` ended within its block: nothing is felt any more."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(ErrorCode.LEASE, f"lease lost: {what}", remedy="arm again")
+
+
 @dataclass(frozen=True)
 class Notification:
     """An event: topic, time [s], number of events dropped before it, data; line: as received."""
@@ -71,29 +76,24 @@ class Response:
     def result(self) -> Any:
         """The result; raises the RpcError that the response holds instead."""
         try:
-            if "error" in self.content:
-                raise _rpc_error(self.content["error"])
-            return self.content["result"]
-        except (KeyError, TypeError, ValueError, ValidationError) as error:
-            raise _not_understood() from error
+            if "error" not in self.content:
+                return self.content["result"]
+            error = read_error(self.content["error"])
+        except (AttributeError, KeyError, TypeError, ValueError) as problem:
+            raise _not_understood() from problem
+        raise error
 
 
-class ClientProtocol:
-    """Numbers requests, and assembles the daemon's bytes to responses and notifications."""
-
-    def __init__(self) -> None:
-        self._last_id = 0
-        self._rest = b""
-
-    def request(self, method: str, params: Message) -> tuple[int, bytes]:
-        """The id of a new request, and the line to send."""
-        self._last_id += 1
-        return self._last_id, request_line(self._last_id, method, params)
-
-    def receive(self, data: bytes) -> list[Response | Notification]:
-        """What these bytes complete; raises Unreachable for what is not a daemon's."""
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        return [_read(line) for line in lines]
+def read_line(line: bytes) -> Response | Notification:
+    """Read a line of a daemon; raises Unreachable for what is not a daemon's."""
+    try:
+        content = json.loads(line)
+        if content.get("method") != "event":
+            return Response(content["id"], content)
+        params = content["params"]
+        return Notification(params["topic"], params["time_s"], params["lost"], params["data"], line)
+    except (ValueError, AttributeError, KeyError, TypeError) as error:
+        raise _not_understood() from error
 
 
 def make_params(model: type[_MessageT], **values: object) -> _MessageT:
@@ -146,27 +146,6 @@ def check_version(hello: object, path: Path) -> None:
             f"the daemon at {path} speaks version {version:.20} of the API, this program "
             f"{API_VERSION}; update the older of the two"
         )
-
-
-def _read(line: bytes) -> Response | Notification:
-    try:
-        content = json.loads(line)
-        if content.get("method") != "event":
-            return Response(content["id"], content)
-        params = content["params"]
-        return Notification(params["topic"], params["time_s"], params["lost"], params["data"], line)
-    except (ValueError, AttributeError, KeyError, TypeError) as error:
-        raise _not_understood() from error
-
-
-def _rpc_error(error: Mapping[str, Any]) -> RpcError:
-    data = error.get("data") or {}
-    return RpcError(
-        ErrorCode(error["code"]),
-        data.get("what", error["message"]),
-        where=data.get("where"),
-        remedy=data.get("remedy"),
-    )
 
 
 def _not_understood() -> Unreachable:

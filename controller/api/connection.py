@@ -5,49 +5,53 @@ flood on one costs the others nothing; output that a client does not read is bou
 """
 
 import asyncio
-from collections import deque
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
-from controller.api.jsonrpc import MAX_LINE_LENGTH, ErrorCode, RpcError, error_line
+from controller.api.jsonrpc import MAX_LINE_LENGTH, ErrorCode, InvalidRequest, RpcError, error_line
 from controller.api.rate_limit import RateLimiter
-from controller.api.superseded import is_superseded
 
 MAX_UNREAD_BYTES = 1 << 18  # written but not read by the client
 _MAX_UNREAD_NOTIFICATIONS = MAX_UNREAD_BYTES // 2  # bytes; the rest is reserved for responses
-_MAX_READ_AHEAD = 1 << 16  # bytes of lines that wait to be served
+_MAX_READ_AHEAD = 1 << 16  # bytes that wait to be served
 UNREAD_TIMEOUT = 5.0  # s; for losing notifications before the connection is closed
 
 MAX_REQUEST_RATE = 2000.0  # 1/s, and as many in a burst
+MAX_PENDING_STOPS = 64  # requests without responses, above which no further line is taken
 
 
 class Connection(asyncio.Protocol):
     """A client's connection.
 
-    on_connect: returns False to refuse it; on_lines: lines wait to be served; on_disconnect: called
-    once at the end.
+    on_connect: called at the beginning; on_lines: lines wait to be served; on_disconnect: called
+    once at the end. ahead: a request that was read from the next line, but not served.
     """
 
     def __init__(
         self,
         *,
-        on_connect: "Callable[[Connection], bool]",
+        on_connect: "Callable[[Connection], None]",
         on_lines: "Callable[[Connection], None]",
         on_disconnect: "Callable[[Connection], None]",
         clock: Callable[[], float],
     ) -> None:
         self.name = "unnamed client"
         self.received_at = clock()  # s; when the last bytes arrived
+        self.has_spoken = False  # whether it has sent a complete line
+        self.is_reserve = False  # whether it has a place in reserve
+        self.excess = 0  # requests beyond the rate since its last pause
+        self.is_paused = False  # whether the server pauses to serve it
+        self.is_urgent = False  # whether its last bytes may hold a stop
+        self.is_at_end = False  # whether it has closed its side
         self.pending: set[asyncio.Task[None]] = set()
+        self.ahead: Any = None
         self._on_connect = on_connect
         self._on_lines = on_lines
         self._on_disconnect = on_disconnect
         self._clock = clock
         self._transport: asyncio.Transport | None = None
-        self._lines: deque[bytes] = deque()
-        self._waiting_bytes = 0  # in _lines
-        self._rest = b""
-        self._is_at_end = False
+        self._input = bytearray()
+        self._line_end = -1  # of the next line in _input; -1: not received yet
         self._lost = 0
         self._losing_since: float | None = None
         self._rate = RateLimiter(MAX_REQUEST_RATE, clock=clock)
@@ -58,66 +62,81 @@ class Connection(asyncio.Protocol):
         return self._transport is not None and not self._transport.is_closing()
 
     @property
+    def has_left(self) -> bool:
+        """Whether the client has closed its side, or the connection is lost."""
+        return self.is_at_end or not self.is_open
+
+    @property
     def has_lines(self) -> bool:
-        """Whether lines wait to be served."""
-        return bool(self._lines) and self.is_open
+        """Whether anything can be served now."""
+        return (
+            self.is_open
+            and (self.ahead is not None or self._has_line)
+            and len(self.pending) < MAX_PENDING_STOPS
+        )
+
+    @property
+    def _has_line(self) -> bool:
+        return self._line_end >= 0 or len(self._input) >= MAX_LINE_LENGTH
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Start, or refuse a client too many."""
+        """Store the transport and take a place at the server."""
         self._transport = cast(asyncio.Transport, transport)
         # Output is bounded here, by the size of the write buffer.
         self._transport.set_write_buffer_limits(high=MAX_UNREAD_BYTES)
-        if not self._on_connect(self):
-            self.refuse(RpcError(ErrorCode.BUSY, "too many connections", remedy="try again later"))
+        self._on_connect(self)
 
     def data_received(self, data: bytes) -> None:
-        """Split into lines; pause reading while many wait to be served."""
+        """Keep it, undivided; pause reading while much waits to be served."""
         self.received_at = self._clock()
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        self._lines.extend(lines)
-        self._waiting_bytes += sum(map(len, lines))
-        line_length = max(map(len, (*lines, self._rest)))
-        if line_length >= MAX_LINE_LENGTH:
-            self.refuse(RpcError(ErrorCode.PARSE, f"line longer than {MAX_LINE_LENGTH} bytes"))
-            return
-        if self._waiting_bytes > _MAX_READ_AHEAD and self._transport is not None:
-            self._transport.pause_reading()
-        if lines:
+        self.is_urgent = b'"stop"' in data
+        before = len(self._input)
+        self._input += data
+        if self._line_end < 0:
+            self._line_end = self._input.find(b"\n", before)
+        if self._has_line:
+            self.has_spoken = True
+            if len(self._input) > _MAX_READ_AHEAD and self._transport is not None:
+                self._transport.pause_reading()
             self._on_lines(self)
 
     def eof_received(self) -> bool:
         """Finish what the client requested before it closed its side, then close."""
-        self._is_at_end = True
+        self.is_at_end = True
         self.close_if_finished()
         return True
 
     def connection_lost(self, error: Exception | None) -> None:
         """Report the end; pending requests are carried out all the same."""
         self._transport = None
-        self._lines.clear()
         self._on_disconnect(self)
 
-    @property
-    def is_next_superseded(self) -> bool:
-        """Whether the line after the next one makes serving the next one unnecessary."""
-        return len(self._lines) > 1 and is_superseded(self._lines[0], self._lines[1])
-
-    def next_line(self) -> bytes:
-        """Take the next line; only while `has_lines`."""
-        line = self._lines.popleft()
-        self._waiting_bytes -= len(line)
-        if not self._lines and self._transport is not None and not self._transport.is_reading():
+    def next_line(self) -> bytes | None:
+        """Take the next line, None if there is none; raises InvalidRequest if it is too long."""
+        if not self.is_open or not self._has_line:
+            return None
+        end = self._line_end
+        if not 0 <= end < MAX_LINE_LENGTH:
+            raise InvalidRequest(
+                ErrorCode.PARSE, f"line longer than {MAX_LINE_LENGTH} bytes", remedy="send less"
+            )
+        line = bytes(memoryview(self._input)[:end])
+        del self._input[: end + 1]
+        self._line_end = self._input.find(b"\n")
+        if len(self._input) <= _MAX_READ_AHEAD and self._transport is not None:
             self._transport.resume_reading()
         return line
 
     def close_if_finished(self) -> None:
         """Close after the last response, if the client has closed its side."""
-        if self._is_at_end and not self._lines and not self.pending:
+        if self.is_at_end and not self.has_lines and not self.pending:
             self.close()
 
     def take_request(self) -> bool:
         """Whether another request is within the rate; counts it."""
-        return self._rate.take()
+        is_within = self._rate.take()
+        self.excess += not is_within
+        return is_within
 
     def respond(self, line: bytes) -> None:
         """Send a response, or close the connection of a client that does not read."""
@@ -146,7 +165,6 @@ class Connection(asyncio.Protocol):
 
     def refuse(self, error: RpcError) -> None:
         """Send an error and close."""
-        self._lines.clear()
         self.respond(error_line(None, error))
         self.close()
 

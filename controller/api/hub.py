@@ -6,6 +6,7 @@ that each client subscribed with.
 """
 
 import asyncio
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from controller.api.connection import Connection
@@ -15,6 +16,8 @@ from controller.api.schema import MAX_RATE, Message, Topic
 DEFAULT_RATE = 10.0  # Hz
 _COALESCED: frozenset[Topic] = frozenset({"contacts", "pattern", "silence"})
 _PERIODIC: frozenset[Topic] = frozenset({"amplifiers", "latency"})
+
+_logger = logging.getLogger(__name__)
 
 
 class Hub:
@@ -33,6 +36,7 @@ class Hub:
         self._newest: dict[Topic, Callable[[], Message | None]] = {}
         self._flush: asyncio.TimerHandle | None = None
         self._flushed_at = -1.0
+        self._failing: set[Topic] = set()
 
     def subscribe(
         self, connection: Connection, topics: Iterable[Topic], *, rate: float | None = None
@@ -103,10 +107,20 @@ class Hub:
         topic: Topic,
         make_data: Callable[[], Message | None],
     ) -> None:
-        message = make_data() if subscribers else None
+        if not subscribers:
+            return
+        try:
+            message = make_data()
+            data = b"" if message is None else message.model_dump_json().encode()
+        except Exception:  # the next change is sent all the same
+            if topic not in self._failing:  # once; marked, as the log is a topic too
+                _logger.exception("topic %s: data not made", topic, extra={"topic": topic})
+            self._failing.add(topic)
+            return
+        self._failing.discard(topic)
         if message is None:
             return
-        now, data = self._clock(), message.model_dump_json().encode()
+        now = self._clock()
         for connection in subscribers:
             connection.notify(lambda lost: event_line(topic, time=now, lost=lost, data=data))
 

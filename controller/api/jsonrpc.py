@@ -1,22 +1,25 @@
 """JSON-RPC 2.0, one object per line: bytes to requests, results and errors to bytes.
 
-UTF-8; a line feed ends a message; a request line has at most 64 KiB; no batches; an id is a short
-text or an integer; a request without an id gets no response. NaN and infinity are refused.
+UTF-8; a line feed ends a message; no batches, no repeated keys; an id is a short text or an
+integer; a request without an id gets no response. NaN and infinity are refused. Length, depth and
+number of keys are bounded before anything is parsed.
 """
 
 import json
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import from_json
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from controller.api.schema import Message
-from model.errors import in_our_words
+from controller.api.schema import AmplifierSilence, Message
+from model.errors import reworded
 
 MAX_LINE_LENGTH = 1 << 16  # bytes, with the line feed
+MAX_OPENINGS = 160  # [ and { of a request: a touch frame has at most 67; bounds the depth too
+MAX_SEPARATORS = 1000  # : and , of a request: a touch frame has at most 400
 _MAX_ERROR_TEXT = 600  # characters of an error's message
 
 Id: TypeAlias = int | str | None
@@ -36,10 +39,11 @@ class ErrorCode(IntEnum):
     REFUSED = 1003
     LINK = 1004
     BUSY = 1005
+    NOT_SILENT = 1006
 
 
 ERROR_MEANINGS = {
-    ErrorCode.PARSE: "the line is not valid JSON, or longer than 64 KiB",
+    ErrorCode.PARSE: "the line is not valid JSON, too long, or has too many keys",
     ErrorCode.INVALID_REQUEST: "the JSON is not a JSON-RPC 2.0 request",
     ErrorCode.UNKNOWN_METHOD: "the method does not exist",
     ErrorCode.INVALID_PARAMS: "a parameter is missing, unknown or out of range",
@@ -49,16 +53,20 @@ ERROR_MEANINGS = {
     ErrorCode.REFUSED: "the guard, a limit or an amplifier refused",
     ErrorCode.LINK: "the link to an amplifier failed",
     ErrorCode.BUSY: "too many requests or connections at once",
+    ErrorCode.NOT_SILENT: "after a stop, an amplifier is not confirmed silent",
 }
 """Meaning of each error code."""
 
 
 class ErrorData(Message):
-    """What is wrong, where, and the remedy."""
+    """Place and remedy of an error; after a stop, the silence of every amplifier."""
 
     what: str
     where: str | None = None
     remedy: str | None = None
+    amplifiers: dict[str, AmplifierSilence] | None = Field(
+        default=None, description="by name; of error 1006 only"
+    )
 
 
 class RpcError(Exception):
@@ -75,6 +83,36 @@ class RpcError(Exception):
         self.data = ErrorData(what=what, where=where, remedy=remedy)
 
 
+class NotSilent(RpcError):
+    """A stop after which an amplifier is not confirmed silent; amplifiers: all, by name."""
+
+    def __init__(self, amplifiers: Mapping[str, AmplifierSilence]) -> None:
+        unconfirmed = {
+            name: each for name, each in amplifiers.items() if each.silence != "confirmed_silent"
+        }
+        what = "not confirmed silent: " + ", ".join(
+            f"{name} ({_in_words(each)})" for name, each in unconfirmed.items()
+        )
+        remedy = "switch these amplifiers off"
+        super().__init__(ErrorCode.NOT_SILENT, what, remedy=remedy)
+        self.amplifiers = dict(amplifiers)
+        self.data = ErrorData(what=what, remedy=remedy, amplifiers=self.amplifiers)
+
+
+class InvalidRequest(RpcError):
+    """A line that is not a request; id: of its response, None if it cannot be read."""
+
+    def __init__(self, code: ErrorCode, what: str, *, remedy: str, id: Id = None) -> None:
+        super().__init__(code, what, remedy=remedy)
+        self.id = id
+
+
+_RequestId: TypeAlias = (
+    Annotated[int, Field(ge=-(2**63), lt=2**63)] | Annotated[str, Field(max_length=80)] | None
+)
+_REQUEST_ID: TypeAdapter[Id] = TypeAdapter(_RequestId, config=ConfigDict(strict=True))
+
+
 class _Envelope(BaseModel):
     """Members of a request."""
 
@@ -83,9 +121,7 @@ class _Envelope(BaseModel):
     jsonrpc: Literal["2.0"]
     method: str = Field(max_length=40)
     params: dict[str, Any] = Field(default_factory=dict)
-    id: (
-        Annotated[int, Field(ge=-(2**63), lt=2**63)] | Annotated[str, Field(max_length=80)] | None
-    ) = None
+    id: _RequestId = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,35 +135,33 @@ class Request:
 
 
 def read_request(line: bytes) -> Request:
-    """Read one line; raises RpcError."""
-    try:
-        document = from_json(line, allow_inf_nan=False)
-    except ValueError as error:
-        raise RpcError(
-            ErrorCode.PARSE,
-            f"the line is not valid JSON: {error!s:.200}",
-            remedy="send one JSON object per line, in UTF-8",
-        ) from error
+    """Read one line; raises InvalidRequest."""
+    document = parse_json(line)
     try:
         envelope = _Envelope.model_validate(document)
     except ValidationError as error:
-        raise RpcError(
+        raise InvalidRequest(
             ErrorCode.INVALID_REQUEST,
-            f"not a JSON-RPC 2.0 request: {_first_problem(error)}",
+            f"not a JSON-RPC 2.0 request: {_first_problem(error)[1]}",
             remedy='send {"jsonrpc": "2.0", "id": 1, "method": ..., "params": {...}}; no batches',
+            id=_readable_id(document),
         ) from error
     return Request(envelope.method, envelope.params, envelope.id, "id" in document)
 
 
 def read_params(model: type[_MessageT], request: Request) -> _MessageT:
     """Validate the parameters of a request; raises RpcError."""
+    # The first of many unknown ones is reported without describing them all.
+    unknown = next((key for key in request.params if key not in model.model_fields), None)
     try:
-        return model.model_validate(request.params)
+        params = request.params if unknown is None else {unknown: None}
+        return model.model_validate(params)
     except ValidationError as error:
+        key, problem = _first_problem(error, key=unknown)
         raise RpcError(
             ErrorCode.INVALID_PARAMS,
-            f"{request.method}: {_first_problem(error)}",
-            where=_key(error),
+            f"{request.method}: {problem}",
+            where=key,
             remedy="see the method in docs/reference/api.md",
         ) from error
 
@@ -151,9 +185,29 @@ def error_line(id: Id, error: RpcError) -> bytes:
     content = {
         "code": int(error.code),
         "message": str(error)[:_MAX_ERROR_TEXT],
-        "data": error.data.model_dump(),
+        "data": error_data(error),
     }
     return json.dumps({"jsonrpc": "2.0", "id": id, "error": content}).encode() + b"\n"
+
+
+def error_data(error: RpcError) -> dict[str, Any]:
+    """The data of an error as JSON."""
+    return error.data.model_dump(exclude=None if error.data.amplifiers else {"amplifiers"})
+
+
+def read_error(error: Mapping[str, Any]) -> RpcError:
+    """The error of a response; raises KeyError, TypeError or ValueError for anything else."""
+    data = error.get("data") or {}
+    code = ErrorCode(error["code"])
+    if code is ErrorCode.NOT_SILENT:
+        return NotSilent(
+            {
+                name: AmplifierSilence.model_validate(each, extra="ignore")
+                for name, each in data["amplifiers"].items()
+            }
+        )
+    what = data.get("what", error["message"])
+    return RpcError(code, what, where=data.get("where"), remedy=data.get("remedy"))
 
 
 def request_line(id: Id, method: str, params: Message) -> bytes:
@@ -171,17 +225,74 @@ def event_line(topic: str, *, time: float, lost: int, data: bytes) -> bytes:
     return f'{head},"lost":{lost},"data":'.encode() + data + b"}}\n"
 
 
-def _first_problem(error: ValidationError) -> str:
-    """Describe the first problem and count the others, without quoting the input."""
+def parse_json(line: bytes) -> Any:
+    """Parse bounded JSON without repeated keys, NaN and infinity; raises InvalidRequest."""
+    problems: list[str] = []
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        content = dict(pairs)
+        if len(content) < len(pairs):
+            counts = Counter(key for key, _ in pairs)
+            problems.append(f"key {_printable(counts.most_common(1)[0][0])} is repeated")
+        return content
+
+    def refuse_constant(name: str) -> None:
+        problems.append(f"{name} is not JSON")
+
+    if (
+        sum(map(line.count, b"{[")) > MAX_OPENINGS
+        or sum(map(line.count, b":,")) > MAX_SEPARATORS
+        or len(line) > MAX_LINE_LENGTH
+    ):
+        raise InvalidRequest(
+            ErrorCode.PARSE, "too many keys or values", remedy="send fewer touches per frame"
+        )
+    try:
+        document = json.loads(
+            line.decode(), object_pairs_hook=unique, parse_constant=refuse_constant
+        )
+    except (ValueError, RecursionError) as error:
+        raise InvalidRequest(
+            ErrorCode.PARSE,
+            f"not valid JSON: {error!s:.200}",
+            remedy="send one JSON object per line, in UTF-8",
+        ) from error
+    if problems:
+        raise InvalidRequest(
+            ErrorCode.PARSE,
+            problems[0],
+            remedy="give every key once, and finite numbers",
+            id=_readable_id(document),
+        )
+    return document
+
+
+def _readable_id(document: object) -> Id:
+    """The id of a document that is not a request, if it has one."""
+    try:
+        return _REQUEST_ID.validate_python(document["id"] if isinstance(document, dict) else None)
+    except (KeyError, ValidationError):
+        return None
+
+
+def _first_problem(error: ValidationError, *, key: str | None = None) -> tuple[str | None, str]:
+    """Key and description of the first problem (of a key), without quoting the input."""
     problems = error.errors(include_url=False, include_context=False, include_input=False)
-    more = f" ({len(problems) - 1} more)" if len(problems) > 1 else ""
-    key = _key(error)
-    return f"{key + ': ' if key else ''}{in_our_words(problems[0]['msg'])}{more}"
+    problem = next((each for each in problems if each["loc"] == (key,)), problems[0])
+    name = _printable(".".join(str(part) for part in problem["loc"]))
+    text = reworded(problem["msg"])
+    return name or None, f"{name}: {text}" if name else text
 
 
-def _key(error: ValidationError) -> str | None:
-    """The key of the first problem, shortened and free of control characters."""
-    location = error.errors(include_url=False, include_context=False, include_input=False)[0]["loc"]
-    name = ".".join(str(part) for part in location)
-    printable = name if name.isprintable() else ascii(name)
-    return printable[:80] or None
+def _printable(name: str) -> str:
+    """A key, shortened and free of control characters."""
+    return (name if name.isprintable() else ascii(name))[:80]
+
+
+def _in_words(outcome: AmplifierSilence) -> str:
+    match outcome.silence, outcome.may_play_for_s:
+        case "may_play", float(left):
+            return f"may play for {left:.2f} s more: {outcome.cause}"
+        case "may_play", _:
+            return f"may play until it is switched off: {outcome.cause}"
+    return f"unreachable, its watchdog has elapsed: {outcome.cause}"

@@ -6,22 +6,23 @@ description all use this table.
 
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import Field
+from pydantic import FailFast, Field
 
 from controller.api.schema import (
     MAX_LEASE,
     MAX_RATE,
     MIN_LEASE,
+    AmplifierSilence,
     AmplifierStatus,
     ContactStatus,
     Count,
     DaemonStateName,
     EffectDescription,
     Empty,
+    GroupStateName,
     LatencySummary,
     Message,
     Name,
-    PhaseName,
     PlayedTone,
     RigSummary,
     TableSummary,
@@ -39,7 +40,7 @@ class HelloParams(Message):
 
 
 class HelloResult(Message):
-    """What the daemon drives; constant while it runs, except for the layout."""
+    """Rig, table and layout of the daemon; constant while it runs, except for the layout."""
 
     api_version: str = Field(description="major.minor; major versions are incompatible")
     software_version: str
@@ -57,24 +58,23 @@ class StatusResult(Message):
     state: DaemonStateName
     cause: str = Field(description="why the daemon is in this state")
     remedy: str | None = Field(description="what to do about it; null if nothing")
-    phase: PhaseName
+    amplifiers_state: GroupStateName
     assume_energised: bool = Field(description="whether lost amplifiers may still be playing")
     lost_for_s: float | None = Field(
         description="how long a link has been lost; null if all are up"
     )
     watchdog_s: float = Field(
-        description="time without commands after which an armed amplifier silences itself"
+        description="time without heartbeats after which an armed amplifier silences itself"
     )
     armed_by: str | None
     lease_left_s: float | None
     contacts: list[ContactStatus] = Field(description="in order of arrival, newest last")
     drive: dict[str, PlayedTone] = Field(description="by ERA, without silent ones")
-    silent_because: str | None = Field(None, description="why nothing plays although armed")
-    plain_because: str | None = Field(
+    silence_reason: str | None = Field(None, description="why nothing plays although armed")
+    ramp_only_reason: str | None = Field(
         None, description="why onsets are plain ramps although shaped ones are possible"
     )
     predicted_contrast_db: float | None
-    robust_contrast_db: float | None
     predicted_level_db_sl: float | None
     amplifiers: list[AmplifierStatus]
     latency_ms: LatencySummary
@@ -108,11 +108,31 @@ class RenewResult(Message):
     lease_s: float
 
 
+class RequestedBy(Message):
+    """Who requests it, for the log, if it is not the connection's own client."""
+
+    client: Name | None = None
+
+
+class DisarmParams(RequestedBy):
+    """Whose lease to end."""
+
+    lease: Annotated[str, Field(min_length=1, max_length=80)] | None = Field(
+        None, description="disarm only while this lease lasts; null: whoever armed"
+    )
+
+
+class StopResult(Message):
+    """Every amplifier is confirmed silent."""
+
+    amplifiers: dict[str, AmplifierSilence] = Field(default={}, description="by name")
+
+
 class TouchParams(Message):
     """All fingers of one source of this client; valid for 150 ms, to be repeated."""
 
     source: Name
-    touches: Annotated[list[TouchPoint], Field(max_length=MAX_TOUCHES)]
+    touches: Annotated[list[TouchPoint], Field(max_length=MAX_TOUCHES), FailFast()]
 
 
 class EffectsResult(Message):
@@ -162,14 +182,16 @@ METHODS: dict[str, Method] = {
         ArmParams, ArmResult, "switch high voltage on; touches are felt until the lease expires"
     ),
     "renew": Method(RenewParams, RenewResult, "extend the lease"),
-    "disarm": Method(Empty, Empty, "ramp to silence and switch high voltage off; any client may"),
-    "stop": Method(
-        Empty,
-        Empty,
-        "quick stop, latched until clear; any client may, at any time; error 1004 if an amplifier "
-        "did not receive it and is therefore lost",
+    "disarm": Method(
+        DisarmParams, Empty, "ramp to silence and switch high voltage off; any client may"
     ),
-    "clear": Method(Empty, Empty, "acknowledge a stop, or a fault whose cause is gone"),
+    "stop": Method(
+        RequestedBy,
+        StopResult,
+        "quick stop, latched until clear; any client may, at any time; error 1006 unless every "
+        "amplifier is confirmed silent",
+    ),
+    "clear": Method(RequestedBy, Empty, "acknowledge a stop, or a fault whose cause is gone"),
     "touch": Method(TouchParams, Empty, "report all fingers of a touch source of this client"),
     "effects": Method(Empty, EffectsResult, "list the effects"),
     "play": Method(PlayParams, Empty, "play an effect at a finger; only while armed"),

@@ -25,7 +25,7 @@ DaemonStateName: TypeAlias = Literal[
 ]
 """State of the daemon: the names of CiA 402, and COMM_LOST."""
 
-PhaseName: TypeAlias = Literal["closed", "disarmed", "armed", "lost"]
+GroupStateName: TypeAlias = Literal["closed", "disarmed", "armed", "lost"]
 """State of all amplifiers together."""
 
 Topic: TypeAlias = Literal[
@@ -121,7 +121,7 @@ class ContactStatus(Message):
 
 
 class PlayedTone(Message):
-    """What an amplifier plays on one ERA, as confirmed."""
+    """Tone of one ERA as confirmed by its amplifier."""
 
     frequency_hz: float
     level: float = Field(description="0 to 1 of the full stroke")
@@ -133,8 +133,10 @@ class LinkCounters(Message):
 
     frames_out: Count
     frames_in: Count
-    bad: Count = Field(description="frames with CRC errors")
-    foreign: Count = Field(description="valid but unexpected frames")
+    invalid_frames: Count = Field(
+        description="frames with a wrong checksum, length, form or version"
+    )
+    unexpected_frames: Count = Field(description="valid but unexpected frames")
     events: Count
     retries: Count
     timeouts: Count
@@ -157,11 +159,27 @@ class AmplifierStatus(Message):
     high_voltage: bool | None
     high_voltage_v: float | None
     reply_age_s: float | None = Field(description="time since its last reply")
+    degraded: bool = Field(
+        False, description="whether it does not reply but may still play, so that nothing new plays"
+    )
     lost: bool = Field(description="whether the link to it is lost")
     closed_with_lost: bool = Field(
         description="whether it still replied but was closed because another one is lost"
     )
     statistics: LinkCounters
+
+
+class AmplifierSilence(Message):
+    """Silence of an amplifier after a stop."""
+
+    silence: Literal["confirmed_silent", "may_play", "watchdog_elapsed"] = Field(
+        description="confirmed by its status after the stop; may play until its watchdog; or out "
+        "of reach for longer than its watchdog"
+    )
+    may_play_for_s: float | None = Field(
+        description="time until its watchdog silences it; null if none does, or if it is silent"
+    )
+    cause: str
 
 
 class LatencySummary(Message):

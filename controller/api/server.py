@@ -5,17 +5,20 @@ the control loop first. What takes longer, such as arming, runs as a task of its
 """
 
 import asyncio
+import contextlib
 import logging
 import socket
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from controller.api.connection import Connection
 from controller.api.jsonrpc import (
     ErrorCode,
-    Request,
+    Id,
+    InvalidRequest,
     RpcError,
     error_line,
     read_params,
@@ -23,17 +26,19 @@ from controller.api.jsonrpc import (
     result_line,
     unknown_method,
 )
-from controller.api.methods import METHODS
+from controller.api.methods import METHODS, TouchParams
+from controller.api.places import RESERVE_METHODS, Places
 from controller.api.schema import Message
+from controller.group.tasks import CoalescedCalls
 from drivers import clock
 from drivers.errors import CommandRefused, DriverError, LinkError
 from model.errors import InputError
 
-MAX_CONNECTIONS = 32
-IDLE_TIMEOUT = 1.0  # s; a client silent for this long can be replaced when there are too many
 MAX_ITERATION_TIME = 0.00025  # s; how long a touch waits for clients that flood
 MAX_PENDING = 8  # requests of one client that take long; stop is not counted
-_ACCEPT_PER_TURN = 4  # connections
+MAX_EXCESS = 3  # requests beyond a client's rate, after which it pauses
+PAUSE = 0.001  # s
+_ACCEPT_PER_TURN = 1  # connections
 _ACCEPT_QUEUE = 64  # connections
 
 Handler: TypeAlias = Callable[[Connection, Any], Message | Awaitable[Message]]
@@ -41,14 +46,41 @@ Handler: TypeAlias = Callable[[Connection, Any], Message | Awaitable[Message]]
 _UNLIMITED = frozenset({"stop", "touch"})
 """Methods that the request rate does not limit: a stop is always served, touches never queue up."""
 
+_BUSY = RpcError(ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
+
 _logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _Call:
+    """A line as read: a method with its parameters, or an error."""
+
+    id: Id
+    expects_response: bool
+    method: str = ""
+    params: Message | None = None
+    error: RpcError | None = None
+
+    def is_superseded_by(self, other: "_Call | None") -> bool:
+        """Whether both are touch frames of one source without an id: only the newest counts.
+
+        A frame holds all fingers of its source, hence no lift is lost.
+        """
+        return (
+            other is not None
+            and not (self.expects_response or other.expects_response)
+            and isinstance(self.params, TouchParams)
+            and isinstance(other.params, TouchParams)
+            and self.params.source == other.params.source
+        )
 
 
 class ApiServer:
     """Serves the methods of the API.
 
     handlers: of all METHODS, called with the client and the parameters; on_disconnect: called with
-    every client that disconnects; is_protected: whether an idle client must not be replaced.
+    every client that disconnects; is_kept: whether a client must not be evicted, since it holds the
+    lease; is_subscribed: whether it has subscriptions; clock [s].
     """
 
     def __init__(
@@ -56,14 +88,15 @@ class ApiServer:
         handlers: Mapping[str, Handler],
         *,
         on_disconnect: Callable[[Connection], None],
-        is_protected: Callable[[Connection], bool],
+        is_kept: Callable[[Connection], bool],
+        is_subscribed: Callable[[Connection], bool],
         clock: Callable[[], float] = clock.now,
     ) -> None:
         self._handlers = handlers
         self._on_disconnect = on_disconnect
-        self._is_protected = is_protected
         self._clock = clock
-        self._connections: set[Connection] = set()
+        self._places = Places(is_kept=is_kept, is_subscribed=is_subscribed, clock=clock)
+        self._stops: dict[Connection, CoalescedCalls[Message]] = {}
         self._waiting: deque[Connection] = deque()
         self._is_turn_scheduled = False
         self._server: asyncio.Server | None = None
@@ -81,43 +114,41 @@ class ApiServer:
         if self._server is None:
             return
         self._server.close()
-        for connection in list(self._connections):
+        for connection in list(self._places.taken):
             connection.close()
         await asyncio.sleep(0)
-        for connection in list(self._connections):
+        for connection in list(self._places.taken):
             connection.abort()
         await self._server.wait_closed()
 
     def _make_connection(self) -> Connection:
         return Connection(
-            on_connect=self._connected,
+            on_connect=self._places.take,
             on_lines=self._lines_received,
             on_disconnect=self._disconnected,
             clock=self._clock,
         )
 
-    def _connected(self, connection: Connection) -> bool:
-        """Accept a client, if necessary in place of the one that has been idle for longest."""
-        if len(self._connections) >= MAX_CONNECTIONS:
-            idle = [c for c in self._connections if not self._is_protected(c) and not c.pending]
-            oldest = min(idle, key=lambda each: each.received_at, default=None)
-            if oldest is None or self._clock() - oldest.received_at < IDLE_TIMEOUT:
-                return False
-            self._connections.discard(oldest)
-            oldest.abort()
-        self._connections.add(connection)
-        return True
-
     def _disconnected(self, connection: Connection) -> None:
-        self._connections.discard(connection)
+        self._places.taken.discard(connection)
+        self._stops.pop(connection, None)
         self._on_disconnect(connection)
 
     def _lines_received(self, connection: Connection) -> None:
-        if connection not in self._waiting:
+        if connection.is_paused:
+            return
+        if connection.is_urgent:
+            with contextlib.suppress(ValueError):
+                self._waiting.remove(connection)
+            self._waiting.appendleft(connection)
+        elif connection not in self._waiting:
             self._waiting.append(connection)
-        if not self._is_turn_scheduled:
+        self._schedule_turn(asyncio.get_running_loop().call_soon)
+
+    def _schedule_turn(self, call: Callable[..., object], *arguments: object) -> None:
+        if self._waiting and not self._is_turn_scheduled:
             self._is_turn_scheduled = True
-            asyncio.get_running_loop().call_soon(self._serve_turn)
+            call(*arguments, self._serve_turn)
 
     def _serve_turn(self) -> None:
         """Serve one line of each waiting client, round and round, until the turn's time is up."""
@@ -125,70 +156,147 @@ class ApiServer:
         end = time.perf_counter() + MAX_ITERATION_TIME
         while self._waiting:
             connection = self._waiting.popleft()
-            if connection.has_lines:
-                is_superseded = connection.is_next_superseded
-                line = connection.next_line()
-                if not is_superseded:
-                    self._serve(connection, line)
-                if connection.has_lines:
-                    self._waiting.append(connection)
+            call = self._next(connection)
+            if isinstance(call, _Call) and isinstance(call.params, TouchParams):
+                connection.ahead = self._read(connection)
+                if call.is_superseded_by(connection.ahead):
+                    call = None
+            if call is not None:
+                self._serve(connection, call)
+            if connection.excess >= MAX_EXCESS:
+                self._pause(connection)
+            elif connection.has_lines:
+                self._waiting.append(connection)
             connection.close_if_finished()
             if time.perf_counter() >= end:
                 break
-        if self._waiting and not self._is_turn_scheduled:
-            # Two iterations of the event loop from now: data that arrived meanwhile and what it
-            # wakes, such as the control loop for a touch, run first.
-            self._is_turn_scheduled = True
-            loop = asyncio.get_running_loop()
-            loop.call_soon(loop.call_soon, self._serve_turn)
+        # Two iterations of the event loop from now: data that arrived meanwhile and what it wakes,
+        # such as the control loop for a touch, run first.
+        loop = asyncio.get_running_loop()
+        self._schedule_turn(loop.call_soon, loop.call_soon)
 
-    def _serve(self, connection: Connection, line: bytes) -> None:
-        """Serve one line, or start to."""
-        request: Request | None = None
+    def _pause(self, connection: Connection) -> None:
+        """Serve a client that exceeds its rate a little at a time, so that it delays no one."""
+        connection.is_paused = True
+        asyncio.get_running_loop().call_later(PAUSE, self._resume, connection)
+
+    def _resume(self, connection: Connection) -> None:
+        connection.is_paused = False
+        connection.excess = 0
+        if connection.has_lines:
+            self._lines_received(connection)
+
+    def _next(self, connection: Connection) -> _Call | None:
+        """The next call of a client, None if there is none."""
+        ahead: _Call | None = connection.ahead
+        connection.ahead = None
+        return ahead or self._read(connection)
+
+    def _read(self, connection: Connection) -> _Call | None:
+        """Read the next line, within the client's rate; refused requests count."""
+        try:
+            line = connection.next_line()
+        except InvalidRequest as error:
+            connection.refuse(error)
+            return None
+        if line is None:
+            return None
         try:
             request = read_request(line)
-            if request.method == "arm" and not request.expects_response:
-                return  # without a response no client has the lease to renew or end
-            result = self._call(connection, request)
+        except InvalidRequest as error:
+            return self._refused(connection, _Call(error.id, True, error=error))
+        head = request.id, request.expects_response, request.method
+        try:
+            if request.method not in METHODS:
+                raise unknown_method(request.method, METHODS)
+            params = read_params(METHODS[request.method].params, request)
+        except RpcError as error:
+            return self._refused(connection, _Call(*head, error=error))
+        if request.method not in _UNLIMITED and not connection.take_request():
+            return _Call(*head, error=_BUSY)
+        return _Call(*head, params)
+
+    def _refused(self, connection: Connection, call: _Call) -> _Call | None:
+        """Count a refused request; close the connection of a client with too many."""
+        if connection.take_request():
+            return call
+        connection.refuse(_BUSY)
+        return None
+
+    def _serve(self, connection: Connection, call: _Call) -> None:
+        """Serve one call, or start to."""
+        if call.error is not None:
+            self._respond_error(connection, call, call.error)
+            return
+        if call.method == "arm" and not call.expects_response:
+            return  # without a response no client has the lease to renew or end
+        try:
+            result = self._call(connection, call)
         except Exception as error:
-            self._respond_error(connection, request, error)
+            self._respond_error(connection, call, error)
             return
         if isinstance(result, Message):
-            self._respond(connection, request, result)
+            self._respond(connection, call, result)
             return
-        task = asyncio.ensure_future(self._finish(connection, request, result))
+        task = asyncio.ensure_future(self._finish(connection, call, result))
         connection.pending.add(task)
-        task.add_done_callback(connection.pending.discard)
-        task.add_done_callback(lambda _: connection.close_if_finished())
+        task.add_done_callback(lambda task: self._finished(connection, task))
 
-    def _call(self, connection: Connection, request: Request) -> Message | Awaitable[Message]:
-        method = METHODS.get(request.method)
-        if request.method not in _UNLIMITED and not connection.take_request():
-            raise RpcError(ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
-        if method is None:
-            raise unknown_method(request.method, METHODS)
-        if len(connection.pending) >= MAX_PENDING and request.method != "stop":
+    def _finished(self, connection: Connection, task: "asyncio.Task[None]") -> None:
+        connection.pending.discard(task)
+        if connection.has_lines:
+            self._lines_received(connection)
+        connection.close_if_finished()
+
+    def _call(self, connection: Connection, call: _Call) -> Message | Awaitable[Message]:
+        if call.method not in RESERVE_METHODS and not self._places.promote(connection):
+            raise RpcError(
+                ErrorCode.BUSY,
+                f"too many clients; this place serves {', '.join(sorted(RESERVE_METHODS))} only",
+                remedy="try again later",
+            )
+        if call.method == "stop":
+            return self._coalesced_stop(connection, call.params)
+        if len(connection.pending) >= MAX_PENDING:
             raise RpcError(ErrorCode.BUSY, "too many pending requests", remedy="await responses")
-        return self._handlers[request.method](connection, read_params(method.params, request))
+        if call.method == "arm":
+            return self._arm(connection, call.params)
+        return self._handlers[call.method](connection, call.params)
+
+    async def _arm(self, connection: Connection, params: Message | None) -> Message:
+        """Arm for a client that has not left with the same bytes."""
+        for _ in range(2):  # iterations in which its end is received
+            await asyncio.sleep(0)
+        if connection.has_left:
+            raise RpcError(ErrorCode.LEASE, "the client has left", remedy="stay to renew the lease")
+        result = self._handlers["arm"](connection, params)
+        return result if isinstance(result, Message) else await result
+
+    def _coalesced_stop(self, connection: Connection, params: Message | None) -> Awaitable[Message]:
+        """Stop; a client's stops during one of its own share the next."""
+
+        async def stop() -> Message:
+            result = self._handlers["stop"](connection, params)
+            return result if isinstance(result, Message) else await result
+
+        calls = self._stops.setdefault(connection, CoalescedCalls())
+        return asyncio.shield(calls.request(stop))
 
     async def _finish(
-        self, connection: Connection, request: Request, result: Awaitable[Message]
+        self, connection: Connection, call: _Call, result: Awaitable[Message]
     ) -> None:
         try:
-            self._respond(connection, request, await result)
+            self._respond(connection, call, await result)
         except Exception as error:
-            self._respond_error(connection, request, error)
+            self._respond_error(connection, call, error)
 
-    def _respond(self, connection: Connection, request: Request, result: Message) -> None:
-        if request.expects_response:
-            connection.respond(result_line(request.id, result.model_dump_json()))
+    def _respond(self, connection: Connection, call: _Call, result: Message) -> None:
+        if call.expects_response:
+            connection.respond(result_line(call.id, result.model_dump_json()))
 
-    def _respond_error(
-        self, connection: Connection, request: Request | None, error: Exception
-    ) -> None:
-        if request is None or request.expects_response:
-            id = None if request is None else request.id
-            connection.respond(error_line(id, _rpc_error(error)))
+    def _respond_error(self, connection: Connection, call: _Call, error: Exception) -> None:
+        if call.expects_response:
+            connection.respond(error_line(call.id, _rpc_error(error)))
 
 
 def _rpc_error(error: Exception) -> RpcError:

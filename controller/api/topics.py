@@ -37,7 +37,6 @@ class PatternEvent(Message):
     contacts: list[ContactStatus]
     drive: dict[str, PlayedTone] = Field(description="by ERA, without silent ones")
     predicted_contrast_db: float | None
-    robust_contrast_db: float | None
     predicted_level_db_sl: float | None
     latency_ms: float = Field(description="from the touch to the last byte of the command")
 
@@ -60,7 +59,7 @@ class LatencyEvent(Message):
     """Latencies, at the subscribed rate."""
 
     latency_ms: LatencySummary
-    plain_because: str | None = Field(
+    ramp_only_reason: str | None = Field(
         description="why onsets are plain ramps although shaped ones are possible"
     )
 
@@ -75,9 +74,13 @@ class LogEvent(Message):
 
 
 class LinkEvent(Message):
-    """The link to amplifiers was lost, could not be reopened, or was reopened."""
+    """The link to amplifiers was lost, could not be reopened, or was reopened.
 
-    event: Literal["lost", "retry", "reopened"]
+    Degraded: an amplifier does not reply but may still play; nothing new is played until it replies
+    (restored) or is lost.
+    """
+
+    event: Literal["degraded", "restored", "lost", "retry", "reopened"]
     amplifier: str | None = Field(description="its name, if known")
     message: str
     remedy: str | None
@@ -104,7 +107,7 @@ TOPICS: dict[Topic, TopicData] = {
     "amplifiers": TopicData(AmplifiersEvent, "status of the amplifiers, at rate_hz"),
     "latency": TopicData(LatencyEvent, "latency from touch to command, at rate_hz"),
     "log": TopicData(LogEvent, "log records from level info, without those of `state` and `link`"),
-    "link": TopicData(LinkEvent, "links to amplifiers that were lost or reopened"),
+    "link": TopicData(LinkEvent, "links to amplifiers that were degraded, lost or reopened"),
     "layout": TopicData(LayoutEvent, "the surface layout was replaced"),
 }
 """Every topic, by name."""

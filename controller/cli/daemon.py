@@ -22,7 +22,7 @@ from registry.suggestions import did_you_mean
 if TYPE_CHECKING:
     from controller.api.client import Client
     from controller.api.client_protocol import Notification
-    from controller.api.methods import StatusResult
+    from controller.api.methods import ArmResult, StatusResult
     from controller.api.schema import RigSummary
 
 app = typer.Typer()
@@ -40,8 +40,9 @@ DASHBOARD = "127.0.0.1:8137"
 """Default address of the page, as of `era gateway`."""
 
 _DEFAULT_TOPICS = ["state", "contacts", "pattern", "silence", "link", "log"]
-"""Of `era watch`; amplifiers and latency are published without end."""
+"""Topics of `era watch`: all but amplifiers and latency, which are published without end."""
 
+_LEASE_CHECK_INTERVAL = 0.5  # s
 _REPEAT_INTERVAL = 0.05  # s; a touch that is not repeated for 150 ms is lifted
 
 
@@ -77,6 +78,10 @@ def daemon(
             help=f"Serve the page from a separate process; default: {DASHBOARD}.",
         ),
     ] = None,
+    trace: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Append every frame on the wires to a file."),
+    ] = None,
 ) -> None:
     """Run the daemon that drives a plate; starts disarmed."""
     from controller.daemon.run import check_daemon, run_daemon
@@ -84,7 +89,7 @@ def daemon(
     if check:
         typer.echo(check_daemon(config))
         return
-    run_daemon(config, dashboard=dashboard)
+    run_daemon(config, dashboard=dashboard, trace=trace)
 
 
 @app.command()
@@ -109,18 +114,17 @@ def arm(
 ) -> None:
     """Switch the high voltage on. Stays and renews the lease; Ctrl-C disarms."""
     with _client(socket) as era:
-        granted = era.arm(owner, lease_s=lease)
+        if once:
+            granted = era.arm(owner, lease_s=lease)
+            _print_lease(granted, f"for {granted.lease_s:g} s", as_json=as_json)
+            return
         try:
-            if as_json:
-                typer.echo(granted.model_dump_json())
-            else:
-                how = f"for {granted.lease_s:g} s" if once else "until Ctrl-C"
-                typer.echo(f"armed {how}; era stop stops everything at once")
-            while not once:
-                time.sleep(granted.lease_s / 3)
-                _renew(era, granted.lease)
+            with era.armed(owner, lease_s=lease) as granted:
+                _print_lease(granted, "until Ctrl-C", as_json=as_json)
+                while True:
+                    time.sleep(_LEASE_CHECK_INTERVAL)
+                    era.status()  # raises LeaseLost
         except KeyboardInterrupt:
-            era.disarm()
             if not as_json:
                 typer.echo("disarmed")
 
@@ -220,31 +224,24 @@ def watch(
 def _client(socket: Path | None) -> "Iterator[Client]":
     """Connect; translate refusals of the daemon to errors with their exit status."""
     from controller.api.client import Client
-    from controller.api.jsonrpc import ErrorCode, RpcError
+    from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
 
     with Client.connect(socket, name="era") as era:
         try:
             yield era
         except RpcError as error:
-            if error.code is ErrorCode.LINK:
+            if error.code is ErrorCode.LINK or isinstance(error, NotSilent):
                 raise LinkError(str(error)) from error
             if error.code is ErrorCode.INVALID_PARAMS:
                 raise InputError(str(error)) from error
             raise CommandRefused(str(error)) from error
 
 
-def _renew(era: "Client", lease: str) -> None:
-    """Renew a lease; raises CommandRefused with the cause if it has ended."""
-    from controller.api.jsonrpc import ErrorCode, RpcError
-
-    try:
-        era.renew(lease)
-    except RpcError as error:
-        if error.code is not ErrorCode.LEASE:
-            raise
-        status = era.status()
-        remedy = f"; {status.remedy}" if status.remedy else ""
-        raise CommandRefused(f"disarmed, {status.state}: {status.cause}{remedy}") from error
+def _print_lease(granted: "ArmResult", how_long: str, *, as_json: bool) -> None:
+    if as_json:
+        typer.echo(granted.model_dump_json())
+    else:
+        typer.echo(f"armed {how_long}; era stop stops everything at once")
 
 
 def _check_places(places: "list[tuple[float, float]]", rig: "RigSummary") -> None:
@@ -288,7 +285,7 @@ def show_status(status: "StatusResult") -> str:
     if status.remedy:
         lines.append(f"  remedy: {status.remedy}")
     if status.lost_for_s is not None:
-        watchdog = f"its watchdog silences it after {status.watchdog_s:g} s without commands"
+        watchdog = f"its watchdog silences it after {status.watchdog_s:g} s without heartbeats"
         lines.append(
             f"  ASSUME ENERGISED: a lost amplifier may still be playing; {watchdog}"
             if status.assume_energised
@@ -304,18 +301,20 @@ def show_status(status: "StatusResult") -> str:
             f"  finger {contact.source} {contact.id} at {contact.x_m:.3f}, {contact.y_m:.3f} m: "
             f"{contact.role or 'not driven'}{level}{contrast}{effect}"
         )
-    if status.silent_because is not None and status.contacts:
-        lines.append(f"  silent: {status.silent_because}")
+    if status.silence_reason is not None and status.contacts:
+        lines.append(f"  silent: {status.silence_reason}")
     elif status.contacts and status.state == "READY_TO_SWITCH_ON":
         lines.append("  silent: not armed; arm with era arm")
-    if status.plain_because is not None:
-        lines.append(f"  plain ramps: {status.plain_because}")
+    if status.ramp_only_reason is not None:
+        lines.append(f"  plain ramps: {status.ramp_only_reason}")
     for era, tone in status.drive.items():
         lines.append(
             f"  ERA {era}: {tone.frequency_hz:g} Hz, level {tone.level:.3f}, {tone.phase_deg:g} deg"
         )
     for amplifier in status.amplifiers:
         parts = [amplifier.state] if amplifier.state else []
+        if amplifier.degraded:
+            parts.append("does not reply, may play")
         if amplifier.lost:
             parts.append("LOST")
         if amplifier.closed_with_lost:

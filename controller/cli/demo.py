@@ -122,24 +122,21 @@ _HEADING = """\
 
 
 def _line(row: "TouchRow") -> str:
-    x, y = (100 * value for value in row.target)
-    start = f"{row.time:5.1f}  {x:5.1f},{y:5.1f}  {len(row.quiet):6d}  "
-    played = row.played
-    if played is None:
+    x, y = (100 * value for value in row.targets_m[0])
+    start = f"{row.time_s:5.1f}  {x:5.1f},{y:5.1f}  {len(row.quiet):6d}  "
+    if row.reason is not None:
         return f"{start}silent: {row.reason}"
     by_frequency: dict[float, list[str]] = {}
-    for era, tone in played.drive.items():
+    for era, tone in row.drive.items():
         by_frequency.setdefault(tone["frequency_hz"], []).append(era)
     eras = ", ".join(f"{' '.join(some)} {hertz:g} Hz" for hertz, some in by_frequency.items())
     numbers = (
-        *(played.predicted_contrast_db, played.measured_contrast_db),
-        *(played.predicted_transient_contrast_db, played.measured_transient_contrast_db),
-        *(played.predicted_level_db_sl, played.measured_level_db_sl),
+        *(row.predicted_contrast_db, row.measured_contrast_db),
+        *(row.predicted_transient_contrast_db, row.measured_transient_contrast_db),
+        *(row.predicted_level_db_sl, row.measured_level_db_sl, row.latency_ms),
     )
-    return (
-        f"{start}{eras:22s} {' '.join(f'{_number(number):>6s}' for number in numbers)} "
-        f"{_number(1000 * played.latency):>6s}{'' if played.is_steady else '  still ringing'}"
-    )
+    figures = " ".join(f"{_number(number):>6s}" for number in numbers)
+    return f"{start}{eras:22s} {figures}{'' if row.steady else '  still ringing'}"
 
 
 def _number(value: float | None) -> str:
@@ -149,12 +146,11 @@ def _number(value: float | None) -> str:
 def _summary(rows: "list[TouchRow]") -> str:
     """Compare prediction and measurement over the touches that reached the steady state."""
     differences = [
-        abs(row.played.predicted_contrast_db - row.played.measured_contrast_db)
+        abs(row.predicted_contrast_db - row.measured_contrast_db)
         for row in rows
-        if row.played is not None
-        and row.played.is_steady
-        and row.played.predicted_contrast_db is not None
-        and row.played.measured_contrast_db is not None
+        if row.steady
+        and row.predicted_contrast_db is not None
+        and row.measured_contrast_db is not None
     ]
     touches = counted(len(rows), "touch", plural="touches")
     if not differences:

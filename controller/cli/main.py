@@ -11,6 +11,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Sequence
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
 from typing import Annotated, TypeAlias
@@ -19,7 +20,7 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_group
 
-from model.errors import in_our_words
+from model.errors import reworded
 from registry.plugins import failed_plugin, failure_text, package_remedy
 
 BAD_INPUT = 2
@@ -111,6 +112,7 @@ def load_commands(modules: Iterable[EntryPoint], *, debug: bool) -> tuple[TyperG
     return group, statuses
 
 
+@cache
 def _group(app: typer.Typer) -> TyperGroup:
     """Return the commands of an application, without rich, which would double the time of help."""
     app.rich_markup_mode = None
@@ -197,7 +199,7 @@ def _file_error(error: OSError) -> str:
 
 def _report_usage(error: typer.TyperException) -> int:
     """Print what is wrong with the command line, or the help without a command."""
-    message = in_our_words(error.format_message())
+    message = reworded(error.format_message())
     context = getattr(error, "ctx", None)
     if context is None:
         _print_error(f"error: {message}")

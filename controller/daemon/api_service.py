@@ -1,41 +1,52 @@
 """The methods of the API, implemented by the daemon."""
 
 import asyncio
+import logging
 import time
 from collections.abc import Mapping
 from typing import cast
 
 from controller.api.connection import Connection
-from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
 from controller.api.methods import (
     ArmParams,
     ArmResult,
+    DisarmParams,
     HelloParams,
     HelloResult,
     PlayParams,
     RenewParams,
     RenewResult,
+    RequestedBy,
     StatusResult,
+    StopResult,
     SubscribeParams,
     TouchParams,
     UnsubscribeParams,
 )
-from controller.api.schema import Empty, PhaseName
+from controller.api.schema import AmplifierSilence, Empty, GroupStateName
 from controller.api.server import Handler
 from controller.daemon.active_layout import ActiveLayout
 from controller.daemon.config import DaemonConfig
 from controller.daemon.hello import hello_result
 from controller.daemon.lease import LeaseHolder
 from controller.daemon.publisher import EventPublisher
-from controller.daemon.states import DaemonEvent, DaemonState, StateMachine, Trigger
+from controller.daemon.states import ACKNOWLEDGE, DaemonEvent, DaemonState, StateMachine, Trigger
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches
+from controller.group.quick_stops import QuickStops
 from controller.loop.loop import Controller
 from drivers import clock
 from drivers.amplifier import WATCHDOG, Amplifier
+from drivers.errors import DriverError
 from model.table.table import LocalizationTable
 
+_LEASE_RECHECK = 0.25  # s
+
+_logger = logging.getLogger(__name__)
+
 _ARMABLE = (DaemonState.SWITCHED_ON, DaemonState.OPERATION_ENABLED)
+_ENABLED = DaemonState.OPERATION_ENABLED
 _REMEDIES = {
     DaemonState.SWITCH_ON_DISABLED: "wait a moment and try again",
     DaemonState.READY_TO_SWITCH_ON: "arm first (era arm)",
@@ -68,6 +79,7 @@ class ApiService:
         self._touches = touches
         self._layout = layout
         self._lease = LeaseHolder()
+        self._holders: set[Connection] = set()  # clients that armed or renewed the lease
         self._expiry: asyncio.TimerHandle | None = None
         self._client_numbers: dict[Connection, int] = {}
         self._client_count = 0
@@ -80,9 +92,9 @@ class ApiService:
             "status": lambda client, params: self.status(),
             "arm": self._arm,
             "renew": self._renew,
-            "disarm": lambda client, params: self._disarm(client),
-            "stop": lambda client, params: self._stop(client),
-            "clear": lambda client, params: self._clear(client),
+            "disarm": self._disarm,
+            "stop": self._stop,
+            "clear": self._clear,
             "touch": self._touch,
             "effects": lambda client, params: self._layout.effects(),
             "play": self._play,
@@ -90,45 +102,39 @@ class ApiService:
             "unsubscribe": self._unsubscribe,
         }
 
-    def state_changed(self, new: StateMachine) -> None:
-        """End the lease when the armed state ends."""
-        if new.state not in _ARMABLE:
-            self._lease.end()
-            self._publisher.view.applied = None
-
     def client_left(self, client: Connection) -> None:
         """Release what a disconnected client holds; lift its fingers."""
         self._publisher.hub.forget(client)
         self._client_numbers.pop(client, None)
+        self._holders.discard(client)
         self._touches.lift_all(client, now=clock.now())
 
-    def keeps(self, client: Connection) -> bool:
-        """Whether a client must not be evicted for another: it has subscriptions."""
-        return self._publisher.hub.is_subscribed(client)
+    def holds_lease(self, client: Connection) -> bool:
+        """Whether a client armed or renewed the current lease: it is never evicted."""
+        return client in self._holders and self._valid_lease.current(clock.now()) is not None
 
     def status(self) -> StatusResult:
         """Return the status of daemon, plate and amplifiers."""
         machine, view, now = self._supervisor.machine, self._publisher.view, clock.now()
-        lease = self._lease.current(now)
-        pattern = view.pattern_event()
+        lease = self._valid_lease.current(now)
+        pattern = view.pattern_event() if machine.state is _ENABLED else None
         return StatusResult(
             time_s=now,
             unix_time_s=time.time(),
             state=machine.state.value,
             cause=machine.cause,
             remedy=machine.remedy,
-            phase=cast("PhaseName", self._controller.phase.name.lower()),
+            amplifiers_state=cast("GroupStateName", self._controller.group_state.name.lower()),
             assume_energised=machine.assume_energised(now),
             lost_for_s=machine.lost_for(now),
             watchdog_s=WATCHDOG,
             armed_by=lease.owner if lease else None,
             lease_left_s=lease.expires_at - now if lease else None,
             contacts=view.contact_statuses(),
-            drive=view.drive(),
-            silent_because=view.silenced.reason if view.silenced and lease else None,
-            plain_because=self._controller.ramp_only_reason,
+            drive=view.drive() if pattern else {},
+            silence_reason=view.silenced.reason if view.silenced and lease else None,
+            ramp_only_reason=self._controller.ramp_only_reason,
             predicted_contrast_db=pattern.predicted_contrast_db if pattern else None,
-            robust_contrast_db=pattern.robust_contrast_db if pattern else None,
             predicted_level_db_sl=pattern.predicted_level_db_sl if pattern else None,
             amplifiers=self._publisher.amplifiers(),
             latency_ms=self._publisher.latencies.summary(),
@@ -142,7 +148,7 @@ class ApiService:
             self._config,
             self._table,
             self._amplifiers,
-            drive_mode=self._controller.capabilities.drive_mode,
+            drive_mode=self._controller.drive_mode,
             layout=self._publisher.layout_event().layout,
         )
 
@@ -153,49 +159,81 @@ class ApiService:
         if machine.state is DaemonState.SWITCHED_ON:
             raise RpcError(ErrorCode.LEASE, "another client is arming", remedy="wait, or disarm")
         duration = min(params.lease_s, self.longest_lease)
-        lease = self._lease.grant(params.owner, duration=duration, now=now)
+        lease = self._valid_lease.grant(params.owner, duration=duration, now=now)
         try:
-            await self._supervisor.handle(
+            await self._handle(
                 DaemonEvent(Trigger.ARM, f"armed by {params.owner!a}", "era disarm, or era stop")
             )
         except BaseException:
             self._end_lease(lease.token)
             raise
-        if self._supervisor.machine.state is not DaemonState.OPERATION_ENABLED:
+        if self._supervisor.machine.state is not _ENABLED:
             self._end_lease(lease.token)
             raise _wrong_state(self._supervisor.machine)
         # Arming may have taken longer than the lease, so its time starts now.
         lease = self._lease.restart(lease.token, now=clock.now())
+        self._holders = {client}
         self._schedule_lease_check()
         # After the reply was sent, or failed to be sent.
         asyncio.get_running_loop().call_soon(self._check_holder, client, lease.token)
         return ArmResult(lease=lease.token, lease_s=lease.duration)
 
     def _renew(self, client: Connection, params: RenewParams) -> RenewResult:
-        lease = self._lease.renew(params.lease, now=clock.now())
+        lease = self._valid_lease.renew(params.lease, now=clock.now())
+        self._holders.add(client)
         self._schedule_lease_check()
         return RenewResult(lease_s=lease.duration)
 
-    async def _disarm(self, client: Connection) -> Empty:
-        await self._supervisor.handle(DaemonEvent(Trigger.DISARM, f"disarmed by {client.name!a}"))
+    async def _disarm(self, client: Connection, params: DisarmParams) -> Empty:
+        machine = self._supervisor.machine
+        if params.lease is not None:
+            self._valid_lease.check(params.lease, now=clock.now())
+        if machine.state in _ARMABLE:
+            cause = f"disarmed by {params.client or client.name!a}"
+            await self._handle(DaemonEvent(Trigger.DISARM, cause))
+            machine = self._supervisor.machine
+        if machine.state is not DaemonState.READY_TO_SWITCH_ON:  # disarmed and read back
+            raise _wrong_state(machine)
         return Empty()
 
-    async def _stop(self, client: Connection) -> Empty:
-        await self._supervisor.handle(
-            DaemonEvent(
-                Trigger.STOP, f"stopped by {client.name!a}", "clear (era clear), then arm again"
-            )
-        )
-        return Empty()
+    async def _stop(self, client: Connection, params: RequestedBy) -> StopResult:
+        cause = f"stopped by {params.client or client.name!a}"
+        try:
+            outcomes = await self._supervisor.stop(cause, "clear (era clear), then arm again")
+        except Exception:
+            _logger.exception("stop failed, stopping each amplifier individually")
+            outcomes = await QuickStops(self._amplifiers).stop()
+        now = clock.now()
+        amplifiers = {
+            name: AmplifierSilence.model_validate(outcome.to_json(now))
+            for name, outcome in outcomes.items()
+        }
+        if not (outcomes and all(outcome.is_confirmed for outcome in outcomes.values())):
+            raise NotSilent(amplifiers)
+        return StopResult(amplifiers=amplifiers)
 
-    async def _clear(self, client: Connection) -> Empty:
+    async def _clear(self, client: Connection, params: RequestedBy) -> Empty:
         machine = self._supervisor.machine
         if machine.state is DaemonState.COMM_LOST:
             raise _wrong_state(machine, ErrorCode.LINK)
-        await self._supervisor.handle(
-            DaemonEvent(Trigger.CLEAR, f"acknowledged by {client.name!a}")
-        )
+        if machine.state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT):
+            await self._handle(
+                DaemonEvent(Trigger.CLEAR, f"acknowledged by {params.client or client.name!a}")
+            )
+            machine = self._supervisor.machine
+        if machine.state is not DaemonState.READY_TO_SWITCH_ON:
+            raise _wrong_state(machine)
         return Empty()
+
+    async def _handle(self, event: DaemonEvent) -> None:
+        """Let the supervisor handle an event; an unexpected exception stops all amplifiers."""
+        try:
+            await self._supervisor.handle(event)
+        except (DriverError, asyncio.CancelledError):
+            raise
+        except Exception:
+            await self._supervisor.stop("a request failed", ACKNOWLEDGE)
+            raise
 
     def _touch(self, client: Connection, params: TouchParams) -> Empty:
         if client not in self._client_numbers:
@@ -208,7 +246,7 @@ class ApiService:
 
     def _play(self, client: Connection, params: PlayParams) -> Empty:
         machine = self._supervisor.machine
-        if machine.state is not DaemonState.OPERATION_ENABLED:
+        if machine.state is not _ENABLED or machine.is_degraded:
             raise _wrong_state(machine)
         self._layout.play(params, self._publisher.view.contacts, now=clock.now())
         self._controller.request_update()
@@ -226,6 +264,13 @@ class ApiService:
     def _unsubscribe(self, client: Connection, params: UnsubscribeParams) -> Empty:
         self._publisher.hub.unsubscribe(client, params.topics)
         return Empty()
+
+    @property
+    def _valid_lease(self) -> LeaseHolder:
+        """The lease, which ends with the armed state."""
+        if self._supervisor.machine.state not in _ARMABLE:
+            self._lease.end()
+        return self._lease
 
     def _end_lease(self, token: str) -> None:
         """End a lease unless another has replaced it."""
@@ -245,15 +290,17 @@ class ApiService:
 
     def _check_holder(self, client: Connection, token: str) -> None:
         """Disarm if the client disconnected before it received its lease."""
-        held = self._lease.current(clock.now())
-        if held is not None and held.token == token and not client.is_open:
+        held = self._valid_lease.current(clock.now())
+        if held is not None and held.token == token and client.has_left:
             self._supervisor.post(
                 DaemonEvent(Trigger.LEASE_LOST, "the arming client disconnected", "arm again")
             )
 
     def _check_lease(self) -> None:
-        self._expiry = None
-        if self._lease.expires_at is None:
+        # Checked again, should anything here fail.
+        self._expiry = asyncio.get_running_loop().call_later(_LEASE_RECHECK, self._check_lease)
+        if self._valid_lease.expires_at is None:
+            self._expiry.cancel()
             return
         if self._lease.current(clock.now()) is not None:
             self._schedule_lease_check()

@@ -48,7 +48,6 @@ class PlateView:
             ],
             drive=self.drive(),
             predicted_contrast_db=_finite(applied.pattern.contrast_db),
-            robust_contrast_db=_finite(applied.pattern.robust_contrast_db),
             predicted_level_db_sl=_finite(applied.pattern.level_db_sl),
             latency_ms=1e3 * applied.latency,
         )
@@ -65,7 +64,7 @@ class PlateView:
         )
 
     def drive(self) -> dict[str, PlayedTone]:
-        """What plays, by ERA."""
+        """The tones that play, by ERA."""
         if self.applied is None:
             return {}
         return {
@@ -104,18 +103,21 @@ def amplifier_statuses(
     amplifiers: Mapping[str, Amplifier],
     backends: Mapping[str, RecordedBackend],
     urls: Mapping[str, str],
+    *,
+    are_open: bool,
 ) -> list[AmplifierStatus]:
     """Describe all amplifiers from their last replies, without sending a request.
 
-    The last reply of an amplifier that cannot be reached is left out.
+    are_open: whether all are open together; else their last replies are left out.
     """
-    is_any_missing = any(backend.is_missing for backend in backends.values())
+    is_any_missing = not are_open and any(backend.is_missing for backend in backends.values())
     return [
         _amplifier_status(
             name,
             amplifier,
             backends[name],
             urls[name],
+            is_open=are_open and not amplifier.is_lost,
             closed_with_lost=is_any_missing and not backends[name].is_missing,
         )
         for name, amplifier in amplifiers.items()
@@ -123,10 +125,16 @@ def amplifier_statuses(
 
 
 def _amplifier_status(
-    name: str, amplifier: Amplifier, backend: RecordedBackend, url: str, *, closed_with_lost: bool
+    name: str,
+    amplifier: Amplifier,
+    backend: RecordedBackend,
+    url: str,
+    *,
+    is_open: bool,
+    closed_with_lost: bool,
 ) -> AmplifierStatus:
     """closed_with_lost: whether it was closed because another amplifier was lost."""
-    status = None if amplifier.is_lost else backend.status  # None while reopening
+    status = backend.status if is_open else None
     status_at = backend.status_at
     statistics = amplifier.statistics
     round_trip = statistics.last_round_trip
@@ -141,13 +149,14 @@ def _amplifier_status(
         high_voltage=status.high_voltage if status else None,
         high_voltage_v=_finite(status.voltage) if status else None,
         reply_age_s=None if status_at is None else max(0.0, clock.now() - status_at),
+        degraded=amplifier.is_degraded,
         lost=status is None and not closed_with_lost,
         closed_with_lost=status is None and closed_with_lost,
         statistics=LinkCounters(
             frames_out=statistics.frames_out,
             frames_in=statistics.frames_in,
-            bad=statistics.invalid_frames,
-            foreign=statistics.unexpected_frames,
+            invalid_frames=statistics.invalid_frames,
+            unexpected_frames=statistics.unexpected_frames,
             events=statistics.events,
             retries=statistics.retries,
             timeouts=statistics.timeouts,

@@ -1,7 +1,8 @@
 """`python -m controller.daemon.child_main PARENT MODULE ...`: run a module until its parent exits.
 
 PARENT is the process number of the starting process. On Linux the kernel terminates the module when
-that process exits, however it exits.
+that process exits, however it exits. Signals to the daemon that reach its children as well, as
+those of `systemctl kill` do, have no effect on them.
 """
 
 import ctypes
@@ -19,6 +20,8 @@ def _main() -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != parent:
         return  # the parent exited before prctl
+    for number in (signal.SIGHUP, signal.SIGUSR1):
+        signal.signal(number, signal.SIG_IGN)
     sys.argv[:] = [module, *sys.argv[3:]]
     runpy.run_module(module, run_name="__main__", alter_sys=True)
 

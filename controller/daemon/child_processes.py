@@ -10,7 +10,8 @@ import logging
 import os
 import sys
 
-from drivers.operation.pauses import pauses
+from drivers import clock
+from drivers.operation.pauses import Backoff
 
 _MAX_PAUSE = 30.0  # s
 _TERMINATE_TIMEOUT = 0.3  # s
@@ -35,7 +36,9 @@ class ChildProcesses:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def _keep_running(self, module: str, arguments: tuple[str, ...]) -> None:
-        for pause in pauses(first=1.0, maximum=_MAX_PAUSE):
+        backoff = Backoff(first=1.0, maximum=_MAX_PAUSE)
+        while True:
+            begin = clock.now()
             try:
                 process = await asyncio.create_subprocess_exec(
                     # -P: do not import a folder named controller in the working directory
@@ -47,10 +50,9 @@ class ChildProcesses:
             except OSError as error:
                 _logger.warning("%s: start failed: %s", module, error)
             else:
-                status = await self._wait(process)
-                _logger.warning(
-                    "%s: exited with status %d, restarting in %g s", module, status, pause
-                )
+                _logger.warning("%s: exited with status %d", module, await self._wait(process))
+            pause = backoff.pause(ran_for=clock.now() - begin)
+            _logger.info("%s: restarting in %g s", module, pause)
             await asyncio.sleep(pause)
 
     async def _wait(self, process: asyncio.subprocess.Process) -> int:

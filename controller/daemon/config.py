@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from urllib.parse import quote
 
@@ -13,6 +14,7 @@ from controller.sources.calibration import CalibratedSource, TouchCalibration, f
 from controller.sources.registry import open_source
 from controller.sources.touch import TouchSource
 from drivers.errors import CommandError
+from drivers.operation.garbage_collection import without_collections
 from drivers.registry import open_backend
 from model.config.document import ConfigError, Document, read_document
 from model.config.sections import Validation
@@ -36,7 +38,8 @@ class TouchInput:
 
     def make(self) -> TouchSource:
         """Create the source, in plate coordinates; raises InputError."""
-        return CalibratedSource(open_source(self.url), self.calibration)
+        with without_collections():  # of a long recording
+            return CalibratedSource(open_source(self.url), self.calibration)
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,6 @@ class DaemonConfig:
     source: Path
     section: DaemonSection
     rig: Rig
-    rig_file: Path
     rig_text: str
     urls: Mapping[str, str]
     table: Path | None
@@ -60,7 +62,7 @@ class DaemonConfig:
     log_file: Path | None
     dump_folder: Path | None
 
-    @property
+    @cached_property
     def effective_layout(self) -> Layout:
         """The layout, or one that buzzes at every touch if none is configured."""
         return self.layout or Layout(effects=default_effects(self.section.level_db_sl))
@@ -68,7 +70,11 @@ class DaemonConfig:
 
 def load_daemon_config(path: Path) -> DaemonConfig:
     """Load a daemon's file with its rig and layout; raises ConfigError with all problems."""
-    document = read_document(path)
+    return daemon_config_of(read_document(path))
+
+
+def daemon_config_of(document: Document) -> DaemonConfig:
+    """Load what a daemon's file names; raises as `load_daemon_config`."""
     _check_kind(document)
     validation = Validation(document, DaemonSection)
     rig_file = _file(document, "rig")
@@ -85,12 +91,10 @@ def load_daemon_config(path: Path) -> DaemonConfig:
     _check_folders(validation, log_file, dump_folder)
     section = validation.finish()
     assert rig is not None  # noqa: S101  else a problem was reported
-    assert rig_file is not None  # noqa: S101  else there is no rig
     return DaemonConfig(
-        source=path,
+        source=Path(document.source),
         section=section,
         rig=rig,
-        rig_file=rig_file,
         rig_text=rig_text,
         urls=urls,
         table=table,
@@ -137,7 +141,7 @@ def _rig(validation: Validation[DaemonSection], file: Path | None) -> tuple[Rig 
     try:
         document = read_document(file)
         rig = rig_of(document)
-        check_supported(rig.plate, rig.eras, loads=rig.loads)
+        check_supported(rig.plate, rig.eras, loads=rig.masses)
         return rig, document.text
     except ConfigError as error:
         validation.add(("rig",), "invalid rig:\n    " + str(error).replace("\n", "\n  "))

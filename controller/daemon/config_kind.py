@@ -1,11 +1,10 @@
 """Daemon files as a kind of configuration for `era config`."""
 
 from collections import Counter
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from controller.daemon.config import is_daemon_document, load_daemon_config
+from controller.daemon.config import daemon_config_of, is_daemon_document
 from controller.daemon.config_sections import DaemonSection
 from drivers.rig_check import check_links
 from model.config.document import Document
@@ -19,13 +18,14 @@ class DaemonKind:
         """Whether a document is a daemon's file."""
         return is_daemon_document(document)
 
-    def check(self, path: Path) -> CheckedFile:
+    def check(self, document: Document) -> CheckedFile:
         """Check a file and the files that it names; return a one-line summary."""
-        config = load_daemon_config(path)
+        config = daemon_config_of(document)
         rig = config.rig
         wired = Counter(channel.amplifier for channel in rig.wiring.values())
-        _, warnings = check_links(config.urls, channels=wired, limits=asdict(rig.limits))
-        hint = "" if config.table is None else f". era daemon {path} --check reads its table, too"
+        _, warnings = check_links(config.urls, channels=wired, limits=rig.limits)
+        daemon = f"era daemon {document.source}"
+        hint = "" if config.table is None else f". {daemon} --check reads its table, too"
         line = (
             f"good: ERAs {', '.join(era.name for era in config.rig.eras)} on "
             f"{', '.join(f'{name} ({url})' for name, url in config.urls.items())}; touches from "

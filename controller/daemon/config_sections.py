@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, Strict
 
 from controller.api.schema import MAX_LEASE, MIN_LEASE
-from controller.loop.envelopes import ENVELOPE_TIME
+from controller.loop.envelopes import MAX_LOADING_TIME
 from model.config.sections import Quantity, Section
 from model.config.units import LENGTH, RATIO, TIME
 from model.drive_modes import DRIVE_MODES
@@ -96,7 +96,9 @@ class DaemonSection(Section):
     table: File | None = None
     mode: Annotated[str, AfterValidator(_mode)] | None = None
     level_db_sl: LevelDbSl = STRONG_DB_SL
-    touch_wait: Annotated[float, Quantity(TIME, at_least=0, at_most=MAX_TOUCH_WAIT)] = ENVELOPE_TIME
+    touch_wait: Annotated[float, Quantity(TIME, at_least=0, at_most=MAX_TOUCH_WAIT)] = (
+        MAX_LOADING_TIME
+    )
     layout: File | None = None
     touch: Annotated[list[TouchSection], Field(max_length=16, default_factory=list)]
     serial_numbers: Annotated[dict[Identifier, str], Field(max_length=64, default_factory=dict)]

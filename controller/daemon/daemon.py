@@ -4,6 +4,8 @@ import asyncio
 import contextlib
 import logging
 import signal
+import sys
+from functools import partial
 
 from controller.api.server import ApiServer
 from controller.daemon.active_layout import ActiveLayout
@@ -11,22 +13,24 @@ from controller.daemon.api_service import ApiService
 from controller.daemon.api_views import amplifier_statuses
 from controller.daemon.child_processes import ChildProcesses
 from controller.daemon.config import DaemonConfig, load_daemon_config
+from controller.daemon.dashboard_token import write_token
 from controller.daemon.fault_dumps import FaultDumps
 from controller.daemon.log import LogThread
 from controller.daemon.message_recorder import RecordedBackend, Recorder
 from controller.daemon.publisher import EventPublisher
-from controller.daemon.reload import plan_reload
+from controller.daemon.reload import DEFERRED, changed_keys, plan_reload
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
 from controller.daemon.states import DaemonState, StateMachine
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches, TouchInputs
+from controller.group.amplifier_group import GroupState
 from controller.loop.loop import Controller
 from controller.sources.touch import TouchFrame
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import DriverError
-from drivers.operation.steady import no_long_collections
+from drivers.operation.garbage_collection import no_long_collections, without_collections
 from drivers.registry import open_backend
 from drivers.threads import in_thread
 from model.errors import InputError
@@ -74,17 +78,26 @@ class Daemon:
         }
         self._supervisor = Supervisor(
             amplifiers,
-            state_changed=self._state_changed,
+            state_changed=(
+                lambda old, new: self._publisher.state_changed(old, new),
+                lambda old, new: manager.status(f"{new.state.value}: {new.cause}"),
+                self._dump_fault,
+            ),
             link_changed=lambda *change: self._publisher.link_changed(*change),
             alive=lambda: manager.alive(clock.now()),
         )
         self._layout = ActiveLayout(config.effective_layout)
         self._publisher = EventPublisher(
             machine=lambda: self._supervisor.machine,
-            amplifiers=lambda: amplifier_statuses(amplifiers, backends, config.urls),
+            amplifiers=lambda: amplifier_statuses(
+                amplifiers,
+                backends,
+                config.urls,
+                are_open=self._controller.group_state in (GroupState.DISARMED, GroupState.ARMED),
+            ),
             effect_of=self._layout.effect_of,
             layout=config.layout,
-            plain_because=lambda: self._controller.ramp_only_reason,
+            ramp_only_reason=lambda: self._controller.ramp_only_reason,
         )
         self._controller = Controller(
             config.rig,
@@ -94,7 +107,7 @@ class Daemon:
             intent_source=self._layout,
             timing=Timing(table),
             drive_mode=config.section.mode,
-            envelope_time=config.section.touch_wait,
+            max_loading_time=config.section.touch_wait,
         )
         self._touches = ApiTouches(config.rig.plate, self._deliver)
         self._inputs = TouchInputs(self._deliver, failed=self._input_failed)
@@ -111,7 +124,8 @@ class Daemon:
         self._server = ApiServer(
             self._api.handlers(),
             on_disconnect=self._api.client_left,
-            is_protected=self._api.keeps,
+            is_kept=self._api.holds_lease,
+            is_subscribed=self._publisher.hub.is_subscribed,
             clock=clock.now,
         )
         self._children = ChildProcesses()
@@ -119,44 +133,37 @@ class Daemon:
     async def run(self, lock: SocketLock) -> None:
         """Open, serve until terminated, silence the amplifiers and close.
 
-        Raises LinkError, CommandError and InputError if the start fails.
+        Amplifiers that do not reply are searched for meanwhile. Raises CommandError and InputError
+        for amplifiers that do not fit the configuration.
         """
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.shut_down, f"{signal.strsignal(number)} received")
         loop.add_signal_handler(signal.SIGHUP, self._request_reload)
+        loop.add_signal_handler(signal.SIGUSR1, lambda: self._log.reopen())
         running: asyncio.Task[None] | None = None
         try:
-            if not await self._open():
-                return
             await self._server.open(lock.bind())
-            await self._inputs.replace(self._config.touch)
             self._log.listener = self._publisher.logged
-            running = asyncio.create_task(self._supervisor.run(), name="control loop")
+            running = asyncio.create_task(
+                self._supervisor.run(self._controller), name="control loop"
+            )
+            await self._inputs.replace(self._config.touch)
             self._start_children()
             shutdown = asyncio.create_task(self._shutdown.wait())
+            started = asyncio.create_task(self._supervisor.started.wait())
+            await asyncio.wait({running, shutdown, started}, return_when=asyncio.FIRST_COMPLETED)
             with no_long_collections():
-                self._manager.ready(self._status_line())
-                _logger.info("serving at %s", lock.path)
+                if started.done():
+                    self._manager.ready(self._status_line())
+                    _logger.info("serving at %s", lock.path)
                 await asyncio.wait({running, shutdown}, return_when=asyncio.FIRST_COMPLETED)
             shutdown.cancel()
+            started.cancel()
         finally:
             await self._close(running)
         if not running.cancelled():
             running.result()
-
-    async def _open(self) -> bool:
-        """Open the amplifiers; return False if terminated before all have replied."""
-        opening = asyncio.create_task(self._supervisor.open(self._controller))
-        shutdown = asyncio.create_task(self._shutdown.wait())
-        await asyncio.wait({opening, shutdown}, return_when=asyncio.FIRST_COMPLETED)
-        shutdown.cancel()
-        if opening.done():
-            opening.result()
-            return True
-        opening.cancel()
-        await asyncio.wait({opening})
-        return False
 
     def shut_down(self, cause: str) -> None:
         """Request an orderly shutdown."""
@@ -169,25 +176,24 @@ class Daemon:
             self._is_reload_pending = False  # a later request needs another read
             self._manager.reloading()
             try:
-                source = self._config.source
-                new = await in_thread(lambda: load_daemon_config(source), name="reload")
-                await self._apply(new)
+                read = partial(_read, self._config, self._initial_config)
+                await self._apply(*await in_thread(read, name="reload"))
             except InputError as error:
                 _logger.error("config: reload rejected, keeping previous: %s", error)
             except Exception:  # systemd waits for the end of the reload
                 _logger.exception("config: reload failed")
             self._manager.ready(self._status_line())
 
-    async def _apply(self, new: DaemonConfig) -> None:
+    async def _apply(self, new: DaemonConfig, changed: list[str], restart: list[str]) -> None:
         is_armed = self._supervisor.machine.state in (
             DaemonState.SWITCHED_ON,
             DaemonState.OPERATION_ENABLED,
         )
-        plan = plan_reload(self._config, new, is_armed=is_armed)
+        plan = plan_reload(self._config, new, changed, is_armed=is_armed)
         if plan.refused is not None:
             _logger.error("config: reload rejected, keeping previous: %s", plan.refused)
             return
-        for key in plan_reload(self._initial_config, new, is_armed=False).restart:
+        for key in restart:
             _logger.warning("config: %s changed, which needs a restart", key)
         for key in plan.apply:
             match key:
@@ -234,9 +240,12 @@ class Daemon:
     def _start_children(self) -> None:
         socket = str(self._config.socket)
         if self._dashboard is not None:
-            self._children.start(
-                "controller.cli", "gateway", "--socket", socket, "--listen", self._dashboard
-            )
+            options = ["--socket", socket, "--listen", self._dashboard]
+            if not sys.stdout.isatty():  # the gateway would print its token into a log
+                token_file = write_token(self._config.socket.with_name("dashboard-token"))
+                _logger.info("dashboard: token in %s", token_file)
+                options += ["--token-file", str(token_file)]
+            self._children.start("controller.cli", "gateway", *options)
         if self._config.section.metrics is not None:
             port = str(self._config.section.metrics)
             self._children.start("controller.metrics", "--socket", socket, "--port", port)
@@ -251,20 +260,19 @@ class Daemon:
         text = str(error) if is_expected else failure_text(error)
         _logger.error("touch source %s: failed, restarting: %s", name, text)
 
-    def _state_changed(self, old: StateMachine, new: StateMachine) -> None:
-        self._publisher.state_changed(old, new)
-        self._api.state_changed(new)
-        self._manager.status(f"{new.state.value}: {new.cause}")
-        if new.state in (DaemonState.FAULT_REACTION_ACTIVE, DaemonState.COMM_LOST):
-            self._dump(new.cause)
-
-    def _dump(self, cause: str) -> None:
+    def _dump_fault(self, old: StateMachine, new: StateMachine) -> None:
+        is_fault = new.state in (
+            DaemonState.FAULT_REACTION_ACTIVE,
+            DaemonState.FAULT,
+            DaemonState.COMM_LOST,
+        )
         folder, dumps = self._config.dump_folder, self._config.section.dumps
-        if folder is not None and dumps is not None:
-            self._dumps.write(folder, cause=cause, keep=dumps.keep)
+        if is_fault and folder is not None and dumps is not None:
+            self._dumps.write(folder, cause=new.cause, keep=dumps.keep)
 
     def _request_reload(self) -> None:
-        """Start a reload; requests during a reload are combined into one after it."""
+        """Reopen the log and start a reload; requests during one are combined into one after it."""
+        self._log.reopen()
         if self._is_reload_pending:
             return
         self._is_reload_pending = True
@@ -275,3 +283,11 @@ class Daemon:
     def _status_line(self) -> str:
         machine = self._supervisor.machine
         return f"{machine.state.value}: {machine.cause}"
+
+
+def _read(old: DaemonConfig, initial: DaemonConfig) -> tuple[DaemonConfig, list[str], list[str]]:
+    """Read the configuration again; return it, its changed keys, and those that need a restart."""
+    with without_collections():  # of what a large layout is parsed to
+        new = load_daemon_config(old.source)
+    restart = [key for key in changed_keys(initial, new) if key in DEFERRED]
+    return new, changed_keys(old, new), restart

@@ -52,6 +52,10 @@ class LeaseHolder:
 
     def renew(self, token: str, *, now: float) -> Lease:
         """Renew the current lease; raises RpcError if it has expired or is not the caller's."""
+        return self.restart(self.check(token, now=now).token, now=now)
+
+    def check(self, token: str, *, now: float) -> Lease:
+        """The current lease; raises RpcError if it has expired or is not the caller's."""
         current = self.current(now)
         if current is None:
             raise RpcError(ErrorCode.LEASE, "lease has expired", remedy="arm again")
@@ -61,7 +65,7 @@ class LeaseHolder:
                 f"lease belongs to {current.owner!a}",
                 remedy="wait until it expires, or disarm first: every client may",
             )
-        return self.restart(current.token, now=now)
+        return current
 
     def end(self) -> None:
         """End the lease."""

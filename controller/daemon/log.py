@@ -6,13 +6,17 @@ many were skipped. JSON escapes control characters, so that messages cannot forg
 """
 
 import contextlib
+import errno
 import json
 import logging
+import os
 import queue
+import stat
 import sys
 import threading
 import time
 from collections.abc import Callable
+from enum import Enum, auto
 from pathlib import Path
 from typing import TextIO
 
@@ -47,6 +51,24 @@ class JsonFormatter(logging.Formatter):
         if record.exc_info:
             fields["traceback"] = self.formatException(record.exc_info)[-4 * _MAX_MESSAGE :]
         return json.dumps(fields)
+
+
+class _Command(Enum):
+    """Entries of the queue that are not lines."""
+
+    REOPEN = auto()
+    CLOSE = auto()
+
+
+def open_log_file(file: Path) -> TextIO:
+    """Open a file to append to, a new one with mode 0600; raises OSError, also for a pipe."""
+    # Non-blocking, so that a named pipe is refused instead of waited for.
+    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC
+    stream = os.fdopen(os.open(file, flags, 0o600), "a", encoding="utf-8")
+    if stat.S_ISFIFO(os.fstat(stream.fileno()).st_mode):
+        stream.close()
+        raise OSError(errno.EINVAL, "a named pipe", str(file))
+    return stream
 
 
 UNLIMITED = frozenset({"controller.daemon.supervisor"})
@@ -88,7 +110,7 @@ class LogThread:
         self.lost = 0
         self.listener: Callable[[logging.LogRecord], None] | None = None
         self._file = file
-        self._lines: queue.Queue[str | None] = queue.Queue(_MAX_QUEUED)
+        self._lines: queue.Queue[str | _Command] = queue.Queue(_MAX_QUEUED)
         self._thread = threading.Thread(target=self._write_all, name="log", daemon=True)
         self._thread.start()
 
@@ -99,17 +121,26 @@ class LogThread:
         except queue.Full:
             self.lost += 1
 
+    def reopen(self) -> None:
+        """Open the file again before the next line, since it may have been renamed."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(_Command.REOPEN)
+
     def close(self) -> None:
         """Write the queued lines, within a time limit."""
         try:
-            self._lines.put(None, timeout=_CLOSE_TIMEOUT)
+            self._lines.put(_Command.CLOSE, timeout=_CLOSE_TIMEOUT)
         except queue.Full:
             return
         self._thread.join(_CLOSE_TIMEOUT)
 
     def _write_all(self) -> None:
         stream: TextIO | None = None
-        while (line := self._lines.get()) is not None:
+        while (line := self._lines.get()) is not _Command.CLOSE:
+            if line is _Command.REOPEN:
+                self._close_file(stream)
+                stream = None
+                continue
             try:
                 if stream is None:
                     stream = self._open()
@@ -124,7 +155,7 @@ class LogThread:
     def _open(self) -> TextIO:
         if self._file is None:
             return sys.stderr
-        return self._file.open("a", encoding="utf-8")
+        return open_log_file(self._file)
 
     def _close_file(self, stream: TextIO | None) -> None:
         if stream is not None and self._file is not None:

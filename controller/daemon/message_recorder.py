@@ -2,9 +2,10 @@
 
 from collections import deque
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from functools import partial
 from typing import NamedTuple
 
+from controller.daemon.deferred_calls import call_guarded
 from drivers import clock
 from drivers.backend import Backend
 from drivers.errors import LinkError
@@ -54,9 +55,13 @@ class RecordedBackend(Backend):
         self._name = name
         self._recorder = recorder
 
+    def _record(self, way: str, what: object) -> None:
+        """Record a message; a stop depends on no record."""
+        call_guarded(partial(self._recorder.add, self._name, way, what))
+
     async def open(self) -> None:
         """Open the backend."""
-        self._recorder.add(self._name, "open", "")
+        self._record("open", "")
         self.status = None  # may have changed meanwhile
         try:
             await self._inner.open()
@@ -66,20 +71,20 @@ class RecordedBackend(Backend):
 
     async def close(self) -> None:
         """Close the backend."""
-        self._recorder.add(self._name, "close", "")
+        self._record("close", "")
         await self._inner.close()
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Exchange a request; record it and its reply or error."""
-        self._recorder.add(self._name, "out", request)
+        self._record("out", request)
         try:
             reply = await self._inner.exchange(request, timeout=timeout)
         except BaseException as error:
-            self._recorder.add(self._name, "none", f"{type(error).__name__}: {error}")
+            self._record("none", f"{type(error).__name__}: {error}")
             self.is_missing = self.is_missing or isinstance(error, LinkError)
             raise
         self.is_missing = False
-        self._recorder.add(self._name, "in", reply)
+        self._record("in", reply)
         if isinstance(reply, Status):
             self.status, self.status_at = reply, clock.now()
         return reply
@@ -90,11 +95,11 @@ class RecordedBackend(Backend):
         """Set the callbacks; events and the loss of the link are recorded."""
 
         def event_received(event: AmplifierEvent) -> None:
-            self._recorder.add(self._name, "event", event)
+            self._record("event", event)
             on_event(event)
 
         def link_lost(reason: str) -> None:
-            self._recorder.add(self._name, "lost", reason)
+            self._record("lost", reason)
             self.is_missing = True
             on_loss(reason)
 
@@ -102,13 +107,13 @@ class RecordedBackend(Backend):
 
     async def broadcast(self, request: Broadcast) -> None:
         """Broadcast a request on the bus; record it."""
-        self._recorder.add(self._name, "out", request)
+        self._record("out", request)
         await self._inner.broadcast(request)
 
     @property
-    def last_sent(self) -> float:
-        """See `Backend.last_sent`."""
-        return self._inner.last_sent
+    def last_sent_at(self) -> float:
+        """See `Backend.last_sent_at`."""
+        return self._inner.last_sent_at
 
     @property
     def counters(self) -> WireCounters:
@@ -119,20 +124,6 @@ class RecordedBackend(Backend):
     def bus(self) -> str | None:
         """See `Backend.bus`."""
         return self._inner.bus
-
-    @property
-    def takes_turns(self) -> bool:
-        """See `Backend.takes_turns`."""
-        return self._inner.takes_turns
-
-    @property
-    def is_unsent(self) -> bool:
-        """See `Backend.is_unsent`."""
-        return self._inner.is_unsent
-
-    def silencing(self, request: Request) -> AbstractContextManager[None]:
-        """See `Backend.silencing`."""
-        return self._inner.silencing(request)
 
     @property
     def wire_times(self) -> WireTimes:

@@ -34,7 +34,7 @@ class EventPublisher:
     """Keeps the current state of the plate and publishes every change at `hub`.
 
     machine: the daemon's state machine; amplifiers: their statuses; effect_of: the effect that
-    plays for a contact; plain_because: why onsets are plain ramps; layout: the surface layout.
+    plays for a contact; ramp_only_reason: why onsets are plain ramps; layout: the surface layout.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class EventPublisher:
         machine: Callable[[], StateMachine],
         amplifiers: Callable[[], list[AmplifierStatus]],
         effect_of: Callable[[ContactKey], str | None],
-        plain_because: Callable[[], str | None],
+        ramp_only_reason: Callable[[], str | None],
         layout: Layout | None,
     ) -> None:
         self.view = PlateView(effect_of)
@@ -61,7 +61,7 @@ class EventPublisher:
                 "silence": self.view.silence_event,
                 "amplifiers": lambda: AmplifiersEvent(amplifiers=amplifiers()),
                 "latency": lambda: LatencyEvent(
-                    latency_ms=self.latencies.summary(), plain_because=plain_because()
+                    latency_ms=self.latencies.summary(), ramp_only_reason=ramp_only_reason()
                 ),
                 "layout": self.layout_event,
             },
@@ -99,17 +99,20 @@ class EventPublisher:
         self.hub.publish("layout", self.layout_event)
 
     def link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
-        """Publish that the link to amplifiers was lost, is being retried, or was reopened."""
+        """Publish that the link to amplifiers was degraded, lost, retried or opened again."""
         if change == "retry" and message != self._last_link_message:
             _logger.warning("link: retrying: %s", message, extra={"topic": "link"})
         self._last_link_message = message
-        if change != "retry":  # contacts are not followed without a link and start anew with it
+        if change in (
+            "lost",
+            "reopened",
+        ):  # contacts are not followed without a link and start anew with it
             self._contacts_changed((), Change())
         event = LinkEvent(
             event=change,
             amplifier=lost[0] if len(lost) == 1 else None,
             message=message,
-            remedy=None if change == "reopened" else "check cables and supply",
+            remedy=None if change in ("restored", "reopened") else "check cables and supply",
         )
         self.hub.publish("link", lambda: event)
 

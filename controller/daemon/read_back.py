@@ -4,8 +4,10 @@ import asyncio
 import contextlib
 from collections.abc import Mapping
 
+from controller.group.tasks import persistently
 from drivers.amplifier import Amplifier
-from drivers.link.turns import Preempted
+from drivers.errors import Preempted
+from drivers.operation.silence import is_silent
 from drivers.protocol.messages import AmplifierState, Fault, Status
 
 READ_BACK_INTERVAL = 0.02  # s
@@ -14,11 +16,16 @@ _DISARMED = (AmplifierState.SWITCH_ON_DISABLED, AmplifierState.READY_TO_SWITCH_O
 
 
 async def read_statuses(amplifiers: Mapping[str, Amplifier]) -> dict[str, Status]:
-    """Read the status of each amplifier, again if a stop or disarm preempted the request."""
+    """Read the status of each amplifier, again if preempted or on a degraded link."""
     while True:
         with contextlib.suppress(Preempted):
-            return {name: await amplifier.status() for name, amplifier in amplifiers.items()}
+            return {name: await persistently(each.status) for name, each in amplifiers.items()}
         await asyncio.sleep(READ_BACK_INTERVAL)
+
+
+def all_silent(statuses: Mapping[str, Status]) -> bool:
+    """Whether all amplifiers report that nothing plays."""
+    return all(is_silent(status) for status in statuses.values())
 
 
 def find_problem(statuses: Mapping[str, Status]) -> str | None:

@@ -7,18 +7,18 @@ from typing import Any, Literal
 from controller.loop.loop import Controller
 from drivers import clock
 from drivers.errors import DriverError
-from drivers.link.link import ASSUME_ENERGISED
+from drivers.link.link import ASSUME_ENERGISED, DEGRADED
 from drivers.operation.pauses import pauses
 from model.errors import InputError
 
 ALIVE_INTERVAL = 0.05  # s; between calls of `alive` while waiting
 
-LinkChange = Literal["lost", "retry", "reopened"]
+LinkChange = Literal["degraded", "restored", "lost", "retry", "reopened"]
 
 
 def error_text(error: Exception) -> str:
     """The text of an error without the warning already implied by the state."""
-    return str(error).removesuffix(ASSUME_ENERGISED)
+    return str(error).removesuffix(ASSUME_ENERGISED).removesuffix(DEGRADED)
 
 
 async def reconnect(
@@ -33,12 +33,12 @@ async def reconnect(
     report: called with "retry" after each failed attempt and "reopened" after the successful one,
     and a message. alive: called every 50 ms meanwhile.
     """
-    await _wait_alive(controller.close(), alive)  # a pending close would close it again
+    await wait_alive(controller.close(), alive)  # a pending close would close it again
     for pause in pauses():
         if not should_continue():
             return False
         try:
-            await _wait_alive(controller.open(), alive)
+            await wait_alive(controller.open(), alive)
             await controller.disarm()  # a short loss may not have expired the watchdog
         except (DriverError, InputError) as error:
             report("retry", error_text(error))
@@ -53,7 +53,7 @@ async def reconnect(
     raise AssertionError("pauses() must not end")
 
 
-async def _wait_alive(work: Coroutine[Any, Any, None], alive: Callable[[], None]) -> None:
+async def wait_alive(work: Coroutine[Any, Any, None], alive: Callable[[], None]) -> None:
     """Await work that may take seconds, such as a connection, calling `alive` meanwhile."""
     task = asyncio.create_task(work)
     try:

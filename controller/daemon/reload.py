@@ -1,5 +1,6 @@
-"""What a running daemon can apply of a changed configuration."""
+"""Changes of the configuration that a running daemon can apply."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from controller.daemon.config import DaemonConfig
@@ -25,9 +26,10 @@ class ReloadPlan:
     refused: str | None = None
 
 
-def plan_reload(old: DaemonConfig, new: DaemonConfig, *, is_armed: bool) -> ReloadPlan:
-    """Plan the change from one valid configuration to another."""
-    changed = _changed_keys(old, new)
+def plan_reload(
+    old: DaemonConfig, new: DaemonConfig, changed: Sequence[str], *, is_armed: bool
+) -> ReloadPlan:
+    """Plan the change from one valid configuration to another with these `changed_keys`."""
     refused = tuple(key for key in BLOCKING if key in changed)
     if refused:
         return ReloadPlan((), refused, f"{', '.join(refused)} changed, which needs a restart")
@@ -43,7 +45,8 @@ def plan_reload(old: DaemonConfig, new: DaemonConfig, *, is_armed: bool) -> Relo
     return ReloadPlan(tuple(key for key in changed if key not in restart), restart)
 
 
-def _changed_keys(old: DaemonConfig, new: DaemonConfig) -> list[str]:
+def changed_keys(old: DaemonConfig, new: DaemonConfig) -> list[str]:
+    """Compare all keys, with the files that they name; takes a while."""
     differs = {
         "rig": (old.rig_text, old.urls) != (new.rig_text, new.urls),
         "table": old.table != new.table,

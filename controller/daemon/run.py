@@ -2,17 +2,20 @@
 
 import asyncio
 import logging
+import signal
 import sys
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.config_sections import loopback_address
 from controller.daemon.daemon import Daemon
-from controller.daemon.log import LogThread, start_log
+from controller.daemon.log import LogThread, open_log_file, start_log
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
 from drivers.errors import DriverError
+from drivers.trace import tracing
 from model.config.document import ConfigError, read_document
 from model.counting import counted
 from model.errors import InputError
@@ -20,6 +23,7 @@ from model.table.file import load_table
 from model.table.table import LocalizationTable
 from model.table.table_cache import cached_table
 
+_IGNORED = (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 _SWITCH_INTERVAL = 0.001  # s; bounds how long another thread can delay the control loop
 
 _logger = logging.getLogger(__name__)
@@ -41,18 +45,22 @@ def check_daemon(path: Path) -> str:
     return f"{path}: valid: {eras}, {amplifiers}; {table}"
 
 
-def run_daemon(path: Path, *, dashboard: str | None) -> None:
+def run_daemon(path: Path, *, dashboard: str | None, trace: Path | None = None) -> None:
     """Run a daemon until it is terminated; raises errors of its start.
 
-    dashboard: HOST:PORT on the loopback; overrides the file.
+    dashboard: HOST:PORT on the loopback; overrides the file. trace: a file for everything on the
+    wires.
     """
     try:
         address = None if dashboard is None else loopback_address(dashboard)
     except ValueError as error:
         raise InputError(f"--dashboard: {error}") from error
-    config = load_daemon_config(path)
-    _check_log_file(config)
     with ExitStack() as stack:
+        stack.enter_context(_ignored_signals())
+        if trace is not None:
+            stack.enter_context(tracing(trace))
+        config = load_daemon_config(path)
+        _check_log_file(config)
         lock = SocketLock(config.socket)
         stack.callback(lock.release)
         log = start_log(config.log_file, level=config.section.log.level)
@@ -60,12 +68,23 @@ def run_daemon(path: Path, *, dashboard: str | None) -> None:
         _run(config, lock, log=log, dashboard=address or config.section.dashboard)
 
 
+@contextmanager
+def _ignored_signals() -> Iterator[None]:
+    """Ignore signals that would end the daemon but request nothing of it, or too early."""
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in _IGNORED}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def _check_log_file(config: DaemonConfig) -> None:
     """Refuse to start with an unwritable log; later a failing log only loses lines."""
     file = config.log_file
     try:
         if file is not None:
-            file.open("a", encoding="utf-8").close()
+            open_log_file(file).close()
     except OSError as error:
         raise InputError(
             f"{config.source}: log.file: cannot write {file}: {error.strerror}; grant this user "

@@ -33,7 +33,7 @@ class SocketLock:
         try:
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             _check_folder(path.parent)
-            self._lock: IO[str] = path.with_name(f"{path.name}.lock").open("a+", encoding="utf-8")
+            self._lock = _open_lock(path.with_name(f"{path.name}.lock"))
         except OSError as error:
             raise InputError(f"{error.filename}: {error.strerror}; {_REMEDY}") from error
         try:
@@ -76,6 +76,18 @@ class SocketLock:
         if self.path.is_socket():
             self.path.unlink()
         self._lock.close()
+
+
+def _open_lock(file: Path) -> IO[str]:
+    """Open a lock that no other user can take; raises OSError, InputError."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    descriptor = os.open(file, flags, 0o600)
+    status = os.fstat(descriptor)
+    if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
+        os.close(descriptor)
+        raise InputError(f"{file}: must be a file of this user; remove it or {_REMEDY}")
+    os.fchmod(descriptor, 0o600)
+    return os.fdopen(descriptor, "a+", encoding="utf-8")
 
 
 def _check_folder(folder: Path) -> None:

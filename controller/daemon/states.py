@@ -42,6 +42,7 @@ class Trigger(Enum):
     """Kinds of events."""
 
     OPENED = auto()  # every amplifier has replied with the expected identity
+    NOT_FOUND = auto()  # an amplifier cannot be reached at the start
     VERIFIED = auto()  # every amplifier was read back: disarmed, no fault, level zero
     ARM = auto()  # requested
     ARMED = auto()  # every amplifier has confirmed
@@ -52,6 +53,8 @@ class Trigger(Enum):
     FAULT = auto()  # reported by an amplifier or the control loop
     REACTION_DONE = auto()  # the fault reaction is complete
     LINK_LOST = auto()  # an amplifier cannot be reached
+    LINK_DEGRADED = auto()  # an amplifier does not reply, and may still play
+    LINK_RESTORED = auto()  # all reply again, and play what they should
     RECONNECTED = auto()  # all amplifiers reply again and are disarmed
     TICK = auto()  # time has passed
     CLOSE = auto()  # the daemon shuts down
@@ -63,7 +66,7 @@ class Action(Enum):
     VERIFY = auto()  # disarm what still plays, read all back: VERIFIED or FAULT
     ARM = auto()  # ARMED or FAULT
     DISARM = auto()
-    STOP = auto()  # quick stop of all reachable amplifiers
+    STOP = auto()  # quick stop of all amplifiers, blindly of lost ones
     REACT = auto()  # quick stop, then REACTION_DONE
     CLEAR = auto()  # acknowledge at the amplifiers, read all back: VERIFIED or FAULT
     RECONNECT = auto()  # with growing pauses: RECONNECTED
@@ -84,7 +87,8 @@ class StateMachine:
     """The daemon's state and everything that its next transition depends on.
 
     is_latched: an acknowledgement is required before arming; is_acknowledged: it was given, and the
-    amplifiers are being read back; lost_at [s]: when the link was lost; is_reconnected: since then.
+    amplifiers are being read back; lost_at [s]: when the link was lost; is_reconnected: since then;
+    is_degraded: whether an amplifier does not reply while armed, so that nothing new is played.
     """
 
     state: DaemonState = DaemonState.NOT_READY
@@ -94,6 +98,7 @@ class StateMachine:
     is_acknowledged: bool = False
     lost_at: float = 0.0
     is_reconnected: bool = False
+    is_degraded: bool = False
 
     def lost_for(self, now: float) -> float | None:
         """Time since the link was lost [s]; None while it is up."""
@@ -119,6 +124,10 @@ _LATCHING = (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT_REACTION_ACTIVE, D
 _OPEN = (*_SILENT, *_ENERGISED, *_LATCHING)
 
 
+def _is_latched(machine: StateMachine, now: float) -> bool:
+    return machine.is_latched
+
+
 def _is_acknowledged(machine: StateMachine, now: float) -> bool:
     return machine.is_acknowledged
 
@@ -139,7 +148,11 @@ _LEAVE_COMM_LOST = (
 
 TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
     (DaemonState.NOT_READY, Trigger.OPENED): (
+        Transition(DaemonState.QUICK_STOP_ACTIVE, (Action.STOP,), _is_latched),
         Transition(DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,)),
+    ),
+    (DaemonState.NOT_READY, Trigger.NOT_FOUND): (
+        Transition(DaemonState.COMM_LOST, (Action.RECONNECT,)),
     ),
     (DaemonState.SWITCH_ON_DISABLED, Trigger.VERIFIED): (
         Transition(DaemonState.READY_TO_SWITCH_ON),
@@ -162,6 +175,7 @@ TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
     **{
         (state, Trigger.STOP): (Transition(state, (Action.STOP,)),)
         for state in (
+            DaemonState.NOT_READY,
             DaemonState.FAULT_REACTION_ACTIVE,
             DaemonState.FAULT,
             DaemonState.COMM_LOST,
@@ -171,7 +185,7 @@ TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
         (state, Trigger.FAULT): (Transition(DaemonState.FAULT_REACTION_ACTIVE, (Action.REACT,)),)
         for state in (*_SILENT, *_ENERGISED, DaemonState.QUICK_STOP_ACTIVE)
     },
-    (DaemonState.FAULT, Trigger.FAULT): (Transition(DaemonState.FAULT),),
+    (DaemonState.FAULT, Trigger.FAULT): (Transition(DaemonState.FAULT, (Action.STOP,)),),
     (DaemonState.FAULT_REACTION_ACTIVE, Trigger.REACTION_DONE): (Transition(DaemonState.FAULT),),
     **{
         (state, Trigger.CLEAR): (Transition(state, (Action.CLEAR,)),)
@@ -188,7 +202,12 @@ TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
             Transition(DaemonState.COMM_LOST, (Action.STOP, Action.RECONNECT)),
         )
         for state in _OPEN
+        if state is not DaemonState.READY_TO_SWITCH_ON
     },
+    # Read back as silent: a stop would latch an amplifier that is back at once.
+    (DaemonState.READY_TO_SWITCH_ON, Trigger.LINK_LOST): (
+        Transition(DaemonState.COMM_LOST, (Action.RECONNECT,)),
+    ),
     (DaemonState.COMM_LOST, Trigger.LINK_LOST): (
         Transition(
             DaemonState.COMM_LOST,
@@ -196,6 +215,10 @@ TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
             lambda machine, now: machine.is_reconnected,
         ),
     ),
+    **{
+        (DaemonState.OPERATION_ENABLED, trigger): (Transition(DaemonState.OPERATION_ENABLED),)
+        for trigger in (Trigger.LINK_DEGRADED, Trigger.LINK_RESTORED)
+    },
     (DaemonState.COMM_LOST, Trigger.RECONNECTED): _LEAVE_COMM_LOST,
     (DaemonState.COMM_LOST, Trigger.TICK): _LEAVE_COMM_LOST,
     **{
@@ -217,6 +240,13 @@ def step(
     return machine, ()
 
 
+def failed(machine: StateMachine, cause: str) -> StateMachine:
+    """Return the state machine after an unexpected exception: latched, and in FAULT if open."""
+    if machine.state in (DaemonState.NOT_READY, DaemonState.COMM_LOST):
+        return replace(machine, is_latched=True, is_acknowledged=False)
+    return StateMachine(DaemonState.FAULT, cause, ACKNOWLEDGE, is_latched=True)
+
+
 def _with_event(machine: StateMachine, event: DaemonEvent, now: float) -> StateMachine:
     """Update the flags that an event sets regardless of the next state."""
     match event.trigger:
@@ -226,6 +256,8 @@ def _with_event(machine: StateMachine, event: DaemonEvent, now: float) -> StateM
             return replace(machine, is_acknowledged=False)
         case Trigger.STOP:
             return replace(machine, is_acknowledged=False, is_latched=True)
+        case Trigger.NOT_FOUND:
+            return replace(machine, lost_at=now, is_reconnected=False)
         case Trigger.LINK_LOST if machine.state is not DaemonState.COMM_LOST:
             return replace(
                 machine,
@@ -234,6 +266,8 @@ def _with_event(machine: StateMachine, event: DaemonEvent, now: float) -> StateM
                 is_latched=machine.is_latched or machine.state in _ENERGISED,
                 is_acknowledged=False,
             )
+        case Trigger.LINK_DEGRADED | Trigger.LINK_RESTORED:
+            return replace(machine, is_degraded=event.trigger is Trigger.LINK_DEGRADED)
         case Trigger.RECONNECTED:
             return replace(machine, is_reconnected=True)
         case _:
@@ -248,7 +282,8 @@ def _enter(
         updated = replace(updated, is_reconnected=False)
     if to is before.state:
         # A persisting fault may have a new cause.
-        is_new_cause = event.trigger is Trigger.FAULT and bool(event.cause)
+        has_cause = (Trigger.FAULT, Trigger.LINK_DEGRADED, Trigger.LINK_RESTORED)
+        is_new_cause = event.trigger in has_cause and bool(event.cause)
         return replace(updated, cause=event.cause, remedy=event.remedy) if is_new_cause else updated
     is_latched = to in _LATCHING or (to is DaemonState.COMM_LOST and updated.is_latched)
     cause, remedy = event.cause or before.cause, event.remedy
@@ -257,5 +292,11 @@ def _enter(
         cause = f"all amplifiers reply again and are disarmed; before: {cause}"
         remedy = ACKNOWLEDGE if to is DaemonState.FAULT else None
     return replace(
-        updated, state=to, cause=cause, remedy=remedy, is_latched=is_latched, is_acknowledged=False
+        updated,
+        state=to,
+        cause=cause,
+        remedy=remedy,
+        is_latched=is_latched,
+        is_acknowledged=False,
+        is_degraded=False,
     )

@@ -1,13 +1,30 @@
-"""Runs the daemon's state machine: applies events, carries out actions, restores lost links."""
+"""Runs the daemon's state machine: applies events, carries out actions, restores lost links.
+
+Actions come before observers: these are called a moment later, each guarded (`DeferredCalls`). An
+unexpected exception in a transition or action ends in a stop of all amplifiers and in FAULT.
+"""
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any, TypeVar
 
-from controller.daemon.read_back import READ_BACK_INTERVAL, find_problem, read_statuses
-from controller.daemon.reconnect import ALIVE_INTERVAL, LinkChange, error_text, reconnect
+from controller.daemon.deferred_calls import DeferredCalls, call_guarded
+from controller.daemon.read_back import (
+    READ_BACK_INTERVAL,
+    all_silent,
+    find_problem,
+    read_statuses,
+)
+from controller.daemon.reconnect import (
+    ALIVE_INTERVAL,
+    LinkChange,
+    error_text,
+    reconnect,
+    wait_alive,
+)
 from controller.daemon.states import (
     ACKNOWLEDGE,
     Action,
@@ -15,54 +32,67 @@ from controller.daemon.states import (
     DaemonState,
     StateMachine,
     Trigger,
+    failed,
     step,
 )
-from controller.group.amplifier_group import Phase
+from controller.group.amplifier_group import GroupState
+from controller.group.quick_stops import QuickStops
 from controller.loop.loop import Controller
 from controller.loop.observer import Observer
 from drivers import clock
 from drivers.amplifier import Amplifier
-from drivers.errors import CommandRefused, DriverError, LinkError
-from drivers.link.turns import Preempted
+from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkError, Preempted
+from drivers.operation.silence import StopOutcome
 from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault
+from registry.plugins import failure_text
 
 STATUS_INTERVAL = 0.5  # s; between status requests to disarmed amplifiers
 _MAX_READ_BACKS = 15
+_SEARCHING = "check cables and supply; the daemon reconnects by itself and stays disarmed"
 
 _LOG_LEVELS = {
     DaemonState.COMM_LOST: logging.ERROR,
     DaemonState.FAULT_REACTION_ACTIVE: logging.ERROR,
 }
 
+StateObserver = Callable[[StateMachine, StateMachine], None]
+"""Receives the old and the new state machine."""
+
 _logger = logging.getLogger(__name__)
 _rate_limited_logger = logging.getLogger(f"{__name__}.background")
+_T = TypeVar("_T")
 
 
 class Supervisor:
     """Keeps the amplifiers of a controller connected, and armed only as the state machine allows.
 
     The controller must be created with `observe(observer)` of this supervisor and the same
-    amplifiers. state_changed receives the old and new state machine at every transition;
-    link_changed the kind of change, the lost amplifiers ("lost" only) and a message; alive is
-    called after each cycle of the control loop and periodically while there is no link.
+    amplifiers. state_changed are called at every transition; link_changed receives the kind of
+    change, the lost amplifiers ("lost" only) and a message; alive is called after each cycle of the
+    control loop and periodically while there is no link.
     """
 
     def __init__(
         self,
         amplifiers: Mapping[str, Amplifier],
         *,
-        state_changed: Callable[[StateMachine, StateMachine], None],
+        state_changed: Sequence[StateObserver],
         link_changed: Callable[[LinkChange, Sequence[str], str], None],
         alive: Callable[[], None],
     ) -> None:
         self.machine = StateMachine()
         self._amplifiers = amplifiers
-        self._state_changed = state_changed
-        self._link_changed = link_changed
-        self._alive = alive
-        self._opened_controller: Controller | None = None
+        self._state_observers = (_log_transition, *state_changed)
+        self._link_observer = link_changed
+        self._alive_observer = alive
+        self.started = asyncio.Event()  # the amplifiers are open, or searched for
+        self._is_closing = False
+        self._reports = DeferredCalls()
+        self._controller_if_running: Controller | None = None
+        self._control_loop: asyncio.Task[None] | None = None
         self._refusal = ""
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._arm_count = 0
+        self._tasks: set[asyncio.Task[Any]] = set()
         self._loss_lock = asyncio.Lock()  # held until the lost amplifiers are closed
 
     def observe(self, observer: Observer) -> Observer:
@@ -75,84 +105,128 @@ class Supervisor:
 
         def cycle_completed() -> None:
             self._check_phase()
+            self._check_degraded()
             self._alive()
             observer.cycle_completed()
 
         return replace(observer, refused=refused, cycle_completed=cycle_completed)
 
-    async def open(self, controller: Controller) -> None:
-        """Open and verify the amplifiers; raises what `Controller.open` raises.
+    async def run(self, controller: Controller) -> None:
+        """Open the amplifiers, run the control loop, and reconnect after every loss, until `close`.
 
-        An amplifier in a fault, or one that refuses, leads to the state FAULT instead.
+        Amplifiers that do not reply at the start are searched for as after a loss; one in a fault,
+        or one that refuses, leads to the state FAULT. Raises CommandError and InputError for
+        amplifiers that do not fit the configuration.
         """
-        self._opened_controller = controller
+        self._controller_if_running = controller
         for name, amplifier in self._amplifiers.items():
             amplifier.listen(partial(self._amplifier_event, name))
-        await controller.open()
-        try:
-            await self.handle(DaemonEvent(Trigger.OPENED, "every amplifier has replied"))
-        except LinkError:
-            raise
-        except DriverError as error:
-            _rate_limited_logger.warning("%s", error)
-
-    async def run(self) -> None:
-        """Run the control loop, and reconnect after every loss, until `close`."""
+        await self._open()
+        self.started.set()
         polling = asyncio.create_task(self._poll_disarmed())
         try:
             while self.machine.state is not DaemonState.NOT_READY:
                 try:
-                    await self._controller.run()
+                    if self.machine.state is not DaemonState.COMM_LOST:
+                        await self._run_control_loop()
                 except LinkError as error:
-                    await self._in_background(self._handle_loss(error))
+                    lost = self._in_background(self._handle_loss(error))
+                    await wait_alive(lost, self._alive)
                 while self.machine.state is DaemonState.COMM_LOST:
                     await self._restore_link()
         finally:
             polling.cancel()
             await asyncio.gather(polling, *self._tasks, return_exceptions=True)
+            self._reports.flush()
+
+    async def _run_control_loop(self) -> None:
+        """Run the control loop until it ends or a reconnection cancels it; raises its error."""
+        loop = self._control_loop = asyncio.create_task(self._controller.run(), name="control loop")
+        try:
+            await asyncio.wait({loop})
+        finally:
+            loop.cancel()
+            await asyncio.wait({loop})
+        if not loop.cancelled():
+            loop.result()
 
     async def close(self, cause: str) -> None:
         """Ramp down, read back, disarm and close the amplifiers; ends `run`."""
-        await self.handle(DaemonEvent(Trigger.CLOSE, cause))
+        self._is_closing = True
+        if self._controller_if_running is not None:
+            await self.handle(DaemonEvent(Trigger.CLOSE, cause))
+        self._reports.flush()
+
+    async def stop(self, cause: str, remedy: str | None = None) -> Mapping[str, StopOutcome]:
+        """Quick-stop all amplifiers in any state; returns the outcome of each, by name."""
+        stopping = self._spawn(self._stop())
+        self._step(DaemonEvent(Trigger.STOP, cause, remedy))
+        return await asyncio.shield(stopping)
 
     async def handle(self, event: DaemonEvent) -> None:
-        """Apply an event and carry out its actions; raises the error of an action."""
-        for action in self._step(event):
-            await self._do(action)
+        """Apply an event and carry out its actions; raises the error of an action.
+
+        The actions are completed even if the caller is cancelled.
+        """
+        try:
+            await asyncio.shield(self._spawn(self._carry_out(self._step(event))))
+        except (DriverError, asyncio.CancelledError):
+            raise
+        except Exception as error:
+            await self._fail(error)
+            raise
 
     def post(self, event: DaemonEvent) -> None:
         """Apply an event at once and carry out its actions in a task."""
-        actions = self._step(event)
-
-        async def do_all() -> None:
-            for action in actions:
-                await self._do(action)
-
-        task = asyncio.ensure_future(self._in_background(do_all()))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self._spawn(self._in_background(self._carry_out(self._step(event))))
 
     @property
     def _controller(self) -> Controller:
-        if self._opened_controller is None:
-            raise RuntimeError("supervisor is not open")
-        return self._opened_controller
+        if self._controller_if_running is None:
+            raise RuntimeError("supervisor is not running")
+        return self._controller_if_running
+
+    def _spawn(self, work: Coroutine[Any, Any, _T]) -> "asyncio.Task[_T]":
+        """Run work in a task that `run` waits for."""
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
 
     def _step(self, event: DaemonEvent) -> tuple[Action, ...]:
-        """Apply one transition and report it; return its actions."""
+        """Apply one transition; return its actions."""
         before = self.machine
-        self.machine, actions = step(before, event, clock.now())
-        after = self.machine
-        if after.state is not before.state:
-            _logger.log(
-                _LOG_LEVELS.get(after.state, logging.INFO),
-                "%s -> %s",
-                before.state,
-                after.state,
-                extra={"topic": "state", "cause": after.cause, "remedy": after.remedy},
-            )
-            self._state_changed(before, after)
+        try:
+            self.machine, actions = step(before, event, clock.now())
+        except Exception as error:
+            self.machine, actions = failed(before, failure_text(error)), (Action.STOP,)
+        call_guarded(partial(self._report_transition, before))
         return actions
+
+    def _report_transition(self, before: StateMachine) -> None:
+        """Tell the observers of the current state, if it is another, a moment later."""
+        if self.machine.state is not before.state:
+            for observer in self._state_observers:
+                self._reports.add(partial(observer, before, self.machine))
+
+    def _link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
+        report = partial(self._link_observer, change, lost, message)
+        call_guarded(partial(self._reports.add, report))
+
+    def _alive(self) -> None:
+        call_guarded(self._alive_observer)
+
+    async def _carry_out(self, actions: Sequence[Action]) -> None:
+        for action in actions:
+            await self._do(action)
+
+    async def _fail(self, error: Exception) -> None:
+        """Stop all amplifiers after an unexpected exception, which is a fault."""
+        before, self.machine = self.machine, failed(self.machine, failure_text(error))
+        call_guarded(partial(self._report_transition, before))
+        await asyncio.shield(self._spawn(self._stop()))
+        if self.machine.state is DaemonState.COMM_LOST and self._control_loop is not None:
+            self._control_loop.cancel()  # so that amplifiers are reopened
 
     async def _do(self, action: Action) -> None:
         match action:
@@ -180,31 +254,68 @@ class Supervisor:
         except LinkError as error:
             await self._handle_loss(error)
             raise
-        except Preempted:
-            raise  # not a fault: the request that preempted it is an event of its own
         except DriverError as error:
-            await self.handle(DaemonEvent(Trigger.FAULT, str(error), ACKNOWLEDGE))
+            # The request that preempted it is an event of its own, and has left this state.
+            is_explained = self.machine.state is not DaemonState.SWITCH_ON_DISABLED
+            if not (isinstance(error, Preempted) and is_explained):
+                await self.handle(DaemonEvent(Trigger.FAULT, str(error), ACKNOWLEDGE))
             raise
 
-    async def _stop(self) -> None:
-        """Stop all amplifiers; raises LinkError for one that did not reply, now a lost link."""
-        await self._controller.stop()
+    async def _stop(self) -> Mapping[str, StopOutcome]:
+        """Stop all amplifiers; one that is lost is a lost link. Never raises an Exception."""
+        try:
+            outcomes = await self._controller.stop()
+        except Exception:
+            _rate_limited_logger.exception("stop failed, stopping each amplifier individually")
+            outcomes = await QuickStops(self._amplifiers).stop()
+        try:
+            await self._check_links()
+        except Exception:
+            _rate_limited_logger.exception("handling of a lost link failed")
+        return outcomes
+
+    async def _check_links(self) -> None:
+        """Handle the loss of an amplifier unless it is handled already."""
         for amplifier in self._amplifiers.values():
             if amplifier.is_lost and self.machine.state not in (
                 DaemonState.COMM_LOST,
                 DaemonState.NOT_READY,
             ):
-                await self._over_link(amplifier.status())  # raises the cause of the loss at once
+                try:
+                    await amplifier.status()  # raises the cause of the loss at once
+                except LinkError as error:
+                    await self._handle_loss(error)
+
+    async def _open(self) -> None:
+        """Open and verify the amplifiers; without a reply they are searched for."""
+        try:
+            await wait_alive(self._controller.open(), self._alive)
+            if self._is_closing:
+                await self._controller.close()
+                return
+        except LinkError as error:
+            self._link_changed("retry", (), error_text(error))
+            event = DaemonEvent(Trigger.NOT_FOUND, error_text(error), _SEARCHING)
+            await self._in_background(self.handle(event))
+            return
+        opened = DaemonEvent(Trigger.OPENED, "every amplifier has replied")
+        await self._in_background(self.handle(opened))
 
     async def _arm(self) -> None:
+        self._arm_count += 1
+        number = self._arm_count
         try:
             await self._controller.arm()
+        except LinkDegraded:  # disarmed by then, and not lost
+            await self.handle(DaemonEvent(Trigger.DISARM, "an amplifier did not reply to arm"))
+            raise
         except LinkError as error:
             await self._handle_loss(error)
             raise
         except DriverError as error:
             # A stop or disarm in the meantime explains the error and is not a fault.
-            if self.machine.state is DaemonState.SWITCHED_ON:
+            is_newest = number == self._arm_count
+            if is_newest and self.machine.state is DaemonState.SWITCHED_ON:
                 await self.handle(DaemonEvent(Trigger.FAULT, str(error), ACKNOWLEDGE))
             raise
         await self.handle(DaemonEvent(Trigger.ARMED, self.machine.cause))
@@ -269,73 +380,121 @@ class Supervisor:
     async def _handle_loss(self, error: LinkError) -> None:
         """Handle a loss; concurrent reports of the same loss wait until it is handled."""
         async with self._loss_lock:
-            lost = [name for name, amplifier in self._amplifiers.items() if amplifier.is_lost]
+            lost = [
+                name
+                for name, amplifier in self._amplifiers.items()
+                if amplifier.is_lost or amplifier.is_degraded
+            ]
             text = error_text(error)
             if self.machine.state is not DaemonState.COMM_LOST:
                 self._link_changed("lost", lost, text)
             cause = f"amplifier {', '.join(lost)}: {text}" if lost else text
-            remedy = "check cables and supply; the daemon reconnects by itself and stays disarmed"
-            await self.handle(DaemonEvent(Trigger.LINK_LOST, cause, remedy))
+            await self.handle(DaemonEvent(Trigger.LINK_LOST, cause, _SEARCHING))
 
     async def _restore_link(self) -> None:
         """Take the next step towards leaving COMM_LOST."""
-        if self.machine.is_reconnected:  # wait for the watchdog of the lost amplifier
-            await asyncio.sleep(ALIVE_INTERVAL)
-            self._alive()
-            await self._in_background(self.handle(DaemonEvent(Trigger.TICK)))
-        elif await reconnect(
-            self._controller,
-            should_continue=lambda: self.machine.state is DaemonState.COMM_LOST,
-            report=lambda change, message: self._link_changed(change, (), message),
-            alive=self._alive,
-        ):
-            await self._in_background(self.handle(DaemonEvent(Trigger.RECONNECTED)))
+        try:
+            if self.machine.is_reconnected:  # wait for the watchdog of the lost amplifier
+                await asyncio.sleep(ALIVE_INTERVAL)
+                self._alive()
+                await self.handle(DaemonEvent(Trigger.TICK))
+            elif await reconnect(
+                self._controller,
+                should_continue=lambda: self.machine.state is DaemonState.COMM_LOST,
+                report=lambda change, message: self._link_changed(change, (), message),
+                alive=self._alive,
+            ):
+                await self.handle(DaemonEvent(Trigger.RECONNECTED))
+        except DriverError as error:
+            _rate_limited_logger.info("failed: %s", error)
+        except Exception:
+            _rate_limited_logger.exception("reconnection failed")
+            await asyncio.sleep(STATUS_INTERVAL)
 
     async def _poll_disarmed(self) -> None:
-        """Poll the status of disarmed amplifiers; the control loop polls armed ones."""
+        """Poll the status of disarmed amplifiers; the control loop polls armed ones.
+
+        A stop or fault reaction that has not silenced all of them is repeated.
+        """
         while True:
             await asyncio.sleep(STATUS_INTERVAL)
-            if self._controller.phase is not Phase.DISARMED:
+            if self._controller.group_state is not GroupState.DISARMED:
                 continue
             try:
-                problem = find_problem(await read_statuses(self._amplifiers))
+                statuses = await read_statuses(self._amplifiers)
             except LinkError as error:
-                if self._controller.phase is Phase.DISARMED:
+                if self._controller.group_state is GroupState.DISARMED:
                     await self._in_background(self._handle_loss(error))
             except DriverError:
                 continue  # preempted by another request, which reports for itself
             except Exception:
                 _rate_limited_logger.exception("status read failed")
             else:
-                is_ready = self.machine.state is DaemonState.READY_TO_SWITCH_ON
-                if problem is not None and is_ready:
+                problem, state = find_problem(statuses), self.machine.state
+                if problem is not None and state is DaemonState.READY_TO_SWITCH_ON:
                     fault = DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE)
                     await self._in_background(self.handle(fault))
+                elif not all_silent(statuses) and state in (
+                    DaemonState.QUICK_STOP_ACTIVE,
+                    DaemonState.FAULT,
+                ):
+                    _rate_limited_logger.error("stop repeated: %s", problem)
+                    await self._stop()
 
     def _check_phase(self) -> None:
-        """Post a fault if the control loop has stopped the amplifiers by itself."""
+        """Post a fault if the control loop has stopped the amplifiers on its own."""
         if self._has_stopped_itself:
             cause = self._refusal or "an amplifier refused a command"
             self.post(DaemonEvent(Trigger.FAULT, cause, ACKNOWLEDGE))
+
+    def _check_degraded(self) -> None:
+        """Note that armed amplifiers have ceased to reply, or that all reply again."""
+        degraded = self._controller.degraded
+        is_armed = self.machine.state is DaemonState.OPERATION_ENABLED
+        if not is_armed or bool(degraded) is self.machine.is_degraded:
+            return
+        if degraded:
+            cause = f"amplifier {', '.join(degraded)} does not reply; nothing new is played"
+            self.post(DaemonEvent(Trigger.LINK_DEGRADED, cause, "check cables and supply"))
+            _rate_limited_logger.warning("link: degraded: %s", cause, extra={"topic": "link"})
+            self._link_changed("degraded", degraded, cause)
+        else:
+            cause = "all amplifiers reply again and play what they should"
+            self.post(DaemonEvent(Trigger.LINK_RESTORED, cause, "era disarm, or era stop"))
+            _rate_limited_logger.info("link: restored: %s", cause, extra={"topic": "link"})
+            self._link_changed("restored", (), cause)
 
     @property
     def _has_stopped_itself(self) -> bool:
         """Whether the control loop has stopped the amplifiers without a request to do so."""
         is_armed = self.machine.state is DaemonState.OPERATION_ENABLED
-        return is_armed and self._controller.phase is Phase.DISARMED
+        return is_armed and self._controller.group_state is GroupState.DISARMED
 
     def _amplifier_event(self, name: str, event: AmplifierEvent) -> None:
-        """Post a fault that an amplifier reports by itself, ahead of the next heartbeat."""
-        is_armed = self.machine.state is DaemonState.OPERATION_ENABLED
-        if event.fault is Fault.NONE or not is_armed:
+        """Post a fault that an amplifier reports unsolicited, ahead of the next heartbeat."""
+        energised = (DaemonState.SWITCHED_ON, DaemonState.OPERATION_ENABLED)
+        if event.fault is Fault.NONE or self.machine.state not in energised:
             return
         channel = "" if event.channel is None else f", channel {event.channel}"
         cause = f"amplifier {name} reports {event.fault.name}{channel}"
         self.post(DaemonEvent(Trigger.FAULT, cause, ACKNOWLEDGE))
 
-    async def _in_background(self, work: Awaitable[None]) -> None:
+    async def _in_background(self, work: Awaitable[object]) -> None:
         """Await work without a caller: its errors are already part of the state."""
         try:
             await work
         except DriverError as error:
             _rate_limited_logger.info("failed: %s", error)
+        except Exception as error:
+            _rate_limited_logger.exception("failed, stopping all amplifiers")
+            await self._fail(error)
+
+
+def _log_transition(before: StateMachine, after: StateMachine) -> None:
+    _logger.log(
+        _LOG_LEVELS.get(after.state, logging.INFO),
+        "%s -> %s",
+        before.state,
+        after.state,
+        extra={"topic": "state", "cause": after.cause, "remedy": after.remedy},
+    )

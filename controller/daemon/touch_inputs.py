@@ -8,12 +8,15 @@ from dataclasses import replace
 from controller.api.methods import TouchParams
 from controller.daemon.config import API_SOURCES, TouchInput
 from controller.sources.touch import Touch, TouchFrame
-from drivers.operation.pauses import pauses
+from drivers import clock
+from drivers.operation.pauses import Backoff
+from drivers.threads import in_thread
 from model.errors import InputError
 from model.structure.plate import Plate
 
 _MIN_PAUSE, _MAX_PAUSE = 1.0, 30.0  # s; before a failed source is restarted
 MAX_SOURCES_PER_CLIENT = 64  # with fingers down; a gateway forwards those of many browsers
+_SOURCE_TIMEOUT = 1.0  # s; without a frame, after which a source no longer counts
 
 _logger = logging.getLogger(__name__)
 
@@ -57,15 +60,19 @@ class TouchInputs:
             source = frame.source if frame.source.isprintable() else ascii(frame.source)
             self._deliver(replace(frame, source=f"{touch_input.name}:{source}"))
 
-        for pause in pauses(first=_MIN_PAUSE, maximum=_MAX_PAUSE):
+        backoff = Backoff(_MIN_PAUSE, _MAX_PAUSE)
+        while True:
+            begin = clock.now()
             try:
-                await touch_input.make().run(deliver)
+                source = await in_thread(touch_input.make, name="touch source")  # reads recordings
+                await source.run(deliver)
             except Exception as error:
                 self._failed(touch_input.name, error)
             else:
                 _logger.info("touch source %s: finished", touch_input.name)
                 return
-            await asyncio.sleep(pause)  # a panel may be plugged in later, a port be released
+            # A panel may be plugged in later, a port be released.
+            await asyncio.sleep(backoff.pause(ran_for=clock.now() - begin))
 
 
 class ApiTouches:
@@ -75,7 +82,7 @@ class ApiTouches:
         self._plate = plate
         self._deliver = deliver
         self._newest: dict[str, TouchFrame] = {}
-        self._sources: dict[object, set[str]] = {}
+        self._sources: dict[object, dict[str, float]] = {}  # time [s] of the last frame
         self._is_scheduled = False
 
     def add(self, client: object, params: TouchParams, *, client_name: str, now: float) -> None:
@@ -84,21 +91,25 @@ class ApiTouches:
         The same source name of two clients denotes two sources.
         """
         source = f"{API_SOURCES}:{client_name}:{params.source}"
-        sources = self._sources.setdefault(client, set())
+        sources = self._sources.setdefault(client, {})
         if not params.touches:
-            sources.discard(source)
-        elif source not in sources:
-            if len(sources) >= MAX_SOURCES_PER_CLIENT:
+            sources.pop(source, None)
+        else:
+            if source not in sources and len(sources) >= MAX_SOURCES_PER_CLIENT:
+                for old in [each for each in sources if now - sources[each] > _SOURCE_TIMEOUT]:
+                    del sources[old]
+            if source not in sources and len(sources) >= MAX_SOURCES_PER_CLIENT:
                 raise InputError(
                     f"a client must have at most {MAX_SOURCES_PER_CLIENT} touch sources with "
                     "fingers down; lift some first"
                 )
-            sources.add(source)
+            sources[source] = now
         touches = tuple(
             Touch(point.id, point.x_m / self._plate.length, 1 - point.y_m / self._plate.width)
             for point in params.touches
         )
-        self._newest[source] = TouchFrame(source, now, touches)
+        origin = f"{API_SOURCES}:{client_name}"
+        self._newest[source] = TouchFrame(source, now, touches, origin=origin)
         self._schedule()
 
     def lift_all(self, client: object, *, now: float) -> None:

@@ -9,7 +9,6 @@ import contextlib
 import sys
 import tempfile
 from collections.abc import AsyncIterator, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
@@ -32,15 +31,15 @@ SIM_OPTIONS: Mapping[str, Sequence[str]] = {
 
 
 class SimulatedPlate:
-    """The plate behind the amplifiers; methods raise LinkError."""
+    """The plate behind the amplifiers, with their URLs by name; methods raise LinkError."""
 
-    def __init__(self, control: PlateControl) -> None:
+    def __init__(self, control: PlateControl, urls: Mapping[str, str]) -> None:
+        self.urls = urls
         self._control = control
 
     async def place_fingers(self, positions: Mapping[str, Place]) -> None:
         """Place fingers at positions [m] by id; all others are removed."""
-        fingers = {id: list(position) for id, position in positions.items()}
-        await self._control.ask({"op": "fingers", "fingers": fingers})
+        await self._control.ask({"op": "fingers", "fingers": dict(positions)})
 
     async def vibration(self, since: float, until: float) -> dict[str, FingerVibration]:
         """Vibration of each finger by id between two times [s] of time.monotonic()."""
@@ -57,18 +56,10 @@ class SimulatedPlate:
         }
 
 
-@dataclass(frozen=True)
-class FarEnd:
-    """The amplifiers' URLs by name, and the plate that they drive."""
-
-    urls: Mapping[str, str]
-    plate: SimulatedPlate
-
-
 @contextlib.asynccontextmanager
-async def open_far_end(
+async def simulated_plate(
     rig_file: Path, amplifiers: Collection[str], *, wire: str
-) -> AsyncIterator[FarEnd]:
+) -> AsyncIterator[SimulatedPlate]:
     """Simulate the amplifiers of a rig file for the duration of the context.
 
     wire: a key of `SIM_OPTIONS` for a process of their own, "sim" for a plate in this process.
@@ -80,14 +71,13 @@ async def open_far_end(
             control = PlateControl(path, remedy=_REMEDY)
             stack.push_async_callback(control.close)
             if wire == "sim":
-                query = f"control={quote(str(path))}&amplifier="
-                base = f"sim://{quote(str(rig_file))}?{query}"
+                base = f"sim://{quote(str(rig_file))}?control={quote(str(path))}&amplifier="
                 urls = {name: base + quote(name) for name in amplifiers}
             else:
                 process = await _start(rig_file, wire=wire, control=path)
                 stack.push_async_callback(_terminate, process)
                 urls = await _read_urls(process, count=len(amplifiers))
-            yield FarEnd(urls, SimulatedPlate(control))
+            yield SimulatedPlate(control, urls)
 
 
 async def _start(rig_file: Path, *, wire: str, control: Path) -> asyncio.subprocess.Process:
@@ -112,9 +102,8 @@ async def _read_urls(process: asyncio.subprocess.Process, *, count: int) -> dict
                 name, _, url = line.strip().partition(": ")
                 urls[name] = url
     except TimeoutError:
-        raise LinkError(
-            f"simulated amplifiers: not ready within {STARTUP_TIMEOUT:g} s; {_REMEDY}"
-        ) from None
+        reason = f"not ready within {STARTUP_TIMEOUT:g} s"
+        raise LinkError(f"simulated amplifiers: {reason}; {_REMEDY}") from None
     if len(urls) < count:
         status = await process.wait()
         raise LinkError(f"simulated amplifiers: exited with status {status}; {_REMEDY}")
@@ -122,13 +111,10 @@ async def _read_urls(process: asyncio.subprocess.Process, *, count: int) -> dict
 
 
 async def _terminate(process: asyncio.subprocess.Process) -> None:
-    if process.returncode is not None:
-        return
     with contextlib.suppress(ProcessLookupError):
         process.terminate()
-    try:
-        async with asyncio.timeout(EXIT_TIMEOUT):
+        try:
+            await asyncio.wait_for(process.wait(), EXIT_TIMEOUT)
+        except TimeoutError:
+            process.kill()
             await process.wait()
-    except TimeoutError:
-        process.kill()
-        await process.wait()

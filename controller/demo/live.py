@@ -10,7 +10,7 @@ from controller.daemon.daemon import Daemon
 from controller.daemon.log import start_log
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
-from controller.demo.far_end import open_far_end
+from controller.demo.far_end import simulated_plate
 from controller.gateway.installed import require_gateway
 from model.rig.file import load_rig
 from model.table.table import LocalizationTable
@@ -34,9 +34,11 @@ async def run_live(rig_file: Path, table: LocalizationTable, *, wire: str, dashb
         stack.callback(lock.release)
         log = start_log(None, level=config.section.log.level)
         stack.callback(log.close)
-        far_end = await stack.enter_async_context(open_far_end(rig_file, rig.amplifiers, wire=wire))
+        plate = await stack.enter_async_context(
+            simulated_plate(rig_file, rig.amplifiers, wire=wire)
+        )
         daemon = Daemon(
-            replace(config, urls=far_end.urls),
+            replace(config, urls=plate.urls),
             table,
             log=log,
             manager=ServiceManager(),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from controller.demo.touch_row import PlayedPattern, TouchRow
+from controller.demo.touch_row import TouchRow
 from model.figures.fingertips import draw_fingertip, draw_level_scale, draw_levels
 from model.table.table import LocalizationTable
 
@@ -20,7 +20,7 @@ def choose_rows(rows: Sequence[TouchRow]) -> list[TouchRow]:
     """
     by_count: dict[int, list[TouchRow]] = {}
     for row in sorted(rows, key=_contrast, reverse=True):
-        if row.played is not None and row.played.measured_level_db_sl is not None:
+        if row.measured_level_db_sl is not None:
             by_count.setdefault(len(row.quiet), []).append(row)
     chosen = by_count.pop(0, [])[:1]
     while by_count and len(chosen) < MAX_PANELS:
@@ -40,23 +40,22 @@ def touches_figure(table: LocalizationTable, rows: Sequence[TouchRow]) -> Figure
     for axes in panels:
         axes.set_axis_off()
     for axes, row in zip(panels, rows, strict=False):
-        if row.played is not None:
-            _draw_touch(axes, table, row, row.played)
+        _draw_touch(axes, table, row)
     draw_level_scale(figure, panels, shrink=0.7)
     return figure
 
 
 def _contrast(row: TouchRow) -> float:
-    contrast = row.played.measured_contrast_db if row.played else None
-    return -math.inf if contrast is None else contrast
+    return -math.inf if row.measured_contrast_db is None else row.measured_contrast_db
 
 
-def _draw_touch(axes: Axes, table: LocalizationTable, row: TouchRow, played: PlayedPattern) -> None:
-    draw_levels(axes, table, played.pattern.excitation)
-    level = played.levels_db_sl.get(row.target_id)
-    draw_fingertip(axes, row.target, felt=True, level_db_sl=level)
+def _draw_touch(axes: Axes, table: LocalizationTable, row: TouchRow) -> None:
+    if row.pattern is not None:
+        draw_levels(axes, table, row.pattern.excitation)
+    level = row.levels_db_sl.get(row.target_id)
+    draw_fingertip(axes, row.targets_m[0], felt=True, level_db_sl=level)
     for id, place in row.quiet.items():
-        draw_fingertip(axes, place, felt=False, level_db_sl=played.levels_db_sl.get(id))
-    contrast = played.measured_contrast_db
+        draw_fingertip(axes, place, felt=False, level_db_sl=row.levels_db_sl.get(id))
+    contrast = row.measured_contrast_db
     title = "one finger alone" if contrast is None else f"contrast {contrast:.1f} dB measured"
     axes.set_title(title, fontsize=11, pad=20)

@@ -3,14 +3,13 @@
 import asyncio
 import math
 from collections.abc import Callable, Coroutine, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from controller.demo.far_end import SimulatedPlate
 from controller.demo.touch_row import (
     FingerVibration,
     Place,
-    PlayedPattern,
     TouchRow,
     peak_contrast_db,
     steady_contrast_db,
@@ -27,6 +26,9 @@ STEADY_WINDOW = 0.25
 
 MARGIN = 0.005
 """Time [s] from the last byte on the wire to the plate, and before the next command."""
+
+STEADY_DURATION = 0.4
+"""Shortest pattern [s] that counts as steady; the plate rings for 50 ms to 1 s."""
 
 MIN_MOVEMENT = 0.001
 """Movement [m] below which a finger's sensor stays in place, so that its window is not broken."""
@@ -101,7 +103,7 @@ class TouchRecorder:
             await asyncio.wait(self._tasks)
         if self._errors:
             raise LinkError(f"demonstration aborted: {self._errors[0]}")
-        self.rows.sort(key=lambda row: row.time)
+        self.rows.sort(key=lambda row: row.time_s)
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
         self._move_sensors(contacts)
@@ -169,22 +171,17 @@ class TouchRecorder:
 
     async def _add_row(self, touch: _Touch) -> None:
         """Make the row of a lifted touch from the pattern that played longest for it."""
-        dominant = max(touch.patterns, key=lambda playing: playing.duration, default=None)
-        contact, quiet, targets = touch.contact, touch.quiet, []
-        if dominant is not None:
-            contact = _prediction(touch, dominant).contact
-            targets = [each.contact for each in dominant.applied.targets]
-            quiet = {_id(other): (other.x, other.y) for other in dominant.applied.quiet}
+        contact = touch.contact
         row = TouchRow(
             target_id=_id(contact),
-            time=contact.since - self._start,
-            until=touch.until - self._start,
-            target=(contact.x, contact.y),
-            other_targets=tuple((each.x, each.y) for each in targets if each.key != contact.key),
-            quiet=quiet,
-            played=await _played(touch, dominant) if dominant else None,
-            reason=None if dominant else touch.reason,
+            time_s=contact.since - self._start,
+            until_s=touch.until - self._start,
+            targets_m=[(contact.x, contact.y)],
+            quiet=touch.quiet,
+            reason=touch.reason,
         )
+        if touch.patterns:
+            row = await _played(touch, row)
         self.rows.append(row)
         self._on_row(row)
 
@@ -200,31 +197,40 @@ class TouchRecorder:
             self._errors.append(str(error))
 
 
-async def _played(touch: _Touch, dominant: _Playing) -> PlayedPattern:
-    """The longest pattern of a touch as measured; latency and onset are of its first pattern."""
-    first = touch.patterns[0]
-    applied, predicted = dominant.applied, _prediction(touch, dominant)
-    vibration = await dominant.steady if dominant.steady else {}
+async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
+    """The row with the longest pattern of a touch; latency and onset are of its first one."""
+    main_part = max(touch.patterns, key=lambda playing: playing.duration)
+    first, applied = touch.patterns[0], main_part.applied
+    predicted = _prediction(touch, main_part)
+    vibration = await main_part.steady if main_part.steady else {}
     target, quiet = _fingers(vibration, predicted.contact, applied)
     onset = await first.onset if first.onset else {}
     onset_target, onset_quiet = _fingers(onset, touch.contact, first.applied)
-    return PlayedPattern(
-        pattern=applied.pattern,
+    contacts = [each.contact for each in applied.targets if each is not predicted]
+    return replace(
+        row,
+        reason=None,
+        target_id=_id(predicted.contact),
+        targets_m=[(each.x, each.y) for each in (predicted.contact, *contacts)],
+        quiet={_id(other): (other.x, other.y) for other in applied.quiet},
         drive={
             era: {"frequency_hz": each.frequency, "level": each.level, "phase_deg": each.phase}
             for era, each in applied.drive.items()
         },
-        latency=first.applied.latency,
-        duration=dominant.duration,
-        is_onset_shaped=bool(first.applied.pattern.onset),
-        predicted_level_db_sl=predicted.level_db_sl,
-        measured_level_db_sl=target.level_db_sl if target else None,
+        mode=applied.pattern.drive_mode,
+        shaped_onset=bool(first.applied.pattern.onset),
+        latency_ms=1000 * first.applied.latency,
+        played_s=main_part.duration,
+        steady=main_part.duration >= STEADY_DURATION,
         predicted_contrast_db=predicted.contrast_db,
         measured_contrast_db=steady_contrast_db(target, quiet) if target else None,
         predicted_transient_contrast_db=first.applied.transient_contrast_db,
         measured_transient_contrast_db=(
             peak_contrast_db(onset_target, onset_quiet) if onset_target and onset_quiet else None
         ),
+        predicted_level_db_sl=predicted.level_db_sl,
+        measured_level_db_sl=target.level_db_sl if target else None,
+        pattern=applied.pattern,
         levels_db_sl={id: finger.level_db_sl for id, finger in vibration.items()},
     )
 
@@ -242,7 +248,7 @@ def _fingers(
 
 
 def _prediction(touch: _Touch, playing: _Playing) -> Prediction:
-    """What was predicted for a touch under a pattern that played for it."""
+    """Prediction for a touch under a pattern that played for it."""
     return next(felt for felt in playing.applied.targets if felt.contact.key == touch.contact.key)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import TypeAlias
 
-from controller.demo.far_end import SIM_OPTIONS, open_far_end
+from controller.demo.far_end import SIM_OPTIONS, simulated_plate
 from controller.demo.picture import choose_rows, touches_figure
 from controller.demo.recorder import TouchRecorder
 from controller.demo.touch_row import TouchRow
@@ -16,7 +16,7 @@ from controller.sources.evemu import EvemuSource
 from controller.sources.touch import TouchSource
 from controller.sources.tuio import TuioSource
 from drivers.amplifier import Amplifier
-from drivers.operation.steady import no_long_collections
+from drivers.operation.garbage_collection import no_long_collections
 from drivers.registry import open_backend
 from model.figures import save_figure
 from model.rig.file import load_rig
@@ -75,13 +75,13 @@ async def run_demo(
     Return all rows in order of time. Raises LinkError if the far end is lost.
     """
     rig = load_rig(rig_file)
-    async with open_far_end(rig_file, rig.amplifiers, wire=wire) as far_end:
+    async with simulated_plate(rig_file, rig.amplifiers, wire=wire) as plate:
         source, play = await touches()
-        recorder = TouchRecorder(far_end.plate, on_row=on_row)
+        recorder = TouchRecorder(plate, on_row=on_row)
         controller = Controller(
             rig,
             table,
-            amplifiers={name: Amplifier(open_backend(url)) for name, url in far_end.urls.items()},
+            amplifiers={name: Amplifier(open_backend(url)) for name, url in plate.urls.items()},
             sources=[source],
             observer=recorder.observer,
             timing=Timing(table),

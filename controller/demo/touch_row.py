@@ -1,7 +1,7 @@
 """One row of the demonstration: a touch, what was predicted for it and what was measured."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -12,9 +12,6 @@ from model.table.pattern import Pattern
 from model.vibration.peak import peak_acceleration
 
 Place: TypeAlias = tuple[float, float]
-
-STEADY_DURATION = 0.4
-"""Shortest pattern [s] that counts as steady; the plate rings for 50 ms to 1 s."""
 
 
 @dataclass(frozen=True)
@@ -35,87 +32,47 @@ class FingerVibration:
         return mean_level_db_sl(self.frequencies, self.amplitudes)
 
 
-@dataclass(frozen=True)
-class PlayedPattern:
-    """The pattern that played longest for a touch.
-
-    predicted and measured figures are of this touch; contrasts are None for a finger alone, and
-    measured ones where the pattern was too short. transient: over the first 100 ms of the touch's
-    first pattern. drive: achieved by the amplifiers, by ERA; latency [s]: from touch frame to last
-    byte on the wire; levels_db_sl: of every finger by id.
-    """
-
-    pattern: Pattern
-    drive: Mapping[str, Mapping[str, float]]
-    latency: float
-    duration: float
-    is_onset_shaped: bool
-    predicted_level_db_sl: float
-    measured_level_db_sl: float | None
-    predicted_contrast_db: float | None
-    measured_contrast_db: float | None
-    predicted_transient_contrast_db: float | None
-    measured_transient_contrast_db: float | None
-    levels_db_sl: Mapping[str, float]
-
-    @property
-    def is_steady(self) -> bool:
-        """Whether the pattern played long enough for the plate to settle."""
-        return self.duration >= STEADY_DURATION
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TouchRow:
-    """A touch from down to up.
+    """A touch from down to up, with the pattern that played longest for it.
 
-    time, until [s] from the start of the recording; target: its place [m]; other_targets [m];
-    quiet [m]: other fingertips by id; reason: why nothing was played, if so.
+    Its fields are the keys of `era demo --json`, but for those that `_OWN` names: quiet: other
+    fingertips by id [m]; pattern; levels_db_sl of every finger by id. Contrasts are None for a
+    finger alone, and measured ones if the pattern was too short; transient ones are over the first
+    100 ms of the touch's first pattern. drive: as the amplifiers achieved it, by ERA; latency_ms:
+    from touch frame to last byte on the wire; reason: why nothing played, if so.
     """
 
     target_id: str
-    time: float
-    until: float
-    target: Place
-    other_targets: tuple[Place, ...]
+    time_s: float
+    until_s: float
+    targets_m: Sequence[Place]
     quiet: Mapping[str, Place]
-    played: PlayedPattern | None
-    reason: str | None
+    reason: str | None = None
+    drive: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    mode: str | None = None
+    shaped_onset: bool = False
+    latency_ms: float | None = None
+    played_s: float = 0.0
+    steady: bool = False
+    predicted_contrast_db: float | None = None
+    measured_contrast_db: float | None = None
+    predicted_transient_contrast_db: float | None = None
+    measured_transient_contrast_db: float | None = None
+    predicted_level_db_sl: float | None = None
+    measured_level_db_sl: float | None = None
+    pattern: Pattern | None = None
+    levels_db_sl: Mapping[str, float] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
         """Return the row in the format of `era demo --json`."""
-        row: dict[str, Any] = {
-            "time_s": self.time,
-            "until_s": self.until,
-            "targets_m": [list(place) for place in (self.target, *self.other_targets)],
-            "quiet_m": [list(place) for place in self.quiet.values()],
-            "reason": self.reason,
+        row = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {key: row[key] for key in row if key not in _OWN} | {
+            "quiet_m": list(self.quiet.values())
         }
-        played = self.played
-        keys = (
-            "predicted_contrast_db",
-            "measured_contrast_db",
-            "predicted_transient_contrast_db",
-            "measured_transient_contrast_db",
-            "predicted_level_db_sl",
-            "measured_level_db_sl",
-        )
-        if played is None:
-            nothing: dict[str, Any] = {
-                "drive": {},
-                "mode": None,
-                "latency_ms": None,
-                "played_s": 0.0,
-            }
-            return row | nothing | {"shaped_onset": False, "steady": False} | dict.fromkeys(keys)
-        return row | {
-            "drive": {era: dict(tone) for era, tone in played.drive.items()},
-            "mode": played.pattern.drive_mode,
-            "shaped_onset": played.is_onset_shaped,
-            "latency_ms": 1000 * played.latency,
-            "played_s": played.duration,
-            "steady": played.is_steady,
-            **{key: getattr(played, key) for key in keys},
-        }
+
+
+_OWN = ("target_id", "quiet", "pattern", "levels_db_sl")
 
 
 def steady_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]) -> float | None:

@@ -47,7 +47,7 @@ class ChannelSweep:
     ) -> None:
         self._rig = rig
         self._amplifiers = amplifiers
-        self._group = AmplifierGroup(amplifiers)
+        self._group = AmplifierGroup(amplifiers, has_own_time=sensors.is_virtual)
         self._sensors = sensors
         self._level, self._settle, self._listen = level, settle, listen
         self._on_step = on_step

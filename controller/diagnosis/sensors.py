@@ -19,12 +19,14 @@ _VIRTUAL_MAX_WAIT = 0.2  # s; watchdogs trip after 0.25 s, and virtual time is n
 class Sensors(ABC):
     """Sensors on a plate.
 
-    names (s,); points (s, 2) [m]; max_wait [s]: longest wait between two heartbeats of amplifiers.
+    names (s,); points (s, 2) [m]; max_wait [s]: longest wait between two heartbeats of amplifiers;
+    is_virtual: whether the plate runs in virtual time.
     """
 
     names: tuple[str, ...]
     points: FloatArray
     max_wait: float = 0.05
+    is_virtual: bool = False
 
     @abstractmethod
     async def wait(self, seconds: float) -> None:
@@ -40,14 +42,11 @@ class Sensors(ABC):
 
 
 class SimulatedSensors(Sensors):
-    """Accelerometers on a simulated plate, read over its control socket.
-
-    is_virtual: whether the plate runs in virtual time.
-    """
+    """Accelerometers on a simulated plate, read over its control socket."""
 
     def __init__(self, plate: PlateControl, points: FloatArray, *, is_virtual: bool) -> None:
         self._plate = plate
-        self._is_virtual = is_virtual
+        self.is_virtual = is_virtual
         if is_virtual:
             self.max_wait = _VIRTUAL_MAX_WAIT
         self.points = points
@@ -55,7 +54,7 @@ class SimulatedSensors(Sensors):
 
     async def wait(self, seconds: float) -> None:
         """Wait [s]: by the event loop, or by stepping a plate in virtual time."""
-        if self._is_virtual:
+        if self.is_virtual:
             await self._plate.ask({"op": "step", "seconds": seconds})
         else:
             await asyncio.sleep(seconds)

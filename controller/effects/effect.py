@@ -33,7 +33,7 @@ Level: TypeAlias = Annotated[float | Literal["neighbours"], BeforeValidator(_lev
 
 @dataclass(frozen=True, slots=True)
 class Sensation:
-    """What a finger shall feel from now on.
+    """Target of one finger from now on.
 
     level_db_sl: None for as strong as the neighbours allow. until: when [s] that may change though
     the finger does nothing; None for never. or_less: where the plate cannot reach the level, as

@@ -70,7 +70,13 @@ def load_layout(path: Path, plate: Plate | None, *, level_db_sl: float = STRONG_
 
     plate: must contain all regions, None for any. level_db_sl: of the default effects.
     """
-    document = read_document(path)
+    return layout_of(read_document(path), plate, level_db_sl=level_db_sl)
+
+
+def layout_of(
+    document: Document, plate: Plate | None, *, level_db_sl: float = STRONG_DB_SL
+) -> Layout:
+    """Make the layout of a document; arguments and errors as of `load_layout`."""
     _check_kind(document)
     validation = Validation(document, LayoutSection)
     effects = _effects(validation, level_db_sl)

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from controller.effects.layout_file import LayoutSection, is_layout_document, load_layout
+from controller.effects.layout_file import LayoutSection, is_layout_document, layout_of
 from controller.effects.registry import effect_kind, effect_kinds
 from model.config.document import Document
 from model.config.kinds import CheckedFile
@@ -16,9 +16,9 @@ class LayoutKind:
         """Whether a document is a surface layout."""
         return is_layout_document(document)
 
-    def check(self, path: Path) -> CheckedFile:
+    def check(self, document: Document) -> CheckedFile:
         """Read a layout; raises ConfigError. Its fit on a plate shows in the daemon's file."""
-        layout = load_layout(path, None)
+        layout = layout_of(document, None)
         return CheckedFile(
             f"good: regions {', '.join(region.name for region in layout.regions) or 'none'}; "
             f"effects {', '.join(layout.effects)}; elsewhere {layout.elsewhere or 'nothing'}. "

@@ -15,7 +15,7 @@ from registry.plugins import WrongResultError
 _NOISE = 0.001
 
 REQUESTED_PRIORITY = 1_000_000
-"""Of an effect requested by name: above all regions."""
+"""Priority of an effect requested by name, above all regions."""
 
 
 @dataclass

@@ -18,11 +18,11 @@ from model.config.units import RATIO, TIME
 from model.finger.perception import STRONG_DB_SL
 
 RAMP_STEP_DB = 2.0
-"""Between levels of a ramp [dB]: below the just noticeable difference."""
+"""Step between levels of a ramp [dB], below the just noticeable difference."""
 
 
 class Ramp(Effect):
-    """From one level to another, then over, or held there while the finger stays."""
+    """A level that rises or falls to another, then ends, or is held while the finger stays."""
 
     kind: ClassVar[str] = "ramp"
     is_for_motion: ClassVar[bool] = False

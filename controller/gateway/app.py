@@ -15,18 +15,34 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
-from controller.api.jsonrpc import ErrorCode, RpcError, read_params, unknown_method
+from controller.api.jsonrpc import (
+    ErrorCode,
+    RpcError,
+    error_data,
+    parse_json,
+    read_params,
+    unknown_method,
+)
 from controller.api.jsonrpc import Request as RpcRequest
+from controller.api.methods import ArmParams
 from controller.api.rate_limit import RateLimiter
 from controller.api.schema import Message
 from controller.gateway.access import MAX_BODY, SUBPROTOCOL, Access
 from controller.gateway.mirror import DaemonMirror
 from controller.gateway.openapi import HTTP_METHODS, HTTP_STATUS, openapi
-from controller.gateway.session import TRY_AGAIN_LATER, Session, touch_params
+from controller.gateway.session import (
+    TRY_AGAIN_LATER,
+    Session,
+    arm_for,
+    in_name_of,
+    name_client,
+    touch_params,
+)
 from controller.gateway.settings import Settings
 
 MAX_SESSIONS = 32
-MAX_HTTP_RATE = 500.0  # 1/s; of all clients together, stops not counted
+MAX_HTTP_RATE = 500.0  # 1/s; of all clients together, of what is not UNLIMITED
+UNLIMITED = frozenset({"stop", "disarm"})
 
 _PAGE = Path(__file__).parent / "page"
 
@@ -81,13 +97,17 @@ class Gateway:
             if method not in HTTP_METHODS:
                 raise unknown_method(method, HTTP_METHODS)
             body = await _body(request)
-            if method != "stop" and not self._rate.take():
+            if method not in UNLIMITED and not self._rate.take():
                 raise RpcError(ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
             call = RpcRequest(method, body, None, expects_response=True)
-            if method == "touch":
-                params: Message = touch_params(call, "http")
+            client = name_client("http", request)
+            if method == "touch":  # fingers belong to the connection
+                params: Message = touch_params(call, client)
             else:
-                params = read_params(HTTP_METHODS[method].params, call)
+                params = in_name_of(client, read_params(HTTP_METHODS[method].params, call))
+            if isinstance(params, ArmParams):
+                daemon, has_left = self._mirror.daemon, request.is_disconnected
+                return JSONResponse(await arm_for(daemon, params, has_left=has_left))
             return JSONResponse(await self._mirror.daemon.call(method, params))
         except RpcError as error:
             return _api_error(error)
@@ -126,9 +146,9 @@ async def _body(request: Request) -> dict[str, Any]:
     if body and not media:  # an empty body needs no type
         raise HTTPException(415, "the content type must be application/json")
     try:
-        params = json.loads(body or b"{}")
-    except (ValueError, RecursionError) as error:
-        raise HTTPException(400, "the body must be a JSON object") from error
+        params = parse_json(body or b"{}")
+    except RpcError as error:
+        raise HTTPException(400, f"the body must be a JSON object: {error}") from error
     if not isinstance(params, dict):
         raise HTTPException(400, "the body must be a JSON object")
     return params
@@ -136,7 +156,7 @@ async def _body(request: Request) -> dict[str, Any]:
 
 def _api_error(error: RpcError) -> Response:
     return JSONResponse(
-        {"error": str(error), "code": int(error.code), "data": error.data.model_dump()},
+        {"error": str(error), "code": int(error.code), "data": error_data(error)},
         HTTP_STATUS[error.code],
     )
 

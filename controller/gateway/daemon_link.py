@@ -8,12 +8,13 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from controller.api.async_client import AsyncClient
-from controller.api.client_protocol import Notification, Unreachable
+from controller.api.channel import Channel
+from controller.api.client_protocol import RESPONSE_TIMEOUT, Notification, Unreachable
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.methods import HelloParams
+from controller.api.methods import SubscribeParams
 from controller.api.schema import Message
 from controller.api.topics import TOPICS
+from controller.group.tasks import CoalescedCalls
 from drivers.operation.pauses import pauses
 
 _MIN_RETRY_INTERVAL, _MAX_RETRY_INTERVAL = 0.1, 2.0  # s
@@ -40,7 +41,8 @@ class DaemonLink:
         self._socket = socket
         self._on_hello = on_hello
         self._on_event = on_event
-        self._client: AsyncClient | None = None
+        self._channel: Channel | None = None
+        self._stops: CoalescedCalls[Any] = CoalescedCalls()  # of all browsers together
         self._failure = ""  # why there is no connection
         self.hello: Mapping[str, Any] | None = None
 
@@ -60,42 +62,70 @@ class DaemonLink:
 
     async def call(self, method: str, params: Message) -> Any:
         """Call a method of the daemon and return its result as parsed JSON; raises RpcError."""
-        if self._client is None or self.hello is None:
+        if method == "hello" and self.hello is not None:
+            return self.hello  # not passed on: it would rename the gateway in the daemon's log
+        if method == "stop":
+            stop = self._stops.request(lambda: self._request(method, params))
+            return await asyncio.shield(stop)
+        return await self._request(method, params)
+
+    async def _request(self, method: str, params: Message) -> Any:
+        if self._channel is None:
             raise RpcError(
                 ErrorCode.LINK,
                 self._failure or "not connected to the daemon yet",
                 remedy="the gateway keeps trying to reconnect",
             )
-        if method == "hello":  # never passed on: it would rename the gateway in the daemon's log
-            return self.hello
         try:
-            return await self._client.request(method, params)
+            async with asyncio.timeout(RESPONSE_TIMEOUT):
+                return await self._channel.request(method, params)
+        except TimeoutError as error:
+            raise RpcError(ErrorCode.LINK, str(Unreachable.at(self._socket, error))) from error
         except Unreachable as error:
             raise RpcError(ErrorCode.LINK, str(error)) from error
 
     async def _follow(self) -> None:
         """Report events until the daemon disconnects; raises RpcError or Unreachable."""
-        client = await AsyncClient.connect(self._socket, name=_NAME)
-        try:
-            self.hello = await client.request("hello", HelloParams(client=_NAME))
-            self._on_hello(self.hello)
-            await client.subscribe(*TOPICS, rate_hz=_RATE)
-            self._client, self._failure = client, ""
-            async for event in client.events():
+        lost = asyncio.Event()
+        failures: list[Exception] = []
+
+        def received(event: Notification) -> None:
+            try:
                 self._on_event(event)
-        except (ValidationError, KeyError) as error:
+            except (ValidationError, KeyError) as error:
+                failures.append(error)
+                channel.close()
+
+        channel = await _open(self._socket, on_event=received, on_lost=lost.set)
+        try:
+            self.hello = channel.hello
+            self._on_hello(self.hello)
+            self._channel, self._failure = channel, ""
+            await self._request("subscribe", SubscribeParams(topics=list(TOPICS), rate_hz=_RATE))
+            await lost.wait()
+        finally:
+            self._channel = self.hello = None
+            self._on_hello(None)
+            channel.close()
+        if failures:
             raise Unreachable(
                 "the daemon sent an event that the gateway does not understand; update the older "
                 "of daemon and gateway, then restart both"
-            ) from error
-        finally:
-            if self.hello is not None:
-                self._client = self.hello = None
-                self._on_hello(None)
-            await client.close()
+            ) from failures[0]
 
     def _disconnected(self, reason: str) -> None:
         """Log why there is no connection, once per reason."""
         if reason != self._failure:
             self._failure = reason
             _logger.warning("not connected to a daemon: %s", reason)
+
+
+async def _open(
+    socket: Path, *, on_event: Callable[[Notification], None], on_lost: Callable[[], object]
+) -> Channel:
+    """Connect; raises RpcError and Unreachable."""
+    try:
+        async with asyncio.timeout(RESPONSE_TIMEOUT):
+            return await Channel.open(socket, name=_NAME, on_event=on_event, on_lost=on_lost)
+    except TimeoutError as error:
+        raise Unreachable.at(socket, error) from error

@@ -1,6 +1,5 @@
 """The plate's vibration field for drawing: complex amplitude per frequency on a grid."""
 
-import cmath
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from controller.api.schema import PlayedTone
+from drivers.command import Knot
 from model.arrays import ComplexArray, lattice
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
@@ -64,7 +64,7 @@ class FieldSolver:
         names = [era.name for era in self._rig.eras]
         amplitude = np.zeros((len(frequencies), self.rows * self.columns), dtype=complex)
         for name, tone in drive.items():
-            weight = cmath.rect(tone.level, math.radians(tone.phase_deg))
+            weight = Knot(tone.level, tone.phase_deg).phasor
             response = self._response(tone.frequency_hz)
             amplitude[frequencies.index(tone.frequency_hz)] += weight * response[names.index(name)]
         return Field(frequencies, amplitude.reshape(-1, self.rows, self.columns))
@@ -72,6 +72,6 @@ class FieldSolver:
     def _solve(self, frequency: float) -> ComplexArray:
         """Acceleration [m/s²] (eras, points) per ERA at full stroke."""
         response: ComplexArray = self._free.acceleration(
-            self._rig.eras, np.array([frequency]), self._points, loads=self._rig.loads
+            self._rig.eras, np.array([frequency]), self._points, loads=self._rig.masses
         )[0]
         return response

@@ -6,7 +6,7 @@ from pydantic.json_schema import models_json_schema
 
 from controller.api.jsonrpc import ERROR_MEANINGS, ErrorCode, ErrorData
 from controller.api.methods import METHODS, Method
-from controller.api.schema import API_VERSION, Empty, Message
+from controller.api.schema import API_VERSION, Message
 
 HTTP_METHODS = {
     name: method for name, method in METHODS.items() if name not in ("subscribe", "unsubscribe")
@@ -24,6 +24,7 @@ HTTP_STATUS = {
     ErrorCode.REFUSED: 409,
     ErrorCode.LINK: 503,
     ErrorCode.BUSY: 429,
+    ErrorCode.NOT_SILENT: 503,
 }
 """HTTP status of each error of the API."""
 
@@ -92,7 +93,7 @@ def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:
         "operationId": name,
         "summary": method.summary,
         "requestBody": {
-            "required": method.params is not Empty,
+            "required": any(field.is_required() for field in method.params.model_fields.values()),
             "content": {"application/json": {"schema": references[method.params, "validation"]}},
         },
         "responses": {

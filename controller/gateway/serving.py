@@ -58,7 +58,7 @@ async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
     """Serve until SIGINT or SIGTERM; announce: called with the port. Raises InputError."""
     os.nice(_NICENESS)
     _allow_many_descriptors()
-    _check_certificate(settings)
+    check_certificate(settings)
     gateway = Gateway(settings)
     listening = listen(settings)
     config = uvicorn.Config(
@@ -93,7 +93,7 @@ async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
         following.result()
 
 
-def _check_certificate(settings: Settings) -> None:
+def check_certificate(settings: Settings) -> None:
     """Check that certificate and key can be read and match; raises InputError."""
     if settings.certificate is None:
         return

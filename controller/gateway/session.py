@@ -4,14 +4,17 @@ import asyncio
 import itertools
 import json
 import logging
-from collections.abc import Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
+from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from controller.api.jsonrpc import (
     ErrorCode,
+    Id,
+    InvalidRequest,
     Request,
     RpcError,
     error_line,
@@ -20,22 +23,31 @@ from controller.api.jsonrpc import (
     result_line,
     unknown_method,
 )
-from controller.api.methods import METHODS, TouchParams
+from controller.api.methods import (
+    METHODS,
+    ArmParams,
+    DisarmParams,
+    HelloParams,
+    RequestedBy,
+    TouchParams,
+)
 from controller.api.rate_limit import RateLimiter
-from controller.api.schema import MAX_RATE, Empty, Message, Topic
+from controller.api.schema import MAX_RATE, Message, Topic
 from controller.gateway.daemon_link import DaemonLink
 from controller.gateway.outbox import Outbox
 
 MAX_REQUEST_RATE = 200.0  # 1/s; touches and stops are not counted
 MAX_PENDING = 16
-MAX_PENDING_STOPS = 4
+MAX_PENDING_STOPS = 64  # above it no further frame is read
 MAX_TOUCH_SOURCES = 4  # a page has one
 SEND_TIMEOUT = 5.0  # s; for one frame
-_MAX_SOURCE_NAME = 80  # characters; as in the API
+_MAX_NAME = 80  # characters; as in the API
+_ITERATIONS = 10  # of the event loop, in which the end of a connection is received
 
 TRY_AGAIN_LATER, UNSUPPORTED_DATA = 1013, 1003  # close codes of RFC 6455 and its registry
 
 _ALL_SENT: frozenset[str] = frozenset({"state", "log", "link"})  # of other topics the latest alone
+_BUSY = RpcError(ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
 _session_numbers = itertools.count(1)
 _logger = logging.getLogger(__name__)
 
@@ -64,6 +76,7 @@ class Session:
         clock: Callable[[], float],
     ) -> None:
         self.name = f"web:{next(_session_numbers)}"
+        self._client = name_client(self.name, socket)
         self.outbox = Outbox()
         self._socket = socket
         self._daemon = daemon
@@ -71,7 +84,7 @@ class Session:
         self._rate = RateLimiter(MAX_REQUEST_RATE, clock=clock)
         self._topics: set[str] = set()
         self._pending: set[asyncio.Task[None]] = set()
-        self._pending_stops = 0
+        self._pending_stops: set[asyncio.Task[None]] = set()
         self._touches: dict[str, TouchParams] = {}  # the newest frame of each source, to be sent
         self._touching: set[str] = set()  # sources with fingers on the plate
         self._touch_task: asyncio.Task[None] | None = None
@@ -128,18 +141,23 @@ class Session:
         while True:
             message = await self._socket.receive()
             if message["type"] == "websocket.disconnect":
+                self._is_closed = True
                 return
             if message.get("text") is None:
                 await self._socket.close(UNSUPPORTED_DATA, "send text frames")
                 return
             self._serve(message["text"])
             await asyncio.sleep(0)  # let others run between queued messages
+            while len(self._pending_stops) >= MAX_PENDING_STOPS:
+                await asyncio.wait(self._pending_stops, return_when=asyncio.FIRST_COMPLETED)
 
     def _serve(self, text: str) -> None:
         """Serve one request, or start to."""
         request: Request | None = None
         try:
             request = read_request(text.encode())
+            if request.method not in ("touch", "stop") and not self._rate.take():
+                raise _BUSY
             match request.method:
                 case "touch":
                     self._touch(request)
@@ -150,8 +168,12 @@ class Session:
                     self._respond(request, {})
                 case _:
                     self._forward(request)
+        except InvalidRequest as error:
+            self._rate.take()
+            self._respond_error(error.id, error)
         except RpcError as error:
-            self._respond_error(request, error)
+            if request is not None and request.expects_response:
+                self._respond_error(request.id, error)
 
     def _subscribe(self, request: Request) -> None:
         topics = _topics(request)
@@ -196,36 +218,36 @@ class Session:
                 return
 
     def _forward(self, request: Request) -> None:
-        """Forward a request to the daemon; stops have a limit of their own."""
+        """Forward a request to the daemon, in the name of this browser."""
         method = METHODS.get(request.method)
         if method is None:
             raise unknown_method(request.method, METHODS)
-        params = read_params(method.params, request)
+        params = in_name_of(self._client, read_params(method.params, request))
+        if isinstance(params, HelloParams):
+            self._client = name_client(f"{params.client[:30]}, {self.name}", self._socket)
         if request.method == "arm" and not request.expects_response:
             return  # without a response the browser has no lease to renew or end
-        if request.method == "stop":
-            if self._pending_stops >= MAX_PENDING_STOPS:
-                raise RpcError(
-                    ErrorCode.BUSY, "stops are pending already", remedy="await their responses"
-                )
-            self._pending_stops += 1
-        elif not self._rate.take():
-            raise RpcError(ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
-        elif len(self._pending) >= MAX_PENDING:
+        if request.method != "stop" and len(self._pending) >= MAX_PENDING:
             raise RpcError(ErrorCode.BUSY, "too many pending requests", remedy="await responses")
-        self._start(self._complete(request, params))
+        task = self._start(self._complete(request, params))
+        if request.method == "stop":
+            self._pending_stops.add(task)
+            task.add_done_callback(self._pending_stops.discard)
 
     async def _complete(self, request: Request, params: Message) -> None:
         try:
-            result = await self._daemon.call(request.method, params)
-            if request.method == "arm" and self._is_closed:  # the lease cannot be renewed any more
-                await self._daemon.call("disarm", Empty())
+            if isinstance(params, ArmParams):
+                result = await arm_for(self._daemon, params, has_left=self._has_left)
+            else:
+                result = await self._daemon.call(request.method, params)
         except RpcError as error:
-            self._respond_error(request, error)
+            if request.expects_response:
+                self._respond_error(request.id, error)
         else:
             self._respond(request, result)
-        finally:
-            self._pending_stops -= request.method == "stop"
+
+    async def _has_left(self) -> bool:
+        return self._is_closed
 
     def _start(self, work: Coroutine[Any, Any, None]) -> "asyncio.Task[None]":
         task = asyncio.create_task(work)
@@ -237,16 +259,44 @@ class Session:
         if request.expects_response:
             self.outbox.respond(result_line(request.id, json.dumps(result)).decode())
 
-    def _respond_error(self, request: Request | None, error: RpcError) -> None:
-        if request is None or request.expects_response:
-            id = None if request is None else request.id
-            self.outbox.respond(error_line(id, error).decode())
+    def _respond_error(self, id: Id, error: RpcError) -> None:
+        self.outbox.respond(error_line(id, error).decode())
 
 
 def touch_params(request: Request, client: str) -> TouchParams:
     """A touch frame, its source prefixed by the client: all share one connection to the daemon."""
     params = read_params(TouchParams, request)
-    return params.model_copy(update={"source": f"{client}:{params.source}"[:_MAX_SOURCE_NAME]})
+    return params.model_copy(update={"source": f"{client}:{params.source}"[:_MAX_NAME]})
+
+
+def name_client(name: str, connection: HTTPConnection) -> str:
+    """A client's name for the daemon's log, with its address."""
+    address = connection.client
+    return name if address is None else f"{name} {address.host}:{address.port}"[:_MAX_NAME]
+
+
+def in_name_of(client: str, params: Message) -> Message:
+    """Parameters with the client that requests it, for the daemon's log."""
+    if isinstance(params, RequestedBy):
+        return params.model_copy(update={"client": client})
+    if isinstance(params, ArmParams):
+        owner = f"{params.owner[: _MAX_NAME - len(client) - 3]} ({client})"
+        return params.model_copy(update={"owner": owner})
+    return params
+
+
+async def arm_for(
+    daemon: DaemonLink, params: ArmParams, *, has_left: Callable[[], Awaitable[bool]]
+) -> Any:
+    """Arm for a client unless it has left, and disarm if it leaves meanwhile; raises RpcError."""
+    for _ in range(_ITERATIONS):
+        await asyncio.sleep(0)
+    if await has_left():
+        raise RpcError(ErrorCode.LEASE, "the client has left", remedy="stay to renew the lease")
+    result = await daemon.call("arm", params)
+    if await has_left():  # the lease cannot be renewed any more
+        await daemon.call("disarm", DisarmParams(lease=result["lease"]))
+    return result
 
 
 def _topics(request: Request) -> set[str]:

@@ -2,22 +2,30 @@
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Coroutine, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from enum import Enum, auto
+from functools import partial
 from typing import Any, TypeVar
 
 from controller.group.quick_stops import QuickStops
-from controller.group.read_back_monitor import ReadBackMonitor
 from controller.group.synchronized_play import Played, SynchronizedPlay
-from controller.group.tasks import gather_all, run_to_completion
+from controller.group.tasks import gather_all, persistently, run_to_completion
 from drivers import clock
 from drivers.amplifier import WATCHDOG, Amplifier
-from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
+from drivers.errors import (
+    CommandError,
+    CommandRefused,
+    DriverError,
+    LinkDegraded,
+    LinkError,
+    Preempted,
+)
 from drivers.guard import SafeCommandSet, SafeEnvelope
-from drivers.link.turns import PREEMPTION_GRACE, Preempted
+from drivers.line.priority import PREEMPTION_GRACE
+from drivers.operation.checked_amplifier import CheckedAmplifier
+from drivers.operation.silence import StopOutcome
 from drivers.operation.watchdog import check_watchdog
-from drivers.protocol.messages import AmplifierState
 
 # How often, and how far apart [s], levels are read back after the closing ramp has ended.
 _READ_BACKS = 5
@@ -27,7 +35,7 @@ _logger = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
 
-class Phase(Enum):
+class GroupState(Enum):
     """State of all amplifiers together: CLOSED until opened and in the end, LOST by a LinkError."""
 
     CLOSED = auto()
@@ -44,17 +52,26 @@ class AmplifierGroup:
     its caller is cancelled.
     """
 
-    def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
-        self.phase = Phase.CLOSED
+    def __init__(self, amplifiers: Mapping[str, Amplifier], *, has_own_time: bool = False) -> None:
+        self.state = GroupState.CLOSED
         self._amplifiers = dict(amplifiers)
-        self._playback = SynchronizedPlay(self._amplifiers)
-        self._quick_stops = QuickStops(self._amplifiers.values())
-        self._read_backs = ReadBackMonitor()
+        self._checked = {
+            name: CheckedAmplifier(amplifier, f"amplifier {name}", has_own_time=has_own_time)
+            for name, amplifier in self._amplifiers.items()
+        }
+        self._playback = SynchronizedPlay(self._checked)
+        self._quick_stops = QuickStops(self._amplifiers)
         self._closing = asyncio.Lock()  # a second close waits for the first
         self._silence_count = 0  # disarms, stops and closes so far
         self._silencing_count = 0  # disarms and stops in progress
+        self._arm_count = 0
         self._may_be_armed = False  # since the amplifiers were opened
         self._limit: asyncio.Timeout | None = None  # of a play or heartbeat in progress
+
+    @property
+    def degraded(self) -> tuple[str, ...]:
+        """Names of amplifiers that do not reply but may still play; nothing new is played then."""
+        return tuple(name for name, each in self._amplifiers.items() if each.is_degraded)
 
     @property
     def is_set_incomplete(self) -> bool:
@@ -73,14 +90,14 @@ class AmplifierGroup:
         except BaseException:
             await self._close_wires()
             raise
-        self.phase = Phase.DISARMED
+        self.state = GroupState.DISARMED
         self._may_be_armed = False
 
     async def arm(self) -> None:
         """Switch the high voltage on at level zero: on all amplifiers, or none stays armed."""
-        if self.phase in (Phase.CLOSED, Phase.LOST):
+        if self.state in (GroupState.CLOSED, GroupState.LOST):
             raise CommandError(
-                f"amplifiers must be open to be armed, got {self.phase.name}; close and open all "
+                f"amplifiers must be open to be armed, got {self.state.name}; close and open all "
                 "of them again"
             )
         if self._silencing_count:  # the result would depend on the order of frames
@@ -88,21 +105,24 @@ class AmplifierGroup:
                 "amplifiers are being stopped or disarmed; arm again if that is still wanted"
             )
         before = self._silence_count
+        self._arm_count += 1
+        number = self._arm_count
         self._may_be_armed = True
         try:
-            await self._gather(amplifier.arm() for amplifier in self._all)
+            await self._gather(checked.arm() for checked in self._checked.values())
             if self._silence_count != before:
                 raise CommandRefused(
                     "amplifiers were disarmed, stopped or closed while arming, and stay disarmed; "
                     "arm again if that is still wanted"
                 )
         except BaseException:
-            self._leave_armed()
-            await self._finish(amplifier.disarm() for amplifier in self._all)
+            if number == self._arm_count:  # else a newer request may have armed them
+                self._leave_armed()
+                with self._silencing():
+                    await self._finish(persistently(amplifier.disarm) for amplifier in self._all)
             raise
-        self._read_backs.forget()
-        self._playback.is_set_incomplete = False
-        self.phase = Phase.ARMED
+        self._playback.forget()
+        self.state = GroupState.ARMED
 
     async def play(
         self,
@@ -112,29 +132,26 @@ class AmplifierGroup:
     ) -> Played | None:
         """Play a set on every amplifier, by name, after loading the envelopes.
 
-        None if a disarm, stop or close came meanwhile, or after `abort_exchange`. Raises
-        DriverError.
+        None if a disarm, stop or close came meanwhile, after `abort_exchange`, or on a degraded
+        link: then it is unknown whether the set plays. Raises DriverError.
         """
-        self._read_backs.forget()
-        played = await self._exchange(
+        return await self._exchange(
             self._playback.play(sets, envelopes or {}, may_play=self._may_play)
         )
-        if played is not None:
-            self._read_backs.expect(sets, played.achieved, now=clock.now())
-        return played
 
     async def heartbeat(self) -> bool:
         """Feed the watchdogs; False where `play` would return None.
 
-        Raises DriverError, also for an amplifier that is not enabled any more or whose levels have
-        differed from the commanded ones for 100 ms.
+        On a degraded link the status is read instead; an amplifier that replies again must still
+        play its set. Raises DriverError, also for an amplifier that is not enabled any more or
+        that contradicts what was asked twice in a row.
         """
         return await self._exchange(self._heartbeat()) is not None
 
     def abort_exchange(self) -> None:
-        """End a `play` or `heartbeat` in progress within 8 ms, with or without its replies.
+        """End a `play` or `heartbeat` in progress, with or without its replies.
 
-        Only silence is sent meanwhile, and nothing is repeated.
+        It takes at most PREEMPTION_GRACE. Only silence is sent meanwhile, and nothing is repeated.
         """
         if self._limit is not None and not self._is_aborting:
             self._limit.reschedule(clock.now() + PREEMPTION_GRACE)
@@ -146,19 +163,20 @@ class AmplifierGroup:
         self._leave_armed()
         try:
             with self._silencing():
-                await self._gather(amplifier.disarm() for amplifier in self._all)
+                await self._gather(persistently(amplifier.disarm) for amplifier in self._all)
         except BaseException:
             await self.stop()
             raise
 
-    async def stop(self) -> None:
-        """Quick-stop every amplifier that can be reached; latched until `clear`.
+    async def stop(self) -> Mapping[str, StopOutcome]:
+        """Quick-stop every amplifier, lost ones too; latched until `clear`.
 
-        Concurrent requests share one further stop.
+        Returns what is known of the silence of each, by name. Concurrent requests share one further
+        stop.
         """
         self._leave_armed()
         with self._silencing():
-            await self._finish(self._quick_stops.request())
+            return await run_to_completion(self._quick_stops.stop())
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone."""
@@ -170,16 +188,16 @@ class AmplifierGroup:
 
     async def close(self, silence: Mapping[str, SafeCommandSet]) -> None:
         """Play silence, confirm it by read-back, disarm and close; may be called twice."""
-        is_armed = self.phase is Phase.ARMED
+        is_armed = self.state is GroupState.ARMED
         self._leave_armed()
-        self.phase = Phase.CLOSED
+        self.state = GroupState.CLOSED
         async with self._closing:
             try:
                 if is_armed:
                     await self._wind_down(silence)
                 elif self._may_be_armed:
                     reachable = [amplifier for amplifier in self._all if not amplifier.is_lost]
-                    await self._finish(amplifier.disarm() for amplifier in reachable)
+                    await self._finish(persistently(each.disarm) for each in reachable)
             except BaseException as error:
                 await self.stop()
                 if not isinstance(error, DriverError):
@@ -190,27 +208,25 @@ class AmplifierGroup:
 
     async def _wind_down(self, silence: Mapping[str, SafeCommandSet]) -> None:
         """Play silence, wait until every amplifier reports level zero, and disarm."""
-        await gather_all(self._amplifiers[name].apply(safe) for name, safe in silence.items())
+        await gather_all(
+            persistently(partial(self._amplifiers[name].apply, safe))
+            for name, safe in silence.items()
+        )
         await asyncio.sleep(max(safe.ramp for safe in silence.values()))
         for _ in range(_READ_BACKS):
-            statuses = await self._gather(amplifier.status() for amplifier in self._all)
+            statuses = await self._gather(persistently(each.status) for each in self._all)
             if not any(level for status in statuses for level in status.levels):
                 break
             await asyncio.sleep(_READ_BACK_INTERVAL)
         else:
             raise CommandRefused("an amplifier reports a level above zero after silence was played")
-        await gather_all(amplifier.disarm() for amplifier in self._all)
+        await gather_all(persistently(amplifier.disarm) for amplifier in self._all)
 
     async def _heartbeat(self) -> bool:
-        """Send a heartbeat to every amplifier and check its status; always True."""
-        statuses = await self._gather(amplifier.heartbeat() for amplifier in self._all)
-        for name, status in zip(self._amplifiers, statuses, strict=True):
-            if status.state is not AmplifierState.OPERATION_ENABLED:
-                raise CommandRefused(
-                    f"amplifier {name}: state must be OPERATION_ENABLED, got {status.state.name} "
-                    f"with fault {status.fault.name}; all were stopped: clear and arm again"
-                )
-            self._read_backs.check(name, status, now=clock.now())
+        """Send a heartbeat to every amplifier; always True."""
+        await self._gather(
+            _heartbeat(checked, self._may_play) for checked in self._checked.values()
+        )
         return True
 
     async def _exchange(self, exchange: Coroutine[Any, Any, _T]) -> _T | None:
@@ -232,9 +248,16 @@ class AmplifierGroup:
                 return None
             if is_timeout and not isinstance(error, LinkError):  # a LinkTimeout is both
                 return None
-            if isinstance(error, DriverError) and self.phase not in (Phase.ARMED, Phase.LOST):
+            if isinstance(error, LinkDegraded):
                 return None
-            await self.stop()
+            if isinstance(error, DriverError) and self.state not in (
+                GroupState.ARMED,
+                GroupState.LOST,
+            ):
+                return None
+            self._leave_armed()
+            with self._silencing():  # lost amplifiers are stopped on, but not waited for
+                await run_to_completion(self._quick_stops.stop(waits_for_lost=False))
             raise
 
     async def _gather(self, requests: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
@@ -258,16 +281,18 @@ class AmplifierGroup:
         return self._limit is not None and self._limit.when() is not None
 
     def _may_play(self) -> bool:
-        return self.phase is Phase.ARMED and not self._is_aborting
+        return self.state is GroupState.ARMED and not self._is_aborting
 
     @contextmanager
     def _detecting_loss(self) -> Iterator[None]:
-        """Enter the phase LOST on a LinkError, so that nothing is played any more."""
+        """Enter the state LOST on a lost link, so that nothing is played any more."""
         try:
             yield
+        except LinkDegraded:
+            raise
         except LinkError:
-            if self.phase is not Phase.CLOSED:
-                self.phase = Phase.LOST
+            if self.state is not GroupState.CLOSED:
+                self.state = GroupState.LOST
             raise
 
     @contextmanager
@@ -282,8 +307,14 @@ class AmplifierGroup:
     def _leave_armed(self) -> None:
         """Play nothing more from here on; lost or closed amplifiers stay that."""
         self._silence_count += 1
-        if self.phase is Phase.ARMED:
-            self.phase = Phase.DISARMED
+        if self.state is GroupState.ARMED:
+            self.state = GroupState.DISARMED
+
+
+async def _heartbeat(checked: CheckedAmplifier, may_feed: Callable[[], bool]) -> None:
+    """Send a heartbeat, unless its link is degraded or it is to be silent by now."""
+    with suppress(LinkDegraded):
+        await checked.heartbeat(may_feed=may_feed)
 
 
 async def _log_failures(requests: Iterable[Awaitable[object]]) -> None:

@@ -1,4 +1,4 @@
-"""Playing one set on several amplifiers: load, stage, commit at one moment, read back."""
+"""Playing one set on several amplifiers: load, stage, commit at one moment, read the tokens."""
 
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -7,16 +7,15 @@ from typing import Any
 
 from controller.group.tasks import gather_all
 from drivers import clock
-from drivers.amplifier import Amplifier
-from drivers.errors import CommandRefused
 from drivers.guard import SafeCommandSet, SafeEnvelope
+from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.operation.simultaneous import at_one_moment
 from drivers.protocol.messages import Achieved
 
 
 @dataclass(frozen=True)
 class Played:
-    """What amplifiers play after a set, by name.
+    """Sets that amplifiers play, by name.
 
     sent [s]: when the last byte of the set left for any amplifier, by the event loop's clock;
     loading_time [s]: how long loading the envelopes before it took, None without envelopes.
@@ -33,9 +32,13 @@ class SynchronizedPlay:
     is_set_incomplete: whether possibly only some amplifiers have committed the last set.
     """
 
-    def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
+    def __init__(self, amplifiers: Mapping[str, CheckedAmplifier]) -> None:
         self.is_set_incomplete = False
         self._amplifiers = amplifiers
+
+    def forget(self) -> None:
+        """Forget what was played: the amplifiers are armed anew, and silent."""
+        self.is_set_incomplete = False
 
     async def play(
         self,
@@ -64,7 +67,7 @@ class SynchronizedPlay:
             achieved = await gather_all(
                 self._amplifiers[name].apply(safe) for name, safe in sets.items()
             )
-            sent = self._last_sent
+            sent = self._last_sent_at
         else:
             achieved = await gather_all(
                 self._amplifiers[name].stage(safe) for name, safe in sets.items()
@@ -72,57 +75,70 @@ class SynchronizedPlay:
             if not may_play():
                 return None  # as above
             self.is_set_incomplete = True
+            since = clock.now()
+            for name, safe in sets.items():
+                self._amplifiers[name].expect_commit(safe)
             await gather_all(self._commits(sets, may_play))
-            sent = self._last_sent  # before the read-back
+            sent = self._last_sent_at  # before the statuses are read
             if not may_play():
                 return None
-            await self._check_tokens(sets)
+            await self._confirm_commits(sets, since)
         self.is_set_incomplete = False
         return Played(dict(zip(sets, achieved, strict=True)), sent, loading_time)
 
     @property
-    def _last_sent(self) -> float:
-        return max(amplifier.last_sent for amplifier in self._amplifiers.values())
+    def _last_sent_at(self) -> float:
+        return max(each.amplifier.last_sent_at for each in self._amplifiers.values())
 
     async def _load(
         self, name: str, envelopes: Sequence[SafeEnvelope], may_play: Callable[[], bool]
     ) -> None:
         for envelope in envelopes:
             if may_play():
-                await self._amplifiers[name].load_envelope(envelope)
+                await self._amplifiers[name].amplifier.load_envelope(envelope)
 
     def _commits(
         self, sets: Mapping[str, SafeCommandSet], may_play: Callable[[], bool]
     ) -> Iterable[Coroutine[Any, Any, object]]:
         """Commit all staged sets so that they arrive at one moment; once for each shared bus."""
-        by_bus: dict[tuple[str, int], list[Amplifier]] = {}
+        by_bus: dict[tuple[str, int], list[str]] = {}
         for name, safe in sets.items():
-            amplifier = self._amplifiers[name]
-            by_bus.setdefault((amplifier.bus or name, safe.token), []).append(amplifier)
+            bus = self._amplifiers[name].amplifier.bus or name
+            by_bus.setdefault((bus, safe.token), []).append(name)
         return at_one_moment(
             [
                 (
-                    first.wire_times.commit(),
-                    partial(_commit, first, token, on_bus=bool(others), may_play=may_play),
+                    self._amplifiers[first].amplifier.wire_times.commit(),
+                    partial(
+                        _commit,
+                        self._amplifiers[first],
+                        sets[first],
+                        on_bus=bool(others),
+                        may_play=may_play,
+                    ),
                 )
-                for (_, token), (first, *others) in by_bus.items()
+                for first, *others in by_bus.values()
             ]
         )
 
-    async def _check_tokens(self, sets: Mapping[str, SafeCommandSet]) -> None:
+    async def _confirm_commits(self, sets: Mapping[str, SafeCommandSet], since: float) -> None:
         """Raise CommandRefused unless every amplifier reports that it plays its set."""
-        statuses = await gather_all(self._amplifiers[name].status() for name in sets)
-        for (name, safe), status in zip(sets.items(), statuses, strict=True):
-            if status.token != safe.token:
-                raise CommandRefused(
-                    f"amplifier {name}: playing set must be {safe.token}, got {status.token}; all "
-                    "were stopped: clear and arm again"
-                )
+        await gather_all(
+            self._amplifiers[name].confirm_commit(safe, since=since) for name, safe in sets.items()
+        )
 
 
 async def _commit(
-    amplifier: Amplifier, token: int, *, on_bus: bool, may_play: Callable[[], bool]
+    checked: CheckedAmplifier,
+    safe: SafeCommandSet,
+    *,
+    on_bus: bool,
+    may_play: Callable[[], bool],
 ) -> None:
     """Commit, unless silence came while this waited for an amplifier on a slower wire."""
-    if may_play():
-        await (amplifier.commit_on_bus(token) if on_bus else amplifier.commit(token))
+    if not may_play():
+        return
+    if on_bus:
+        await checked.amplifier.commit_on_bus(safe.token)
+    else:
+        await checked.commit(safe)

@@ -1,11 +1,10 @@
-"""What the open amplifiers of a rig can play together, in the terms of the table."""
+"""Capabilities of the open amplifiers of a rig together, in the terms of the table."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from controller.group.guards import guard_limits
 from controller.loop.envelopes import (
-    ENVELOPE_TIME,
+    MAX_LOADING_TIME,
     EnvelopeSupport,
     OpenAmplifier,
     envelope_support,
@@ -18,7 +17,7 @@ from model.rig.rig import Rig
 
 @dataclass(frozen=True)
 class PlaybackCapabilities:
-    """What all amplifiers of a rig can play.
+    """Capabilities that all amplifiers of a rig share.
 
     drive_mode: of the questions to the table; playable: the drive modes that every amplifier can
     play; frequencies: the lowest and highest [Hz]; max_amplitudes [m] by ERA;
@@ -37,11 +36,11 @@ def playback_capabilities(
     amplifiers: Mapping[str, OpenAmplifier],
     *,
     drive_mode: str | None = None,
-    envelope_time: float = ENVELOPE_TIME,
+    max_loading_time: float = MAX_LOADING_TIME,
 ) -> PlaybackCapabilities:
     """Return what the open amplifiers of a rig, by name, can play.
 
-    drive_mode: None for the best that all can; envelope_time [s]: how long loading envelopes may
+    drive_mode: None for the best that all can; max_loading_time [s]: how long loading envelopes may
     delay a touch, 0 for ramps only. Raises InputError for a drive mode that one cannot play.
     """
     capabilities = {name: amplifier.capabilities for name, amplifier in amplifiers.items()}
@@ -55,7 +54,7 @@ def playback_capabilities(
             f"drive mode must be one that all amplifiers play ({', '.join(playable)}), got "
             f"{drive_mode}; leave it out for the best"
         )
-    configured = guard_limits(rig.limits)
+    configured = rig.limits
     limits = {name: limits_in_force(configured, caps) for name, caps in capabilities.items()}
     return PlaybackCapabilities(
         drive_mode=drive_mode or playable[-1],
@@ -67,5 +66,5 @@ def playback_capabilities(
         max_amplitudes={
             era.name: era.stroke * limits[rig.wiring[era.name].amplifier].level for era in rig.eras
         },
-        envelope_support=envelope_support(rig, amplifiers, within=envelope_time),
+        envelope_support=envelope_support(rig, amplifiers, max_loading_time=max_loading_time),
     )

@@ -1,20 +1,21 @@
-"""What the control loop decides, without waiting: touch frames in, safe command sets out.
+"""Decisions of the control loop, without waiting: touch frames in, safe command sets out.
 
 take(frame)  ->  contacts
 decide(now)  ->  contacts -> intent -> selection -> routing -> guard -> safe sets
 """
 
 import logging
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.envelopes import ENVELOPE_TIME, RAMPS_ONLY
+from controller.loop.envelopes import MAX_LOADING_TIME, RAMPS_ONLY
 from controller.loop.intent import IntentSource
 from controller.loop.loading_times import LoadingTimes
 from controller.loop.safe_sets import FADE_RAMP, SafeSets, SetBuilder
 from controller.loop.selection import Selection, Selector
-from controller.sources.contacts import Change, Contact, ContactTracker
+from controller.sources.contacts import MAX_CONTACT_TIMEOUT, Change, Contact, ContactTracker
 from controller.sources.touch import TouchFrame
 from drivers.command import DriveCommand
 from drivers.errors import CommandRefused
@@ -28,6 +29,12 @@ from registry.plugins import failure_text
 
 # With no finger left on the plate the end may be short: zero within 20 ms of the lift.
 RELEASE_RAMP = 0.010
+
+# A vibration ends by itself on the amplifier unless it is renewed, which happens at half of its
+# time and only while its targets are confirmed by their sources. Not shorter than this [s], so that
+# a slow wire or a rate limit of one set a second does not interrupt it.
+MIN_VALID_FOR = 2.0
+_VALIDITY_MARGIN = 0.2  # s; after the contact is lifted, so that a late frame makes no gap
 
 _logger = logging.getLogger(__name__)
 
@@ -56,10 +63,13 @@ class Decision:
 
 @dataclass(frozen=True)
 class _Playing:
-    """What the amplifiers have been playing since the last decision with sets, as far as known.
+    """Known playback of the amplifiers since the last decision with sets.
 
     confirmed_commands: by ERA; has_endings: whether endings were added; endings_due [s]: when
-    endings can be added; retry_at [s]: when a guard would pass what it refused.
+    endings can be added; retry_at [s]: when a guard would pass what it refused. confirmed_until
+    [s]: when the first target would have been lifted, as known when the sets were sent;
+    renewal_due, renewable_until [s]: between these they are renewed if all targets have been
+    confirmed since.
     """
 
     decision: Decision | None = None
@@ -67,6 +77,9 @@ class _Playing:
     has_endings: bool = False
     endings_due: float | None = None
     retry_at: float | None = None
+    confirmed_until: float = math.inf
+    renewal_due: float = math.inf
+    renewable_until: float = math.inf
 
     @property
     def is_silent(self) -> bool:
@@ -78,7 +91,7 @@ class _Playing:
 class Decider:
     """Contacts, intent, selection and safe sets of one plate; reads no clock and never waits.
 
-    guards: one for each amplifier, by name; envelope_time [s]: longest loading of envelopes. A
+    guards: one for each amplifier, by name; max_loading_time [s]: longest loading of envelopes. A
     decision never raises: it falls back to silence on any exception.
     """
 
@@ -91,15 +104,15 @@ class Decider:
         capabilities: PlaybackCapabilities,
         intent_source: IntentSource,
         timing: Timing | None = None,
-        envelope_time: float = ENVELOPE_TIME,
+        max_loading_time: float = MAX_LOADING_TIME,
     ) -> None:
         self._table = table
         self._timing = timing
         self._capabilities = capabilities
-        self._loading_times = LoadingTimes(envelope_time)
+        self._loading_times = LoadingTimes(max_loading_time)
         self._tracker = ContactTracker(rig.plate)
         self._intent_source = intent_source
-        self._intent_due: float | None = None  # when the intent may change by itself
+        self._intent_due: float | None = None  # when the intent may change without a touch
         self._selector = Selector(table)
         self._builder = SetBuilder(rig, guards, timing=timing)
         self._selected: Selection | None = None
@@ -108,7 +121,7 @@ class Decider:
 
     @property
     def capabilities(self) -> PlaybackCapabilities:
-        """What the amplifiers can play."""
+        """Capabilities of the amplifiers together."""
         return self._capabilities
 
     @property
@@ -186,11 +199,33 @@ class Decider:
         decision = self._playing.decision
         if decision is None or decision.sets is None or decision.pattern is None:
             return
+        self._note_validity(decision.sets, decision.selection, now)
         if decision.adds_endings_only:
             self._playing = replace(self._playing, has_endings=True)
         elif self._capabilities_at(now).envelope_support.endings and self._timing is not None:
             endings_due = now + decision.sets.settled_after
             self._playing = replace(self._playing, endings_due=endings_due)
+
+    def renewal(self, now: float) -> SafeSets | None:
+        """Return the sets by which what plays goes on, if that is due at a time [s]; else None.
+
+        A vibration whose targets no source has confirmed since it was sent is not renewed, and ends
+        by itself. So does one that a guard has shortened: renewing it would circumvent the limit.
+        """
+        decision = self._playing.decision
+        if decision is None or decision.sets is None:
+            return None
+        if not self._playing.renewal_due <= now < self._playing.renewable_until:
+            return None
+        if self._confirmed_until(decision.selection) <= self._playing.confirmed_until:
+            return None
+        valid_for = self._valid_for(decision.selection, now)
+        return self._builder.renew(decision.sets, valid_for=valid_for)
+
+    def confirm_renewal(self, sets: SafeSets, *, now: float) -> None:
+        """Note that the amplifiers have accepted the sets of a renewal."""
+        if self._playing.decision is not None:
+            self._note_validity(sets, self._playing.decision.selection, now)
 
     def note_loading_time(self, duration: float, *, now: float) -> None:
         """Note how long [s] loading envelopes took; too long means plain ramps for a while."""
@@ -262,7 +297,11 @@ class Decider:
         is_shaped = self._capabilities_at(now).envelope_support.onsets
         try:
             sets, played = self._builder.play(
-                pattern, question, is_shaped=is_shaped, playing=self._playing.confirmed_commands
+                pattern,
+                question,
+                is_shaped=is_shaped,
+                playing=self._playing.confirmed_commands,
+                valid_for=self._valid_for(decided.selection, now),
             )
         except CommandRefused as error:
             silence = self.silence(ramp=FADE_RAMP)
@@ -277,7 +316,12 @@ class Decider:
             return None
         if not _is_due(playing.endings_due, now):
             return None
-        sets = self._builder.add_endings(pattern, question, playing=playing.confirmed_commands)
+        sets = self._builder.add_endings(
+            pattern,
+            question,
+            playing=playing.confirmed_commands,
+            valid_for=self._valid_for(decided.selection, now),
+        )
         if sets is None:
             return None
         return replace(decided, sets=sets, pattern=pattern, adds_endings_only=True)
@@ -287,6 +331,26 @@ class Decider:
         if not contacts:
             return self.silence(ramp=RELEASE_RAMP)
         return self._builder.end() if along_endings else self.silence(ramp=FADE_RAMP)
+
+    def _confirmed_until(self, selection: Selection) -> float:
+        """Return when [s] the first target is lifted unless a frame arrives."""
+        expiries = [self._tracker.expiry_of(contact.key) for contact, _ in selection.targets]
+        return min(expiries, default=-math.inf)
+
+    def _valid_for(self, selection: Selection, now: float) -> float:
+        """Return for how long [s] a vibration at a time [s] may last by itself."""
+        lasts = self._confirmed_until(selection) - now + _VALIDITY_MARGIN
+        return min(max(lasts, MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
+
+    def _note_validity(self, sets: SafeSets, selection: Selection, now: float) -> None:
+        """Note until when sets committed by now [s] last, and what is known of their targets."""
+        is_shortened = sets.valid_for < MIN_VALID_FOR
+        self._playing = replace(
+            self._playing,
+            confirmed_until=self._confirmed_until(selection),
+            renewal_due=math.inf if is_shortened else now + sets.valid_for / 2,
+            renewable_until=now + sets.valid_for - _VALIDITY_MARGIN / 2,
+        )
 
     def _note(self, change: Change, time: float) -> None:
         """Remember when the first change since the last decision arrived."""

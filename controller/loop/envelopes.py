@@ -8,11 +8,9 @@ A touch waits for its onset only. Endings follow once the onset is over: the sam
 changes nothing that is felt, now with their endings.
 """
 
-import cmath
-import math
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from drivers.command import Envelope, Knot
@@ -23,7 +21,7 @@ from model.table.pattern import Pattern
 from model.transients.envelope import KNOT_STEP
 from model.transients.knots import ENDING_KNOTS, ONSET_KNOTS
 
-ENVELOPE_TIME = 0.030
+MAX_LOADING_TIME = 0.030
 """How long [s] loading envelopes may delay a touch: up to 50 ms in total feel immediate, and a
 shaped onset gains no more."""
 
@@ -33,7 +31,7 @@ _DIGITS = 9
 
 @dataclass(frozen=True, slots=True)
 class EnvelopeSupport:
-    """Which envelopes are played: onsets, endings, both or none."""
+    """Supported envelopes: onsets, endings, both or none."""
 
     onsets: bool
     endings: bool
@@ -44,7 +42,7 @@ class EnvelopeSupport:
 
 
 RAMPS_ONLY = EnvelopeSupport(onsets=False, endings=False)
-"""Ramps only."""
+"""Support of ramps only."""
 
 
 class OpenAmplifier(Protocol):
@@ -64,14 +62,18 @@ class OpenAmplifier(Protocol):
 
 
 def envelope_support(
-    rig: Rig, amplifiers: Mapping[str, OpenAmplifier], *, within: float
+    rig: Rig, amplifiers: Mapping[str, OpenAmplifier], *, max_loading_time: float
 ) -> EnvelopeSupport:
-    """Return what all amplifiers, by name, can play and load within a time [s]."""
-    if within <= 0:
+    """Return what all amplifiers, by name, can play and load within `max_loading_time` [s]."""
+    if max_loading_time <= 0:
         return RAMPS_ONLY
     return EnvelopeSupport(
-        onsets=_fits(rig, amplifiers, knots=ONSET_KNOTS - 1, slots=1, within=within),
-        endings=_fits(rig, amplifiers, knots=ENDING_KNOTS - 1, slots=2, within=within),
+        onsets=_fits(
+            rig, amplifiers, knots=ONSET_KNOTS - 1, slots=1, max_loading_time=max_loading_time
+        ),
+        endings=_fits(
+            rig, amplifiers, knots=ENDING_KNOTS - 1, slots=2, max_loading_time=max_loading_time
+        ),
     )
 
 
@@ -113,9 +115,9 @@ def wire_envelopes(pattern: Pattern, rig: Rig) -> dict[str, tuple[Envelope, ...]
 
 
 def _knot(value: complex) -> Knot:
-    """Return the knot of a complex amplitude in strokes."""
-    degrees = math.degrees(cmath.phase(value))
-    return Knot(round(abs(value), _DIGITS), 180.0 if degrees == -180.0 else degrees)
+    """Return the knot of a complex amplitude in strokes, its level rounded."""
+    knot = Knot.from_phasor(value)
+    return replace(knot, level=round(knot.level, _DIGITS))
 
 
 def _wired(rig: Rig) -> dict[str, int]:
@@ -127,7 +129,12 @@ def _wired(rig: Rig) -> dict[str, int]:
 
 
 def _fits(
-    rig: Rig, amplifiers: Mapping[str, OpenAmplifier], *, knots: int, slots: int, within: float
+    rig: Rig,
+    amplifiers: Mapping[str, OpenAmplifier],
+    *,
+    knots: int,
+    slots: int,
+    max_loading_time: float,
 ) -> bool:
     """Whether every amplifier plays an envelope of this many knots per ERA and loads it in time.
 
@@ -144,4 +151,4 @@ def _fits(
         ):
             return False
         busy[amplifier.bus or name] += wired * amplifier.wire_times.loading(knots)
-    return max(busy.values(), default=0.0) <= within
+    return max(busy.values(), default=0.0) <= max_loading_time

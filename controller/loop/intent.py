@@ -32,7 +32,7 @@ class Target:
 
 @dataclass(frozen=True)
 class HapticIntent:
-    """What is intended now.
+    """Targets and their levels at one moment.
 
     targets: each contact once; those that are not on the plate are ignored. reason: why there are
     none. until: when [s] the intent may change though no contact has; None for never.

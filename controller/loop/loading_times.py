@@ -10,19 +10,19 @@ MAX_SLOW = 3
 """Consecutive slow loads before falling back to ramps; as many fast ones reset the backoff."""
 
 FIRST_PAUSE, MAX_PAUSE = 30.0, 480.0
-"""Until loading is retried [s]: each attempt may delay the onset of one touch."""
+"""First and longest time [s] until loading is retried; a retry may delay the onset of a touch."""
 
 _logger = logging.getLogger(__name__)
 
 
 class LoadingTimes:
-    """Follows how long [s] loading envelopes takes; at most `max_duration` is in time.
+    """Follows how long [s] loading envelopes takes; at most `max_loading_time` is in time.
 
     Times [s] are arguments and never decrease.
     """
 
-    def __init__(self, max_duration: float) -> None:
-        self._max_duration = max_duration
+    def __init__(self, max_loading_time: float) -> None:
+        self._max_loading_time = max_loading_time
         self._slow_in_a_row = 0
         self._in_time_in_a_row = 0
         self._pause = FIRST_PAUSE  # the next
@@ -32,7 +32,7 @@ class LoadingTimes:
     def note(self, duration: float, *, now: float) -> None:
         """Note that a loading took so long [s]."""
         self._last = duration
-        if duration <= self._max_duration:
+        if duration <= self._max_loading_time:
             self._slow_in_a_row = 0
             self._in_time_in_a_row += 1
             if self._in_time_in_a_row >= MAX_SLOW:
@@ -55,6 +55,6 @@ class LoadingTimes:
             return None
         return (
             f"loading envelopes took {1000 * self._last:.0f} ms, more than the "
-            f"{1000 * self._max_duration:.0f} ms that a touch may wait; retrying in {left:.0f} s; "
-            "use a faster wire, or allow a longer wait"
+            f"{1000 * self._max_loading_time:.0f} ms that a touch may wait; retrying in "
+            f"{left:.0f} s; use a faster wire, or allow a longer wait"
         )

@@ -6,12 +6,12 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import ParamSpec
 
-from controller.group.amplifier_group import AmplifierGroup, Phase
+from controller.group.amplifier_group import AmplifierGroup, GroupState
 from controller.group.guards import make_guards
 from controller.group.synchronized_play import Played
 from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
 from controller.loop.decision import RELEASE_RAMP, Decider, Decision
-from controller.loop.envelopes import ENVELOPE_TIME
+from controller.loop.envelopes import MAX_LOADING_TIME
 from controller.loop.intent import IntentSource, NewestBuzzes
 from controller.loop.observer import Observer, applied_by, silenced_by
 from controller.loop.routing import commands_by_era
@@ -23,7 +23,10 @@ from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.command import DriveCommand
 from drivers.errors import CommandError, DriverError, LinkError
+from drivers.guard import Guard
+from drivers.operation.silence import StopOutcome
 from drivers.operation.watchdog import HEARTBEAT
+from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
@@ -49,7 +52,7 @@ class Controller:
 
     intent_source: by default the newest contact buzzes where it is. timing: shapes the patterns of
     the table, ramps only without it. drive_mode: None for the best that the amplifiers can play.
-    envelope_time [s]: how long loading envelopes may delay a touch, 0 for ramps only.
+    max_loading_time [s]: how long loading envelopes may delay a touch, 0 for ramps only.
     """
 
     def __init__(
@@ -63,7 +66,7 @@ class Controller:
         intent_source: IntentSource | None = None,
         timing: Timing | None = None,
         drive_mode: str | None = None,
-        envelope_time: float = ENVELOPE_TIME,
+        max_loading_time: float = MAX_LOADING_TIME,
     ) -> None:
         if amplifiers.keys() != rig.amplifiers.keys():
             raise InputError(
@@ -79,22 +82,35 @@ class Controller:
         self._intent_source = intent_source or NewestBuzzes()
         self._timing = timing
         self._drive_mode = drive_mode
-        self._envelope_time = envelope_time if timing is not None else 0.0
+        self._max_loading_time = max_loading_time if timing is not None else 0.0
         self._rejects = RejectCounter(_logger)
         self._decider_if_open: Decider | None = None
+        self._guards: Mapping[str, Guard] = {}
         self._wake = asyncio.Event()
         self._heartbeat_due = 0.0
         self._expiry: asyncio.TimerHandle | None = None
 
     @property
-    def phase(self) -> Phase:
+    def group_state(self) -> GroupState:
         """State of all amplifiers together."""
-        return self._group.phase
+        return self._group.state
+
+    @property
+    def degraded(self) -> tuple[str, ...]:
+        """Names of amplifiers that do not reply but may still play; nothing new is played then."""
+        return self._group.degraded
 
     @property
     def capabilities(self) -> PlaybackCapabilities:
-        """What the open amplifiers can play together; raises CommandError before `open`."""
+        """Capabilities of the open amplifiers together; raises CommandError before `open`."""
         return self._decider.capabilities
+
+    @property
+    def drive_mode(self) -> str:
+        """The drive mode of questions to the table; the best possible one until `open`."""
+        if self._decider_if_open is not None:
+            return self._decider_if_open.capabilities.drive_mode
+        return self._drive_mode or [*DRIVE_MODES][-1]
 
     @property
     def ramp_only_reason(self) -> str | None:
@@ -114,19 +130,20 @@ class Controller:
         """
         await self._group.open()
         try:
+            self._guards = make_guards(self._rig, self._amplifiers, self._guards)
             decider = Decider(
                 self._rig,
                 self._table,
-                guards=make_guards(self._rig, self._amplifiers),
+                guards=self._guards,
                 capabilities=playback_capabilities(
                     self._rig,
                     self._amplifiers,
                     drive_mode=self._drive_mode,
-                    envelope_time=self._envelope_time,
+                    max_loading_time=self._max_loading_time,
                 ),
                 intent_source=self._intent_source,
                 timing=self._timing,
-                envelope_time=self._envelope_time,
+                max_loading_time=self._max_loading_time,
             )
             decider.prepare()
         except BaseException:
@@ -147,9 +164,9 @@ class Controller:
         """Ramp to silence, then switch the high voltage off."""
         await self._group.disarm()
 
-    async def stop(self) -> None:
-        """Quick-stop every amplifier that can be reached; latched until `clear`."""
-        await self._group.stop()
+    async def stop(self) -> Mapping[str, StopOutcome]:
+        """Quick-stop every amplifier; latched until `clear`; returns the outcome of each."""
+        return await self._group.stop()
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone; nothing arms by itself."""
@@ -167,11 +184,11 @@ class Controller:
 
         All others have been stopped by then. A source that fails or ends does not end the loop.
         While disarmed the loop sends nothing: a lost link then shows in the next request, which
-        raises, and in `phase`; the daemon's supervisor checks both.
+        raises, and in `group_state`; the daemon's supervisor checks both.
         """
         listening = [asyncio.create_task(self._listen(source)) for source in self._sources]
         try:
-            while self.phase is not Phase.CLOSED:
+            while self.group_state is not GroupState.CLOSED:
                 await self.step()
                 self._report(self._observer.cycle_completed)
                 await self._wait_for_event()
@@ -186,25 +203,34 @@ class Controller:
         """Run the loop once: decide, send what changed, then the heartbeat if it is due."""
         self._wake.clear()
         now = clock.now()
-        self._report_change(self._decider.expire(now))
+        expired = self._decider.expire(now)
         decision = self._decider.decide(now)
+        is_aborted = False
         try:
-            if self.phase is Phase.ARMED and decision is not None:
-                await self._execute(decision)
-            if self._is_heartbeat_due and await self._group.heartbeat():
+            if self.group_state is GroupState.ARMED and decision is not None:
+                if decision.pattern is not None and self._group.degraded:
+                    self._decider.forget()  # decided again once all amplifiers reply
+                else:
+                    is_aborted = not await self._execute(decision)
+            elif self.group_state is GroupState.ARMED and not self._group.degraded:
+                await self._renew(now)
+            # Half a set may play then: the next turn silences it, and the heartbeat comes after.
+            if self._is_heartbeat_due and not is_aborted and await self._group.heartbeat():
                 self._heartbeat_due = clock.now() + HEARTBEAT
         except LinkError as error:
             self._report(self._observer.link_lost, str(error))
             raise
         except DriverError as error:
             self._report(self._observer.refused, str(error))
+        finally:
+            self._report_change(expired)
 
     def deliver(self, frame: TouchFrame) -> None:
         """Take a touch frame; to be called in the loop's thread."""
         change = self._decider.take(frame)
+        self._follow(change)
         for reason in change.rejected:
             self._rejects.count(reason, f"touch of {frame.source}")
-        self._follow(change)
 
     def request_update(self) -> None:
         """Query the intent source again, because its intent changed without a touch."""
@@ -213,7 +239,7 @@ class Controller:
     @property
     def _is_heartbeat_due(self) -> bool:
         """Whether to feed the watchdogs now; pending silence has priority."""
-        is_time = self.phase is Phase.ARMED and clock.now() >= self._heartbeat_due
+        is_time = self.group_state is GroupState.ARMED and clock.now() >= self._heartbeat_due
         return is_time and not self._decider.is_silence_pending
 
     @property
@@ -224,12 +250,12 @@ class Controller:
 
     def _follow(self, change: Change) -> None:
         """Act on a change of contacts, also while amplifiers are being awaited."""
-        self._report_change(change)
         if change:
             self._wake.set()
         if self._decider.is_silence_pending:
             self._group.abort_exchange()
         self._schedule_expiry()
+        self._report_change(change)
 
     def _schedule_expiry(self) -> None:
         """Check for expired sources when the next one times out."""
@@ -237,21 +263,24 @@ class Controller:
             self._expiry.cancel()
             self._expiry = None
         due = self._decider.next_expiry
-        if due is not None and self.phase is Phase.ARMED:
+        if due is not None and self.group_state is GroupState.ARMED:
             pause = max(0.0, due - clock.now())
             self._expiry = asyncio.get_running_loop().call_later(pause, self._expire)
 
     def _expire(self) -> None:
         self._follow(self._decider.expire(clock.now()))
 
-    async def _execute(self, decision: Decision) -> None:
-        """Send the sets of a decision and report the outcome; raises DriverError."""
+    async def _execute(self, decision: Decision) -> bool:
+        """Send the sets of a decision and report the outcome; raises DriverError.
+
+        False if silence came in between.
+        """
         commands: Mapping[str, DriveCommand] = {}
         sent = None
         if decision.sets is not None:
             played = await self._play(decision.sets, is_pattern=decision.pattern is not None)
             if played is None:
-                return
+                return False
             commands, sent = commands_by_era(played.achieved, self._rig), played.sent
             self._decider.confirm(commands, now=clock.now())
             if played.loading_time is not None:
@@ -259,7 +288,7 @@ class Controller:
         if decision.refusal is not None:
             self._report(self._observer.refused, decision.refusal)
         if decision.adds_endings_only:
-            return  # what is felt stays the same
+            return True  # what is felt stays the same
         if decision.pattern is not None and sent is not None:
             applied = applied_by(
                 decision, decision.pattern, commands=commands, sent=sent, timing=self._timing
@@ -268,6 +297,13 @@ class Controller:
         else:
             silenced = silenced_by(decision, sent=sent, now=clock.now())
             self._report(self._observer.silenced, silenced)
+        return True
+
+    async def _renew(self, now: float) -> None:
+        """Let what plays go on if it is due; raises DriverError."""
+        sets = self._decider.renewal(now)
+        if sets is not None and await self._play(sets, is_pattern=True) is not None:
+            self._decider.confirm_renewal(sets, now=clock.now())
 
     async def _play(self, sets: SafeSets, *, is_pattern: bool) -> Played | None:
         """Play sets on all amplifiers; None if silence came in between."""
@@ -298,7 +334,7 @@ class Controller:
         moments = [now + IDLE_INTERVAL]
         if self._decider.due is not None:
             moments.append(self._decider.due)
-        if self.phase is Phase.ARMED:
+        if self.group_state is GroupState.ARMED:
             moments.append(self._heartbeat_due)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(max(0.0, min(moments) - now)):

@@ -1,4 +1,4 @@
-"""What the control loop reports to a demo, a log or a dashboard."""
+"""Reports of the control loop to a demo, a log or a dashboard."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

@@ -46,10 +46,17 @@ def route(
         slots = onset_slots(rig)
         for name, envelope in onset.items():
             drive[name] = replace(drive[name], frequency=envelope.frequency, onset=slots[name])
-    max_level = max((command.level for command in drive.values()), default=0.0)
-    min_ramp = max_level / rig.limits.slew  # from rest, the longest case
+    max_rise = max((_rise(drive[name], (playing or {}).get(name)) for name in drive), default=0.0)
+    min_ramp = max_rise / rig.limits.slew
     ramp = min_ramp if min_ramp > ramp else ramp  # the guard refuses NaN
     return _sets(drive, rig, token=token, ramp=ramp)
+
+
+def _rise(command: DriveCommand, before: DriveCommand | None) -> float:
+    """Return the highest rise of a level: from rest, or through zero to another phase."""
+    if before is None or not command.level or before.frequency != command.frequency:
+        return command.level
+    return command.level + before.level
 
 
 def commands_by_era(

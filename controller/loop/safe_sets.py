@@ -1,6 +1,7 @@
 """Command sets for all amplifiers of a rig: routed, shaped where possible, checked by guards."""
 
 import logging
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -9,7 +10,7 @@ from controller.loop.routing import continues_any_tone, route, route_to_silence,
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, SafeCommandSet, SafeEnvelope
-from drivers.protocol.definition import token_after
+from drivers.protocol.definition import random_token, token_after
 from model.rig.rig import Rig
 from model.table.pattern import Pattern
 from model.table.question import Question
@@ -38,6 +39,12 @@ class SafeSets:
         )
 
     @property
+    def valid_for(self) -> float:
+        """Time [s] after the commit when the first amplifier ends its vibration by itself."""
+        times = [safe.valid_for for safe in self.sets.values() if not safe.is_silent]
+        return min((time for time in times if time > 0), default=math.inf)
+
+    @property
     def settled_after(self) -> float:
         """Time [s] after the commit when the last fade or envelope has ended."""
         return max((safe.settled_after for safe in self.sets.values()), default=0.0)
@@ -53,7 +60,7 @@ class SetBuilder:
         self._rig = rig
         self._guards = guards
         self._timing = timing
-        self._token = 0
+        self._token = random_token()
 
     def play(
         self,
@@ -62,12 +69,13 @@ class SetBuilder:
         *,
         is_shaped: bool,
         playing: Mapping[str, DriveCommand],
+        valid_for: float,
     ) -> tuple[SafeSets, Pattern]:
         """Build the sets of a pattern; returns them and the pattern with the ramp they have.
 
         is_shaped: whether to shape its onset; a ramp takes its place where a guard refuses it.
-        playing: what each ERA plays now; a tone that continues needs no onset. Raises
-        CommandRefused if a guard refuses any of it.
+        playing: what each ERA plays now; a tone that continues needs no onset. valid_for [s]: for
+        how long it plays unless it is renewed. Raises CommandRefused if a guard refuses any of it.
         """
         if (
             is_shaped
@@ -77,11 +85,11 @@ class SetBuilder:
             shaped = self._timing.with_envelopes(question, pattern, onset=True, ending=False)
             try:
                 envelopes = self._envelopes(shaped)
-                sets = self._checked(self._routed(shaped, playing))
+                sets = self._checked(self._routed(shaped, playing, valid_for))
                 return SafeSets(sets, envelopes), _with_ramp(shaped, sets)
             except CommandRefused as error:
                 _logger.info("loop: plain ramp instead of an onset: %s", error)
-        routed = self._routed(replace(pattern, onset=None), playing)
+        routed = self._routed(replace(pattern, onset=None), playing, valid_for)
         # Every guard sees its set, so that all refusals are reported at once.
         checked = {
             name: guard.check_or_silence(routed[name], ramp=FADE_RAMP)
@@ -94,7 +102,12 @@ class SetBuilder:
         return SafeSets(sets), _with_ramp(pattern, sets)
 
     def add_endings(
-        self, pattern: Pattern, question: Question, *, playing: Mapping[str, DriveCommand]
+        self,
+        pattern: Pattern,
+        question: Question,
+        *,
+        playing: Mapping[str, DriveCommand],
+        valid_for: float,
     ) -> SafeSets | None:
         """Build the sets that give shaped endings to what plays; None if a guard refuses any."""
         if self._timing is None:
@@ -113,9 +126,30 @@ class SetBuilder:
                 ramp=FADE_RAMP,
                 ending=shaped.ending,
             )
-            return SafeSets(self._checked(sets), envelopes)
+            return SafeSets(self._checked(_lasting(sets, valid_for)), envelopes)
         except CommandRefused as error:
             _logger.info("loop: plain ramp instead of an ending: %s", error)
+            return None
+
+    def renew(self, played: SafeSets, *, valid_for: float) -> SafeSets | None:
+        """Build the sets by which played ones go on for a time [s]; None if a guard refuses one."""
+        token = self._next_token()
+        sets = {
+            name: CommandSet(
+                token=token,
+                commands=tuple(
+                    replace(command, keep_phase=command.level > 0, onset=0)
+                    for command in safe.commands
+                ),
+                ramp=FADE_RAMP,
+                valid_for=valid_for,
+            )
+            for name, safe in played.sets.items()
+        }
+        try:
+            return SafeSets(self._checked(sets))
+        except CommandRefused as error:
+            _logger.debug("loop: vibration not renewed: %s", error)
             return None
 
     def end(self) -> SafeSets:
@@ -142,10 +176,10 @@ class SetBuilder:
         )
 
     def _routed(
-        self, pattern: Pattern, playing: Mapping[str, DriveCommand]
+        self, pattern: Pattern, playing: Mapping[str, DriveCommand], valid_for: float
     ) -> dict[str, CommandSet]:
         """Route a pattern to the rig's channels under the next token."""
-        return route(
+        sets = route(
             pattern.excitation,
             self._rig,
             token=self._next_token(),
@@ -153,6 +187,7 @@ class SetBuilder:
             playing=playing,
             onset=pattern.onset,
         )
+        return _lasting(sets, valid_for)
 
     def _checked(self, sets: Mapping[str, CommandSet]) -> dict[str, SafeCommandSet]:
         """Check every set by its guard; raises CommandRefused."""
@@ -170,6 +205,11 @@ class SetBuilder:
         """Return a token for all amplifiers: 1..65535, then from 1 again."""
         self._token = token_after(self._token)
         return self._token
+
+
+def _lasting(sets: Mapping[str, CommandSet], valid_for: float) -> dict[str, CommandSet]:
+    """Return sets that vibrate for a time [s] at most."""
+    return {name: replace(each, valid_for=valid_for) for name, each in sets.items()}
 
 
 def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:

@@ -13,8 +13,8 @@ from controller.sources.contacts import Contact
 from model.errors import InputError
 from model.finger.contrast import contrast_db, mean_level_db_sl
 from model.finger.fingertip import fingertip_points
-from model.finger.perception import FELT_DB_SL
-from model.table.pattern import UNAWARE_DB_SL, Pattern
+from model.finger.perception import FELT_DB_SL, decibels
+from model.table.pattern import IMPERCEPTIBLE_DB_SL, Pattern
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.vibration.peak import peak_acceleration
@@ -33,7 +33,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a target is predicted to feel in the steady state.
+    """Predicted steady vibration at a target.
 
     contact: as it was when the pattern was chosen; contrast_db: to the loudest quiet point, None
     without quiet contacts.
@@ -200,18 +200,18 @@ def strongest(
 ) -> Pattern:
     """Scale a pattern to as strong as the neighbours allow.
 
-    No quiet finger is aware of it then, no ERA exceeds its largest amplitude [m], by name, and no
+    Quiet fingers do not feel it then, no ERA exceeds its largest amplitude [m], by name, and no
     target exceeds max_db_sl [dB SL]. Raises InputError if nothing remains to be felt.
     """
     headroom = [
-        20 * math.log10(max_amplitudes[name] / tone.amplitude)
+        float(decibels(max_amplitudes[name] / tone.amplitude))
         for name, tone in pattern.excitation.items()
         if tone.amplitude > 0
     ]
     gain = min([max_db_sl - pattern.level_db_sl, *headroom])
     quiet = pattern.quiet_level_db_sl
     if quiet is not None:
-        gain = min(gain, UNAWARE_DB_SL - quiet)
+        gain = min(gain, IMPERCEPTIBLE_DB_SL - quiet)
     level = pattern.level_db_sl + gain
     if level <= 0:
         raise InputError(

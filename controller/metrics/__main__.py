@@ -1,16 +1,19 @@
 """`python -m controller.metrics --socket PATH --port N`: serve a daemon's metrics on 127.0.0.1."""
 
+import asyncio
 import signal
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client import CONTENT_TYPE_LATEST
 
-from controller.api.client import Client
-from controller.api.methods import StatusResult
+from controller.api.async_client import AsyncClient
+from controller.api.jsonrpc import RpcError
 from controller.api.socket_path import find_socket
-from controller.metrics.collector import DaemonCollector
+from controller.metrics.collector import exposition
+from controller.metrics.server import PageServer
+from drivers.errors import LinkError
 
 
 def serve(
@@ -18,15 +21,8 @@ def serve(
     socket: Annotated[Path | None, typer.Option(help="The daemon's socket.")] = None,
 ) -> None:
     """Serve a daemon's metrics to Prometheus on 127.0.0.1, until SIGINT or SIGTERM."""
-
-    def read_status() -> StatusResult:
-        with Client.connect(find_socket(socket), name="metrics") as era:
-            return era.status()
-
-    registry = CollectorRegistry(auto_describe=False)
-    registry.register(DaemonCollector(read_status))
     try:
-        server, _ = start_http_server(port, addr="127.0.0.1", registry=registry)
+        asyncio.run(_serve(port, socket))
     except OSError as error:
         typer.echo(
             f"era: error: cannot serve metrics on 127.0.0.1 port {port} ({error.strerror}); stop "
@@ -34,10 +30,25 @@ def serve(
             err=True,
         )
         raise typer.Exit(2) from error
-    typer.echo(f"metrics: http://127.0.0.1:{server.server_port}/metrics")
-    signal.sigwait({signal.SIGTERM, signal.SIGINT})
+
+
+async def _serve(port: int, socket: Path | None) -> None:
+    ended = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, ended.set)
+
+    async def page() -> bytes:
+        try:
+            async with await AsyncClient.connect(find_socket(socket), name="metrics") as era:
+                return exposition(await era.status())
+        except (LinkError, RpcError):
+            return exposition(None)
+
+    server = await PageServer("/metrics", page, content=CONTENT_TYPE_LATEST).start(port)
+    typer.echo(f"metrics: http://127.0.0.1:{server.sockets[0].getsockname()[1]}/metrics")
+    await ended.wait()
+    server.close()
 
 
 if __name__ == "__main__":
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGINT})
     typer.run(serve)

@@ -1,9 +1,10 @@
 """The daemon's status as Prometheus metrics."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from itertools import accumulate
 from typing import get_args
 
+from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import (
     CounterMetricFamily,
     GaugeMetricFamily,
@@ -12,16 +13,14 @@ from prometheus_client.core import (
 )
 from prometheus_client.registry import Collector
 
-from controller.api.jsonrpc import RpcError
 from controller.api.methods import StatusResult
 from controller.api.schema import AmplifierStatus, DaemonStateName, LatencySummary
-from drivers.errors import LinkError
 
 _LINK_COUNTS = {
     "frames_out": "Frames sent to an amplifier.",
     "frames_in": "Frames received from an amplifier.",
-    "bad": "Frames with CRC errors.",
-    "foreign": "Valid but unexpected frames.",
+    "invalid_frames": "Frames with a wrong checksum, length, form or version.",
+    "unexpected_frames": "Valid but unexpected frames.",
     "events": "Events sent by an amplifier.",
     "retries": "Repeated requests.",
     "timeouts": "Requests without a reply in time.",
@@ -29,22 +28,23 @@ _LINK_COUNTS = {
 }
 
 
-class DaemonCollector(Collector):
-    """Reads the daemon's status at every scrape; read_status may raise LinkError or RpcError."""
+class _Metrics(Collector):
+    """Metrics that are known already."""
 
-    def __init__(self, read_status: Callable[[], StatusResult]) -> None:
-        self._read_status = read_status
+    def __init__(self, metrics: Iterable[Metric]) -> None:
+        self._metrics = list(metrics)
 
     def collect(self) -> Iterable[Metric]:
-        """All metrics; only `era_up 0` without a daemon."""
-        up = GaugeMetricFamily("era_up", "Whether the daemon responds.")
-        try:
-            status = self._read_status()
-        except (LinkError, RpcError):
-            up.add_metric([], 0)
-            return [up]
-        up.add_metric([], 1)
-        return [up, *metrics_of(status)]
+        """All of them."""
+        return self._metrics
+
+
+def exposition(status: StatusResult | None) -> bytes:
+    """Format a status in Prometheus' text format; only `era_up 0` without one."""
+    up = _gauge("era_up", "Whether the daemon responds.", float(status is not None))
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(_Metrics([up, *(() if status is None else metrics_of(status))]))
+    return generate_latest(registry)
 
 
 def metrics_of(status: StatusResult) -> Iterator[Metric]:
@@ -104,6 +104,7 @@ def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
     gauges = {
         name: GaugeMetricFamily(f"era_amplifier_{name}", text, labels=["amplifier"])
         for name, text in (
+            ("degraded", "Whether it does not reply but may still play."),
             ("lost", "Whether the link is lost."),
             ("fault", "Whether it reports a fault."),
             ("high_voltage", "Whether high voltage is on."),
@@ -119,6 +120,7 @@ def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
     for amplifier in amplifiers:
         round_trip = amplifier.statistics.round_trip_ms
         values = {
+            "degraded": float(amplifier.degraded),
             "lost": float(amplifier.lost),
             "fault": None if amplifier.fault is None else float(amplifier.fault != "NONE"),
             "high_voltage": amplifier.high_voltage,

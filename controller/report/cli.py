@@ -32,8 +32,7 @@ def report(
 ) -> None:
     """Collect versions, files and daemon state for a bug report.
 
-    Passwords, tokens and the path of your home folder are removed; check the file before you
-    send it.
+    Shows known keys, numbers and words of this program alone; check the file before you send it.
     """
     from controller.report.collect import collect
     from controller.report.zip_file import write_zip

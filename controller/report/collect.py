@@ -15,10 +15,11 @@ from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.daemon.config import is_daemon_document
 from controller.daemon.fault_dumps import DUMP_PATTERN
-from controller.report.redaction import redacted
+from controller.report.shown import Shown, installed_from
 from drivers.errors import LinkError
 from model.config.document import read_document
 from model.errors import InputError
+from model.files.regular_file import regular_file
 
 MAX_FILE_SIZE = 1 << 20  # bytes; of a larger file only the end is included
 MAX_DUMPS = 5
@@ -45,15 +46,16 @@ def collect(configs: Iterable[Path], *, socket: Path | None, home: Path) -> Repo
     for path in configs:
         for named in _with_named(path, missing):
             _include(named, files, missing)
-    files["versions.json"] = json.dumps(versions(), indent=2)
     try:
         with Client.connect(socket, name="era report") as daemon:
             files["status.json"] = daemon.status().model_dump_json(indent=2)
     except (LinkError, RpcError) as error:
-        missing.append(f"status of a daemon: {error}")
+        missing.append(f"status of a daemon ({type(error).__name__})")
+    shown = Shown(home=home)
     return Report(
-        {name: redacted(text, home=home) for name, text in files.items()},
-        tuple(redacted(text, home=home) for text in missing),
+        {name: shown.text(text, is_dump=name.endswith(".jsonl")) for name, text in files.items()}
+        | {"versions.json": json.dumps(versions(), indent=2)},
+        tuple(missing),
     )
 
 
@@ -73,7 +75,9 @@ def versions() -> dict[str, Any]:
     }
     return {
         "era-haptics": version("era-haptics"),
-        "installed": distribution("era-haptics").read_text("direct_url.json") or "from an index",
+        "installed_from": installed_from(
+            json.loads(distribution("era-haptics").read_text("direct_url.json") or "null")
+        ),
         "python": sys.version,
         "system": platform.platform(),
         "machine": platform.machine(),
@@ -101,7 +105,7 @@ def _with_named(path: Path, missing: list[str]) -> Iterable[Path]:
         document = read_document(path)
     except InputError as error:
         if path.is_file():  # a missing file is reported when it is read
-            missing.append(f"files that it names: {error}")
+            missing.append(f"files that {path.name} names ({type(error).__name__})")
         return
     if not is_daemon_document(document):
         return
@@ -119,11 +123,11 @@ def _with_named(path: Path, missing: list[str]) -> Iterable[Path]:
 def _include(path: Path, files: dict[str, str], missing: list[str]) -> None:
     """Include a text file under its name; of a large one only the end."""
     try:
-        with path.open("rb") as stream:
+        with open(path, "rb", opener=regular_file) as stream:
             stream.seek(max(0, path.stat().st_size - MAX_FILE_SIZE))
             text = stream.read(MAX_FILE_SIZE).decode("utf-8", errors="replace")
     except OSError as error:
-        missing.append(f"{path}: {error.strerror}")
+        missing.append(f"{path.name}: {error.strerror}")
         return
     name = path.name
     while name in files:

@@ -4,6 +4,7 @@ The matrix is that of libinput's LIBINPUT_CALIBRATION_MATRIX: x' = a x + b y + c
 on coordinates 0..1 from the top left corner.
 """
 
+import asyncio
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -109,20 +110,32 @@ def fitted(touched: Sequence[Point], places: Sequence[Point], plate: Plate) -> T
 
 
 class CalibratedSource(TouchSource):
-    """A touch source mapped to the coordinates of the plate."""
+    """A touch source mapped to the coordinates of the plate; fingers are lifted when it ends."""
 
     def __init__(self, source: TouchSource, calibration: TouchCalibration) -> None:
         self._source = source
         self._calibration = calibration
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
-        """Run the source and deliver its frames with mapped touches."""
+        """Run the source and deliver its frames with mapped touches.
+
+        Its fingers are lifted as soon as it ends, fails or is cancelled.
+        """
         place = self._calibration.place
+        touched: dict[str, TouchFrame] = {}
 
         def placed(frame: TouchFrame) -> None:
+            touched.pop(frame.source, None)
+            if frame.touches:
+                touched[frame.source] = frame
             deliver(replace(frame, touches=tuple(map(place, frame.touches))))
 
-        await self._source.run(placed)
+        try:
+            await self._source.run(placed)
+        finally:
+            now = asyncio.get_running_loop().time()
+            for frame in touched.values():
+                deliver(replace(frame, time=now, touches=()))
 
 
 def _reversed(row: Row) -> Row:

@@ -15,11 +15,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from controller.sources.recording import recorded_lines
 from drivers.errors import LinkError, system_message
 from model.errors import InputError
 
 HEADER = "# era-haptics TUIO capture 1"
-_LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)")
+_LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)", re.ASCII)
 _MAX_DATAGRAM = 65_507  # bytes; UDP over IPv4
 
 
@@ -34,15 +35,7 @@ class Datagram:
 def read_capture(path: Path | str) -> list[Datagram]:
     """Read a capture; raises InputError with file and line."""
     path = Path(path)
-    try:
-        lines = path.read_text(encoding="ascii").splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: must be a TUIO capture, got a binary file") from error
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); check the path, which is relative to the "
-            "working directory, and its permissions"
-        ) from error
+    lines = recorded_lines(path, what="a TUIO capture")
     if not lines or lines[0] != HEADER:
         raise InputError(f"{path}, line 1: must be {HEADER!r} for a TUIO capture")
     datagrams: list[Datagram] = []

@@ -1,17 +1,21 @@
 """The contacts on the plate, from any sequence of touch frames."""
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from controller.sources.touch import Touch, TouchFrame
 from model.finger import MAX_CONTACTS
 from model.structure.plate import Plate
 
-# s; sources repeat their frames at least every 100 ms, and a contact that is not confirmed must not
-# be driven.
+# s; most sources repeat their frames at least every 100 ms, others state their own timeout. A
+# contact that is not confirmed must not be driven.
 CONTACT_TIMEOUT = 0.150
+
+# s; a finger that rests longer without any sign of its sensor is not to be relied on.
+MAX_CONTACT_TIMEOUT = 60.0
 
 
 class ContactKey(NamedTuple):
@@ -23,12 +27,17 @@ class ContactKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """A finger on the plate at x, y [m] from its south-west corner, down since a time [s]."""
+    """A finger on the plate at x, y [m] from its south-west corner, down since a time [s].
+
+    pressure, touch_major: as in `Touch`; a contact that differs in nothing else has not changed.
+    """
 
     key: ContactKey
     x: float
     y: float
     since: float
+    pressure: float | None = field(default=None, compare=False)
+    touch_major: float | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,19 +57,34 @@ class Change:
         return bool(self.down or self.moved or self.up)
 
 
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """A source with contacts: the time [s] of its last frame, and its origin."""
+
+    received: float
+    timeout: float
+    origin: str
+
+    @property
+    def expiry(self) -> float:
+        """When [s] its contacts are lifted unless another frame arrives."""
+        return self.received + self.timeout
+
+
 class ContactTracker:
     """The contacts on one plate. Deterministic: reads no clock.
 
     x = X L and y = (1 - Y) W, since touch sensors count Y downwards. Rejects touches that are off
-    the plate (outside 0..1), have non-finite coordinates, repeat an id within a frame (the last one
-    counts) or exceed the maximum number of contacts; a contact whose touch is rejected is
-    lifted.
+    the plate (outside 0..1), have non-finite coordinates or repeat an id within a frame (the last
+    one counts); a contact whose touch is rejected is lifted. Where the maximum number of contacts
+    is reached, a contact of the input, origin or source that has most is evicted until both have
+    equal shares; else the touch is rejected.
     """
 
     def __init__(self, plate: Plate) -> None:
         self._plate = plate
         self._contacts: dict[ContactKey, Contact] = {}
-        self._last_frame: dict[str, float] = {}
+        self._sources: dict[str, _Source] = {}
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
@@ -70,69 +94,122 @@ class ContactTracker:
     @property
     def next_expiry(self) -> float | None:
         """When [s] the first source with contacts times out unless a frame of it arrives."""
-        return min(self._last_frame.values()) + CONTACT_TIMEOUT if self._last_frame else None
+        return min((source.expiry for source in self._sources.values()), default=None)
+
+    def expiry_of(self, key: ContactKey) -> float:
+        """Return when [s] a contact is lifted unless a frame arrives; -inf for none of that key."""
+        return self._sources[key.source].expiry if key in self._contacts else -math.inf
 
     def update(self, frame: TouchFrame) -> Change:
         """Apply a frame, which replaces the previous one of its source."""
         rejected: list[str] = []
-        places: dict[ContactKey, tuple[float, float]] = {}
+        touches: dict[ContactKey, Touch] = {}
         if math.isfinite(frame.time):
-            places = self._places(frame.source, frame.touches, rejected)
+            touches = _valid_touches(frame, rejected)
         elif frame.touches:
             rejected.append("no_time")
         up = self._lift(
-            key for key in self._contacts if key.source == frame.source and key not in places
+            key for key in self._contacts if key.source == frame.source and key not in touches
         )
+        self._sources[frame.source] = _source_of(frame)
         down: list[Contact] = []
         moved: list[Contact] = []
-        for key, (x, y) in places.items():
+        for key, touch in touches.items():
             known = self._contacts.get(key)
             if known is None and len(self._contacts) >= MAX_CONTACTS:
-                rejected.append("too_many")
-                continue
-            contact = Contact(key, x, y, since=known.since if known else frame.time)
-            self._contacts[key] = contact
+                evicted = self._contact_to_evict(key)
+                if evicted is None:
+                    rejected.append("too_many")
+                    continue
+                up += self._lift([evicted])
+            contact = self._contacts[key] = self._contact(key, touch, known, frame.time)
             if known is None:
                 down.append(contact)
-            elif known != contact:
+            elif (known.x, known.y) != (contact.x, contact.y):
                 moved.append(contact)
-        if any(key.source == frame.source for key in self._contacts):
-            self._last_frame[frame.source] = frame.time
-        else:
-            self._last_frame.pop(frame.source, None)
+        self._forget_sources()
         return Change(tuple(down), tuple(moved), up, tuple(rejected))
 
     def expire(self, now: float) -> Change:
         """Lift the contacts of all sources that have timed out at now [s]."""
-        for source, received in list(self._last_frame.items()):
-            # Same expression as next_expiry, so both round alike.
-            if received + CONTACT_TIMEOUT <= now:
-                del self._last_frame[source]
-            else:  # clamp timestamps in the future
-                self._last_frame[source] = min(received, now)
-        return Change(
-            up=self._lift(key for key in self._contacts if key.source not in self._last_frame)
+        # Same expression as next_expiry, so both round alike. Frames dated in the future are
+        # treated as received now.
+        expired = {name for name, source in self._sources.items() if source.expiry <= now}
+        up = self._lift(key for key in self._contacts if key.source in expired)
+        self._forget_sources()
+        for name, source in self._sources.items():
+            self._sources[name] = replace(source, received=min(source.received, now))
+        return Change(up=up)
+
+    def _contact(
+        self, key: ContactKey, touch: Touch, known: Contact | None, time: float
+    ) -> Contact:
+        """Return the contact of a touch, down since a time [s] unless it is known."""
+        return Contact(
+            key,
+            touch.x * self._plate.length,
+            (1 - touch.y) * self._plate.width,
+            since=time if known is None else known.since,
+            pressure=touch.pressure,
+            touch_major=touch.touch_major,
         )
 
-    def _places(
-        self, source: str, touches: tuple[Touch, ...], rejected: list[str]
-    ) -> dict[ContactKey, tuple[float, float]]:
-        """Return the places [m] of the touches that can be contacts."""
-        last = {touch.id: touch for touch in touches}
-        rejected += ["twice"] * (len(touches) - len(last))
-        places = {}
-        for touch in last.values():
-            if not (math.isfinite(touch.x) and math.isfinite(touch.y)):
-                rejected.append("not_finite")
-            elif not (0 <= touch.x <= 1 and 0 <= touch.y <= 1):
-                rejected.append("off_plate")
-            else:
-                places[ContactKey(source, touch.id)] = (
-                    touch.x * self._plate.length,
-                    (1 - touch.y) * self._plate.width,
-                )
-        return places
+    def _contact_to_evict(self, newcomer: ContactKey) -> ContactKey | None:
+        """Return the contact to lift for another one; None if all shares are equal.
+
+        The newest contact of the input, then the origin, then the source with most contacts, if it
+        has at least two more than the newcomer's.
+        """
+        keys = list(self._contacts)
+        groupings: tuple[Callable[[ContactKey], str], ...]
+        groupings = (_input_of, self._origin_of, lambda key: key.source)
+        for depth, group_of in enumerate(groupings):
+            counts = Counter(map(group_of, keys))
+            own = group_of(newcomer)
+            if max(counts.values(), default=0) > counts[own] + 1:
+                for deeper in groupings[depth:]:
+                    ((fullest, _),) = Counter(map(deeper, keys)).most_common(1)
+                    keys = [key for key in keys if deeper(key) == fullest]
+                return keys[-1]
+            keys = [key for key in keys if group_of(key) == own]
+        return None
+
+    def _origin_of(self, key: ContactKey) -> str:
+        return self._sources[key.source].origin
 
     def _lift(self, keys: Iterable[ContactKey]) -> tuple[Contact, ...]:
         """Remove contacts and return them."""
         return tuple(self._contacts.pop(key) for key in tuple(keys))
+
+    def _forget_sources(self) -> None:
+        """Forget sources without contacts."""
+        names = {key.source for key in self._contacts}
+        self._sources = {name: self._sources[name] for name in self._sources if name in names}
+
+
+def _input_of(key: ContactKey) -> str:
+    """Return the input of a source, the beginning of its name; without one its kind."""
+    return key.source.partition(":")[0]
+
+
+def _source_of(frame: TouchFrame) -> _Source:
+    timeout = frame.timeout
+    if timeout is None or not 0 < timeout <= MAX_CONTACT_TIMEOUT:  # NaN is not
+        timeout = CONTACT_TIMEOUT
+    origin = frame.source if frame.origin is None else frame.origin
+    return _Source(frame.time, timeout, origin)
+
+
+def _valid_touches(frame: TouchFrame, rejected: list[str]) -> dict[ContactKey, Touch]:
+    """Return the touches that can be contacts; add a reason for each of the others."""
+    last = {touch.id: touch for touch in frame.touches}
+    rejected += ["twice"] * (len(frame.touches) - len(last))
+    valid = {}
+    for touch in last.values():
+        if not (math.isfinite(touch.x) and math.isfinite(touch.y)):
+            rejected.append("not_finite")
+        elif not (0 <= touch.x <= 1 and 0 <= touch.y <= 1):
+            rejected.append("off_plate")
+        else:
+            valid[ContactKey(frame.source, touch.id)] = touch
+    return valid

@@ -1,7 +1,7 @@
 """UDP datagrams with their times of arrival, several per iteration of the event loop.
 
-The event loop's own endpoint reads one datagram per turn and knows only when it did so: decisions
-would use outdated touches, and waiting times would stay invisible. Here one turn reads all that has
+The event loop's own endpoint reads one datagram per iteration and knows only when it did so:
+touches would be outdated and the queueing delay unmeasured. Here one iteration reads all that has
 arrived and delivers the backlog in slices of at most 0.25 ms. On Linux the kernel timestamps each.
 In a flood the newest are kept; the kernel would keep the oldest.
 """
@@ -18,10 +18,10 @@ from typing import NamedTuple, TypeAlias
 
 MAX_ITERATION_TIME = 0.00025  # s; longest delay of other tasks by a flood
 BACKLOG_THRESHOLD = 16  # waiting datagrams; from here on superseded ones are dropped
-_MAX_WAITING = 512  # also read per turn; the oldest are dropped
+_MAX_WAITING = 512  # also read per iteration; the oldest are dropped
 
 Peer: TypeAlias = tuple[str, int]
-Received: TypeAlias = Callable[[bytes, Peer, float], None]
+DatagramCallback: TypeAlias = Callable[[bytes, Peer, float], None]
 """Called with a datagram, its sender's host and port, and its arrival [s] by the loop's clock."""
 
 
@@ -38,6 +38,7 @@ DropSuperseded: TypeAlias = Callable[[Sequence[Datagram]], Iterable[Datagram]]
 
 _TIMESTAMPS = 35  # SO_TIMESTAMPNS and SCM_TIMESTAMPNS of Linux, which Python does not name
 _TIMESPEC = struct.Struct("@ll")
+_ANCILLARY = 64  # bytes; room for a timestamp and its header
 _CLOCK_READS, _MAX_READ_TIME = 3, 0.00005  # s; clocks read further apart are read again
 _MAX_AGE = 1.0  # s; a step of the system clock must not make touches old
 
@@ -48,14 +49,14 @@ class Datagrams:
     def __init__(
         self,
         endpoint: socket.socket,
-        received: Received,
+        received: DatagramCallback,
         *,
         max_size: int,
-        thin: DropSuperseded,
+        drop_superseded: DropSuperseded,
     ) -> None:
         self._socket = endpoint
         self._received = received
-        self._thin = thin
+        self._drop_superseded = drop_superseded
         self._waiting: deque[Datagram] = deque(maxlen=_MAX_WAITING)
         self._is_due = False
         self._buffer_size = max_size + 1  # so that a larger one shows by its size
@@ -87,7 +88,7 @@ class Datagrams:
             at = (str(peer[0]), int(peer[1]))
             self._waiting.append(Datagram(data, at, self._arrival(ancillary, offset)))
         if len(self._waiting) > BACKLOG_THRESHOLD:
-            self._waiting = deque(self._thin(self._waiting), maxlen=_MAX_WAITING)
+            self._waiting = deque(self._drop_superseded(self._waiting), maxlen=_MAX_WAITING)
         if not self._is_due:
             self._deliver_backlog()
 
@@ -130,21 +131,18 @@ def _clock_offset(clock: Callable[[], float]) -> float:
     return offset
 
 
-_ANCILLARY = 64  # bytes; room for a timestamp and its header
-
-
 async def listen(
     host: str,
     port: int,
-    received: Received,
+    received: DatagramCallback,
     *,
     max_size: int,
-    thin: DropSuperseded = tuple,
+    drop_superseded: DropSuperseded = tuple,
 ) -> Datagrams:
     """Listen on a host and UDP port, 0 for any that is free; raises OSError.
 
-    max_size: bytes of the longest datagram; longer ones are cut to one byte more. thin: drops
-    superseded datagrams where many wait.
+    max_size: bytes of the longest datagram; longer ones are cut to one byte more. drop_superseded:
+    drops superseded datagrams where many wait.
     """
     loop = asyncio.get_running_loop()
     found = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
@@ -153,7 +151,7 @@ async def listen(
     try:
         endpoint.setblocking(False)
         endpoint.bind(address)
-        return Datagrams(endpoint, received, max_size=max_size, thin=thin)
+        return Datagrams(endpoint, received, max_size=max_size, drop_superseded=drop_superseded)
     except BaseException:
         endpoint.close()
         raise

@@ -73,7 +73,7 @@ class EvdevSource(TouchSource):
     async def _follow(self, panel: InputDevice, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver the frames of a panel until it is unplugged; raises OSError then."""
         loop = asyncio.get_running_loop()
-        reader = SlotReader(panel.x_range, panel.y_range)
+        reader = SlotReader(panel.ranges)
         reader.adopt(panel.slots(), current=panel.current_slot)
         self._deliver(deliver, reader.touches)
         readable = asyncio.Event()

@@ -5,15 +5,18 @@ The format is evemu's (freedesktop.org, evemu-record(1)): a description of the d
 """
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller.sources.playing import play
+from controller.sources.playing import play, with_lifts
+from controller.sources.recording import recorded_lines
 from controller.sources.slots import (
     ABS_MT_POSITION_X,
     ABS_MT_POSITION_Y,
+    ABS_MT_PRESSURE,
     ABS_MT_SLOT,
+    ABS_MT_TOUCH_MAJOR,
     EventError,
     SlotReader,
 )
@@ -57,11 +60,15 @@ def read_evemu(path: Path | str) -> list[TouchFrame]:
                 key: limit for key, limit in _parse(description)[0].items() if key[1] != "Value"
             }
             header = ranges | header
-    reader = SlotReader(
-        _axis(path, header, ABS_MT_POSITION_X, "ABS_MT_POSITION_X"),
-        _axis(path, header, ABS_MT_POSITION_Y, "ABS_MT_POSITION_Y"),
-        first_slot=header.get((ABS_MT_SLOT, "Value"), 0),
-    )
+    limits = {
+        ABS_MT_POSITION_X: _axis(path, header, ABS_MT_POSITION_X, "ABS_MT_POSITION_X"),
+        ABS_MT_POSITION_Y: _axis(path, header, ABS_MT_POSITION_Y, "ABS_MT_POSITION_Y"),
+    }
+    for axis in (ABS_MT_PRESSURE, ABS_MT_TOUCH_MAJOR):
+        low, high = header.get((axis, "Min"), 0), header.get((axis, "Max"), 0)
+        if low < high:
+            limits[axis] = (low, high)
+    reader = SlotReader(limits, first_slot=header.get((ABS_MT_SLOT, "Value"), 0))
     frames = _frames(path, events, reader)
     if not frames:
         raise InputError(f"{path}: must be an evemu recording with touch reports; record it again")
@@ -87,7 +94,7 @@ def _parse(path: Path) -> tuple[dict[tuple[int, str], int], list[_Event]]:
     header: dict[tuple[int, str], int] = {}
     events: list[_Event] = []
     code: int | None = None
-    for number, line in _lines(path):
+    for number, line in enumerate(recorded_lines(path, what="an evemu recording"), start=1):
         if match := _EVENT.fullmatch(line):
             time, kind, event_code, value = match.group(1, 2, 3, 4)
             event = _Event(number, float(time), int(kind, 16), int(event_code, 16), int(value))
@@ -112,21 +119,6 @@ def _parse(path: Path) -> tuple[dict[tuple[int, str], int], list[_Event]]:
                 f"{path}, line {number}: must be a line of an evemu recording, got {line[:60]!r}"
             )
     return header, events
-
-
-def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the numbered lines of a text file."""
-    try:
-        with path.open(encoding="utf-8") as file:
-            for number, line in enumerate(file, start=1):
-                yield number, line.rstrip("\r\n")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: must be an evemu recording, got a binary file") from error
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); check the path, which is relative to the "
-            "working directory, and its permissions"
-        ) from error
 
 
 def _axis(path: Path, header: dict[tuple[int, str], int], code: int, name: str) -> tuple[int, int]:
@@ -155,7 +147,7 @@ class EvemuSource(TouchSource):
         path = url.removeprefix("evemu:")
         if path == url or not path:
             raise InputError(f"touch source must be evemu:PATH of a recording (.events), got {url}")
-        self.frames = read_evemu(path)
+        self.frames = with_lifts(read_evemu(path))
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver the frames of the recording at its pace."""

@@ -12,9 +12,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from controller.sources.slots import (
+    ABS_MT_DISTANCE,
     ABS_MT_POSITION_X,
     ABS_MT_POSITION_Y,
+    ABS_MT_PRESSURE,
     ABS_MT_SLOT,
+    ABS_MT_TOOL_TYPE,
+    ABS_MT_TOUCH_MAJOR,
     ABS_MT_TRACKING_ID,
     Range,
     SlotState,
@@ -26,6 +30,10 @@ _EVENT = struct.Struct("llHHi")  # struct input_event: time of two longs, type, 
 _AXIS = struct.Struct("6i")  # struct input_absinfo: value, minimum, maximum, fuzz, flat, resolution
 _INT = struct.Struct("i")
 _EVENTS_AT_ONCE = 64
+_SLOT_AXES = (
+    *(ABS_MT_TRACKING_ID, ABS_MT_POSITION_X, ABS_MT_POSITION_Y, ABS_MT_TOOL_TYPE),
+    *(ABS_MT_DISTANCE, ABS_MT_PRESSURE, ABS_MT_TOUCH_MAJOR),
+)  # as in SlotState
 
 
 def _request(direction: int, number: int, size: int) -> int:
@@ -33,12 +41,12 @@ def _request(direction: int, number: int, size: int) -> int:
     return direction << 30 | size << 16 | ord("E") << 8 | number
 
 
-def get_axis(axis: int) -> int:
+def eviocgabs(axis: int) -> int:
     """Return the request EVIOCGABS: range and value of an axis."""
     return _request(_READ, 0x40 + axis, _AXIS.size)
 
 
-def get_slots(size: int) -> int:
+def eviocgmtslots(size: int) -> int:
     """Return the request EVIOCGMTSLOTS: an axis in every slot, for a buffer of a size."""
     return _request(_READ, 0x0A, size)
 
@@ -76,8 +84,13 @@ class InputDevice:
         except OSError as error:
             raise InputError(f"touch source {path}: {_advice(error, path)}") from error
         try:
-            self.x_range = self._range(ABS_MT_POSITION_X)
-            self.y_range = self._range(ABS_MT_POSITION_Y)
+            self.ranges = {
+                axis: self._range(axis) for axis in (ABS_MT_POSITION_X, ABS_MT_POSITION_Y)
+            }
+            for axis in (ABS_MT_PRESSURE, ABS_MT_TOUCH_MAJOR):
+                _, low, high = self._axis(axis)
+                if low < high:  # both are 0 on a panel without the axis
+                    self.ranges[axis] = (low, high)
             self._slot_count = self._range(ABS_MT_SLOT)[1] + 1
             if grab:
                 fcntl.ioctl(self._descriptor, GRAB, 1)
@@ -107,11 +120,8 @@ class InputDevice:
 
     def slots(self) -> dict[int, SlotState]:
         """Return the state of every slot; raises OSError if the device is unplugged."""
-        ids, xs, ys = (
-            self._of_slots(axis)
-            for axis in (ABS_MT_TRACKING_ID, ABS_MT_POSITION_X, ABS_MT_POSITION_Y)
-        )
-        return {slot: SlotState(*state) for slot, state in enumerate(zip(ids, xs, ys, strict=True))}
+        states = zip(*map(self._slot_values, _SLOT_AXES), strict=True)
+        return {slot: SlotState(*state) for slot, state in enumerate(states)}
 
     def read(self) -> list[InputEvent]:
         """Return the pending events; raises OSError if the device is unplugged."""
@@ -129,7 +139,7 @@ class InputDevice:
 
     def _axis(self, axis: int) -> tuple[int, int, int]:
         """Return value, minimum and maximum of an axis."""
-        raw = fcntl.ioctl(self._descriptor, get_axis(axis), bytes(_AXIS.size))
+        raw = fcntl.ioctl(self._descriptor, eviocgabs(axis), bytes(_AXIS.size))
         value, low, high, *_ = _AXIS.unpack(raw)
         return value, low, high
 
@@ -143,11 +153,13 @@ class InputDevice:
             )
         return low, high
 
-    def _of_slots(self, axis: int) -> tuple[int, ...]:
+    def _slot_values(self, axis: int) -> tuple[int, ...]:
         """Return the value of an axis in every slot."""
         layout = struct.Struct(f"{1 + self._slot_count}i")
-        question = layout.pack(axis, *([0] * self._slot_count))
-        _, *values = layout.unpack(fcntl.ioctl(self._descriptor, get_slots(layout.size), question))
+        buffer = layout.pack(axis, *([0] * self._slot_count))
+        _, *values = layout.unpack(
+            fcntl.ioctl(self._descriptor, eviocgmtslots(layout.size), buffer)
+        )
         return tuple(values)
 
 

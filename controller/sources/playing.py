@@ -1,7 +1,7 @@
 """Playback of recorded touch frames at their recorded pace."""
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 from controller.sources.touch import TouchFrame
@@ -10,21 +10,29 @@ from controller.sources.touch import TouchFrame
 REPEAT_INTERVAL = 0.05
 
 
-async def play(
-    frames: Sequence[TouchFrame], deliver: Callable[[TouchFrame], None], *, speed: float = 1.0
-) -> None:
-    """Deliver frames, of which there is at least one, times from 0 s, on the event loop's clock.
+def with_lifts(frames: Sequence[TouchFrame], *, speed: float = 1.0) -> list[TouchFrame]:
+    """Return recorded frames, of which there is at least one, and the lifts of remaining touches.
 
-    A frame with touches is repeated every 50 ms; remaining touches are lifted 50 ms after the last
-    frame. speed: relative to the recording.
+    These are 50 ms after the last frame, at a speed relative to the recording. Takes long for a
+    long recording.
+    """
+    last = {frame.source: frame for frame in frames}
+    end = max(frame.time for frame in frames) + REPEAT_INTERVAL * speed
+    lifts = [replace(frame, time=end, touches=()) for frame in last.values() if frame.touches]
+    return [*frames, *lifts]
+
+
+async def play(
+    frames: Iterable[TouchFrame], deliver: Callable[[TouchFrame], None], *, speed: float = 1.0
+) -> None:
+    """Deliver frames, times from 0 s, on the event loop's clock.
+
+    A frame with touches is repeated every 50 ms. speed: relative to the recording.
     """
     loop = asyncio.get_running_loop()
     start = loop.time()
-    last: dict[str, TouchFrame] = {frame.source: frame for frame in frames}
-    end = max(frame.time for frame in frames) + REPEAT_INTERVAL * speed
-    lifted = [replace(frame, time=end, touches=()) for frame in last.values() if frame.touches]
     current: dict[str, TouchFrame] = {}
-    for frame in (*frames, *lifted):
+    for frame in frames:
         due = start + frame.time / speed
         while current and loop.time() + REPEAT_INTERVAL < due:
             await asyncio.sleep(REPEAT_INTERVAL)

@@ -6,20 +6,20 @@ from collections.abc import Callable
 
 from drivers import clock
 
+LOG_INTERVAL = 1.0  # s
+
 
 class RejectCounter:
-    """Counts by reason, and logs at most once per interval [s]; clock [s]."""
+    """Counts by reason, and logs at most once per LOG_INTERVAL; clock [s]."""
 
     def __init__(
         self,
         logger: logging.Logger,
         *,
-        interval: float = 1.0,
         clock: Callable[[], float] = clock.now,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._logger = logger
-        self._interval = interval
         self._clock = clock
         self._unlogged = 0
         self._logged_at: float | None = None
@@ -29,7 +29,7 @@ class RejectCounter:
         self.counts[reason] += 1
         self._unlogged += 1
         now = self._clock()
-        if self._logged_at is not None and now - self._logged_at < self._interval:
+        if self._logged_at is not None and now - self._logged_at < LOG_INTERVAL:
             return
         self._logger.warning(
             "%s: %s (new=%d, total: %s)",

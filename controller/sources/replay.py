@@ -1,16 +1,15 @@
 """TUIO captures as a touch source."""
 
 import logging
-import math
 from collections.abc import Callable
 from pathlib import Path
-from urllib.parse import parse_qsl
 
 from controller.sources.capture import read_capture
-from controller.sources.playing import play
+from controller.sources.playing import play, with_lifts
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import TouchFrame, TouchSource
 from controller.sources.tuio import TuioReader
+from controller.sources.url_options import number_option
 from model.errors import InputError
 
 _logger = logging.getLogger(__name__)
@@ -33,9 +32,10 @@ class ReplaySource(TouchSource):
             reader.read(datagram.payload, (Path(path).name, 0), now=datagram.time)
             for datagram in read_capture(path)
         ]
-        self.frames = [frame for frame in frames if frame is not None]
-        if not self.frames:
+        touched = [frame for frame in frames if frame is not None]
+        if not touched:
             raise InputError(f"touch source {url}: capture must contain touches; record it again")
+        self.frames = with_lifts(touched, speed=self._speed)
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver the frames of the capture at its pace."""
@@ -44,12 +44,8 @@ class ReplaySource(TouchSource):
 
 def _speed(url: str, options: str) -> float:
     """Return the speed option of a URL; raises InputError."""
-    asked = dict(parse_qsl(options, keep_blank_values=True))
-    try:
-        speed = float(asked.pop("speed", "1"))
-    except ValueError:
-        speed = math.nan
-    if asked or not 0.01 <= speed <= 100:
+    speed = number_option(options, "speed", default=1.0)
+    if not 0.01 <= speed <= 100:  # NaN is not
         raise InputError(
             f"touch source {url}: options must be ?speed=N with N from 0.01 to 100, got ?{options}"
         )

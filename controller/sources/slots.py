@@ -13,6 +13,8 @@ from controller.sources.touch import Touch
 EV_SYN, EV_ABS = 0x00, 0x03
 SYN_REPORT, SYN_MT_REPORT, SYN_DROPPED = 0, 2, 3
 ABS_MT_SLOT, ABS_MT_POSITION_X, ABS_MT_POSITION_Y, ABS_MT_TRACKING_ID = 0x2F, 0x35, 0x36, 0x39
+ABS_MT_TOUCH_MAJOR, ABS_MT_TOOL_TYPE, ABS_MT_PRESSURE, ABS_MT_DISTANCE = 0x30, 0x37, 0x3A, 0x3B
+MT_TOOL_FINGER = 0  # others are a pen, a palm, a dial
 
 Range: TypeAlias = tuple[int, int]  # lowest and highest value of an axis
 
@@ -23,7 +25,7 @@ class EventError(ValueError):
 
 @dataclass(frozen=True)
 class Report:
-    """What a panel reported up to a SYN_REPORT.
+    """Events of a panel up to a SYN_REPORT.
 
     states: all its touches, for each state within the report, so that a contact is seen that comes
     and goes within it or is replaced in its slot. is_partial: events were lost before it, so that
@@ -36,11 +38,18 @@ class Report:
 
 @dataclass(frozen=True)
 class SlotState:
-    """The kernel's state of a slot; tracking_id is negative without a contact."""
+    """The kernel's state of a slot; tracking_id is negative without a contact.
+
+    Values of axes that the panel does not have are 0.
+    """
 
     tracking_id: int
     x: int
     y: int
+    tool: int = MT_TOOL_FINGER
+    distance: int = 0
+    pressure: int = 0
+    touch_major: int = 0
 
 
 @dataclass
@@ -49,12 +58,27 @@ class _Slot:
 
     contact: id of the touch, None without a contact. is_certain: whether a tracking id was
     reported; a slot that moves without one has had its contact since before the first event.
+    tool: MT_TOOL_FINGER for a finger; palms and pens are ignored. distance: above 0 while hovering,
+    ignored.
     """
 
     contact: int | None = None
     is_certain: bool = False
     x: float | None = None
     y: float | None = None
+    tool: int = MT_TOOL_FINGER
+    distance: int = 0
+    pressure: float | None = None
+    touch_major: float | None = None
+
+    @property
+    def touch(self) -> Touch | None:
+        """The touch, None unless a finger with known coordinates is on the panel."""
+        if self.contact is None or self.x is None or self.y is None:
+            return None
+        if self.tool != MT_TOOL_FINGER or self.distance > 0:
+            return None
+        return Touch(self.contact, self.x, self.y, self.pressure, self.touch_major)
 
 
 class SlotReader:
@@ -62,12 +86,13 @@ class SlotReader:
 
     A contact appears once both its coordinates are known. A slot keeps the coordinates of its last
     contact, since the kernel omits values that did not change. Contacts that were down before the
-    first event have negative ids.
+    first event have negative ids. Palms, pens and what hovers are no touches: a finger that becomes
+    a palm is lifted. ranges: of the axes ABS_MT_POSITION_X and _Y, and of ABS_MT_PRESSURE and
+    ABS_MT_TOUCH_MAJOR where there are any.
     """
 
-    def __init__(self, x_range: Range, y_range: Range, *, first_slot: int = 0) -> None:
-        self._x_range = x_range
-        self._y_range = y_range
+    def __init__(self, ranges: Mapping[int, Range], *, first_slot: int = 0) -> None:
+        self._ranges = ranges
         self._slots: dict[int, _Slot] = {}
         self._current = first_slot
         self._anonymous = 0
@@ -77,12 +102,9 @@ class SlotReader:
 
     @property
     def touches(self) -> tuple[Touch, ...]:
-        """All contacts with known coordinates, by slot."""
-        return tuple(
-            Touch(slot.contact, slot.x, slot.y)
-            for _, slot in sorted(self._slots.items())
-            if slot.contact is not None and slot.x is not None and slot.y is not None
-        )
+        """All touches, by slot."""
+        touches = (slot.touch for _, slot in sorted(self._slots.items()))
+        return tuple(touch for touch in touches if touch is not None)
 
     def take(self, kind: int, code: int, value: int) -> Report | None:
         """Process one event (EV_..., code and value); return the report that it completes, or None.
@@ -109,8 +131,12 @@ class SlotReader:
             number: _Slot(
                 contact=state.tracking_id if state.tracking_id >= 0 else None,
                 is_certain=True,
-                x=_share(state.x, self._x_range),
-                y=_share(state.y, self._y_range),
+                x=self._share(ABS_MT_POSITION_X, state.x),
+                y=self._share(ABS_MT_POSITION_Y, state.y),
+                tool=state.tool,
+                distance=state.distance,
+                pressure=self._share(ABS_MT_PRESSURE, state.pressure),
+                touch_major=self._share(ABS_MT_TOUCH_MAJOR, state.touch_major),
             )
             for number, state in slots.items()
         }
@@ -141,12 +167,21 @@ class SlotReader:
                 self._anonymous += 1
                 slot.contact = -self._anonymous  # tracking ids are never negative
             if code == ABS_MT_POSITION_X:
-                slot.x = _share(value, self._x_range)
+                slot.x = self._share(code, value)
             else:
-                slot.y = _share(value, self._y_range)
+                slot.y = self._share(code, value)
+        elif code == ABS_MT_TOOL_TYPE:
+            slot.tool = value
+        elif code == ABS_MT_DISTANCE:
+            slot.distance = value
+        elif code == ABS_MT_PRESSURE:
+            slot.pressure = self._share(code, value)
+        elif code == ABS_MT_TOUCH_MAJOR:
+            slot.touch_major = self._share(code, value)
 
-
-def _share(value: int, limits: Range) -> float:
-    """Return a value relative to the range of its axis, 0..1 within it."""
-    low, high = limits
-    return (value - low) / (high - low)
+    def _share(self, code: int, value: int) -> float | None:
+        """Return a value relative to the range of its axis, 0..1 within it; None without one."""
+        if code not in self._ranges:
+            return None
+        low, high = self._ranges[code]
+        return (value - low) / (high - low)

@@ -8,16 +8,19 @@ Specification". A bundle with any malformed message is ignored as a whole.
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 
+from controller.sources.contacts import CONTACT_TIMEOUT, MAX_CONTACT_TIMEOUT
 from controller.sources.datagrams import Datagram, Datagrams, Peer, listen
 from controller.sources.osc import OscError, osc_messages
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchFrame, TouchSource
+from controller.sources.url_options import number_option
 from model.errors import InputError
 
 ADDRESS = "/tuio/2Dcur"
@@ -33,6 +36,9 @@ _SOURCE = b"source\0\0"  # OSC string, NUL-padded
 # restart within the first 100 frames shows by the pause: reordered frames are never this late.
 _LATE_FRAMES = 100
 _LATE_SECONDS = 0.5
+# Senders such as the reference implementation are silent while fingers rest; some repeat the alive
+# message once a second.
+DEFAULT_TIMEOUT = 3.0  # s
 
 _logger = logging.getLogger(__name__)
 
@@ -49,9 +55,10 @@ class _Bundle:
 
 @dataclass
 class _Sender:
-    """The state of one sender."""
+    """The state of one sender; peer: the host and port that it was last heard from."""
 
     last_heard: float
+    peer: Peer
     sequence: int = 0
     sequence_time: float = -math.inf  # when that sequence number arrived
     alive: tuple[int, ...] = ()
@@ -62,14 +69,17 @@ class TuioReader:
     """Datagrams in, touch frames out; no socket, no clock.
 
     Senders are distinguished by the name in their source message and their host, or without a name
-    by host and port. Never raises: unusable datagrams are counted in `rejects`.
+    by host and port; where there are too many, a sender of the busiest peer is dropped. Every
+    bundle with cursors or an alive message confirms all contacts of its sender for the timeout [s].
+    Never raises: unusable datagrams are counted in `rejects`.
     """
 
-    def __init__(self, rejects: RejectCounter) -> None:
+    def __init__(self, rejects: RejectCounter, *, timeout: float = DEFAULT_TIMEOUT) -> None:
         self.rejects = rejects
+        self._timeout = timeout
         self._senders: dict[str, _Sender] = {}
 
-    def read(self, datagram: bytes, peer: tuple[str, int], *, now: float) -> TouchFrame | None:
+    def read(self, datagram: bytes, peer: Peer, *, now: float) -> TouchFrame | None:
         """Return the frame that a datagram completes at now [s], or None.
 
         A cursor that is alive but was never set is omitted; positions may be NaN.
@@ -87,48 +97,68 @@ class TuioReader:
         name = f"tuio:{peer[0]}:{peer[1]}"
         if bundle.source is not None:
             name = f"tuio:{peer[0]}/{bundle.source}"
-        sender = self._sender(name, now)
-        if sender is None or self._is_late(bundle.sequence, sender, name, now=now):
+        sender = self._sender(name, peer, now)
+        if sender is None or not self._accept_sequence(bundle.sequence, sender, name, now=now):
             return None
         for x, y in bundle.positions.values():
             if not (math.isfinite(x) and math.isfinite(y)):
                 self.rejects.count("not_finite", f"{name} sent a cursor at ({x}, {y})")
-        sender.last_heard = now
+        sender.last_heard, sender.peer = now, peer
         if bundle.alive is not None:
             sender.alive = tuple(dict.fromkeys(bundle.alive))
         known = sender.positions | bundle.positions
         sender.positions = {id: known[id] for id in sender.alive if id in known}
         touches = tuple(Touch(id, x, y) for id, (x, y) in sender.positions.items())
-        return TouchFrame(name, now, touches)
+        return TouchFrame(name, now, touches, self._timeout, origin=f"tuio:{peer[0]}:{peer[1]}")
 
-    def _sender(self, name: str, now: float) -> _Sender | None:
+    def _sender(self, name: str, peer: Peer, now: float) -> _Sender | None:
         """Return the state of a sender, a new one if it is unknown, None if there are too many."""
         if name not in self._senders:
             if len(self._senders) >= _MAX_SENDERS:
-                oldest = min(self._senders, key=lambda known: self._senders[known].last_heard)
-                if now - self._senders[oldest].last_heard < _LATE_SECONDS:
+                evicted = self._sender_to_evict(peer, now)
+                if evicted is None:
                     self.rejects.count("too_many_senders", f"{name} is ignored")
                     return None
-                del self._senders[oldest]
-            self._senders[name] = _Sender(last_heard=now)
+                del self._senders[evicted]
+            self._senders[name] = _Sender(now, peer)
         return self._senders[name]
 
-    def _is_late(self, sequence: int | None, sender: _Sender, name: str, *, now: float) -> bool:
-        """Whether a newer frame has arrived before; stores the number otherwise.
+    def _sender_to_evict(self, peer: Peer, now: float) -> str | None:
+        """Return the sender to drop for a new sender of this peer; None if there is none.
+
+        It is the one not heard from for longest if that has been idle, or else of the busiest peer.
+        """
+
+        def oldest(names: Iterable[str]) -> str:
+            return min(names, key=lambda name: self._senders[name].last_heard)
+
+        idle = oldest(self._senders)
+        if now - self._senders[idle].last_heard >= _LATE_SECONDS:
+            return idle
+        counts = Counter(sender.peer for sender in self._senders.values())
+        ((busiest, count),) = counts.most_common(1)
+        if count <= counts[peer] + 1:
+            return None
+        return oldest(name for name, sender in self._senders.items() if sender.peer == busiest)
+
+    def _accept_sequence(
+        self, sequence: int | None, sender: _Sender, name: str, *, now: float
+    ) -> bool:
+        """Store a sequence number and return True, or False if a newer frame has arrived before.
 
         Bundles without a number and redundant ones (-1) are never late; a frame split over
         several bundles repeats its number.
         """
         if sequence is None or sequence < 0:
-            return False
+            return True
         behind = sender.sequence - sequence
         if behind > 0:
             if behind <= _LATE_FRAMES and now - sender.sequence_time < _LATE_SECONDS:
                 self.rejects.count("late", f"frame {sequence} of {name} after {sender.sequence}")
-                return True
+                return False
             sender.alive, sender.positions = (), {}  # a restarted sender
         sender.sequence, sender.sequence_time = sequence, now
-        return False
+        return True
 
 
 def _read_bundle(datagram: bytes) -> _Bundle:
@@ -208,15 +238,17 @@ class TuioSource(TouchSource):
     """Listens for TUIO at `tuio:HOST:PORT`, `tuio:PORT` or `tuio:` (127.0.0.1:3333).
 
     Port 0 selects a free port. A touch table on another machine needs an explicit HOST, because
-    TUIO has no authentication. Raises InputError for any other URL.
+    TUIO has no authentication. `?timeout=SECONDS`: how long a resting finger stays without a
+    bundle. Raises InputError for any other URL.
     """
 
     def __init__(self, url: str) -> None:
-        self.host, self._port = _host_and_port(url)
+        address, _, options = url.partition("?")
+        self.host, self._port = _host_and_port(address)
         self.rejects = RejectCounter(_logger)
         self._url = url
         self._endpoint: Datagrams | None = None
-        self._reader = TuioReader(self.rejects)
+        self._reader = TuioReader(self.rejects, timeout=_timeout(url, options))
         self._deliver: Callable[[TouchFrame], None] | None = None
 
     @property
@@ -237,7 +269,7 @@ class TuioSource(TouchSource):
                 self._port,
                 self._received,
                 max_size=_MAX_DATAGRAM,
-                thin=without_superseded,
+                drop_superseded=without_superseded,
             )
         except OSError as error:
             raise InputError(
@@ -264,6 +296,17 @@ class TuioSource(TouchSource):
         frame = self._reader.read(datagram, peer, now=arrived)
         if frame is not None:
             self._deliver(frame)
+
+
+def _timeout(url: str, options: str) -> float:
+    """Return the timeout option [s] of a URL; raises InputError."""
+    timeout = number_option(options, "timeout", default=DEFAULT_TIMEOUT)
+    if not CONTACT_TIMEOUT <= timeout <= MAX_CONTACT_TIMEOUT:  # NaN is not
+        raise InputError(
+            f"touch source {url}: options must be ?timeout=SECONDS from {CONTACT_TIMEOUT:g} to "
+            f"{MAX_CONTACT_TIMEOUT:g}, got ?{options}"
+        )
+    return timeout
 
 
 def _host_and_port(url: str) -> tuple[str, int]:

@@ -23,8 +23,15 @@ _T = TypeVar("_T")
 class Port(Protocol):
     """An open serial port; data and loss are reported to the callbacks of its opening."""
 
+    @property
+    def is_blocked(self) -> bool:
+        """Whether it has not taken all bytes yet."""
+
     def write(self, data: bytes) -> None:
-        """Send bytes; LinkTimeout if the line is blocked, LinkError if it is lost."""
+        """Send bytes without waiting, as soon as the line takes them; LinkError if it is lost.
+
+        They replace the unsent rest of earlier ones.
+        """
 
     def close(self) -> None:
         """Close it; no callback is called any more."""
@@ -36,8 +43,11 @@ class Port(Protocol):
 class Adapter(Protocol):
     """An open CAN adapter; frames and loss are reported to the callbacks of its opening."""
 
-    def send(self, frames: Sequence[CanFrame]) -> None:
-        """Send frames back to back; LinkError if the bus is lost."""
+    def send(self, frames: Sequence[CanFrame]) -> int:
+        """Send frames back to back without waiting; LinkError if the bus is lost.
+
+        Returns how many of them the adapter took: fewer while its transmit queue is full.
+        """
 
     def close(self) -> None:
         """Close it; no callback is called any more."""

@@ -20,7 +20,7 @@ class SharedLine(ABC, Generic[_OpenT]):
     """
 
     address_term: ClassVar[str]
-    """What this wire calls the number of a user: address, unit or node."""
+    """Word of this wire for the number of a user: address, unit or node."""
 
     def __init__(self, name: str) -> None:
         self.name = name

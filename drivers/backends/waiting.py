@@ -33,3 +33,5 @@ async def reply_within(reply: "asyncio.Future[_T]", timeout: float) -> _T:
         return await reply
     finally:
         timer.cancel()
+        if reply.done() and not reply.cancelled():
+            reply.exception()  # it counts as retrieved where this wait was cancelled

@@ -5,7 +5,7 @@ from typing import TypeVar
 
 from drivers.backend import Backend
 from drivers.errors import LinkError
-from drivers.protocol.messages import AmplifierEvent
+from drivers.protocol.messages import AmplifierEvent, Request, Stop
 from drivers.statistics import WireCounters
 
 _LineT = TypeVar("_LineT")
@@ -14,13 +14,13 @@ _LineT = TypeVar("_LineT")
 class WireBackend(Backend):
     """A backend with counters and callbacks.
 
-    Subclasses count in `_counters`, set `_last_sent` when a request has gone out, `_loss` when the
-    wire is lost, and call `_on_event` and `_on_loss`, which have no effect before `listen`.
+    Subclasses count in `_counters`, set `_last_sent_at` when a request has gone out, `_loss` when
+    the wire is lost, and call `_on_event` and `_on_loss`, which have no effect before `listen`.
     """
 
     def __init__(self) -> None:
         self._counters = WireCounters()
-        self._last_sent = 0.0
+        self._last_sent_at = 0.0
         self._on_event: Callable[[AmplifierEvent], None] = _ignore
         self._on_loss: Callable[[str], None] = _ignore
         self._loss: str | None = None  # until reopened, even if others have joined the line again
@@ -31,9 +31,9 @@ class WireBackend(Backend):
         return self._counters
 
     @property
-    def last_sent(self) -> float:
+    def last_sent_at(self) -> float:
         """Time [s] when system or adapter took the last byte, by the event loop's clock."""
-        return self._last_sent
+        return self._last_sent_at
 
     def listen(
         self, on_event: Callable[[AmplifierEvent], None], on_loss: Callable[[str], None]
@@ -41,9 +41,9 @@ class WireBackend(Backend):
         """See `Backend.listen`."""
         self._on_event, self._on_loss = on_event, on_loss
 
-    def _require(self, line: _LineT | None, place: str) -> _LineT:
-        """Return the open line; LinkError if it is not open, or lost."""
-        if line is None or self._loss is not None:
+    def _require(self, line: _LineT | None, place: str, request: Request) -> _LineT:
+        """Return the open line; LinkError if it is not open, or lost, except for a Stop."""
+        if line is None or (self._loss is not None and not isinstance(request, Stop)):
             raise LinkError(self._loss or f"{place} is not open; open the amplifier first")
         return line
 

@@ -40,7 +40,7 @@ def _checks(*several: Steps, drives: bool) -> tuple[Check, ...]:
     return tuple(
         Check(
             name=steps.__name__,
-            proves=(steps.__doc__ or "").removeprefix("It ").removesuffix("."),
+            requirement=(steps.__doc__ or "").removeprefix("It ").removesuffix("."),
             drives=drives,
             run=steps,
         )

@@ -13,10 +13,10 @@ Steps: TypeAlias = Callable[[Bench], Coroutine[None, None, None]]
 
 @dataclass(frozen=True)
 class Check:
-    """A requirement: its name, what it proves, and whether outputs are driven for it."""
+    """A requirement: its name, what it requires, and whether outputs are driven for it."""
 
     name: str
-    proves: str
+    requirement: str
     drives: bool
     run: Steps
 

@@ -86,7 +86,7 @@ def with_slcan(place: Candidate) -> Candidate:
 async def _ask(url: str) -> Found:
     try:
         amplifier = Amplifier(open_backend(url))
-        await amplifier.open()
+        await amplifier.open(take_over=False)
     except DriverError as problem:
         was_asked = isinstance(problem, LinkTimeout | FrameError)
         return Found(url, None, str(problem), was_asked=was_asked)

@@ -5,10 +5,10 @@ from drivers.guard.limits import (
     FREQUENCY_CEILING,
     FREQUENCY_FLOOR,
     LEVEL_CEILING,
-    GuardLimits,
     limits_in_force,
 )
 from drivers.guard.required import require_safe
+from registry.limits import GuardLimits
 
 __all__ = [
     "FREQUENCY_CEILING",

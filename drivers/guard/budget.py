@@ -3,85 +3,99 @@
 from collections import deque
 
 from drivers.errors import CommandRefused
-from drivers.guard.limits import GuardLimits
+from registry.limits import GuardLimits
 
 DUTY_WINDOW = 10.0
 """Window of the duty limit [s]; short against the thermal time constant of an amplifier."""
 
-_BURST = 1.0  # s; unused rate can be caught up within it
-_ROUNDING = 1e-6  # of a set; a caller that waits until the given moment must pass
+COMMIT_DELAY = 0.1
+"""Longest time [s] from sending a set until it is played: three attempts of 30 ms each."""
+
+CHECK_DELAY = 0.25
+"""Longest time [s] from a check until the set is played, envelopes loaded in between."""
+
+_RATE_WINDOW = 1.0  # s
 
 
 class Budget:
-    """Counts checked sets and vibration time; times [s] are arguments and never decrease."""
+    """Sets sent and the longest time they may vibrate; times [s] are arguments."""
 
     def __init__(self, limits: GuardLimits) -> None:
-        self._rate = limits.rate
-        self._on_time = limits.on_time
-        self._duty_time = limits.duty * DUTY_WINDOW if limits.duty < 1 else None
-        self._allowance = limits.rate * _BURST  # sets that may be sent now
-        self._counted = 0.0
+        self._limits = limits
+        self._duty_time = limits.duty * DUTY_WINDOW if limits.duty < 1 else float("inf")
+        allowed = max(1, int(limits.rate * _RATE_WINDOW))
+        # Sets that were delayed on their way arrive closer together than they were sent.
+        self._window = max(_RATE_WINDOW, allowed / limits.rate) + COMMIT_DELAY
+        self._sent: deque[float] = deque(maxlen=allowed)
         self._vibrations: deque[tuple[float, float]] = deque()  # ended ones: begin, end
-        self._since: float | None = None  # begin of the present one
-        self._until = 0.0  # end of the present one by valid_for
+        self._begin: float | None = None  # earliest begin of the present one
+        self._end = 0.0  # its latest end
 
-    def remaining(self, now: float) -> float | None:
-        """Longest vibration [s] that may start now; None if unlimited.
+    def remaining(self, now: float, *, fade: float, delay: float = CHECK_DELAY) -> float:
+        """Longest valid_for [s] of a vibration that is sent now, infinite if unlimited.
 
-        Raises CommandRefused if no time is left or the rate is exceeded.
+        fade [s]: how long it takes to end after that; delay [s]: allowance until it is played,
+        while the present vibration goes on. Raises CommandRefused if no time is left or the rate is
+        exceeded.
         """
-        self._refill(now)
-        if self._allowance < 1 - _ROUNDING:
+        if len(self._sent) == self._sent.maxlen and now < self._sent[0] + self._window:
             raise CommandRefused(
-                f"rate must be at most {self._rate:g} command sets a second; send fewer, the limit "
-                "stops runaway loops",
-                until=now + (1 - self._allowance) / self._rate,
+                f"rate must be at most {self._limits.rate:g} command sets a second; send fewer, "
+                "the limit stops runaway loops",
+                until=self._sent[0] + self._window,
             )
-        used = 0.0 if self._since is None else now - self._since
-        left = [_left("on-time limit", used, self._on_time)]
-        if self._duty_time is not None:
-            name = f"duty limit over {DUTY_WINDOW:g} s"
-            left.append(_left(name, self._used(now), self._duty_time))
-        shortest = min(left)
-        return None if shortest == float("inf") else shortest
+        is_vibrating = self._begin is not None and now < self._end
+        spent = fade + (delay if is_vibrating else 0.0)
+        used = now - self._begin if is_vibrating and self._begin is not None else 0.0
+        return min(
+            _left("on-time limit", used, self._limits.on_time, spent),
+            _left(f"duty limit over {DUTY_WINDOW:g} s", self._used(now), self._duty_time, spent),
+        )
 
-    def note(self, now: float, *, lasts: float) -> None:
-        """Count a checked set: vibration for a time [s], 0 for silence."""
-        self._refill(now)
-        if lasts > 0:
-            self._allowance -= 1
-            self._since = now if self._since is None else self._since
-            self._until = now + lasts
-        elif self._since is not None:
-            self._end(now)
+    def fade_left(self, now: float) -> float:
+        """Longest time [s] in which the present vibration may fade if silence is sent now."""
+        if self._begin is None or now >= self._end:
+            return float("inf")
+        used = max(self._used(now) - self._duty_time, now - self._begin - self._limits.on_time)
+        return max(0.0, -used - COMMIT_DELAY)
 
-    def _refill(self, now: float) -> None:
-        """Advance the token bucket and end expired vibrations."""
-        if self._since is not None and self._until <= now:
-            self._end(self._until)
+    def sent(self, now: float, *, lasts: float) -> None:
+        """Note a set that vibrates for at most a time [s], its fade included."""
+        self._sent.append(now)
+        self._close(now)
+        if self._begin is None:
+            self._begin, self._end = now, now
+        self._end = max(self._end, now + COMMIT_DELAY + lasts)
+
+    def confirm(self, since: float, now: float, *, end: float) -> None:
+        """Note that the set sent at a time [s] plays, and ends at another at the latest."""
+        self._close(now)
+        if self._begin is None and now < end:
+            self._begin = since
+        self._end = end
+
+    def _close(self, now: float) -> None:
+        """File the present vibration once it has ended."""
+        if self._begin is not None and self._end <= now:
+            self._vibrations.append((self._begin, self._end))
+            self._begin = None
         while self._vibrations and self._vibrations[0][1] < now - DUTY_WINDOW:
             self._vibrations.popleft()
-        self._allowance = min(
-            self._rate * _BURST, self._allowance + (now - self._counted) * self._rate
-        )
-        self._counted = now
-
-    def _end(self, moment: float) -> None:
-        if self._since is not None:
-            self._vibrations.append((self._since, moment))
-        self._since = None
 
     def _used(self, now: float) -> float:
         """Vibration time within the window before now [s]."""
         opened = now - DUTY_WINDOW
-        present = () if self._since is None else ((self._since, now),)
+        present = () if self._begin is None else ((self._begin, min(now, self._end)),)
         spans = [end - max(begin, opened) for begin, end in (*self._vibrations, *present)]
         return sum((max(0.0, span) for span in spans), start=0.0)
 
 
-def _left(name: str, used: float, limit: float) -> float:
-    """Return the time [s] that a limit leaves; CommandRefused if none."""
-    left = limit - used
+def _left(name: str, used: float, limit: float, spent: float) -> float:
+    """Return the time [s] of a limit that is not spent; CommandRefused if none."""
+    left = limit - used - spent
     if left <= 0:
-        raise CommandRefused(f"{name} ({used:.3g} s of {limit:.3g} s) reached; pause the vibration")
+        raise CommandRefused(
+            f"{name} of {limit:.3g} s reached ({used:.3g} s used, {spent:.3g} s to end); pause the "
+            "vibration"
+        )
     return left

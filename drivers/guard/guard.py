@@ -3,17 +3,28 @@
 Its limits are fixed at construction, see `drivers.guard.limits`.
 """
 
+import math
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from typing import final
 
 from drivers.clock import now
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandRefused
-from drivers.guard.budget import Budget
-from drivers.guard.limits import GuardLimits, capabilities_in_force, limits_in_force
-from drivers.guard.rules import GuardContext, check_envelope, check_set, is_finite, is_token
+from drivers.guard.channel_state import duration
+from drivers.guard.limits import capabilities_in_force, limits_in_force
+from drivers.guard.record import PlayRecord, skips_endings, vibrates
+from drivers.guard.rules import (
+    GuardContext,
+    check_envelope,
+    check_power,
+    check_set,
+    is_finite,
+    is_token,
+)
 from drivers.protocol.definition import PROTOCOL, token_after
 from drivers.protocol.messages import Capabilities
+from registry.limits import GuardLimits
 
 _KEY = object()
 
@@ -22,10 +33,12 @@ _KEY = object()
 class SafeCommandSet(CommandSet):
     """A command set that has passed a guard; only a `Guard` can make one.
 
-    settled_after [s]: time from its commit until all ramps and envelopes have ended.
+    settled_after [s]: time from its commit until all ramps and envelopes have ended; record: of the
+    guard, for `Amplifier`.
     """
 
     settled_after: float
+    record: PlayRecord
 
     def __init__(
         self,
@@ -35,12 +48,14 @@ class SafeCommandSet(CommandSet):
         ramp: float,
         valid_for: float,
         settled_after: float = 0.0,
+        record: PlayRecord | None = None,
         key: object = None,
     ) -> None:
-        if key is not _KEY:
+        if key is not _KEY or record is None:
             raise TypeError("SafeCommandSet must be made by Guard.check or Guard.silence")
         super().__init__(token=token, commands=commands, ramp=ramp, valid_for=valid_for)
         object.__setattr__(self, "settled_after", settled_after)
+        object.__setattr__(self, "record", record)
 
     def __init_subclass__(cls) -> None:
         raise TypeError("SafeCommandSet cannot be subclassed")
@@ -48,14 +63,23 @@ class SafeCommandSet(CommandSet):
 
 @final
 class SafeEnvelope(Envelope):
-    """An envelope that has passed a guard; only a `Guard` can make one."""
+    """An envelope that has passed a guard; only a `Guard` can make one. record: of the guard."""
+
+    record: PlayRecord
 
     def __init__(
-        self, slot: int, step: float, knots: tuple[Knot, ...], *, key: object = None
+        self,
+        slot: int,
+        step: float,
+        knots: tuple[Knot, ...],
+        *,
+        record: PlayRecord | None = None,
+        key: object = None,
     ) -> None:
-        if key is not _KEY:
+        if key is not _KEY or record is None:
             raise TypeError("SafeEnvelope must be made by Guard.check_envelope")
         super().__init__(slot=slot, step=step, knots=knots)
+        object.__setattr__(self, "record", record)
 
     def __init_subclass__(cls) -> None:
         raise TypeError("SafeEnvelope cannot be subclassed")
@@ -65,9 +89,9 @@ class SafeEnvelope(Envelope):
 class Guard:
     """Checks the command sets of one amplifier.
 
-    limits: the configured ones. clock [s]: for rate,
-    on-time and duty, the event loop's by default. Raises CommandError for limits that leave nothing
-    to play.
+    limits: the configured ones. clock [s]: the event loop's by default. Raises CommandError for
+    limits that leave nothing to play. Checking a set changes nothing: `Amplifier` records in
+    `SafeCommandSet.record` what it sends and what is confirmed.
     """
 
     def __init__(
@@ -77,75 +101,71 @@ class Guard:
         *,
         clock: Callable[[], float] = now,
     ) -> None:
+        self._made_for = (limits, capabilities)
         self._limits = limits_in_force(limits, capabilities)
         self._capabilities = capabilities_in_force(capabilities)
-        self._clock = clock
-        self._budget = Budget(self._limits)
-        self._last_token = 0
-        self._playing: dict[int, DriveCommand] = {}
-        self._loaded: dict[int, SafeEnvelope] = {}
+        self._record = PlayRecord(self._limits, self._capabilities.channels, clock)
 
     @property
     def limits(self) -> GuardLimits:
         """The limits in force: the least of configuration, amplifier and ceilings."""
         return self._limits
 
+    def is_for(self, limits: GuardLimits, capabilities: Capabilities) -> bool:
+        """Whether it was made for these limits and capabilities."""
+        return self._made_for == (limits, capabilities)
+
     def check(self, command_set: CommandSet) -> SafeCommandSet:
         """Check a set. Raises CommandRefused with channel and reason.
 
-        valid_for is shortened to the on-time and duty that are left.
+        It is checked as the wire rounds it, ramps upward. valid_for is shortened to the on-time and
+        duty that are left; a set that is sent later than at once is checked again by then.
         """
         check_set(command_set, self._context)
-        valid_for = float(command_set.valid_for)
-        shaped = any(command.onset for command in command_set.commands)
-        if shaped or not command_set.is_silent:
-            remaining = self._budget.remaining(self._clock())
-            if remaining is not None:
-                valid_for = min(valid_for or remaining, remaining, _MAX_VALID_FOR)
-        # A silent channel gets a frequency that the amplifier accepts.
-        commands = tuple(
-            DriveCommand(
-                channel=int(command.channel),
-                frequency=float(
-                    command.frequency
-                    if command.level > 0 or command.onset
-                    else self._idle_frequency
-                ),
-                level=float(command.level),
-                phase=float(command.phase),
-                keep_phase=bool(command.keep_phase),
-                onset=int(command.onset),
-                ending=int(command.ending),
-                skip_ending=bool(command.skip_ending),
-            )
-            for command in command_set.commands
-        )
-        return self._make_safe(
-            int(command_set.token), commands, ramp=float(command_set.ramp), valid_for=valid_for
-        )
+        rounded = self._rounded(command_set)
+        check_power(rounded, self._context)
+        remaining = self._record.check(rounded, ramp=rounded.ramp)
+        valid_for = rounded.valid_for
+        if vibrates(rounded) and remaining != float("inf"):
+            valid_for = min(valid_for or remaining, remaining, _VALID_FOR.high)
+            # Rounded down; 0 on the wire would be without end.
+            valid_for = math.floor(valid_for * _VALID_FOR.per_unit) / _VALID_FOR.per_unit
+            if valid_for <= 0:
+                raise CommandRefused("on-time or duty limit reached; pause the vibration")
+            rounded = replace(rounded, valid_for=valid_for)
+        elif not vibrates(rounded):
+            rounded = replace(rounded, ramp=self._shortened(rounded.ramp))
+        return self._make_safe(rounded)
 
     def check_envelope(self, envelope: Envelope) -> SafeEnvelope:
         """Check an envelope. Raises CommandRefused with knot and reason.
 
-        Sets that refer to its slot are checked with it from now on: load it before them.
+        Sets that refer to its slot are checked with it too from now on: load it before them.
         """
         check_envelope(envelope, self._context)
-        knots = tuple(Knot(float(knot.level), float(knot.phase)) for knot in envelope.knots)
-        safe = SafeEnvelope(int(envelope.slot), float(envelope.step), knots, key=_KEY)
-        if knots:
-            self._loaded[safe.slot] = safe
-        else:
-            self._loaded.pop(safe.slot, None)
+        quantities = PROTOCOL.quantities
+        knots = tuple(
+            Knot(
+                quantities.level.quantise(float(knot.level)),
+                quantities.phase.quantise(float(knot.phase)),
+            )
+            for knot in envelope.knots
+        )
+        step = quantities.envelope_step.quantise(float(envelope.step))
+        safe = SafeEnvelope(int(envelope.slot), step, knots, record=self._record, key=_KEY)
+        check_envelope(safe, self._context)
+        self._record.expect_load(safe)
         return safe
 
     def silence(self, token: int, channels: Collection[int], *, ramp: float) -> SafeCommandSet:
         """Make a set with level zero on these channels; never fails.
 
         Channels not listed are silenced as well; an invalid token becomes the next valid one.
-        Unknown channels are skipped, a ramp [s] is clipped into range, no endings are played.
+        Unknown channels are skipped, no endings are played. A ramp [s] is clipped into range, and
+        to the on-time and duty that are left.
         """
         if not is_token(token):
-            token = token_after(self._last_token)
+            token = token_after(self._record.last_token)
         commands = tuple(
             DriveCommand(
                 channel=channel, frequency=self._idle_frequency, level=0.0, skip_ending=True
@@ -154,7 +174,8 @@ class Guard:
             if channel in channels
         )
         ramp = min(max(float(ramp), 0.0), self._capabilities.ramp_max) if is_finite(ramp) else 0.0
-        return self._make_safe(int(token), commands, ramp=ramp, valid_for=0.0)
+        silent = CommandSet(int(token), commands, ramp=self._shortened(ramp), valid_for=0.0)
+        return self._make_safe(silent)
 
     def check_or_silence(
         self, command_set: CommandSet, *, ramp: float
@@ -180,31 +201,66 @@ class Guard:
 
     @property
     def _context(self) -> GuardContext:
-        return GuardContext(self._limits, self._capabilities, self._playing, self._loaded)
+        return GuardContext(self._limits, self._capabilities, self._record.slots)
 
-    def _make_safe(
-        self, token: int, commands: tuple[DriveCommand, ...], *, ramp: float, valid_for: float
-    ) -> SafeCommandSet:
-        self._last_token = token
-        fades = [ramp]
-        if not all(command.skip_ending for command in commands):  # an earlier ending may play
-            fades += [_duration(envelope) for envelope in self._loaded.values()]
-        vibrates = any(command.level > 0 or command.onset for command in commands)
-        self._budget.note(self._clock(), lasts=(valid_for or _FOREVER) if vibrates else 0.0)
-        self._playing = {command.channel: command for command in commands if command.level > 0}
+    def _shortened(self, ramp: float) -> float:
+        """Return the ramp [s] of a silent set, shortened to the on-time and duty that are left."""
+        left = self._record.fade_left()
+        if ramp <= left:
+            return ramp
+        return math.floor(left * _RAMP.per_unit) / _RAMP.per_unit
+
+    def _rounded(self, command_set: CommandSet) -> CommandSet:
+        """Return a set that passed the rules as the wire carries it; a silent channel gets a
+        frequency that the amplifier accepts."""
+        quantities = PROTOCOL.quantities
+        valid_for = float(command_set.valid_for)
+        return CommandSet(
+            token=int(command_set.token),
+            commands=tuple(
+                DriveCommand(
+                    channel=int(command.channel),
+                    frequency=quantities.frequency.quantise(float(command.frequency))
+                    if command.level > 0 or command.onset
+                    else self._idle_frequency,
+                    level=quantities.level.quantise(float(command.level)),
+                    phase=quantities.phase.quantise(float(command.phase)),
+                    keep_phase=bool(command.keep_phase),
+                    onset=int(command.onset),
+                    ending=int(command.ending),
+                    skip_ending=bool(command.skip_ending),
+                )
+                for command in command_set.commands
+            ),
+            ramp=min(_rounded_up(command_set.ramp), self._capabilities.ramp_max),
+            # Rounded to 0 it would be without end.
+            valid_for=max(_VALID_FOR.quantise(valid_for), _VALID_FOR.step) if valid_for else 0.0,
+        )
+
+    def _make_safe(self, command_set: CommandSet) -> SafeCommandSet:
+        fades = [command_set.ramp]
+        if not skips_endings(command_set):  # an earlier ending may play
+            fades += [
+                duration(envelope)
+                for several in self._record.slots.values()
+                for envelope in several
+            ]
         return SafeCommandSet(
-            token,
-            commands,
-            ramp=ramp,
-            valid_for=valid_for,
+            command_set.token,
+            command_set.commands,
+            ramp=command_set.ramp,
+            valid_for=command_set.valid_for,
             settled_after=max(fades),
+            record=self._record,
             key=_KEY,
         )
 
 
-_MAX_VALID_FOR = PROTOCOL.quantities.valid_for.high
-_FOREVER = float("inf")
+def _rounded_up(ramp: float) -> float:
+    """Round a ramp [s] to the next step of the wire, so that no level rises faster."""
+    return math.ceil(float(ramp) * _RAMP.per_unit - _SLACK) / _RAMP.per_unit
 
 
-def _duration(envelope: Envelope) -> float:
-    return envelope.step * (len(envelope.knots) + 1)
+_SLACK = 1e-6  # of a step; sums of floats
+_VALID_FOR = PROTOCOL.quantities.valid_for
+_RAMP = PROTOCOL.quantities.ramp

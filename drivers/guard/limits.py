@@ -1,11 +1,12 @@
 """Limits in force: the least of the configuration, the amplifier's report and built-in ceilings."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from drivers.errors import CommandError
-from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import Capabilities
+from registry.limits import GuardLimits
 
 # Below 10 Hz a plate on springs only moves as a rigid body and nothing is felt.
 FREQUENCY_FLOOR = 10.0
@@ -15,25 +16,7 @@ FREQUENCY_CEILING = PROTOCOL.quantities.frequency.high
 LEVEL_CEILING = 1.0
 # No bus carries more sets per second, so a higher rate can only be a runaway loop.
 RATE_CEILING = 2000.0
-
-
-@dataclass(frozen=True)
-class GuardLimits:
-    """Limits of one amplifier: mechanical frequency [Hz] and level (1 is full stroke).
-
-    slew [1/s]: highest rise of a level; power: sum of squared levels over all channels; on_time
-    [s]: longest vibration without a pause; duty: share of `drivers.guard.budget.DUTY_WINDOW`;
-    rate [1/s]: command sets that are not silent. All of these are unlimited by default.
-    """
-
-    frequency_min: float
-    frequency_max: float
-    level: float
-    slew: float = math.inf
-    power: float = math.inf
-    on_time: float = math.inf
-    duty: float = 1.0
-    rate: float = math.inf
+_SLACK = 1e-6  # of a step; sums of floats
 
 
 def limits_in_force(configured: GuardLimits, capabilities: Capabilities) -> GuardLimits:
@@ -53,11 +36,15 @@ def limits_in_force(configured: GuardLimits, capabilities: Capabilities) -> Guar
     for name in ("slew", "power", "on_time", "duty", "rate"):
         if not getattr(configured, name) > 0:
             raise CommandError(f"{name} limit must be positive, got {getattr(configured, name):g}")
+    frequency, level = PROTOCOL.quantities.frequency, PROTOCOL.quantities.level
+    lowest = max(configured.frequency_min, capabilities.frequency_min, FREQUENCY_FLOOR)
+    highest = min(configured.frequency_max, capabilities.frequency_max, FREQUENCY_CEILING)
     limits = replace(
         configured,
-        frequency_min=max(configured.frequency_min, capabilities.frequency_min, FREQUENCY_FLOOR),
-        frequency_max=min(configured.frequency_max, capabilities.frequency_max, FREQUENCY_CEILING),
-        level=min(configured.level, capabilities.level_max, LEVEL_CEILING),
+        # In whole steps of the wire, so that no value is rounded beyond its limit.
+        frequency_min=-_whole_steps(-lowest, frequency),
+        frequency_max=_whole_steps(highest, frequency),
+        level=_whole_steps(min(configured.level, capabilities.level_max, LEVEL_CEILING), level),
         rate=min(configured.rate, RATE_CEILING),
     )
     if limits.frequency_min > limits.frequency_max:
@@ -69,6 +56,11 @@ def limits_in_force(configured: GuardLimits, capabilities: Capabilities) -> Guar
     if limits.level < 0:
         raise CommandError(f"level limit must be at least 0, got {limits.level:g}")
     return limits
+
+
+def _whole_steps(value: float, quantity: Quantity) -> float:
+    """Round a value down to a step of the wire."""
+    return math.floor(value * quantity.per_unit + _SLACK) / quantity.per_unit
 
 
 def capabilities_in_force(capabilities: Capabilities) -> Capabilities:

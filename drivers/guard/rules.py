@@ -1,33 +1,32 @@
 """Rules for one set or envelope: each passes or raises CommandRefused.
 
-    token -> times -> channels -> finite -> level -> frequency -> slots -> slew -> power
+    token -> times -> channels -> finite -> level -> frequency -> slots -> power
 
-Every rule may rely on those before it. Limits over time are in `drivers.guard.budget`.
+Every rule may rely on those before it. What depends on what plays is in `drivers.guard.record`.
 """
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from numbers import Integral, Real
 
 from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.errors import CommandRefused
-from drivers.guard.limits import GuardLimits
+from drivers.guard.channel_state import steepest_rise
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Capabilities
+from registry.limits import GuardLimits
 
 _ROUNDING = 1 + 1e-9  # sums of floats
 
 
 @dataclass(frozen=True)
 class GuardContext:
-    """What a set is checked against: limits, amplifier, playing channels and loaded slots."""
+    """Context of a check: limits, amplifier, and the envelopes that a slot may hold."""
 
     limits: GuardLimits
     capabilities: Capabilities
-    playing: Mapping[int, DriveCommand]
-    loaded: Mapping[int, Envelope]
+    slots: Mapping[int, Sequence[Envelope]]
 
 
 def check_set(command_set: CommandSet, context: GuardContext) -> None:
@@ -61,8 +60,12 @@ def check_envelope(envelope: Envelope, context: GuardContext) -> None:
                 f"knot {number} must have a level of 0 to {limits.level:g} and a finite phase, got "
                 f"{knot.level!r} and {knot.phase!r} degrees"
             )
-    levels = [knot.level for knot in envelope.knots]
-    _check_rises(levels, envelope.step, limits, what=f"envelope in slot {envelope.slot}")
+    rise = steepest_rise([knot.phasor for knot in envelope.knots])
+    if rise > limits.slew * envelope.step * _ROUNDING:
+        raise CommandRefused(
+            f"envelope in slot {envelope.slot}: level must rise by at most {limits.slew:g} per "
+            f"second, got {rise:g} within {envelope.step:g} s; use a longer step"
+        )
 
 
 def is_finite(value: object) -> bool:
@@ -143,38 +146,19 @@ def _check_slots(command_set: CommandSet, context: GuardContext) -> None:
                 raise _refused(
                     command, name, f"must be slot 0 (no envelope) to {slots}, got {slot!r}"
                 )
-            if slot and slot not in context.loaded:
+            if slot and slot not in context.slots:
                 raise _refused(
                     command, name, f"refers to empty slot {slot}; load an envelope into it first"
                 )
 
 
-def _check_slew(command_set: CommandSet, context: GuardContext) -> None:
-    for command in command_set.commands:
-        before = context.playing.get(command.channel)
-        is_same_tone = before is not None and before.frequency == command.frequency
-        start = before.level if before is not None and is_same_tone else 0.0
-        onset = context.loaded.get(command.onset)
-        what = f"channel {command.channel}"
-        if onset is None:
-            _check_rises([start, command.level], command_set.ramp, context.limits, what=what)
-        else:
-            levels = [start if command.keep_phase else 0.0, *(knot.level for knot in onset.knots)]
-            _check_rises([*levels, command.level], onset.step, context.limits, what=what)
+def check_power(command_set: CommandSet, context: GuardContext) -> None:
+    """Raise CommandRefused if the highest levels of all channels together exceed the power."""
 
-
-def _check_rises(levels: Sequence[float], step: float, limits: GuardLimits, *, what: str) -> None:
-    steepest = max((following - level for level, following in pairwise(levels)), default=0.0)
-    if steepest > limits.slew * step * _ROUNDING:
-        raise CommandRefused(
-            f"{what}: level must rise by at most {limits.slew:g} per second, got {steepest:g} "
-            f"within {step:g} s; use a longer ramp"
-        )
-
-
-def _check_power(command_set: CommandSet, context: GuardContext) -> None:
     def peak_level(command: DriveCommand) -> float:
-        envelopes = [context.loaded[slot] for slot in (command.onset, command.ending) if slot]
+        envelopes = [
+            one for slot in (command.onset, command.ending) if slot for one in context.slots[slot]
+        ]
         return max([command.level, *(knot.level for one in envelopes for knot in one.knots)])
 
     power = sum(peak_level(command) ** 2 for command in command_set.commands)
@@ -197,6 +181,5 @@ _RULES: tuple[Callable[[CommandSet, GuardContext], None], ...] = (
     _check_levels,
     _check_frequencies,
     _check_slots,
-    _check_slew,
-    _check_power,
+    check_power,
 )

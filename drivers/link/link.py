@@ -3,44 +3,57 @@
 A lost link stays lost until it is reopened: every request raises LinkError at once.
 """
 
-import asyncio
+import contextlib
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import asdict
 from typing import TypeVar, final
 
 from drivers import clock
 from drivers.backend import Backend
-from drivers.errors import FrameError, LinkError, LinkTimeout
+from drivers.errors import FrameError, LinkDegraded, LinkError, LinkTimeout
+from drivers.line.priority import priority_of
+from drivers.line.sender import Again, Sender, sender_of
 from drivers.link.refusals import PROTOCOL_VIOLATION, is_busy, refusal
-from drivers.link.turns import SUPERSEDED, Preempted, RequestPriority, Turns
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
     AmplifierEvent,
+    Apply,
     Broadcast,
     Capabilities,
+    Disarm,
     FaultList,
+    GetCaps,
+    GetFaults,
+    GetStatus,
+    Hello,
     Identity,
     Loaded,
     Nak,
     Reply,
     Request,
     Status,
+    Stop,
 )
 from drivers.statistics import LinkStatistics
 
 REPLY_TIMEOUT = 0.030  # s; a heartbeat and three of these are less than three heartbeats of 50 ms
 RETRIES = 2
 ASSUME_ENERGISED = (
-    ". Assume that the amplifier is energised until its watchdog has passed; opened again, it is "
+    ". Assume that the amplifier is energised until its watchdog has expired; opened again, it is "
     "disarmed"
 )
 """End of every message of a loss."""
 
+DEGRADED = (
+    ". The amplifier may play its last set until its watchdog has passed; nothing new is played "
+    "until it replies"
+)
+"""End of every message of a degraded link."""
+
 BUSY_PAUSE = 0.005  # s; before a retry to a busy amplifier; short against the latency of touch
 
-_ReplyT = TypeVar("_ReplyT", Identity, Capabilities, Status, Achieved, FaultList, Loaded)
+ReplyT = TypeVar("ReplyT", Identity, Capabilities, Status, Achieved, FaultList, Loaded)
 
 
 def retries_on(round_trip: float, *, reply_timeout: float = REPLY_TIMEOUT) -> int:
@@ -52,91 +65,103 @@ def retries_on(round_trip: float, *, reply_timeout: float = REPLY_TIMEOUT) -> in
     return RETRIES - 1 if is_slow else RETRIES
 
 
+def is_allowed_when_degraded(request: Request) -> bool:
+    """Whether a request silences the amplifier or does not feed its watchdog."""
+    if isinstance(request, Apply):
+        return request.command_set.is_silent
+    return isinstance(request, Stop | Disarm | GetStatus | GetFaults | Hello | GetCaps)
+
+
 @final
 class Link:
     """Serialises requests to one backend: priorities, retries, loss detection, statistics.
 
     reply_timeout [s]: of one exchange, extended on slow wires. Three requests in a row without a
-    reply are a loss; two on a wire too slow for three within three heartbeats, see `allow_for`.
-    on_event: called, in the event loop, with unsolicited events.
+    reply are a loss; two on a wire too slow for three within three heartbeats, see
+    `allow_longest_exchange`. on_event: called, in the event loop, with unsolicited events;
+    silent_from: returns the time [s] by which the amplifier's watchdog must have expired, minus
+    infinity if it was never armed.
+
+    Without a reply to several requests in a row the link is degraded while the amplifier may still
+    play, and lost once it must be silent. On a degraded link only requests are sent that silence
+    the amplifier or do not feed its watchdog; any reply restores it.
     """
 
     def __init__(
-        self, backend: Backend, *, reply_timeout: float, on_event: Callable[[AmplifierEvent], None]
+        self,
+        backend: Backend,
+        *,
+        reply_timeout: float,
+        on_event: Callable[[AmplifierEvent], None],
+        silent_from: Callable[[], float],
     ) -> None:
         self.backend = backend
+        self._silent_from = silent_from
         self._reply_timeout = reply_timeout
         self._retries_allowed = RETRIES
-        self._turns = Turns(lambda: backend.is_unsent)
+        self._sender = Sender()  # that of the line, once it is open
         self._loss: str | None = "the amplifier is not open yet; call open() first"
-        self._unanswered = 0
-        self._is_aborting_unsent = False  # callers cancel soon
-        self._is_persistently_busy = (
-            False  # busy after all retries: none until it replies otherwise
-        )
+        self._is_open = False
+        self._unanswered = 0  # requests without a reply since the last reply
+        # Busy after all retries: none until it replies otherwise.
+        self._is_persistently_busy = False
         self._retries = self._timeouts = self._refusals = 0
         self._last_round_trip: float | None = None
-        self._last_heartbeat: float | None = None
         backend.listen(on_event, self._on_idle_loss)
 
     @property
     def is_lost(self) -> bool:
-        """Whether every further request raises LinkError."""
+        """Whether every further request but a Stop raises LinkError."""
         return self._loss is not None
+
+    @property
+    def is_degraded(self) -> bool:
+        """Whether several requests in a row had no reply; the amplifier may still play."""
+        return self._unanswered > self._retries_allowed and not self.is_lost
 
     @property
     def statistics(self) -> LinkStatistics:
         """Link statistics; counted since opening or construction, see `LinkStatistics`."""
-        beat = self._last_heartbeat
         return LinkStatistics(
             **asdict(self.backend.counters),
             retries=self._retries,
             timeouts=self._timeouts,
             refusals=self._refusals,
             last_round_trip=self._last_round_trip,
-            heartbeat_age=None if beat is None else clock.now() - beat,
         )
 
     async def open(self) -> None:
         """Open the wire; raises LinkError."""
         await self.backend.open()
+        self._sender = sender_of(self.backend)
         self._loss = None
+        self._is_open = True
         self._unanswered = 0
 
     async def close(self) -> None:
         """Close the wire."""
+        self._is_open = False
         if self._loss is None:
             self._loss = "the amplifier was closed; open a new one"
         await self.backend.close()
 
-    def allow_for(self, round_trip: float) -> None:
+    def allow_longest_exchange(self, round_trip: float) -> None:
         """Retry once less if the longest exchange on the wire [s] exceeds the timeout."""
         self._retries_allowed = retries_on(round_trip, reply_timeout=self._reply_timeout)
 
-    def heartbeat_acknowledged(self) -> None:
-        """Note the reply to a heartbeat."""
-        self._last_heartbeat = clock.now()
-
     async def ask(
-        self,
-        request: Request,
-        *,
-        expect: type[_ReplyT],
-        priority: RequestPriority = RequestPriority.ORDINARY,
-        timeout: float | None = None,
-    ) -> _ReplyT:
+        self, request: Request, *, expect: type[ReplyT], timeout: float | None = None
+    ) -> ReplyT:
         """Send a request by its priority and return its reply; timeout [s]: None for the default.
 
         Raises LinkError, CommandRefused for a refusal or if superseded, and FrameError for an
-        invalid reply or one of another type.
+        invalid reply or one of another type. A Stop is sent on a lost link, too.
         """
-        self._raise_if_lost()
-        timeout = timeout or self._reply_timeout
+        self._raise_if_unusable(request)
         name = type(request).__name__
-        silencing = self.backend.silencing(request) if priority.is_stop_class else nullcontext()
+        attempts = _Attempts(self, request, timeout or self._reply_timeout)
         try:
-            with silencing:
-                reply = await self._retry_if_preempted(request, priority, timeout)
+            reply = await self._sender.send(self.backend, priority_of(request), attempts.make_one)
         except FrameError as problem:
             raise FrameError(
                 f"invalid reply to {name}: {problem}; {PROTOCOL_VIOLATION}"
@@ -152,62 +177,36 @@ class Link:
         return reply
 
     def abort_unsent(self) -> None:
-        """Do not send unsent requests, and retry none: they raise Preempted.
+        """Do not send unsent requests, and repeat none: they raise Preempted.
 
         Requests of the stop class are exempt.
         """
-        self._is_aborting_unsent = True
-        self._turns.preempt_unsent()
+        self._sender.abort_unsent(self.backend)
 
-    async def broadcast(self, request: Broadcast, priority: RequestPriority) -> None:
-        """Broadcast by its priority; raises LinkError, CommandError."""
-        self._raise_if_lost()
-        async with self._turns.take(priority):
-            await self.backend.broadcast(request)
+    async def broadcast(self, request: Broadcast) -> None:
+        """Broadcast by its priority; raises LinkError, CommandError.
 
-    async def _retry_if_preempted(
-        self, request: Request, priority: RequestPriority, timeout: float
-    ) -> Reply:
-        while True:
-            try:
-                async with self._turns.take(priority):
-                    self._raise_if_lost()
-                    return await self._exchange(request, priority, timeout)
-            except Preempted:
-                if not priority.is_stop_class:  # stop-class requests are retried
-                    raise
+        A Stop is broadcast during an exchange, too, if the wire can, and then again after it.
+        """
+        self._raise_if_unusable(request)
+        if isinstance(request, Stop) and self._sender.is_in_use:
+            with contextlib.suppress(LinkError):
+                await self.backend.broadcast(request)
+        await self._sender.send(
+            self.backend, priority_of(request), lambda: self.backend.broadcast(request)
+        )
 
-    async def _exchange(self, request: Request, priority: RequestPriority, timeout: float) -> Reply:
-        busy = 0
-        self._is_aborting_unsent = False
-        while True:
-            begin = clock.now()
-            try:
-                reply = await self.backend.exchange(request, timeout=timeout)
-            except LinkTimeout as problem:
-                self._timeouts += 1
-                # Counted across requests: superseded ones must not hide a lost link.
-                self._unanswered += 1
-                if self._unanswered > self._retries_allowed:
-                    what = f"{problem} (no reply to {self._unanswered} requests in a row)"
-                    raise LinkTimeout(self._lose(what)) from problem
-            except LinkError as problem:
-                raise LinkError(self._lose(str(problem))) from problem
-            else:
-                self._unanswered = 0
-                self._last_round_trip = clock.now() - begin
-                if not is_busy(reply):
-                    self._is_persistently_busy = False
-                    return reply
-                if self._is_persistently_busy or busy == RETRIES:
-                    self._is_persistently_busy = True
-                    return reply
-                busy += 1
-                await asyncio.sleep(BUSY_PAUSE)
-            self._turns.raise_if_overtaken(priority)
-            if self._is_aborting_unsent and not priority.is_stop_class:
-                raise Preempted(SUPERSEDED)
-            self._retries += 1
+    def _no_reply(self, problem: LinkTimeout) -> LinkTimeout | None:
+        """Count a missing reply; returns the error after too many: degraded, or now lost."""
+        self._timeouts += 1
+        # Counted across requests: superseded ones must not hide a lost link.
+        self._unanswered += 1
+        if self._unanswered <= self._retries_allowed:
+            return None
+        what = f"{problem} (no reply to {self._unanswered} requests in a row)"
+        if self._loss is None and clock.now() < self._silent_from():
+            return LinkDegraded(f"{what}{DEGRADED}")
+        return LinkTimeout(self._lose(what))
 
     def _on_idle_loss(self, what: str) -> None:
         """Note a loss found without a request."""
@@ -215,9 +214,50 @@ class Link:
             self._lose(what)
 
     def _lose(self, what: str) -> str:
-        self._loss = f"{what}{ASSUME_ENERGISED}"
+        self._loss = self._loss or f"{what}{ASSUME_ENERGISED}"
         return self._loss
 
-    def _raise_if_lost(self) -> None:
-        if self._loss is not None:
+    def _raise_if_unusable(self, request: Request) -> None:
+        """Raise LinkError if a request must not be sent on a lost or degraded link."""
+        if self._loss is not None and not (self._is_open and isinstance(request, Stop)):
             raise LinkError(self._loss)
+        if self.is_degraded and not is_allowed_when_degraded(request):
+            raise LinkDegraded(f"no reply to {self._unanswered} requests in a row{DEGRADED}")
+
+
+@final
+class _Attempts:
+    """The attempts of one request."""
+
+    __slots__ = ("_busy", "_link", "_made", "_request", "_timeout")
+
+    def __init__(self, link: Link, request: Request, timeout: float) -> None:
+        self._link = link
+        self._request = request
+        self._timeout = timeout
+        self._made = self._busy = 0
+
+    async def make_one(self) -> Reply:
+        """Send the request and return its reply; raises `Again` to repeat it."""
+        link = self._link
+        link._raise_if_unusable(self._request)  # it may have waited
+        link._retries += self._made > 0
+        self._made += 1
+        begin = clock.now()
+        try:
+            reply = await link.backend.exchange(self._request, timeout=self._timeout)
+        except LinkTimeout as problem:
+            error = link._no_reply(problem)
+            is_last_stop = isinstance(self._request, Stop) and self._made > RETRIES
+            if error is not None and (is_last_stop or not isinstance(self._request, Stop)):
+                raise error from problem
+            raise Again from problem
+        except LinkError as problem:
+            raise LinkError(link._lose(str(problem))) from problem
+        link._unanswered = 0
+        link._last_round_trip = clock.now() - begin
+        if is_busy(reply) and not link._is_persistently_busy and self._busy < RETRIES:
+            self._busy += 1
+            raise Again(BUSY_PAUSE)
+        link._is_persistently_busy = is_busy(reply)
+        return reply

@@ -1,1 +1,1 @@
-"""Amplifiers in operation: synchronized commits, watchdog and read-back."""
+"""Amplifiers in operation: commits, watchdog, comparison of replies with what was asked."""

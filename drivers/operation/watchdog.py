@@ -7,12 +7,13 @@ from drivers.link.link import REPLY_TIMEOUT, retries_on
 from drivers.protocol.definition import PROTOCOL
 
 HEARTBEAT = 0.05  # s; interval of the control loop's heartbeats
-MAX_MISSED_HEARTBEATS = 3  # until the amplifier falls silent
+MIN_HEARTBEATS_PER_WATCHDOG = 3  # a watchdog must outlast this many intervals
+MAX_LOSS_DETECTION_TIME = 3 * HEARTBEAT  # s; `era config check` warns of slower lines
 
 
 def shortest_watchdog(round_trip: float) -> float:
     """Return the shortest watchdog [s] for a wire with this round trip [s]."""
-    return MAX_MISSED_HEARTBEATS * HEARTBEAT + round_trip
+    return MIN_HEARTBEATS_PER_WATCHDOG * HEARTBEAT + round_trip
 
 
 def check_watchdog(watchdog: float, round_trip: float) -> None:
@@ -23,14 +24,14 @@ def check_watchdog(watchdog: float, round_trip: float) -> None:
     shortest = shortest_watchdog(round_trip)
     if not watchdog >= shortest - 1e-9:  # sums of floats
         raise CommandError(
-            f"watchdog must be at least {shortest * 1e3:.0f} ms ({MAX_MISSED_HEARTBEATS} "
+            f"watchdog must be at least {shortest * 1e3:.0f} ms ({MIN_HEARTBEATS_PER_WATCHDOG} "
             f"heartbeats of {HEARTBEAT * 1e3:g} ms and a round trip of {round_trip * 1e3:.1f} ms), "
             f"got {watchdog * 1e3:g} ms; lengthen it, or use a faster line"
         )
 
 
 def loss_detection_time(round_trips: Iterable[float]) -> float:
-    """Return the longest time [s] until silent amplifiers on one line are detected as lost.
+    """Return the longest time [s] until silent amplifiers on one line count as degraded, or lost.
 
     Worst case: all fall silent right after a reply, and each is sent a set next, one after the
     other, with the repetitions of `drivers.link`. round_trips [s]: of the longest exchange of each.

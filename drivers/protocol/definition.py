@@ -1,6 +1,7 @@
 """The protocol's numbers as typed values, loaded once from protocol.yaml."""
 
 import math
+import random
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -172,3 +173,9 @@ PROTOCOL = _load()
 def token_after(token: int) -> int:
     """Return the token after this one (0 before the first): 1..65535, then 1 again."""
     return token % PROTOCOL.quantities.token.maximum + 1
+
+
+def random_token() -> int:
+    """Return a random initial token, so that tokens of an earlier host are not repeated."""
+    token = PROTOCOL.quantities.token
+    return random.randint(token.minimum, token.maximum)  # noqa: S311  not a secret

@@ -1,6 +1,6 @@
 """Messages between host and amplifier, whatever the wire.
 
-Every request has exactly one reply: the one listed beside it here, or a `Nak`.
+Every request has exactly one reply: the one listed with it here, or a `Nak`.
 An `AmplifierEvent` comes unsolicited, on wires on which an amplifier may speak first. Codecs turn
 these into bytes and back; nothing here deals with bytes.
 
@@ -159,7 +159,7 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """What an amplifier can play: frequencies [Hz], steps, watchdog range [s], longest ramp [s].
+    """Capabilities of an amplifier: frequencies [Hz], steps, watchdog range [s], longest ramp [s].
 
     envelope_knots: most knots of an envelope; envelope_slots: number of slots; envelope steps [s];
     all 0 without envelopes. events: whether it sends unsolicited events.
@@ -202,7 +202,7 @@ class Status:
 
 @dataclass(frozen=True, slots=True)
 class Achieved:
-    """What a token really plays, after the amplifier's quantisation."""
+    """Playback of the set of a token, after the amplifier's quantisation."""
 
     token: int
     commands: tuple[DriveCommand, ...]

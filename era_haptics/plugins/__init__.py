@@ -1,4 +1,4 @@
-"""What a plug-in imports: a module for each kind, named as the group of its entry points.
+"""Interfaces for plug-ins: a module for each kind, named as the group of its entry points.
 
 `backends`, `touch_sources`, `effects`, `materials` and `elements` hold what a plug-in of that kind
 derives from, takes and gives. The names in their `__all__` stay while the modules behind them move.

@@ -1,4 +1,4 @@
-"""For amplifiers with a protocol of their own: entry points `era_haptics.backends`."""
+"""Interfaces for amplifiers with their own protocol: entry points `era_haptics.backends`."""
 
 from drivers.backend import Backend
 from drivers.backends.wire_backend import WireBackend

@@ -1,4 +1,4 @@
-"""For what a finger feels over time: entry points `era_haptics.effects`."""
+"""Interfaces for effects: entry points `era_haptics.effects`."""
 
 from controller.effects.effect import Effect, EffectRun, Level, NoSensation, Sensation
 from controller.effects.registry import effect_kind

@@ -1,4 +1,4 @@
-"""For plate elements: entry points `era_haptics.elements`."""
+"""Interfaces for plate elements: entry points `era_haptics.elements`."""
 
 from model.arrays import FloatArray
 from model.fem.elements.element import Element, rigidities

@@ -1,4 +1,4 @@
-"""For materials by name: entry points `era_haptics.materials`."""
+"""Interfaces for materials by name: entry points `era_haptics.materials`."""
 
 from model.structure.materials import KnownMaterial
 from model.structure.plate import Material

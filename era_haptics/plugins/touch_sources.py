@@ -1,4 +1,4 @@
-"""For panels with a protocol of their own: entry points `era_haptics.touch_sources`.
+"""Interfaces for panels with their own protocol: entry points `era_haptics.touch_sources`.
 
 `open_source`, `ContactTracker` and what it tells are for trying one, as contacts on a plate.
 """

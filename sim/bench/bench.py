@@ -15,14 +15,13 @@ import numpy as np
 from drivers import clock
 from drivers.protocol.messages import Reply, Request
 from model.arrays import FloatArray
-from model.fem.assembly import era_positions
 from model.fem.mesh import Mesh
 from model.finger.load import FingerLoad
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.actuator import Era
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad, load_positions
+from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import Term
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.plant.felt import Felt, measure_vibration
@@ -72,12 +71,12 @@ class Bench:
         self.imperfections = imperfections
         self.probes: list[Probe] = []
         reduced = _reduced(
-            rig.plate, rig.mesh, tuple(rig.eras), tuple(rig.loads), rig.limits.frequency_max
+            rig.plate, rig.mesh, tuple(rig.eras), tuple(rig.masses), rig.limits.frequency_max
         )
         self.fingers = Fingers(reduced)
         self._time = now
         # Advanced only where its drive changes or its motion is sampled.
-        self._plant = Plant(reduced, rig.eras, loads=rig.loads, time=now)
+        self._plant = Plant(reduced, rig.eras, loads=rig.masses, time=now)
         self.amplifiers: Mapping[str, SimulatedAmplifier] = {
             name: SimulatedAmplifier(name, channels=_channel_count(rig, name))
             for name in rig.amplifiers
@@ -229,7 +228,7 @@ def _reduced(
     loads: tuple[PointLoad, ...],
     frequency_max: float,
 ) -> ReducedPlate:
-    points = np.vstack([era_positions(eras), load_positions(loads)])
+    points = footprints_of(eras, loads)
     return reduce_plate(plate, mesh, points, frequency_max=frequency_max)
 
 

@@ -8,6 +8,7 @@ cached. Structural damping remains that of the plate on its ERAs.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import TypeAlias
 
 import numpy as np
 
@@ -16,7 +17,9 @@ from model.reduction.reduced_plate import ReducedPlate
 from model.structure.actuator import Era
 from model.structure.point_load import PointLoad
 from model.transients.time_response import PlateInTime, plate_in_time
-from sim.plant.fingers import Position
+
+Footprint: TypeAlias = tuple[float, float, float]
+"""x, y, radius [m]."""
 
 BLOCK = 256  # samples per table of exponentials
 
@@ -57,14 +60,14 @@ class LoadedPlateCache:
         self._unloaded = reduced
         self._eras = tuple(eras)
         self._loads = tuple(loads)
-        self._lifted: dict[Position, float] = {}  # by point: when [s]
-        self._resting: tuple[Position, ...] = ()
+        self._lifted: dict[Footprint, float] = {}  # by point: when [s]
+        self._resting: tuple[Footprint, ...] = ()
         self._solved = lru_cache(_MAX_SOLVED)(self._solve)
         self._reduced_at = lru_cache(_MAX_SOLVED)(self._reduce)
 
     def under(self, contacts: Sequence[PointLoad], *, time: float) -> LoadedPlate:
         """The plate under these contacts from a time [s]; calls must be in order of time."""
-        resting = tuple(sorted({(contact.x, contact.y) for contact in contacts}))
+        resting = tuple(sorted({(each.x, each.y, each.foot) for each in contacts}))
         for point in self._resting:
             self._lifted.pop(point, None)
             self._lifted[point] = time
@@ -77,7 +80,7 @@ class LoadedPlateCache:
         self._lifted = {point: self._lifted[point] for point in recent}
         return self._solved((*resting, *sorted(recent)), tuple(contacts))
 
-    def _solve(self, points: tuple[Position, ...], contacts: tuple[PointLoad, ...]) -> LoadedPlate:
+    def _solve(self, points: tuple[Footprint, ...], contacts: tuple[PointLoad, ...]) -> LoadedPlate:
         if not points:
             unloaded = _solve_unloaded(self._unloaded, self._eras, self._loads)
             return LoadedPlate(contacts, self._unloaded, unloaded)
@@ -85,7 +88,7 @@ class LoadedPlateCache:
         plate = plate_in_time(reduced, self._eras, loads=self._loads, contacts=contacts)
         return LoadedPlate(contacts, reduced, plate)
 
-    def _reduce(self, points: tuple[Position, ...]) -> ReducedPlate:
+    def _reduce(self, points: tuple[Footprint, ...]) -> ReducedPlate:
         return self._unloaded.with_attachments_at(np.array(points))
 
 

@@ -124,7 +124,7 @@ def play(
             f"duration must be above {settled:g} s (the onset) and at most {MAX_DURATION:g} s, got "
             f"{duration:g} s; one second suffices for most plates"
         )
-    plant = Plant(reduced, rig.eras, loads=rig.loads)
+    plant = Plant(reduced, rig.eras, loads=rig.masses)
     contacts = (*fingers.targets, *fingers.quiet)
     if finger_load is not None:
         plant.set_contacts([finger_load.at(*at) for at in contacts])

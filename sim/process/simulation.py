@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from drivers import clock
-from drivers.operation.steady import no_long_collections
+from drivers.operation.garbage_collection import no_long_collections
 from model.finger.load import FingerLoad
 from model.rig.rig import Rig
 from sim.bench.bench import Bench, keep_time

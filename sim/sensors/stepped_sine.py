@@ -11,10 +11,9 @@ import numpy as np
 from model.arrays import FloatArray
 from model.calibration.responses import Responses
 from model.errors import InputError
-from model.fem.assembly import era_positions
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
-from model.structure.point_load import load_positions
+from model.structure.point_load import footprints_of
 from model.transients.base_motion import Term
 from sim.plant.plant import Plant
 from sim.sensors.accelerometer import Accelerometer, positions, read_sensors
@@ -43,12 +42,12 @@ def record_responses(
             f"frequencies must be below {0.4 * sample_rate:g} Hz at a sampling rate of "
             f"{sample_rate:g} Hz, got {frequencies.max():g} Hz"
         )
-    attached = np.vstack([era_positions(rig.eras), load_positions(rig.loads)])
+    attached = footprints_of(rig.eras, rig.masses)
     reduced = reduce_plate(
         rig.plate, rig.mesh, attached, frequency_max=max(float(frequencies.max()), 200.0)
     )
     shapes = reduced.at(positions(sensors))
-    plant = Plant(reduced, rig.eras, loads=rig.loads)
+    plant = Plant(reduced, rig.eras, loads=rig.masses)
     rng = np.random.default_rng(seed)
     values = np.empty((len(frequencies), len(rig.eras), len(sensors)), dtype=complex)
     for number, era in enumerate(rig.eras):

@@ -18,6 +18,7 @@ class AmplifierSession:
 
     pending: requests by the key of their reply, each with its time; superseded: keys of requests
     that were repeated and answered; abandoned: keys of a host that has disconnected since;
+    overtaken: keys of those that were pending when a broadcast Stop was sent after them;
     is_disturbed: whether faults were injected into the wire at or shortly before a time.
     """
 
@@ -30,6 +31,7 @@ class AmplifierSession:
     overdue: set[Hashable] = field(default_factory=set)
     superseded: set[Hashable] = field(default_factory=set)
     abandoned: set[Hashable] = field(default_factory=set)
+    overtaken: set[Hashable] = field(default_factory=set)
     vibrates: bool = False  # by the last set that was sent
     last_vibration: float = -math.inf  # when a vibrating set was accepted
     last_silenced: float = -math.inf  # when a silencing request was sent
@@ -53,3 +55,4 @@ class AmplifierSession:
         self.pending.clear()
         self.overdue.clear()
         self.superseded.clear()
+        self.overtaken.clear()

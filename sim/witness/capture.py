@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from model.errors import InputError
+from model.files.regular_file import regular_file
 from sim.witness.decoded import Direction
 
 
@@ -31,7 +32,7 @@ def read_capture(path: Path, *, wires: Collection[str] = ()) -> Iterator[Piece]:
     """
     last = -math.inf
     try:
-        with path.open(encoding="utf-8", errors="backslashreplace") as lines:
+        with open(path, encoding="utf-8", errors="backslashreplace", opener=regular_file) as lines:
             for number, line in enumerate(lines, start=1):
                 text = line.partition("#")[0].strip()
                 if not text:

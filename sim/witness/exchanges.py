@@ -47,6 +47,7 @@ class Exchanges:
             if now > at + _PENDING_TIMEOUT:
                 session.overdue.discard(key)
                 session.superseded.discard(key)
+                session.overtaken.discard(key)
                 del session.pending[key]
 
     def sent(self, wire: WatchedWire, time: float, raw: Data, message: Message) -> None:
@@ -65,6 +66,7 @@ class Exchanges:
                 session.pending[message.key] = (time, message)
                 session.overdue.discard(message.key)
                 session.superseded.discard(message.key)
+                session.overtaken.discard(message.key)
                 if not message.problem and (
                     message.kind in STATE_CHANGING or message.kind is RequestKind.PING
                 ):
@@ -124,6 +126,8 @@ class Exchanges:
         elif request.kind is RequestKind.HELLO:
             self._host.request_granted(session, time, request)
         elif request.kind in (RequestKind.STOP, RequestKind.COMMIT):
+            if request.kind is RequestKind.STOP:
+                session.overtaken.update(session.pending)
             session.amplifier.broadcast_sent(request, time)
             self._host.request_granted(session, time, request)
 
@@ -142,6 +146,8 @@ class Exchanges:
             what = f"incomplete reply of {session.name}: {reply.problem}"
             session.report("answer", time, what)
         was_lost = reply.key in session.overdue or reply.key in session.superseded
+        is_overtaken = reply.key in session.overtaken
+        session.overtaken.discard(reply.key)
         session.overdue.discard(reply.key)
         session.superseded.discard(reply.key)
         if reply.refusal:
@@ -155,7 +161,7 @@ class Exchanges:
         if was_lost or request.problem:
             return
         if reply.refusal:
-            if reply.status is not None:
+            if reply.status is not None and not is_overtaken:
                 session.amplifier.status_reported(reply.status, at, time)
             return
         if request.kind in STATE_CHANGING:
@@ -167,6 +173,9 @@ class Exchanges:
             }
             at = min([at, *same.values()])
             session.superseded.update(same)
+        if is_overtaken:  # carried out before the Stop, answered after it
+            session.amplifier.granted_before_stop(request, reply, at, time)
+            return
         self._host.request_granted(session, time, request)
         if session.is_disturbed(time) and request.kind is RequestKind.ARM:
             session.amplifier.forget_state()

@@ -75,6 +75,8 @@ class ReferenceAmplifier:
             -math.inf,
         )  # and until when it is valid
         self._states_before: tuple[set[int], float] = (set(), -math.inf)  # of a stop
+        self._broadcast_stop: Request | None = None  # the last one
+        self._stopped_between = (-math.inf, -math.inf)  # when it took effect
         self._played_tokens: deque[int] = deque(maxlen=_REMEMBERED)
         self._staged: Request | None = None
         self._outputs = ReferenceOutputs(name, config, slack=times.slack, report=report)
@@ -151,6 +153,37 @@ class ReferenceAmplifier:
         if reply.status is not None:
             self.status_reported(reply.status, begin, end)
 
+    def granted_before_stop(self, request: Request, reply: Reply, begin: float, end: float) -> None:
+        """Apply a request that preceded the last broadcast Stop, and whose reply came after it.
+
+        A line delivers in order: the request was carried out first, and its reply reports how the
+        amplifier was then. Of that only the set is compared.
+        """
+        self.advance(begin)
+        stop, between = self._broadcast_stop, self._stopped_between
+        if stop is None or self.state is None:
+            return
+        if request.kind in WATCHDOG_FEEDING:
+            self.watchdog.may_feed(between[1])
+        match request.kind:
+            case RequestKind.ARM:
+                self.watchdog.time = request.watchdog
+                self._played_tokens.clear()
+                self._token = 0
+                self._states_before[0].add(_ENABLED)
+            case RequestKind.DISARM:
+                self._states_before[0].add(3)
+            case RequestKind.CLEAR if reply.status is not None and reply.status.state in _OFF:
+                self.state, self._fault, self._is_reported = _STOPPED, 0, False
+            case RequestKind.APPLY | RequestKind.STAGE:
+                self._check_achieved(request, reply, end)
+            case _:
+                pass
+        if request.kind in (RequestKind.APPLY, RequestKind.COMMIT) and request.token != self._token:
+            self._token = request.token
+            self._played_tokens.append(request.token)
+            self._outputs.set_unknown(between[1] + stop.ramp)
+
     def broadcast_sent(self, request: Request, time: float) -> None:
         """Apply a broadcast, which has no reply."""
         self.advance(time)
@@ -160,6 +193,7 @@ class ReferenceAmplifier:
         soon = (time, time + 0.010)  # as a reply would take
         if request.kind is RequestKind.STOP:
             self._states_before = ({self.state}, soon[1])
+            self._broadcast_stop, self._stopped_between = request, soon
             self._stopped(request, *soon)
         elif (
             request.kind is RequestKind.COMMIT
@@ -190,8 +224,6 @@ class ReferenceAmplifier:
             self.state = self.state if self.state in (_REACTING, _FAULT) else _STOPPED
         elif self.state == _ENABLED:
             self.state = 3
-        elif _ENABLED in self._states_before[0] and begin <= self._states_before[1]:
-            self._states_before[0].add(3)  # it may have been disarmed before it was stopped
 
     def _cleared(self, reply: Reply) -> None:
         """Apply Clear, which may leave the state as it is."""

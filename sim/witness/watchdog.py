@@ -67,8 +67,8 @@ class Watchdog:
 
     def check_left(self, left: float, begin: float, end: float) -> None:
         """Check the reported time left [s], true at some time between two."""
-        low = self.time - (end - self._fed[0]) - _LEFT
-        high = self.time - max(0.0, begin - self._fed[1]) + _LEFT
+        low = self.time - (end - self._fed[0]) - _LEFT - self._slack
+        high = self.time - max(0.0, begin - self._fed[1]) + _LEFT + self._slack
         if self.time < math.inf and not low <= left <= high:
             self._report(
                 "watchdog",

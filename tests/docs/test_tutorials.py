@@ -26,7 +26,7 @@ def home() -> Iterator[Path]:
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, marks=[pytest.mark.alone] if page in IN_REAL_TIME else [])
+        pytest.param(page, marks=[pytest.mark.real_time] if page in IN_REAL_TIME else [])
         for page in sorted(path.stem for path in PAGES.glob("*.md"))
     ],
 )

@@ -34,7 +34,7 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.open_amplifier: {"rig": RIG, "name": "main", "url": "sim://"},
     era.commands_for: {"rig": RIG, "drive": DRIVE},
     era.Drive: {"frequency": 110.0, "level": 1.0, "phase_deg": 0.0},
-    era.FingerLoad: {"stiffness": 1.0, "damping": 1.0, "mass": 0.0},
+    era.FingerLoad: {"stiffness": 1.0, "damping": 1.0, "mass": 0.0, "foot": 0.005},
     era.Grid: {"nx": 4, "ny": 3},
 }  # fmt: skip
 """Valid arguments by function; None: a small table."""

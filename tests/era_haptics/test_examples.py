@@ -23,10 +23,10 @@ TABLE_2 = ["31.98", "68.50", "76.62", "107.84", "160.77"]
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A cache of tables for this module."""
+def cache(table_cache: Path) -> Iterator[None]:
+    """A cache of tables of the tests' own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("XDG_CACHE_HOME", str(table_cache))
         yield
 
 
@@ -71,7 +71,7 @@ def test_researcher_example_reproduces_the_paper(
     assert pictures == ["map.png", "pattern.png", "ramp.png", "shaped.png"]
 
 
-@pytest.mark.alone
+@pytest.mark.real_time
 @pytest.mark.usefixtures("cache")
 def test_hmi_engineer_example_feels_what_was_predicted() -> None:
     """The contrast on the plate in time is the predicted one, and the daemon ends with status 0."""

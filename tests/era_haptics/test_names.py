@@ -67,11 +67,3 @@ def test_name_loads_only_what_it_needs(module: str, not_loaded: str) -> None:
     names = module.partition(".")
     load = f"import era_haptics.{module}" if names[1] else f"import era_haptics as e; e.{module}"
     assert modules_after(load) & set(not_loaded.split()) == set()
-
-
-@pytest.mark.parametrize(
-    "package", ["registry", "controller", "drivers", "era_haptics", "model", "sim"]
-)
-def test_package_is_marked_as_typed(package: str) -> None:
-    """By py.typed."""
-    assert (SOURCE.parents[1] / package / "py.typed").is_file()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import era_haptics as era
-from model.structure.point_mass import PointMass
+from model.structure.point_load import PointLoad
 from model.vibration.maps import plate_map
 from paper_plate import make_paper_rig
 
@@ -43,7 +43,7 @@ def test_solved_plate_modes_are_converged(plate: era.SolvedPlate) -> None:
 
 def test_solved_plate_map_equals_direct_solve() -> None:
     """Of a plate that carries a mass, at two frequencies, within 1e-4 of the largest."""
-    rig = replace(make_paper_rig(24, 18), masses=(PointMass(0.1, 0.1, 0.02),))
+    rig = replace(make_paper_rig(24, 18), masses=(PointLoad(0.1, 0.1, mass=0.02),))
     drive = {"SW": 110, "NE": era.Drive(110, level=0.5, phase_deg=90), "SE": era.Tone(250, 2e-5)}
     excitation = {
         "SW": era.Tone(110, 1e-4),

@@ -40,8 +40,8 @@ def test_query_equals_the_command(
         CliRunner().invoke(app, ["table", "query", path, *options, "--json"]).stdout
     )
     for measure in (
-        *("level_db_sl", "contrast_db", "contrast_db_sl", "robust_contrast_db"),
-        *("transient_contrast_db", "left_after_db", "quiet_level_db_sl", "usable_level_db_sl"),
+        *("level_db_sl", "contrast_db", "felt_contrast_db", "robust_contrast_db"),
+        *("transient_contrast_db", "residual_db", "quiet_level_db_sl", "usable_level_db_sl"),
     ):
         assert getattr(pattern, measure) == pytest.approx(answer[measure], abs=1e-6), measure
     assert table.drive_of(pattern.excitation) == answer["drive"]

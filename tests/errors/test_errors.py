@@ -47,7 +47,7 @@ SHOWN = {tuple(case.typed): case for case in cases() if case.shown}
 
 @pytest.mark.parametrize("quoted", quotations(), ids=lambda quoted: quoted.typed[-1])
 def test_page_quotes_message_and_remedy(quoted: Quotation, shelf: Path, tmp_path: Path) -> None:
-    """Those that users meet most; `python tests/support/error_cases.py` quotes them anew."""
+    """A quoted message is the present one; `python tests/support/error_cases.py` quotes anew."""
     case = SHOWN[tuple(quoted.typed)]
     assert case.status == quoted.status
     assert REMEDY.search(quoted.text)
@@ -55,5 +55,5 @@ def test_page_quotes_message_and_remedy(quoted: Quotation, shelf: Path, tmp_path
 
 
 def test_page_quotes_every_case_that_is_shown() -> None:
-    """Each of them has a box of its own."""
+    """Each shown case has a box of its own."""
     assert sorted(tuple(quoted.typed) for quoted in quotations()) == sorted(SHOWN)

@@ -39,7 +39,7 @@ def amplifier_at(serial: ModuleType, now: list[float]) -> Any:
 
 
 def test_amplifier_is_silent_5_ms_after_its_watchdog_expired(serial: ModuleType) -> None:
-    """Along a raised cosine from when it expires, however late it is read; the fault latches."""
+    """Levels fall along a raised cosine from its expiry, however late read; the fault latches."""
     now = [1000.0]
     amplifier = amplifier_at(serial, now)
     amplifier.arm(WATCHDOG)

@@ -45,7 +45,7 @@ def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_page_commands_print_what_is_shown(name: str, reader: Reader) -> None:
-    """In order, with the output on the page."""
+    """Commands, run in order, print the output on the page."""
     steps = read_steps(PAGES / f"{name}.md")
     assert sum(isinstance(step, Typed) and step.shown is not None for step in steps) > 2
     for step in steps:
@@ -54,7 +54,7 @@ def test_page_commands_print_what_is_shown(name: str, reader: Reader) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_page_includes_code_from_files(name: str) -> None:
-    """So that page and file cannot differ."""
+    """Page and file cannot differ."""
     text = (PAGES / f"{name}.md").read_text("utf-8")
     included = re.findall(r"^```\{literalinclude\} (\S+)$", text, re.MULTILINE)
     assert included

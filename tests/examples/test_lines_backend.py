@@ -124,7 +124,7 @@ async def test_backend_counts_and_drops_damaged_lines(
 
 
 async def test_backend_returns_a_refusal_as_nak(backend: Backend, far_end: FarEnd) -> None:
-    """With its channel."""
+    """The refusal names its channel."""
     far_end.replies = lambda number: line(number, {"refused": 4, "channel": 3})
     assert await backend.exchange(Ping(), timeout=LONG) == Nak(NakCode.BAD_CHANNEL, 3)
 
@@ -152,6 +152,6 @@ async def test_backend_sends_only_guarded_sets(backend: Backend) -> None:
 
 @pytest.mark.parametrize("url", ["lines://", "lines://host", "lines://host:x", "lines://h:1/2?a=b"])
 async def test_backend_refuses_an_invalid_url(url: str, backend: Backend) -> None:
-    """Without opening a connection."""
+    """No connection is opened."""
     with pytest.raises(CommandError, match="must be lines://HOST:PORT"):
         type(backend)(url)

@@ -12,7 +12,7 @@ MODULES = sorted(PLUGINS.glob("*/*.py"))
 
 @pytest.mark.parametrize("path", MODULES, ids=[path.stem for path in MODULES])
 def test_example_plugin_imports_stable_names_only(path: Path) -> None:
-    """Of this project from `era_haptics` only."""
+    """Of this project plug-ins import `era_haptics` only."""
     imported = re.findall(r"^\s*(?:from|import) ([\w.]+)", path.read_text("utf-8"), re.MULTILINE)
     homes = {name.partition(".")[0] for name in imported}
     assert homes & {"registry", "controller", "drivers", "model", "sim"} == set()

@@ -4,7 +4,7 @@ import pytest
 
 from kills import PLACES, kill_everywhere
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.real_time
 
 KILLS = 8  # `make kill-test` takes two hundred
 

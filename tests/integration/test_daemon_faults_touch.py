@@ -11,20 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from best_of import best_of
 from controller.api.async_client import AsyncClient
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
 from daemon_bench import PATIENCE, far_end, until
-from daemon_process import DaemonProcess, armed, daemon_process, disarmed, play
+from daemon_process import DaemonProcess, armed, daemon_process, play
 from floods import flood
-from journal import Journal, loudness, silent_from
+from journal import Journal, loudness
 from tuio_panel import free_port, panel
 
-pytestmark = pytest.mark.alone
-
-LIFT_TO_ZERO = 0.020  # s; from the last lift to zero on the wire
-CONTACT_TIMEOUT = 0.150  # s
+pytestmark = pytest.mark.real_time
 
 
 class Panel:
@@ -40,17 +36,14 @@ class Panel:
         """Close the sender."""
         self._socket.close()
 
-    def send(self, *touches: Touch, source: str = "panel") -> float:
-        """Send all touches of a source; return the time [s]."""
-        now = time.monotonic()
-        datagram = tuio_datagram(TouchFrame(source, 0.0, touches), -1)
+    def send(self, *touches: Touch) -> None:
+        """Send all touches of the panel."""
+        datagram = tuio_datagram(TouchFrame("panel", 0.0, touches), -1)
         self._socket.sendto(datagram, ("127.0.0.1", self.port))
-        return now
 
-    async def silence(self) -> float:
-        """Wait until all is silent; return since when [s]."""
+    async def silence(self) -> None:
+        """Wait until all is silent."""
         await until(lambda: loudness(self.far) == 0)
-        return silent_from(self.far)
 
     async def counted(self, **expected: int) -> None:
         """Wait for these counts of rejected touches by reason."""
@@ -90,52 +83,21 @@ async def touched(folder: Path) -> AsyncIterator[Panel]:
             made.close()
 
 
-async def test_last_lift_is_zero_on_wire_when_touches_flood(tmp_path: Path) -> None:
-    """Up to three fingers that jump at 10 kHz: few frames become sets, and none after the lift."""
+@pytest.mark.alone
+async def test_few_of_a_flood_of_touches_become_sets(tmp_path: Path) -> None:
+    """Of up to three fingers that jump at 10 kHz, fewer than a tenth; none after the last lift."""
     async with touched(tmp_path) as test:
-
-        async def attempt() -> float:
-            await armed(test.era)
-            begin = time.monotonic()
-            async with flood("tuio", test.port, 10_000, 1.0) as sender:
-                assert sender.stdout is not None
-                counts = json.loads(await sender.stdout.readline())
-            silent = await test.silence()
-            await test.journal.hear(5)
-            assert loudness(test.far) == 0
-            assert len(test.journal.raising_since(begin)) < counts["sent"] / 10
-            await disarmed(test.era)
-            return silent - float(counts["up_s"])
-
-        await best_of("from the last lift to zero on the wire, at 10 kHz", attempt, LIFT_TO_ZERO)
-
-
-async def test_last_lift_is_zero_on_wire(tmp_path: Path) -> None:
-    """Within 20 ms of the datagram."""
-    async with touched(tmp_path) as test:
-
-        async def attempt() -> float:
-            await test.played(Touch(1, 0.4, 0.5))
-            return -test.send() + await test.silence()
-
-        await best_of("from the last lift to zero on the wire", attempt, LIFT_TO_ZERO)
-
-
-async def test_contact_times_out_when_sender_is_gone(tmp_path: Path) -> None:
-    """Zero on the wire within 170 ms of its last frame, and not before 130 ms."""
-    async with touched(tmp_path) as test:
-
-        async def attempt() -> float:
-            await test.played(Touch(1, 0.4, 0.5))
-            last = test.send(Touch(1, 0.41, 0.5))
-            silent = await test.silence()
-            return silent - last if silent - last > CONTACT_TIMEOUT - LIFT_TO_ZERO else -1.0
-
-        await best_of(
-            "from the last frame of a contact to zero on the wire",
-            attempt,
-            CONTACT_TIMEOUT + LIFT_TO_ZERO,
-        )
+        await armed(test.era)
+        begin = time.monotonic()
+        async with flood("tuio", test.port, 10_000, 1.0) as sender:
+            assert sender.stdout is not None
+            counts = json.loads(await sender.stdout.readline())
+        await test.silence()
+        silent = time.monotonic()
+        await test.journal.hear(5)
+        assert loudness(test.far) == 0
+        assert not test.journal.raising_since(silent)
+        assert len(test.journal.raising_since(begin)) < counts["sent"] / 10
 
 
 async def test_invalid_touches_are_counted_and_not_played(tmp_path: Path) -> None:

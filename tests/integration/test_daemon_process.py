@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from controller.api.async_client import AsyncClient
 from controller.cli.main import run
 from daemon_bench import PATIENCE, daemon_table, far_end, until, until_state, write_daemon
 from daemon_process import (
@@ -24,7 +25,7 @@ from model.table.file import save_table
 
 
 async def test_second_daemon_is_refused_while_first_plays_on(tmp_path: Path) -> None:
-    """Exit status 2 with the process id of the first; 3 at another socket over the same link."""
+    """Exit status 2 with the process id of the first; at another socket it waits for the link."""
     async with (
         far_end(tmp_path) as far,
         daemon_process(tmp_path, far) as daemon,
@@ -35,9 +36,15 @@ async def test_second_daemon_is_refused_while_first_plays_on(tmp_path: Path) -> 
         assert f"process {daemon.process.pid}" in err
         text = (tmp_path / "daemon.yaml").read_text("utf-8")
         (tmp_path / "other.yaml").write_text(text.replace("era.sock", "b.sock"), "utf-8")
-        status, _, err = await run_era("daemon", tmp_path / "other.yaml")
-        assert status == 3
-        assert "Traceback" not in err
+        other = await asyncio.create_subprocess_exec(
+            *(ERA, "daemon", tmp_path / "other.yaml"), stderr=asyncio.subprocess.PIPE
+        )
+        await until((tmp_path / "b.sock").is_socket)
+        async with await AsyncClient.connect(tmp_path / "b.sock", name="test") as waiting:
+            await until_state(waiting, "COMM_LOST")
+        other.terminate()
+        _, log = await other.communicate()
+        assert b"Traceback" not in log
         assert (await era.status()).state == "OPERATION_ENABLED"
         await until(lambda: any(far.device.status().levels))
 

@@ -14,7 +14,7 @@ from controller.api.topics import LatencyEvent, StateEvent
 from controller.gateway.app import MAX_SESSIONS
 from daemon_bench import running_daemon, until_state
 from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard
-from gateway_bench import RawWebSocket, ScriptedDaemon, gateway_process
+from gateway_bench import UNCONFIRMED, RawWebSocket, ScriptedDaemon, gateway_process
 from sim.faults.fault_window import FaultWindow
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
@@ -92,6 +92,21 @@ async def test_end_of_the_daemon_is_no_return_of_a_lost_link(tab: Page, tmp_path
     assert events[1].endswith("amplifier main: cut")
 
 
+async def test_stop_names_the_amplifiers_that_are_not_silent(tab: Page, tmp_path: Path) -> None:
+    """Beside the button and in the list of events, until a stop is confirmed."""
+    problem = "document.querySelector('#problem').innerText"
+    with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
+        await open_dashboard(tab, gateway, DESKTOP)
+        daemon.silence = UNCONFIRMED
+        await tab.click("#stop")
+        shown = await tab.until(problem, lambda text: "side" in text)
+        assert "main" not in shown
+        assert shown in (await tab.evaluate(EVENTS))[0]
+        daemon.silence = {}
+        await tab.click("#stop")
+        await tab.until(f"{problem} === ''")
+
+
 async def test_reason_for_plain_onsets_is_shown(tab: Page, tmp_path: Path) -> None:
     """Beside the latencies, while it holds."""
     summary = LatencySummary(count=0, median=None, p99=None, p999=None, histogram=[])
@@ -102,7 +117,7 @@ async def test_reason_for_plain_onsets_is_shown(tab: Page, tmp_path: Path) -> No
             ("loading took 50 ms", "loading took 50 ms"),
             (None, ""),
         ):
-            daemon.publish("latency", LatencyEvent(latency_ms=summary, plain_because=because))
+            daemon.publish("latency", LatencyEvent(latency_ms=summary, ramp_only_reason=because))
             await tab.until(
                 plain, lambda text, shown=shown: text.endswith(shown) and bool(text) == bool(shown)
             )

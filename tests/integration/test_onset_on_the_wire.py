@@ -40,10 +40,10 @@ def test_onset_contrast_matches_prediction(touches):
     rows = asyncio.run(
         run_demo(rig_file, table, wire="serial", touches=touches, on_row=lambda row: None)
     )
-    (row,) = [row for row in rows if row.played is not None]
-    assert row.played.is_onset_shaped
-    measured = row.played.measured_transient_contrast_db
-    assert measured == pytest.approx(row.played.predicted_transient_contrast_db, abs=2)
-    question = Question((row.target,), tuple(row.quiet.values()), drive_mode="phased")
+    (row,) = [row for row in rows if row.reason is None]
+    assert row.shaped_onset
+    measured = row.measured_transient_contrast_db
+    assert measured == pytest.approx(row.predicted_transient_contrast_db, abs=2)
+    question = Question((row.targets_m[0],), tuple(row.quiet.values()), drive_mode="phased")
     ramped = Timing(table).with_transient_measures(question, table.query(question))
     assert measured > ramped.transient_contrast_db + 6

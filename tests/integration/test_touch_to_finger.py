@@ -26,7 +26,7 @@ from rig_files import write_rig
 from touch_stream import Stream
 from whole_chain import Chain, Played, running_chain
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.real_time
 
 PLACES = {
     "A": (0.07, 0.06),
@@ -49,9 +49,8 @@ STREAM = Stream(
         (3.8, {}),
     ],
 )
-BRIEF = Stream(PLACES, [*STREAM.changes[:2], (1.4, {}), (1.7, {5: "A"}), (2.3, {}), (2.6, {})])
-"""Stream for the other wires, since the daemon's decisions do not depend on the wire."""
 SHORT = Stream(PLACES, [*STREAM.changes[:1], (0.8, {}), (1.1, {})])
+"""Stream for the other wires, since the daemon's decisions do not depend on the wire."""
 
 ATTEMPTS = 3
 # On Modbus RTU at 115 200 baud envelopes take 59 ms, and a touch waits 30 ms at most.
@@ -104,10 +103,10 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
 
 @pytest.fixture(scope="module")
 def played(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Played]:
-    """Results by wire: of the full stream over the first, of the brief one over the others."""
+    """Results by wire: of the full stream over the first, of the short one over the others."""
     folder = tmp_path_factory.mktemp("wires")
     chains = {wire: (wire, {}) for wire in WIRES}
-    return asyncio.run(play_all(folder, truth, chains, {WIRES[0]: STREAM}, BRIEF))
+    return asyncio.run(play_all(folder, truth, chains, {WIRES[0]: STREAM}, SHORT))
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +165,7 @@ def test_fingers_feel_the_commanded_pattern(
 ) -> None:
     """Every check passes over every wire."""
     if wire != "sim":
-        assert played[wire].frames > 100
+        assert played[wire].frames > 80  # its heartbeats alone, every 50 ms for 4 s
     CHECKS[check](played[wire], replace(truth, is_shaped=wire not in PLAIN))
 
 
@@ -183,12 +182,12 @@ def test_plate_response_is_equal_over_all_wires(
 
     All wires round alike: drives agree to the last digit. Compared while the streams are the same.
     """
-    mine, yours = (replace(played[each], heard=played[each].heard[:2]) for each in (wire, WIRES[0]))
+    mine, yours = (replace(played[each], heard=played[each].heard[:1]) for each in (wire, WIRES[0]))
     for one, other in zip(mine.heard, yours.heard, strict=True):
         assert one.situation.fingers == other.situation.fingers
         assert _drives(one) == _drives(other)
     apart = response_differences(mine, yours)
-    assert len(apart) == 2
+    assert len(apart) == 1
     for share, limit in zip(apart, rounding(mine, truth), strict=True):
         assert share <= 2 * limit
 

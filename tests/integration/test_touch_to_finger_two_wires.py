@@ -19,7 +19,7 @@ from rig_files import TWO_AMPLIFIERS, write_rig
 from touch_stream import Stream
 from whole_chain import Played, running_chain
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.real_time
 
 STREAM = Stream(
     {"A": (0.07, 0.06), "B": (0.16, 0.14), "C": (0.28, 0.04)},

@@ -11,8 +11,8 @@ from drivers.command import CommandSet, DriveCommand
 from drivers.guard import Guard, GuardLimits
 from drivers.registry import open_backend
 from far_end_process import FarEndProcess, far_end_process
-from model.calibration.fast_plate import fast_plate
 from model.rig.file import load_rig
+from model.vibration.parametric_plate import parametric_plate
 from rig_files import TWO_AMPLIFIERS, write_rig
 
 FREQUENCY = 170.0
@@ -64,7 +64,7 @@ def predicted(file: Path) -> np.ndarray:
     """Steady accelerations (s,) [m/s²] by the model."""
     rig = load_rig(file)
     points = np.array(list(SENSORS.values()))
-    responses = fast_plate(rig, points, np.array([FREQUENCY])).responses(rig)[0]
+    responses = parametric_plate(rig, points, np.array([FREQUENCY])).responses(rig)[0]
     bases = [
         DRIVE[era.name][0] * era.stroke * np.exp(1j * np.radians(DRIVE[era.name][1]))
         for era in rig.eras

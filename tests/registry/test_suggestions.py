@@ -23,7 +23,7 @@ from registry.suggestions import did_you_mean
     ],
 )
 def test_did_you_mean_suggests_similar_names(name: str, known: list[str], meant: str) -> None:
-    """Mistyped, in another case, or one word of the name."""
+    """Mistyped names, another case and one word of a name are understood."""
     assert did_you_mean(name, known) == meant
 
 

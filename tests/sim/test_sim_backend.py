@@ -35,7 +35,7 @@ async def test_sim_backend_plays_a_checked_set() -> None:
             writer.write(b'{"op": "state"}\n')
             state = json.loads(await reader.readline())
             assert state["amplifiers"]["main"]["levels"] == [0.5, 0, 0, 0]
-            assert state["time_s"] >= backend.last_sent
+            assert state["time_s"] >= backend.last_sent_at
             writer.close()
             await writer.wait_closed()
         finally:

@@ -15,37 +15,25 @@ from controller.sources.touch import Touch, TouchFrame, TouchSource
 from drivers.amplifier import Amplifier
 from drivers.backend import Backend
 from drivers.command import CommandSet
-from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
-    Achieved,
+    AmplifierEvent,
     AmplifierState,
     Apply,
-    Arm,
-    Capabilities,
-    Clear,
-    Commit,
-    Disarm,
-    Fault,
-    GetCaps,
-    Hello,
-    Identity,
-    Nak,
-    NakCode,
     Reply,
     Request,
-    Stage,
     Status,
-    Stop,
 )
 from drivers.protocol.wire_times import WireTimes
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
-from model.rig.rig import Channel, Limits, Rig
+from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
 from model.structure.plate import Material, Plate
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone
+from registry.limits import GuardLimits
+from sim.amplifier.amplifier import SimulatedAmplifier
 from stub_wire_times import StubWireTimes
 
 FINGER = (1, 0.5, 0.5)
@@ -53,7 +41,7 @@ OTHER = (2, 0.9, 0.9)
 
 
 class FarEnd(Backend):
-    """An amplifier that obeys and remembers everything it was asked, and when.
+    """A simulated amplifier without envelopes that remembers everything it was asked, and when.
 
     The last byte leaves at once, the reply takes `delay` [s]. `answer` may override any reply.
     """
@@ -61,14 +49,20 @@ class FarEnd(Backend):
     def __init__(self, channels: int = 2) -> None:
         self.asked: list[tuple[float, Request]] = []
         self.delay = self.commit_takes = 0.0
-        self.channels = channels
-        self.state = AmplifierState.SWITCH_ON_DISABLED
-        self.levels = (0.0,) * channels
-        self.token = 0
-        self.staged: CommandSet | None = None
+        self.amplifier = SimulatedAmplifier("any", channels=channels)
+        self.amplifier.capabilities = replace(
+            self.amplifier.capabilities, frequency_max=600.0, envelope_knots=0, envelope_slots=0
+        )
         self.answer: Callable[[Request], Reply | None] = lambda request: None
         self.is_open = False
-        self._last_sent = 0.0
+        self.report: Callable[[AmplifierEvent], None] = lambda event: None
+        self._last_sent_at = 0.0
+
+    def listen(
+        self, on_event: Callable[[AmplifierEvent], None], on_loss: Callable[[str], None]
+    ) -> None:
+        """Keep the callback of events, for tests to call."""
+        self.report = on_event
 
     async def open(self) -> None:
         """Always succeeds."""
@@ -79,9 +73,9 @@ class FarEnd(Backend):
         self.is_open = False
 
     @property
-    def last_sent(self) -> float:
+    def last_sent_at(self) -> float:
         """On the loop's clock [s]."""
-        return self._last_sent
+        return self._last_sent_at
 
     @property
     def wire_times(self) -> WireTimes:
@@ -90,59 +84,35 @@ class FarEnd(Backend):
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Remember, wait, answer."""
-        self._last_sent = asyncio.get_running_loop().time()
-        self.asked.append((self._last_sent, request))
+        self._last_sent_at = asyncio.get_running_loop().time()
+        self.asked.append((self._last_sent_at, request))
         await asyncio.sleep(self.delay)
         return self.answer(request) or self.obey(request)
 
     def obey(self, request: Request) -> Reply:
-        """What an amplifier without faults answers."""
-        match request:
-            case Hello():
-                return Identity("maker", "box", "1", "1", PROTOCOL.version)
-            case GetCaps():
-                return Capabilities(
-                    channels=self.channels,
-                    frequency_min=10.0,
-                    frequency_max=600.0,
-                    frequency_step=0.01,
-                    level_max=1.0,
-                    level_step=1e-4,
-                    phase_step=0.01,
-                    ramp_max=1.0,
-                    watchdog_min=0.1,
-                    watchdog_max=1.0,
-                    envelope_knots=0,
-                )
-            case Arm() if self.state is AmplifierState.SWITCH_ON_DISABLED:
-                self.state = AmplifierState.OPERATION_ENABLED
-            case Arm():
-                return Nak(NakCode.WRONG_STATE)
-            case Disarm() if self.state is AmplifierState.QUICK_STOP_ACTIVE:
-                self.levels = (0.0,) * self.channels  # silence undoes no latched stop
-            case Disarm() | Clear():
-                self.state = AmplifierState.SWITCH_ON_DISABLED
-                self.levels = (0.0,) * self.channels
-            case Stop():
-                self.state = AmplifierState.QUICK_STOP_ACTIVE
-                self.levels = (0.0,) * self.channels
-            case Stage(command_set=staged):
-                self.staged = staged
-                return Achieved(staged.token, staged.commands)
-            case Commit():
-                assert self.staged is not None
-                return self._play(self.staged)
-            case Apply(command_set=wanted):
-                return self._play(wanted)
-            case _:
-                pass
-        return Status(self.state, Fault.NONE, self.token, True, 25.0, 0.25, self.levels)
+        """What the simulated amplifier answers."""
+        return self.amplifier.handle(request, asyncio.get_running_loop().time())
 
-    def _play(self, wanted: CommandSet) -> Achieved:
-        levels = {command.channel: command.level for command in wanted.commands}
-        self.levels = tuple(levels.get(channel, 0.0) for channel in range(self.channels))
-        self.token = wanted.token
-        return Achieved(wanted.token, wanted.commands)
+    def status(self) -> Status:
+        """What it reports now."""
+        now = asyncio.get_running_loop().time()
+        self.amplifier.tick(now)
+        return self.amplifier.status(now)
+
+    @property
+    def state(self) -> AmplifierState:
+        """Its state now."""
+        return self.status().state
+
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """Its levels now."""
+        return self.status().levels
+
+    @property
+    def token(self) -> int:
+        """Token of the set that plays."""
+        return self.status().token
 
     def sets(self) -> list[CommandSet]:
         """All sets that were to be applied."""
@@ -230,7 +200,7 @@ def _rig(*amplifiers: str) -> Rig:
         ),
         wiring={"SW": Channel(amplifiers[0], 0), "NE": Channel(amplifiers[-1], 1)},
         amplifiers=dict.fromkeys(amplifiers, "fake://"),
-        limits=Limits(40.0, 500.0, 1.0),
+        limits=GuardLimits(40.0, 500.0, 1.0),
     )
 
 
@@ -285,17 +255,18 @@ def make_bench(
     channels: int = 2,
     far_ends: list[Any] | None = None,
     rate: float = math.inf,
+    on_time: float = math.inf,
     **options: Any,
 ) -> Bench:
     """A bench within a running loop; one amplifier unless more are named.
 
-    rate [1/s]: the rig's limit of sets; options: as a `Controller` takes them.
+    rate [1/s], on_time [s]: limits of the rig; options: as a `Controller` takes them.
     """
     names = amplifiers or ("main",)
     far_ends = far_ends or [FarEnd(channels) for _ in names]
     reports = Reports()
     rig = _rig(*names)
-    rig = replace(rig, limits=replace(rig.limits, rate=rate))
+    rig = replace(rig, limits=replace(rig.limits, rate=rate, on_time=on_time))
     table = Table({"SW": Tone(110.0, 20e-6, math.pi / 2)}, rig.plate)
     controller = Controller(
         rig,

@@ -7,7 +7,6 @@ time.monotonic(), the same for all processes.
 import asyncio
 import contextlib
 import json
-import math
 import os
 import sys
 import time
@@ -16,7 +15,6 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from best_of import best_of
 from controller.api.async_client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from daemon_bench import (
@@ -201,15 +199,17 @@ async def watch(
 
 async def plays_on(
     what: str, daemon: DaemonProcess, era: AsyncClient, journal: Journal, *, seconds: float = 0.6
-) -> float:
-    """Return the widest gap [s] of a period without a loss; the best of several tries.
+) -> None:
+    """Assert that it stays enabled for a period, and tell the widest gap between signs of life.
 
     what: the disturbance, for the printed figure.
     """
+    await play(era, daemon.far)
+    window = await watch(daemon, era, journal, seconds)
+    assert window.states == {ENABLED}
+    tell(f"between signs of life, {what}", window.widest_gap)
 
-    async def attempt() -> float:
-        await play(era, daemon.far)
-        window = await watch(daemon, era, journal, seconds)
-        return window.widest_gap if window.states == {ENABLED} else math.inf
 
-    return await best_of(f"between signs of life, {what}", attempt, WATCHDOG)
+def tell(what: str, seconds: float) -> None:
+    """Print a measured time; it is not asserted, for other programs on the machine lengthen it."""
+    sys.stdout.write(f"\nmeasured: {what}: {1e3 * seconds:.1f} ms\n")

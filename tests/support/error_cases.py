@@ -29,6 +29,7 @@ from typing import Any
 from ruamel.yaml import YAML
 
 from controller.api.client import Client
+from controller.api.jsonrpc import RpcError
 from controller.cli.main import run
 from gateway_bench import real_daemon
 
@@ -57,6 +58,7 @@ _PREPARED = {
     "layout.yaml": "effects:\n  tick: {kind: click}\n"
     "regions:\n  ok: {circle: {at: [0.1, 0.1], radius: 0.02}, on_press: tick}\n",
 }
+_COMMANDS = entry_points(group="era_haptics.commands")
 _SOCKET, _DAEMON = "era.sock", "running"
 
 
@@ -124,7 +126,7 @@ def provoke(case: Case, folder: Path, shelf: Path) -> Outcome:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             program, *arguments = shlex.split(case.run)
             assert program == "era"
-            status = run(arguments, entry_points(group="era_haptics.commands"))
+            status = run(arguments, _COMMANDS)
     text = err.getvalue().replace(str(folder), HOME)
     if case.blur:
         text = re.sub(case.blur, "...", text)
@@ -185,7 +187,10 @@ def _without_uvicorn(stack: contextlib.ExitStack) -> None:
 def _disarmed(stack: contextlib.ExitStack) -> Client:
     """A client of the running daemon, which is disarmed first."""
     client = stack.enter_context(Client.connect(Path(_SOCKET), name="another"))
-    client.disarm()
+    while client.status().state == "NOT_READY":
+        time.sleep(0.005)
+    with contextlib.suppress(RpcError):  # it may be stopped
+        client.disarm()
     client.clear()
     while client.status().state != "READY_TO_SWITCH_ON":
         time.sleep(0.005)

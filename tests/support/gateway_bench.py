@@ -21,7 +21,7 @@ from pathlib import Path
 from controller.api.client import Client
 from controller.api.connection import Connection
 from controller.api.hub import Hub
-from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
 from controller.api.methods import (
     METHODS,
     ArmResult,
@@ -29,10 +29,12 @@ from controller.api.methods import (
     HelloResult,
     RenewResult,
     StatusResult,
+    StopResult,
     SubscribeParams,
 )
 from controller.api.schema import (
     API_VERSION,
+    AmplifierSilence,
     EffectDescription,
     Empty,
     EraPosition,
@@ -59,6 +61,7 @@ class ScriptedDaemon:
     def __init__(self, folder: Path) -> None:
         self.socket = folder / "era.sock"
         self.calls: list[tuple[str, Message]] = []
+        self.silence: dict[str, AmplifierSilence] = {}  # after a stop that is not confirmed
         self._rig_text = write_rig(folder / "rig.yaml").read_text(encoding="utf-8")
         self._loop = asyncio.new_event_loop()
         self._serving = threading.Event()
@@ -104,7 +107,8 @@ class ScriptedDaemon:
         server = ApiServer(
             {name: self._handler(name) for name in METHODS},
             on_disconnect=self._hub.forget,
-            is_protected=self._hub.is_subscribed,
+            is_kept=lambda client: False,
+            is_subscribed=self._hub.is_subscribed,
         )
         bound = socket.socket(socket.AF_UNIX)
         bound.bind(str(self.socket))
@@ -142,6 +146,10 @@ class ScriptedDaemon:
                 raise RpcError(ErrorCode.REFUSED, "there is no such effect", remedy="see effects")
             case "status":
                 return _status()
+            case "stop" if self.silence:
+                raise NotSilent(self.silence)
+            case "stop":
+                return StopResult(amplifiers={})
             case _:
                 return Empty()
 
@@ -183,7 +191,7 @@ def _status() -> StatusResult:
         state="READY_TO_SWITCH_ON",
         cause="it is a script",
         remedy=None,
-        phase="disarmed",
+        amplifiers_state="disarmed",
         assume_energised=False,
         lost_for_s=None,
         watchdog_s=0.25,
@@ -192,7 +200,6 @@ def _status() -> StatusResult:
         contacts=[],
         drive={},
         predicted_contrast_db=None,
-        robust_contrast_db=None,
         predicted_level_db_sl=None,
         amplifiers=[],
         latency_ms=LatencySummary(count=0, median=None, p99=None, p999=None, histogram=[]),
@@ -476,3 +483,10 @@ def frame(payload: bytes, *, first: int = 0x81, is_masked: bool = True) -> bytes
     else:
         size = bytes([mask | 127]) + len(payload).to_bytes(8, "big")
     return bytes([first]) + size + key + payload
+
+
+UNCONFIRMED = {
+    "main": AmplifierSilence(silence="confirmed_silent", may_play_for_s=None, cause="read"),
+    "side": AmplifierSilence(silence="may_play", may_play_for_s=0.2, cause="no reply"),
+}
+"""What a stop may leave: one amplifier of two is not confirmed silent."""

@@ -1,7 +1,7 @@
 """`era` on a machine whose wall clock jumps: `python tests/support/jumping_clock.py daemon ...`.
 
-Every SIGUSR1 sets it to the next of `JUMPS`. Only what Python reads as the time of day jumps; what
-the kernel and CLOCK_MONOTONIC tell does not, as when an administrator or NTP sets the clock.
+Every SIGVTALRM sets it to the next of `JUMPS`. Only what Python reads as the time of day jumps, not
+what the kernel and CLOCK_MONOTONIC tell, as when an administrator or NTP sets the clock.
 """
 
 import itertools
@@ -29,7 +29,7 @@ def _jumping() -> None:
     def from_now(of: Callable[[float], Any]) -> Callable[..., Any]:
         return lambda seconds=None: of(time.time() if seconds is None else seconds)
 
-    signal.signal(signal.SIGUSR1, jump)
+    signal.signal(signal.SIGVTALRM, jump)
     time.time = lambda: real() + offset
     time.time_ns = lambda: real_ns() + round(offset * 1e9)
     time.gmtime = from_now(time.gmtime)  # type: ignore[assignment]

@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 import contextvars
 import queue
+import random
 from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, TypeVar, cast
@@ -124,6 +125,7 @@ def live_in_memory() -> MemoryMachine:
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualLoop)
     machine = MemoryMachine(loop)
+    random.seed(loop.rng.random())  # of tokens
     HARDWARE_PROVIDER.set(machine)
     TERMINAL_MAKER.set(machine.make_terminal)
     return machine
@@ -201,6 +203,10 @@ class MemoryPort:
         self._is_closed = self._is_hung_up = False
         self.outward = _Direction(on_data)
 
+    @property
+    def is_blocked(self) -> bool:
+        return False
+
     def write(self, data: bytes) -> None:
         if self._is_closed or self._is_hung_up:
             raise LinkError(f"serial line {self._terminal.port} was lost")
@@ -238,8 +244,9 @@ class _Slcan:
         for frame in self._reader.feed(data):
             self._on_frame(frame)
 
-    def send(self, frames: Sequence[CanFrame]) -> None:
+    def send(self, frames: Sequence[CanFrame]) -> int:
         self.port.write(b"".join(map(slcan_line, frames)))
+        return len(frames)
 
     def close(self) -> None:
         with contextlib.suppress(LinkError):  # already lost
@@ -283,10 +290,11 @@ class _Socketcand(asyncio.Protocol):
         if not self._is_closed:
             self._on_loss(f"the CAN bus {self._url} was lost (the socketcand server hung up)")
 
-    def send(self, frames: Sequence[CanFrame]) -> None:
+    def send(self, frames: Sequence[CanFrame]) -> int:
         if self._transport is None:
             raise LinkError(f"the CAN bus {self._url} was lost")
         self._transport.write(b"".join(map(socketcand_element, frames)))
+        return len(frames)
 
     def close(self) -> None:
         self._is_closed = True

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import signal
 import socket
 import subprocess
@@ -12,6 +13,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from preloaded import ERA
 from printed import difference
 from typed_page import Edited, Interrupted, PageError, Seen, Step, Typed, Written
 
@@ -117,33 +119,38 @@ class Reader:
         path.write_text(text.replace(step.old, step.new), encoding="utf-8")
 
     def _type(self, step: Typed) -> None:
-        done = subprocess.run(
-            ["bash", "-e", "-c", step.commands],
-            cwd=self._folder,
-            env=self._environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            timeout=PATIENCE,
-            check=False,
-        )
-        if done.returncode != step.status:
-            raise PageError(f"line {step.line}: exit status {done.returncode}\n{done.stdout}")
-        _compare(step.line, step.shown, done.stdout)
+        printed, status = "", 0
+        for words in _commands(step.commands):
+            done = subprocess.run(
+                words,
+                cwd=self._folder,
+                env=self._environment,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                timeout=PATIENCE,
+                check=False,
+            )
+            printed, status = printed + done.stdout, done.returncode
+            if status:
+                break
+        if status != step.status:
+            raise PageError(f"line {step.line}: exit status {status}\n{printed}")
+        _compare(step.line, step.shown, printed)
 
     def _begin(self, step: Typed) -> None:
         assert step.terminal is not None
         output = self._folder.parent / f"{step.terminal}.txt"
+        commands = _commands(step.commands)
         with output.open("wb") as file:
             process = subprocess.Popen(
-                ["bash", "-c", step.commands],
+                commands[0] if len(commands) == 1 else ["bash", "-e", "-c", step.commands],
                 cwd=self._folder,
                 env=self._environment,
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                preexec_fn=_heed_ctrl_c,
             )
         self._terminals[step.terminal] = process, output
         self._wait_for(step.line, step.terminal, step.shown or "")
@@ -181,9 +188,13 @@ class Reader:
             raise PageError(f"line {step.line}: goes on\n{output.read_text('utf-8')}") from None
 
 
-def _heed_ctrl_c() -> None:
-    """Programs that a shell has put into the background ignore it, and what they start does."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+def _commands(fence: str) -> list[list[str]]:
+    """What runs a fence: each line by itself where all are plain commands, else a shell."""
+    plain = re.fullmatch(r"((era|pip|python|cp) [^|&;<>$`*?~#\\\n]+\n)+", fence)
+    if plain is None:
+        return [["bash", "-e", "-c", fence]]
+    lines = [shlex.split(line) for line in fence.splitlines()]
+    return [[ERA, *words[1:]] if words[0] == "era" else words for words in lines]
 
 
 def _compare(line: int, shown: str | None, printed: str) -> None:

@@ -1,9 +1,10 @@
 """The founding paper's plate, for tests that need a rig without a file."""
 
 from model.fem.mesh import Mesh
-from model.rig.rig import Channel, Limits, Rig
+from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era, damping_from_ratio
 from model.structure.plate import Material, Plate
+from registry.limits import GuardLimits
 
 # Section 3 of the founding paper; stiffness recovered from its Table 2, damping and stroke assumed.
 ALUMINIUM = Material("aluminium", E=70e9, rho=2700.0, nu=0.33)
@@ -22,5 +23,5 @@ def make_paper_rig(nx: int, ny: int, *, damping_ratio: float = 0.05) -> Rig:
         for name, (x, y) in corners.items()
     )
     wiring = {era.name: Channel("main", number) for number, era in enumerate(eras)}
-    limits = Limits(frequency_min=40.0, frequency_max=500.0, level=1.0)
+    limits = GuardLimits(frequency_min=40.0, frequency_max=500.0, level=1.0)
     return Rig(plate, Mesh(nx, ny, LENGTH, WIDTH), eras, wiring, {"main": "sim://"}, limits)

@@ -36,9 +36,9 @@ from drivers.codec.serial_line import frame as serial_frame
 from drivers.codec.serial_line import sets as serial_sets
 from drivers.command import CommandSet, DriveCommand
 from drivers.guard import rules
-from drivers.link import turns
+from drivers.line import priority
+from drivers.line.sender import Sender
 from drivers.link.link import Link
-from drivers.link.turns import Turns
 from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import AmplifierState, Apply, Disarm, Hello, Identity, Stage, Status
 from sim.amplifier import amplifier as simulated
@@ -155,7 +155,7 @@ async def _sleeps_past_heartbeats(next_cause: Any, controller: Any) -> None:
             controller._heartbeat_due = due
 
 
-async def _checks_no_tokens(playback: Any, sets: Any) -> None:
+async def _checks_no_tokens(playback: Any, sets: Any, since: float) -> None:
     pass
 
 
@@ -208,13 +208,15 @@ CONTROLLER: dict[str, Bug] = {
     ),
     "a stop reaches one amplifier only": Bug(
         "stop",
-        wrapped(QuickStops, "__init__", lambda init, self, all_: init(self, list(all_)[:1])),
+        wrapped(
+            QuickStops, "__init__", lambda init, self, all_: init(self, dict([*all_.items()][:1]))
+        ),
         amplifiers=_TWO,
     ),
     "a set is committed by one amplifier only": Bug(
         "commit",
         both(
-            replaced(SynchronizedPlay, "_check_tokens", _checks_no_tokens),
+            replaced(SynchronizedPlay, "_confirm_commits", _checks_no_tokens),
             wrapped(
                 SynchronizedPlay,
                 "_commits",
@@ -255,6 +257,10 @@ def _nan_as_integer(to_wire: Any, quantity: Quantity, value: float) -> int:
     return -0x8000 if math.isnan(value) else to_wire(quantity, value)
 
 
+def _nan_unrounded(quantise: Any, quantity: Quantity, value: float) -> float:
+    return value if math.isnan(value) else quantise(quantity, value)
+
+
 class _AnyChecksum(int):
     """A checksum that equals every other."""
 
@@ -270,12 +276,14 @@ _unchecked = replaced(
 
 
 def _credited_to_first(received: Any, backend: Any, frame: Any) -> None:
-    waiting = next(iter(backend._pending), frame.sequence) if frame.is_reply else frame.sequence
-    received(backend, replace(frame, sequence=waiting))
+    pending = backend._pending if frame.is_reply else None
+    received(backend, replace(frame, sequence=pending.request.sequence) if pending else frame)
 
 
-async def _takes_at_once(_acquire: Any, line: Any, _priority: Any) -> None:
-    line._is_in_use = True
+async def _sends_at_once(
+    _send: Any, _sender: Any, _backend: Any, _priority: Any, attempt: Any
+) -> Any:
+    return await attempt()
 
 
 async def _knows_already(ask: Any, link: Link, request: Any, **how: Any) -> Any:
@@ -308,7 +316,13 @@ DRIVERS: dict[str, Bug] = {
     "the level limit is removed": Bug("limits", _without(rules._check_levels), scenarios.too_loud),
     "the check for NaN is skipped": Bug(
         "garbage",
-        both(_without(rules._check_finite), wrapped(Quantity, "to_wire", _nan_as_integer)),
+        both(
+            _without(rules._check_finite),
+            both(
+                wrapped(Quantity, "quantise", _nan_unrounded),
+                wrapped(Quantity, "to_wire", _nan_as_integer),
+            ),
+        ),
         scenarios.not_a_number,
     ),
     "every set has the same token": Bug("token", replaced(safe_sets, "token_after", lambda _: 1)),
@@ -331,15 +345,15 @@ DRIVERS: dict[str, Bug] = {
         "credit", wrapped(SerialBackend, "_received", _credited_to_first), scenarios.foreign_answer
     ),
     "two requests are on the line at once": Bug(
-        "credit", wrapped(Turns, "acquire", _takes_at_once), scenarios.slow_touch
+        "credit", wrapped(Sender, "send", _sends_at_once), scenarios.slow_touch
     ),
     "a stop is queued behind": Bug(
-        "stop", replaced(turns, "PREEMPTION_GRACE", 10.0), scenarios.slow_stop
+        "stop", replaced(priority, "PREEMPTION_GRACE", 10.0), scenarios.slow_stop
     ),
     "silence waits its turn": Bug(
         "lift",
         both(
-            replaced(turns, "PREEMPTION_GRACE", 10.0),
+            replaced(priority, "PREEMPTION_GRACE", 10.0),
             replaced(amplifier_group, "PREEMPTION_GRACE", 10.0),
         ),
         scenarios.slow_lift,
@@ -525,7 +539,7 @@ FAR_ENDS: dict[str, Bug] = {
         "plays", _plays_each(lambda one: replace(one, level=one.level / 10))
     ),
     "it reports that nothing plays": Bug(
-        "plays", _reports(lambda one: replace(one, levels=(0.0,) * len(one.levels)))
+        "commit", _reports(lambda one: replace(one, levels=(0.0,) * len(one.levels)))
     ),
     "an incomplete set is played": Bug(
         "commit",

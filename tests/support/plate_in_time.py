@@ -7,10 +7,10 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from model.arrays import ComplexArray, FloatArray
-from model.fem.assembly import era_positions
 from model.reduction.modal_matrices import modal_matrices
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
+from model.structure.point_load import footprints_of
 from model.transients.time_response import PlateInTime, plate_in_time
 from paper_plate import make_paper_rig
 
@@ -22,7 +22,7 @@ def make_plate_in_time(*, frequency_max: float = 500.0) -> tuple[Rig, PlateInTim
     """The rig and its plate; modes enough for a frequency [Hz]."""
     rig = make_paper_rig(16, 12)
     reduced = reduce_plate(
-        rig.plate, rig.mesh, era_positions(rig.eras), frequency_max=frequency_max
+        rig.plate, rig.mesh, footprints_of(rig.eras), frequency_max=frequency_max
     )
     return rig, plate_in_time(reduced, rig.eras)
 
@@ -48,7 +48,7 @@ def stepped_acceleration(
     times (n,) ascending; breaks: where a base's velocity jumps [s], from 0 to the end.
     """
     M, C, K = modal_matrices(plate.reduced, plate.eras)
-    phi = plate.reduced.at(era_positions(plate.eras))
+    phi = plate.reduced.at(footprints_of(plate.eras))
     inverse = np.linalg.inv(M)
 
     def acceleration(t: float, x: FloatArray) -> FloatArray:

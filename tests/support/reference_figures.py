@@ -61,7 +61,7 @@ def reference_figures() -> dict[str, list[float]]:
                 pattern.quiet_level_db_sl,
                 pattern.robust_contrast_db,
                 pattern.transient_contrast_db,
-                pattern.left_after_db,
+                pattern.residual_db,
             )
             figures[f"query_{drive_mode}_{name}_db"] = np.array(
                 [each for each in measures if each is not None]

@@ -11,7 +11,7 @@ from drivers.protocol.messages import Reply, Request
 from drivers.protocol.wire_times import WireTimes
 from model.table.pattern import Pattern
 from model.table.question import Question
-from model.transients.envelope import Envelope
+from model.transients.envelope import BaseEnvelope
 from sim.amplifier.amplifier import SimulatedAmplifier
 from stub_wire_times import StubWireTimes
 
@@ -44,13 +44,13 @@ class Shapes:
         return replace(pattern, transient_contrast_db=30.0 if pattern.onset else 10.0)
 
 
-def _along(pattern: Pattern, start: float, shares: Sequence[float]) -> dict[str, Envelope]:
+def _along(pattern: Pattern, start: float, shares: Sequence[float]) -> dict[str, BaseEnvelope]:
     tones = {
         name: (tone.frequency, cmath.rect(tone.amplitude, tone.phase))
         for name, tone in pattern.excitation.items()
     }
     return {
-        name: Envelope(frequency, start * full, tuple(share * full for share in shares))
+        name: BaseEnvelope(frequency, start * full, tuple(share * full for share in shares))
         for name, (frequency, full) in tones.items()
     }
 
@@ -66,7 +66,7 @@ class Link(Backend):
         self.asked: list[tuple[float, Request]] = []
         self.delay: Callable[[Request], float] = lambda request: 0.0
         self.loading = 0.0
-        self._last_sent = 0.0
+        self._last_sent_at = 0.0
 
     async def open(self) -> None:
         """Always succeeds."""
@@ -75,9 +75,9 @@ class Link(Backend):
         """Nothing is to be given back."""
 
     @property
-    def last_sent(self) -> float:
+    def last_sent_at(self) -> float:
         """On the loop's clock [s]."""
-        return self._last_sent
+        return self._last_sent_at
 
     @property
     def wire_times(self) -> WireTimes:
@@ -86,9 +86,9 @@ class Link(Backend):
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Obey at once, answer later."""
-        self._last_sent = asyncio.get_running_loop().time()
-        self.asked.append((self._last_sent, request))
-        reply = self.amplifier.handle(request, self._last_sent)
+        self._last_sent_at = asyncio.get_running_loop().time()
+        self.asked.append((self._last_sent_at, request))
+        reply = self.amplifier.handle(request, self._last_sent_at)
         await asyncio.sleep(self.delay(request))
         return reply
 

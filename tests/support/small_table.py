@@ -1,5 +1,7 @@
 """A table of the paper's plate that is built in a moment."""
 
+from functools import cache
+
 import numpy as np
 
 from model.finger.grid import Grid
@@ -16,6 +18,7 @@ def small_problem(*, nx: int = 12, ny: int = 9) -> TableProblem:
     return TableProblem(make_paper_rig(nx, ny), FREQUENCIES, Grid(4, 3))
 
 
+@cache
 def small_table(*, drive_mode: str = "switched") -> LocalizationTable:
     """On the paper's own mesh."""
     return build_in_parts(small_problem(), drive_mode=drive_mode).table

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, TextIO
 
-from controller.group.amplifier_group import Phase
+from controller.group.amplifier_group import GroupState
 from controller.loop.loop import Controller
 from controller.loop.observer import Applied, Observer
 from controller.sources.touch import Touch, TouchFrame
@@ -278,7 +278,7 @@ class _Run:
     def _must_be_felt(self) -> bool:
         """Whether a first touch now must lead to a pattern."""
         at = self.loop.time() - START
-        is_armed = self.controller is not None and self.controller.phase is Phase.ARMED
+        is_armed = self.controller is not None and self.controller.group_state is GroupState.ARMED
         return is_armed and self.plan.is_calm(at - 0.1, at + _PATTERN)
 
     def _expect_pattern(self) -> None:
@@ -296,7 +296,7 @@ class _Run:
     def _expect_loss(self, number: int) -> None:
         """Check that an armed controller detects an unplugged wire in time."""
         controller = self.controller
-        if controller is None or controller.phase is not Phase.ARMED:
+        if controller is None or controller.group_state is not GroupState.ARMED:
             return
         if number and len(self.plan.lines) == 1:
             return  # a shared line is unplugged at its first amplifier
@@ -306,7 +306,7 @@ class _Run:
         def look() -> None:
             if running is None or self.running is not running:
                 return  # stalled meanwhile
-            if self.controller is controller and controller.phase is Phase.ARMED:
+            if self.controller is controller and controller.group_state is GroupState.ARMED:
                 self.checks.violate("a wire is unplugged and the controller still armed")
 
         self.loop.call_later(_NOTICED, look)
@@ -321,14 +321,14 @@ class _Run:
             if self.plan.is_calm(action.at - 0.4, action.at):
                 self.checks.violate("could not be opened without a fault")
         elif action.what == "ready":
-            if controller.phase is not Phase.ARMED:
+            if controller.group_state is not GroupState.ARMED:
                 await self._call("clear", controller.clear)
                 await self._call("arm", controller.arm)
             at = self.loop.time() - START
             is_calm = self.plan.is_calm(action.at - 0.1, at)
-            if controller.phase is Phase.LOST and controller is self.controller:
+            if controller.group_state is GroupState.LOST and controller is self.controller:
                 self._reopen()
-            elif is_calm and controller.phase is not Phase.ARMED:
+            elif is_calm and controller.group_state is not GroupState.ARMED:
                 self.checks.violate("could not be armed without a fault")
         else:
             await self._call(action.what, getattr(controller, action.what))

@@ -12,4 +12,4 @@ def free_port() -> int:
 
 def panel(port: int) -> str:
     """The lines of a daemon's file for a TUIO panel."""
-    return f'touch: [{{name: panel, url: "tuio:127.0.0.1:{port}"}}]\n'
+    return f'touch: [{{name: panel, url: "tuio:127.0.0.1:{port}?timeout=0.15"}}]\n'

@@ -58,6 +58,7 @@ LEVELS = (0.2, 0.0, 0.0, 1.0)
 PLAYING = Status(S.OPERATION_ENABLED, Fault.NONE, 513, True, 25.0, 0.25, LEVELS, 1800.0)
 FADING = Status(S.SWITCHED_ON, Fault.NONE, 513, True, 25.0, 0.0, LEVELS, 1800.0)
 STOPPED = Status(S.QUICK_STOP_ACTIVE, Fault.NONE, 513, True, 25.0, 0.0, LEVELS, 1800.0)
+HALTED = Status(S.QUICK_STOP_ACTIVE, Fault.NONE, 513, True, 25.0, 0.0, (0.0,) * 4, 1800.0)
 TRIPPED = Status(S.FAULT, Fault.WATCHDOG, 513, False, -5.3, 0.0, (0.0,) * 4)
 
 
@@ -120,6 +121,10 @@ def usual_reply(request: Request) -> Reply:
             return Achieved(token, COMMANDS)
         case LoadEnvelope(envelope=envelope):
             return Loaded(envelope.slot, len(envelope.knots))
+        case Disarm() | Clear():
+            return OFF
+        case Stop():
+            return HALTED
         case _:
             return ARMED
 

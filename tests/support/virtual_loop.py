@@ -33,6 +33,7 @@ class VirtualLoop(BaseEventLoop):
 
     def __init__(self, rng: random.Random | None = None, seen: Seen | None = None) -> None:
         self.now = START
+        self.ends = math.inf  # s; afterwards it is stuck
         super().__init__()
         self._turns = 0
         self.rng = rng or random.Random(0)
@@ -62,6 +63,9 @@ class VirtualLoop(BaseEventLoop):
             raise Stuck(f"{_TURNS_MAX} turns at one moment: a task reschedules itself endlessly")
         if timeout is None:
             raise Stuck("deadlock: no timer and no ready task")
+        if self.now > self.ends:
+            self.ends = math.inf
+            raise Stuck("tasks that do not end although they were cancelled")
         if timeout > 0:
             self._turns = 0
             self.now = max(self.now, self._scheduled[0].when())

@@ -23,18 +23,24 @@ RETIRED = {
     "Order|OrderMaker": "CommandSet and its envelopes",
     "Means": "PlaybackCapabilities",
     "Station|Site": "SimulatedDevice, SimulationContext",
+    "Phase": "GroupState",
+    "bad|foreign": "invalid_frames, unexpected_frames",
+    "misses|proves": "failed_count, requirement",
 }
 """Whole identifiers."""
 
 RETIRED_WORDS = {
     "momenta": "mass_weighted_modes",
+    "likeness": "MAC, the modal assurance criterion",
+    "drive_vector": "Weights",
+    "brakes?": "ending",
     "spread": "std, bandwidth or radius",
     "promising": "MAX_CANDIDATES",
     "move_shares": "lawson_iterations",
     "likely": "expected",
     "gave_way|gives?_way|given_way": "Preempted, preempt",
     "hurry|hurried": "abort_unsent",
-    "beaten|borne": "heartbeat_acknowledged, MAX_MISSED_HEARTBEATS",
+    "beaten|borne": "a word for the event, MIN_HEARTBEATS_PER_WATCHDOG",
     "keep_free": "reserve",
     "told|told_after": "reported, notified, loss_detection_time",
     "left_out": "skipped",
@@ -49,6 +55,10 @@ RETIRED_WORDS = {
     "telegrams?": "ADU",
     "dearest|dear": "SLOWEST",
     "nearness": "suggestions",
+    "unaware": "imperceptible",
+    "because": "reason",
+    "surplus": "to_evict",
+    "trouble": "errors",
     "nobody|somebody|anybody|everybody|whoever": "the component's name",
     "patience": "_TIMEOUT",
     "(?<!at_)most|longest|usual": "MAX_, DEFAULT_",
@@ -58,13 +68,11 @@ RETIRED_WORDS = {
 CONTACT_PACKAGES = ("controller/sources/", "controller/loop/", "sim/")
 """Where `lease`, the word of arming, would mean the timeout of a contact."""
 
-ALLOWED_FILES = (
-    "drivers/link/",
-    "drivers/backends/line_turns.py",
-)
+ALLOWED_FILES = ("drivers/link/",)
 """Their names follow the next version of the protocol."""
 
 ALLOWED = {
+    "answers": "JSON of `era table verify` and `era amp discover`: not modal ones",
     "most_at_once": "a key of the configuration file",
     "longest_lease": "a key of the configuration file",
     "hold": "a parameter of the effect `ramp`: the last level is held",
@@ -88,7 +96,7 @@ def retired_identifiers() -> Iterator[str]:
 
 
 def _definitions(tree: ast.Module) -> Iterator[tuple[str, int]]:
-    """Names of functions, classes, arguments, variables and attributes where they are assigned."""
+    """Names of functions, classes, arguments, assigned variables and attributes, and JSON keys."""
     for node in ast.walk(tree):
         match node:
             case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name):
@@ -97,6 +105,12 @@ def _definitions(tree: ast.Module) -> Iterator[tuple[str, int]]:
                 yield name, node.lineno
             case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):
                 yield name, node.lineno
+            case ast.Dict(keys=keys):  # of JSON
+                yield from (
+                    (key.value, key.lineno)
+                    for key in keys
+                    if isinstance(key, ast.Constant) and isinstance(key.value, str)
+                )
 
 
 def _replacement(name: str, file: str) -> str | None:

@@ -173,7 +173,7 @@ async def damaged_answer(chain: Chain) -> None:
 
 
 async def foreign_answer(chain: Chain) -> None:
-    """Instead of the answer to a heartbeat comes that to another request, and a finger."""
+    """Instead of the answer to a status comes that to an earlier one, and a finger."""
     kept: list[bytes] = []
     replaced = asyncio.Event()
 
@@ -181,9 +181,9 @@ async def foreign_answer(chain: Chain) -> None:
         if toward != "host" or replaced.is_set():
             return data
         kept.append(data)
-        if len(kept) > 1 and len(data) == len(kept[-2]):
+        if len(kept) > 2 and len(data) == len(kept[-3]):  # a heartbeat's is between them
             replaced.set()
-            return kept[-2]
+            return kept[-3]
         return data
 
     await chain.operate("arm", rest=0.02)

@@ -24,12 +24,13 @@ from drivers.registry import open_backend
 from memory_machine import MemoryMachine, live_in_memory
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
-from model.rig.rig import Channel, Limits, Rig
+from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
 from model.structure.plate import Material, Plate
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone
+from registry.limits import GuardLimits
 from sim.bench.bench import Bench
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import Wire, open_wire
@@ -78,7 +79,7 @@ class OneTable:
         return np.array([110.0]), np.ones((1, len(points)))
 
 
-def make_rig(amplifiers: Sequence[str], limits: Limits) -> Rig:
+def make_rig(amplifiers: Sequence[str], limits: GuardLimits) -> Rig:
     """Three ERAs on one amplifier, or NE on another; SE is never driven."""
     return Rig(
         plate=Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33)),
@@ -245,7 +246,7 @@ def play(
     scenario: Scenario,
     *,
     amplifiers: Collection[str] = ("main",),
-    limits: Limits | None = None,
+    limits: GuardLimits | None = None,
     seed: int = 1,
 ) -> Outcome:
     """Play a scenario to its end on a wire of this kind; returns the outcome."""
@@ -255,7 +256,7 @@ def play(
     return run_virtual(main, rng=rng, seen=probe.seen)
 
 
-_LIMITS = Limits(40.0, 500.0, 0.5)
+_LIMITS = GuardLimits(40.0, 500.0, 0.5)
 
 
 class _Probe:
@@ -277,7 +278,7 @@ async def _play(
     wire: str,
     scenario: Scenario,
     names: tuple[str, ...],
-    limits: Limits,
+    limits: GuardLimits,
     probe: _Probe,
 ) -> Outcome:
     loop = asyncio.get_running_loop()
@@ -302,11 +303,12 @@ async def _play(
         controller = Controller(rig, table, amplifiers=backends)
         chain = Chain(loop, machine, between, bench, witness, table, controller, backends, links)
         async with _sensed(chain):
-            await controller.open()
-            chain.run()
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(_LONGEST):
-                    await chain._try(scenario(chain))
+            await chain._try(controller.open())
+            if not chain.errors:
+                chain.run()
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(_LONGEST):
+                        await chain._try(scenario(chain))
             await _end(chain)
         for device in devices:
             device.close()

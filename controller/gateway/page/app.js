@@ -56,14 +56,17 @@ async function call(method, params) {
   }
 }
 
+const NOT_SILENT = 1006;
+
 async function stop() {
   lease = null;
   try {
     if (!connection) throw new Error("no token");
     await connection.stop();
     at("problem").textContent = "";
-  } catch {
-    showError(new Error("The stop was not confirmed. Switch the amplifiers off by hand."));
+  } catch ({ errors }) {
+    const unconfirmed = errors?.find(({ code }) => code === NOT_SILENT);  // it names the amplifiers
+    showError(unconfirmed ?? new Error("The stop was not confirmed. Switch the amplifiers off by hand."));
   }
 }
 
@@ -158,11 +161,10 @@ function showLinkLoss(cause, remedy) {
   linkLoss ??= { item: addEvent(log, "error", `link lost: ${cause}`, remedy), remedy, retries: 0 };
 }
 
-function summarise({ contacts, predicted_contrast_db, robust_contrast_db, predicted_level_db_sl, latency_ms }) {
+function summarise({ contacts, predicted_contrast_db, predicted_level_db_sl, latency_ms }) {
   const parts = [];
   if (predicted_level_db_sl !== null) parts.push(`target: ${fixed(predicted_level_db_sl)} dB SL`);
   if (predicted_contrast_db !== null) parts.push(`${fixed(predicted_contrast_db)} dB over the other fingers`);
-  if (robust_contrast_db !== null) parts.push(`${fixed(robust_contrast_db)} dB robust`);
   parts.push(`${fixed(latency_ms, 1)} ms from touch to wire`);
   at("summary").textContent = `${contacts.length} ${contacts.length === 1 ? "finger" : "fingers"}: ${parts.join(", ")}`;
 }
@@ -186,7 +188,7 @@ const HANDLERS = {
     outage = null;
     showBanner();
     overlay.setUp(daemon);
-    connection.call("status").then(showStatus).catch(showError);
+    connection.call("status").then(showStatus).catch((error) => error.code && showError(error));  // 0: an outage, shown already
     connection.call("effects").then(({ effects }) => showEffects(at("effects-section"), at("effects"), effects, play)).catch(() => {});
   },
   state({ old, new: next, cause, remedy }) {
@@ -221,9 +223,9 @@ const HANDLERS = {
   amplifiers({ amplifiers }) {
     showAmplifiers(at("amplifiers"), amplifiers, overlay.rig?.eras ?? []);
   },
-  latency({ latency_ms, plain_because }) {
+  latency({ latency_ms, ramp_only_reason }) {
     showLatency(at("latency-numbers"), at("latency"), latency_ms);
-    at("plain").textContent = plain_because ? `Plain ramps instead of shaped onsets: ${plain_because}` : "";
+    at("plain").textContent = ramp_only_reason ? `Plain ramps instead of shaped onsets: ${ramp_only_reason}` : "";
   },
   log({ level, message, cause, remedy }) {
     addEvent(log, level, cause ? `${message}: ${cause}` : message, remedy);

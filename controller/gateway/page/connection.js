@@ -99,10 +99,11 @@ export class Connection {
     if (this.isOpen) this.socket.send(JSON.stringify({ jsonrpc: "2.0", method, params }));
   }
 
-  // Stop over the WebSocket and over HTTP; a promise that one of them was confirmed.
+  // Stop over the WebSocket and over HTTP; a promise that all amplifiers are confirmed silent.
   stop() {
-    const overHttp = this.post("stop").then((response) => {
-      if (!response.ok) throw new Error("the stop was not carried out");
+    const overHttp = this.post("stop").then(async (response) => {
+      const { error, code, data } = await response.json();
+      if (!response.ok) throw new RpcError({ message: error, code, data });
     });
     return Promise.any([this.call("stop"), overHttp]);
   }

@@ -8,20 +8,20 @@ from collections.abc import Callable, Sequence
 from typing import final
 
 import can
-import serial
 
-from drivers.backends.can_bus.interfaces import open_bus, send_all, wake
+from drivers.backends.can_bus.interfaces import flush, open_bus, send_some, wake
 from drivers.backends.hardware import HARDWARE_PROVIDER, Adapter
 from drivers.backends.ports.watched import remedy_of
 from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.frame import CanFrame
-from drivers.errors import LinkError, LinkTimeout, system_message
+from drivers.errors import LinkError, system_message
 from drivers.threads import close_in_thread, in_thread
 
 _READ_TIMEOUT = 0.05  # s; interval in which the reader notices its end
 _BUS_OFF = 0x40  # error class of SocketCAN
-_OFF = "the adapter went bus-off; check wiring, termination and bit rate"
-_TROUBLE = (can.CanError, OSError, ValueError, TypeError)  # TypeError: closed during a read
+FULL_PAUSE = 0.0005  # s; before frames are sent again to a full transmit queue
+_BUS_OFF_MESSAGE = "the adapter went bus-off; check wiring, termination and bit rate"
+_CAN_ERRORS = (can.CanError, OSError, ValueError, TypeError)  # TypeError: closed during a read
 
 logging.getLogger("can").addHandler(logging.NullHandler())  # its messages become LinkErrors
 
@@ -39,8 +39,8 @@ async def open_adapter(
         return await hardware.open_adapter(url, on_frame=on_frame, on_loss=on_loss)
     try:
         bus = await in_thread(lambda: open_bus(url), name=f"era-open {url}", undo=_shut)
-    except _TROUBLE as problem:
-        raise LinkError(_why_not_open(url, problem)) from problem
+    except _CAN_ERRORS as problem:
+        raise LinkError(_open_error_message(url, problem)) from problem
     return _ThreadedAdapter(bus, url, on_frame, on_loss)
 
 
@@ -66,19 +66,25 @@ class _ThreadedAdapter:
         self._thread = threading.Thread(target=self._read, name=f"era-can {url}", daemon=True)
         self._thread.start()
 
-    def send(self, frames: Sequence[CanFrame]) -> None:
-        """Send frames back to back; LinkTimeout if the adapter is blocked, LinkError."""
+    def send(self, frames: Sequence[CanFrame]) -> int:
+        """Send frames back to back, as many as the adapter takes; returns them, or LinkError."""
         try:
             with self._sending:
-                send_all(self._bus, frames)
-        except serial.SerialTimeoutException as stuck:
-            raise LinkTimeout(
-                f"{self._url}: send timed out; check the adapter and flow control"
-            ) from stuck
-        except _TROUBLE as problem:
-            what = self._what_was_lost(problem)
+                taken = send_some(self._bus, frames)
+                is_clear = flush(self._bus)
+        except _CAN_ERRORS as problem:
+            what = self._loss_message(problem)
             self._loop.call_soon_threadsafe(self._lose, what)
             raise LinkError(what) from problem
+        if not is_clear:
+            self._loop.call_soon_threadsafe(self._loop.call_later, FULL_PAUSE, self._flush)
+        return taken
+
+    def _flush(self) -> None:
+        """Send what is left of a frame; the loss of the bus is reported by `_lose`."""
+        if not self._closing.is_set():
+            with contextlib.suppress(LinkError):
+                self.send(())
 
     def close(self) -> None:
         """Let the reader end, which closes the adapter."""
@@ -98,18 +104,18 @@ class _ThreadedAdapter:
                 # A closed adapter may hang here while others have reopened the bus.
                 if message is not None and not self._closing.is_set():
                     problem = self._take(message)
-        except _TROUBLE as error:
+        except _CAN_ERRORS as error:
             problem = error
         finally:
             _shut(self._bus)
         if not self._closing.is_set():
             with contextlib.suppress(RuntimeError):  # of a closed loop
-                self._loop.call_soon_threadsafe(self._lose, self._what_was_lost(problem))
+                self._loop.call_soon_threadsafe(self._lose, self._loss_message(problem))
 
     def _take(self, message: can.Message) -> str:
         """Pass a frame on; returns the problem that an error frame reports, if any."""
         if message.is_error_frame:
-            return _OFF if message.arbitration_id & _BUS_OFF else ""
+            return _BUS_OFF_MESSAGE if message.arbitration_id & _BUS_OFF else ""
         if not (message.is_remote_frame or message.is_extended_id):
             data = bytes(message.data)
             self._on_frame(CanFrame(message.arbitration_id, data, fd=message.is_fd))
@@ -122,7 +128,7 @@ class _ThreadedAdapter:
         self.close()
         self._on_loss(what)
 
-    def _what_was_lost(self, problem: Exception | str) -> str:
+    def _loss_message(self, problem: Exception | str) -> str:
         return (
             f"the CAN bus {self._url} was lost ({problem}): check the adapter and the cable, then "
             "open the amplifier again"
@@ -131,11 +137,11 @@ class _ThreadedAdapter:
 
 def _shut(bus: can.BusABC) -> None:
     """Close an adapter, also a lost one."""
-    with contextlib.suppress(*_TROUBLE):
+    with contextlib.suppress(*_CAN_ERRORS):
         bus.shutdown()
 
 
-def _why_not_open(url: CanBusUrl, problem: Exception) -> str:
+def _open_error_message(url: CanBusUrl, problem: Exception) -> str:
     if url.interface == "slcan":
         remedy = remedy_of(problem) or "check the port's name, the adapter and the bit rate"
     elif url.interface == "socketcand":

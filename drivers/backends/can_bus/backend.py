@@ -46,10 +46,12 @@ from drivers.protocol.messages import (
     Reply,
     Request,
     Stage,
+    Stop,
 )
 from drivers.statistics import WireCounters
 
-_OBJECTS_WAIT = 40  # most SDO replies of one job
+_BROADCAST_TIMEOUT = 0.03  # s; for room in the transmit queue
+_MAX_SDO_RESPONSES = 40  # of one job
 _START = CANOPEN["nmt"]["start"]
 _T = TypeVar("_T")
 
@@ -74,14 +76,9 @@ class CanBackend(WireBackend):
             self._url, on_reply=self._received, on_event=self._notify, on_loss=self._lose
         )
         self._pending = PendingRequests()
+        self._start = CanFrame(cob_id("nmt"), bytes([_START, self._url.node]))
         self._staged: Achieved | None = None  # as requested
         self._channels = PROTOCOL.quantities.channel_count.maximum
-        self._is_listening = False
-
-    @property
-    def is_unsent(self) -> bool:
-        """Whether it still listens for another host before arming."""
-        return self._is_listening
 
     @property
     def bus(self) -> str:
@@ -100,10 +97,10 @@ class CanBackend(WireBackend):
         bus = can_bus(self._url.bus)
         await bus.join(self._url.node, self._lose)
         worker = make_worker(f"era-sdo {self._url.node}")
-        objects = ObjectClient(bus.network, self._url.node, worker)
+        self._counters = WireCounters()
+        objects = ObjectClient(bus.network, self._url.node, worker, self._counters)
         self._joined = _Joined(bus, objects, worker)
         self._loss = None
-        self._counters = WireCounters()
         self._node.join(bus, objects, self._counters)
 
     async def close(self) -> None:
@@ -124,28 +121,27 @@ class CanBackend(WireBackend):
 
         timeout [s]: of the whole exchange, in SDO transfers of each frame; extended on slow buses.
         """
-        self._opened()
+        self._opened(request)
         match request:
             case Hello():
-                return await self._hello(timeout)
+                return await self._hello(request, timeout)
             case GetCaps():
-                capabilities = await self._objects_job(ObjectClient.capabilities, timeout)
+                capabilities = await self._objects_job(ObjectClient.capabilities, request, timeout)
                 self._channels = capabilities.channels
                 return capabilities
             case GetFaults():
-                return await self._objects_job(ObjectClient.faults, timeout)
+                return await self._objects_job(ObjectClient.faults, request, timeout)
             case LoadEnvelope():
                 load = partial(ObjectClient.load_envelope, request=request)
-                return await self._objects_job(load, timeout)
+                return await self._objects_job(load, request, timeout)
             case _:
                 return await self._exchange_pdo(request, timeout)
 
     async def broadcast(self, request: Broadcast) -> None:
         """Send a commit or a stop to every amplifier of the bus; raises LinkError."""
-        self._opened()
-        self._send(encode_broadcast(request))
+        await self._send(encode_broadcast(request), request, _BROADCAST_TIMEOUT)
 
-    async def _hello(self, timeout: float) -> Reply:
+    async def _hello(self, request: Hello, timeout: float) -> Reply:
         heartbeat = round(self._url.heartbeat * 1000)
 
         def ask(objects: ObjectClient, *, timeout: float) -> Reply:
@@ -153,18 +149,15 @@ class CanBackend(WireBackend):
             objects.set_heartbeat(heartbeat, timeout=timeout)
             return identity
 
-        identity = await self._objects_job(ask, timeout)
-        self._send([CanFrame(cob_id("nmt"), bytes([_START, self._url.node]))])
+        identity = await self._objects_job(ask, request, timeout)
+        await self._send([self._start], request, timeout)
         self._node.start()
         return identity
 
     async def _exchange_pdo(self, request: PdoRequest, timeout: float) -> Reply:
         if isinstance(request, Arm):
-            self._is_listening = True
-            try:
-                await self._node.check_no_other_host()
-            finally:
-                self._is_listening = False
+            await self._node.check_no_other_host()
+            self._node.tolerance = request.watchdog
         sequence = self._pending.next_sequence()
         frames = encode_request(
             request, node=self._url.node, sequence=sequence, fd=bool(self._url.bus.fd)
@@ -173,14 +166,15 @@ class CanBackend(WireBackend):
             for command in request.command_set.commands:
                 if command.channel >= self._channels:  # its COB-ID belongs to another node
                     return Nak(NakCode.BAD_CHANNEL, command.channel)
+        if isinstance(request, Stop) and not self._node.is_started:
+            frames = (self._start, *frames)  # a node that is not operational ignores the rest
         bus = self._url.bus
-        on_wire = 2 * self.wire_times.frames(frames)
+        timeout = max(timeout, 2 * self.wire_times.frames(frames) + PROTOCOL.reaction)
+        deadline = clock.now() + timeout
+        await self._send(frames, request, timeout)
         try:
             answer = await self._pending.reply_to(
-                request,
-                sequence=sequence,
-                send=lambda: self._send(frames),
-                timeout=max(timeout, on_wire + PROTOCOL.reaction),
+                request, sequence=sequence, timeout=deadline - clock.now()
             )
         except LinkError:
             raise
@@ -205,20 +199,20 @@ class CanBackend(WireBackend):
         if wanted is not None and answer.exact:
             achieved = wanted
         else:
-            achieved = await self._objects_job(ObjectClient.achieved, timeout)
+            achieved = await self._objects_job(ObjectClient.achieved, request, timeout)
             if wanted is not None:
                 achieved = _in_order_of(wanted, achieved)
         if isinstance(request, Apply | Stage):
             self._staged = achieved
         return achieved
 
-    async def _objects_job(self, job: Callable[..., _T], timeout: float) -> _T:
+    async def _objects_job(self, job: Callable[..., _T], request: Request, timeout: float) -> _T:
         """Run an SDO job, with the object client and timeout [s], outside the event loop."""
-        joined = self._opened()
+        joined = self._opened(request)
         objects = joined.objects
         future = joined.worker.submit(lambda: job(objects, timeout=timeout))
         try:
-            async with asyncio.timeout(_OBJECTS_WAIT * timeout):
+            async with asyncio.timeout(_MAX_SDO_RESPONSES * timeout):
                 result = await asyncio.shield(future)
         except TimeoutError as problem:
             if isinstance(problem, LinkError):
@@ -237,9 +231,10 @@ class CanBackend(WireBackend):
         self._counters.frames_in += 1
         return result
 
-    def _send(self, frames: Sequence[CanFrame]) -> None:
-        self._opened().bus.send(frames)
-        self._last_sent = clock.now()
+    async def _send(self, frames: Sequence[CanFrame], request: Request, timeout: float) -> None:
+        is_stop = isinstance(request, Stop)
+        await self._opened(request).bus.send(frames, timeout=timeout, is_stop=is_stop)
+        self._last_sent_at = clock.now()
         self._counters.frames_out += len(frames)
 
     def _notify(self, event: AmplifierEvent) -> None:
@@ -266,8 +261,8 @@ class CanBackend(WireBackend):
             self._joined.objects.close()
         self._pending.fail(self._loss)
 
-    def _opened(self) -> _Joined:
-        return self._require(self._joined, str(self._url.bus))
+    def _opened(self, request: Request) -> _Joined:
+        return self._require(self._joined, str(self._url.bus), request)
 
 
 def _in_order_of(wanted: Achieved, achieved: Achieved) -> Achieved:

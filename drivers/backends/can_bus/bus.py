@@ -4,20 +4,30 @@ The network is fed here and not by python-can's Notifier, which spins on a lost 
 run in the adapter's thread.
 """
 
+import asyncio
 import logging
+import time
 from collections.abc import Sequence
 
 import canopen
 
-from drivers import clock
-from drivers.backends.can_bus.adapter import open_adapter
+from drivers import clock, trace
+from drivers.backends.can_bus.adapter import FULL_PAUSE, open_adapter
 from drivers.backends.hardware import Adapter
 from drivers.backends.shared_line import SharedLine, shared_line
 from drivers.backends.urls.can_bus import CanBusUrl
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.frame import CanFrame, meaning
+from drivers.errors import LinkTimeout
+from drivers.trace import Direction
 
 # Its messages become LinkErrors.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
+
+_FULL = (
+    "transmit queue full; check that another node acknowledges on the bus, its load, and "
+    "txqueuelen of the interface"
+)
+_FULL_TRIES = 60  # with their pauses the usual timeout of a reply
 
 _logger = logging.getLogger(__name__)
 
@@ -30,7 +40,7 @@ class _Network(canopen.Network):
         self._bus = bus
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        self._bus.send([CanFrame(can_id, bytes(data))])
+        self._bus.send_blocking(CanFrame(can_id, bytes(data)))
 
 
 class CanBus(SharedLine[Adapter]):
@@ -42,10 +52,48 @@ class CanBus(SharedLine[Adapter]):
         super().__init__(str(url))
         self.url = url
         self.network = _Network(self)
+        self._waiting_stops = 0
 
-    def send(self, frames: Sequence[CanFrame]) -> None:
-        """Send frames back to back; raises LinkError."""
-        self._ready().send(frames)
+    async def send(
+        self, frames: Sequence[CanFrame], *, timeout: float, is_stop: bool = False
+    ) -> None:
+        """Send frames back to back, those of stops first while the transmit queue is full.
+
+        Waits for it until a timeout [s]; cancelling leaves the rest unsent. Raises LinkError.
+        """
+        deadline = clock.now() + timeout
+        self._waiting_stops += is_stop
+        try:
+            while True:
+                if is_stop or not self._waiting_stops:
+                    frames = frames[self._send_some(frames) :]
+                    if not frames:
+                        return
+                if clock.now() >= deadline:
+                    raise LinkTimeout(f"{self.name}: {_FULL}")
+                await asyncio.sleep(FULL_PAUSE)
+        finally:
+            self._waiting_stops -= is_stop
+
+    def send_blocking(self, frame: CanFrame) -> None:
+        """Send one frame from a thread; raises LinkError."""
+        for _ in range(_FULL_TRIES):
+            if self._send_some([frame]):
+                return
+            time.sleep(FULL_PAUSE)
+        raise LinkTimeout(f"{self.name}: {_FULL}")
+
+    def _send_some(self, frames: Sequence[CanFrame]) -> int:
+        """Send frames while the transmit queue has room; returns their number."""
+        taken = self._ready().send(frames)
+        for frame in frames[:taken]:
+            self._trace(Direction.OUT, frame)
+        return taken
+
+    def _trace(self, direction: Direction, frame: CanFrame) -> None:
+        if trace.is_active():
+            where = f"{self.name} {frame.id:03x}"
+            trace.frame(direction, frame.data, where, lambda: meaning(frame))
 
     async def _open(self) -> Adapter:
         return await open_adapter(self.url, on_frame=self._take, on_loss=self._lose)
@@ -53,6 +101,7 @@ class CanBus(SharedLine[Adapter]):
     def _take(self, frame: CanFrame) -> None:
         """Pass a frame on, in the adapter's thread."""
         try:
+            self._trace(Direction.IN, frame)
             self.network.notify(frame.id, bytearray(frame.data), clock.now())
         except Exception:  # a frame of another device must not end the reader
             _logger.debug("%s: frame %03x raised an exception", self.name, frame.id, exc_info=True)

@@ -1,11 +1,12 @@
 """CAN adapters of python-can, made robust against lost servers and invalid text.
 
-python-can's socketcand does not detect a closed connection, waits for ever for a silent server, and
-fails permanently on invalid text, as slcan does. Their text is parsed here (see
+python-can's socketcand does not detect a closed connection, waits indefinitely for a silent server,
+and fails permanently on invalid text, as slcan does. Their text is parsed here (see
 `drivers.codec.can_bus.adapter_text`), and the frames of a request are written at once.
 """
 
 import contextlib
+import errno
 import re
 import select
 import socket
@@ -18,7 +19,7 @@ import can
 from can.interfaces.slcan import slcanBus
 from can.interfaces.virtual import VirtualBus
 
-from drivers.backends.ports.writing import write_all
+from drivers.backends.ports.writing import descriptor, write_some
 from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.adapter_text import (
     SlcanReader,
@@ -28,10 +29,10 @@ from drivers.codec.can_bus.adapter_text import (
 )
 from drivers.codec.can_bus.frame import CanFrame
 
-_SEND_TIMEOUT = 0.02  # s; a frame fits into every driver's buffer unless the bus is blocked
 _SERIAL_TIMEOUT = 0.05  # s; of a read of the serial port
 _CONNECT_TIMEOUT = 2.0  # s
 _READ_MAX = 4096
+_FULL = "Transmit buffer full"  # of python-can, if the socket's buffer is full
 _HANDSHAKE = (("", b"< hi"), ("< open {channel} >", b"< ok"), ("< rawmode >", b"< ok"))
 _IS_FRAME = re.compile(rb"\s*< (fd)?frame ")
 
@@ -52,13 +53,26 @@ def open_bus(url: CanBusUrl) -> can.BusABC:
             return can.Bus(interface=url.interface, channel=url.channel, ignore_config=True)
 
 
-def send_all(bus: can.BusABC, frames: Sequence[CanFrame]) -> None:
-    """Send frames one after the other; raises can.CanError or OSError."""
+def send_some(bus: can.BusABC, frames: Sequence[CanFrame]) -> int:
+    """Send frames without waiting until the adapter's transmit queue is full.
+
+    Returns their number; raises can.CanError or OSError.
+    """
     if isinstance(bus, _Socketcand | _Slcan):
-        bus.send_frames(frames)
-        return
-    for frame in frames:
-        bus.send(_message(frame), timeout=_SEND_TIMEOUT)
+        return bus.send_frames(frames)
+    for number, frame in enumerate(frames):
+        try:
+            bus.send(_message(frame))
+        except can.CanOperationError as error:
+            if error.error_code == errno.ENOBUFS or _FULL in str(error):
+                return number
+            raise
+    return len(frames)
+
+
+def flush(bus: can.BusABC) -> bool:
+    """Send what is left of a frame; returns whether nothing is left."""
+    return bus.flush_unsent() if isinstance(bus, _Socketcand | _Slcan) else True
 
 
 def wake(bus: can.BusABC) -> None:
@@ -74,6 +88,28 @@ class _TextBus(can.BusABC):
 
     def _begin(self) -> None:
         self._messages: deque[can.Message] = deque()
+        self._unsent = b""
+
+    def send_frames(self, frames: Sequence[CanFrame]) -> int:
+        """Send all at once, or none while the adapter has not taken those before."""
+        if not self.flush_unsent():
+            return 0
+        self._unsent = self._write_some(b"".join(map(self._text, frames)))
+        return len(frames)
+
+    def flush_unsent(self) -> bool:
+        """Send what the adapter has not taken yet; returns whether nothing is left."""
+        if self._unsent:
+            self._unsent = self._write_some(self._unsent)
+        return not self._unsent
+
+    @abstractmethod
+    def _text(self, frame: CanFrame) -> bytes:
+        """Encode a frame."""
+
+    @abstractmethod
+    def _write_some(self, data: bytes) -> bytes:
+        """Write what the adapter takes without waiting and return the rest."""
 
     def _take(self, frames: Iterable[CanFrame]) -> None:
         self._messages.extend(map(_message, frames))
@@ -99,8 +135,7 @@ class _Socketcand(_TextBus):
         try:
             self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._shake_hands(url.channel)
-            # Reads wait for data first, so this only limits sends.
-            self._connection.settimeout(_SEND_TIMEOUT)
+            self._connection.setblocking(False)  # reads wait for data first
             can.BusABC.__init__(self, channel=url.channel)
         except BaseException:
             self._connection.close()
@@ -145,9 +180,14 @@ class _Socketcand(_TextBus):
         with contextlib.suppress(OSError):
             self._connection.shutdown(socket.SHUT_RDWR)
 
-    def send_frames(self, frames: Sequence[CanFrame]) -> None:
-        """Send all at once."""
-        self._connection.sendall(b"".join(map(socketcand_element, frames)))
+    def _text(self, frame: CanFrame) -> bytes:
+        return socketcand_element(frame)
+
+    def _write_some(self, data: bytes) -> bytes:
+        try:
+            return data[self._connection.send(data) :]
+        except BlockingIOError:
+            return data
 
     def _read_text(self, timeout: float | None) -> None:
         if select.select([self._connection], [], [], timeout)[0]:
@@ -164,7 +204,6 @@ class _Slcan(_TextBus, slcanBus):
         self._begin()
         self._reader = SlcanReader()
         self._is_ended = False
-        self._is_cut = False
         slcanBus.__init__(
             self,
             url.channel,
@@ -174,7 +213,7 @@ class _Slcan(_TextBus, slcanBus):
             timeout=_SERIAL_TIMEOUT,
         )
         try:
-            self.serialPortOrig.write_timeout = _SEND_TIMEOUT
+            self.serialPortOrig.write_timeout = 0  # where there is no descriptor
             self.serialPortOrig.exclusive = True
             if url.fd:
                 self.set_bitrate(url.bitrate, url.fd)
@@ -195,12 +234,15 @@ class _Slcan(_TextBus, slcanBus):
         with contextlib.suppress(OSError):
             self.serialPortOrig.close()
 
-    def send_frames(self, frames: Sequence[CanFrame]) -> None:
-        """Send all at once; unlike python-can, do not wait for the last byte."""
-        begin = b"\r" if self._is_cut else b""  # ends a half-sent line
-        self._is_cut = True
-        write_all(self.serialPortOrig, begin + b"".join(map(slcan_line, frames)))
-        self._is_cut = False
+    def _text(self, frame: CanFrame) -> bytes:
+        return slcan_line(frame)
+
+    def _write_some(self, data: bytes) -> bytes:
+        opened = descriptor(self.serialPortOrig)
+        if opened is not None:
+            return write_some(opened, data)
+        self.serialPortOrig.write(data)
+        return b""
 
     def _read_text(self, timeout: float | None) -> None:
         port = self.serialPortOrig

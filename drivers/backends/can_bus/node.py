@@ -20,7 +20,7 @@ from drivers.errors import FrameError, LinkError
 from drivers.protocol.messages import AmplifierEvent
 from drivers.statistics import WireCounters
 
-MAX_MISSED_HEARTBEATS = 3  # of the amplifier, until it is lost
+MAX_MISSED_NODE_HEARTBEATS = 3  # of the amplifier, until it is lost
 _LATE = 0.005  # s; delay of timers, so that a loss is detected by the third heartbeat
 _SHORTEST = 1e-4  # s; shortest pause
 _HOST_HEARTBEAT = CANOPEN["heartbeat_ms"] / 1000  # s; interval of every host while armed
@@ -47,6 +47,7 @@ class NodeWatch:
         self._reply_reader = CanReplyReader(url.node)
         self._emergencies = EmcyConsumer()
         self._subscribed: list[tuple[int, Callable[..., None]]] = []
+        self.tolerance = 0.0  # s, beyond three heartbeats: the watchdog of one that may play
         self._is_watched = False
         self._was_operational = False
         self._joined = 0.0
@@ -84,8 +85,14 @@ class NodeWatch:
                 bus.network.unsubscribe(can_id, callback)
         self._subscribed.clear()
 
+    @property
+    def is_started(self) -> bool:
+        """Whether the node was set operational, and is supervised."""
+        return self._is_watched
+
     def start(self) -> None:
         """Start to supervise heartbeat and NMT state."""
+        self.tolerance = 0.0
         self._heard = self._check_due = clock.now()
         self._was_operational = False
         if not self._is_watched:
@@ -102,7 +109,7 @@ class NodeWatch:
     async def check_no_other_host(self) -> None:
         """Listen for another host before arming; LinkError if there is one."""
         await asyncio.sleep(max(0.0, self._joined + 1.2 * _HOST_HEARTBEAT - clock.now()))
-        if clock.now() - self._host_heard < MAX_MISSED_HEARTBEATS * _HOST_HEARTBEAT:
+        if clock.now() - self._host_heard < MAX_MISSED_NODE_HEARTBEATS * _HOST_HEARTBEAT:
             raise LinkError(
                 f"another program drives node {self._url.node} on {self._url.bus}; end that one"
             )
@@ -158,7 +165,7 @@ class NodeWatch:
         """
         now = clock.now()
         silent = now - self._heard
-        limit = MAX_MISSED_HEARTBEATS * self._url.heartbeat - _LATE
+        limit = MAX_MISSED_NODE_HEARTBEATS * self._url.heartbeat - _LATE + self.tolerance
         was_delayed = now - self._check_due > self._url.heartbeat / 2
         if silent < limit or was_delayed:
             # A remainder by rounding must not lead to an immediate check.

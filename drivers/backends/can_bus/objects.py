@@ -39,6 +39,7 @@ from drivers.protocol.messages import (
     LoadEnvelope,
     Nak,
 )
+from drivers.statistics import WireCounters
 
 _LENGTH = 8
 _WAITING_MAX = 256  # replies; bounds the memory on a flooded bus
@@ -83,9 +84,10 @@ class _Client(SdoClient):
 class ObjectClient:
     """SDO client of one node, for jobs of a worker; `feed` takes its replies."""
 
-    def __init__(self, network: canopen.Network, node: int, worker: Worker) -> None:
-        self.unexpected_frames = 0
-        self._network = network
+    def __init__(
+        self, network: canopen.Network, node: int, worker: Worker, counters: WireCounters
+    ) -> None:
+        self._counters = counters
         self._node = node
         self._worker = worker
         self._client = _Client(node, worker)
@@ -100,7 +102,7 @@ class ObjectClient:
         if is_wanted and len(data) == _LENGTH:
             self._client.on_response(can_id, data, timestamp)
         else:
-            self.unexpected_frames += 1
+            self._counters.unexpected_frames += 1
 
     def abandon(self) -> None:
         """Abort the present transfer."""

@@ -1,7 +1,6 @@
 """Pending requests on a CAN bus, and the matching of their replies."""
 
 import asyncio
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers.backends.hardware import number_below
@@ -34,10 +33,8 @@ class PendingRequests:
         self._sequence = self._sequence % SEQUENCE_MAX + 1
         return self._sequence
 
-    async def reply_to(
-        self, request: PdoRequest, *, sequence: int, send: Callable[[], None], timeout: float
-    ) -> CanReply:
-        """Send a request and wait for its reply; LinkError, TimeoutError."""
+    async def reply_to(self, request: PdoRequest, *, sequence: int, timeout: float) -> CanReply:
+        """Wait for the reply to a request that was just sent; LinkError, TimeoutError."""
         token = None
         if isinstance(request, Apply):
             token = request.command_set.token
@@ -46,7 +43,6 @@ class PendingRequests:
         answer: asyncio.Future[CanReply] = asyncio.get_running_loop().create_future()
         self._pending[sequence] = pending = _Pending(action_of(request), token, answer)
         try:
-            send()
             return await reply_within(answer, timeout)
         finally:
             if self._pending.get(sequence) is pending:

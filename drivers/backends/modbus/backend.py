@@ -9,11 +9,9 @@ Modbus has no unsolicited messages: events are changes of state or fault between
 """
 
 import asyncio
-from contextlib import AbstractContextManager, nullcontext
-from typing import NamedTuple
+from collections.abc import Awaitable, Callable
 
 from drivers.backends.hardware import number_below
-from drivers.backends.line_turns import priority_on_line
 from drivers.backends.modbus.line import ModbusLine, modbus_line
 from drivers.backends.sole_host import SoleHost
 from drivers.backends.urls.modbus import ModbusUrl
@@ -25,7 +23,6 @@ from drivers.codec.modbus.blocks import unpack_fault_count
 from drivers.codec.modbus.exchanges import Exchange, Read, Write
 from drivers.codec.modbus.timing import ModbusTimes
 from drivers.errors import LinkError, LinkTimeout
-from drivers.link.turns import RequestPriority
 from drivers.protocol.messages import (
     AmplifierEvent,
     AmplifierState,
@@ -39,6 +36,7 @@ from drivers.protocol.messages import (
     NakCode,
     Reply,
     Request,
+    Stop,
 )
 from drivers.protocol.wire_times import WireTimes
 
@@ -47,11 +45,8 @@ _GATEWAY = (10, 11)  # gateway: no path to the amplifier, or no response from it
 _TAGS = (1 << 16) - 1
 
 
-class _Asked(NamedTuple):
-    """Priority of a request on the line, and timeout [s] of each transaction."""
-
-    priority: RequestPriority
-    timeout: float
+_Transact = Callable[[Read | None, Write | None, int | None], Awaitable[ModbusResponse]]
+"""Write, read, or both, with the tag that the registers read must carry."""
 
 
 class ModbusBackend(WireBackend):
@@ -81,22 +76,6 @@ class ModbusBackend(WireBackend):
             return WireTimes()
         return ModbusTimes(self._url.baud, self._url.bits_per_byte)
 
-    @property
-    def takes_turns(self) -> bool:
-        """The line is half duplex."""
-        return True
-
-    @property
-    def is_unsent(self) -> bool:
-        """Whether the request waits for others or for silence on the line."""
-        return self._line is not None and self._line.is_unsent(self._url.unit)
-
-    def silencing(self, request: Request) -> AbstractContextManager[None]:
-        """See `Backend.silencing`."""
-        if self._line is None:
-            return nullcontext()
-        return self._line.silencing(request, self._url.unit)
-
     async def open(self) -> None:
         """Open the line, or join it if open in this process; raises LinkError."""
         if self._line is not None:
@@ -124,31 +103,26 @@ class ModbusBackend(WireBackend):
         """
         if isinstance(request, Arm) and not self._url.device:
             self._sole_host.claim()
-        asked = _Asked(priority_on_line(request), timeout)
         self._is_asking = True
         try:
-            reply, registers = await self._ask(request, asked)
+            reply, registers = await self._ask(request, timeout)
             if isinstance(reply, Capabilities):
                 self._channels = reply.channels
             elif isinstance(reply, FaultList):
                 count = unpack_fault_count(registers)
                 if count > len(reply.faults):
-                    reply, _ = await self._ask(request, asked, records=count)
+                    reply, _ = await self._ask(request, timeout, records=count)
         finally:
             self._is_asking = False
         return reply
 
     async def broadcast(self, request: Broadcast) -> None:
-        """Write a commit or a stop to all units of the line; a stop has priority."""
-        line = self._opened()
-        priority = priority_on_line(request)
-        unit = None if priority.is_stop_class else self._url.unit
-        await line.broadcast(exchanges.encode_broadcast(request), priority, unit=unit)
-        self._last_sent = line.last_sent
+        """Write a commit or a stop to all units of the line."""
+        line = self._require(self._line, self._url.place, request)
+        await line.broadcast(exchanges.encode_broadcast(request), self._sent)
 
-    async def _check_alone(self) -> None:
+    async def _check_alone(self, line: ModbusLine) -> None:
         """Wait for a second amplifier of this unit; LinkError if one responds."""
-        line = self._opened()
         await asyncio.sleep(SETTLE)
         if line.has_duplicate_responder:
             raise LinkError(
@@ -161,53 +135,62 @@ class ModbusBackend(WireBackend):
         return self._tag
 
     async def _ask(
-        self, request: Request, asked: _Asked, *, records: int = exchanges.RECORDS_FIRST
+        self, request: Request, timeout: float, *, records: int = exchanges.RECORDS_FIRST
     ) -> tuple[Reply, tuple[int, ...]]:
         """Return the reply to a request, and its registers; records: number of faults to read."""
         tag = self._next_tag()
         exchange = exchanges.encode_request(
             request, tag=tag, channels=self._channels, records=records
         )
-        answer = await self._carry_out(exchange, tag, asked)
+
+        async def transact(
+            read: Read | None, write: Write | None, tag: int | None
+        ) -> ModbusResponse:
+            return await self._transact(read, write, tag, request=request, timeout=timeout)
+
+        answer = await self._carry_out(exchange, tag, transact)
         if answer.exception:
-            return await self._refusal(answer, tag, asked), ()
+            return await self._refusal(answer, tag, transact), ()
         self._report_change(request, answer)
         if isinstance(request, Hello) and self._url.is_rtu:
-            await self._check_alone()
+            await self._check_alone(self._require(self._line, self._url.place, request))
         return exchanges.decode_reply(request, answer.registers), answer.registers
 
-    async def _carry_out(self, exchange: Exchange, tag: int, asked: _Asked) -> ModbusResponse:
+    async def _carry_out(self, exchange: Exchange, tag: int, transact: _Transact) -> ModbusResponse:
         read, write = exchange.read, exchange.write
         if write is None:
-            return await self._transact(read, None, asked, tag=None)
+            return await transact(read, None, None)
         if self._can_read_back:
-            answer = await self._transact(read, write, asked, tag=tag)
+            answer = await transact(read, write, tag)
             if answer.exception != _ILLEGAL_FUNCTION:
                 return answer
             self._can_read_back = False
-        answer = await self._transact(None, write, asked, tag=None)
-        return answer if answer.exception else await self._transact(read, None, asked, tag=tag)
+        answer = await transact(None, write, None)
+        return answer if answer.exception else await transact(read, None, tag)
 
     async def _transact(
-        self, read: Read | None, write: Write | None, asked: _Asked, *, tag: int | None
+        self,
+        read: Read | None,
+        write: Write | None,
+        tag: int | None,
+        *,
+        request: Request,
+        timeout: float,
     ) -> ModbusResponse:
         def accept(answer: ModbusResponse) -> bool:
             if answer.exception or read is None:
                 return True
             return exchanges.is_of(answer.registers, tag=tag)
 
-        line = self._opened()
-        try:
-            answer = await line.transact(
-                read,
-                write,
-                unit=self._url.unit,
-                priority=asked.priority,
-                timeout=asked.timeout,
-                accept=accept,
-            )
-        finally:
-            self._last_sent = line.last_sent
+        answer = await self._require(self._line, self._url.place, request).transact(
+            read,
+            write,
+            unit=self._url.unit,
+            timeout=timeout,
+            accept=accept,
+            sent=self._sent,
+            is_stop=isinstance(request, Stop),
+        )
         if answer.exception in _GATEWAY:
             raise LinkTimeout(
                 f"gateway {self._url.place}: no response from unit {self._url.unit}; "
@@ -215,14 +198,14 @@ class ModbusBackend(WireBackend):
             )
         return answer
 
-    async def _refusal(self, answer: ModbusResponse, tag: int, asked: _Asked) -> Nak:
+    async def _refusal(self, answer: ModbusResponse, tag: int, transact: _Transact) -> Nak:
         """Read the reason of a refused write, unless the exception is unambiguous."""
         if answer.exception == _ILLEGAL_FUNCTION:
             return Nak(NakCode.UNKNOWN_TYPE)
         only = exchanges.nak_of_exception(answer.exception)
         if only is not None and only.code is NakCode.BUSY:
             return only
-        refusal = await self._transact(exchanges.refusal_read(), None, asked, tag=None)
+        refusal = await transact(exchanges.refusal_read(), None, None)
         nak = None if refusal.exception else exchanges.decode_refusal(refusal.registers, tag=tag)
         if nak is not None:
             return nak
@@ -241,8 +224,8 @@ class ModbusBackend(WireBackend):
         if before is not None:
             self._on_event(AmplifierEvent(*state))
 
-    def _opened(self) -> ModbusLine:
-        return self._require(self._line, self._url.place)
+    def _sent(self, time: float) -> None:
+        self._last_sent_at = time
 
     def _lost(self, what: str) -> None:
         self._loss = what

@@ -7,11 +7,9 @@ response to a cancelled one, which would collide with it.
 import asyncio
 import contextlib
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 
-from drivers import clock
+from drivers import clock, trace
 from drivers.backends.hardware import Port
-from drivers.backends.line_turns import LineTurns
 from drivers.backends.modbus.stream import open_stream
 from drivers.backends.shared_line import SharedLine, shared_line
 from drivers.backends.urls.modbus import ModbusUrl
@@ -20,10 +18,9 @@ from drivers.codec.modbus.adu import ModbusResponse, RequestAdu, ResponseReader,
 from drivers.codec.modbus.exchanges import Read, Write
 from drivers.codec.modbus.timing import ModbusTimes
 from drivers.errors import LinkError, LinkTimeout
-from drivers.link.turns import RequestPriority
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import Request
 from drivers.statistics import WireCounters
+from drivers.trace import Direction
 
 _REACTION = PROTOCOL.reaction
 _BROADCAST: int = PROTOCOL.modbus["broadcast"]
@@ -40,8 +37,8 @@ class ModbusLine(SharedLine[Port]):
         super().__init__(url.place)
         self.url = url
         self.counters = WireCounters()
-        self.last_sent = 0.0
-        self._turns = LineTurns()
+        self._last_sent_at = 0.0
+        self._is_transacting = False
         self._reader = ResponseReader(is_rtu=url.is_rtu, counters=self.counters)
         self.has_duplicate_responder = False  # the last response was followed by a different one
         self._last_response: ModbusResponse | None = None
@@ -69,82 +66,75 @@ class ModbusLine(SharedLine[Port]):
         write: Write | None,
         *,
         unit: int,
-        priority: RequestPriority = RequestPriority.ORDINARY,
         timeout: float,
         accept: Callable[[ModbusResponse], bool],
+        sent: Callable[[float], None] = lambda time: None,
+        is_stop: bool = False,
     ) -> ModbusResponse:
         """Write, read, or both in one transaction, and wait for the response.
 
-        priority: on the line, see `priority_on_line`; accept: whether a well-formed response
-        matches. timeout [s]: of the whole transaction, extended on slow lines. Raises LinkTimeout,
-        LinkError.
+        timeout [s]: of the whole transaction, extended on slow lines; accept: whether a well-formed
+        response matches; sent: called with the time when the request was sent; is_stop: send it for
+        an amplifier that has not been reopened since a loss, too. Raises LinkTimeout, LinkError.
         """
-
-        async def exchange() -> ModbusResponse:
+        self._is_transacting = True
+        try:
             await self._await_silence()
-            self.raise_if_lost(unit)
+            if not is_stop:
+                self.raise_if_lost(unit)
             request = self._make(read, write, unit=unit)
             self._request, self._accept = request, accept
-            self._answer = asyncio.get_running_loop().create_future()
             on_line = self._time_of(len(request.frame) + _RTU_OVERHEAD + request.response_size)
             on_line += 2 * self._gap  # before the response, and at the end of the request
-            try:
-                self._send(request.frame)
-                self._is_response_pending = True
-                self._free_from = self.last_sent + on_line + _REACTION
-                return await reply_within(self._answer, max(timeout, on_line + _REACTION))
-            except LinkError:
-                raise
-            except TimeoutError:
-                raise LinkTimeout(
-                    f"no response from unit {unit} on {self.name} within {timeout * 1e3:g} ms; "
-                    "check that the amplifier is switched on and has this unit"
-                    + (f" and {self.url.baud} baud" if self.url.device else "")
-                ) from None
-            finally:
-                self._answer = None
+            self._send(request)
+            sent(self._last_sent_at)
+            self._answer = asyncio.get_running_loop().create_future()
+            self._is_response_pending = True
+            self._free_from = self._last_sent_at + on_line + _REACTION
+            return await reply_within(self._answer, max(timeout, on_line + _REACTION))
+        except LinkError:
+            raise
+        except TimeoutError:
+            raise LinkTimeout(
+                f"no response from unit {unit} on {self.name} within {timeout * 1e3:g} ms; "
+                "check that the amplifier is switched on and has this unit"
+                + (f" and {self.url.baud} baud" if self.url.device else "")
+            ) from None
+        finally:
+            self._answer = None
+            self._is_transacting = False
 
-        return await self._turns.carry_out(priority, exchange, address=unit)
+    async def broadcast(self, write: Write, sent: Callable[[float], None]) -> None:
+        """Write to all units; there are no responses.
 
-    async def broadcast(self, write: Write, priority: RequestPriority, *, unit: int | None) -> None:
-        """Write to all units with this priority; there are no responses.
-
-        unit: the one whose stop preempts this, or None.
+        Raises LinkError during a transaction over RTU, with whose response it would collide.
         """
-
-        async def send() -> None:
-            await self._await_silence()
+        if self.url.is_rtu and self._is_transacting:
+            raise LinkError(f"{self.name} is in use; broadcast after the transaction")
+        await self._await_silence()
+        request = self._make(None, write, unit=_BROADCAST)
+        if self.url.is_rtu:
             self._request = None
-            request = self._make(None, write, unit=_BROADCAST)
-            self._send(request.frame)
-            self._free_from = self.last_sent + self._time_of(len(request.frame)) + self._gap
-
-        await self._turns.carry_out(priority, send, address=unit)
-
-    def is_unsent(self, unit: int) -> bool:
-        """Whether the request to a unit waits for others or for silence on the line."""
-        return self._turns.is_unsent(unit)
-
-    def silencing(self, request: Request, unit: int) -> AbstractContextManager[None]:
-        """See `Backend.silencing`."""
-        return self._turns.silencing(request, unit)
+        self._send(request)
+        sent(self._last_sent_at)
+        self._free_from = self._last_sent_at + self._time_of(len(request.frame)) + self._gap
 
     def _make(self, read: Read | None, write: Write | None, *, unit: int) -> RequestAdu:
         self._transaction = (self._transaction + 1) % _TRANSACTIONS
         number = 0 if self.url.is_rtu else self._transaction
         return build_adu(read, write, unit=unit, transaction=number, is_rtu=self.url.is_rtu)
 
-    def _send(self, frame: bytes) -> None:
+    def _send(self, request: RequestAdu) -> None:
         stream = self._ready()
         if self.url.is_rtu:
             self._reader.clear()
         self._is_response_pending = False
         self._last_response, self.has_duplicate_responder = None, False
         self._response_received.clear()
-        stream.write(frame)
-        self._turns.mark_sent()
-        self.last_sent = clock.now()
+        stream.write(request.frame)
+        self._last_sent_at = clock.now()
         self.counters.frames_out += 1
+        trace.frame(Direction.OUT, request.frame, self.name, lambda: _meaning(request))
 
     async def _await_silence(self) -> None:
         """Wait until a serial line is free."""
@@ -162,7 +152,9 @@ class ModbusLine(SharedLine[Port]):
         return self._times.of(size) if self._times else 0.0
 
     def _received(self, data: bytes) -> None:
-        for answer in self._reader.feed(data, self._request):
+        replies = self._reader.feed(data, self._request)
+        trace.frame(Direction.IN, data, self.name, lambda: ", ".join(map(repr, replies)))
+        for answer in replies:
             if not self._accept(answer):
                 self.counters.unexpected_frames += 1
                 continue
@@ -187,6 +179,10 @@ class ModbusLine(SharedLine[Port]):
 def modbus_line(url: ModbusUrl) -> ModbusLine:
     """Return the line of a URL in the running event loop."""
     return shared_line(ModbusLine, url.line, lambda: ModbusLine(url.line))
+
+
+def _meaning(request: RequestAdu) -> str:
+    return f"unit {request.unit}, function {request.function}: {request.read}, {request.write}"
 
 
 def _any(answer: ModbusResponse) -> bool:

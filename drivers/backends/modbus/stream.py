@@ -61,6 +61,10 @@ class _Connection(asyncio.Protocol):
                 "the network, then open the amplifier again"
             )
 
+    @property
+    def is_blocked(self) -> bool:
+        return self._transport.get_write_buffer_size() > 0
+
     def write(self, data: bytes) -> None:
         if self._transport.get_write_buffer_size() > _UNSENT_MAX:
             raise LinkTimeout(f"{self._place}: write blocked; check the network")

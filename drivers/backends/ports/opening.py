@@ -10,7 +10,6 @@ import serial
 from drivers.backends.hardware import HARDWARE_PROVIDER, Port
 from drivers.backends.ports.watched import (
     READ_TIMEOUT,
-    WRITE_TIMEOUT,
     WatchedPort,
     close_port,
     connection_of,
@@ -62,8 +61,6 @@ def _open_port(name: str, baud: int, parity: str, stop: int) -> serial.Serial:
         parity=serial.PARITY_NONE if is_pseudo else parity,
         stopbits=stop,
         timeout=READ_TIMEOUT,
-        # not supported by pyserial over RFC 2217
-        write_timeout=None if name.startswith("rfc2217://") else WRITE_TIMEOUT,
         exclusive=True,
     )
     port.open()

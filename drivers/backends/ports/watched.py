@@ -15,12 +15,11 @@ from typing import final
 
 import serial
 
-from drivers.backends.ports.writing import descriptor, write_all
-from drivers.errors import LinkError, LinkTimeout
+from drivers.backends.ports.writing import descriptor, make_writer
+from drivers.errors import LinkError
 from drivers.threads import close_in_thread
 
 READ_TIMEOUT = 0.1  # s; interval in which a reader thread notices its end
-WRITE_TIMEOUT = 0.02  # s; a frame fits into every driver's buffer unless the line is blocked
 _READ_MAX = 4096
 
 
@@ -47,6 +46,7 @@ class WatchedPort:
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._descriptor = descriptor(port)
+        self._writer = make_writer(port, lambda error: self._lose(self._what_was_lost(error)))
         if self._descriptor is not None:
             self._loop.add_reader(self._descriptor, self._readable)
             return
@@ -54,20 +54,21 @@ class WatchedPort:
         self._thread.start()
 
     def write(self, data: bytes) -> None:
-        """Send bytes; raises LinkTimeout if the line is blocked, LinkError."""
+        """Send bytes, as soon as the port takes them; raises LinkError."""
         try:
-            write_all(self._port, data)
-        except serial.SerialTimeoutException:
-            raise LinkTimeout(
-                f"{self._name}: write timed out; check flow control and the adapter"
-            ) from None
+            self._writer.write(data)
         except OSError as problem:
             what = self._what_was_lost(problem)
             self._lose(what)
             raise LinkError(what) from problem
 
+    @property
+    def is_blocked(self) -> bool:
+        """Whether the port has not taken all bytes yet."""
+        return self._writer.is_blocked
+
     def close(self) -> None:
-        """Stop reading; `wait_closed` closes the port."""
+        """Stop reading and writing; `wait_closed` closes the port."""
         self._ignore()
         self._closing.set()
         if self._thread is not None and hasattr(self._port, "cancel_read"):
@@ -100,6 +101,7 @@ class WatchedPort:
             self._lose(self._what_was_lost("end of file"))
 
     def _ignore(self) -> None:
+        self._writer.close()
         watched, self._descriptor = self._descriptor, None
         if watched is not None:
             self._loop.remove_reader(watched)

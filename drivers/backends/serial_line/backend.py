@@ -5,11 +5,10 @@ address.
 """
 
 import asyncio
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
+from drivers import clock, trace
 from drivers.backends.hardware import number_below
-from drivers.backends.line_turns import priority_on_line
 from drivers.backends.serial_line.line import SerialLine, serial_line
 from drivers.backends.urls.serial_line import SerialUrl
 from drivers.backends.waiting import SETTLE, reply_within
@@ -22,6 +21,7 @@ from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Broadcast, Hello, Reply, Request, Stop
 from drivers.protocol.wire_times import WireTimes
 from drivers.statistics import WireCounters
+from drivers.trace import Direction
 
 
 @dataclass
@@ -40,7 +40,7 @@ class SerialBackend(WireBackend):
         self._url = SerialUrl.parse(url)
         self._times = SerialTimes(self._url.baud)
         self._line: SerialLine | None = None
-        self._pending: dict[int, _Pending] = {}
+        self._pending: _Pending | None = None
         # A random start, so that a reply to an earlier run does not match.
         self._sequence = number_below(1 << 16)
         self._last_reply: Frame | None = None  # the reply to the last request, if received
@@ -63,22 +63,6 @@ class SerialBackend(WireBackend):
     def wire_times(self) -> WireTimes:
         """Durations on the line; unknown behind a server."""
         return self._times if self._url.is_local else WireTimes()
-
-    @property
-    def takes_turns(self) -> bool:
-        """The line is half duplex."""
-        return True
-
-    @property
-    def is_unsent(self) -> bool:
-        """Whether the request waits for others on the line."""
-        return self._line is not None and self._line.turns.is_unsent(self._url.address)
-
-    def silencing(self, request: Request) -> AbstractContextManager[None]:
-        """See `Backend.silencing`."""
-        if self._line is None:
-            return nullcontext()
-        return self._line.turns.silencing(request, self._url.address)
 
     async def open(self) -> None:
         """Open the port, exclusively if the system can; raises LinkError."""
@@ -106,31 +90,41 @@ class SerialBackend(WireBackend):
 
         timeout [s]: of the whole exchange, extended on slow lines.
         """
-        line = self._opened()
-        # Also on a line of its own: an amplifier that joins must wait for a pending reply.
-        return await line.turns.carry_out(
-            priority_on_line(request),
-            lambda: self._exchange(line, request, timeout),
-            address=self._url.address,
-        )
+        line = self._require(self._line, self._url.port, request)
+        if not isinstance(request, Stop):
+            line.raise_if_lost(self._url.address)
+        frame = self._frame(request, self._url.address)
+        data = encode_frame(frame)
+        self._last_reply, self._has_duplicate_responder = None, False
+        self._send(line, data, request)
+        pending = self._pending = _Pending(frame, asyncio.get_running_loop().create_future())
+        on_line = self._times.exchange(len(data))
+        try:
+            reply = await reply_within(pending.reply, max(timeout, on_line + PROTOCOL.reaction))
+        except LinkError:
+            raise
+        except TimeoutError:
+            remedy = (
+                "check flow control and the adapter: the port takes no bytes"
+                if line.is_blocked
+                else f"check that the amplifier is switched on and set to {self._url.baud} baud"
+            )
+            raise LinkTimeout(
+                f"no reply from address {self._url.address} on {self._url.port} within "
+                f"{timeout * 1e3:g} ms; {remedy}"
+            ) from None
+        finally:
+            if self._pending is pending:
+                self._pending = None
+        if isinstance(request, Hello):
+            await self._check_alone()
+        return reply
 
     async def broadcast(self, request: Broadcast) -> None:
-        """Send a commit to every amplifier of the line by its priority, or a stop at once.
-
-        A stop is repeated by its priority if it may have collided with a reply on the line.
-        """
-        line = self._opened()
-        is_stop, was_in_use = isinstance(request, Stop), line.turns.is_in_use
+        """Send a commit or a stop to every amplifier of the line."""
+        line = self._require(self._line, self._url.port, request)
         data = encode_frame(self._frame(request, PROTOCOL.serial.broadcast))
-
-        async def send() -> None:
-            self._send(line, data)
-
-        if is_stop:
-            await send()
-        if was_in_use or not is_stop:
-            address = None if is_stop else self._url.address
-            await line.turns.carry_out(priority_on_line(request), send, address=address)
+        self._send(line, data, request)
 
     async def _check_alone(self) -> None:
         """Wait for a second amplifier of this address; LinkError if one replies."""
@@ -141,46 +135,21 @@ class SerialBackend(WireBackend):
                 "give each its own address"
             )
 
-    async def _exchange(self, line: SerialLine, request: Request, timeout: float) -> Reply:
-        frame = self._frame(request, self._url.address)
-        data = encode_frame(frame)
-        pending = _Pending(frame, asyncio.get_running_loop().create_future())
-        self._pending[frame.sequence] = pending
-        self._last_reply, self._has_duplicate_responder = None, False
-        try:
-            line.raise_if_lost(self._url.address)
-            self._send(line, data)
-            line.turns.mark_sent()
-            on_line = self._times.exchange(len(data))
-            reply = await reply_within(pending.reply, max(timeout, on_line + PROTOCOL.reaction))
-        except LinkError:
-            raise
-        except TimeoutError:
-            raise LinkTimeout(
-                f"no reply from address {self._url.address} on {self._url.port} within "
-                f"{timeout * 1e3:g} ms; check that the amplifier is switched on and set to "
-                f"{self._url.baud} baud"
-            ) from None
-        finally:
-            del self._pending[frame.sequence]
-            pending.reply.cancel()  # also if it has an exception
-        if isinstance(request, Hello):
-            await self._check_alone()
-        return reply
-
-    def _send(self, line: SerialLine, data: bytes) -> None:
+    def _send(self, line: SerialLine, data: bytes, request: Request) -> None:
         line.send(data)
-        self._last_sent = line.last_sent
+        self._last_sent_at = clock.now()
         self._counters.frames_out += 1
+        trace.frame(Direction.OUT, data, self._url.port, lambda: repr(request))
 
     def _frame(self, request: Request, address: int) -> Frame:
         self._sequence = (self._sequence + 1) & 0xFFFF
         return encode_request(request, address=address, sequence=self._sequence)
 
-    def _opened(self) -> SerialLine:
-        return self._require(self._line, self._url.port)
-
     def _received(self, frame: Frame) -> None:
+        if trace.is_active():
+            asked = self._pending.request if self._pending is not None else None
+            data = encode_frame(frame)
+            trace.frame(Direction.IN, data, self._url.port, lambda: _meaning(frame, asked))
         self._counters.frames_in += 1
         if frame.address == self._url.address and is_event(frame):
             self._notify(frame)
@@ -188,9 +157,10 @@ class SerialBackend(WireBackend):
         first = self._last_reply
         if first is not None and (frame.sequence, frame.address) == (first.sequence, first.address):
             self._has_duplicate_responder = self._has_duplicate_responder or frame != first
-        pending = self._pending.get(frame.sequence)
+        pending = self._pending
         if (
             pending is None
+            or pending.request.sequence != frame.sequence
             or pending.reply.done()
             or not frame.is_reply
             or frame.address != self._url.address
@@ -214,12 +184,20 @@ class SerialBackend(WireBackend):
 
     def _lost(self, what: str) -> None:
         self._loss = what
-        was_waiting = bool(self._pending)
+        was_waiting = self._pending is not None
         self._fail(LinkError(what))
         if not was_waiting:
             self._on_loss(what)
 
     def _fail(self, problem: LinkError) -> None:
-        for pending in self._pending.values():
-            if not pending.reply.done():
-                pending.reply.set_exception(problem)
+        if self._pending is not None and not self._pending.reply.done():
+            self._pending.reply.set_exception(problem)
+
+
+def _meaning(frame: Frame, request: Frame | None) -> str:
+    """Describe a received frame; request: the pending one, if any."""
+    if is_event(frame):
+        return repr(decode_event(frame))
+    if request is None or request.sequence != frame.sequence:
+        return f"unexpected: {frame}"
+    return repr(decode_reply(frame, request))

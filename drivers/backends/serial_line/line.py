@@ -2,35 +2,35 @@
 
 from collections.abc import Callable
 
-from drivers import clock
+from drivers import trace
 from drivers.backends.hardware import Port
-from drivers.backends.line_turns import LineTurns
 from drivers.backends.ports.opening import open_port
 from drivers.backends.shared_line import SharedLine, shared_line
 from drivers.codec.serial_line.frame import Frame, FrameReader
 from drivers.errors import LinkError
+from drivers.trace import Direction
 
 
 class SerialLine(SharedLine[Port]):
-    """A port, named as in pyserial, at a speed [baud]; see `serial_line`.
-
-    turns: arbitrates between amplifiers, since only one may reply at a time.
-    """
+    """A port, named as in pyserial, at a speed [baud]; see `serial_line`."""
 
     address_term = "address"
 
     def __init__(self, port: str, *, baud: int) -> None:
         super().__init__(port)
         self.baud = baud
-        self.turns = LineTurns()
-        self.last_sent = 0.0
-        self._reader = FrameReader()
+        self._reader = self._make_reader()
         self._listeners: dict[int, Callable[[Frame], None]] = {}
 
     @property
     def invalid_frames(self) -> int:
         """Number of invalid frames received."""
         return self._reader.counters.invalid_frames
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether the port has not taken all bytes yet."""
+        return self._ready().is_blocked
 
     def listen(self, address: int, on_frame: Callable[[Frame], None] | None) -> None:
         """Set the callback for frames from an address; None removes it."""
@@ -40,14 +40,18 @@ class SerialLine(SharedLine[Port]):
             self._listeners[address] = on_frame
 
     def send(self, data: bytes) -> None:
-        """Send a frame; raises LinkTimeout if the line is blocked, LinkError."""
+        """Send a frame, as soon as the port takes it; raises LinkError."""
         self._ready().write(data)
-        self.last_sent = clock.now()
 
     async def _open(self) -> Port:
-        self._reader = FrameReader()
+        self._reader = self._make_reader()
         return await open_port(
             self.name, baud=self.baud, on_data=self._received, on_loss=self._lose
+        )
+
+    def _make_reader(self) -> FrameReader:
+        return FrameReader(
+            on_invalid=lambda piece: trace.frame(Direction.IN, piece, self.name, lambda: "damaged")
         )
 
     def _received(self, data: bytes) -> None:

@@ -87,3 +87,21 @@ def command_id(node: int, channel: int) -> int:
     """Return the COB-ID of the RPDO with the command of a channel."""
     each = int(CANOPEN["channels_per_node"])
     return cob_id("command", node + channel // each) + 0x100 * (channel % each)
+
+
+_FUNCTION = 0x780  # bits of a COB-ID besides the node
+_KINDS: Mapping[int, str] = {
+    **{base: kind for kind, base in CANOPEN["cob_ids"].items() if kind != "sync"},
+    **{cob_id("command") + 0x100 * place: "command" for place in range(4)},
+}
+
+
+def meaning(frame: CanFrame) -> str:
+    """Describe a frame: its kind, its node, and the fields of its blocks."""
+    kind = _KINDS.get(frame.id & _FUNCTION, "unknown")
+    if frame.id == cob_id("sync"):
+        return "sync"
+    layout = LAYOUTS.get(kind)
+    blocks = [frame.data[at : at + BLOCK] for at in range(0, len(frame.data), BLOCK)]
+    fields = [layout.unpack(block) for block in blocks] if layout is not None else []
+    return " ".join([kind, f"node {frame.id & ~_FUNCTION}", *map(str, fields)])

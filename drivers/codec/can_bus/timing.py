@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import final
+from typing import ClassVar, final
 
 from drivers.codec.can_bus.frame import BLOCK, CanFrame
 from drivers.protocol.wire_times import WireTimes
@@ -20,6 +20,8 @@ _SEGMENT = 7  # bytes
 @dataclass(frozen=True)
 class CanTimes(WireTimes):
     """Durations with worst-case bit stuffing; fd: data bit rate, 0 without CAN FD."""
+
+    is_multi_master: ClassVar[bool] = True
 
     bitrate: int
     fd: int = 0

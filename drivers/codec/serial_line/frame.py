@@ -10,6 +10,7 @@ noise; empty frames are ignored.
 
 import struct
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from cobs import cobs
@@ -79,11 +80,13 @@ def frame_length(payload_length: int) -> int:
 class FrameReader:
     """Splits a stream of bytes into frames; invalid pieces are counted and skipped.
 
-    Buffers at most one frame.
+    Buffers at most one frame. on_invalid: called with each invalid piece, of an overlong one with
+    its beginning.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, on_invalid: Callable[[bytes], None] = lambda piece: None) -> None:
         self.counters = FrameCounters()
+        self._on_invalid = on_invalid
         self._stuffed = bytearray()
         self._skipping = False
 
@@ -103,7 +106,7 @@ class FrameReader:
         if self._skipping:
             return
         if len(self._stuffed) + len(piece) > _STUFFED_MAX:
-            self.counters.invalid_frames += 1
+            self._count_invalid(bytes(self._stuffed + piece)[:_STUFFED_MAX])
             self._skipping = True
             self._stuffed.clear()
             return
@@ -117,10 +120,14 @@ class FrameReader:
             return None
         frame = _decode_frame(stuffed)
         if frame is None:
-            self.counters.invalid_frames += 1
+            self._count_invalid(stuffed)
         else:
             self.counters.good += 1
         return frame
+
+    def _count_invalid(self, piece: bytes) -> None:
+        self.counters.invalid_frames += 1
+        self._on_invalid(piece)
 
 
 def _decode_frame(stuffed: bytes) -> Frame | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from model.errors import InputError
+from model.files.regular_file import regular_file
 from model.files.uff import read_bytes
 from sim.sensors.recording import Format, Recording, rounded
 
@@ -18,7 +19,7 @@ _CHUNK = 10_000  # written at once
 
 
 def _write(path: Path, recording: Recording) -> None:
-    with path.open("w", newline="", encoding="utf-8") as stream:
+    with open(path, "w", newline="", encoding="utf-8", opener=regular_file) as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(["time_s", *(name + _UNIT for name in recording.names)])
         for label, positions in zip(_POSITIONS, recording.points.T.tolist(), strict=True):

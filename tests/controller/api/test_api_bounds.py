@@ -1,15 +1,21 @@
 """Bounds of one connection, to the byte and the request, in virtual time."""
 
 import asyncio
+import json
+import time
 from collections.abc import Callable
 from typing import cast
+
+import pytest
 
 from controller.api.connection import MAX_REQUEST_RATE, MAX_UNREAD_BYTES, Connection
 from controller.api.hub import Hub
 from controller.api.methods import METHODS
+from controller.api.places import MAX_CONNECTIONS, Places
 from controller.api.schema import MAX_RATE, Message
 from controller.api.server import ApiServer
 from controller.api.topics import ContactsEvent
+from drivers.operation.garbage_collection import no_long_collections
 
 
 class Wire(asyncio.Transport):
@@ -24,9 +30,8 @@ class Wire(asyncio.Transport):
         """Whether it was closed."""
         return self.is_aborted
 
-    def is_reading(self) -> bool:
-        """Whether it reads: always."""
-        return True
+    def resume_reading(self) -> None:
+        """Do nothing."""
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         """Keep the data as unread."""
@@ -39,9 +44,14 @@ class Wire(asyncio.Transport):
     def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
         """Do nothing."""
 
+    def pause_reading(self) -> None:
+        """Do nothing."""
+
     def abort(self) -> None:
         """Close."""
         self.is_aborted = True
+
+    close = abort
 
 
 async def iterate() -> None:
@@ -53,7 +63,7 @@ async def iterate() -> None:
 def connect(now: Callable[[], float]) -> tuple[Connection, Wire]:
     """A connection and its transport."""
     connection = Connection(
-        on_connect=lambda one: True,
+        on_connect=lambda one: None,
         on_lines=lambda one: None,
         on_disconnect=lambda one: None,
         clock=now,
@@ -76,9 +86,8 @@ def test_connection_closes_when_unread_responses_exceed_256_kib() -> None:
     assert (len(wire.waiting), wire.is_aborted) == (1 << 20, False)
 
 
-async def test_server_limits_the_request_rate_except_for_stop_and_touch() -> None:
-    """After 2000 requests at once the next is refused; stop and touch are served."""
-    served: list[str] = []
+def serve(served: list[str]) -> tuple[ApiServer, Connection, Wire]:
+    """A server that records its calls, and a client of it."""
 
     def handler(name: str) -> Callable[[Connection, Message], Message]:
         def handle(client: Connection, params: Message) -> Message:
@@ -90,24 +99,150 @@ async def test_server_limits_the_request_rate_except_for_stop_and_touch() -> Non
     server = ApiServer(
         {name: handler(name) for name in METHODS},
         on_disconnect=lambda client: None,
-        is_protected=lambda client: True,
+        is_kept=lambda client: True,
+        is_subscribed=lambda client: False,
         clock=lambda: 0.0,
     )
-    connection = server._make_connection()
-    connection.connection_made(Wire())
+    connection, wire = server._make_connection(), Wire()
+    connection.connection_made(wire)
+    return server, connection, wire
 
-    async def send(method: str, params: str = "{}") -> None:
-        line = f'{{"jsonrpc":"2.0","method":"{method}","params":{params}}}\n'
-        connection.data_received(line.encode())
-        await iterate()
 
-    for _ in range(int(MAX_REQUEST_RATE) + 1):
-        await send("disarm")
+def line(method: str, params: str = "{}", *, head: str = "") -> bytes:
+    """A request, without an id unless the head has one."""
+    return f'{{"jsonrpc":"2.0",{head}"method":"{method}","params":{params}}}\n'.encode()
+
+
+async def test_server_limits_the_request_rate_except_for_stop_and_touch() -> None:
+    """After 2000 requests at once the next is refused; stop and touch are served."""
+    served: list[str] = []
+    _, connection, _ = serve(served)
+
+    async def send(*lines: bytes) -> None:
+        for each in lines:
+            connection.data_received(each)
+            await iterate()
+
+    await send(*[line("disarm")] * (int(MAX_REQUEST_RATE) + 1))
     assert served == ["disarm"] * 2000
-    await send("stop")
-    await send("touch", '{"source":"a","touches":[]}')
-    await send("clear")
+    await send(line("stop"), line("touch", '{"source":"a","touches":[]}'), line("clear"))
     assert served[2000:] == ["stop", "touch"]
+
+
+async def test_refused_requests_count_in_the_rate() -> None:
+    """Whatever is wrong with them: after 2000 at once the connection is closed."""
+    for wrong in (b"\n", b"{}\n", line("nothing"), line("stop", '{"x":1}')):
+        _, connection, wire = serve([])
+        for _ in range(int(MAX_REQUEST_RATE)):
+            connection.data_received(wrong)
+            wire.waiting = b""
+            await iterate()
+        assert connection.is_open
+        connection.data_received(wrong)
+        await iterate()
+        assert wire.is_aborted
+        assert json.loads(wire.waiting.splitlines()[-1])["error"]["code"] == 1005
+
+
+TOUCH = '{"id":1,"x_m":0.1,"y_m":0.1}'
+WRONG = '{"id":"a","x_m":"b","y_m":[],"z":0,"t":0}'
+HEAVY = {
+    "newlines": b"\n" * (1 << 18),
+    "keys": line("arm", "{" + ",".join(f'"{n}":1' for n in range(7000)) + "}"),
+    "keys within the bound": line("arm", "{" + ",".join(f'"{n}":1' for n in range(490)) + "}"),
+    "repeated keys": line("arm", "{" + ",".join(['"a":1'] * 490) + "}"),
+    "members": b"{" + b",".join(b'"%d":1' % n for n in range(490)) + b"}\n",
+    "depth": b'{"a":' * 5000 + b"\n",
+    "depth within the bound": b"[" * 159 + b"]" * 159 + b"\n",
+    "touches": line("touch", f'{{"source":"a","touches":[{",".join([TOUCH] * 64)}]}}') * 30,
+    "touches in turn": b"".join(
+        line("touch", f'{{"source":"{n}","touches":[{",".join([TOUCH] * 64)}]}}') for n in range(30)
+    ),
+    "wrong touches": line("touch", f'{{"source":"a","touches":[{",".join([WRONG] * 70)}]}}'),
+    "digits": b"9" * 60_000 + b"\n" + line("stop", "{}", head=f'"id":{"9" * 4000},'),
+    "text": line("hello", f'{{"client":"{"é" * 30_000}"}}', head='"id":1,'),
+    "no end": b"x" * (1 << 18),
+    "requests": line("hello", '{"client":"a"}', head='"id":1,') * 3000,
+    "stops": line("stop", head='"id":1,') * 3000,
+}
+
+
+@pytest.mark.parametrize("name", HEAVY)
+async def test_no_callback_takes_longer_than_two_milliseconds(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of its thread's processor time, for whatever bytes a client may send at once."""
+    _, connection, _ = serve([])
+    times: list[float] = []
+    run = asyncio.Handle._run
+
+    def timed(handle: asyncio.Handle) -> None:
+        begin = time.thread_time()
+        run(handle)
+        times.append(time.thread_time() - begin)
+
+    with no_long_collections():
+        monkeypatch.setattr(asyncio.Handle, "_run", timed)
+        asyncio.get_running_loop().call_soon(connection.data_received, HEAVY[name])
+        for _ in range(300):
+            await asyncio.sleep(0)
+        monkeypatch.undo()
+    connection.abort()
+    await asyncio.gather(*connection.pending)
+    assert len(times) > 300
+    assert max(times) < 0.002
+
+
+@pytest.mark.parametrize(
+    ("clients", "dropped"),
+    [
+        ([("kept", 99), ("pending", 99), ("asking", 0.5)], None),
+        ([("kept", 99), ("silent", 0.2), ("subscribed", 99), ("asking", 99)], 1),
+        ([("kept", 99), ("silent", 0.05), ("subscribed", 99)], None),  # it may still speak
+        ([("asking", 99), ("subscribed", 2), ("subscribed", 3)], 2),
+        ([("asking", 2), ("asking", 3), ("subscribed", 0.5)], 1),
+    ],
+)
+def test_place_is_taken_from_the_silent_then_idle_subscribers_then_the_idle(
+    clients: list[tuple[str, float]], dropped: int | None
+) -> None:
+    """Never from a holder of the lease or one that waits; kind and silence [s] of each client."""
+    made: list[tuple[Connection, str]] = []
+    places = Places(
+        is_kept=lambda one: (one, "kept") in made,
+        is_subscribed=lambda one: (one, "subscribed") in made,
+        clock=lambda: 100.0,
+    )
+    for kind, silence in [*clients, *[("kept", 0.0)] * (MAX_CONNECTIONS - len(clients))]:
+        connection, _ = connect(lambda silence=silence: 100.0 - silence)
+        connection.has_spoken = kind != "silent"
+        connection.pending = {cast("asyncio.Task[None]", None)} if kind == "pending" else set()
+        made.append((connection, kind))
+        places.taken.add(connection)
+    new, _ = connect(lambda: 100.0)
+    places.take(new)
+    assert new.is_reserve is (dropped is None)
+    gone = [number for number, (one, _) in enumerate(made) if one not in places.taken]
+    assert gone == ([] if dropped is None else [dropped])
+
+
+async def test_hub_survives_an_exception_of_a_producer(caplog: pytest.LogCaptureFixture) -> None:
+    """The failure is logged once, outside the topic of the log; later events are sent."""
+    hub = Hub({}, clock=lambda: 0.0)
+    connection, wire = connect(lambda: 0.0)
+    hub.subscribe(connection, ["log", "contacts"])
+
+    def fail() -> Message:
+        raise ZeroDivisionError
+
+    for topic in ("log", "contacts", "log"):
+        hub.publish(topic, fail)  # type: ignore[arg-type]
+    await asyncio.sleep(0.03)
+    assert [hasattr(record, "topic") for record in caplog.records] == [True, True]
+    hub.publish("contacts", lambda: ContactsEvent(contacts=[]))
+    await asyncio.sleep(0.03)
+    assert b'"topic":"contacts"' in wire.waiting
+    hub.close()
 
 
 async def test_hub_sends_a_coalesced_topic_at_most_sixty_times_per_second() -> None:

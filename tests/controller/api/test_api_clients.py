@@ -3,25 +3,29 @@
 import asyncio
 import contextlib
 import inspect
+import json
 import os
 import re
 import socket
+import struct
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
 import controller
 from controller.api.async_client import AsyncClient
 from controller.api.client import Client
-from controller.api.client_protocol import Unreachable
-from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.client_protocol import LeaseLost, Unreachable
+from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError, event_line
 from controller.api.methods import METHODS
-from controller.api.schema import Message
+from controller.api.peer import check_peer
 from controller.api.socket_path import SYSTEM_SOCKET, find_socket
-from daemon_bench import PLACE, running_daemon, until_state
+from daemon_bench import PLACE, next_event, ready_daemon, running_daemon, until_state
 from model.errors import InputError
 
 PAGE = Path(controller.__file__).parent.parent / "docs" / "reference" / "api.md"
@@ -30,20 +34,21 @@ READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 
 async def test_client_keeps_its_lease_and_receives_events(tmp_path: Path) -> None:
     """Armed for longer than a lease, touched, notified, stopped and cleared, from a thread."""
-    async with running_daemon(tmp_path) as bench:
+    async with ready_daemon(tmp_path) as (bench, _):
 
         def study() -> list[str]:
             seen: list[str] = []
             with Client.connect(bench.socket, name="study") as era:
                 era.subscribe("pattern", "state")
-                with era.armed("study", lease_s=1):
+                with era.armed("study", lease_s=60):
                     end = time.monotonic() + 1.3
                     while time.monotonic() < end:
                         era.touch([PLACE])
                         time.sleep(0.03)
                     seen.append(era.status().state)
                 era.unsubscribe("pattern")
-                era.stop()
+                with era.armed("study"):
+                    era.stop()  # by this client itself, so that no lease is lost
                 with pytest.raises(RpcError) as caught:
                     era.arm("study")
                 assert caught.value.code is ErrorCode.WRONG_STATE
@@ -53,42 +58,81 @@ async def test_client_keeps_its_lease_and_receives_events(tmp_path: Path) -> Non
                 seen += [event.topic for event in era.events(timeout=0.2)]
             return seen
 
-        async with await bench.client() as era:
-            await until_state(era, READY)
         seen = await asyncio.to_thread(study)
         assert seen[:2] == [ENABLED, READY]
         assert "pattern" in seen[2:]
         assert seen.count("state") >= 6
 
 
-async def test_async_client_keeps_its_lease(tmp_path: Path) -> None:
-    """Armed for longer than a lease of a second, then disarmed; concurrent calls all complete."""
-    async with running_daemon(tmp_path) as bench, await bench.client() as era:
-        await until_state(era, READY)
+async def test_client_connects_again_with_subscriptions_and_lease(tmp_path: Path) -> None:
+    """The server drops its connections twice: a call, `events` and the lease outlive it."""
+    async with ready_daemon(tmp_path) as (bench, era):
+
+        async def drop() -> None:
+            for connection in list(bench.daemon._server._places.taken):
+                connection.abort()
+            await asyncio.sleep(0)
+
+        await era.subscribe("state")
         async with era.armed("me", lease_s=1):
-            await asyncio.sleep(1.3)
+            await drop()
             assert (await era.status()).state == ENABLED
-        await until_state(era, READY)
+            await drop()
+            await asyncio.sleep(1.3)  # the lease was renewed over a third connection
+            assert (await era.status()).armed_by == "me"
+        events = []
+        while not events or events[-1].data["new"] != READY:
+            events.append(await next_event(era, "state"))
         results = await asyncio.gather(*(era.status() for _ in range(50)))
         assert {status.state for status in results} == {READY}
 
 
-async def test_async_client_ends_when_the_daemon_does(tmp_path: Path) -> None:
-    """Calls raise Unreachable, `events` ends, also for later iterations."""
+async def test_lease_lost_within_armed_raises_at_the_next_call_and_at_the_end(
+    tmp_path: Path,
+) -> None:
+    """Another client stops: both clients raise, with the cause, except for `stop`."""
+    loop = asyncio.get_running_loop()
+    async with ready_daemon(tmp_path) as (bench, other):
 
-    async def count_events(era: AsyncClient) -> int:
-        return len([event async for event in era.events()])
+        def study() -> None:
+            with Client.connect(bench.socket) as era, era.armed("study", lease_s=60):
+                asyncio.run_coroutine_threadsafe(other.stop(), loop).result()
+                end = time.monotonic() + 15  # s; less than a third of the lease
+                with contextlib.suppress(LeaseLost):
+                    while time.monotonic() < end and era.status():
+                        time.sleep(0.01)
+                with pytest.raises(LeaseLost):
+                    era.status()
+                era.stop()
 
-    async with running_daemon(tmp_path) as bench:
-        era = await bench.client()
-        await until_state(era, READY)
+        async def async_study(error: Exception | None = None) -> None:
+            async with await bench.client() as era, era.armed("me", lease_s=1):
+                await other.stop()
+                if error is not None:
+                    raise error
+
+        with pytest.raises(LeaseLost, match="stopped by"):
+            await asyncio.to_thread(study)
+        await other.clear()
+        with pytest.raises(LeaseLost, match="stopped by"):
+            await async_study()
+        await other.clear()
+        with pytest.raises(KeyError):  # the study's own error has priority
+            await async_study(KeyError())
+
+
+async def test_client_raises_when_the_daemon_has_ended(tmp_path: Path) -> None:
+    """Calls and `events`, after the attempts to connect again; at once when it was closed."""
+    async with ready_daemon(tmp_path) as (bench, _):
+        era = await AsyncClient.connect(bench.socket, timeout=0.3)
         await era.subscribe("state")
-        counting = asyncio.create_task(count_events(era))
-    assert await asyncio.wait_for(counting, 20) >= 1
-    assert await asyncio.wait_for(count_events(era), 20) == 0
+    assert (await era.next_event(timeout=0)) is not None
+    with pytest.raises(Unreachable):
+        [_ async for _ in era.events()]
     with pytest.raises(Unreachable):
         await era.status()
     await era.close()
+    assert [event async for event in era.events()] == []
 
 
 async def test_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,7 +141,7 @@ async def test_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.Monk
     assert found is not None
     code = re.sub(r"^    ", "", found[1], flags=re.MULTILINE)
     async with running_daemon(tmp_path) as bench:
-        monkeypatch.setattr("controller.api.client.find_socket", lambda path: bench.socket)
+        monkeypatch.setattr("controller.api.async_client.find_socket", lambda path: bench.socket)
         async with await bench.client() as era:
             await until_state(era, READY)
             await asyncio.to_thread(exec, code, {})
@@ -110,12 +154,16 @@ def test_clients_have_the_same_methods() -> None:
         own = inspect.signature(getattr(Client, name))
         other = inspect.signature(getattr(AsyncClient, name))
         assert own == other
-        assert list(own.parameters)[1:] or not METHODS[name].params.model_fields
+        fields = METHODS[name].params.model_fields.values()
+        assert list(own.parameters)[1:] or not any(field.is_required() for field in fields)
+
+
+HELLO = b'{"jsonrpc":"2.0","id":1,"result":{"api_version":"1.0"}}\n'
 
 
 @contextlib.contextmanager
-def responding(path: Path, *lines: bytes) -> Iterator[None]:
-    """A server that sends these lines to its first client and closes."""
+def responding(path: Path, *answers: bytes, rest: bytes = b"") -> Iterator[None]:
+    """A server that answers its client's requests in turn, then closes, or repeats the rest."""
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(path))
         server.listen()
@@ -124,20 +172,25 @@ def responding(path: Path, *lines: bytes) -> Iterator[None]:
             with contextlib.suppress(OSError):
                 client, _ = server.accept()
                 with client:
-                    client.recv(1000)
-                    client.sendall(b"".join(lines))
+                    for answer in answers or [b""]:
+                        client.recv(1000)
+                        client.sendall(answer)
+                    while rest:
+                        client.sendall(rest)
+                        time.sleep(0.01)
 
         thread = threading.Thread(target=respond)
         thread.start()
         yield
+        server.close()
         thread.join()
 
 
 async def connect_error(folder: Path, *lines: bytes) -> tuple[Exception, Exception]:
     """The errors of both clients' `connect` to a server that sends these lines."""
-    with responding(folder / "a", *lines), pytest.raises((Unreachable, RpcError)) as one:
+    with responding(folder / "a", b"".join(lines)), pytest.raises((Unreachable, RpcError)) as one:
         await asyncio.to_thread(Client.connect, folder / "a")
-    with responding(folder / "b", *lines), pytest.raises((Unreachable, RpcError)) as other:
+    with responding(folder / "b", b"".join(lines)), pytest.raises((Unreachable, RpcError)) as other:
         await AsyncClient.connect(folder / "b")
     return one.value, other.value
 
@@ -170,51 +223,43 @@ async def test_connect_raises_an_error_without_id(tmp_path: Path) -> None:
         assert error.code is ErrorCode.BUSY
 
 
-def test_connect_times_out_without_a_response(tmp_path: Path) -> None:
-    """A server that accepts and stays silent."""
+def test_calls_end_within_the_timeout(tmp_path: Path) -> None:
+    """Of a silent daemon, and of one that sends events without end but no response."""
+    event = event_line("log", time=1.0, lost=0, data=b"{}")
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(tmp_path / "s"))
         server.listen()
         with pytest.raises(Unreachable, match="see its log"):
             Client.connect(tmp_path / "s", timeout=0.05)
+    with responding(tmp_path / "t", HELLO, rest=event):
+        with Client.connect(tmp_path / "t", timeout=0.2) as era:
+            for call in (era.stop, era.status):
+                with pytest.raises(Unreachable, match="does not respond"):
+                    call()
+        with pytest.raises(Unreachable, match="is closed"):
+            era.stop()
 
 
-class Note(Message):
-    """Parameters that exceed a socket's buffer."""
-
-    text: str
-
-
-def test_client_closes_after_an_incomplete_line(tmp_path: Path) -> None:
-    """After part of a request nothing more is sent: the daemon would misread it."""
-    hello = b'{"jsonrpc":"2.0","id":1,"result":{"api_version":"1.0"}}\n'
-    with socket.socket(socket.AF_UNIX) as server:
-        server.bind(str(tmp_path / "s"))
-        server.listen()
-        peers: list[socket.socket] = []
-
-        def respond() -> None:
-            peers.append(server.accept()[0])
-            peers[0].recv(1000)
-            peers[0].sendall(hello)
-
-        thread = threading.Thread(target=respond)
-        thread.start()
-        with Client.connect(tmp_path / "s", timeout=0.2) as era:
-            thread.join()
-            peers[0].settimeout(5)
-            with peers[0] as daemon, daemon.makefile("rb") as lines:
-                with pytest.raises(Unreachable):
-                    era.call("note", Note(text="x" * 10_000_000), Note)
-                with pytest.raises(Unreachable):
-                    era.stop()
-                assert lines.read().endswith(b"x")
+def test_stop_names_the_amplifiers_that_are_not_silent(tmp_path: Path) -> None:
+    """Error 1006 as NotSilent, with what is known of every amplifier."""
+    amplifiers = {
+        "main": {"silence": "confirmed_silent", "may_play_for_s": None, "cause": "status read"},
+        "side": {"silence": "may_play", "may_play_for_s": 0.25, "cause": "no reply"},
+        "rear": {"silence": "watchdog_elapsed", "may_play_for_s": None, "cause": "link lost"},
+    }
+    error = {"code": 1006, "message": "-", "data": {"what": "-", "amplifiers": amplifiers}}
+    line = json.dumps({"jsonrpc": "2.0", "id": 2, "error": error}).encode() + b"\n"
+    with responding(tmp_path / "s", HELLO, line), Client.connect(tmp_path / "s") as era:
+        with pytest.raises(NotSilent, match=r"side.*0\.25 s.*rear") as caught:
+            era.stop()
+        assert caught.value.amplifiers["side"].may_play_for_s == 0.25
+        assert "main" not in str(caught.value)
+        assert caught.value.amplifiers.keys() == amplifiers.keys()
 
 
 def test_client_refuses_invalid_arguments(tmp_path: Path) -> None:
     """Before anything is sent, with the method, the key and the value."""
-    with responding(tmp_path / "s"):
-        era = Client(tmp_path / "s")
+    with responding(tmp_path / "s", HELLO), Client.connect(tmp_path / "s") as era:
         for call, words in [
             (lambda: era.arm("me", lease_s=0.5), "arm: lease_s .*got 0.5"),
             (lambda: era.touch(0.1), "touch: places .*got 0.1"),  # type: ignore[arg-type]
@@ -225,7 +270,36 @@ def test_client_refuses_invalid_arguments(tmp_path: Path) -> None:
         ]:
             with pytest.raises(InputError, match=words):
                 call()
-        era.close()
+
+
+@pytest.mark.parametrize(
+    ("folder", "file", "process", "is_trusted"),
+    [
+        (1000, 1000, 1000, True),  # the caller
+        (0, 0, 0, True),
+        (990, 990, 990, True),  # the service
+        (1001, 1001, 1001, False),  # another user, as who puts a socket into a shared folder
+        (0, 1001, 1001, False),
+        (1000, 1000, 1001, False),
+        (1001, 1000, 1000, False),
+    ],
+)
+def test_peer_is_believed_only_as_root_caller_or_service(
+    monkeypatch: pytest.MonkeyPatch, folder: int, file: int, process: int, is_trusted: bool
+) -> None:
+    """Folder, socket and process have one owner, who is one of the three."""
+    users = {"/run/x": folder, "/run/x/era.sock": file}
+    found = dict.fromkeys(("st_mode", "st_ino"), 0)
+    monkeypatch.setattr(
+        Path, "stat", lambda path: SimpleNamespace(st_uid=users[str(path)], **found)
+    )
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    monkeypatch.setattr("pwd.getpwnam", lambda name: SimpleNamespace(pw_uid={"plate": 990}[name]))
+    credentials = struct.pack("3i", 4711, process, process)
+    connected = cast(socket.socket, SimpleNamespace(getsockopt=lambda *_: credentials))
+    expected = contextlib.nullcontext() if is_trusted else pytest.raises(Unreachable, match="ERA_")
+    with expected:
+        check_peer(Path("/run/x/era.sock"), connected, environment={"ERA_HAPTICS_USER": "plate"})
 
 
 async def test_connect_names_the_problem_of_a_path(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 import api_page
 from controller.api.jsonrpc import (
     ErrorCode,
+    InvalidRequest,
     RpcError,
     error_line,
     read_params,
@@ -62,7 +63,7 @@ def test_request_expects_response_only_with_an_id(id: str, expected: bool) -> No
         (b"hello", ErrorCode.PARSE),
         (b"\xff\xfe", ErrorCode.PARSE),
         (b'{"jsonrpc":"2.0","id":1,"method":"stop"', ErrorCode.PARSE),
-        (b'{"jsonrpc":"2.0","id":1,"method":"\\ud800"}', ErrorCode.PARSE),
+        (b'{"jsonrpc":"2.0","id":1,"method":"\\ud800"}', ErrorCode.INVALID_REQUEST),
         (call("touch", '{"source":"a","touches":[{"id":1,"x_m":NaN,"y_m":0}]}'), ErrorCode.PARSE),
         (call("arm", '{"owner":"me","lease_s":Infinity}'), ErrorCode.PARSE),
         (b"[" * 60_000, ErrorCode.PARSE),
@@ -92,6 +93,28 @@ def test_line_that_is_no_request_is_refused(line: bytes, code: ErrorCode) -> Non
     error = refusal(line)
     assert error.code is code
     assert error.data.remedy
+
+
+@pytest.mark.parametrize(
+    ("line", "id"),
+    [
+        (b'{"jsonrpc":"1.0","id":7,"method":"stop"}', 7),
+        (b'{"id":"a","method":1}', "a"),
+        (b'{"jsonrpc":"2.0","id":7,"method":"stop","method":"arm"}', 7),
+        (b'{"jsonrpc":"2.0","id":7,"method":"stop","params":{"a":1,"a":1}}', 7),
+        (b'{"jsonrpc":"2.0","id":7,"method":"stop","params":{"a":NaN}}', 7),
+        (b'{"jsonrpc":"1.0","id":1.5,"method":"stop"}', None),
+        (b'{"jsonrpc":"2.0","id":7,"method":"stop"', None),
+        (b'[{"id":7}]', None),
+    ],
+)
+def test_invalid_request_is_refused_with_its_id_if_that_can_be_read(
+    line: bytes, id: int | str | None
+) -> None:
+    """JSON that is no request, repeats a key or has NaN; null as JSON-RPC 2.0 has it otherwise."""
+    with pytest.raises(InvalidRequest) as caught:
+        read_request(line)
+    assert caught.value.id == id
 
 
 @pytest.mark.parametrize(

@@ -47,14 +47,14 @@ async def relay(
         daemon_reader, daemon_writer = await asyncio.open_unix_connection(daemon, limit=1 << 20)
 
         async def forth() -> None:
-            while data := await reader.read(1 << 16):
-                daemon_writer.write(data)
-            daemon_writer.close()
+            with contextlib.suppress(ConnectionError), contextlib.closing(daemon_writer):
+                while data := await reader.read(1 << 16):
+                    daemon_writer.write(data)
 
         async def back() -> None:
-            while line := await daemon_reader.readline():
-                writer.write(json.dumps(change(json.loads(line))).encode() + b"\n")
-            writer.close()
+            with contextlib.suppress(ConnectionError), contextlib.closing(writer):
+                while line := await daemon_reader.readline():
+                    writer.write(json.dumps(change(json.loads(line))).encode() + b"\n")
 
         under_way.update((asyncio.create_task(forth()), asyncio.create_task(back())))
 

@@ -162,25 +162,6 @@ async def test_shutdown_ends_wait_for_amplifier_at_start(tmp_path: Path) -> None
             lock.release()
 
 
-async def test_daemon_stays_alive_and_shuts_down_during_endless_reconnection(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An attempt may take longer than the service manager's watchdog of 2 s."""
-    async with ready_daemon(tmp_path) as (bench, _):
-        signs_of_life: list[float] = []
-        is_opening = asyncio.Event()
-
-        async def open_for_ever() -> None:
-            is_opening.set()
-            await asyncio.Event().wait()
-
-        monkeypatch.setattr(bench.daemon._controller, "open", open_for_ever)
-        bench.far.device.inject_fault(FaultWindow("hang"))
-        await asyncio.wait_for(is_opening.wait(), PATIENCE)
-        monkeypatch.setattr(bench.daemon._manager, "alive", signs_of_life.append)
-        await until(lambda: len(signs_of_life) >= 3)
-
-
 async def test_log_event_escapes_bytes_that_are_not_text(tmp_path: Path) -> None:
     """A file name that is not UTF-8 reaches subscribers."""
     async with running_daemon(tmp_path) as bench, await bench.client() as era:

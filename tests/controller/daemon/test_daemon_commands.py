@@ -1,6 +1,7 @@
 """The daemon's commands: what they print of a daemon, and what they refuse."""
 
 import asyncio
+import os
 import re
 import socket
 import subprocess
@@ -13,10 +14,12 @@ import typer
 from typer.testing import CliRunner
 
 from controller.api.client_protocol import Notification
+from controller.api.jsonrpc import RpcError
 from controller.cli.daemon import app, show_event, show_status, status, touch
 from controller.daemon.run import run_daemon
 from controller.metrics.__main__ import serve
 from daemon_bench import holding, ready_daemon, until, until_state, write_daemon
+from drivers.errors import CommandError
 from model.errors import InputError
 from sim.faults.fault_window import FaultWindow
 
@@ -61,7 +64,7 @@ async def test_status_shows_why_touches_are_silent_or_plain(tmp_path: Path) -> N
             armed = await era.status()
         assert "silent: not armed" not in show_status(armed)
         assert "plain ramps" not in show_status(armed)
-        slow = armed.model_copy(update={"plain_because": "took 50 ms"})
+        slow = armed.model_copy(update={"ramp_only_reason": "took 50 ms"})
         assert "plain ramps: took 50 ms\n" in show_status(slow)
 
 
@@ -73,7 +76,8 @@ async def test_status_of_lost_amplifier(tmp_path: Path, capsys: pytest.CaptureFi
         await until_state(era, "COMM_LOST")
         lost = await era.status()
         await asyncio.to_thread(status, socket=bench.socket)  # another status is an exception
-        await era.stop()  # latches: without it the link would come back to no fault
+        with pytest.raises(RpcError):  # latches: without it the link would come back to no fault
+            await era.stop()
         bench.far.device.recover()
         await until_state(era, "FAULT")
         await asyncio.to_thread(status, socket=bench.socket)
@@ -103,7 +107,7 @@ def test_dashboard_option_has_optional_address(
     calls: list[tuple[str, str | None]] = []
     monkeypatch.setattr(
         "controller.daemon.run.run_daemon",
-        lambda config, *, dashboard: calls.append((config.name, dashboard)),
+        lambda config, *, dashboard, trace: calls.append((config.name, dashboard)),
     )
     for line in (["daemon", "d.yaml", *arguments], ["daemon", *arguments, "d.yaml"]):
         result = CliRunner().invoke(app, line)
@@ -119,6 +123,22 @@ def test_daemon_does_not_start_when_log_not_writable(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"daemon\.yaml: log\.file: .*taken"):
             run_daemon(path, dashboard=None)
     assert not (tmp_path / "era.sock").exists()
+
+
+def test_daemon_refuses_pipe_as_log_or_trace(tmp_path: Path) -> None:
+    """A named pipe is not waited for, whether it is read or not."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    for is_read in (True, False):
+        with pytest.raises(InputError, match=r"daemon\.yaml: log\.file: .*pipe"):
+            run_daemon(
+                write_daemon(tmp_path, {"main": "sim://"}, "log: {file: pipe}\n"), dashboard=None
+            )
+        with pytest.raises(CommandError, match="pipe"):
+            run_daemon(write_daemon(tmp_path, {"main": "sim://"}), dashboard=None, trace=pipe)
+        if is_read:
+            os.close(reader)
 
 
 def test_metrics_exit_when_port_taken(capsys: pytest.CaptureFixture[str]) -> None:

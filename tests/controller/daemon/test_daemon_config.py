@@ -237,10 +237,3 @@ def test_config_commands_create_and_check_daemon_files(
     bad = RUNNER.invoke(config_app, ["check", "d.yaml", "--json"])
     assert bad.exit_code == 1
     assert [error["key"] for error in json.loads(bad.stdout)["errors"]] == ["level"]
-
-
-def test_config_init_refuses_unknown_kind(tmp_path: Path) -> None:
-    """The error lists the known ones."""
-    result = RUNNER.invoke(config_app, ["init", str(tmp_path / "x.yaml"), "--kind", "boat"])
-    assert isinstance(result.exception, InputError)
-    assert "daemon" in str(result.exception)

@@ -46,7 +46,7 @@ async def test_daemon_plays_effects_by_region_and_by_name(
         async with holding(era, ON_QUIET):
             await until(lambda: [each.effect for each in view.contact_statuses()] == [None])
             await until(lambda: not any(bench.far.device.status().levels))
-            assert (await era.status()).silent_because
+            assert (await era.status()).silence_reason
             for effect, place, level in (
                 ("alert", ON_PAD, None),  # no finger there
                 ("unknown", ON_QUIET, None),
@@ -64,7 +64,7 @@ async def test_daemon_plays_effects_by_region_and_by_name(
             await era.play("alert", ON_QUIET, level_db_sl=12)
             assert decided  # not with the next heartbeat
             assert await level_of("alert") == pytest.approx(12, abs=0.5)
-            assert (await era.status()).silent_because is None
+            assert (await era.status()).silence_reason is None
 
 
 async def test_click_ends_on_wire_while_finger_rests(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -16,10 +16,12 @@ import pytest
 from controller.daemon.fault_dumps import write_dump
 from controller.daemon.latency import LatencyStatistics
 from controller.daemon.log import JsonFormatter, LogHandler, LogThread, RateLimitFilter
-from controller.daemon.message_recorder import MAX_RECORDS, Record, RecordedBackend, Recorder
+from controller.daemon.message_recorder import Record, RecordedBackend, Recorder
 from controller.daemon.service_manager import ServiceManager
+from controller_bench import FarEnd
 from drivers.backend import Backend
-from drivers.protocol.messages import AmplifierState, Arm, Fault, Status
+from drivers.protocol.messages import AmplifierState, Arm, Fault, Status, Stop
+from virtual_loop import in_virtual_time
 
 
 def record(message: str, line: int = 1, **extra: object) -> logging.LogRecord:
@@ -65,6 +67,14 @@ def logger() -> Iterator[logging.Logger]:
     made.handlers.clear()
 
 
+def wait_until(holds: Callable[[], object]) -> None:
+    """Wait for what a thread does."""
+    deadline = time.monotonic() + 20
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+
+
 def test_log_loses_lines_only_while_disk_is_full(logger: logging.Logger, tmp_path: Path) -> None:
     """/dev/full refuses every byte: lost lines are counted, and later ones are written."""
     file = tmp_path / "log"
@@ -73,10 +83,7 @@ def test_log_loses_lines_only_while_disk_is_full(logger: logging.Logger, tmp_pat
     logger.addHandler(LogHandler(thread))
     for _ in range(10):
         logger.warning("lost")
-    deadline = time.monotonic() + 20
-    while thread.lost < 10 and time.monotonic() < deadline:
-        time.sleep(0.001)
-    assert thread.lost == 10
+    wait_until(lambda: thread.lost == 10)
     file.unlink()
     logger.warning("written")
     thread.close()
@@ -120,6 +127,22 @@ def test_log_listener_gets_records_from_info_on(logger: logging.Logger, tmp_path
     assert heard == ["news"]
     lines = (tmp_path / "log").read_text("utf-8").splitlines()
     assert [json.loads(line)["message"] for line in lines] == ["detail", "news"]
+
+
+def test_log_is_reopened_after_rotation(logger: logging.Logger, tmp_path: Path) -> None:
+    """Lines after it are in a new file, which only its owner may read."""
+    file, rotated = tmp_path / "log", tmp_path / "log.1"
+    thread = LogThread(file)
+    logger.addHandler(LogHandler(thread))
+    logger.warning("before")
+    wait_until(lambda: file.exists() and file.read_text("utf-8"))
+    file.rename(rotated)
+    thread.reopen()
+    logger.warning("after")
+    thread.close()
+    messages = [json.loads(each.read_text("utf-8"))["message"] for each in (rotated, file)]
+    assert messages == ["before", "after"]
+    assert file.stat().st_mode & 0o777 == 0o600
 
 
 @pytest.fixture
@@ -187,15 +210,6 @@ def test_service_manager_may_be_missing() -> None:
         manager.close()
 
 
-def test_recorder_keeps_newest_messages() -> None:
-    """Memory is bounded."""
-    recorder = Recorder()
-    for number in range(3 * MAX_RECORDS):
-        recorder.add("main", "out", number)
-    last = recorder.records()
-    assert [each.what for each in last] == list(range(2 * MAX_RECORDS, 3 * MAX_RECORDS))
-
-
 def test_dump_is_json_lines_for_owner_only(tmp_path: Path) -> None:
     """The cause first, then each message with its content by name; only the newest files stay."""
     folder = tmp_path / "new" / "folder"
@@ -235,3 +249,19 @@ def test_recorded_backend_forwards_every_member() -> None:
     """A member that were not forwarded would have the default of the base class."""
     members = {name for name in vars(Backend) if not name.startswith("_")}
     assert members <= vars(RecordedBackend).keys()
+
+
+@in_virtual_time
+async def test_failing_recorder_prevents_no_stop() -> None:
+    """The wire gets the Stop, and the caller its reply."""
+
+    class FailingRecorder(Recorder):
+        def add(self, link: str, way: str, what: object) -> None:
+            raise MemoryError
+
+    far_end = FarEnd()
+    backend = RecordedBackend(far_end, "main", FailingRecorder())
+    await backend.open()
+    reply = await backend.exchange(Stop(ramp=0.005), timeout=1.0)
+    assert isinstance(reply, Status)
+    assert far_end.requests(Stop)

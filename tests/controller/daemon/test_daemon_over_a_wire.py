@@ -13,6 +13,7 @@ import pytest
 
 from controller.api.jsonrpc import ErrorCode
 from controller.cli.daemon import show_status
+from controller.gateway.settings import read_token
 from controller.loop.intent import NO_CONTACTS
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
@@ -31,14 +32,10 @@ from daemon_bench import (
     until,
     until_state,
 )
-from drivers.amplifier import Amplifier
-from drivers.errors import LinkError
-from drivers.protocol.messages import AmplifierState, Apply, LoadEnvelope
-from drivers.registry import open_backend
+from drivers.protocol.messages import AmplifierState
 from rig_files import TWO_AMPLIFIERS
 from sim.faults.fault_window import FaultWindow
 from tuio_panel import free_port
-from wires import FarSide
 
 
 async def test_daemon_plays_touches_only_while_armed(tmp_path: Path) -> None:
@@ -61,7 +58,11 @@ async def test_daemon_plays_touches_only_while_armed(tmp_path: Path) -> None:
             assert pattern["contacts"][1]["level_db_sl"] == pytest.approx(20, abs=0.5)
             assert pattern["latency_ms"] > 0
             status = await era.status()
-            assert (status.state, status.phase, status.armed_by) == (ENABLED, "armed", "me")
+            assert (status.state, status.amplifiers_state, status.armed_by) == (
+                ENABLED,
+                "armed",
+                "me",
+            )
             assert 0 < (status.lease_left_s or 0) <= 30
             commanded = [pattern["drive"][era]["level"] for era in ("SW", "SE", "NE", "NW")]
             await until(
@@ -72,20 +73,6 @@ async def test_daemon_plays_touches_only_while_armed(tmp_path: Path) -> None:
         await until(lambda: not any(bench.far.device.status().levels))
         assert (await next_event(era, "silence")).data["reason"]
         assert (await era.status()).drive == {}
-
-
-@pytest.mark.parametrize(("wait", "is_shaped"), [("30 ms", True), ("0 ms", False)])
-async def test_daemon_shapes_onsets_only_when_touches_may_wait(
-    tmp_path: Path, wait: str, is_shaped: bool
-) -> None:
-    """Envelopes are loaded by default, and not with a touch_wait of zero."""
-    async with ready_daemon(tmp_path, f"touch_wait: {wait}\n") as (bench, era):
-        await era.arm("me", lease_s=30)
-        async with holding(era, far=bench.far):
-            records = bench.daemon._recorder.records()
-            requests = [type(each.what) for each in records if each.way == "out"]
-            assert Apply in requests
-            assert (LoadEnvelope in requests) is is_shaped
 
 
 async def test_daemon_lifts_contacts_of_disconnected_client(
@@ -105,17 +92,13 @@ async def test_daemon_lifts_contacts_of_disconnected_client(
 
 
 async def test_daemon_disarms_when_lease_not_renewed(tmp_path: Path) -> None:
-    """Armed while it is renewed, disarmed a second after the last renewal of a lease of 1 s."""
+    """Armed for 1.4 s by a lease of 1 s that is renewed once; then disarmed."""
     async with ready_daemon(tmp_path) as (bench, era):
         lease = await era.arm("me", lease_s=1)
-        for _ in range(3):
-            await asyncio.sleep(0.4)
-            await era.renew(lease.lease)
+        await asyncio.sleep(0.7)
+        await era.renew(lease.lease)
+        await asyncio.sleep(0.7)
         assert (await era.status()).state == ENABLED
-        loop = asyncio.get_running_loop()
-        begin = loop.time()
-        await until_state(era, READY, "SWITCH_ON_DISABLED")
-        assert loop.time() - begin >= 0.9
         await until_state(era, READY)
         assert bench.far.device.status().state is AmplifierState.SWITCH_ON_DISABLED
         assert await error_code(era.renew(lease.lease)) is ErrorCode.LEASE
@@ -141,19 +124,6 @@ async def test_any_client_stops_daemon_armed_by_another(tmp_path: Path) -> None:
         await until_state(era, READY)
 
 
-async def test_stop_overtakes_arming_on_same_connection(tmp_path: Path) -> None:
-    """Both are requested at once: the daemon ends stopped, whichever comes first."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        arming = asyncio.ensure_future(era.arm("me"))
-        await asyncio.sleep(0)
-        await era.stop()
-        await asyncio.gather(arming, return_exceptions=True)
-        status = await era.status()
-        assert status.state in ("QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT")
-        assert status.armed_by is None
-        assert bench.far.device.status().state is not AmplifierState.OPERATION_ENABLED
-
-
 async def test_daemon_stays_disarmed_and_latched_after_link_loss_while_armed(
     tmp_path: Path,
 ) -> None:
@@ -170,9 +140,12 @@ async def test_daemon_stays_disarmed_and_latched_after_link_loss_while_armed(
             status = await era.status()
             assert (status.assume_energised, status.armed_by) == (True, None)
             assert status.remedy
-            ended = [(await next_event(era, "link", "silence")) for _ in range(2)]
+            ended = [(await next_event(era, "link", "silence")) for _ in range(3)]
+            links = [event.data for event in ended if event.topic == "link"]
+            assert [(each["event"], each["amplifier"]) for each in links] == [
+                *(("degraded", "main"), ("lost", "main")),
+            ]
             data = {event.topic: event.data for event in ended}
-            assert (data["link"]["event"], data["link"]["amplifier"]) == ("lost", "main")
             # On a busy machine the finger may time out first.
             assert (
                 "no reply" in data["silence"]["reason"] or data["silence"]["reason"] == NO_CONTACTS
@@ -180,7 +153,7 @@ async def test_daemon_stays_disarmed_and_latched_after_link_loss_while_armed(
         assert (await era.status()).drive == {}
         assert await error_code(era.arm("me")) is ErrorCode.WRONG_STATE
         assert await error_code(era.clear()) is ErrorCode.LINK
-        await era.stop()
+        assert await error_code(era.stop()) is ErrorCode.NOT_SILENT
         bench.far.device.recover()
         await until_state(era, "FAULT")
         assert not (await era.status()).assume_energised
@@ -273,8 +246,11 @@ async def test_status_tells_lost_amplifier_from_one_closed_with_it(tmp_path: Pat
 
 
 async def test_fault_stops_is_dumped_and_must_be_cleared(tmp_path: Path) -> None:
-    """Over-voltage: silent, latched, and the last messages in a file in order of time."""
-    async with ready_daemon(tmp_path, "dumps: {folder: dumps, keep: 2}\n") as (bench, era):
+    """Over-voltage: silent, latched, and the last messages in a file in order of time.
+
+    None loads an envelope, since touches may not wait for it.
+    """
+    async with ready_daemon(tmp_path, "dumps: {folder: dumps}\ntouch_wait: 0 ms\n") as (bench, era):
         await era.arm("me", lease_s=30)
         async with holding(era, far=bench.far):
             bench.far.device.inject_fault(FaultWindow("over_voltage"))
@@ -287,40 +263,11 @@ async def test_fault_stops_is_dumped_and_must_be_cleared(tmp_path: Path) -> None
         (dump,) = (tmp_path / "dumps").iterdir()
         head, *lines = [json.loads(line) for line in dump.read_text("utf-8").splitlines()]
         assert "OVER_VOLTAGE" in head["cause"]
-        assert {"Arm", "Apply", "Status"} <= {line["message"] for line in lines}
+        messages = {line["message"] for line in lines}
+        assert {"Arm", "Apply", "Status"} <= messages
+        assert "LoadEnvelope" not in messages
         times = [line["time_s"] for line in lines]
         assert times == sorted(times)
-
-
-async def leave_armed(far: FarSide, *, watchdog: float) -> None:
-    """Arm the amplifier and close the link without disarming it; watchdog [s]."""
-    amplifier = Amplifier(open_backend(far.url), reply_timeout=1.0)
-    await amplifier.open()
-    await amplifier.arm(watchdog)
-    assert far.device.status().state is AmplifierState.OPERATION_ENABLED
-    await amplifier.close()
-
-
-async def test_daemon_disarms_amplifier_found_armed_at_start(tmp_path: Path) -> None:
-    """It starts disarmed and does not continue what another program has left."""
-    async with far_end(tmp_path) as far:
-        await leave_armed(far, watchdog=2.0)
-        async with daemon_at(far, tmp_path) as bench, await bench.client() as era:
-            await until_state(era, READY)
-            assert far.device.status().state is AmplifierState.SWITCH_ON_DISABLED
-
-
-async def test_daemon_requires_clear_when_amplifier_in_fault_at_start(tmp_path: Path) -> None:
-    """As after a daemon that was killed, for which the watchdog has tripped."""
-    async with far_end(tmp_path) as far:
-        await leave_armed(far, watchdog=0.15)
-        await until(lambda: far.device.status().state is AmplifierState.FAULT)
-        async with daemon_at(far, tmp_path) as bench, await bench.client() as era:
-            await until_state(era, "FAULT")
-            assert "WATCHDOG" in (await era.status()).cause
-            assert await error_code(era.arm("me")) is ErrorCode.WRONG_STATE
-            await era.clear()
-            await until_state(era, READY)
 
 
 async def test_reload_applies_what_is_safe(tmp_path: Path) -> None:
@@ -381,11 +328,39 @@ async def test_sighup_replaces_touch_sources(tmp_path: Path) -> None:
             again.bind(("127.0.0.1", ports[0]))
 
 
+async def test_daemon_keeps_dashboard_token_out_of_its_output(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not on a terminal, the gateway reads it from a file of the owner instead of printing it."""
+    started: list[tuple[str, ...]] = []
+    monkeypatch.setattr(
+        "controller.daemon.daemon.ChildProcesses.start",
+        lambda children, *arguments: started.append(arguments),
+    )
+    async with running_daemon(tmp_path) as bench:
+        bench.daemon._dashboard = "127.0.0.1:0"
+        bench.daemon._start_children()
+        ((*_, option, file),) = started
+        assert option == "--token-file"
+        assert len(read_token(Path(file))) >= 32  # which refuses a file that others may read
+
+
+async def test_signals_reopen_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SIGHUP, which also reloads, and SIGUSR1, which must not end the daemon."""
+    async with running_daemon(tmp_path) as bench:
+        reopened: list[int] = []
+        monkeypatch.setattr(bench.daemon._log, "reopen", lambda: reopened.append(1))
+        for number in (signal.SIGHUP, signal.SIGUSR1):
+            os.kill(os.getpid(), number)
+        await until(lambda: len(reopened) == 2)
+
+
 async def test_daemon_refuses_amplifier_with_another_serial_number(tmp_path: Path) -> None:
-    """The error names both serial numbers."""
-    with pytest.raises(LinkError, match=r"A1.*SIM-main"):
-        async with running_daemon(tmp_path, "serial_numbers: {main: A1}\n"):
-            pass
+    """It searches for the other one; the cause names both serial numbers."""
+    more = "serial_numbers: {main: A1}\n"
+    async with running_daemon(tmp_path, more) as bench, await bench.client() as era:
+        await until_state(era, "COMM_LOST")
+        assert re.search(r"A1.*SIM-main", (await era.status()).cause)
 
 
 async def test_daemon_describes_rig_and_amplifiers(tmp_path: Path) -> None:

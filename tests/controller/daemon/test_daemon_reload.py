@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from controller.daemon.config import DaemonConfig, load_daemon_config
-from controller.daemon.reload import ReloadPlan, plan_reload
+from controller.daemon.reload import ReloadPlan, changed_keys, plan_reload
 from model.rig.file import example_rig_path
 
 DEFAULTS = {
@@ -41,6 +41,11 @@ def config(folder: Path, **changes: str) -> DaemonConfig:
     return load_daemon_config(path)
 
 
+def planned(old: DaemonConfig, new: DaemonConfig, *, is_armed: bool) -> ReloadPlan:
+    """The plan of a change."""
+    return plan_reload(old, new, changed_keys(old, new), is_armed=is_armed)
+
+
 @pytest.mark.parametrize("is_armed", [False, True])
 @pytest.mark.parametrize(
     ("changes", "plan"),
@@ -62,7 +67,7 @@ def test_reload_applies_safe_keys_and_defers_others(
     folder: Path, changes: dict[str, str], plan: ReloadPlan, is_armed: bool
 ) -> None:
     """Armed or not: touch sources, leases, log level, dumps and a lower level."""
-    assert plan_reload(config(folder), config(folder, **changes), is_armed=is_armed) == plan
+    assert planned(config(folder), config(folder, **changes), is_armed=is_armed) == plan
 
 
 @pytest.mark.parametrize("is_armed", [False, True])
@@ -80,7 +85,7 @@ def test_reload_is_refused_when_rig_table_mode_or_amplifiers_change(
 ) -> None:
     """Nothing else that changed with them is applied either."""
     changed = config(folder, touch="[]", **{key: value})
-    plan = plan_reload(config(folder), changed, is_armed=is_armed)
+    plan = planned(config(folder), changed, is_armed=is_armed)
     assert plan.apply == ()
     assert key in (plan.refused or "")
 
@@ -90,14 +95,14 @@ def test_reload_is_refused_when_rig_file_was_edited(folder: Path) -> None:
     old = config(folder)
     text = (folder / "rig.yaml").read_text("utf-8")
     (folder / "rig.yaml").write_text(text.replace("level: 1.0", "level: 0.9"), "utf-8")
-    assert plan_reload(old, config(folder), is_armed=False).refused is not None
+    assert planned(old, config(folder), is_armed=False).refused is not None
 
 
 @pytest.mark.parametrize("change", [{"level_db_sl": "21"}, {"layout": "neighbours.yaml"}])
 def test_reload_raises_no_level_while_armed(folder: Path, change: dict[str, str]) -> None:
     """From 20 dB SL to 21, or to whatever the neighbours allow, only once disarmed."""
     old, new = config(folder), config(folder, touch="[]", **change)
-    plan = plan_reload(old, new, is_armed=True)
+    plan = planned(old, new, is_armed=True)
     assert plan.refused is not None
     assert plan.apply == ()
-    assert set(plan_reload(old, new, is_armed=False).apply) == {"layout", "touch"}
+    assert set(planned(old, new, is_armed=False).apply) == {"layout", "touch"}

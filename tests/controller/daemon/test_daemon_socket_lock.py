@@ -17,7 +17,8 @@ def test_socket_is_for_its_user_only(tmp_path: Path) -> None:
     try:
         lock = SocketLock(tmp_path / "new" / "era.sock")
         with lock.bind():
-            assert lock.path.stat().st_mode & 0o777 == 0o600
+            for name in ("era.sock", "era.sock.lock"):
+                assert lock.path.with_name(name).stat().st_mode & 0o777 == 0o600
             assert lock.path.parent.stat().st_mode & 0o777 == 0o700
         assert os.umask(0) == 0
         lock.release()
@@ -47,6 +48,26 @@ def test_socket_lock_refuses_second_daemon(tmp_path: Path) -> None:
         other.release()
         assert first.path.is_socket()
     first.release()
+
+
+@pytest.mark.parametrize("kind", ["link", "pipe", "foreign"])
+def test_socket_lock_cannot_be_prepared_by_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """A lock file must be a plain file of this user; others lose access to it."""
+    lock = tmp_path / "era.sock.lock"
+    match kind:
+        case "link":
+            lock.symlink_to("elsewhere")
+        case "pipe":
+            os.mkfifo(lock)
+        case _:
+            lock.touch(0o644)
+            SocketLock(tmp_path / "era.sock").release()
+            assert lock.stat().st_mode & 0o777 == 0o600
+            monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
+    with pytest.raises(InputError, match=str(lock)):
+        SocketLock(tmp_path / "era.sock")
 
 
 def test_socket_of_killed_daemon_is_replaced(tmp_path: Path) -> None:

@@ -9,16 +9,19 @@ from typing import Any
 
 import pytest
 
-from controller.daemon.states import DaemonEvent, DaemonState, StateMachine, Trigger
+from controller.daemon.states import DaemonEvent, DaemonState, Trigger
 from controller.daemon.supervisor import Supervisor
 from controller.loop.loop import Controller
 from controller.loop.observer import Observer
 from controller.sources.touch import Touch, TouchFrame
 from controller_bench import make_bench
 from drivers.amplifier import Amplifier
-from drivers.errors import CommandRefused, LinkError
+from drivers.command import CommandSet
+from drivers.errors import CommandRefused, LinkError, LinkTimeout
+from drivers.line.priority import PREEMPTION_GRACE
 from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import (
+    AmplifierEvent,
     AmplifierState,
     Apply,
     Arm,
@@ -36,6 +39,7 @@ from drivers.protocol.messages import (
 )
 from virtual_loop import in_virtual_time
 
+ENABLED = DaemonState.OPERATION_ENABLED
 ARM, STOP, CLEAR = (DaemonEvent(each) for each in (Trigger.ARM, Trigger.STOP, Trigger.CLEAR))
 
 
@@ -64,6 +68,11 @@ class Watched:
         """Put a finger on the middle of the plate."""
         now = asyncio.get_running_loop().time()
         self.controller.deliver(TouchFrame("test", now, (Touch(1, 0.5, 0.5),)))
+
+    def touch_elsewhere(self) -> None:
+        """Move the finger far enough for another pattern."""
+        now = asyncio.get_running_loop().time()
+        self.controller.deliver(TouchFrame("test", now, (Touch(1, 0.9, 0.9),)))
 
     def cut(self) -> None:
         """Let no request reach the amplifier any more."""
@@ -97,12 +106,9 @@ async def watched() -> AsyncIterator[Watched]:
     amplifiers = {"main": Amplifier(bench.far_end)}
     loop = asyncio.get_running_loop()
 
-    def changed(old: StateMachine, new: StateMachine) -> None:
-        daemon.states.append(new.state)
-
     supervisor = Supervisor(
         amplifiers,
-        state_changed=changed,
+        state_changed=[lambda old, new: daemon.states.append(new.state)],
         link_changed=lambda event, lost, message: daemon.links.append(event),
         alive=lambda: daemon.alive.append(loop.time()),
     )
@@ -115,9 +121,9 @@ async def watched() -> AsyncIterator[Watched]:
         ),
     )
     daemon = Watched(supervisor, controller, bench.far_end)
-    await supervisor.open(controller)
-    running = asyncio.create_task(supervisor.run())
-    await asyncio.sleep(0.001)
+    running = asyncio.create_task(supervisor.run(controller))
+    await supervisor.started.wait()
+    await asyncio.sleep(0.005)
     try:
         yield daemon
     finally:
@@ -135,16 +141,6 @@ def slow_down(controller: Controller, *, stop: float) -> None:
         await asyncio.sleep(stop)
 
     controller.stop = slow_stop
-
-
-@in_virtual_time
-async def test_supervisor_starts_disarmed_and_ready() -> None:
-    """Opened, read back, ready; a touch arms and plays nothing."""
-    async with watched() as daemon:
-        assert daemon.states == [DaemonState.SWITCH_ON_DISABLED, DaemonState.READY_TO_SWITCH_ON]
-        daemon.touch()
-        await asyncio.sleep(1)
-        assert not daemon.far_end.requests(Arm, Apply, Ping)
 
 
 @in_virtual_time
@@ -190,12 +186,11 @@ async def test_control_loop_gives_signs_of_life_in_every_state() -> None:
 
 @pytest.mark.parametrize("trigger", [Trigger.STOP, Trigger.FAULT])
 @in_virtual_time
-async def test_stop_without_reply_is_reported_as_loss_at_once(trigger: Trigger) -> None:
-    """It raises at the caller, assumes the amplifier energised, and is latched."""
+async def test_stop_without_reply_is_handled_as_loss(trigger: Trigger) -> None:
+    """The amplifier is assumed energised, the stop is latched."""
     async with watched() as daemon:
         daemon.cut()
-        with pytest.raises(LinkError, match="energised"):
-            await daemon.handle(DaemonEvent(trigger))
+        await daemon.handle(DaemonEvent(trigger))
         assert daemon.state is DaemonState.COMM_LOST
         assert daemon.links == ["lost"]
         daemon.obey()
@@ -226,12 +221,11 @@ async def test_loss_is_handled_before_reopening_when_found_twice() -> None:
         controller.close, controller.open = early_close, noted_open
         daemon.cut()
         stopping = asyncio.create_task(daemon.handle(STOP))
-        await asyncio.sleep(0.4)  # it stops the others again because of the loss
+        await asyncio.sleep(0.7)  # it stops the others again because of the loss
         daemon.obey()
         controller.step = lost_step
         controller.request_update()
-        with pytest.raises(LinkError):
-            await stopping
+        await stopping
         await asyncio.sleep(1)
         controller.close = close
         assert len(opened) == 1
@@ -246,10 +240,9 @@ async def test_close_ends_handling_of_loss() -> None:
         slow_down(daemon.controller, stop=0.3)
         daemon.cut()
         stopping = asyncio.create_task(daemon.handle(STOP))
-        await asyncio.sleep(0.4)
+        await asyncio.sleep(0.7)
         assert daemon.state is DaemonState.COMM_LOST
-    with pytest.raises(LinkError):
-        await asyncio.wait_for(stopping, 5)
+    await asyncio.wait_for(stopping, 5)
     assert daemon.links == ["lost"]
 
 
@@ -297,11 +290,12 @@ async def test_amplifier_that_returns_armed_is_disarmed() -> None:
     async with watched() as daemon:
         await daemon.handle(ARM)
         daemon.cut()
-        await asyncio.sleep(0.2)
+        await asyncio.sleep(2)  # no blind stop is sent any more
         assert daemon.state is DaemonState.COMM_LOST
-        daemon.far_end.state = AmplifierState.OPERATION_ENABLED
+        daemon.far_end.obey(Clear())
+        daemon.far_end.obey(Arm(2.0))
         daemon.obey()
-        await asyncio.sleep(1)
+        await asyncio.sleep(3)
         assert daemon.state is DaemonState.FAULT
         assert daemon.far_end.requests(Disarm)
         assert daemon.far_end.state is AmplifierState.SWITCH_ON_DISABLED
@@ -420,6 +414,24 @@ async def test_amplifier_that_refuses_to_arm_is_a_fault() -> None:
 
 
 @in_virtual_time
+async def test_fault_reported_while_arming_stops_all() -> None:
+    """Before the reply to Arm; nothing is armed afterwards."""
+    async with watched() as daemon:
+        daemon.far_end.delay = 0.02
+        arming = asyncio.create_task(daemon.handle(ARM))
+        await asyncio.sleep(0.005)
+        daemon.far_end.report(AmplifierEvent(AmplifierState.FAULT, Fault.ARC, 1))
+        await asyncio.sleep(PREEMPTION_GRACE + 0.001)
+        assert daemon.far_end.requests(Stop)
+        with pytest.raises(CommandRefused):
+            await arming
+        await asyncio.sleep(0.1)
+        assert daemon.state is DaemonState.FAULT
+        assert DaemonState.OPERATION_ENABLED not in daemon.states
+        assert daemon.far_end.state is not AmplifierState.OPERATION_ENABLED
+
+
+@in_virtual_time
 async def test_fault_of_disarmed_amplifier_is_noticed() -> None:
     """Within a second, without any request of a client."""
     async with watched() as daemon:
@@ -428,21 +440,65 @@ async def test_fault_of_disarmed_amplifier_is_noticed() -> None:
         assert daemon.state is DaemonState.FAULT
 
 
+async def stall(daemon: Watched, seconds: float) -> None:
+    """Let the amplifier hear nothing for a time [s]."""
+
+    def no_reply(request: Request) -> Reply | None:
+        raise LinkTimeout("no reply")
+
+    daemon.far_end.answer, daemon.far_end.delay = no_reply, 0.03
+    await asyncio.sleep(seconds)
+    daemon.far_end.answer, daemon.far_end.delay = (lambda request: None), 0.0
+
+
 @in_virtual_time
-async def test_close_while_playing_ramps_down_reads_back_and_disarms() -> None:
-    """Zero along 50 ms, a status, then disarmed, in less than half a second."""
-    loop = asyncio.get_running_loop()
+async def test_stall_shorter_than_watchdog_ends_without_fault() -> None:
+    """Three heartbeats without a reply degrade the link; new touches are played once it is back."""
     async with watched() as daemon:
         await daemon.handle(ARM)
         daemon.touch()
         await asyncio.sleep(0.02)
-        assert daemon.far_end.levels[0] > 0
-        begin = loop.time()
-        await daemon.supervisor.close("end of the test")
-        assert loop.time() - begin < 0.5
-        requests = [request for time, request in daemon.far_end.asked if time >= begin]
-        silence = next(request for request in requests if isinstance(request, Apply))
-        assert silence.command_set.is_silent
-        assert silence.command_set.ramp == pytest.approx(0.05)
-        kinds = [type(request) for request in requests]
-        assert kinds.index(Apply) < kinds.index(GetStatus) < kinds.index(Disarm)
+        stalling = asyncio.create_task(stall(daemon, 0.18))
+        await asyncio.sleep(0.16)
+        assert (daemon.state, daemon.supervisor.machine.is_degraded) == (ENABLED, True)
+        begun = len(daemon.far_end.asked)
+        daemon.touch_elsewhere()
+        await stalling
+        await asyncio.sleep(0.1)
+        kinds = [type(request) for _, request in daemon.far_end.asked[begun:]]
+        assert kinds.index(GetStatus) < kinds.index(Apply)
+        assert (daemon.state, daemon.supervisor.machine.is_degraded) == (ENABLED, False)
+        assert daemon.links == ["degraded", "restored"]
+        assert any(daemon.far_end.levels)
+
+
+@in_virtual_time
+async def test_degraded_link_is_lost_when_watchdog_must_have_expired() -> None:
+    """Not before 0.25 s after the last request that fed it, and then at once."""
+    async with watched() as daemon:
+        await daemon.handle(ARM)
+        await asyncio.sleep(0.12)
+        begin = asyncio.get_running_loop().time()
+        stalling = asyncio.create_task(stall(daemon, 1.0))
+        for _ in range(450):
+            if daemon.state is not ENABLED:
+                break
+            await asyncio.sleep(0.001)
+        assert asyncio.get_running_loop().time() - begin >= 0.25
+        assert daemon.state is DaemonState.COMM_LOST
+        await asyncio.sleep(0.01)
+        assert daemon.links[:2] == ["degraded", "lost"]
+        await stalling
+
+
+@in_virtual_time
+async def test_amplifier_that_plays_another_set_after_a_stall_is_stopped() -> None:
+    """Another program may have played it meanwhile."""
+    async with watched() as daemon:
+        await daemon.handle(ARM)
+        await asyncio.sleep(0.02)
+        await stall(daemon, 0.15)
+        daemon.far_end.obey(Apply(CommandSet(7, (), ramp=0.0, valid_for=0.0)))
+        await asyncio.sleep(0.2)
+        assert daemon.state is DaemonState.FAULT
+        assert daemon.far_end.requests(Stop)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from controller.demo import far_end
-from controller.demo.far_end import SimulatedPlate, open_far_end
+from controller.demo.far_end import SimulatedPlate, simulated_plate
 from controller.demo.recorder import TouchRecorder
 from controller.plate_control import PlateControl
 from drivers.errors import LinkError
@@ -26,7 +26,7 @@ async def test_far_end_terminates_process_when_not_ready_in_time(
 
     monkeypatch.setattr(far_end, "_terminate", note)
     with pytest.raises(LinkError):
-        async with open_far_end(example_rig_path(), ["main"], wire="serial"):
+        async with simulated_plate(example_rig_path(), ["main"], wire="serial"):
             pass
     assert len(exit_statuses) == 1
     assert exit_statuses[0] is not None
@@ -39,14 +39,14 @@ async def test_far_end_reports_exit_status_when_rig_is_invalid(
     rig = tmp_path / "rig.yaml"
     rig.write_text("plate: 3\n")
     with pytest.raises(LinkError, match="status 2"):
-        async with open_far_end(rig, ["main"], wire="serial"):
+        async with simulated_plate(rig, ["main"], wire="serial"):
             pass
     assert f"{rig}:1: plate: " in capfd.readouterr().err
 
 
 async def test_recorder_reports_first_error_at_the_end(tmp_path: Path) -> None:
     """Of several errors the first is raised, since it usually causes the others."""
-    plate = SimulatedPlate(PlateControl(tmp_path / "missing", remedy="start it again"))
+    plate = SimulatedPlate(PlateControl(tmp_path / "missing", remedy="start it again"), {})
     recorder = TouchRecorder(plate, on_row=lambda row: None)
     recorder.observer.refused("no pattern was found")
     recorder._run(plate.place_fingers({"1": (0.1, 0.1)}))

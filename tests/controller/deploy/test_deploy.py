@@ -99,22 +99,6 @@ def test_service_files_refuse_path_when_systemd_would_interpret_it(path: Path) -
         service_files(path, ERA, Permissions())
 
 
-def test_install_prints_files_when_dry_run(tmp_path: Path) -> None:
-    """A dry run prints the files and the next commands; with a root these are written."""
-    era = Path(sys.executable).with_name("era")
-    command = [str(era), "systemd", "install"]
-    shown = subprocess.run([*command, "--dry-run"], capture_output=True, text=True, check=True)
-    files = service_files(CONFIG, era, Permissions())
-    for path, text in files.items():
-        assert str(path) in shown.stdout
-        assert text in shown.stdout
-    assert "systemctl enable --now era-haptics" in shown.stdout
-    assert not any(path.exists() for path in files)
-    subprocess.run([*command, "--root", str(tmp_path)], capture_output=True, check=True)
-    written = {f"/{path.relative_to(tmp_path)}" for path in tmp_path.rglob("*") if path.is_file()}
-    assert written == {str(path) for path in files}
-
-
 @pytest.fixture
 def era(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
     """Run a command line in this process; return exit status, stdout and stderr."""
@@ -130,6 +114,20 @@ def era(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str
 def contents(folder: Path) -> dict[str, bytes]:
     """The files of a folder by path."""
     return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_install_prints_files_when_dry_run(
+    era: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    """A dry run prints the files and the next commands; with a root these are written."""
+    status, out, _ = era("systemd", "install", "--dry-run")
+    files = service_files(CONFIG, Path(sys.executable).with_name("era"), Permissions())
+    assert status == 0
+    assert all(str(path) in out and text in out for path, text in files.items())
+    assert "systemctl enable --now era-haptics" in out
+    assert not any(path.exists() for path in files)
+    era("systemd", "install", "--root", tmp_path)
+    assert contents(tmp_path).keys() == {f"{tmp_path}{path}" for path in files}
 
 
 @pytest.mark.parametrize("before", [{}, {"systemd/system/era-haptics.service": "old\n"}])

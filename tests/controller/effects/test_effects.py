@@ -37,7 +37,7 @@ def wanted(
 
 
 def test_click_ends_after_its_duration() -> None:
-    """A click of 40 ms; the intent expires then."""
+    """A click lasts for 40 ms; the intent expires then."""
     player = EffectPlayer(Layout(effects={"click": Click(level=18.0)}, elsewhere="click"))
     here = [finger(1)]
     intent = player.intent(here, 10.0)
@@ -49,7 +49,7 @@ def test_click_ends_after_its_duration() -> None:
 
 
 def test_buzz_lasts_while_the_finger_stays() -> None:
-    """Without a duration; a new finger starts it again."""
+    """A buzz without a duration goes on; a new finger starts it again."""
     player = EffectPlayer(Layout())
     assert wanted(player, [finger(1)], 0.0) == {1: 20.0}
     assert player.intent([finger(1)], 100.0).until is None
@@ -87,7 +87,7 @@ def test_ramp_steps_are_no_shorter_than_the_plate_response() -> None:
 
 
 def test_ramp_holds_its_last_level() -> None:
-    """After it has risen; as strong as the neighbours allow if that is the level."""
+    """It stays at the last level, or as strong as the neighbours allow if that is the level."""
     course = Ramp(start_level=8.0, duration=0.3, hold=True).start(finger(1), 0.0, level_db_sl=12.0)
     felt = [course.feel(finger(1), now) for now in (0.0, 0.11, 0.21, 9.0)]
     assert [getattr(one, "level_db_sl", None) for one in felt] == [8.0, 10.0, 12.0, 12.0]
@@ -159,7 +159,7 @@ def test_player_keeps_the_region_of_a_finger_on_an_edge() -> None:
 
 
 def test_layout_max_level() -> None:
-    """What may be felt at all: a ramp's first level too, also where a region lowers its last."""
+    """The first level of a ramp counts too, also where a region lowers its last."""
     falling = Ramp(start_level=40.0, level=12.0)
     assert Layout(effects={"fall": falling}).max_db_sl == 40.0
     region = Region("pad", LEFT, on_press="soft", level_db_sl=30.0, has_level=True)
@@ -219,7 +219,7 @@ def test_player_prefers_priority_then_the_newest() -> None:
 
 
 def test_intent_expires_at_the_first_end() -> None:
-    """Of a click of 40 ms and a detent of 30 ms at two fingers it is after the detent."""
+    """A detent of 30 ms ends before a click of 40 ms at another finger."""
     slider = Region("slider", LEFT, on_move="dots")
     effects: dict[str, Effect] = {"dots": Detents(duration=0.03), "click": Click(duration=0.04)}
     player = EffectPlayer(Layout((slider,), effects, elsewhere="click"))
@@ -264,7 +264,7 @@ def test_player_plays_an_effect_by_name() -> None:
 
 
 def test_requested_effect_ends_with_its_finger() -> None:
-    """Through other regions too, unlike what a region has for it."""
+    """It goes on through other regions, unlike what a region has for it."""
     regions = (Region("left", LEFT, on_press="hum"), Region("right", RIGHT))
     effects: dict[str, Effect] = {"hum": Buzz(level=9.0), "alert": Buzz(level=18.0)}
     player = EffectPlayer(Layout(regions, effects, elsewhere=None))
@@ -408,7 +408,7 @@ def test_shapes(
 
 
 def test_effect_kinds_include_plug_ins() -> None:
-    """With their parameters as JSON."""
+    """Their parameters are described as JSON."""
 
     class Rhythm(Buzz):
         """Beats of one's own."""

@@ -24,7 +24,7 @@ def refused(path: Path, text: str) -> str:
 
 
 def test_load_layout_reads_the_example() -> None:
-    """With its numbers in metres."""
+    """Its numbers are in metres."""
     layout = load_layout(EXAMPLE, load_rig(example_rig_path()).plate)
     assert [region.name for region in layout.regions] == ["keypad", "slider", "knob", "patch"]
     keypad, slider, _, patch = layout.regions
@@ -44,7 +44,7 @@ def test_load_layout_reads_the_example() -> None:
 
 
 def test_region_at_returns_the_later_region_where_two_overlap(tmp_path: Path) -> None:
-    """In the order of the file."""
+    """Regions lie on top of each other in the order of the file."""
     path = tmp_path / "layout.yaml"
     path.write_text(
         "regions:\n"
@@ -84,7 +84,7 @@ def test_load_layout_names_place_and_remedy(
 
 
 def test_load_layout_reports_all_problems_at_once(tmp_path: Path) -> None:
-    """Each with its key."""
+    """Each problem has its key."""
     reported = refused(
         tmp_path / "layout.yaml",
         "effects: {a: {kind: silk}, b: {kind: click, level: 90}}\n"

@@ -16,6 +16,7 @@ from controller.api.topics import LogEvent, PatternEvent
 from gateway_bench import (
     ARM,
     TOKEN,
+    UNCONFIRMED,
     GatewayProcess,
     RawWebSocket,
     ScriptedDaemon,
@@ -88,6 +89,17 @@ def test_http_error_has_the_code_and_data_of_the_api(gateway: GatewayProcess) ->
     }
 
 
+def test_http_stop_tells_what_is_known_of_every_amplifier(
+    gateway: GatewayProcess, daemon: ScriptedDaemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """503 and code 1006 unless all are confirmed silent."""
+    monkeypatch.setattr(daemon, "silence", UNCONFIRMED)
+    status, body = call(gateway, "stop")
+    assert (status, body["code"]) == (503, 1006)
+    found = body["data"]["amplifiers"]  # type: ignore[index]
+    assert found == {name: each.model_dump() for name, each in UNCONFIRMED.items()}
+
+
 def test_http_hello_is_answered_by_the_gateway(
     gateway: GatewayProcess, daemon: ScriptedDaemon
 ) -> None:
@@ -98,12 +110,15 @@ def test_http_hello_is_answered_by_the_gateway(
     assert daemon.calls == []
 
 
-def test_http_touches_have_a_source_prefix(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:
-    """Distinct from those of WebSockets."""
+def test_http_touches_belong_to_their_connection(
+    gateway: GatewayProcess, daemon: ScriptedDaemon
+) -> None:
+    """The same source of another connection is another one: it lifts no other client's fingers."""
     call(gateway, "touch")
-    (params,) = [params for _, params in daemon.calls]
-    assert isinstance(params, TouchParams)
-    assert params.source == "http:me"
+    call(gateway, "touch")
+    one, other = (params.source for _, params in daemon.calls if isinstance(params, TouchParams))
+    assert re.fullmatch(r"http 127\.0\.0\.1:\d+:me", one)
+    assert one != other
 
 
 def test_http_method_without_parameters_needs_no_body(
@@ -262,7 +277,6 @@ def test_websocket_receives_the_field_of_the_drive(
                 contacts=[],
                 drive={"SW": PlayedTone(frequency_hz=5.0, level=0.5, phase_deg=0.0)},
                 predicted_contrast_db=None,
-                robust_contrast_db=None,
                 predicted_level_db_sl=None,
                 latency_ms=1.0,
             ),
@@ -317,7 +331,7 @@ def test_websocket_stop_is_served_while_requests_are_pending(
             assert isinstance(error, dict)
             assert error["code"] == 1005
             ws.call("stop", {}, id=99)
-            assert ws.response(99)["result"] == {}
+            assert ws.response(99)["result"] == {"amplifiers": {}}
         wait_for(lambda: is_accepted(ws))  # all pending requests are completed
 
 

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,7 +14,7 @@ from drivers.errors import CommandRefused
 from drivers.guard import GuardLimits
 from drivers.protocol.messages import Capabilities
 from model.rig.file import example_rig_path, load_rig
-from model.rig.rig import Limits, Rig
+from model.rig.rig import Rig
 from model.vibration.excitation import Tone
 
 CAPABILITIES = Capabilities(
@@ -70,7 +71,7 @@ def test_make_guards_applies_the_lowest_limit(
     least: dict[str, float],
 ) -> None:
     """Of file, amplifier and built-in ceiling."""
-    rig = replace(coarse_rig, limits=replace(Limits(40.0, 500.0, 1.0), **file))
+    rig = replace(coarse_rig, limits=replace(GuardLimits(40.0, 500.0, 1.0), **file))
     limits = in_force(rig, Reports(replace(CAPABILITIES, **reported)))  # type: ignore[arg-type]
     for name, value in least.items():
         assert getattr(limits, name) == pytest.approx(value)
@@ -88,3 +89,12 @@ def test_route_lengthens_ramps_to_the_slew_limit(coarse_rig: Rig) -> None:
     short = CommandSet(2, (DriveCommand(1, 110.0, 0.5),), ramp=0.02, valid_for=0.0)
     with pytest.raises(CommandRefused, match="use a longer ramp"):
         guard.check(short)
+
+
+def test_make_guards_keeps_what_earlier_guards_count(coarse_rig: Rig) -> None:
+    """Reopening an amplifier does not give it its on-time anew; other limits need another guard."""
+    amplifiers: dict[str, Any] = {"main": Reports()}
+    earlier = make_guards(coarse_rig, amplifiers)
+    assert make_guards(coarse_rig, amplifiers, earlier) == earlier
+    other = replace(coarse_rig, limits=replace(coarse_rig.limits, duty=0.5))
+    assert make_guards(other, amplifiers, earlier)["main"] is not earlier["main"]

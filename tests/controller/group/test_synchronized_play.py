@@ -1,5 +1,7 @@
 """Playing one set on several amplifiers."""
 
+from collections.abc import Mapping
+
 import pytest
 
 from controller.group.synchronized_play import SynchronizedPlay
@@ -7,10 +9,20 @@ from controller_bench import FarEnd
 from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.guard import Guard, GuardLimits
+from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.protocol.messages import Commit, Request, Stage
 from virtual_loop import in_virtual_time
 
 NAMES = ("a", "b")
+
+
+async def armed(far_ends: Mapping[str, FarEnd]) -> dict[str, CheckedAmplifier]:
+    """Amplifiers at these far ends, armed."""
+    amplifiers = {name: CheckedAmplifier(Amplifier(end)) for name, end in far_ends.items()}
+    for checked in amplifiers.values():
+        await checked.amplifier.open()
+        await checked.arm()
+    return amplifiers
 
 
 @pytest.mark.parametrize(("steps", "asked"), [(0, []), (1, [Stage])])
@@ -19,11 +31,9 @@ async def test_play_ends_when_silenced_between_steps(
 ) -> None:
     """Nothing is sent, or nothing committed once all are staged; the set is not incomplete."""
     far_ends = {name: FarEnd() for name in NAMES}
-    amplifiers = {name: Amplifier(far_end) for name, far_end in far_ends.items()}
-    for amplifier in amplifiers.values():
-        await amplifier.open()
+    amplifiers = await armed(far_ends)
     before = len(far_ends["a"].asked)
-    guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifiers["a"].capabilities)
+    guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifiers["a"].amplifier.capabilities)
     wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.2),), ramp=0.01, valid_for=0.0)
     joint = SynchronizedPlay(amplifiers)
     played = await joint.play(
@@ -42,13 +52,10 @@ async def test_play_reports_when_the_last_commit_was_sent() -> None:
     """The commit on the faster wire is sent 10 ms later."""
     far_ends = {name: FarEnd() for name in NAMES}
     far_ends["a"].commit_takes = 0.010
-    amplifiers = {name: Amplifier(far_end) for name, far_end in far_ends.items()}
-    for amplifier in amplifiers.values():
-        await amplifier.open()
-        await amplifier.arm()
+    amplifiers = await armed(far_ends)
     for far_end in far_ends.values():
         far_end.delay = 0.003
-    guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifiers["a"].capabilities)
+    guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifiers["a"].amplifier.capabilities)
     wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.2),), ramp=0.01, valid_for=0.0)
     sets = dict.fromkeys(NAMES, guard.check(wanted))
     played = await SynchronizedPlay(amplifiers).play(sets, {}, may_play=lambda: True)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from controller.group.amplifier_group import Phase
+from controller.group.amplifier_group import GroupState
 from controller.loop.loop import Controller
 from controller.sources.touch import Touch, TouchFrame
 from controller_bench import make_bench
@@ -30,7 +30,7 @@ class Link(Backend):
         self.amplifier = SimulatedAmplifier("any", channels=2)
         self._dice = rng
         self._loss = loss
-        self._last_sent = 0.0
+        self._last_sent_at = 0.0
 
     async def open(self) -> None:
         """Do nothing."""
@@ -39,14 +39,14 @@ class Link(Backend):
         """Do nothing."""
 
     @property
-    def last_sent(self) -> float:
+    def last_sent_at(self) -> float:
         """On the loop's clock [s]."""
-        return self._last_sent
+        return self._last_sent_at
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Obey at once, reply later."""
-        self._last_sent = asyncio.get_running_loop().time()
-        reply = self.amplifier.handle(request, self._last_sent)
+        self._last_sent_at = asyncio.get_running_loop().time()
+        reply = self.amplifier.handle(request, self._last_sent_at)
         if self._dice.random() < self._loss:
             await asyncio.sleep(timeout)
             raise LinkTimeout("the answer was lost")
@@ -88,7 +88,7 @@ async def step_at_random(
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.1])
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(12))
 @in_virtual_time
 async def test_controller_never_stays_vibrating_for_any_order_of_events(
     seed: int, loss: float
@@ -116,7 +116,7 @@ async def test_controller_never_stays_vibrating_for_any_order_of_events(
         if was and not down:
             lifted = loop.time()
         await asyncio.sleep(rng.choice(PAUSES))
-        if down or loop.time() - lifted < 0.0205 or controller.phase is not Phase.ARMED:
+        if down or loop.time() - lifted < 0.0205 or controller.group_state is not GroupState.ARMED:
             continue
         assert loss or max(link.level() for link in links.values()) < 1e-3
     if rng.random() < 0.5:
@@ -128,5 +128,7 @@ async def test_controller_never_stays_vibrating_for_any_order_of_events(
     assert max(link.level() for link in links.values()) == 0
     await controller.close()
     for ended in await asyncio.gather(*tasks, return_exceptions=True):
-        assert ended is None or isinstance(ended, DriverError | asyncio.CancelledError)
+        assert not isinstance(ended, BaseException) or isinstance(
+            ended, DriverError | asyncio.CancelledError
+        )
     assert asyncio.all_tasks() == {asyncio.current_task()}

@@ -21,12 +21,13 @@ from drivers.protocol.messages import Capabilities
 from drivers.protocol.wire_times import WireTimes
 from model.errors import InputError
 from model.fem.mesh import Mesh
-from model.rig.rig import Channel, Limits, Rig
+from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
 from model.structure.plate import Material, Plate
 from model.table.pattern import Pattern
-from model.transients.envelope import Envelope
+from model.transients.envelope import BaseEnvelope
 from model.vibration.excitation import Tone
+from registry.limits import GuardLimits
 from sim.amplifier.amplifier import capabilities
 from stub_wire_times import StubWireTimes
 
@@ -63,7 +64,7 @@ def rig() -> Rig:
         ),
         wiring={"A": Channel("left", 3), "C": Channel("right", 0), "B": Channel("left", 1)},
         amplifiers={"left": "fake://", "right": "fake://"},
-        limits=Limits(40.0, 500.0, 0.8),
+        limits=GuardLimits(40.0, 500.0, 0.8),
     )
 
 
@@ -127,12 +128,14 @@ def test_envelope_support_needs_capability_and_loading_time(
     left: Opened, right: Opened, expected: EnvelopeSupport
 ) -> None:
     """Knots, slots and steps of every amplifier, and 20 ms for every wire."""
-    assert envelope_support(rig(), {"left": left, "right": right}, within=0.020) == expected
+    assert (
+        envelope_support(rig(), {"left": left, "right": right}, max_loading_time=0.020) == expected
+    )
 
 
 def test_envelope_support_is_empty_without_loading_time() -> None:
     """However fast the wire is."""
-    assert not envelope_support(rig(), {"left": Opened(), "right": Opened()}, within=0.0)
+    assert not envelope_support(rig(), {"left": Opened(), "right": Opened()}, max_loading_time=0.0)
 
 
 def test_wire_envelopes_by_hand() -> None:
@@ -144,10 +147,10 @@ def test_wire_envelopes_by_hand() -> None:
         None,
         None,
         onset={
-            "B": Envelope(110.0, 0, (1e-4j, -2e-4, 0)),
-            "A": Envelope(110.0, 0, (2e-5, 5e-5)),
+            "B": BaseEnvelope(110.0, 0, (1e-4j, -2e-4, 0)),
+            "A": BaseEnvelope(110.0, 0, (2e-5, 5e-5)),
         },
-        ending={"A": Envelope(110.0, 5e-5, (-1e-5j, 0))},
+        ending={"A": BaseEnvelope(110.0, 5e-5, (-1e-5j, 0))},
     )
     assert onset_slots(rig()) == {"A": 1, "B": 2, "C": 1}
     assert ending_slots(rig()) == {"A": 3, "B": 4, "C": 2}
@@ -164,6 +167,6 @@ def test_wire_envelopes_by_hand() -> None:
 def test_wire_envelopes_round_full_stroke_to_one() -> None:
     """A rounding error above it would be refused by the guard."""
     full = complex(1e-4 * math.cos(1.0), 1e-4 * math.sin(1.0)) * (1 + 1e-12)
-    pattern = Pattern({}, 0.02, 20.0, None, None, onset={"A": Envelope(110.0, 0, (full, 0))})
+    pattern = Pattern({}, 0.02, 20.0, None, None, onset={"A": BaseEnvelope(110.0, 0, (full, 0))})
     ((envelope,), _) = wire_envelopes(pattern, rig()).values()
     assert envelope.knots[0].level == 1.0

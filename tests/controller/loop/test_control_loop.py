@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import pytest
 
-from controller.group.amplifier_group import Phase
+from controller.group.amplifier_group import GroupState
 from controller.loop.intent import NO_CONTACTS
 from controller.loop.observer import Observer
 from controller.sources.touch import Touch, TouchFrame, TouchSource
@@ -16,11 +16,12 @@ from controller_bench import FINGER, OTHER, Bench, armed, running
 from drivers.errors import LinkTimeout
 from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import (
-    AmplifierState,
     Apply,
     Arm,
     Commit,
+    Disarm,
     GetCaps,
+    GetStatus,
     Hello,
     Ping,
     Reply,
@@ -127,30 +128,15 @@ async def test_controller_restarts_phase_after_a_disarm() -> None:
         assert [each.commands[0].keep_phase for each in bench.far_end.sets()] == [False, False]
 
 
-@in_virtual_time
-async def test_controller_silences_after_the_last_lift() -> None:
-    """Every channel is at zero within 20 ms."""
-    async with running() as bench:
-        bench.touch(FINGER, OTHER)
-        await asyncio.sleep(0.02)
-        lifted = now()
-        bench.touch()
-        await asyncio.sleep(0.02)
-        assert_silenced_within_20_ms(bench, lifted)
-        assert {command.channel for command in bench.far_end.sets()[-1].commands} == {0, 1}
-        assert bench.reports.silenced[-1].reason == NO_CONTACTS
-        assert bench.reports.silenced[-1].latency == 0.0
-
-
-@pytest.mark.parametrize("kind", [Apply, Ping])
+@pytest.mark.parametrize("kind", [Apply, GetStatus, Ping])
 @in_virtual_time
 async def test_controller_silences_a_lift_while_a_reply_is_awaited(kind: type[Request]) -> None:
     """Zero is reached within 20 ms also while the reply to another request is missing."""
     async with running() as bench:
         due = now()
-        if kind is Ping:
+        if kind is not Apply:
             await bench.hold(FINGER, seconds=0.1)
-            due = bench.far_end.times(Ping)[-1] + HEARTBEAT
+            due = bench.far_end.times(Ping)[-1] + HEARTBEAT + 0.045 * (kind is Ping)
         bench.far_end.delay = 0.045
         bench.touch(FINGER)
         await asyncio.sleep(due + 0.001 - now())
@@ -159,27 +145,29 @@ async def test_controller_silences_a_lift_while_a_reply_is_awaited(kind: type[Re
         bench.touch()
         await asyncio.sleep(0.02)
         assert_silenced_within_20_ms(bench, lifted)
+        assert {command.channel for command in bench.far_end.sets()[-1].commands} == {0, 1}
         bench.far_end.delay = 0.0
         beats = len(bench.far_end.times(Ping))
         await asyncio.sleep(0.06)
+        assert bench.reports.silenced[-1].reason == NO_CONTACTS
         assert len(bench.far_end.times(Ping)) > beats
-        assert bench.controller.phase is Phase.ARMED
+        assert bench.controller.group_state is GroupState.ARMED
 
 
 @in_virtual_time
 async def test_controller_repeats_no_aborted_request() -> None:
-    """A Ping without a reply yields to a pattern that is due since, and is no fault.
+    """A heartbeat without a reply yields to a pattern that is due since, and is no fault.
 
     The last finger lifts 25 ms after it, and another comes at once.
     """
     async with running() as bench:
         await bench.hold(FINGER, seconds=0.1)
-        beat = bench.far_end.times(Ping)[-1] + HEARTBEAT
+        due = bench.far_end.times(Ping)[-1] + HEARTBEAT
         bench.touch(FINGER)
-        await asyncio.sleep(beat - 0.001 - now())
+        await asyncio.sleep(due - 0.001 - now())
 
         def no_reply(request: Request) -> Reply | None:
-            if isinstance(request, Ping):
+            if isinstance(request, GetStatus):
                 raise LinkTimeout("no answer")
             return None
 
@@ -190,12 +178,12 @@ async def test_controller_repeats_no_aborted_request() -> None:
         bench.touch(OTHER)
         await asyncio.sleep(0.010)
         bench.far_end.delay, bench.far_end.answer = 0.0, lambda request: None
-        (first, ping), (second, pattern), *_ = bench.far_end.asked[asked:]
-        assert isinstance(ping, Ping)
+        (first, beat), (second, pattern), *_ = bench.far_end.asked[asked:]
+        assert isinstance(beat, GetStatus)
         assert isinstance(pattern, Apply)
         assert not pattern.command_set.is_silent
         assert second == pytest.approx(first + 0.030)
-        assert bench.controller.phase is Phase.ARMED
+        assert bench.controller.group_state is GroupState.ARMED
         assert bench.reports.refused == []
 
 
@@ -211,7 +199,7 @@ async def test_controller_commits_no_set_after_its_finger_lifted() -> None:
         for far_end in bench.far_ends:
             assert far_end.requests(Commit) == []
             assert far_end.sets()[-1].is_silent
-        assert bench.controller.phase is Phase.ARMED
+        assert bench.controller.group_state is GroupState.ARMED
         assert bench.reports.refused == []
 
 
@@ -248,17 +236,6 @@ async def test_controller_resends_cancelled_silence() -> None:
         await asyncio.sleep(0.001)
         assert bench.silences() == [False, True, True]
     await second
-
-
-@in_virtual_time
-async def test_controller_silences_when_a_source_times_out() -> None:
-    """150 ms after its last frame."""
-    async with running() as bench:
-        bench.touch(FINGER)
-        start = now()
-        await asyncio.sleep(0.3)
-        assert bench.silences() == [True, False, True]
-        assert bench.far_end.times(Apply)[-1] == pytest.approx(start + 0.150, abs=1e-6)
 
 
 @pytest.mark.parametrize("ago", [5.0, 0.146])
@@ -308,12 +285,12 @@ async def test_resting_finger_costs_heartbeats_only() -> None:
 async def test_heartbeat_is_sent_only_after_the_loop_has_run() -> None:
     """Only a turn of the loop sends it, once, after what the turn had to send."""
     async with armed() as bench:
-        await asyncio.sleep(1.0)
+        await asyncio.sleep(4 * HEARTBEAT)
         assert bench.far_end.requests(Ping) == []
         bench.touch(FINGER)
         await bench.controller.step()
         kinds = [type(request) for _, request in bench.far_end.asked]
-        assert kinds == [Hello, GetCaps, Arm, Apply, Ping]
+        assert kinds == [Hello, GetCaps, Disarm, Arm, Apply, GetStatus, Ping]
         await asyncio.sleep(1.0)
         assert len(bench.far_end.requests(Ping)) == 1
 
@@ -323,10 +300,10 @@ async def test_heartbeat_stops_when_the_loop_hangs() -> None:
     """While the loop waits for one amplifier, the other gets no heartbeat."""
     async with running("a", "b") as bench:
         slow, other = bench.far_ends
-        slow.delay = 0.4
+        slow.delay = 0.2
         hung = now()
         bench.touch(FINGER)
-        await asyncio.sleep(0.35)
+        await asyncio.sleep(0.15)
         assert [time for time in other.times(Ping) if time > hung] == []
         slow.delay = 0.0
         await asyncio.sleep(0.5)
@@ -340,12 +317,11 @@ async def test_arm_aborts_no_heartbeat() -> None:
         await asyncio.sleep(2.5 * HEARTBEAT)
         await asyncio.sleep(bench.far_end.times(Ping)[-1] + 0.9 * HEARTBEAT - now())
         bench.far_end.delay = 0.02
-        bench.far_end.state = AmplifierState.SWITCH_ON_DISABLED  # from where it can be armed
         begin = len(bench.far_end.asked)
         await bench.controller.arm()
         await asyncio.sleep(0.1)
         times, requests = zip(*bench.far_end.asked[begin:], strict=True)
-        assert [type(request) for request in requests[:3]] == [Arm, Ping, Apply]
+        assert [type(request) for request in requests[:4]] == [Arm, GetStatus, Ping, Apply]
         assert min(after - before for before, after in pairwise(times)) > 0.0199
 
 
@@ -409,7 +385,7 @@ async def test_controller_silences_when_the_guard_refuses(tone: tuple[float, flo
         assert refusal.startswith("main: ")
         assert "channel 0" in refusal
         assert bench.reports.silenced[-1].reason == refusal
-        assert bench.controller.phase is Phase.ARMED
+        assert bench.controller.group_state is GroupState.ARMED
 
 
 @pytest.mark.parametrize("amplifiers", [["main"], ["left", "right"]])
@@ -417,7 +393,9 @@ async def test_controller_silences_when_the_guard_refuses(tone: tuple[float, flo
 async def test_controller_retries_a_pattern_when_the_rate_limit_permits(
     amplifiers: list[str],
 ) -> None:
-    """At two sets a second the third touch is refused, and played half a second later.
+    """Of two sets a second the third is refused, and played 1.1 s after the first.
+
+    A tenth more than a second, in case the first is delayed on its way.
 
     The table is not queried in between; a finger that has lifted by then is not played.
     """
@@ -430,7 +408,7 @@ async def test_controller_retries_a_pattern_when_the_rate_limit_permits(
             bench.touch()
             await asyncio.sleep(0.010)
         asked = len(bench.table.asked)
-        await bench.hold(FINGER, seconds=0.4)
+        await bench.hold(FINGER, seconds=1.0)
         (refusal,) = bench.reports.refused
         assert "2 command sets" in refusal
         assert bench.reports.silenced[-1].reason == refusal
@@ -439,16 +417,17 @@ async def test_controller_retries_a_pattern_when_the_rate_limit_permits(
         assert any(bench.far_end.levels)
         assert len(bench.reports.refused) == 1
         assert len(bench.table.asked) == asked + 1
-        assert bench.reports.applied[-1].time == pytest.approx(begin + 0.5, abs=1e-3)
-        bench.touch()
-        await asyncio.sleep(0.010)
-        bench.touch(FINGER)
-        await asyncio.sleep(0.010)
-        assert len(bench.reports.refused) == 2
+        assert bench.reports.applied[-1].time == pytest.approx(begin + 1.1, abs=1e-3)
+        for refused in (1, 2):
+            bench.touch()
+            await asyncio.sleep(0.010)
+            bench.touch(FINGER)
+            await asyncio.sleep(0.010)
+            assert len(bench.reports.refused) == refused
         bench.touch()
         await asyncio.sleep(2)
         assert not any(bench.far_end.levels)
-        assert len(bench.reports.applied) == 3
+        assert len(bench.reports.applied) == 4
 
 
 @in_virtual_time
@@ -492,9 +471,11 @@ class FailingSource(TouchSource):
 
 @in_virtual_time
 async def test_controller_survives_a_failing_source(caplog: pytest.LogCaptureFixture) -> None:
-    """The failure is reported; its finger times out; other sources continue."""
+    """The failure is reported; its finger times out after 150 ms; other sources continue."""
     async with running(sources=[FailingSource()]) as bench:
+        start = bench.far_end.times(Apply)[-1]
         await asyncio.sleep(0.2)
+        assert bench.far_end.times(Apply)[-1] == pytest.approx(start + 0.150, abs=1e-6)
         assert bench.reports.failed == ["OSError: the panel was unplugged"]
         assert bench.far_end.sets()[-1].is_silent
         assert len(bench.reports.applied) == 1

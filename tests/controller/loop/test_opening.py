@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from controller.group.amplifier_group import Phase
+from controller.group.amplifier_group import GroupState
 from controller.loop.loop import Controller
 from drivers.amplifier import Amplifier
 from model.errors import InputError
@@ -28,4 +28,4 @@ async def test_open_refuses_a_table_without_playable_frequencies() -> None:
     )
     with pytest.raises(InputError, match=r"400 to 500 Hz.*60 to 250 Hz"):
         await controller.open()
-    assert controller.phase is Phase.CLOSED
+    assert controller.group_state is GroupState.CLOSED

@@ -9,10 +9,11 @@ from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.messages import Achieved
 from model.errors import InputError
 from model.fem.mesh import Mesh
-from model.rig.rig import Channel, Limits, Rig
+from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
 from model.structure.plate import Material, Plate
 from model.vibration.excitation import Excitation, Tone
+from registry.limits import GuardLimits
 
 PLATE = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
 RIG = Rig(
@@ -28,7 +29,7 @@ RIG = Rig(
     ),
     wiring={"SW": Channel("left", 1), "SE": Channel("right", 0), "NE": Channel("left", 0)},
     amplifiers={"left": "sim://", "right": "sim://"},
-    limits=Limits(40.0, 500.0, 1.0),
+    limits=GuardLimits(40.0, 500.0, 1.0),
 )
 
 

@@ -57,7 +57,8 @@ async def test_touch_starts_along_its_onset(link: Link, shapes: Shapes) -> None:
         (onset,) = loaded(link)
         assert onset.step == 0.005
         assert [knot.level for knot in onset.knots] == pytest.approx(
-            [FULL * number / 21 for number in range(1, 21)]
+            [FULL * number / 21 for number in range(1, 21)],
+            abs=0.5e-4,  # the wire has steps of 1e-4
         )
         assert {knot.phase for knot in onset.knots} == {90.0}
         (played,) = sets(link)
@@ -218,21 +219,6 @@ async def test_ending_belongs_to_its_own_pattern(link: Link, shapes: Shapes) -> 
         assert [each.skip_ending for each in sets(link)[-1].commands] == [True, True]
 
 
-@in_virtual_time
-async def test_failure_skips_the_ending(
-    link: Link, shapes: Shapes, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """After any exception in a decision all fall silent along the ramp."""
-    async with running(far_ends=[link], timing=shapes, intent_source=Always()) as bench:
-        await bench.hold(FINGER, seconds=0.2)
-        monkeypatch.setattr(Always, "intent", lambda self, contacts, now: 1 / 0)
-        bench.touch((1, 0.51, 0.5))
-        await asyncio.sleep(0.005)
-        assert sets(link)[-1].is_silent
-        assert [each.skip_ending for each in sets(link)[-1].commands] == [True, True]
-        monkeypatch.undo()
-
-
 class Always:
     """An intent source for which every contact is a target."""
 
@@ -296,7 +282,7 @@ async def test_ramps_replace_envelopes_when_loading_is_slow(
     slow = 0.0
     link.delay = lambda request: slow if isinstance(request, LoadEnvelope) else 0.0
     caplog.set_level(logging.WARNING)
-    async with running(far_ends=[link], timing=shapes, envelope_time=0.020) as bench:
+    async with running(far_ends=[link], timing=shapes, max_loading_time=0.020) as bench:
 
         async def is_shaped(duration: float) -> bool:
             nonlocal slow
@@ -360,19 +346,18 @@ async def test_amplifiers_start_onsets_together(shapes: Shapes) -> None:
 
 @in_virtual_time
 async def test_failing_intent_source_silences_until_it_recovers(
-    link: Link, monkeypatch: pytest.MonkeyPatch
+    link: Link, shapes: Shapes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Heartbeats continue; touches are felt again afterwards."""
-    async with running(far_ends=[link], intent_source=Always()) as bench:
-        bench.touch(FINGER)
-        await asyncio.sleep(0.030)
+    """Along the ramp, without endings; heartbeats continue, and touches are felt again later."""
+    async with running(far_ends=[link], timing=shapes, intent_source=Always()) as bench:
+        await bench.hold(FINGER, seconds=0.2)
         assert link.levels()[0] > 0
         with monkeypatch.context() as patch:
             patch.setattr(Always, "intent", lambda self, contacts, now: 1 / 0)
             await bench.hold(FINGER, OTHER, seconds=0.3)
+        assert [each.skip_ending for each in sets(link)[-1].commands] == [True, True]
         assert link.levels() == (0.0, 0.0)
         assert bench.reports.silenced[-1].reason.startswith("ZeroDivisionError")
         assert link.amplifier.state is AmplifierState.OPERATION_ENABLED
-        bench.touch((3, 0.2, 0.2))
-        await asyncio.sleep(0.030)
+        await bench.hold((3, 0.2, 0.2), seconds=0.2)
         assert link.levels()[0] > 0

@@ -1,6 +1,7 @@
 """From touch frames to contacts."""
 
 import math
+from collections import Counter
 
 import pytest
 from hypothesis import given
@@ -14,9 +15,15 @@ from model.structure.plate import Material, Plate
 PLATE = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
 
 
-def frame(time: float, *touches: tuple[int, float, float], source: str = "a") -> TouchFrame:
+def frame(
+    time: float,
+    *touches: tuple[int, float, float],
+    source: str = "a",
+    timeout: float | None = None,
+    origin: str | None = None,
+) -> TouchFrame:
     """A frame of a source."""
-    return TouchFrame(source, time, tuple(Touch(*touch) for touch in touches))
+    return TouchFrame(source, time, tuple(Touch(*touch) for touch in touches), timeout, origin)
 
 
 def ids(tracker: ContactTracker) -> list[int]:
@@ -43,7 +50,7 @@ def test_tracker_maps_touches_to_the_plate(
 
 
 def test_tracker_reports_down_moved_up() -> None:
-    """Each once; a contact keeps the time since when it is down."""
+    """Each change is reported once; a contact keeps the time since when it is down."""
     tracker = ContactTracker(PLATE)
     change = tracker.update(frame(1.0, (7, 0.5, 0.5)))
     assert [contact.key for contact in change.down] == [ContactKey("a", 7)]
@@ -106,6 +113,84 @@ def test_tracker_accepts_ten_contacts() -> None:
     assert ids(tracker) == list(range(1, 11))
 
 
+def fingers(count: int) -> list[tuple[int, float, float]]:
+    """So many touches."""
+    return [(id, 0.5, 0.5) for id in range(count)]
+
+
+def shares(tracker: ContactTracker) -> dict[str, int]:
+    """Number of contacts by source."""
+    return dict(Counter(contact.key.source for contact in tracker.contacts))
+
+
+def test_origin_that_has_all_contacts_gives_way_to_another() -> None:
+    """Its newest contacts are lifted, one for each of the other's, until both have five.
+
+    No frame of either takes any back; what one lifts the other may have.
+    """
+    tracker = ContactTracker(PLATE)
+    greedy = frame(0.0, *fingers(12), source="tuio:a", origin="x")
+    tracker.update(greedy)
+    change = tracker.update(frame(0.0, *fingers(1), source="tuio:b"))
+    assert [contact.key for contact in change.up] == [("tuio:a", 9)]
+    for _ in range(3):
+        tracker.update(frame(0.0, *fingers(9), source="tuio:b"))
+        tracker.update(greedy)
+        assert shares(tracker) == {"tuio:a": 5, "tuio:b": 5}
+    tracker.update(frame(0.0, *fingers(2), source="tuio:b"))
+    tracker.update(greedy)
+    assert shares(tracker) == {"tuio:a": 8, "tuio:b": 2}
+
+
+def test_sources_of_one_origin_have_equal_shares() -> None:
+    """Two browsers behind one gateway: the one with ten fingers leaves five to the other."""
+    tracker = ContactTracker(PLATE)
+    tracker.update(frame(0.0, *fingers(10), source="api:1:a", origin="api:1"))
+    tracker.update(frame(0.0, *fingers(9), source="api:1:b", origin="api:1"))
+    assert shares(tracker) == {"api:1:a": 5, "api:1:b": 5}
+
+
+def test_origin_gains_nothing_by_many_sources() -> None:
+    """Ten names of one origin, or ten origins of one input, do not keep a panel out."""
+    for origin in ("one", None):
+        tracker = ContactTracker(PLATE)
+        for number in range(10):
+            tracker.update(frame(0.0, *fingers(1), source=f"tuio:{number}", origin=origin))
+        tracker.update(frame(0.0, *fingers(5), source="panel:evdev"))
+        assert shares(tracker)["panel:evdev"] == 5
+        tracker.update(frame(0.0, *fingers(9), source="tuio:other"))
+        expected = 2 if origin else 0  # all origins of the input have one contact each
+        assert shares(tracker).get("tuio:other", 0) == expected
+        assert shares(tracker)["panel:evdev"] == 5
+        assert len(tracker.contacts) == MAX_CONTACTS
+
+
+@pytest.mark.parametrize(
+    ("stated", "timeout"),
+    [(3.0, 3.0), (None, 0.15), (math.nan, 0.15), (math.inf, 0.15), (-1.0, 0.15), (61.0, 0.15)],
+)
+def test_tracker_waits_as_long_as_the_frame_states(stated: float | None, timeout: float) -> None:
+    """A timeout of up to a minute counts; the next frame of the source may state another."""
+    tracker = ContactTracker(PLATE)
+    tracker.update(frame(10.0, (1, 0.5, 0.5), timeout=stated))
+    assert tracker.next_expiry == pytest.approx(10.0 + timeout)
+    assert not tracker.expire(10.0 + timeout - 0.001)
+    assert tracker.expire(10.0 + timeout + 0.001)
+    tracker.update(frame(20.0, (1, 0.5, 0.5), timeout=stated))
+    tracker.update(frame(20.1, (1, 0.5, 0.5), timeout=1.0))
+    assert tracker.next_expiry == pytest.approx(21.1)
+
+
+def test_tracker_carries_pressure_along_without_a_move() -> None:
+    """A contact has its latest pressure; a change of nothing else is no movement."""
+    tracker = ContactTracker(PLATE)
+    for pressure in (0.25, 0.5):
+        change = tracker.update(TouchFrame("a", 0.0, (Touch(1, 0.5, 0.5, pressure, 0.1),)))
+        (contact,) = tracker.contacts
+        assert (contact.pressure, contact.touch_major) == (pressure, 0.1)
+    assert not change
+
+
 def test_tracker_lifts_contacts_after_the_timeout() -> None:
     """A source without news for 150 ms has all its contacts lifted, others keep theirs."""
     tracker = ContactTracker(PLATE)
@@ -145,6 +230,8 @@ FRAMES = st.builds(
     st.sampled_from("ab"),
     st.floats(allow_nan=True, allow_infinity=True) | st.floats(0, 1),
     st.lists(st.builds(Touch, st.integers(0, 14), NUMBERS, NUMBERS), max_size=14).map(tuple),
+    st.none() | st.floats(0, 1),
+    st.none() | st.sampled_from("xy"),
 )
 
 
@@ -174,5 +261,5 @@ def test_tracker_invariants_for_any_sequence(events: list[TouchFrame | float]) -
         assert all(math.isfinite(contact.since) for contact in contacts)
         assert (tracker.next_expiry is None) == (not contacts)
     tracker.expire(latest)
-    tracker.expire(latest + CONTACT_TIMEOUT)
+    tracker.expire(latest + 1.0)
     assert tracker.contacts == ()

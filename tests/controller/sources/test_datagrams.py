@@ -63,7 +63,7 @@ async def until_stamped(send: Send) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="timestamps of Linux")
 async def test_datagrams_have_their_time_of_arrival() -> None:
-    """However late they are read: as far apart as they were sent, and in the past."""
+    """However late they are read, arrivals are as far apart as they were sent, and in the past."""
     loop = asyncio.get_running_loop()
     async with receiving() as send:
         await until_stamped(send)
@@ -78,7 +78,7 @@ async def test_datagrams_have_their_time_of_arrival() -> None:
 
 
 async def test_oversized_datagram_is_cut_to_one_byte_more() -> None:
-    """So that its receiver can tell."""
+    """The receiver sees by its size that it was cut."""
     async with receiving() as send:
         (short, _), (long, _) = await send(bytes(100), bytes(150))
     assert (len(short), len(long)) == (100, 101)
@@ -108,7 +108,7 @@ async def test_receiver_may_close_within_its_callback() -> None:
 async def test_datagrams_have_the_time_of_reading_when_the_clock_was_set(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The clock jumped by an hour between arrival and reading."""
+    """A clock that jumps by an hour between arrival and reading does not make touches old."""
     loop = asyncio.get_running_loop()
     begin = loop.time()
     clock = time.time

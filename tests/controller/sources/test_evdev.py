@@ -16,8 +16,8 @@ from controller.sources.input_device import (
     GRAB,
     InputDevice,
     InputEvent,
-    get_axis,
-    get_slots,
+    eviocgabs,
+    eviocgmtslots,
     parse_events,
 )
 from controller.sources.registry import open_source
@@ -27,7 +27,10 @@ from model.errors import InputError
 from virtual_sockets import run_virtual_on_sockets
 
 EMPTY = SlotState(-1, 0, 0)
-KINDS = {"slot": (3, 0x2F), "id": (3, 0x39), "x": (3, 0x35), "y": (3, 0x36)}
+KINDS = {
+    **{"slot": (3, 0x2F), "id": (3, 0x39), "x": (3, 0x35), "y": (3, 0x36)},
+    **{"tool": (3, 0x37), "distance": (3, 0x3B), "pressure": (3, 0x3A), "major": (3, 0x30)},
+}
 
 
 def raw(words: str, *, dropped: bool = False) -> bytes:
@@ -42,7 +45,7 @@ class PipePanel:
     """A panel of 1000 by 500 with two slots, whose events come through a pipe."""
 
     def __init__(self) -> None:
-        self.x_range, self.y_range = (0, 1000), (0, 500)
+        self.ranges = {0x35: (0, 1000), 0x36: (0, 500), 0x3A: (0, 255)}
         self.current_slot = 0
         self.state = {0: EMPTY, 1: EMPTY}
         self.is_gone = False
@@ -187,6 +190,54 @@ def test_evdev_source_resyncs_after_lost_events() -> None:
     assert touches_of([panel], play)[-1] == {9: (1.0, 0.0)}
 
 
+def test_evdev_source_lifts_a_finger_that_becomes_a_palm() -> None:
+    """Palms, pens and what hovers over the panel are no touches, by events and by polling.
+
+    Tools 1 and 2 are a pen and a palm in the kernel's input-event-codes.h; a distance above zero is
+    a hovering contact, by its multi-touch-protocol.rst.
+    """
+    panel = PipePanel()
+    panel.state = {0: SlotState(5, 500, 250, tool=2), 1: SlotState(6, 500, 250, distance=3)}
+
+    async def play() -> None:
+        for words in (
+            *("slot 0 tool 0", "tool 2", "tool 1", "slot 1 distance 0", "distance 1"),
+            *("id -1 slot 0 id -1", "id 7 tool 2 x 250 y 100", "id 8", "id 9 tool 0"),
+        ):
+            os.write(panel.into, raw(words))
+            await asyncio.sleep(0.001)
+        panel.state = {0: SlotState(9, 250, 100, tool=2), 1: EMPTY}
+        await asyncio.sleep(0.05)
+
+    middle, corner = (0.5, 0.5), (0.25, 0.2)
+    assert touches_of([panel], play) == [
+        {},
+        *({5: middle}, {}, {}, {6: middle}, {}),
+        *({}, {}, {}, {9: corner}),
+        {},
+    ]
+
+
+def test_evdev_source_carries_pressure_along() -> None:
+    """Pressure is relative to its axis; a panel without an axis for the size reports none."""
+    panel = PipePanel()
+    seen: list[TouchFrame] = []
+
+    async def play() -> None:
+        running = asyncio.create_task(EvdevSource("evdev:p", open_panel=opened).run(seen.append))
+        await asyncio.sleep(0)
+        os.write(panel.into, raw("id 7 x 0 y 0 pressure 51 major 9"))
+        await asyncio.sleep(0.01)
+        running.cancel()
+
+    def opened(path: str, *, grab: bool) -> PipePanel:
+        return panel
+
+    run_virtual_on_sockets(play())
+    (touch,) = seen[-1].touches
+    assert (touch.pressure, touch.touch_major) == (0.2, None)
+
+
 @pytest.mark.parametrize("notices", ["by reading", "by polling"])
 def test_evdev_source_reopens_an_unplugged_panel(notices: str) -> None:
     """Its fingers are lifted when it is unplugged; it is followed once it is back."""
@@ -212,13 +263,13 @@ def test_evdev_source_reopens_an_unplugged_panel(notices: str) -> None:
 
 def test_ioctl_request_numbers() -> None:
     """The numbers that the kernel's header gives on x86-64 and Arm, as strace shows them."""
-    assert get_axis(0x35) == 0x80184575  # EVIOCGABS(ABS_MT_POSITION_X)
-    assert get_slots(44) == 0x802C450A  # EVIOCGMTSLOTS(44)
+    assert eviocgabs(0x35) == 0x80184575  # EVIOCGABS(ABS_MT_POSITION_X)
+    assert eviocgmtslots(44) == 0x802C450A  # EVIOCGMTSLOTS(44)
     assert GRAB == 0x40044590  # EVIOCGRAB
 
 
 def test_parse_events_skips_incomplete_events() -> None:
-    """Type, code and value of each complete event."""
+    """Each complete event has its type, code and value."""
     assert list(parse_events(raw("x -5") + b"\0" * 10)) == [
         InputEvent(3, 0x35, -5),
         InputEvent(0, 0, 0),
@@ -233,8 +284,11 @@ def kernel(monkeypatch: pytest.MonkeyPatch, *, width: int, grab: OSError | None 
             if grab is not None:
                 raise grab
             return b""
-        high = 9 if request == get_axis(0x2F) else width
-        return struct.pack("6i", 0, 0, high, 0, 0, 0)
+        if isinstance(argument, bytes) and request == eviocgmtslots(len(argument)):
+            (axis,) = struct.unpack_from("i", argument)
+            return struct.pack("11i", axis, *(axis + slot for slot in range(10)))
+        highs = {eviocgabs(0x2F): 9, eviocgabs(0x3A): 255, eviocgabs(0x30): 0}
+        return struct.pack("6i", 0, 0, highs.get(request, width), 0, 0, 0)
 
     monkeypatch.setattr("controller.sources.input_device.fcntl.ioctl", ioctl)
 
@@ -254,7 +308,7 @@ BUSY = OSError(errno.EBUSY, "Device or resource busy")
 def test_input_device_refuses_what_is_no_usable_panel(
     monkeypatch: pytest.MonkeyPatch, path: str, reported: dict[str, Any] | None, words: str
 ) -> None:
-    """Another file, none, one grabbed by another program, an axis without width; all are closed."""
+    """Another file, a grabbed panel and an axis without width are refused, and closed."""
     if reported is not None:
         kernel(monkeypatch, **reported)
     before = sorted(Path("/proc/self/fd").iterdir())
@@ -264,10 +318,17 @@ def test_input_device_refuses_what_is_no_usable_panel(
 
 
 def test_input_device_opens_a_panel(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the ranges of its axes."""
+    """It has the ranges of its axes, and the kernel's values of all slots."""
     kernel(monkeypatch, width=1000)
     device = InputDevice("/dev/null")
-    assert (device.x_range, device.y_range) == ((0, 1000), (0, 1000))
+    assert device.ranges == {0x35: (0, 1000), 0x36: (0, 1000), 0x3A: (0, 255)}
+    assert device.slots()[2] == SlotState(
+        *(0x39 + 2, 0x35 + 2, 0x36 + 2),
+        tool=0x37 + 2,
+        distance=0x3B + 2,
+        pressure=0x3A + 2,
+        touch_major=0x30 + 2,
+    )
     device.close()
 
 
@@ -275,6 +336,6 @@ def test_input_device_opens_a_panel(monkeypatch: pytest.MonkeyPatch) -> None:
     "url", ["evdev:", "evdev:?grab=yes", "evdev:/dev/x?grab=no", "evdev:/dev/x?grab=yes&a=b"]
 )
 def test_evdev_source_refuses_bad_urls(url: str) -> None:
-    """With the form of the URL."""
+    """The error shows the form of the URL."""
     with pytest.raises(InputError, match=r"evdev:PATH.grab=yes"):
         open_source(url)

@@ -44,6 +44,8 @@ CODES = {
     "x": "0003 0035",
     "y": "0003 0036",
     "touch": "0001 014a",
+    "tool": "0003 0037",
+    "distance": "0003 003b",
     "report": "0000 0000",
     "dropped": "0000 0003",
 }
@@ -114,6 +116,15 @@ SEQUENCES: dict[str, tuple[list[tuple[float, str]], Shown]] = {
         [(0, "id 1 x 100 y 0"), (1, "id -1 id 1")],
         [(0.0, {1: (0.1, 0.5)}), (1.0, {}), (1.0, {1: (0.1, 0.5)})],
     ),
+    "a palm, a finger that becomes one, a hovering finger that lands": (
+        [
+            (0, "id 1 tool 2 x 100 y 0"),
+            (1, "tool 0"),
+            (2, "tool 2 slot 1 id 2 distance 5 x 200 y 0"),
+            (3, "distance 0"),
+        ],
+        [(0.0, {}), (1.0, {1: (0.1, 0.5)}), (2.0, {}), (3.0, {2: (0.2, 0.5)})],
+    ),
     "another id without -1 before it": (
         [(0, "id 1 x 100 y 0"), (1, "id 2 x 200")],
         [(0.0, {1: (0.1, 0.5)}), (1.0, {2: (0.2, 0.5)})],
@@ -123,7 +134,7 @@ SEQUENCES: dict[str, tuple[list[tuple[float, str]], Shown]] = {
 
 @pytest.mark.parametrize("name", SEQUENCES)
 def test_read_evemu_follows_slots(tmp_path: Path, name: str) -> None:
-    """Frames by the multi-touch protocol, worked out by hand."""
+    """Frames are those worked out by hand from the multi-touch protocol."""
     reports, expected = SEQUENCES[name]
     assert shown(read_evemu(write(tmp_path, *reports))) == expected
 
@@ -264,6 +275,6 @@ async def test_evemu_source_keeps_times(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("path", "words"), [("", "evemu:PATH"), ("missing", "No such file")])
 def test_evemu_source_refuses_bad_urls(path: str, words: str) -> None:
-    """Before anything is replayed."""
+    """A URL without a readable file is refused before anything is replayed."""
     with pytest.raises(InputError, match=words):
         EvemuSource(f"evemu:{path}")

@@ -63,14 +63,14 @@ def test_replay_source_scales_times(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("options", ["speed=0", "speed=fast", "speed=nan", "loop=yes", "speed"])
 def test_replay_source_refuses_bad_options(tmp_path: Path, options: str) -> None:
-    """With the valid options."""
+    """The error names the valid options."""
     write(tmp_path / "taps.tuio", (0.0, ()))
     with pytest.raises(InputError, match=r"\?speed=N"):
         open_source(f"replay:{tmp_path}/taps.tuio?{options}")
 
 
 def test_replay_source_refuses_a_capture_without_touches(tmp_path: Path) -> None:
-    """With its file."""
+    """The error names the file."""
     write_capture(tmp_path / "noise.tuio", [Datagram(0.0, b"noise")])
     with pytest.raises(InputError, match=r"noise.tuio"):
         open_source(f"replay:{tmp_path}/noise.tuio")

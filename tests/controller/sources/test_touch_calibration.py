@@ -32,7 +32,7 @@ PLATE = Plate(length=0.4, width=0.2, thickness=1e-3, material=ALUMINIUM)
 def test_turned_maps_corners(
     degrees: int, mirror: str | None, top_left: tuple[int, int], top_right: tuple[int, int]
 ) -> None:
-    """Where the sensor's upper corners come to lie on the plate, by turning a sheet of paper."""
+    """The sensor's upper corners lie on the plate where those of a turned sheet of paper lie."""
     calibration = turned(degrees, mirror=mirror)
     for corner, place in (((0, 0), top_left), ((1, 0), top_right)):
         placed = calibration.place(Touch(1, *corner))
@@ -89,7 +89,7 @@ def test_fitted_refuses_a_large_residual() -> None:
 def test_fitted_refuses_insufficient_points(
     touched: list[tuple[float, float]], places: list[tuple[float, float]], words: str
 ) -> None:
-    """Each with its reason."""
+    """The error has the reason."""
     with pytest.raises(InputError, match=words):
         fitted(touched, places, PLATE)
 
@@ -103,16 +103,25 @@ def test_calibration_refuses_singular_matrices() -> None:
         turned(45)
 
 
-async def test_calibrated_source_maps_touches() -> None:
-    """Frames keep their source, time and ids; not finite stays so, for contacts to refuse."""
+async def test_calibrated_source_maps_touches_and_lifts_them_at_its_end() -> None:
+    """Frames keep their source, time and ids; not finite stays so, for contacts to refuse.
+
+    Of two sources that it has reported, the one with fingers down is lifted when it fails.
+    """
 
     class Once(TouchSource):
         async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
-            deliver(TouchFrame("panel", 1.5, (Touch(4, 0.25, 0.5), Touch(5, math.nan, 0))))
+            deliver(TouchFrame("other", 1.0, (Touch(4, 0.25, 0.5),)))
+            deliver(TouchFrame("other", 1.0, ()))
+            deliver(TouchFrame("panel", 1.5, (Touch(4, 0.25, 0.5), Touch(5, math.nan, 0)), 3.0))
+            raise InputError("unplugged")
 
     seen: list[TouchFrame] = []
-    await asyncio.wait_for(CalibratedSource(Once(), turned(180)).run(seen.append), 1)
-    (frame,) = seen
+    with pytest.raises(InputError, match="unplugged"):
+        await CalibratedSource(Once(), turned(180)).run(seen.append)
+    _, _, frame, lifted = seen
+    assert (lifted.source, lifted.touches) == ("panel", ())
+    assert 1.5 < lifted.time <= asyncio.get_running_loop().time()
     assert (frame.source, frame.time) == ("panel", 1.5)
     assert frame.touches[0] == Touch(4, 0.75, 0.5)
     assert frame.touches[1].id == 5

@@ -3,54 +3,22 @@
 import asyncio
 import logging
 import math
+import re
 import socket
 import struct
-from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
-from pythonosc.osc_message_builder import OscMessageBuilder
 
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import TuioReader, TuioSource, tuio_datagram
 from model.errors import InputError
+from tuio_messages import bundle, cursor, frame, message
 from virtual_sockets import in_virtual_time_on_sockets
 
 PEER = ("192.0.2.7", 50000)
-
-
-def message(*arguments: Any, address: str = "/tuio/2Dcur") -> Any:
-    """An OSC message with python-osc's own choice of types."""
-    builder = OscMessageBuilder(address)
-    for argument in arguments:
-        builder.add_arg(argument)
-    return builder.build()
-
-
-def bundle(*messages: Any) -> bytes:
-    """A bundle as a TUIO sender makes it."""
-    builder = OscBundleBuilder(IMMEDIATELY)
-    for part in messages:
-        builder.add_content(part)
-    return builder.build().dgram
-
-
-def cursor(id: int, x: float, y: float) -> Any:
-    """A set message of a cursor at rest."""
-    return message("set", id, x, y, 0.0, 0.0, 0.0)
-
-
-def frame(*touches: tuple[int, float, float], fseq: int = -1, source: str = "table@a") -> bytes:
-    """A complete bundle."""
-    return bundle(
-        message("source", source),
-        message("alive", *(id for id, _, _ in touches)),
-        *(cursor(*touch) for touch in touches),
-        message("fseq", fseq),
-    )
 
 
 @pytest.fixture
@@ -87,7 +55,8 @@ def test_reader_reads_a_golden_bundle(reader: TuioReader) -> None:
         + element(b"/tuio/2Dcur\0,si\0fseq\0\0\0\0\0\0\0\1")
     )
     result = reader.read(golden, PEER, now=5.0)
-    assert result == TouchFrame("tuio:192.0.2.7:50000", 5.0, (Touch(42, 0.5, 0.25),))
+    sender = "tuio:192.0.2.7:50000"
+    assert result == TouchFrame(sender, 5.0, (Touch(42, 0.5, 0.25),), 3.0, sender)
 
 
 def test_reader_keeps_unchanged_cursors(reader: TuioReader) -> None:
@@ -102,27 +71,18 @@ def test_reader_keeps_unchanged_cursors(reader: TuioReader) -> None:
     assert touches(reader.read(none, PEER, now=0.03)) == []
 
 
-def test_reader_omits_cursors_without_a_position(reader: TuioReader) -> None:
-    """A cursor whose set message was lost appears once its place is known, not at the origin."""
-    assert touches(reader.read(bundle(message("alive", 5)), PEER, now=0)) == []
-    late = bundle(message("alive", 5), cursor(5, 0.5, 0.5))
-    assert touches(reader.read(late, PEER, now=0)) == [(5, 0.5, 0.5)]
-
-
 def test_reader_drops_late_frames(reader: TuioReader) -> None:
-    """A reordered frame changes nothing, neither positions nor what is alive."""
+    """A reordered frame changes nothing, neither positions nor what is alive.
+
+    A redundant one (-1) is never late, and does not make the next one late.
+    """
     reader.read(frame((1, 0.25, 0.5), fseq=10), PEER, now=0)
     assert reader.read(frame((1, 0.75, 0.5), (2, 0.5, 0.5), fseq=9), PEER, now=0.01) is None
     again = bundle(message("source", "table@a"), message("alive", 1), message("fseq", 11))
     assert touches(reader.read(again, PEER, now=0.02)) == [(1, 0.25, 0.5)]
+    assert touches(reader.read(frame((1, 0.5, 0.5), fseq=-1), PEER, now=0.03)) == [(1, 0.5, 0.5)]
+    assert touches(reader.read(frame((1, 0.75, 0.5), fseq=12), PEER, now=0.04)) == [(1, 0.75, 0.5)]
     assert counts(reader) == {"late": 1}
-
-
-def test_reader_accepts_redundant_frames(reader: TuioReader) -> None:
-    """A frame numbered -1 is never late, and does not make the next one late."""
-    reader.read(frame((1, 0.25, 0.5), fseq=10), PEER, now=0)
-    assert touches(reader.read(frame((1, 0.5, 0.5), fseq=-1), PEER, now=0.01)) == [(1, 0.5, 0.5)]
-    assert touches(reader.read(frame((1, 0.75, 0.5), fseq=11), PEER, now=0.02)) == [(1, 0.75, 0.5)]
 
 
 @pytest.mark.parametrize(("before", "pause"), [(5000, 0.001), (50, 0.6)])
@@ -162,6 +122,17 @@ def test_number_of_senders_is_bounded(reader: TuioReader) -> None:
     assert reader.read(frame(source="s16"), PEER, now=0.2) is None
     assert counts(reader) == {"too_many_senders": 1}
     assert reader.read(frame(source="s16"), PEER, now=0.51) is not None
+
+
+def test_peer_with_all_names_gives_way_to_another(reader: TuioReader) -> None:
+    """Sixteen names that are never quiet keep no other peer out; both have eight in the end."""
+    other = ("127.0.0.1", 50001)
+    for _ in range(3):
+        for number in range(16):
+            reader.read(frame(source=f"s{number}"), PEER, now=0.1)
+        for number in range(8):
+            assert reader.read(frame(source=f"o{number}"), other, now=0.1) is not None
+    assert reader.read(frame(source="o8"), other, now=0.1) is None
 
 
 def test_reader_passes_positions_unchecked(reader: TuioReader) -> None:
@@ -205,6 +176,9 @@ MALFORMED = {
     "too few arguments": bytes(message("set", 1, 0.5, 0.5).dgram),
     "floats cut off": bytes(message("set", 1, 0.5, 0.5, 0.0, 0.0, 0.0).dgram)[:-20],
     "unknown command": bytes(message("wave", 1).dgram),
+    "one bad message among good ones": bundle(
+        message("source", "table@a"), message("alive", 1, 2), cursor(1, 0.5, 0.5), message("set", 2)
+    ),
     "a name of 4000 letters": bytes(message("source", "x" * 4000).dgram),
 }
 
@@ -213,21 +187,13 @@ MALFORMED = {
 def test_reader_counts_malformed_datagrams(
     reader: TuioReader, datagram: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Each is counted and logged, none raises or makes a touch, and python-osc stays silent."""
+    """Each is counted and logged, none raises or changes a touch, and python-osc stays silent."""
     reader.read(frame((1, 0.25, 0.5), fseq=1), PEER, now=0)
     assert reader.read(datagram, PEER, now=0) is None
     assert counts(reader) == {"malformed": 1}
     assert [record.name for record in caplog.records] == ["test"]
-
-
-def test_reader_ignores_a_bundle_with_a_malformed_message(reader: TuioReader) -> None:
-    """A bundle with one malformed message changes nothing at all."""
-    reader.read(frame((1, 0.25, 0.5), fseq=1), PEER, now=0)
-    source = message("source", "table@a")
-    bad = bundle(source, message("alive", 1, 2), cursor(1, 0.5, 0.5), message("set", 2, "x"))
-    assert reader.read(bad, PEER, now=0) is None
-    fine = bundle(source, message("alive", 1), message("fseq", 2))
-    assert touches(reader.read(fine, PEER, now=0)) == [(1, 0.25, 0.5)]
+    still = bundle(message("source", "table@a"), message("alive", 1, 2), message("fseq", 2))
+    assert touches(reader.read(still, PEER, now=0)) == [(1, 0.25, 0.5)]
 
 
 def test_reader_refuses_oversized_bundles(reader: TuioReader) -> None:
@@ -240,7 +206,7 @@ def test_reader_refuses_oversized_bundles(reader: TuioReader) -> None:
 
 @given(st.binary(max_size=200), st.integers(0, 300))
 def test_reader_never_raises(noise: bytes, cut: int) -> None:
-    """For any bytes, alone or within a valid bundle."""
+    """Any bytes are read or counted, alone or within a valid bundle."""
     reader = TuioReader(RejectCounter(logging.getLogger("test")))
     good = frame((1, 0.25, 0.5), fseq=1)
     for datagram in (noise, good[:cut], good[:cut] + noise, good[:cut] + noise + good[cut:]):
@@ -259,7 +225,8 @@ def test_tuio_datagram_round_trip(places: dict[int, tuple[float, float]]) -> Non
     wanted = tuple(Touch(id, x, y) for id, (x, y) in places.items())
     datagram = tuio_datagram(TouchFrame("table@a", 0.0, wanted), 7)
     result = TuioReader(RejectCounter(logging.getLogger("test"))).read(datagram, PEER, now=2.0)
-    assert result == TouchFrame("tuio:192.0.2.7/table@a", 2.0, wanted)
+    assert result is not None
+    assert (result.source, result.time, result.touches) == ("tuio:192.0.2.7/table@a", 2.0, wanted)
 
 
 @in_virtual_time_on_sockets
@@ -298,17 +265,26 @@ async def test_tuio_source_reports_a_taken_port() -> None:
         ("tuio:", "127.0.0.1", 3333),
         ("tuio:4000", "127.0.0.1", 4000),
         ("tuio:192.0.2.1:4000", "192.0.2.1", 4000),
-        ("tuio:[::1]:4000", "::1", 4000),
+        ("tuio:[::1]:4000?timeout=0.5", "::1", 4000),
     ],
 )
 def test_tuio_source_defaults_of_urls(url: str, host: str, port: int) -> None:
-    """The loopback and the registered port."""
+    """A URL without host or port means the loopback and the registered port."""
     source = TuioSource(url)
     assert (source.host, source.port) == (host, port)
 
 
-@pytest.mark.parametrize("url", ["tuio:host", "tuio:host:65536", "tuio:host:-1", "udp:1:2"])
-def test_tuio_source_refuses_bad_urls(url: str) -> None:
-    """A URL that names no port is refused with an example."""
-    with pytest.raises(InputError, match=r"tuio:127\.0\.0\.1:3333"):
+@pytest.mark.parametrize(
+    ("url", "remedy"),
+    [
+        *((url, "tuio:127.0.0.1:3333") for url in ("tuio:host", "tuio:host:65536", "udp:1:2")),
+        *(
+            (f"tuio:{options}", "timeout=SECONDS from 0.15 to 60")
+            for options in ("?timeout=0.1", "?timeout=61", "?timeout=nan", "?timeout=3&a=b", "?a")
+        ),
+    ],
+)
+def test_tuio_source_refuses_bad_urls(url: str, remedy: str) -> None:
+    """A missing port, a timeout out of range and other options are refused with an example."""
+    with pytest.raises(InputError, match=re.escape(remedy)):
         TuioSource(url)

@@ -6,34 +6,20 @@ import socket
 
 from hypothesis import given
 from hypothesis import strategies as st
-from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
-from pythonosc.osc_message_builder import OscMessageBuilder
 
 from controller.sources.datagrams import BACKLOG_THRESHOLD, Datagram, Peer, listen
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import TuioReader, tuio_datagram, without_superseded
+from tuio_messages import bundle, cursor, message
 
 HERE, THERE = ("127.0.0.1", 5001), ("127.0.0.1", 5002)
 
 
 def partial(source: str, alive: list[int], places: dict[int, float]) -> bytes:
     """A bundle with the positions of only some cursors, as TUIO 1.1 allows."""
-    bundle = OscBundleBuilder(IMMEDIATELY)
-    messages: list[list[tuple[str, object]]] = [
-        [("s", "source"), ("s", source)],
-        [("s", "alive"), *(("i", id) for id in alive)],
-        *(
-            [("s", "set"), ("i", id), *(("f", each) for each in (x, x, 0.0, 0.0, 0.0))]
-            for id, x in places.items()
-        ),
-    ]
-    for message in messages:
-        builder = OscMessageBuilder("/tuio/2Dcur")
-        for kind, value in message:
-            builder.add_arg(value, kind)
-        bundle.add_content(builder.build())
-    return bytes(bundle.build().dgram)
+    cursors = (cursor(id, x, x) for id, x in places.items())
+    return bundle(message("source", source), message("alive", *alive), *cursors)
 
 
 def full(source: str, *ids: int) -> bytes:
@@ -75,7 +61,7 @@ bundles = st.builds(
 
 @given(st.lists(st.tuples(bundles, st.sampled_from([HERE, THERE])), max_size=12))
 def test_without_superseded_preserves_the_final_touches(sent: list[tuple[bytes, Peer]]) -> None:
-    """For any bundles, of senders with one port each."""
+    """Any bundles of senders with one port each leave the same touches with and without it."""
     sent = [(data, peer) for data, peer in sent if (peer == HERE) == (b"a\0\0\0" in data)]
     frames: list[dict[str, tuple[Touch, ...]]] = []
     for each in (waiting(*sent), without_superseded(waiting(*sent))):
@@ -99,7 +85,7 @@ async def test_listen_drops_superseded_bundles_of_a_flood() -> None:
         if data == up:
             done.set()
 
-    line = await listen("127.0.0.1", 0, take, max_size=8192, thin=without_superseded)
+    line = await listen("127.0.0.1", 0, take, max_size=8192, drop_superseded=without_superseded)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for number in range(200):
             sender.sendto(full("a", number), ("127.0.0.1", line.port))

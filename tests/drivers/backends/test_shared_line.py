@@ -1,7 +1,9 @@
 """Lines of several amplifiers: opened by the first, lost for all, closed by the last."""
 
 import asyncio
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import pytest
 
@@ -17,8 +19,11 @@ from drivers.backends.modbus.backend import ModbusBackend
 from drivers.backends.serial_line.backend import SerialBackend
 from drivers.backends.shared_line import SharedLine, shared_line
 from drivers.backends.wire_backend import WireBackend
+from drivers.codec.can_bus.frame import CanFrame
 from drivers.errors import LinkError
-from drivers.protocol.messages import Arm, Ping
+from drivers.line.priority import priority_of
+from drivers.line.sender import sender_of
+from drivers.protocol.messages import Arm, Ping, Stop
 
 
 class Line(SharedLine[Port]):
@@ -37,6 +42,8 @@ class Line(SharedLine[Port]):
             raise LinkError("there is no such line")
         await self._note("opened")
         return self
+
+    is_blocked = False
 
     def write(self, data: bytes) -> None:
         """Discard it."""
@@ -203,19 +210,20 @@ class _Machine(HardwareProvider):
 
     def __init__(self) -> None:
         self.sent: list[object] = []
+        self.is_lost = False
         self.lose: Callable[[str], None] = lambda what: None
 
     async def open_port(
         self, name: str, *, on_data: object, on_loss: Callable[[str], None]
     ) -> Port:
         self.lose = on_loss
-        return _Open(self.sent)
+        return _Open(self)
 
     async def open_adapter(
         self, url: object, *, on_frame: object, on_loss: Callable[[str], None]
     ) -> Adapter:
         self.lose = on_loss
-        return _Open(self.sent)
+        return _Open(self)
 
     def make_worker(self) -> Worker:
         return Worker("era-test")
@@ -225,13 +233,21 @@ class _Machine(HardwareProvider):
 
 
 class _Open:
-    def __init__(self, sent: list[object]) -> None:
-        self._sent = sent
+    def __init__(self, machine: _Machine) -> None:
+        self._machine = machine
+
+    is_blocked = False
 
     def write(self, data: bytes) -> None:
-        self._sent.append(data)
+        if self._machine.is_lost:
+            self._machine.lose("pulled out")
+            raise LinkError("pulled out")
+        self._machine.sent.append(data)
 
-    send = write  # type: ignore[assignment]
+    def send(self, frames: Sequence[CanFrame]) -> int:
+        for frame in frames:
+            self.write(frame.data)
+        return len(frames)
 
     def close(self) -> None:
         """Do nothing."""
@@ -245,6 +261,7 @@ WAITING = {
     ModbusBackend: ("modbus+rtu:///dev/none#{}", [Ping(), Arm(watchdog=0.25)]),
     CanBackend: ("can+slcan:///dev/none#{}", [Arm(watchdog=0.25)]),  # listens first
 }
+STOP = Stop(0.005)
 
 
 @pytest.mark.parametrize("kind", WAITING)
@@ -258,7 +275,13 @@ async def test_request_queued_before_a_loss_is_not_sent_after_reopening(
     east, west = (kind(url.format(number)) for number in (1, 2))
     await east.open()
     await west.open()
-    asked = [asyncio.create_task(west.exchange(each, timeout=0.2)) for each in requests]
+    sender = sender_of(west)
+    asked = [
+        asyncio.create_task(
+            sender.send(west, priority_of(each), partial(west.exchange, each, timeout=0.2))
+        )
+        for each in requests
+    ]
     await asyncio.sleep(0.01)
     before = len(machine.sent)
     machine.lose("pulled out")
@@ -268,8 +291,36 @@ async def test_request_queued_before_a_loss_is_not_sent_after_reopening(
         with pytest.raises(LinkError, match=r"pulled out|reopened"):
             await each
     assert len(machine.sent) == before
+    stopping = asyncio.create_task(west.exchange(STOP, timeout=0.2))  # a stop is
+    await asyncio.sleep(0.01)
+    assert len(machine.sent) > before
+    stopping.cancel()
     await west.close()
     await east.close()
+
+
+@pytest.mark.parametrize("kind", WAITING)
+async def test_loss_found_while_writing_leaves_no_unretrieved_exception(
+    kind: type[WireBackend],
+) -> None:
+    """The port reports the loss and raises, as one that was unplugged does."""
+    url, _ = WAITING[kind]
+    machine = _Machine()
+    HARDWARE_PROVIDER.set(machine)
+    unretrieved: list[object] = []
+    asyncio.get_running_loop().set_exception_handler(
+        lambda loop, context: unretrieved.append(context)
+    )
+    backend = kind(url.format(1))
+    losses: list[str] = []
+    backend.listen(lambda event: None, losses.append)
+    await backend.open()
+    machine.is_lost = True
+    with pytest.raises(LinkError, match="pulled out"):
+        await backend.exchange(STOP, timeout=0.2)
+    await backend.close()
+    gc.collect()
+    assert unretrieved == []
 
 
 @pytest.mark.parametrize("kind", WAITING)

@@ -1,13 +1,13 @@
 """Conformance checks against amplifiers with one mistake each."""
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
+from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.backend import Backend
 from drivers.command import CommandSet
@@ -31,6 +31,7 @@ from drivers.protocol.messages import (
 )
 from sim.amplifier.amplifier import SimulatedAmplifier
 from vendor_pages import plain
+from virtual_loop import in_virtual_time
 
 Answer = Callable[[SimulatedAmplifier, Request, float], Reply]
 Deed = Callable[[SimulatedAmplifier, float], None]
@@ -50,11 +51,11 @@ class Flawed(Backend):
         """Nothing to close."""
 
     @property
-    def last_sent(self) -> float:
+    def last_sent_at(self) -> float:
         return 0.0
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
-        return self._answer(self._amplifier, request, time.monotonic())
+        return self._answer(self._amplifier, request, clock.now())
 
 
 def altered_reply(kind: type[Any], **changes: object) -> Answer:
@@ -185,11 +186,9 @@ MISTAKES: list[tuple[str, Answer]] = [
 
 
 @pytest.mark.parametrize(("name", "answer"), MISTAKES)
-async def test_check_fails_for_its_mistake_only(
-    name: str, answer: Answer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@in_virtual_time
+async def test_check_fails_for_its_mistake_only(name: str, answer: Answer) -> None:
     """An amplifier without the mistake passes."""
-    monkeypatch.setattr("drivers.conformance.bench.EVENT_TIMEOUT", 1.0)
     (check,) = [check for check in CHECKS if check.name == name]
     outcomes = []
     for behaviour in (answer, SimulatedAmplifier.handle):

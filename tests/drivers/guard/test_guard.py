@@ -118,7 +118,8 @@ def test_check_or_silence_turns_any_exception_into_silence() -> None:
 def test_silence_takes_a_new_token() -> None:
     """A token that was played already would make the amplifier ignore the silence."""
     for last, following in ((41, 42), (65535, 1)):
-        GUARD.check(replace(GOOD, token=last))
+        safe = GUARD.check(replace(GOOD, token=last))
+        safe.record.send(safe)
         assert GUARD.silence(0, [0], ramp=0.01).token == following
 
 

@@ -1,14 +1,12 @@
 """Commits over wires of different speed, in virtual time."""
 
 import asyncio
-from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
-from typing import Any
 
 import pytest
 
 from drivers.operation.simultaneous import at_one_moment
-from virtual_loop import VirtualLoop
+from virtual_loop import VirtualLoop, in_virtual_time
 
 
 @dataclass
@@ -24,53 +22,34 @@ class Wire:
         return self.takes
 
 
-def in_virtual_time(work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    """Run it in virtual time."""
-    loop = VirtualLoop()
-    try:
-        loop.run_until_complete(work())
-    finally:
-        loop.close()
-
-
-def test_commits_arrive_together() -> None:
+@in_virtual_time
+async def test_commits_arrive_together() -> None:
     """6.5, 2 and 0 ms on the wire: sent at once, after 4.5 and after 6.5 ms."""
-
-    async def work() -> None:
-        wires = [Wire(0.002), Wire(0.0), Wire(0.0065)]
-        begin = asyncio.get_running_loop().time()
-        answers = await asyncio.gather(*at_one_moment([(w.takes, w.commit) for w in wires]))
-        assert answers == [0.0065, 0.002, 0.0]
-        assert [wire.sent[0] - begin for wire in wires] == pytest.approx([0.0045, 0.0065, 0.0])
-
-    in_virtual_time(work)
+    wires = [Wire(0.002), Wire(0.0), Wire(0.0065)]
+    begin = asyncio.get_running_loop().time()
+    answers = await asyncio.gather(*at_one_moment([(w.takes, w.commit) for w in wires]))
+    assert answers == [0.0065, 0.002, 0.0]
+    assert [wire.sent[0] - begin for wire in wires] == pytest.approx([0.0045, 0.0065, 0.0])
 
 
-def test_equal_wires_commit_at_once() -> None:
+@in_virtual_time
+async def test_equal_wires_commit_at_once() -> None:
     """Within one iteration of the event loop."""
-
-    async def work() -> None:
-        wires = [Wire(0.003) for _ in range(4)]
-        tasks = [
-            asyncio.ensure_future(each)
-            for each in at_one_moment([(w.takes, w.commit) for w in wires])
-        ]
-        await asyncio.sleep(0)
-        assert all(len(wire.sent) == 1 for wire in wires)
-        await asyncio.gather(*tasks)
-
-    in_virtual_time(work)
+    wires = [Wire(0.003) for _ in range(4)]
+    tasks = [
+        asyncio.ensure_future(each) for each in at_one_moment([(w.takes, w.commit) for w in wires])
+    ]
+    await asyncio.sleep(0)
+    assert all(len(wire.sent) == 1 for wire in wires)
+    await asyncio.gather(*tasks)
 
 
-def test_remainder_below_clock_resolution_ends() -> None:
+@in_virtual_time
+async def test_remainder_below_clock_resolution_ends() -> None:
     """2 ms and 0.4 ps to wait, on a clock whose steps are 0.9 ps: it goes out after 2 ms."""
-
-    async def work() -> None:
-        loop = asyncio.get_running_loop()
-        assert isinstance(loop, VirtualLoop)
-        loop.now = begin = 4552.311810074659
-        wires = [Wire(0.0), Wire(0.0020000000004)]
-        await asyncio.gather(*at_one_moment([(w.takes, w.commit) for w in wires]))
-        assert [wire.sent[0] - begin for wire in wires] == pytest.approx([0.002, 0.0])
-
-    in_virtual_time(work)
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualLoop)
+    loop.now = begin = 4552.311810074659
+    wires = [Wire(0.0), Wire(0.0020000000004)]
+    await asyncio.gather(*at_one_moment([(w.takes, w.commit) for w in wires]))
+    assert [wire.sent[0] - begin for wire in wires] == pytest.approx([0.002, 0.0])

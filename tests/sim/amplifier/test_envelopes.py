@@ -22,7 +22,7 @@ from drivers.protocol.messages import (
     Stage,
     Stop,
 )
-from model.transients.envelope import Envelope as BaseEnvelope
+from model.transients.envelope import BaseEnvelope
 from sim.amplifier.amplifier import SimulatedAmplifier
 
 STROKE = 1e-4

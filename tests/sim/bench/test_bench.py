@@ -13,7 +13,6 @@ from model.fem.harmonic import direct_acceleration
 from model.finger.fingertip import fingertip_points
 from model.rig.rig import Rig
 from model.structure.point_load import PointLoad
-from model.structure.point_mass import PointMass
 from plate_in_time import apart
 from sim.bench.bench import Bench
 
@@ -26,7 +25,7 @@ def test_bench_felt_vibration_agrees_with_the_model(coarse_rig: Rig, is_heavy: b
 
     Against the sparse direct solve, within 1 %; the masses make a difference of 30 %.
     """
-    masses = (PointMass(0.1, 0.15, 0.05), PointMass(0.3048, 0.1, 0.03))
+    masses = (PointLoad(0.1, 0.15, mass=0.05), PointLoad(0.3048, 0.1, mass=0.03))
     rig = replace(coarse_rig, masses=masses if is_heavy else ())
     fingers = {"a": (0.08, 0.06), "b": (0.25, 0.2)}
     bench = Bench(rig, now=START)

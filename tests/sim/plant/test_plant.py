@@ -28,11 +28,13 @@ def eras(damping: float = 3.46, bolt_mass: float = 0.02) -> list[Era]:
     ]
 
 
+MESH = Mesh(16, 12, PLATE.length, PLATE.width)
+
+
 @pytest.fixture(scope="module")
 def reduced() -> ReducedPlate:
     """The paper's plate on a coarse mesh."""
-    mesh = Mesh(16, 12, PLATE.length, PLATE.width)
-    return reduce_plate(PLATE, mesh, np.array(CORNERS))
+    return reduce_plate(PLATE, MESH, np.array(CORNERS))
 
 
 def hysteretic_response(
@@ -56,9 +58,9 @@ def steady_difference(reduced: ReducedPlate, driven: int, frequency: float) -> f
     w = 2 * np.pi * frequency
     plant.set_input(driven, [Term(0.0, np.inf, w, STROKE)])
     plant.skip(30.0)
-    times, felt = plant.advance(30.2, sample_rate=10_000.0, shapes=reduced.shapes)
+    times, felt = plant.advance(30.2, sample_rate=10_000.0, shapes=reduced.at(MESH.nodes))
     q = hysteretic_response(reduced, eras(), driven, frequency) * STROKE
-    expected = -(w**2) * (reduced.shapes @ q)
+    expected = -(w**2) * (reduced.at(MESH.nodes) @ q)
     return apart(lock_in(times, felt, frequency), expected)
 
 
@@ -83,12 +85,15 @@ def test_plant_steady_state_is_exact_without_structural_damping() -> None:
     dynamic = np.diag(lossless.omega**2 - w**2 + 0j)
     dynamic += (phi.T * (17000.0 + 50j * w - 0.02 * w**2)) @ phi
     expected = (
-        -(w**2) * STROKE * lossless.shapes @ np.linalg.solve(dynamic, phi[2] * (17000.0 + 50j * w))
+        -(w**2)
+        * STROKE
+        * lossless.at(MESH.nodes)
+        @ np.linalg.solve(dynamic, phi[2] * (17000.0 + 50j * w))
     )
     plant = Plant(lossless, eras(damping=50.0))
     plant.set_input(2, [Term(0.0, np.inf, w, STROKE)])
     plant.skip(100.0)
-    times, felt = plant.advance(100.1, sample_rate=10_000.0, shapes=lossless.shapes)
+    times, felt = plant.advance(100.1, sample_rate=10_000.0, shapes=lossless.at(MESH.nodes))
     np.testing.assert_allclose(lock_in(times, felt, 230.0), expected, rtol=1e-6, atol=1e-6)
 
 
@@ -118,14 +123,14 @@ def test_plant_transient_agrees_with_runge_kutta() -> None:
     after_rise = Term(rise, np.inf, w1, STROKE * np.exp(1j * w1 * rise))
     plant.set_input(0, [Term(0.0, rise, w1, 0j, STROKE / rise), after_rise])
     plant.set_input(2, [Term(later, np.inf, w2, STROKE)])
-    times, felt = plant.advance(0.05, sample_rate=2000.0, shapes=small.shapes)
+    times, felt = plant.advance(0.05, sample_rate=2000.0, shapes=small.at(MESH.nodes))
     stepped = stepped_acceleration(
         plate_in_time(small, eras()),
         [rising, still, late, still],
         times[:-1],
         breaks=np.array([0.0, later, rise, 0.05]),
     )
-    expected = stepped @ small.shapes.T
+    expected = stepped @ small.at(MESH.nodes).T
     np.testing.assert_allclose(felt[:-1], expected, atol=2e-6 * np.abs(expected).max())
 
 
@@ -163,7 +168,7 @@ def test_plant_superposes_terms(reduced: ReducedPlate) -> None:
     ):
         plant = Plant(reduced, eras())
         plant.set_input(1, terms)
-        felt.append(plant.advance(0.08, sample_rate=10_000.0, shapes=reduced.shapes[:9])[1])
+        felt.append(plant.advance(0.08, sample_rate=10_000.0, shapes=reduced.at(MESH.nodes[:9]))[1])
     np.testing.assert_allclose(felt[0], felt[1], atol=1e-9 * np.abs(felt[1]).max())
 
 

@@ -9,13 +9,13 @@ from scipy.signal import butter, sosfiltfilt
 
 from driven_bases import BASES, STILL, STROKE, Base
 from model.arrays import ComplexArray, FloatArray
-from model.fem.assembly import assemble, era_positions
+from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
 from model.finger.load import FingerLoad
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.actuator import Era
-from model.structure.point_load import PointLoad
+from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import Term
 from paper_plate import make_paper_rig
 from plate_in_time import apart, lock_in
@@ -51,7 +51,7 @@ def whole(rig: Rig) -> WholePlate:
 @pytest.fixture(scope="module")
 def reduced(rig: Rig) -> ReducedPlate:
     """A few dozen coordinates of it, as the bench takes them."""
-    return reduce_plate(rig.plate, rig.mesh, era_positions(rig.eras))
+    return reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras))
 
 
 def set_bases(plant: Plant, bases: Sequence[Base]) -> None:
@@ -142,7 +142,7 @@ def test_plant_steady_state_under_fingers_agrees_with_the_direct_solve(rig: Rig)
     """
     fine = make_paper_rig(24, 18)
     lossless = replace(fine.plate, loss_factor=0.0)
-    reduced = reduce_plate(lossless, fine.mesh, era_positions(rig.eras))
+    reduced = reduce_plate(lossless, fine.mesh, footprints_of(rig.eras))
     contacts = [FIRST, SECOND]
     plant = Plant(reduced, rig.eras)
     plant.skip(1.0)
@@ -170,7 +170,7 @@ def test_plant_viscous_equivalent_agrees_with_the_loss_factor() -> None:
     """
     fine = make_paper_rig(24, 18)
     eras: Sequence[Era] = fine.eras
-    reduced = reduce_plate(fine.plate, fine.mesh, era_positions(eras))
+    reduced = reduce_plate(fine.plate, fine.mesh, footprints_of(eras))
     frequencies = np.arange(40.0, 501.0, 20.0)
     direct = direct_acceleration(
         assemble(fine.plate, fine.mesh), eras, frequencies, fine.mesh.nodes

@@ -9,13 +9,12 @@ from numpy.testing import assert_allclose
 from driven_bases import Base, faded_base, shaped_base
 from finger_energy import held_by_fingers
 from model.arrays import FloatArray
-from model.fem.assembly import era_positions
 from model.fem.mesh import Mesh
 from model.finger.load import FingerLoad, finger_loads
 from model.reduction.modal_matrices import modal_matrices
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
-from model.structure.point_load import PointLoad
+from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import Term
 from sim.plant.plant import Plant
 
@@ -31,7 +30,7 @@ FINGERS = finger_loads([(0.11, 0.07), (0.25, 0.15), (0.3048, 0.1)])
 @pytest.fixture(scope="module")
 def reduced(coarse_rig: Rig) -> ReducedPlate:
     """The paper's plate on its own mesh."""
-    return reduce_plate(coarse_rig.plate, coarse_rig.mesh, era_positions(coarse_rig.eras))
+    return reduce_plate(coarse_rig.plate, coarse_rig.mesh, footprints_of(coarse_rig.eras))
 
 
 def vibrating(reduced: ReducedPlate, rig: Rig, *, until: float = 0.05) -> Plant:
@@ -45,7 +44,8 @@ def vibrating(reduced: ReducedPlate, rig: Rig, *, until: float = 0.05) -> Plant:
 
 def on_the_mesh(plant: Plant) -> tuple[FloatArray, FloatArray]:
     """Displacement and velocity at all nodes."""
-    shapes = plant.reduced.shapes
+    plate = plant.reduced.plate
+    shapes = plant.reduced.at(Mesh(12, 9, plate.length, plate.width).nodes)
     return shapes @ plant.state[0], shapes @ plant.state[1]
 
 
@@ -194,9 +194,12 @@ def test_contacts_on_a_plate_without_nodes(coarse_rig: Rig) -> None:
     """Without its origin a plate keeps its coordinates; a rigid one sways on all its springs."""
     # Three rigid motions of a plate of 1 kg: up and down, and two tilts.
     mesh = Mesh(2, 2, coarse_rig.plate.length, coarse_rig.plate.width)
-    x, y = (mesh.nodes - mesh.nodes.mean(axis=0)).T
-    shapes = np.column_stack([np.ones(len(x)), 10 * x, 10 * y])
-    rigid = ReducedPlate(coarse_rig.plate, mesh, np.zeros(3), shapes)
+
+    def shapes(points: FloatArray) -> FloatArray:
+        x, y = (points[:, :2] - mesh.nodes.mean(axis=0)).T
+        return np.column_stack([np.ones(len(x)), 10 * x, 10 * y])
+
+    rigid = ReducedPlate(coarse_rig.plate, np.zeros(3), shapes)
     plant = Plant(rigid, coarse_rig.eras)
     plant.set_contacts([PointLoad(float(mesh.nodes[4, 0]), float(mesh.nodes[4, 1]), 1e4)])
     assert len(plant.reduced.omega) == 3

@@ -9,12 +9,11 @@ from scipy.integrate import simpson
 
 from driven_bases import BASES
 from finger_energy import held_by_fingers
-from model.fem.assembly import era_positions
 from model.finger.load import finger_loads
 from model.reduction.modal_matrices import modal_matrices
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
-from model.structure.point_load import PointLoad, load_positions
+from model.structure.point_load import PointLoad, footprints_of
 from paper_plate import make_paper_rig
 from sim.plant.plant import Plant
 
@@ -52,9 +51,9 @@ def rig() -> Rig:
 def kept_for(plant: Plant, rig: Rig, until: float) -> Books:
     """Go on until a moment [s] and keep books, from displacements, velocities and spring laws."""
     _, structural, _ = modal_matrices(plant.reduced, rig.eras)
-    at_eras = plant.reduced.at(era_positions(rig.eras))
+    at_eras = plant.reduced.at(footprints_of(rig.eras))
     structural = structural - (at_eras.T * [era.damping for era in rig.eras]) @ at_eras
-    at_fingers = plant.reduced.at(load_positions(plant.contacts))
+    at_fingers = plant.reduced.at(footprints_of(plant.contacts))
     k = np.array([era.stiffness for era in rig.eras])
     c = np.array([era.damping for era in rig.eras])
     bolts = np.array([era.bolt_mass for era in rig.eras])
@@ -90,7 +89,7 @@ def test_plant_energy_balance(rig: Rig) -> None:
     When a finger comes or goes, what is stored changes by what its spring and its mass hold, and by
     nothing else.
     """
-    reduced = reduce_plate(rig.plate, rig.mesh, era_positions(rig.eras))
+    reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras))
     plant = Plant(reduced, rig.eras)
     for number, base in enumerate(BASES):
         plant.set_input(number, base.terms)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
-from model.fem.assembly import assemble, era_positions
+from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
 from model.finger.contrast import mean_level_db_sl
 from model.finger.fingertip import fingertip_points
@@ -14,9 +14,9 @@ from model.finger.load import FingerLoad
 from model.finger.perception import detection_threshold
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
-from model.structure.point_load import PointLoad
+from model.structure.point_load import PointLoad, footprints_of
 from model.table.question import Question
-from model.transients.envelope import Envelope, shaped
+from model.transients.envelope import BaseEnvelope, shaped
 from model.transients.measures import Transients
 from model.transients.time_response import plate_in_time
 from model.vibration.excitation import Tone
@@ -32,7 +32,7 @@ EXCITATION = {"SW": Tone(110.0, 1e-5), "NE": Tone(250.0, 5e-6, math.pi / 2)}
 @pytest.fixture(scope="module")
 def reduced(coarse_rig: Rig) -> ReducedPlate:
     """The paper's plate, for forces at its ERAs."""
-    return reduce_plate(coarse_rig.plate, coarse_rig.mesh, era_positions(coarse_rig.eras))
+    return reduce_plate(coarse_rig.plate, coarse_rig.mesh, footprints_of(coarse_rig.eras))
 
 
 def steady(rig: Rig, place: tuple[float, float], *loads: PointLoad) -> np.ndarray:
@@ -85,7 +85,10 @@ def test_playback_measures_of_several_targets() -> None:
 def test_playback_with_an_onset_envelope(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """What fingertips go through is what another solution in time says, the model's own."""
     excitation = {"SW": Tone(110.0, 1e-5)}
-    onset = {"SW": Envelope(110.0, 2e-6, (4e-6j, -1e-5, 1e-5)), "NE": Envelope(110.0, 0, (5e-6, 0))}
+    onset = {
+        "SW": BaseEnvelope(110.0, 2e-6, (4e-6j, -1e-5, 1e-5)),
+        "NE": BaseEnvelope(110.0, 0, (5e-6, 0)),
+    }
     played = play(coarse_rig, reduced, excitation, FINGERS, duration=0.2, onset=onset)
     assert played.settled == pytest.approx(0.015)
     transients = Transients(plate_in_time(reduced, coarse_rig.eras))

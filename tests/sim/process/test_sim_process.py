@@ -11,8 +11,6 @@ from pathlib import Path
 import pytest
 
 from controller.cli.main import run
-from drivers.amplifier import Amplifier
-from drivers.backends.serial_line.backend import SerialBackend
 from drivers.command import DriveCommand
 from drivers.protocol.messages import AmplifierState
 from model.rig.file import example_rig_path
@@ -40,13 +38,13 @@ async def wait(process: asyncio.subprocess.Process) -> tuple[int, str, str]:
     return process.returncode, out.decode(), err.decode()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-async def test_sim_serves_until_a_signal(number: signal.Signals) -> None:
+@pytest.mark.parametrize("is_interrupted", [True, False])
+async def test_sim_serves_until_interrupted_or_eof(is_interrupted: bool) -> None:
     """It prints a URL, serves the amplifier, and exits with status 0 and no files left."""
     with tempfile.TemporaryDirectory() as folder:
         control = Path(folder) / "control"
         process = await start(
-            [str(example_rig_path()), "--serial", "--control", str(control), "--finger", "0.1,0.1"]
+            [str(example_rig_path()), "--serial", "--control", str(control), "--until-eof"]
         )
         try:
             assert process.stdout is not None
@@ -60,24 +58,13 @@ async def test_sim_serves_until_a_signal(number: signal.Signals) -> None:
             assert (status.state, status.token) == (AmplifierState.OPERATION_ENABLED, 1)
             assert status.levels == (0, 0, 0.25, 0)
         finally:
-            process.send_signal(number)
+            if is_interrupted:
+                process.send_signal(signal.SIGINT)
+            elif process.stdin is not None:
+                process.stdin.close()
             ending = await wait(process)
         assert ending == (0, "", "")
         assert not control.exists()
-
-
-async def test_sim_until_eof_exits_with_standard_input() -> None:
-    """The end of standard input suffices for an orderly exit."""
-    process = await start([str(example_rig_path()), "--serial", "--until-eof"])
-    assert process.stdin is not None
-    assert process.stdout is not None
-    line = await asyncio.wait_for(process.stdout.readline(), TIMEOUT)
-    assert line.startswith(b"main: serial://")
-    amplifier = Amplifier(SerialBackend(line.decode().split()[1]), reply_timeout=5.0)
-    await amplifier.open()
-    await amplifier.close()
-    process.stdin.close()
-    assert await wait(process) == (0, "", "")
 
 
 @pytest.mark.parametrize(

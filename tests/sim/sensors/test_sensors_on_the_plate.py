@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from model.fem.assembly import era_positions
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
+from model.structure.point_load import footprints_of
 from model.transients.base_motion import Term
 from model.transients.time_response import plate_in_time
 from sim.plant.plant import Plant
@@ -28,7 +28,7 @@ QUIET = Accelerometer("quiet", 0.21, 0.17, noise_density=1e-3, reach=500.0, reso
 @pytest.fixture(scope="module")
 def reduced(coarse_rig: Rig) -> ReducedPlate:
     """The plate in few coordinates."""
-    return reduce_plate(coarse_rig.plate, coarse_rig.mesh, era_positions(coarse_rig.eras))
+    return reduce_plate(coarse_rig.plate, coarse_rig.mesh, footprints_of(coarse_rig.eras))
 
 
 def record(

@@ -122,24 +122,32 @@ def test_reference_accepts_any_output_in_an_unknown_state() -> None:
 
 
 @pytest.mark.parametrize(
-    ("query", "says", "late"), [(DISARM, SWITCHED_ON, "latched"), (STATUS, ENABLED, "armed")]
+    ("request_", "says"),
+    [(DISARM, SWITCHED_ON), (STATUS, ENABLED), (ARM, ENABLED), (BRIEF, ENABLED)],
 )
-def test_reference_accepts_a_reply_older_than_a_broadcast_stop(
-    query: Request, says: int, late: str
+def test_reference_accepts_a_reply_overtaken_by_a_broadcast_stop(
+    request_: Request, says: int
 ) -> None:
-    """Asked, then all of the bus are stopped, and only then the answer comes: of how it was before.
-
-    A broadcast stop has no reply, so it takes effect within 10 ms.
-    """
-    for asked_at, broken in ((1.0995, []), (1.1095, [late])):
-        watched = Watched()
+    """The reply reports how it was before the stop, which holds all the same."""
+    watched = Watched()
+    if request_ is not ARM:
         watched.grants(ARM, 1.0, ENABLED)
-        watched.amplifier.broadcast_sent(STOP_ALL, 1.1)
-        watched.grants(query, asked_at, says)
-        assert watched.broken == broken
+    else:
+        watched.amplifier.restarted(1.0)
+    watched.amplifier.broadcast_sent(STOP_ALL, 1.1)
+    reply = Reply(1, request_.key, status=Status(says, 0))
+    watched.amplifier.granted_before_stop(request_, reply, 1.0995, 1.1005)
+    watched.grants(STATUS, 1.12, STOPPED)
+    assert watched.broken == []
+    watched.grants(STATUS, 1.2, ENABLED)
+    assert watched.broken == ["armed"]
+
+
+@pytest.mark.parametrize(("time", "broken"), [(1.1095, []), (1.1105, ["armed"])])
+def test_reference_expects_a_broadcast_stop_within_10_ms(time: float, broken: list[str]) -> None:
+    """Until then an event may still report how it was before."""
     watched = Watched()
     watched.grants(ARM, 1.0, ENABLED)
     watched.amplifier.broadcast_sent(STOP_ALL, 1.1)
-    watched.grants(query, 1.0995, says)
-    watched.grants(STATUS, 1.12, STOPPED)
-    assert watched.broken == []
+    watched.amplifier.event_received(ENABLED, 0, time)
+    assert watched.broken == broken

@@ -8,6 +8,7 @@ import pytest
 from drivers.backends.can_bus.objects import ObjectClient
 from drivers.backends.hardware import Worker
 from drivers.errors import LinkTimeout
+from drivers.statistics import WireCounters
 
 TIMEOUT = 0.01  # s; of a node that never answers
 
@@ -28,7 +29,7 @@ class Network(canopen.Network):
 def test_queued_transfer_does_not_start_after_close() -> None:
     """The job was taken before, and its turn comes afterwards: the bus may be another's by then."""
     network = Network()
-    client = ObjectClient(network, 1, Worker("era-test"))
+    client = ObjectClient(network, 1, Worker("era-test"), WireCounters())
     client.close()
     with pytest.raises(LinkTimeout):
         client.capabilities(timeout=TIMEOUT)
@@ -38,7 +39,7 @@ def test_queued_transfer_does_not_start_after_close() -> None:
 def test_cancelled_transfer_is_not_retried() -> None:
     """After an aborted one it would read an object up to five times."""
     network = Network()
-    client = ObjectClient(network, 1, Worker("era-test"))
+    client = ObjectClient(network, 1, Worker("era-test"), WireCounters())
     with pytest.raises(LinkTimeout):
         client.faults(timeout=TIMEOUT)
     network.sent, network.on_send = 0, client.abandon

@@ -115,7 +115,7 @@ async def test_request_is_one_transaction(
     """A block written and one read back by FC23; identity and capabilities are only read."""
     assert await backend.exchange(request_, timeout=PATIENCE) == expected
     assert far.functions == [4 if isinstance(request_, Hello | GetCaps) else 23]
-    assert backend.last_sent > 0
+    assert backend.last_sent_at > 0
 
 
 async def test_many_faults_are_read_in_two_transactions(far: Peer, backend: ModbusBackend) -> None:
@@ -224,7 +224,8 @@ async def test_late_exception_is_not_credited_to_the_next_request(
 
 async def test_transaction_numbers_and_tags_wrap(far: Peer, backend: ModbusBackend) -> None:
     """After 16 bits."""
-    backend._opened()._transaction = backend._tag = 0xFFFF - 1
+    assert backend._line is not None
+    backend._line._transaction = backend._tag = 0xFFFF - 1
     for _ in range(3):
         assert await backend.exchange(Arm(0.25), timeout=PATIENCE) == ARMED
 
@@ -339,10 +340,13 @@ async def test_refused_connection_has_a_remedy() -> None:
 
 async def test_units_share_one_connection(far: Peer) -> None:
     """One request at a time; the last user closes it."""
-    first, second = ModbusBackend(far.url), ModbusBackend(far.url[:-1] + "2")
-    await first.open()
-    await second.open()
-    await second.open()
+    first, second = (
+        Amplifier(ModbusBackend(url), reply_timeout=PATIENCE)
+        for url in (far.url, far.url[:-1] + "2")
+    )
+    await first.open(take_over=False)
+    await second.open(take_over=False)
+    far.requests.clear()
     assert far.connections == 1
     assert first.bus == second.bus
     waiting: list[int] = []
@@ -360,14 +364,11 @@ async def test_units_share_one_connection(far: Peer) -> None:
         return None
 
     far.answer = answer
-    replies = await asyncio.gather(
-        *(backend.exchange(Ping(), timeout=PATIENCE) for backend in (first, second) * 5)
-    )
+    replies = await asyncio.gather(*(one.heartbeat() for one in (first, second) * 5))
     assert replies == [ARMED] * 10
     assert sorted(request.unit for request in far.requests) == [1] * 5 + [2] * 5
     await first.close()
-    assert await second.exchange(Ping(), timeout=PATIENCE) == ARMED
-    await second.close()
+    assert await second.heartbeat() == ARMED
     await second.close()
 
 
@@ -459,7 +460,7 @@ async def test_open_refuses_two_amplifiers_of_one_unit() -> None:
         far.answer = answered_by(far.unit, other)
         amplifier = Amplifier(ModbusBackend(far.url), reply_timeout=PATIENCE)
         with pytest.raises(LinkError, match=r"several amplifiers .*unit 1"):
-            await amplifier.open()
+            await amplifier.open(take_over=False)
         far.answer = answered_by(far.unit, far.unit)
-        await amplifier.open()
+        await amplifier.open(take_over=False)
         await amplifier.close()

@@ -1,7 +1,9 @@
-"""Writing to a serial port, on a pseudo-terminal."""
+"""Writing to a serial port, which never blocks, on a pseudo-terminal and by a thread."""
 
+import asyncio
 import os
 import pty
+import threading
 import tty
 from collections.abc import Iterator
 
@@ -9,8 +11,10 @@ import pytest
 import serial
 
 from drivers.backends.ports.watched import WatchedPort
-from drivers.backends.ports.writing import write_all
-from drivers.errors import LinkTimeout
+from drivers.backends.ports.writing import make_writer
+from drivers.errors import LinkError
+
+TIMEOUT = 5.0  # s; for what is expected
 
 
 @pytest.fixture
@@ -18,45 +22,83 @@ def ends() -> Iterator[tuple[serial.Serial, int]]:
     """A port, and the descriptor at its other end."""
     far, near = pty.openpty()
     tty.setraw(near)
-    port = serial.Serial(os.ttyname(near), timeout=0, write_timeout=0.02)
+    port = serial.Serial(os.ttyname(near), timeout=0)
     yield port, far
     port.close()
     os.close(near)
     os.close(far)
 
 
-def test_taken_bytes_are_not_a_timeout(
-    ends: tuple[serial.Serial, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Even if the process is delayed while it writes."""
+async def read_until(far: int, end: bytes) -> bytes:
+    """Read from the other end until these bytes."""
+    os.set_blocking(far, False)
+    got = b""
+    async with asyncio.timeout(TIMEOUT):
+        while not got.endswith(end):
+            try:
+                got += os.read(far, 1 << 16)
+            except BlockingIOError:
+                await asyncio.sleep(0)
+    return got
+
+
+async def test_blocked_port_takes_the_newest_frame(ends: tuple[serial.Serial, int]) -> None:
+    """Unsent bytes of an older one are dropped; the newest follows without another call."""
     port, far = ends
-    monkeypatch.setattr("serial.serialposix.Timeout.expired", lambda self: True)
-    write_all(port, b"all of it")
-    assert os.read(far, 100) == b"all of it"
-
-
-def test_blocked_port_is_a_timeout(ends: tuple[serial.Serial, int]) -> None:
-    """The other end does not read, so its buffer fills up."""
-    port, _ = ends
-    with pytest.raises(serial.SerialTimeoutException):
-        write_all(port, bytes(1 << 20))
-
-
-async def test_blocked_line_is_a_timeout_with_a_remedy(
-    ends: tuple[serial.Serial, int],
-) -> None:
-    """Which is retried."""
-    port, _ = ends
     watched = WatchedPort(port, "/dev/ttyUSB9", lambda data: None, lambda what: None)
-    with pytest.raises(LinkTimeout, match=r"/dev/ttyUSB9.*check flow control"):
-        watched.write(bytes(1 << 20))
+    watched.write(b"a" * (1 << 20))
+    assert watched.is_blocked
+    watched.write(b"b" * (1 << 20))
+    watched.write(b"stop")
+    got = await read_until(far, b"stop")
+    assert got.count(b"b") < 1 << 20
+    assert got.count(b"a") < 1 << 20
+    assert not watched.is_blocked
     watched.close()
     await watched.wait_closed()
 
 
-def test_closed_port_is_a_link_error(ends: tuple[serial.Serial, int]) -> None:
-    """Like a lost one."""
-    port, _ = ends
-    port.close()
-    with pytest.raises(OSError, match="not open"):
-        write_all(port, b"x")
+async def test_closed_port_is_a_link_error(ends: tuple[serial.Serial, int]) -> None:
+    """And the loss is reported once."""
+    port, far = ends
+    losses: list[str] = []
+    watched = WatchedPort(port, "/dev/ttyUSB9", lambda data: None, losses.append)
+    watched.write(b"a" * (1 << 20))
+    os.close(os.dup(far))
+    os.dup2(os.open(os.devnull, os.O_RDWR), far)  # hangs up
+    with pytest.raises(LinkError, match="check the cable"):
+        watched.write(b"stop")
+    assert len(losses) == 1
+    watched.close()
+    await watched.wait_closed()
+
+
+async def test_port_without_a_descriptor_is_written_by_a_thread() -> None:
+    """A server of RFC 2217 that takes nothing for seconds does not block the caller."""
+    entered, taken = threading.Semaphore(0), threading.Semaphore(0)
+    written: list[bytes] = []
+    errors: asyncio.Queue[OSError] = asyncio.Queue()
+
+    class Server:
+        name = "rfc2217://server"
+
+        def fileno(self) -> int:
+            raise OSError("no descriptor")
+
+        def write(self, data: bytes) -> None:
+            entered.release()
+            assert taken.acquire(timeout=TIMEOUT)
+            written.append(data)
+            if data == b"stop":
+                raise ConnectionResetError("gone")
+
+    writer = make_writer(Server(), errors.put_nowait)  # type: ignore[arg-type]
+    writer.write(b"one")
+    assert await asyncio.to_thread(entered.acquire, timeout=TIMEOUT)
+    for data in (b"two", b"stop"):
+        assert writer.is_blocked
+        writer.write(data)
+    taken.release(2)
+    assert isinstance(await asyncio.wait_for(errors.get(), TIMEOUT), ConnectionResetError)
+    assert written == [b"one", b"stop"]
+    writer.close()

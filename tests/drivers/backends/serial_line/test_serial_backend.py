@@ -46,7 +46,7 @@ async def test_request_gets_its_reply(backend: SerialBackend, far_end: FarEnd) -
     first, second = far_end.frames
     assert (second.sequence - first.sequence) % 65536 == 1
     assert (first.address, second.address) == (1, 1)
-    assert backend.last_sent > 0
+    assert backend.last_sent_at > 0
 
 
 async def test_missing_reply_is_a_timeout(backend: SerialBackend, far_end: FarEnd) -> None:

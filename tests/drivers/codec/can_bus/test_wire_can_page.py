@@ -7,7 +7,7 @@ import drivers
 from can_eds import entries
 from can_files import FILES
 from can_session import session
-from drivers.codec.can_bus.frame import CANOPEN, LAYOUTS
+from drivers.codec.can_bus.frame import CANOPEN
 from drivers.protocol.definition import PROTOCOL
 
 DOCS = Path(drivers.__file__).parent.parent / "docs" / "reference"
@@ -52,18 +52,6 @@ def test_fields_equal_the_definition() -> None:
         for field, place in fields.items()
     }
     assert rows == declared
-
-
-def test_fields_do_not_overlap() -> None:
-    """Within eight bytes."""
-    for layout in LAYOUTS.values():
-        bits = [
-            bit
-            for field in layout.fields.values()
-            for bit in range(field.first, field.first + field.bits)
-        ]
-        assert len(set(bits)) == len(bits)
-        assert max(bits) < 64
 
 
 def test_objects_equal_the_definition() -> None:

@@ -1,0 +1,132 @@
+"""One connection of a client to the daemon: requests, their responses, and notifications."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Self, cast
+
+from controller.api.client_protocol import (
+    Notification,
+    Response,
+    Unreachable,
+    check_version,
+    make_params,
+    read_line,
+)
+from controller.api.jsonrpc import request_line
+from controller.api.methods import HelloParams
+from controller.api.peer import check_peer
+from controller.api.schema import Message
+
+
+class Channel(asyncio.Protocol):
+    """A connection, made by `open`; any number of requests may be pending.
+
+    hello: result of `hello`; lost: None while it is open.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        on_event: Callable[[Notification], None],
+        on_lost: Callable[[], object],
+    ) -> None:
+        self.path = path
+        self.hello: Any = None
+        self.lost: Unreachable | None = None
+        self._on_event = on_event
+        self._on_lost = on_lost
+        self._pending: dict[int, asyncio.Future[Any]] = {}
+        self._last_id = 0
+        self._rest = b""
+        self._transport: asyncio.Transport | None = None
+
+    @classmethod
+    async def open(
+        cls,
+        path: Path,
+        *,
+        name: str,
+        on_event: Callable[[Notification], None],
+        on_lost: Callable[[], object],
+    ) -> Self:
+        """Connect, check the peer, and introduce this client; raises RpcError and Unreachable."""
+        params = make_params(HelloParams, client=name)
+        channel = cls(path, on_event=on_event, on_lost=on_lost)
+        try:
+            await channel._connect()
+            channel.hello = await channel.request("hello", params)
+            check_version(channel.hello, path)
+        except BaseException:
+            channel.close()
+            raise
+        return channel
+
+    async def _connect(self) -> None:
+        loop = asyncio.get_running_loop()
+        try:
+            transport, _ = await loop.create_unix_connection(lambda: self, str(self.path))
+            check_peer(self.path, transport.get_extra_info("socket"))
+        except Unreachable:
+            raise
+        except OSError as error:
+            raise Unreachable.at(self.path, error) from error
+
+    async def request(self, method: str, params: Message) -> Any:
+        """Call a method and return its result as parsed JSON; raises RpcError and Unreachable."""
+        assert self._transport is not None  # noqa: S101  `open` connects
+        if self.lost is not None:
+            raise self.lost.with_traceback(None)
+        self._last_id += 1
+        id = self._last_id
+        response = self._pending[id] = asyncio.get_running_loop().create_future()
+        try:
+            self._transport.write(request_line(id, method, params))
+            return (await response).result()
+        finally:
+            del self._pending[id]
+
+    def close(self) -> None:
+        """Close at once; the daemon lifts this client's fingers."""
+        if self._transport is not None:
+            self._transport.abort()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Store the transport."""
+        self._transport = cast(asyncio.Transport, transport)
+
+    def data_received(self, data: bytes) -> None:
+        """Hand out complete responses and notifications."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        for line in lines:
+            try:
+                received = read_line(line)
+            except Unreachable as error:
+                self._lose(error)
+                self.close()
+                return
+            if isinstance(received, Notification):
+                self._on_event(received)
+            else:
+                self._resolve(received)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        """Fail all pending requests."""
+        closed = ConnectionResetError("closed by the daemon")
+        self._lose(Unreachable.at(self.path, error if isinstance(error, OSError) else closed))
+
+    def _resolve(self, response: Response) -> None:
+        """Resolve the request that a response is for; without an id, all of them."""
+        for id, pending in self._pending.items():
+            if response.id in (id, None) and not pending.done():
+                pending.set_result(response)
+
+    def _lose(self, error: Unreachable) -> None:
+        if self.lost is not None:
+            return
+        self.lost = error
+        for pending in self._pending.values():
+            if not pending.done():
+                pending.set_exception(error)
+        self._on_lost()

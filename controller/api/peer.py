@@ -1,0 +1,55 @@
+"""Authentication of the process behind the daemon's socket."""
+
+import os
+import pwd
+import socket
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+
+from controller.api.client_protocol import Unreachable
+
+SERVICE_USER_VARIABLE = "ERA_HAPTICS_USER"
+_SERVICE_USER = "era-haptics"  # as the system service is installed
+_CREDENTIALS = struct.Struct("3i")  # process, user, group
+
+
+def check_peer(
+    path: Path, connected: socket.socket, *, environment: Mapping[str, str] = os.environ
+) -> None:
+    """Check the peer of a connected socket; raises Unreachable.
+
+    Folder, socket and process must have one owner: root, the caller, or the user of the service,
+    `era-haptics` unless the variable ERA_HAPTICS_USER names another. Otherwise any user could pose
+    as the daemon in a folder that all may write to.
+    """
+    service = environment.get(SERVICE_USER_VARIABLE, _SERVICE_USER)
+    owners = {"folder": path.parent.stat().st_uid, "socket": path.stat().st_uid}
+    option = getattr(socket, "SO_PEERCRED", None)  # of Linux
+    if option is not None:
+        raw = connected.getsockopt(socket.SOL_SOCKET, option, _CREDENTIALS.size)
+        owners["process"] = _CREDENTIALS.unpack(raw)[1]
+    trusted = {0, os.geteuid(), _uid(service)}
+    if len(set(owners.values())) == 1 and set(owners.values()) <= trusted:
+        return
+    found = ", ".join(f"its {what} belongs to {_name(uid)}" for what, uid in owners.items())
+    raise Unreachable(
+        f"{path} must belong, with its folder and process, to root, to you, or to the service's "
+        f"user {service}, but {found}; give another socket, or name the service's user in "
+        f"{SERVICE_USER_VARIABLE}"
+    )
+
+
+def _uid(user: str) -> int | None:
+    """The id of a user by name; None if there is none."""
+    try:
+        return pwd.getpwnam(user).pw_uid
+    except KeyError:
+        return None
+
+
+def _name(uid: int) -> str:
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return f"user {uid}"

@@ -1,0 +1,331 @@
+"""Playback of an amplifier as known to the host: confirmed sets, and those that were only sent.
+
+A set that was sent and not confirmed may play or not, since any moment since then; what is checked
+next must be allowed in either case. `Amplifier` records what it sends and what replies confirm.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from drivers.command import CommandSet, DriveCommand, Envelope
+from drivers.errors import CommandRefused
+from drivers.guard.budget import COMMIT_DELAY, Budget
+from drivers.guard.channel_state import (
+    ChannelState,
+    Interval,
+    duration,
+    followed_by,
+    unknown_between,
+)
+from drivers.protocol.messages import Achieved, AmplifierState, Status
+from registry.limits import GuardLimits
+
+_ROUNDING = 1 + 1e-9  # sums of floats
+_SILENT = ChannelState()
+
+States = tuple[ChannelState, ...]
+
+
+@dataclass
+class _Sent:
+    """A set that may play; since [s]: when it was sent."""
+
+    command_set: CommandSet
+    since: float
+    achieved: tuple[DriveCommand, ...] = field(default=())
+
+
+class PlayRecord:
+    """The record of one amplifier, at first silent; clock [s].
+
+    slots: the envelopes that each slot may hold; last_token: of the set that was sent last.
+    """
+
+    def __init__(self, limits: GuardLimits, channels: int, clock: Callable[[], float]) -> None:
+        self.slots: dict[int, tuple[Envelope, ...]] = {}
+        self.last_token = 0
+        self._limits = limits
+        self._clock = clock
+        self._budget = Budget(limits)
+        self._confirmed: States = (_SILENT,) * channels
+        self._confirmed_token = 0
+        self._pending: list[_Sent] = []
+        self._staged: _Sent | None = None
+        self._may_be_silent = False  # a stop was sent and not confirmed
+
+    def check(self, command_set: CommandSet, *, ramp: float) -> float:
+        """Return the longest valid_for [s] of a set sent now; CommandRefused if it must not play.
+
+        ramp [s]: by which it ends. Changes nothing.
+        """
+        now = self._clock()
+        max_valid_for = math.inf
+        if vibrates(command_set):
+            max_valid_for = self._budget.remaining(now, fade=self._fade(command_set, ramp))
+        elif not skips_endings(command_set):
+            endings = [state.ending_time for state in self._confirmed if state.ending is not None]
+            if max(endings, default=0.0) > self._budget.fade_left(now):
+                raise CommandRefused("on-time or duty limit reached; end along a ramp")
+        self._check_transition(command_set, now)
+        return max_valid_for
+
+    def fade_left(self) -> float:
+        """Return the longest time [s] in which a silent set sent now may fade."""
+        return self._budget.fade_left(self._clock())
+
+    def send(self, command_set: CommandSet) -> None:
+        """Record a set that is about to be sent, again or for the first time.
+
+        Raises CommandRefused if it must not play by now, because of what was sent since its check.
+        """
+        self.last_token = token = command_set.token
+        if token == self._confirmed_token or any(
+            sent.command_set.token == token for sent in self._pending
+        ):
+            return
+        now = self._clock()
+        if vibrates(command_set):
+            fade = self._fade(command_set, command_set.ramp)
+            left = self._budget.remaining(now, fade=fade, delay=COMMIT_DELAY)
+            if left < (command_set.valid_for or math.inf) and left != math.inf:
+                raise CommandRefused("set was checked too long ago; check it again")
+            self._check_transition(command_set, now)
+            self._budget.sent(now, lasts=(command_set.valid_for or math.inf) + fade)
+        elif not skips_endings(command_set):
+            self._check_transition(command_set, now)
+        self._pending.append(_Sent(command_set, now))
+
+    def stage(self, command_set: CommandSet) -> None:
+        """Record a set that is about to be staged: from then on it may be committed."""
+        self.send(command_set)
+        self._staged = next(
+            (sent for sent in self._pending if sent.command_set.token == command_set.token), None
+        )
+
+    def commit(self, token: int) -> None:
+        """Record that the staged set is about to be committed."""
+        if self._staged is not None and self._staged.command_set.token == token:
+            self.send(self._staged.command_set)
+
+    def achieve(self, achieved: Achieved) -> None:
+        """Record what a sent set plays once it is committed."""
+        for sent in self._pending:
+            if sent.command_set.token == achieved.token:
+                sent.achieved = achieved.commands
+
+    def confirm(self, token: int) -> None:
+        """Record that the set of this token plays by now, and none that was sent before it."""
+        now = self._clock()
+        tokens = [sent.command_set.token for sent in self._pending]
+        if token not in tokens:
+            return
+        number = tokens.index(token)
+        sent = self._pending[number]
+        when = Interval(sent.since, now)
+        before = self._states(self._pending[:number], when)
+        played = _played(sent)
+        if self._limits.slew == math.inf and not self._is_shaped(sent.command_set):
+            self._confirmed = _highest_after(before, played, when)
+        else:
+            self._confirmed = states_after(before, played, when, self.slots)[0]
+        self._confirmed_token = token
+        self._pending = self._pending[number + 1 :]
+        self._may_be_silent = False
+        if not self._pending:
+            self._budget.confirm(sent.since, now, end=self._silent_at(sent.command_set, now))
+
+    def silence_sent(self) -> None:
+        """Record that a stop, a disarm or an arm is about to be sent."""
+        self._may_be_silent = True
+
+    def silenced(self, ramp: float) -> None:
+        """Record that all channels fall silent within a ramp [s] from now at the latest."""
+        now = self._clock()
+        when = Interval(now, now)
+        commands = tuple(
+            DriveCommand(channel, 0.0, 0.0, skip_ending=True)
+            for channel in range(len(self._confirmed))
+        )
+        silence = CommandSet(0, commands, ramp=ramp, valid_for=0.0)
+        self._confirmed = states_after(self._states(self._pending, when), silence, when, {})[0]
+        self._confirmed_token = 0
+        self._pending.clear()
+        self._staged = None
+        self._may_be_silent = False
+        self._budget.confirm(now, now, end=now + ramp)
+
+    def report(self, status: Status) -> None:
+        """Record a status: a set that plays, or silence that lasts until the next arming."""
+        if status.state is AmplifierState.OPERATION_ENABLED:
+            self.confirm(status.token)
+        elif not any(status.levels):
+            self.silenced(0.0)
+
+    def expect_load(self, envelope: Envelope) -> None:
+        """Record an envelope that a slot may hold from now on; none may be left in an empty one."""
+        others = [one for one in self.slots.pop(envelope.slot, ()) if one != envelope]
+        if envelope.knots:
+            self.slots[envelope.slot] = (*others, envelope)
+
+    def load(self, envelope: Envelope) -> None:
+        """Record the envelope that a slot holds by now."""
+        if envelope.knots:
+            self.slots[envelope.slot] = (envelope,)
+
+    def _check_transition(self, command_set: CommandSet, now: float) -> None:
+        if self._limits.slew == math.inf and not self._is_shaped(command_set):
+            return  # along one ramp nothing exceeds both what played and what will play
+        try:
+            self._check_from(self._states(self._pending, Interval(now, now)), command_set, now)
+        except CommandRefused as refused:
+            refused.until = self._allowed_from(command_set, now)
+            raise
+
+    def _allowed_from(self, command_set: CommandSet, now: float) -> float | None:
+        """Return the time [s] from which a set is allowed, if only present fades forbid it."""
+        if self._pending or self._may_be_silent:
+            return None
+        settled = max(state.commit.latest + state.settled_after for state in self._confirmed)
+        if not now < settled < math.inf:
+            return None
+        try:
+            self._check_from(self._confirmed, command_set, settled)
+        except CommandRefused:
+            return None
+        return settled
+
+    def _check_from(self, before: States, command_set: CommandSet, now: float) -> None:
+        """Raise CommandRefused if a set must not play after these states."""
+        when = Interval(now, now + COMMIT_DELAY)
+        after, slopes = states_after(before, command_set, when, self.slots)
+        limits = self._limits
+        for channel, slope in enumerate(slopes):
+            if slope > limits.slew * _ROUNDING:
+                raise CommandRefused(
+                    f"channel {channel}: level must rise by at most {limits.slew:g} per second, "
+                    f"got {slope:g} per second; use a longer ramp",
+                    channel=channel,
+                )
+        if not self._is_shaped(command_set):
+            return
+        levels = [state.worst for state in after]
+        for channel, level in enumerate(levels):
+            if level > limits.level * _ROUNDING:
+                raise CommandRefused(
+                    f"channel {channel}: level must be at most {limits.level:g} while the previous "
+                    f"tone fades, got {level:g}; use a ramp instead of an envelope",
+                    channel=channel,
+                )
+        power = sum(level**2 for level in levels)
+        if power > limits.power * _ROUNDING:
+            raise CommandRefused(
+                f"sum of squared levels must be at most {limits.power:g} while the previous tones "
+                f"fade, got {power:g}; use a ramp instead of an envelope"
+            )
+
+    def _is_shaped(self, command_set: CommandSet) -> bool:
+        """Whether a channel may follow an envelope during this set or at its end."""
+        return (
+            any(command.onset or command.ending for command in command_set.commands)
+            or any(state.ending or state.is_shaped or state.keeps_rest for state in self._confirmed)
+            or any(
+                command.ending for sent in self._pending for command in sent.command_set.commands
+            )
+        )
+
+    def _states(self, pending: Sequence[_Sent], when: Interval) -> States:
+        """Return the states in which the channels may be once the sets before have been sent."""
+        states = self._confirmed
+        for sent in pending:
+            committed = Interval(sent.since, max(sent.since, when.latest))
+            after, _ = states_after(states, _played(sent), committed, self.slots)
+            states = tuple(
+                unknown_between(both, committed) for both in zip(states, after, strict=True)
+            )
+        if self._may_be_silent:
+            states = tuple(unknown_between((state, _SILENT), when) for state in states)
+        return states
+
+    def _fade(self, command_set: CommandSet, ramp: float) -> float:
+        """Return the longest time [s] from the end of a set until silence."""
+        endings = [
+            duration(envelope)
+            for command in command_set.commands
+            for envelope in self.slots.get(command.ending, ())
+        ]
+        return max([ramp, *endings])
+
+    def _silent_at(self, command_set: CommandSet, now: float) -> float:
+        """Return the latest time [s] at which a confirmed set is silent."""
+        if vibrates(command_set):
+            lasts = command_set.valid_for or math.inf
+            return now + lasts + self._fade(command_set, command_set.ramp)
+        return now + max(state.settled_after for state in self._confirmed)
+
+
+def vibrates(command_set: CommandSet) -> bool:
+    """Whether a set drives any channel, and be it by an onset only."""
+    return any(command.level > 0 or command.onset for command in command_set.commands)
+
+
+def skips_endings(command_set: CommandSet) -> bool:
+    """Whether a silent set lets no channel follow an earlier ending."""
+    return all(command.skip_ending for command in command_set.commands)
+
+
+def states_after(
+    states: States,
+    command_set: CommandSet,
+    when: Interval,
+    slots: dict[int, tuple[Envelope, ...]],
+) -> tuple[States, list[float]]:
+    """Return the states after a set, and the steepest rise [1/s] of each channel."""
+    commands = {command.channel: command for command in command_set.commands}
+    following, slopes = [], []
+    for channel, state in enumerate(states):
+        command = commands.get(channel) or DriveCommand(channel, 0.0, 0.0)
+        # A slot may hold one of several envelopes while one is being loaded.
+        several = [
+            followed_by(
+                state,
+                command,
+                when,
+                ramp=command_set.ramp,
+                valid_for=command_set.valid_for,
+                onset=onset,
+                ending=ending,
+            )
+            for onset in slots.get(command.onset) or (None,)
+            for ending in slots.get(command.ending) or (None,)
+        ]
+        after = [one for one, _ in several]
+        following.append(after[0] if len(after) == 1 else unknown_between(after, when))
+        slopes.append(max(slope for _, slope in several))
+    return tuple(following), slopes
+
+
+def _highest_after(states: States, command_set: CommandSet, when: Interval) -> States:
+    """Return states after a set of ramps that bound its levels from above only."""
+    tones = {command.channel: command for command in command_set.commands}
+    ramp, valid_for = command_set.ramp, command_set.valid_for or math.inf
+    return tuple(
+        ChannelState(
+            frequency=tones[channel].frequency if channel in tones else 0.0,
+            path=(0j, complex(tones[channel].level if channel in tones else 0.0)),
+            step=ramp,
+            commit=when,
+            rest=state.high(when),
+            fade=ramp,
+            valid_for=valid_for,
+        )
+        for channel, state in enumerate(states)
+    )
+
+
+def _played(sent: _Sent) -> CommandSet:
+    """Return what a sent set plays, with the levels that the amplifier reported."""
+    asked = sent.command_set
+    if not sent.achieved:
+        return asked
+    return CommandSet(asked.token, sent.achieved, ramp=asked.ramp, valid_for=asked.valid_for)

@@ -1,0 +1,67 @@
+"""Records of what one amplifier is sent and replies, for the guards whose sets it plays."""
+
+import weakref
+
+from drivers.guard.guard import SafeCommandSet, SafeEnvelope
+from drivers.guard.record import PlayRecord
+from drivers.protocol.messages import (
+    Achieved,
+    Apply,
+    Arm,
+    Commit,
+    Disarm,
+    Loaded,
+    LoadEnvelope,
+    Reply,
+    Request,
+    Stage,
+    Status,
+    Stop,
+)
+
+_ARMING_RAMP = 0.005  # s; within it an amplifier that is armed while it plays falls silent
+
+
+class Recorder:
+    """Tells every guard about requests and replies; guards are known by their sets."""
+
+    def __init__(self) -> None:
+        self._records: weakref.WeakSet[PlayRecord] = weakref.WeakSet()
+
+    def sending(self, request: Request) -> None:
+        """Record a request that is about to be sent.
+
+        Raises CommandRefused for a set that must not play any more.
+        """
+        match request:
+            case Apply(command_set=SafeCommandSet() as safe):
+                self._records.add(safe.record)
+                safe.record.send(safe)
+            case Stage(command_set=SafeCommandSet() as safe):
+                self._records.add(safe.record)
+                safe.record.stage(safe)
+            case Commit(token=token):
+                for record in self._records:
+                    record.commit(token)
+            case Stop() | Disarm() | Arm():
+                for record in self._records:
+                    record.silence_sent()
+
+    def replied(self, request: Request, reply: Reply) -> None:
+        """Record what a reply confirms."""
+        if isinstance(request, LoadEnvelope) and isinstance(reply, Loaded):
+            if isinstance(request.envelope, SafeEnvelope):
+                request.envelope.record.load(request.envelope)
+            return
+        for record in self._records:
+            match reply:
+                case Achieved(token=token):
+                    record.achieve(reply)
+                    if not isinstance(request, Stage):
+                        record.confirm(token)
+                case Status():
+                    if isinstance(request, Stop | Disarm):
+                        record.silenced(request.ramp)
+                    elif isinstance(request, Arm):
+                        record.silenced(_ARMING_RAMP)
+                    record.report(reply)

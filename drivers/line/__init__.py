@@ -1,0 +1,1 @@
+"""The sender of one physical line: the priority queue of its requests."""

@@ -1,0 +1,121 @@
+"""An amplifier whose every reply is compared with what was asked, while it is armed."""
+
+import math
+from collections.abc import Callable
+
+from drivers import clock
+from drivers.amplifier import WATCHDOG, Amplifier
+from drivers.errors import CommandRefused
+from drivers.guard import SafeCommandSet
+from drivers.operation.plausibility import PlausibilityCheck
+from drivers.protocol.messages import Achieved, Status
+
+_RUNNING_SHARE = 0.05
+"""Share of the line's time for statuses that only show whether the watchdog runs down."""
+
+
+class CheckedAmplifier:
+    """Arms, plays and feeds an open amplifier; arguments as `PlausibilityCheck`.
+
+    Raises CommandRefused if it contradicts what was asked twice in a row (`PlausibilityCheck`), or
+    is not enabled any more, and the errors of `Amplifier`.
+    """
+
+    def __init__(
+        self, amplifier: Amplifier, name: str = "the amplifier", *, has_own_time: bool = False
+    ) -> None:
+        self.amplifier = amplifier
+        self._name = name
+        self._has_own_time = has_own_time
+        self._check_if_used: PlausibilityCheck | None = None
+        self._running_checked_at = -math.inf
+
+    async def arm(self, watchdog: float = WATCHDOG) -> Status:
+        """Arm with a watchdog [s]; what was expected before is forgotten."""
+        begin = clock.now()
+        status = await self.amplifier.arm(watchdog)
+        check = self._new_check()
+        check.expect_armed(watchdog, sent_at=begin, now=clock.now())
+        self._check_if_used = check
+        return status
+
+    async def apply(self, safe: SafeCommandSet) -> Achieved:
+        """Play a set now; returns what it really plays."""
+        check, begin = self._check, clock.now()
+        check.forget(safe)
+        achieved = await self.amplifier.apply(safe)
+        check.expect(safe, sent_at=begin, now=clock.now())
+        check.check_achieved(safe, achieved)
+        return achieved
+
+    async def stage(self, safe: SafeCommandSet) -> Achieved:
+        """Keep a set ready under its token; returns what its commit would play."""
+        check = self._check
+        achieved = await self.amplifier.stage(safe)
+        check.check_achieved(safe, achieved)
+        return achieved
+
+    async def commit(self, safe: SafeCommandSet) -> None:
+        """Play the staged set."""
+        check = self._check
+        check.check_achieved(safe, await self.amplifier.commit(safe.token))
+
+    def expect_commit(self, safe: SafeCommandSet) -> None:
+        """Expect that a staged set may play from now on."""
+        self._check.forget(safe)
+
+    async def confirm_commit(self, safe: SafeCommandSet, *, since: float) -> None:
+        """Read whether a set plays that was committed since a time [s], directly or by broadcast.
+
+        Raises CommandRefused if it does not.
+        """
+        check, begin = self._check, clock.now()
+        status = await self.amplifier.status()
+        if status.token != safe.token:
+            raise CommandRefused(
+                f"{self._name}: playing set must be {safe.token}, got {status.token}; clear and "
+                "arm again"
+            )
+        check.expect(safe, sent_at=since, now=clock.now())
+        check.check_status(status, sent_at=begin, now=clock.now())
+
+    async def heartbeat(self, *, may_feed: Callable[[], bool] = lambda: True) -> Status | None:
+        """Feed the watchdog; on a degraded link only once the amplifier has replied as expected.
+
+        may_feed: asked just before; None if that has become wrong.
+        """
+        if self.amplifier.is_degraded:
+            status = await self._beat()
+            if self.amplifier.is_degraded:
+                return status
+        else:
+            await self._check_running(self._check)
+        return await self._beat() if may_feed() else None
+
+    async def _beat(self) -> Status:
+        """Send a heartbeat and compare the status."""
+        check, begin, feeds = self._check, clock.now(), not self.amplifier.is_degraded
+        status = await self.amplifier.heartbeat()
+        check.check_status(status, sent_at=begin, now=clock.now(), feeds=feeds)
+        return status
+
+    async def _check_running(self, check: PlausibilityCheck) -> None:
+        """Read a status just before the watchdog is fed, unless the wire is too slow for that."""
+        begin, fed = clock.now(), self.amplifier.last_fed_at
+        pause = self.amplifier.round_trip() / _RUNNING_SHARE
+        if fed is None or begin - self._running_checked_at < pause:
+            return
+        self._running_checked_at = begin
+        status = await self.amplifier.status()
+        check.check_running(status, sent_at=begin, last_fed_at=fed)
+
+    @property
+    def _check(self) -> PlausibilityCheck:
+        if self._check_if_used is None:
+            self._check_if_used = self._new_check()
+        return self._check_if_used
+
+    def _new_check(self) -> PlausibilityCheck:
+        return PlausibilityCheck(
+            self.amplifier.capabilities, self._name, has_own_time=self._has_own_time
+        )

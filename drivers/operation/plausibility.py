@@ -1,0 +1,277 @@
+"""Comparison of what an amplifier reports with what was asked of it.
+
+Tolerances are the amplifier's own steps. Levels are compared at any time, also while they change:
+they must be within the bounds of a transition whose commit is known as an interval.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+from drivers.command import DriveCommand
+from drivers.errors import CommandRefused
+from drivers.guard import SafeCommandSet
+from drivers.guard.channel_state import ChannelState, Interval
+from drivers.guard.record import states_after
+from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.messages import Achieved, AmplifierState, Capabilities, Status
+
+MAX_CONTRADICTIONS = 2
+"""Contradictions in a row that are a fault; a single one may be a moment between two sets."""
+
+MEASURING_ERROR = 0.002
+"""Of full stroke; for amplifiers that measure their levels (`drivers.conformance`)."""
+
+CYCLE = 0.002
+"""Longest time [s] by which what an amplifier plays and reports may lag behind its commit."""
+
+_WEAK = 0.25  # share of a weak level that a measuring error may be
+_ROUNDING = 1e-9
+_Q = PROTOCOL.quantities
+_WATCHDOG_ERROR = PROTOCOL.reaction + _Q.watchdog_left.step  # s
+
+
+class PlausibilityCheck:
+    """Compares every Status and Achieved of one armed amplifier with what was asked of it.
+
+    name: of the amplifier, in messages. Times [s] are of the host's clock: sent_at of the request,
+    now of its reply. Two contradictions in a row raise CommandRefused with the reason; an Achieved
+    that contradicts its set counts again with each Status until the next set. has_own_time: for
+    simulated amplifiers whose time is stepped, so that levels and watchdog cannot be compared.
+    """
+
+    def __init__(
+        self,
+        capabilities: Capabilities,
+        name: str = "the amplifier",
+        *,
+        has_own_time: bool = False,
+    ) -> None:
+        self._has_own_time = has_own_time
+        self._capabilities = capabilities
+        self._name = name
+        self._states: tuple[ChannelState, ...] = ()  # empty: unknown
+        self._known: tuple[ChannelState, ...] = ()  # before the first unconfirmed set
+        self._unconfirmed: set[int] = set()  # tokens
+        # What each channel may play, while its state is unknown [Hz].
+        self._frequencies: list[set[float]] = [set() for _ in range(capabilities.channels)]
+        self._fade = 0.0  # s; the longest fade while states are unknown
+        self._tokens: set[int] = set()  # that may be active; empty: unknown
+        self._watchdog: float | None = None
+        self._fed: Interval | None = None
+        self._achieved_problem: str | None = None
+        self._contradictions = 0
+        self._is_of_level = False  # the last contradiction
+        self._standing_watchdog = 0  # statuses in a row in which it did not run down
+
+    def expect_armed(self, watchdog: float, *, sent_at: float, now: float) -> None:
+        """Expect silence and a full watchdog [s] after an Arm was confirmed."""
+        self._states = (ChannelState(),) * self._capabilities.channels
+        self._tokens = {0}
+        self._watchdog = _Q.watchdog.quantise(watchdog)
+        self._fed = Interval(sent_at, now)
+        self._achieved_problem = None
+        self._contradictions = self._standing_watchdog = 0
+
+    def forget(self, asked: SafeCommandSet) -> None:
+        """Expect no levels: a set is sent, and until it is confirmed it may play or not."""
+        if self._states:
+            self._known = self._states
+            self._frequencies = [{state.frequency, *state.frequencies} for state in self._states]
+            self._fade = max(state.settled_after for state in self._states)
+        self._unconfirmed.add(asked.token)
+        self._fade = max(self._fade, asked.settled_after)
+        for command in asked.commands:
+            self._frequencies[command.channel].add(command.frequency)
+        self._states = ()
+        if self._tokens:
+            self._tokens.add(asked.token)
+
+    def expect(self, asked: SafeCommandSet, *, sent_at: float, now: float) -> None:
+        """Expect a set that was confirmed; sent_at [s]: before its commit."""
+        when = Interval(sent_at, now + CYCLE)
+        slots = asked.record.slots
+        if self._known and self._unconfirmed <= {asked.token}:
+            self._states, _ = states_after(self._known, asked, when, slots)
+        else:
+            unknown, _ = states_after(self._unknown_states(when), asked, when, slots)
+            # Where there are endings, earlier fades may go on beside them.
+            fade = max(self._fade, asked.settled_after) if slots else asked.ramp
+            self._states = tuple(_long_rest(state, fade) for state in unknown)
+        self._known, self._unconfirmed = (), set()
+        self._tokens = {asked.token}
+        self._fed = Interval(sent_at, now)
+
+    def check_achieved(self, asked: SafeCommandSet, achieved: Achieved) -> None:
+        """Compare what a set plays with what was asked."""
+        self._achieved_problem = next(self._achieved_problems(asked, achieved), None)
+        if self._achieved_problem is not None:
+            self._contradictions += 1
+            self._is_of_level = False
+            self._raise_if_fault(self._contradictions, self._achieved_problem)
+
+    def check_status(
+        self,
+        status: Status,
+        *,
+        sent_at: float,
+        now: float,
+        feeds: bool = False,
+    ) -> None:
+        """Compare a status with what was asked; feeds: whether its request fed the watchdog.
+
+        Right after a commit hardly any level is a contradiction, so that agreement forgives none of
+        levels. Raises CommandRefused at once for an amplifier that is not enabled any more.
+        """
+        if status.state is not AmplifierState.OPERATION_ENABLED:
+            raise CommandRefused(
+                f"{self._name}: state must be OPERATION_ENABLED, got {status.state.name} with "
+                f"fault {status.fault.name}; once the cause is gone, clear and arm again"
+            )
+        when = Interval(sent_at, now)
+        problem = (
+            self._watchdog_problem(status, when, feeds=feeds)
+            or next(self._other_problems(status), None)
+            or self._achieved_problem
+        )
+        level_problem = (
+            None if self._has_own_time else next(self._level_problems(status, when), None)
+        )
+        if problem or level_problem:
+            self._contradictions += 1
+            self._is_of_level = problem is None
+        elif self._shows_levels(when) or not self._is_of_level:
+            self._contradictions = 0
+        problem = problem or level_problem
+        self._raise_if_fault(self._contradictions, problem)
+
+    def check_running(self, status: Status, *, sent_at: float, last_fed_at: float) -> None:
+        """Compare the watchdog with the time since it may have been fed last, if it is long enough.
+
+        status: of a request that does not feed it.
+        """
+        if self._watchdog is None or self._fed is None or self._has_own_time:
+            return
+        elapsed = sent_at - max(last_fed_at, self._fed.latest)
+        if elapsed <= 2 * _WATCHDOG_ERROR:
+            return
+        highest = self._watchdog - elapsed + _WATCHDOG_ERROR
+        is_standing = status.watchdog_left > highest
+        self._standing_watchdog = self._standing_watchdog + 1 if is_standing else 0
+        self._raise_if_fault(
+            self._standing_watchdog,
+            f"watchdog left must be at most {highest:.3f} s {elapsed:.3f} s after it was fed, got "
+            f"{status.watchdog_left:.3f} s",
+        )
+
+    def _watchdog_problem(self, status: Status, when: Interval, *, feeds: bool) -> str | None:
+        """Describe an impossible time that is left; notes that the watchdog was fed."""
+        if self._watchdog is None or self._fed is None or self._has_own_time:
+            return None
+        full = self._watchdog + _WATCHDOG_ERROR
+        lowest = self._watchdog - (when.latest - self._fed.earliest) - _WATCHDOG_ERROR
+        highest = full
+        if feeds:
+            just_fed = self._watchdog - (when.latest - when.earliest) - _WATCHDOG_ERROR
+            if just_fed <= status.watchdog_left <= full:
+                self._fed = when
+                return None
+            # On CAN the frame that feeds it may be lost, and it runs on.
+            highest = full - (when.earliest - self._fed.latest)
+        if lowest <= status.watchdog_left <= highest:
+            return None
+        return (
+            f"watchdog left must be {max(0.0, lowest):.3f} to {full:.3f} s, got "
+            f"{status.watchdog_left:.3f} s"
+        )
+
+    def _unknown_states(self, when: Interval) -> tuple[ChannelState, ...]:
+        """Return states of channels that may play any level until a set replaces it."""
+        return tuple(
+            ChannelState(
+                rest=self._capabilities.level_max,
+                step=math.inf,
+                fade=math.inf,
+                frequencies=frozenset(frequencies),
+                commit=when,
+            )
+            for frequencies in self._frequencies
+        )
+
+    def _achieved_problems(self, asked: SafeCommandSet, achieved: Achieved) -> Iterator[str]:
+        if achieved.token != asked.token:
+            yield f"token achieved must be {asked.token}, got {achieved.token}"
+        wanted = {command.channel: command for command in asked.commands}
+        played = {command.channel: command for command in achieved.commands}
+        can = self._capabilities
+        for channel in sorted(wanted.keys() | played.keys()):
+            silent = DriveCommand(channel, 0.0, 0.0)
+            one, other = wanted.get(channel, silent), played.get(channel, silent)
+            compared = [("level", one.level, other.level, _tolerance(_Q.level, can.level_step))]
+            if one.level > 0:
+                phase = math.remainder(other.phase - one.phase, 360.0)
+                compared += [
+                    (
+                        "frequency",
+                        one.frequency,
+                        other.frequency,
+                        _tolerance(_Q.frequency, can.frequency_step),
+                    ),
+                    (
+                        "phase",
+                        one.phase,
+                        one.phase + phase,
+                        _tolerance(_Q.phase, can.phase_step),
+                    ),
+                    ("onset", one.onset, other.onset, 0.0),
+                    ("ending", one.ending, other.ending, 0.0),
+                ]
+            for name, expected, got, tolerance in compared:
+                if not abs(got - expected) <= tolerance + _ROUNDING:
+                    yield f"{name} achieved on channel {channel} must be {expected:g}, got {got:g}"
+
+    def _other_problems(self, status: Status) -> Iterator[str]:
+        if not status.high_voltage:
+            yield "high voltage must be on, got off"
+        if self._tokens and status.token not in self._tokens:
+            possible = " or ".join(map(str, sorted(self._tokens)))
+            yield f"playing set must be {possible}, got {status.token}"
+
+    def _level_problems(self, status: Status, when: Interval) -> Iterator[str]:
+        step = max(_Q.level.step, self._capabilities.level_step)
+        tolerance = 2 * step
+        for channel, (state, level) in enumerate(zip(self._states, status.levels, strict=False)):
+            low, high = state.low(when), state.high(when)
+            # Tones that fade may cancel the one that lasts, but not to zero twice in a row.
+            if level == 0 and state.own_low(when) > 0.75 * step:
+                yield f"level of channel {channel} must be above 0, got 0"
+            low -= tolerance + min(MEASURING_ERROR, _WEAK * low)
+            high += tolerance + min(MEASURING_ERROR, _WEAK * high)
+            if not low <= level <= high:
+                expected = f"{max(0.0, low):.4g} to {high:.4g}"
+                yield f"level of channel {channel} must be {expected}, got {level:g}"
+
+    def _shows_levels(self, when: Interval) -> bool:
+        """Whether every channel that plays must report a level."""
+        return bool(self._states) and all(
+            not state.is_lasting(when) or state.own_low(when) > 0 for state in self._states
+        )
+
+    def _raise_if_fault(self, contradictions: int, problem: str | None) -> None:
+        if contradictions >= MAX_CONTRADICTIONS:
+            raise CommandRefused(
+                f"{self._name} contradicts what was asked: {problem}; look for a derated or "
+                "broken channel, an exchanged cable or firmware, then clear and arm again"
+            )
+
+
+def _long_rest(state: ChannelState, lasts: float) -> ChannelState:
+    """Return a state in which what played before may last for a time [s], as along its ending."""
+    if lasts <= state.fade:
+        return state
+    return replace(state, fade=lasts, keeps_rest=True)
+
+
+def _tolerance(quantity: Quantity, step: float) -> float:
+    """Return the rounding error of an amplifier with a step, and of the wire."""
+    return (step + quantity.step) / 2

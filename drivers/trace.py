@@ -1,0 +1,151 @@
+"""Trace of everything on the wires, for `--trace FILE`.
+
+Layers log to children of one logger, each line with its time:
+
+    trace.wire      every frame, both directions: in hexadecimal, with its meaning
+    trace.request   every request of an amplifier with its reply, its error and its duration
+
+A line is formatted and written by a thread of its own. Logging never waits for it: records beyond
+MAX_PENDING are dropped, and their number is written as soon as there is room.
+"""
+
+import logging
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import TextIO
+
+from drivers.errors import CommandError
+
+MAX_PENDING = 20_000
+"""Records kept for the thread: more than a second of the fastest wire."""
+
+_POLL_INTERVAL = 0.05  # s
+_root = logging.getLogger("trace")
+_root.propagate = False
+_root.setLevel(logging.CRITICAL)
+_wire = logging.getLogger("trace.wire")
+_request = logging.getLogger("trace.request")
+
+
+class Direction(StrEnum):
+    """Direction of a frame."""
+
+    OUT = ">"
+    IN = "<"
+
+
+def is_active() -> bool:
+    """Whether anything is traced; ask it where the bytes of a frame must be made first."""
+    return _wire.isEnabledFor(logging.DEBUG)
+
+
+def frame(direction: Direction, data: bytes, where: str, decode: Callable[[], str]) -> None:
+    """Trace one frame of a wire, named by its URL or port.
+
+    decode: returns the meaning; called later in the writing thread, so its arguments must not
+    change. Costs a comparison while nothing is traced.
+    """
+    if is_active():
+        _wire.debug("%s %s %s  %s", where, direction, _Lazy(lambda: data.hex(" ")), _Lazy(decode))
+
+
+def request(asked: object, outcome: object, duration: float) -> None:
+    """Trace a request with its reply or error, and its duration [s]."""
+    if _request.isEnabledFor(logging.DEBUG):
+        _request.debug("%r -> %r in %.1f ms", asked, outcome, duration * 1e3)
+
+
+@contextmanager
+def tracing(path: Path) -> Iterator[None]:
+    """Append all traces to a file while the context lasts; raises CommandError."""
+    try:
+        # Non-blocking, so that a FIFO is refused instead of waited for.
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK, 0o600)
+        file = os.fdopen(descriptor, "a", encoding="utf-8")
+    except OSError as error:
+        raise CommandError(f"trace file {path} cannot be written: {error.strerror}") from error
+    if not path.is_file():
+        file.close()
+        raise CommandError(f"trace file must be a regular file, got {path}")
+    writer = TraceWriter(file)
+    _root.addHandler(writer)
+    _root.setLevel(logging.DEBUG)
+    try:
+        yield
+    finally:
+        _root.removeHandler(writer)
+        if not _root.handlers:
+            _root.setLevel(logging.CRITICAL)
+        writer.close()
+
+
+class TraceWriter(logging.Handler):
+    """Writes records to a file in a thread; `dropped` counts those for which there was no room."""
+
+    def __init__(self, file: TextIO) -> None:
+        super().__init__()
+        self.dropped = 0
+        self._file = file
+        self._pending: deque[logging.LogRecord] = deque()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="trace", daemon=True)
+        self._thread.start()
+
+    def handle(self, record: logging.LogRecord) -> bool:
+        """Queue a record without a lock."""
+        if len(self._pending) < MAX_PENDING:
+            self._pending.append(record)
+        else:
+            self.dropped += 1
+        return True
+
+    def close(self) -> None:
+        """Write what is pending and close the file; waits for a slow one for at most a second."""
+        self._ending.set()
+        self._thread.join(1.0)
+        super().close()
+
+    def _run(self) -> None:
+        reported = 0
+        is_last = False
+        while not is_last:
+            is_last = self._ending.wait(_POLL_INTERVAL)
+            try:
+                while self._pending:
+                    self._file.write(_line(self._pending.popleft()))
+                if self.dropped > reported:
+                    self._file.write(f"trace: {self.dropped - reported} records dropped\n")
+                    reported = self.dropped
+                self._file.flush()
+            except OSError as error:
+                self.dropped += len(self._pending)
+                self._pending.clear()
+                logging.getLogger(__name__).warning("trace: not written: %s", error)
+        with suppress(OSError):  # of a disk that is still full
+            self._file.close()
+
+
+class _Lazy:
+    """Text that is made when it is written."""
+
+    __slots__ = ("_make",)
+
+    def __init__(self, make: Callable[[], str]) -> None:
+        self._make = make
+
+    def __str__(self) -> str:
+        try:
+            return self._make()
+        except Exception as error:  # a damaged frame must not end the trace
+            return f"not decoded: {error}"
+
+
+def _line(record: logging.LogRecord) -> str:
+    moment = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="microseconds")
+    return f"{moment} {record.name.rpartition('.')[2]} {record.getMessage()}\n"

@@ -1,0 +1,70 @@
+"""`era amp stop` over every wire, at an amplifier that another host left playing."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from drivers import amp_actions
+from drivers.amplifier import Amplifier
+from drivers.protocol.messages import AmplifierState
+from drivers.registry import open_backend
+from drivers.trace import tracing
+from memory_machine import live_in_memory
+from model.rig.rig import Rig
+from sim.far_ends.wires import Wire
+from virtual_loop import run_virtual
+from wires import far_side, tones
+
+KINDS = ["serial", "modbus-rtu", "modbus-tcp", "socketcand", "slcan"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_stop_is_sent_before_anything_is_read(kind: str, coarse_rig: Rig, tmp_path: Path) -> None:
+    """Silent while it plays; identity, capabilities and status are read afterwards."""
+
+    async def run() -> None:
+        live_in_memory()
+        async with far_side(Wire(kind), coarse_rig) as far:
+            earlier = Amplifier(open_backend(far.url))
+            await earlier.open()
+            await earlier.arm(2.0)
+            await earlier.apply(tones(earlier, 0.5))
+            await earlier.close()
+            with tracing(tmp_path / "trace"):
+                result = await amp_actions.stop(far.url)
+            assert (result["silence"], result["cause"]) == ("confirmed_silent", "")
+            assert result["state"] == "QUICK_STOP_ACTIVE"
+            assert far.amplifier.state is AmplifierState.QUICK_STOP_ACTIVE
+            assert not any(far.amplifier.status(far.bench.time).levels)
+
+    run_virtual(run())
+    requests = re.findall(r" request (\w+)\(.*\) -> ", (tmp_path / "trace").read_text("utf-8"))
+    assert requests[0] == "Stop"
+    assert set(requests[1:]) >= {"Hello", "GetCaps", "GetStatus"}
+
+
+@pytest.mark.parametrize("take_over", [True, False])
+@pytest.mark.parametrize("kind", KINDS)
+def test_opening_disarms_unless_the_caller_only_looks(
+    kind: str, take_over: bool, coarse_rig: Rig
+) -> None:
+    """An earlier host has left it playing."""
+
+    async def run() -> None:
+        live_in_memory()
+        async with far_side(Wire(kind), coarse_rig) as far:
+            earlier = Amplifier(open_backend(far.url))
+            await earlier.open()
+            await earlier.arm(2.0)
+            await earlier.apply(tones(earlier, 0.5))
+            await earlier.close()
+            amplifier = Amplifier(open_backend(far.url))
+            await amplifier.open(take_over=take_over)
+            status = await amplifier.status()
+            disarmed = AmplifierState.SWITCH_ON_DISABLED
+            assert status.state is (disarmed if take_over else AmplifierState.OPERATION_ENABLED)
+            assert any(status.levels) is not take_over
+            await amplifier.close()
+
+    run_virtual(run())

@@ -1,0 +1,205 @@
+"""`era` and `python -P -m sim`, forked off one process that has loaded all that they need.
+
+Loading takes most of the time of a short command, and the suite starts about two hundred. Whoever
+starts one of them by `subprocess` or asyncio gets a process as usual: with its pipes, environment
+and folder, a child of the caller, with signals and an exit status of its own. Only a `preexec_fn`
+needs a start of its own, and gets one.
+"""
+
+import ctypes
+import gc
+import inspect
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from io import TextIOWrapper
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+ERA = str(Path(sys.executable).with_name("era"))
+SIM = [sys.executable, "-P", "-m", "sim"]
+_LOADED = (
+    "controller.daemon.run",
+    "controller.gateway.serving",
+    "drivers.amp_actions",
+    "model.commands.progress",
+    "model.figures.table_pictures",
+    "model.fem.modal",
+    "model.studies.run",
+    "model.table.build",
+    "scipy.ndimage",
+    "sim.backend",
+    "sim.process.simulation",
+    "typer._adapters",
+)
+"""Modules that commands load when they run."""
+_PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
+_SIZE = 8  # bytes of the length of a request
+
+_execute_child: Any = subprocess.Popen._execute_child
+
+
+class Loaded:
+    """The process that has loaded everything; started when it is first needed."""
+
+    def __init__(self) -> None:
+        self._socket: socket.socket | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._turn = threading.Lock()
+
+    def start(
+        self, arguments: Sequence[str], folder: str, environment: Mapping[str, str],
+        files: Sequence[int], *, new_session: bool,
+    ) -> int:  # fmt: skip
+        """Fork a child off it, with these three standard files; return its process id."""
+        connection = self._connected()
+        request = json.dumps([arguments, folder, dict(environment), new_session]).encode()
+        with self._turn:
+            # The child is a grandchild of that process: an orphan, and so a child of this one.
+            _adopt_orphans(True)
+            try:
+                socket.send_fds(connection, [len(request).to_bytes(_SIZE, "big")], files)
+                connection.sendall(request)
+                return int.from_bytes(connection.recv(_SIZE), "big")
+            finally:
+                _adopt_orphans(False)
+
+    def close(self) -> None:
+        """End it; those that it has started go on."""
+        if self._socket is not None and self._process is not None:
+            self._socket.close()
+            self._process.wait()
+
+    def _connected(self) -> socket.socket:
+        if self._socket is None:
+            self._socket, theirs = socket.socketpair()
+            with theirs:
+                command = [sys.executable, "-P", __file__]
+                self._process = subprocess.Popen(command, stdin=theirs, start_new_session=True)
+        return self._socket
+
+
+def install() -> Loaded:
+    """Fork `era` and `sim` off a loaded process from now on."""
+    loaded = Loaded()
+    signature = inspect.signature(_execute_child)
+
+    def execute_child(popen: Any, *arguments: Any) -> None:
+        named = signature.bind(popen, *arguments).arguments
+        words = named["args"]
+        if named["preexec_fn"] or not _is_known(words):
+            _execute_child(popen, *arguments)
+            return
+        ends = (named["p2cread"], named["c2pwrite"], named["errwrite"])
+        popen.pid = loaded.start(
+            [os.fsdecode(word) for word in words],
+            os.fsdecode(named["cwd"] or Path.cwd()),
+            os.environ if named["env"] is None else named["env"],
+            [number if end == -1 else end for number, end in enumerate(ends)],
+            new_session=named["start_new_session"],
+        )
+        popen._child_created = True
+        popen._close_pipe_fds(*(named[name] for name in _PIPES))
+
+    subprocess.Popen._execute_child = execute_child
+    return loaded
+
+
+_PIPES = ("p2cread", "p2cwrite", "c2pread", "c2pwrite", "errread", "errwrite")
+
+
+def _is_known(words: Any) -> bool:
+    if not isinstance(words, list | tuple):
+        return False
+    return str(words[0]) == ERA or [str(word) for word in words[: len(SIM)]] == SIM
+
+
+def _adopt_orphans(adopts: bool) -> None:
+    ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, int(adopts), 0, 0, 0)
+
+
+def _serve(connection: socket.socket) -> list[str]:
+    """Fork children until the connection ends; return in a child, with its words."""
+    while True:
+        size, files, _, _ = socket.recv_fds(connection, _SIZE, 3)
+        if not size:
+            os._exit(0)
+        request = b""
+        while len(request) < int.from_bytes(size, "big"):
+            request += connection.recv(1 << 20)
+        reading, writing = os.pipe()
+        if not (between := os.fork()):
+            if not (child := os.fork()):
+                os.close(reading)
+                os.close(writing)
+                words, *where = json.loads(request)
+                connection.detach()  # its number is that of a child's standard input
+                _settle(files, *where)
+                return cast(list[str], words)
+            os.write(writing, child.to_bytes(_SIZE, "big"))
+            os._exit(0)
+        os.waitpid(between, 0)
+        connection.sendall(os.read(reading, _SIZE))
+        for file in (reading, writing, *files):
+            os.close(file)
+
+
+def _settle(files: list[int], folder: str, environment: dict[str, str], new_session: bool) -> None:
+    """Take the place, the environment and the standard files of a child."""
+    if new_session:
+        os.setsid()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number, file in enumerate(files):
+        os.dup2(file, number)
+    os.closerange(3, max(files) + 1)
+    os.chdir(folder)
+    os.environ.clear()
+    os.environ.update(environment)
+    places = environment.get("PYTHONPATH", "").split(":")
+    sys.path[:0] = [place for place in places if place and place not in sys.path]
+    through = bool(environment.get("PYTHONUNBUFFERED"))
+    sys.stdin = open(0, encoding="utf-8", closefd=False)  # noqa: SIM115
+    for name, number in (("stdout", 1), ("stderr", 2)):
+        file = cast(BinaryIO, open(number, "wb", closefd=False))  # noqa: SIM115
+        buffered = not (through or number == 2 or file.isatty())
+        setattr(sys, name, TextIOWrapper(file, "utf-8", write_through=through))
+        getattr(sys, name).reconfigure(line_buffering=not buffered)
+
+
+def _load() -> None:
+    """Load what any of them needs."""
+    from importlib.metadata import entry_points
+
+    from controller.cli.main import load_commands
+
+    load_commands(entry_points(group="era_haptics.commands"), debug=False)
+    for name in _LOADED:
+        import_module(name)
+    gc.collect()
+    gc.freeze()
+
+
+def main() -> int:
+    """Serve; in a child, run its command."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _load()
+    words = _serve(socket.socket(fileno=0))
+    if words[0] == ERA:
+        sys.argv = words
+        from controller.cli.main import main as era
+
+        return era()
+    sys.argv = [words[0], *words[len(SIM) :]]
+    from sim.__main__ import main as sim
+
+    return sim()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -10,27 +10,25 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint style format docs fuzz kill-test fault-test soak bench bench-latency \
+.PHONY: demo test lint format docs fuzz kill-test fault-test stop-test soak bench bench-latency \
 	bench-localization bench-plant bench-wires dist smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
 demo: .venv/installed
 	$(BIN)/era demo
 
-# Types are checked beside the tests; those that measure time run afterwards, with nothing beside.
-test: style
-	$(BIN)/mypy & types=$$!; \
-	$(BIN)/pytest -m 'not alone' --numprocesses auto --dist loadfile --no-loadscope-reorder; \
-	tests=$$?; wait $$types && exit $$tests
+# What needs the processors, a worker each; what waits in real time, more of them than processors;
+# what loads the processors itself.
+test: .venv/installed-test
+	$(BIN)/pytest -m 'not real_time and not alone' --numprocesses auto --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest -m 'real_time and not alone' --numprocesses 3 --dist loadfile --no-loadscope-reorder
 	$(BIN)/pytest -m alone
 
-lint: style
-	$(BIN)/mypy
-
-style: .venv/installed-test
+lint: .venv/installed-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
+	$(BIN)/mypy
 
 # A million damaged frames for every codec; `make test` takes a few thousand.
 fuzz: .venv/installed-test
@@ -45,7 +43,12 @@ kill-test: .venv/installed-test
 fault-test: .venv/installed-test
 	$(BIN)/pytest -q -s tests/integration/test_daemon_faults_*.py
 
-# The whole chain in virtual time, thousands of seeds; `make test` takes 160 short ones.
+# Ten thousand stops while frames are lost, late and doubled, and two thousand with an exception
+# on their way; `make test` takes some hundreds. Others: make stop-test STOPS='--stops 100000'
+stop-test: .venv/installed-test
+	$(BIN)/python tests/support/stops.py $(STOPS)
+
+# The whole chain in virtual time, thousands of seeds; `make test` takes twelve short ones.
 # Others: make soak SOAK='--hours 10 --wire serial', or one again: make soak SOAK='--seed 17'
 soak: .venv/installed-test
 	$(BIN)/python tests/support/soak.py $(SOAK)
@@ -74,6 +77,7 @@ bench-wires: .venv/installed-test
 # The pages as a site, with warnings as errors; nothing in it comes from elsewhere.
 docs: .venv/installed-docs
 	$(BIN)/sphinx-build -b html -W --keep-going -q docs docs/_build/html
+	! grep -rlE --include='*.html' '<(script|link|img|iframe)[^>]+(src|href)="(https?:)?//' docs/_build/html
 	@echo "Next: open docs/_build/html/index.html"
 
 # The same bytes for the same sources, wherever and whenever; from a clean checkout.

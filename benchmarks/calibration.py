@@ -6,10 +6,10 @@ values, and contrast of the calibrated rig's patterns on the true plate.
 
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
+from benchmarks.setting import RIG, random_contacts
 from examples.make_measured import FREQUENCIES, SENSOR, true_rig
 from model.calibration.calibrate import calibrate
 from model.calibration.calibration_result import Calibration
@@ -23,11 +23,9 @@ from model.table.table import LocalizationTable
 from sim.sensors.accelerometer import scanning_grid
 from sim.sensors.stepped_sine import record_responses
 
-RIG = Path(__file__).parent.parent / "examples" / "paper_plate.yaml"
 GRIDS = ((2, 2), (3, 2), (4, 3), (6, 4))
 NOISE = (1.0, 10.0, 100.0)  # times that of the example's sensors
 CONTACTS = 30
-APART = 0.05  # m
 
 
 def measure(rig: Rig, truth: Rig, *, grid: tuple[int, int], noise: float) -> Calibration:
@@ -63,15 +61,6 @@ def reached(
     return float(contrast_db([peak(target)], np.concatenate([peak(place) for place in quiet])))
 
 
-def contacts(rng: np.random.Generator, count: int, rig: Rig) -> np.ndarray:
-    """Places [m] at least 5 cm apart, (count, 2)."""
-    while True:
-        places = rng.uniform(0.02, [rig.plate.length - 0.02, rig.plate.width - 0.02], (count, 2))
-        gaps = np.linalg.norm(places[:, None] - places[None], axis=-1)
-        if gaps[np.triu_indices(count, 1)].min() > APART:
-            return places
-
-
 def show_contrast(rig: Rig, truth: Rig, found: Calibration) -> None:
     tables = [build_table(each) for each in (truth, found.rig, rig)]
     print(f"contrast on the true plate, dB, median of {CONTACTS} random contact sets")
@@ -79,7 +68,10 @@ def show_contrast(rig: Rig, truth: Rig, found: Calibration) -> None:
     for drive_mode in ("switched", "signed", "phased"):
         for quiet in (1, 2):
             rng = np.random.default_rng(1)
-            sets = [contacts(rng, 1 + quiet, rig) for _ in range(CONTACTS)]
+            sets = [
+                random_contacts(rng, 1 + quiet, (rig.plate.length, rig.plate.width), margin=0.02)
+                for _ in range(CONTACTS)
+            ]
             rows = [
                 [reached(tables[0], each, s, drive_mode=drive_mode) for each in tables]
                 for s in sets

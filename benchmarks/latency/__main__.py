@@ -3,7 +3,7 @@
     python -m benchmarks.latency [--seconds 100] [--seed 1] [--report | --check WIRE]
 
 The daemon, the amplifier, the panel and programs that load the machine are separate processes
-(`benchmarks.latency.run`). It takes nine minutes on an otherwise idle machine; a trial run with
+(`benchmarks.latency.run`). It takes eleven minutes on an otherwise idle machine; a trial run with
 --seconds 2 takes one. A disturbed case is repeated once; if that fails, too, the others follow.
 
 --report: write docs/measured/latency.md and its picture. --check: measure taps at 100 Hz only, over
@@ -33,7 +33,14 @@ def main() -> None:
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"  # before numpy loads: with two threads the daemon would compete
 
-    from benchmarks.latency.report import as_json, cases, check_case, lines, write_report
+    from benchmarks.latency.report import (
+        as_json,
+        cases,
+        check_case,
+        flooded_lines,
+        lines,
+        write_report,
+    )
     from benchmarks.latency.run import Failed, Found, attempt, measure
     from model.rig.file import example_rig_path, load_rig
     from model.table.file import save_table
@@ -55,6 +62,7 @@ def main() -> None:
         for case in cases(options.seconds, options.seed):
             found.append(attempt(case, partial(measure, case, file, table)))
             print(lines(found[-1:], first=len(found) == 1), flush=True)
+        print(flooded_lines(found))
         minutes = (time.monotonic() - begun) / 60
         print(f"{minutes:.1f} minutes")
     if options.report:

@@ -1,17 +1,21 @@
-"""Programs of the latency benchmark: a panel, a client that floods, and CPU load.
+"""Programs of the latency benchmark: a panel, clients that flood, and CPU load.
 
     python -m benchmarks.latency.clients panel RIG PORT KIND COUNT RATE SEED FILE
     python -m benchmarks.latency.clients flood SOCKET RIG RATE
+    python -m benchmarks.latency.clients flooder KIND SOCKET
+    python -m benchmarks.latency.clients stopper SOCKET COUNT FILE
     python -m benchmarks.latency.clients work
 
 The panel writes the time of each datagram, on CLOCK_MONOTONIC [ns]. Late ones are sent at once, to
-keep the rate.
+keep the rate. The stopper writes the time of each `stop` from request to response [s].
 """
 
+import contextlib
 import json
 import socket
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
@@ -55,6 +59,46 @@ def flood(path: str, rig: str, rate: str) -> None:
         _wait_until(begin + int(sent * 1e9 / float(rate)))
 
 
+def flooder(kind: str, path: str) -> None:
+    """Send as much of one kind as is taken, over a new connection when it is closed."""
+    data = FLOODS[kind]
+    silent: deque[socket.socket] = deque()
+    print("flooding", flush=True)
+    while True:
+        line = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        line.settimeout(0.1)
+        with contextlib.suppress(OSError):
+            line.connect(path)
+            while data:
+                line.sendall(data)
+                with contextlib.suppress(BlockingIOError):
+                    while line.recv(1 << 16, socket.MSG_DONTWAIT):
+                        pass
+        silent.append(line)
+        while len(silent) > (0 if data else MAX_SILENT):
+            silent.popleft().close()
+
+
+def stopper(path: str, count: str, file: str) -> None:
+    """Stop and clear again and again, at the priority of a device."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as line, line.makefile("rb") as answers:
+        line.connect(path)
+
+        def call(method: str) -> float:
+            begin = time.perf_counter()
+            line.sendall(_request(method, "{}"))
+            response = json.loads(answers.readline())
+            if "error" in response:
+                sys.exit(f"{method}: {response['error']}")
+            return time.perf_counter() - begin
+
+        times = []
+        for _ in range(int(count)):
+            times.append(call("stop"))
+            call("clear")
+    np.save(file, times)
+
+
 def work() -> None:
     while True:
         sum(range(10_000))
@@ -66,6 +110,22 @@ def _touch(x: float, y: float) -> bytes:
     return json.dumps({"jsonrpc": "2.0", "method": "touch", "params": params}).encode() + b"\n"
 
 
+def _request(method: str, params: str) -> bytes:
+    return f'{{"jsonrpc":"2.0","id":1,"method":"{method}","params":{params}}}\n'.encode()
+
+
+MAX_SILENT = 100  # connections of one flooder
+FLOODS = {
+    "touches": _request("touch", '{"source":"flood","touches":[]}') * 100,
+    "requests": _request("status", "{}") * 100,
+    "keys": _request("status", "{" + ",".join(f'"{n:05d}":1' for n in range(6000)) + "}"),
+    "newlines": b"\n" * (1 << 18),
+    "stops": _request("renew", '{"lease":"stop"}') * 100,
+    "connections": b"",
+}
+"""What a flooder sends, by kind. Stops would disarm, so they are lines that look like one."""
+
+
 def _wait_until(moment: int) -> None:
     """Sleep until a time [ns]."""
     left = moment - time.monotonic_ns()
@@ -74,5 +134,11 @@ def _wait_until(moment: int) -> None:
 
 
 if __name__ == "__main__":
-    programs: dict[str, Callable[..., None]] = {"panel": panel, "flood": flood, "work": work}
+    programs: dict[str, Callable[..., None]] = {
+        "panel": panel,
+        "flood": flood,
+        "flooder": flooder,
+        "stopper": stopper,
+        "work": work,
+    }
     programs[sys.argv[1]](*sys.argv[2:])

@@ -65,7 +65,8 @@ class Flooded(asyncio.Protocol):
         """Parse them."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
-            json.loads(line)
+            with contextlib.suppress(ValueError):
+                json.loads(line)
 
 
 def _opened(url: SerialUrl) -> serial.Serial | socket.socket:

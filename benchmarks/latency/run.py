@@ -32,19 +32,23 @@ from sim.amplifier.amplifier import capabilities
 FLOOD_RATE = 10_000  # Hz
 WORKERS = 2  # programs at work in the loaded case, one for each core
 ATTEMPTS = 2  # per case
+FLOODERS = 4  # of one kind
+STOPS = 300  # measured per case with flooders
 _SETTLE = 1.0  # s
 
 
 @dataclass(frozen=True)
 class Case:
     """A case: touches; whether the machine is loaded; touch_wait [ms] of the daemon, None for the
-    baseline; wire: `tcp` or `pty`."""
+    baseline; wire: `tcp` or `pty`; flooders: kind of those that run meanwhile, of
+    `benchmarks.latency.clients.FLOODS`, after which stops are measured."""
 
     name: str
     work: Work
     is_loaded: bool
     touch_wait: float | None
     wire: str = "tcp"
+    flooders: str | None = None
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,7 @@ class Found:
     computed: float
     others: float
     is_urgent: bool
+    stops: np.ndarray = field(default_factory=lambda: np.zeros(0))  # s; from call to result
 
 
 @dataclass(frozen=True)
@@ -131,6 +136,12 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
         )
         panel.line()
         programs = [far, tested, panel]
+        if case.flooders is not None:
+            for _ in range(FLOODERS):
+                arguments = (*module("clients"), "flooder", case.flooders, path)
+                flooder = Program(all_, *arguments)
+                flooder.line()
+                programs.append(flooder)
         if case.is_loaded:
             flood = Program(all_, *module("clients"), "flood", path, rig_file, FLOOD_RATE)
             flood.line()
@@ -152,6 +163,13 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
                     f"{status.state}: {status.cause}"
                 )
             own = status.latency_ms
+        stops = np.zeros(0)
+        if daemon is not None and case.flooders is not None:
+            daemon.stop()  # ends its lease
+            daemon.clear()
+            command = (*module("clients"), "stopper", path, STOPS, folder / "stops.npy")
+            Program(all_, *command, rank=Rank.DEVICE).wait(TIMEOUT)
+            stops = np.load(folder / "stops.npy")
         panel.tell("done")
         panel.wait(TIMEOUT)
         far.finish()
@@ -163,7 +181,7 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
         ]
     matched = _matched(case, commands, sent, rig, table)
     is_urgent = all(program.is_urgent for program in programs)
-    return Found(case, matched, own, len(sent), computed, busy, is_urgent)
+    return Found(case, matched, own, len(sent), computed, busy, is_urgent, stops)
 
 
 def _matched(
@@ -202,7 +220,7 @@ LAST = 0.03  # s; fingers expire after the last touch, and silence has no touch
 
 def _capabilities(rig: Rig, touch_wait: float) -> PlaybackCapabilities:
     opened = {name: _Open(capabilities(4)) for name in rig.amplifiers}
-    return playback_capabilities(rig, opened, envelope_time=touch_wait * 1e-3)
+    return playback_capabilities(rig, opened, max_loading_time=touch_wait * 1e-3)
 
 
 def _daemon_file(folder: Path, url: str, table: Path, port: int, touch_wait: float) -> Path:

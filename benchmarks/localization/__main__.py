@@ -10,8 +10,9 @@ its draws counts. Printed: the median over the sets, in brackets the tenth perce
 """
 
 import argparse
-import os
 from functools import partial
+
+from benchmarks.setting import use_one_thread
 
 
 def main() -> None:
@@ -21,8 +22,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--report", action="store_true")
     options = parser.parse_args()
-    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[variable] = "1"  # before numpy loads
+    use_one_thread()
 
     from benchmarks.localization.contrast import (
         contrast_section,

@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
+from benchmarks.setting import APART, RIG, random_contacts
 from model.arrays import Complex64Array, ComplexArray, FloatArray, IntArray
-from model.drive_modes.fields import DriveVector, Fields
+from model.drive_modes.fields import Fields, Weights
 from model.finger.contrast import contrast_db
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import STRONG_DB_SL
@@ -17,9 +17,7 @@ from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.vibration.excitation import random_gains
 
-RIG = Path(__file__).parents[2] / "examples" / "paper_plate.yaml"
 FREQUENCIES = np.linspace(40.0, 500.0, 27)
-APART = 0.05  # m
 LEAST = 1.0  # m/s² at the target
 
 
@@ -34,13 +32,8 @@ def contact_sets(
 ) -> FloatArray:
     """Sets of fingers [m] anywhere on the plate, (count, fingers, 2)."""
     plate = paper_table().plate
-    found: list[FloatArray] = []
-    while len(found) < count:
-        places = rng.uniform(0, [plate.length, plate.width], (fingers, 2))
-        gaps = np.linalg.norm(places[:, None] - places, axis=-1)
-        if gaps[np.triu_indices(fingers, 1)].min(initial=np.inf) >= apart:
-            found.append(places)
-    return np.array(found)
+    size = (plate.length, plate.width)
+    return np.array([random_contacts(rng, fingers, size, apart=apart) for _ in range(count)])
 
 
 def question_of(
@@ -99,7 +92,7 @@ class Errors:
         return contrast_db([peak(target) for target in fields.targets], peak(fields.quiet))
 
 
-def weights_of(drive: DriveVector, fields: Fields) -> ComplexArray:
+def weights_of(drive: Weights, fields: Fields) -> ComplexArray:
     """A drive as weights (f, eras)."""
     weights = np.zeros((fields.frequency_count, fields.era_count), dtype=complex)
     for frequency, weight in drive.tones():

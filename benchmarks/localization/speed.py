@@ -14,12 +14,12 @@ import numpy as np
 
 from benchmarks.localization.cases import (
     FREQUENCIES,
-    RIG,
     contact_sets,
     paper_table,
     question_of,
 )
 from benchmarks.localization.contrast import Section
+from benchmarks.setting import RIG
 from model.arrays import FloatArray
 from model.drive_modes.exact_search import search_exactly
 from model.drive_modes.fields import Fields

@@ -10,13 +10,13 @@ the first line of the same run. Exits with 1 where that is not fifty times faste
 """
 
 import argparse
-import os
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
 
 from benchmarks.plant.problem import Case
+from benchmarks.setting import use_one_thread
 
 WANTED = 50.0  # times faster than real time
 
@@ -26,8 +26,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args()
-    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[variable] = "1"  # before numpy loads: one core
+    use_one_thread()
     from benchmarks.plant.cases import Rigs, contact_times
 
     rigs = Rigs()

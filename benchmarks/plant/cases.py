@@ -7,16 +7,17 @@ from functools import cache
 
 import numpy as np
 
-from benchmarks.plant.problem import FINGERS, RIG, Case
+from benchmarks.plant.problem import FINGERS, Case
+from benchmarks.setting import RIG
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.messages import Achieved, Apply, Arm
-from model.fem.assembly import era_positions
 from model.finger.fingertip import fingertip_points
 from model.finger.load import FingerLoad, finger_loads
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.file import load_rig
 from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
+from model.structure.point_load import footprints_of
 from model.transients.base_motion import fade
 from sim.bench.bench import Bench
 from sim.plant.plant import SAMPLE_RATE, Plant
@@ -61,7 +62,7 @@ class Rigs:
 
     def _reduce(self, eras: int, frequency_max: float) -> ReducedPlate:
         paper = self._paper
-        at = era_positions(self.eras(eras))
+        at = footprints_of(self.eras(eras))
         return reduce_plate(paper.plate, paper.mesh, at, frequency_max=frequency_max)
 
     def _plant(self, case: Case) -> Callable[[float], None]:

@@ -14,17 +14,16 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from benchmarks.setting import RIG
 from model.arrays import FloatArray
-from model.fem.assembly import era_positions
 from model.finger.load import finger_loads
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.file import load_rig
 from model.rig.rig import Rig
-from model.structure.point_load import PointLoad
+from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import fade
 from sim.plant.plant import Plant
 
-RIG = Path(__file__).parents[2] / "examples" / "paper_plate.yaml"
 FREQUENCY = 110.0  # Hz
 LANDS, GOES, ENDS = 0.40, 0.60, 0.80  # s
 FINGER, OTHER = (0.29, 0.10), (0.08, 0.15)
@@ -57,7 +56,7 @@ def vibrate(
     rig: Rig, points: FloatArray, contacts: Sequence[PointLoad]
 ) -> tuple[FloatArray, FloatArray]:
     """Times (n,) [s] and accelerations (n, p) [m/s²] from long before the touch to its end."""
-    reduced = reduce_plate(rig.plate, rig.mesh, era_positions(rig.eras))
+    reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras))
     plant = Plant(reduced, rig.eras)
     omega = 2 * np.pi * FREQUENCY
     stroke = 0.2 * rig.eras[1].stroke

@@ -1,9 +1,7 @@
 """Cases of the plant benchmark as values, so that numpy is loaded later."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
-RIG = Path(__file__).parents[2] / "examples" / "paper_plate.yaml"
 STEP = 0.01  # s
 FINGERS = ((0.10, 0.08), (0.25, 0.17), (0.05, 0.19), (0.18, 0.03), (0.28, 0.05),
            (0.15, 0.14), (0.21, 0.20), (0.03, 0.03), (0.12, 0.21), (0.20, 0.10))  # fmt: skip

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.plate.report import Result, write_report
+from benchmarks.setting import ONE_THREAD, RIG
 from model.arrays import ComplexArray
 
 ROOT = Path(__file__).parents[2]
@@ -32,8 +33,6 @@ LAYOUTS, WORKERS = 10_000, 2
 # times as many elements. Near a resonance a natural frequency 0.2 % off, which is what a thin-plate
 # theory or a mesh of that size has, already makes several percent.
 AGREEMENT = 0.1
-
-_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def main() -> None:
@@ -69,7 +68,7 @@ def main() -> None:
 def measure(program: str, task: str, mesh: tuple[int, int]) -> Result:
     """What one process of `benchmarks.plate.measure` prints."""
     command = [sys.executable, "-m", "benchmarks.plate.measure", program, task, *map(str, mesh)]
-    environment = os.environ | dict.fromkeys(_THREADS, "1")
+    environment = os.environ | ONE_THREAD
     done = subprocess.run(
         command, cwd=ROOT, env=environment, check=True, capture_output=True, text=True
     )
@@ -110,7 +109,7 @@ def study() -> Result:
     with tempfile.TemporaryDirectory() as folder:
         command = [
             str(Path(sys.executable).with_name("era")), "study", "placement",
-            str(ROOT / "examples" / "paper_plate.yaml"), "--layouts", str(LAYOUTS),
+            str(RIG), "--layouts", str(LAYOUTS),
             "--workers", str(WORKERS), "-o", folder, "--json",
         ]  # fmt: skip
         watch = (

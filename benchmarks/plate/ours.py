@@ -30,7 +30,7 @@ class Plate:
 
     def __init__(self, nx: int, ny: int) -> None:
         plate = PlateOf(LENGTH, WIDTH, THICKNESS, Material("aluminium", E, RHO, NU), LOSS_FACTOR)
-        mesh = Mesh(nx, ny, LENGTH, WIDTH) if nx else Mesh.auto(plate, frequency_max=500.0)
+        mesh = Mesh(nx, ny, LENGTH, WIDTH) if nx else Mesh.accurate(plate, frequency_max=500.0)
         self.free = solve_free_plate(plate, mesh)
         self.points = mesh.nodes
         self.dof = 3 * mesh.node_count

@@ -10,10 +10,10 @@ endings, where less is better, the ninetieth).
 """
 
 import argparse
-import os
 from pathlib import Path
 
-RIG = Path(__file__).parents[2] / "examples" / "paper_plate.yaml"
+from benchmarks.setting import RIG, use_one_thread
+
 LOW = 150.0  # Hz; below it an ending has fewer periods in which to stop the plate
 
 
@@ -24,8 +24,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
-    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[variable] = "1"  # before numpy loads: what is timed is one thread
+    use_one_thread()
     import numpy as np
 
     from benchmarks.transients.bench import Bench, print_columns

@@ -15,17 +15,20 @@ from benchmarks.transients.cases import (
     quantised,
     with_errors,
 )
-from model.fem.assembly import era_positions
+from model.finger.contrast import contrast_db
+from model.finger.fingertip import fingertip_points
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
-from model.structure.point_load import load_positions
+from model.structure.point_load import footprints_of
 from model.table.build import build_table
 from model.table.question import Question
 from model.transients.envelope import Bases, ramped_ending, ramped_onset, shaped
-from model.transients.measures import Transients
+from model.transients.hats import steady_states
+from model.transients.measures import ENDING_WINDOW, Transients
 from model.transients.shaping import Shaper
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation, random_gains
+from model.vibration.peak import base_amplitudes
 
 T = TypeVar("T")
 Columns = dict[str, list[float]]
@@ -119,12 +122,12 @@ class Bench:
                 bases = ramped_ending(excitation, eras, ramp=ramp)
                 left[name].append(self._left(excitation, bases))
                 contrast[name].append(self._end_contrast(case, excitation, bases))
-            brake = self.clock("ending", partial(self.shaper.ending, excitation))
-            quiet_brake = self.clock(
+            ending = self.clock("ending", partial(self.shaper.ending, excitation))
+            quiet_ending = self.clock(
                 f"ending, {len(case.quiet)} quiet",
                 partial(self.shaper.ending, excitation, targets=case.targets, quiet=case.quiet),
             )
-            for name, envelopes in (("40 ms brake", brake), ("the same, quietly", quiet_brake)):
+            for name, envelopes in (("shaped", ending), ("shaped, quietly", quiet_ending)):
                 bases = shaped(envelopes, eras)
                 left[name].append(self._left(excitation, bases))
                 contrast[name].append(self._end_contrast(case, excitation, bases))
@@ -147,9 +150,28 @@ class Bench:
         return left, contrast
 
     def _end_contrast(self, case: Case, excitation: Excitation, bases: Bases) -> float:
-        return self.transients.ending_contrast_db(
-            excitation, bases, targets=case.targets, quiet=case.quiet
+        """Steady peak at the weakest target to the loudest at a quiet finger from the end on [dB].
+
+        From time 0, when the bases begin the ending, until 100 ms after it.
+        """
+        discs = [fingertip_points(*each, self.rig.plate) for each in (*case.targets, *case.quiet)]
+        steady = np.zeros(sum(len(disc) for disc in discs))
+        frequencies, phasors = base_amplitudes(excitation, self.rig.eras)
+        for omega, amplitudes in zip(2 * np.pi * frequencies, phasors, strict=True):
+            weights = amplitudes / [era.stroke for era in self.rig.eras]
+            state = weights @ steady_states(self.plate, omega)
+            shapes = self.plate.reduced.at(np.concatenate(discs)) @ self.plate.displacement
+            steady += omega**2 * np.abs(shapes @ state)
+        ends = np.cumsum([len(disc) for disc in discs])
+        *targets, _ = np.split(steady, ends[: len(case.targets)])
+        last = max((term.end for base in bases for term in base), default=0.0)
+        quiet = self.transients.acceleration(
+            bases,
+            np.concatenate(discs[len(case.targets) :]),
+            duration=last + ENDING_WINDOW,
+            after=excitation,
         )
+        return float(contrast_db(targets, np.abs(quiet).max(axis=0)))
 
     def _left(self, excitation: Excitation, bases: Bases) -> float:
         return self.clock("level left", lambda: self.transients.residual_db(excitation, bases))
@@ -163,9 +185,9 @@ class Bench:
 
 def in_time(rig: Rig) -> PlateInTime:
     """The rig's plate on its ERAs in time."""
-    attachments = np.vstack([era_positions(rig.eras), load_positions(rig.loads)])
+    attachments = footprints_of(rig.eras, rig.masses)
     reduced = reduce_plate(rig.plate, rig.mesh, attachments, frequency_max=rig.limits.frequency_max)
-    return plate_in_time(reduced, rig.eras, loads=rig.loads)
+    return plate_in_time(reduced, rig.eras, loads=rig.masses)
 
 
 def print_columns(title: str, columns: Columns, *, worse: float) -> None:

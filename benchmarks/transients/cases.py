@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from benchmarks.setting import random_contacts
 from model.arrays import ComplexArray
 from model.finger.contrast import contrast_db
 from model.finger.fingertip import FINGERTIP_RADIUS, fingertip_points
@@ -15,7 +16,6 @@ from model.transients.envelope import Envelopes
 from model.vibration.excitation import GAIN_ERROR, PHASE_ERROR, Excitation, Tone
 
 FREQUENCIES = np.linspace(40, 500, 27)
-APART = 0.05
 WANTED = 1.0  # m/s²
 
 
@@ -58,16 +58,6 @@ class Case:
         }
 
 
-def random_contacts(rng: np.random.Generator, rig: Rig, count: int) -> list[tuple[float, float]]:
-    """Contacts at least 5 cm apart, whole fingertips on the plate."""
-    size = np.array([rig.plate.length, rig.plate.width])
-    while True:
-        points = rng.uniform(FINGERTIP_RADIUS, size - FINGERTIP_RADIUS, (count, 2))
-        distance = np.linalg.norm(points[:, None] - points, axis=-1)
-        if distance[np.triu_indices(count, 1)].min() > APART:
-            return [(float(x), float(y)) for x, y in points]
-
-
 def robust_weights(target: ComplexArray, quiet: ComplexArray) -> tuple[float, ComplexArray]:
     """Score and weights (eras,) at one frequency from fields (eras, p): R w = conj(h).
 
@@ -93,12 +83,14 @@ def robust_weights(target: ComplexArray, quiet: ComplexArray) -> tuple[float, Co
 def find_cases(rig: Rig, *, others: int, count: int, rng: np.random.Generator) -> list[list[Case]]:
     """For each contact set its patterns, the best first."""
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(FREQUENCIES[-1]))
+    size = (rig.plate.length, rig.plate.width)
     cases: list[list[Case]] = []
     while len(cases) < count:
-        contacts = random_contacts(rng, rig, 1 + others)
+        places = random_contacts(rng, 1 + others, size, margin=FINGERTIP_RADIUS)
+        contacts = [(float(x), float(y)) for x, y in places]
         fields = [
             free.acceleration(
-                rig.eras, FREQUENCIES, fingertip_points(*each, rig.plate), loads=rig.loads
+                rig.eras, FREQUENCIES, fingertip_points(*each, rig.plate), loads=rig.masses
             )
             for each in contacts
         ]

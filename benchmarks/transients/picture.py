@@ -43,7 +43,7 @@ def draw(plate: PlateInTime, rig: Rig, cases: list[list[Case]], path: Path) -> N
             RAMPED,
             ramped_ending(excitation, rig.eras, ramp=ONSET_RAMP),
         ),
-        ("shaped", shaped(onset, rig.eras), "brake, quietly", shaped(ending, rig.eras)),
+        ("shaped", shaped(onset, rig.eras), "shaped, quietly", shaped(ending, rig.eras)),
     ]
     points = [fingertip_points(*each, rig.plate) for each in case.contacts]
     count = len(points[0])

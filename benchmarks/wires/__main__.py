@@ -24,6 +24,8 @@ from benchmarks.wires.bench import (
     ours,
     sent_apart,
 )
+from benchmarks.wires.stops import STOPS, stop_latencies
+from benchmarks.wires.stops import WIRES as STOP_WIRES
 from drivers.codec.modbus import exchanges
 from drivers.codec.modbus.adu import build_adu
 from drivers.codec.serial_line.exchanges import decode_request, encode_request
@@ -124,6 +126,10 @@ HEAD = (
     "| ratio | codec [sets/s, encode and decode] |",
     "|---|---|---|---|---|---|---|---|---|",
 )
+STOP_HEAD = (
+    "| wire | median [ms] | 99th [ms] | maximum [ms] |",
+    "|---|---|---|---|",
+)
 EIGHT_HEAD = (
     "| arrangement | median [ms] | 99th [ms] | CPU [ms] | skew of commits, median [ms] "
     "| 99th [ms] |",
@@ -137,11 +143,13 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         rig = _coarse_rig(Path(folder))
         rows = [_row(name, WIRES[name], rig) for name in names]
+        stops = [_stop_row(name, options, rig) for name, options in STOP_WIRES.items()]
         eight = _eight(Path(folder))
     machine = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
     run = f"{COUNT} exchanges each, in {ROUNDS} alternating rounds ({machine})."
     parts = {
         "wires": "\n".join([run, "", *HEAD, *rows]),
+        "stops": "\n".join([f"{STOPS} stops each ({machine}).", "", *STOP_HEAD, *stops]),
         "eight": "\n".join([*EIGHT_HEAD, *eight]),
     }
     print("\n\n".join(parts.values()))
@@ -161,6 +169,14 @@ def _row(name: str, wire: Measured, rig: Path) -> str:
         f"| {name} | {mine.median * 1e3:.2f} | {mine.p99 * 1e3:.2f} | {mine.rate:.0f} | "
         f"{wire.library} | {bare.median * 1e3:.2f} | {bare.p99 * 1e3:.2f} | "
         f"{mine.median / bare.median:.2f} | {_codec_rate(wire)} |"
+    )
+
+
+def _stop_row(name: str, options: Sequence[str], rig: Path) -> str:
+    with far_end(rig, options) as (url,):
+        times = Times.of(asyncio.run(stop_latencies(url)))
+    return (
+        f"| {name} | {times.median * 1e3:.2f} | {times.p99 * 1e3:.2f} | {times.maximum * 1e3:.2f} |"
     )
 
 

@@ -1,0 +1,37 @@
+"""What benchmarks on the paper's plate have in common; numpy is loaded only when it is used."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from model.arrays import FloatArray
+
+RIG = Path(__file__).parents[1] / "examples" / "paper_plate.yaml"
+APART = 0.05  # m; between the fingers of a contact set
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+def use_one_thread() -> None:
+    """Let linear algebra use one thread; call before numpy is loaded."""
+    os.environ.update(ONE_THREAD)
+
+
+def random_contacts(
+    rng: "np.random.Generator",
+    count: int,
+    size: "tuple[float, float]",
+    *,
+    margin: float = 0.0,
+    apart: float = APART,
+) -> "FloatArray":
+    """Contacts (count, 2) [m] on a plate of a size, so far apart and so far from its edges."""
+    import numpy as np
+
+    while True:
+        places = rng.uniform(margin, np.array(size) - margin, (count, 2))
+        gaps = np.linalg.norm(places[:, None] - places, axis=-1)
+        if gaps[np.triu_indices(count, 1)].min(initial=np.inf) > apart:
+            return places

@@ -137,12 +137,13 @@ class Request:
 def read_request(line: bytes) -> Request:
     """Read one line; raises InvalidRequest."""
     document = parse_json(line)
+    unknown = _first_unknown(_Envelope, document) if isinstance(document, dict) else None
     try:
-        envelope = _Envelope.model_validate(document)
+        envelope = _Envelope.model_validate(document if unknown is None else {unknown: None})
     except ValidationError as error:
         raise InvalidRequest(
             ErrorCode.INVALID_REQUEST,
-            f"not a JSON-RPC 2.0 request: {_first_problem(error)[1]}",
+            f"not a JSON-RPC 2.0 request: {_first_problem(error, key=unknown)[1]}",
             remedy='send {"jsonrpc": "2.0", "id": 1, "method": ..., "params": {...}}; no batches',
             id=_readable_id(document),
         ) from error
@@ -151,8 +152,7 @@ def read_request(line: bytes) -> Request:
 
 def read_params(model: type[_MessageT], request: Request) -> _MessageT:
     """Validate the parameters of a request; raises RpcError."""
-    # The first of many unknown ones is reported without describing them all.
-    unknown = next((key for key in request.params if key not in model.model_fields), None)
+    unknown = _first_unknown(model, request.params)
     try:
         params = request.params if unknown is None else {unknown: None}
         return model.model_validate(params)
@@ -265,6 +265,11 @@ def parse_json(line: bytes) -> Any:
             id=_readable_id(document),
         )
     return document
+
+
+def _first_unknown(model: type[BaseModel], content: Mapping[str, Any]) -> str | None:
+    """The first unknown key, so that of many one is described, in bounded time; or None."""
+    return next((key for key in content if key not in model.model_fields), None)
 
 
 def _readable_id(document: object) -> Id:

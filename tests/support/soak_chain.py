@@ -22,7 +22,7 @@ from controller.sources.touch import Touch, TouchFrame
 from drivers.amplifier import Amplifier
 from drivers.backend import Backend
 from drivers.errors import DriverError
-from drivers.protocol.messages import Reply, Request
+from drivers.protocol.messages import AmplifierEvent, Fault, Reply, Request
 from drivers.registry import open_backend
 from memory_machine import live_in_memory
 from model.rig.rig import Channel, Rig
@@ -413,16 +413,27 @@ class _Run:
             self.witness.set_stalled(False)
 
     def _make_controller(self) -> Controller:
+        amplifiers = {name: Amplifier(_backend(url)) for name, url in self.urls.items()}
+        for amplifier in amplifiers.values():
+            amplifier.listen(self._amplifier_event)
         return Controller(
             self.rig,
             _table(),
-            amplifiers={name: Amplifier(_backend(url)) for name, url in self.urls.items()},
+            amplifiers=amplifiers,
             observer=Observer(
                 pattern_applied=self._applied,
                 refused=lambda why: self.note("observer refused", why),
                 link_lost=lambda what: self.note("observer lost", what),
             ),
         )
+
+    def _amplifier_event(self, event: AmplifierEvent) -> None:
+        """Stop all at a fault that an amplifier reports while armed or arming, as a daemon does."""
+        controller = self.controller
+        if event.fault is Fault.NONE or controller is None:
+            return
+        if self.arm_requests or controller.group_state is GroupState.ARMED:
+            self._spawn(self._call("stop", controller.stop))
 
     def _applied(self, applied: Applied) -> None:
         self.counts["patterns"] += 1

@@ -31,7 +31,14 @@ from controller.daemon.config import DaemonConfig
 from controller.daemon.hello import hello_result
 from controller.daemon.lease import LeaseHolder
 from controller.daemon.publisher import EventPublisher
-from controller.daemon.states import ACKNOWLEDGE, DaemonEvent, DaemonState, StateMachine, Trigger
+from controller.daemon.states import (
+    ACKNOWLEDGE,
+    ENERGISED,
+    DaemonEvent,
+    DaemonState,
+    StateMachine,
+    Trigger,
+)
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches
 from controller.group.quick_stops import QuickStops
@@ -45,7 +52,6 @@ _LEASE_RECHECK = 0.25  # s
 
 _logger = logging.getLogger(__name__)
 
-_ARMABLE = (DaemonState.SWITCHED_ON, DaemonState.OPERATION_ENABLED)
 _ENABLED = DaemonState.OPERATION_ENABLED
 _REMEDIES = {
     DaemonState.SWITCH_ON_DISABLED: "wait a moment and try again",
@@ -154,7 +160,7 @@ class ApiService:
 
     async def _arm(self, client: Connection, params: ArmParams) -> ArmResult:
         machine, now = self._supervisor.machine, clock.now()
-        if machine.state not in (DaemonState.READY_TO_SWITCH_ON, *_ARMABLE):
+        if machine.state not in (DaemonState.READY_TO_SWITCH_ON, *ENERGISED):
             raise _wrong_state(machine)
         if machine.state is DaemonState.SWITCHED_ON:
             raise RpcError(ErrorCode.LEASE, "another client is arming", remedy="wait, or disarm")
@@ -188,7 +194,7 @@ class ApiService:
         machine = self._supervisor.machine
         if params.lease is not None:
             self._valid_lease.check(params.lease, now=clock.now())
-        if machine.state in _ARMABLE:
+        if machine.state in ENERGISED:
             cause = f"disarmed by {params.client or client.name!a}"
             await self._handle(DaemonEvent(Trigger.DISARM, cause))
             machine = self._supervisor.machine
@@ -268,7 +274,7 @@ class ApiService:
     @property
     def _valid_lease(self) -> LeaseHolder:
         """The lease, which ends with the armed state."""
-        if self._supervisor.machine.state not in _ARMABLE:
+        if self._supervisor.machine.state not in ENERGISED:
             self._lease.end()
         return self._lease
 

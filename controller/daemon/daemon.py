@@ -21,7 +21,7 @@ from controller.daemon.publisher import EventPublisher
 from controller.daemon.reload import DEFERRED, changed_keys, plan_reload
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
-from controller.daemon.states import DaemonState, StateMachine
+from controller.daemon.states import ENERGISED, DaemonState, StateMachine
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches, TouchInputs
 from controller.group.amplifier_group import GroupState
@@ -185,10 +185,7 @@ class Daemon:
             self._manager.ready(self._status_line())
 
     async def _apply(self, new: DaemonConfig, changed: list[str], restart: list[str]) -> None:
-        is_armed = self._supervisor.machine.state in (
-            DaemonState.SWITCHED_ON,
-            DaemonState.OPERATION_ENABLED,
-        )
+        is_armed = self._supervisor.machine.state in ENERGISED
         plan = plan_reload(self._config, new, changed, is_armed=is_armed)
         if plan.refused is not None:
             _logger.error("config: reload rejected, keeping previous: %s", plan.refused)

@@ -103,10 +103,7 @@ class EventPublisher:
         if change == "retry" and message != self._last_link_message:
             _logger.warning("link: retrying: %s", message, extra={"topic": "link"})
         self._last_link_message = message
-        if change in (
-            "lost",
-            "reopened",
-        ):  # contacts are not followed without a link and start anew with it
+        if change in ("lost", "reopened"):  # contacts are not followed meanwhile and start anew
             self._contacts_changed((), Change())
         event = LinkEvent(
             event=change,

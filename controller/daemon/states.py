@@ -119,9 +119,10 @@ class Transition(NamedTuple):
 
 
 _SILENT = (DaemonState.SWITCH_ON_DISABLED, DaemonState.READY_TO_SWITCH_ON)
-_ENERGISED = (DaemonState.SWITCHED_ON, DaemonState.OPERATION_ENABLED)
+ENERGISED = (DaemonState.SWITCHED_ON, DaemonState.OPERATION_ENABLED)
+"""States in which amplifiers have or get high voltage."""
 _LATCHING = (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT_REACTION_ACTIVE, DaemonState.FAULT)
-_OPEN = (*_SILENT, *_ENERGISED, *_LATCHING)
+_OPEN = (*_SILENT, *ENERGISED, *_LATCHING)
 
 
 def _is_latched(machine: StateMachine, now: float) -> bool:
@@ -165,12 +166,12 @@ TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
         (state, trigger): (
             Transition(DaemonState.SWITCH_ON_DISABLED, (Action.DISARM, Action.VERIFY)),
         )
-        for state in _ENERGISED
+        for state in ENERGISED
         for trigger in (Trigger.DISARM, Trigger.LEASE_LOST)
     },
     **{
         (state, Trigger.STOP): (Transition(DaemonState.QUICK_STOP_ACTIVE, (Action.STOP,)),)
-        for state in (*_SILENT, *_ENERGISED, DaemonState.QUICK_STOP_ACTIVE)
+        for state in (*_SILENT, *ENERGISED, DaemonState.QUICK_STOP_ACTIVE)
     },
     **{
         (state, Trigger.STOP): (Transition(state, (Action.STOP,)),)
@@ -183,7 +184,7 @@ TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
     },
     **{
         (state, Trigger.FAULT): (Transition(DaemonState.FAULT_REACTION_ACTIVE, (Action.REACT,)),)
-        for state in (*_SILENT, *_ENERGISED, DaemonState.QUICK_STOP_ACTIVE)
+        for state in (*_SILENT, *ENERGISED, DaemonState.QUICK_STOP_ACTIVE)
     },
     (DaemonState.FAULT, Trigger.FAULT): (Transition(DaemonState.FAULT, (Action.STOP,)),),
     (DaemonState.FAULT_REACTION_ACTIVE, Trigger.REACTION_DONE): (Transition(DaemonState.FAULT),),
@@ -263,7 +264,7 @@ def _with_event(machine: StateMachine, event: DaemonEvent, now: float) -> StateM
                 machine,
                 lost_at=now,
                 is_reconnected=False,
-                is_latched=machine.is_latched or machine.state in _ENERGISED,
+                is_latched=machine.is_latched or machine.state in ENERGISED,
                 is_acknowledged=False,
             )
         case Trigger.LINK_DEGRADED | Trigger.LINK_RESTORED:

@@ -27,6 +27,7 @@ from controller.daemon.reconnect import (
 )
 from controller.daemon.states import (
     ACKNOWLEDGE,
+    ENERGISED,
     Action,
     DaemonEvent,
     DaemonState,
@@ -472,8 +473,7 @@ class Supervisor:
 
     def _amplifier_event(self, name: str, event: AmplifierEvent) -> None:
         """Post a fault that an amplifier reports unsolicited, ahead of the next heartbeat."""
-        energised = (DaemonState.SWITCHED_ON, DaemonState.OPERATION_ENABLED)
-        if event.fault is Fault.NONE or self.machine.state not in energised:
+        if event.fault is Fault.NONE or self.machine.state not in ENERGISED:
             return
         channel = "" if event.channel is None else f", channel {event.channel}"
         cause = f"amplifier {name} reports {event.fault.name}{channel}"

@@ -11,7 +11,7 @@ from scipy import sparse
 from model.arrays import FloatArray, IntArray, lattice
 from model.errors import InputError
 from model.fem.elements import MITC4, Q5, Element
-from model.structure.footprint import mean_over
+from model.structure.footprint import check_on_plate, mean_over
 from model.structure.plate import Plate
 
 PAPER_ELEMENT = MITC4
@@ -230,15 +230,7 @@ class Mesh:
         points = np.atleast_2d(np.asarray(points, dtype=float))
         if points.shape[1] == 3:
             return mean_over(self.interpolation, points, length=self.length, width=self.width)
-        tolerance = 1e-9 * max(self.length, self.width)
-        upper = np.array([self.length, self.width])
-        off = ~((points >= -tolerance) & (points <= upper + tolerance)).all(axis=1)
-        if off.any():
-            x, y = points[np.argmax(off)]
-            raise InputError(
-                f"point ({x:g}, {y:g}) m is not on the plate, (0, 0) to "
-                f"({self.length:g}, {self.width:g}) m"
-            )
+        check_on_plate(points, length=self.length, width=self.width)
         cell_x, weight_x = self._locate(points[:, 0], self.lines[0])
         cell_y, weight_y = self._locate(points[:, 1], self.lines[1])
         weights = weight_y[:, :, None] * weight_x[:, None, :]

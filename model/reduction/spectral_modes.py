@@ -10,12 +10,12 @@ from functools import cached_property
 import numpy as np
 
 from model.arrays import FloatArray
-from model.errors import InputError
 from model.fem.symmetry import CLASSES
 from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
 from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import SpectralClass, solve_class
+from model.structure.footprint import check_on_plate
 from model.structure.plate import Plate
 
 _MAX_CACHED = 4  # sets of points whose polynomials are kept
@@ -88,23 +88,11 @@ class SpectralModes:
         points = np.atleast_2d(np.asarray(points, dtype=float))
         key = points.tobytes()
         if key not in self._known:
-            self._check_on_plate(points)
+            check_on_plate(points, length=self._mesh.length, width=self._mesh.width)
             if len(self._known) >= _MAX_CACHED:
                 self._known.pop(next(iter(self._known)))
             self._known[key] = tuple(part.deflection_at(points) for part in self._classes)
         return self._known[key]
-
-    def _check_on_plate(self, points: FloatArray) -> None:
-        sides = np.array([self._mesh.length, self._mesh.width])
-        tolerance = 1e-9 * sides.max()
-        at = points[:, :2]
-        off = ~((at >= -tolerance) & (at <= sides + tolerance)).all(axis=1)
-        if off.any():
-            x, y = at[np.argmax(off)]
-            raise InputError(
-                f"point ({x:g}, {y:g}) m is not on the plate, (0, 0) to ({sides[0]:g}, "
-                f"{sides[1]:g}) m"
-            )
 
 
 def spectral_modes(

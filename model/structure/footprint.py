@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from model.arrays import FloatArray
+from model.errors import InputError
 
 # Gauss points across a disc and along each chord: enough for fields that vary over its radius.
 _ACROSS, _ALONG = 10, 8
@@ -28,6 +29,22 @@ def as_footprints(places: FloatArray) -> FloatArray:
     if places.size == 0:
         return np.empty((0, 3))
     return places if places.shape[1] == 3 else np.column_stack([places, np.zeros(len(places))])
+
+
+def check_on_plate(places: FloatArray, *, length: float, width: float) -> None:
+    """Check that points (n, 2) or the centres of footprints (n, 3) [m] are on the plate.
+
+    Its edges included; raises InputError.
+    """
+    sides = np.array([length, width])
+    tolerance = 1e-9 * sides.max()
+    at = places[:, :2]
+    off = ~((at >= -tolerance) & (at <= sides + tolerance)).all(axis=1)
+    if off.any():
+        x, y = at[np.argmax(off)]
+        raise InputError(
+            f"point must be on the plate, (0, 0) to ({length:g}, {width:g}) m, got ({x:g}, {y:g}) m"
+        )
 
 
 def mean_over(

@@ -97,15 +97,12 @@ def all_columns(ranking: Ranking) -> Columns:
             for case, drive in pairs
         ],
     }
-    # As many digits as are the same in every run.
-    statistics = [
-        [float(f"{value:.6g}") for value in column] for column in results.statistics[rows, drives].T
-    ]
+    statistics = results.statistics[rows, drives]
     return (
         columns
         | {
-            f"{name.replace(' ', '_')}{'' if name == STATISTICS[-1] else '_m_s2'}": column
-            for name, column in zip(STATISTICS, statistics, strict=True)
+            f"{name.replace(' ', '_')}{'' if name == STATISTICS[-1] else '_m_s2'}": statistics[:, k]
+            for k, name in enumerate(STATISTICS)
         }
         | {"supported": ["yes" if ranking.supported[case] else "no" for case in rows]}
     )

@@ -120,12 +120,13 @@ def study_convergence(
     reference = reference_mesh(rig.plate, frequency_max=high)
     exact = _natural_frequencies(rig, reference)
     supported = exact > _MIN_FREQUENCY_RATIO * rig.plate.lowest_bending_frequency
-    exact_response = _response(rig, reference, checked)
+    (exact_response,) = _responses(rig, reference, rig.eras, frequencies=checked)
     size = np.linalg.norm(exact_response, axis=2)
     errors = []
     for done, mesh in enumerate(meshes, start=1):
         progress(done, 1 + len(meshes))
-        difference = np.linalg.norm(_response(rig, mesh, checked) - exact_response, axis=2)
+        (response,) = _responses(rig, mesh, rig.eras, frequencies=checked)
+        difference = np.linalg.norm(response - exact_response, axis=2)
         errors.append(
             MeshError(
                 mesh,
@@ -135,13 +136,19 @@ def study_convergence(
             )
         )
     progress(1 + len(meshes), 1 + len(meshes))
+    by_place, by_foot = _changes(
+        rig,
+        [_nearer_the_middle(era, rig.plate) for era in rig.eras],
+        [replace(era, foot=era.foot + FOOT) for era in rig.eras],
+        frequencies=checked,
+    )
     return Convergence(
         reference,
         checked,
         exact[supported],
         tuple(errors),
-        by_place=_change(rig, [_nearer_the_middle(era, rig.plate) for era in rig.eras], checked),
-        by_foot=_change(rig, [replace(era, foot=era.foot + FOOT) for era in rig.eras], checked),
+        by_place=by_place,
+        by_foot=by_foot,
     )
 
 
@@ -154,22 +161,26 @@ def _nearer_the_middle(era: Era, plate: Plate) -> Era:
     return replace(era, x=float(x), y=float(y))
 
 
-def _change(rig: Rig, eras: Sequence[Era], frequencies: FloatArray) -> FloatArray:
-    """Change of the response by other ERAs, relative L2, the worst driven ERA, (f,)."""
+def _changes(rig: Rig, *layouts: Sequence[Era], frequencies: FloatArray) -> tuple[FloatArray, ...]:
+    """Change of the response by other ERAs, relative L2, the worst driven ERA, (f,) for each."""
     mesh = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)
-    before = _response(rig, mesh, frequencies)
-    after = _response(replace(rig, eras=tuple(eras)), mesh, frequencies)
-    change = np.linalg.norm(after - before, axis=2) / np.linalg.norm(before, axis=2)
-    return np.asarray(change.max(axis=1))
+    before, *others = _responses(rig, mesh, rig.eras, *layouts, frequencies=frequencies)
+    size = np.linalg.norm(before, axis=2)
+    return tuple(
+        np.asarray((np.linalg.norm(after - before, axis=2) / size).max(axis=1)) for after in others
+    )
 
 
 def _natural_frequencies(rig: Rig, mesh: PlateMesh) -> FloatArray:
     return natural_modes(rig, MODE_COUNT, support="eras", mesh=mesh).frequencies
 
 
-def _response(rig: Rig, mesh: PlateMesh, frequencies: FloatArray) -> ComplexArray:
+def _responses(
+    rig: Rig, mesh: PlateMesh, *layouts: Sequence[Era], frequencies: FloatArray
+) -> list[ComplexArray]:
+    """Acceleration fields of a plate on each layout, (f, eras, points)."""
     x = np.linspace(0, rig.plate.length, _RASTER[0])
     y = np.linspace(0, rig.plate.width, _RASTER[1])
     points = lattice(x, y)
     free = solve_free_plate(rig.plate, mesh, frequency_max=rig.limits.frequency_max)
-    return free.acceleration(rig.eras, frequencies, points, loads=rig.masses)
+    return [free.acceleration(eras, frequencies, points, loads=rig.masses) for eras in layouts]

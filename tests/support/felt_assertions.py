@@ -55,6 +55,7 @@ class Truth:
 
     def fields(self, heard: Heard, points: FloatArray) -> tuple[FloatArray, ComplexArray]:
         """Frequencies (f,) [Hz] of the reported pattern, and its acceleration (f, p) [m/s²]."""
+        assert heard.patterns, "no pattern was reported"
         drive = heard.patterns[-1]["drive"]
         frequencies = np.array(sorted({tone["frequency_hz"] for tone in drive.values()}))
         alone = direct_acceleration(

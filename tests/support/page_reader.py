@@ -64,6 +64,8 @@ class Reader:
             "COLUMNS": "100",
             "PATH": ":".join([*first, str(Path(sys.executable).parent), os.environ["PATH"]]),
             "PYTHONUNBUFFERED": "1",
+            # Figures depend on the processor that OpenBLAS is told to assume, by 1e-10.
+            **{name: value for name, value in os.environ.items() if name.startswith("OPENBLAS_")},
             "OPENBLAS_NUM_THREADS": "1",
             "TMPDIR": str(home),
             "XDG_CACHE_HOME": str(home / "cache"),

@@ -1,24 +1,34 @@
 """Modes of the free plate in Legendre polynomials, and its truncated ones between any points.
 
-The residual vectors of all polynomials of the deflection are solved once; those of a force at any
-point are then a product with the polynomials there, and so are the sums over truncated modes.
+The residual vectors of the points of the first layout are solved for alone. For a second one those
+of all polynomials of the deflection are: the residual vectors of a force at any point are then a
+product with the polynomials there, and so are the sums over truncated modes.
 """
 
 import math
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 
 from model.arrays import FloatArray
 from model.fem.symmetry import CLASSES
 from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
-from model.spectral.local_compliance import local_compliance
+from model.spectral.local_compliance import Unresolved, compliance_between, unresolved_at
 from model.spectral.mesh import SpectralMesh
-from model.spectral.modes import SpectralClass, solve_class
+from model.spectral.modes import SpectralClass, deflections_by_class, solve_class
 from model.structure.footprint import check_on_plate
 from model.structure.plate import Plate
 
 _MAX_CACHED = 4  # sets of points whose polynomials are kept
+
+
+@dataclass(frozen=True, eq=False)
+class _Observed:
+    """At p points: deflections by class, each (p, m), shapes (p, r), unresolved compliance."""
+
+    deflections: tuple[FloatArray, ...]
+    shapes: FloatArray
+    unresolved: Unresolved
 
 
 class SpectralModes:
@@ -29,70 +39,106 @@ class SpectralModes:
     ) -> None:
         self._plate = plate
         self._mesh = mesh
+        self._directions = mesh.directions(plate)
         self._classes = classes
         self.eigenvalues = np.concatenate([part.eigenvalues for part in classes])
         self.largest_truncated = max(part.largest_truncated for part in classes)
-        self._known: dict[bytes, tuple[FloatArray, ...]] = {}
+        self._first: PointSolutions | None = None
+        self._operators: tuple[FloatArray, ...] | None = None
+        self._known: dict[bytes, _Observed] = {}
 
     def solve_at(self, points: FloatArray) -> PointSolutions:
         """Solve for forces at points [m] (n, 2)."""
-        at = self._deflections(points)
-        shapes = [own @ part.vectors[: part.deflections] for own, part in self._by_class(at)]
+        at = self._observe(points)
+        if self._first is None:
+            self._first = self._solve_alone(points, at)
+        if np.array_equal(self._first.points, points):
+            return self._first
         residuals = tuple(
             np.moveaxis(operator[:RESIDUAL_ORDER] @ own.T, 2, 0)
-            for own, operator in zip(at, self._operators, strict=True)
+            for own, operator in zip(at.deflections, self._solved_operators(), strict=True)
         )
-        return PointSolutions(
-            points, np.hstack(shapes), residuals, self.truncated_terms(points, points)
-        )
+        return PointSolutions(points, at.shapes, residuals, self.truncated_terms(points, points))
 
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Sums between points (n, 2) and others (m, 2), as in `PointSolutions`."""
+        own, other = self._observe(points), self._observe(others)
         truncated_terms = np.zeros((2 * RESIDUAL_ORDER, len(points), len(others)))
-        pairs = zip(self._deflections(points), self._deflections(others), strict=True)
-        for (own, other), operator in zip(pairs, self._operators, strict=True):
-            truncated_terms += own @ operator @ other.T
-        truncated_terms[0] += self._local(points, others)
+        pairs = zip(own.deflections, other.deflections, self._solved_operators(), strict=True)
+        for left, right, operator in pairs:
+            truncated_terms += left @ operator @ right.T
+        truncated_terms[0] += self._local(own, other)
         return truncated_terms
 
     def basis(self, attached: PointSolutions, points: FloatArray) -> FloatArray:
         """Deflection at points of modes and residual vectors, (p, r + RESIDUAL_ORDER n)."""
-        at = self._deflections(points)
-        count = len(attached.points)
-        shapes = [own @ part.vectors[: part.deflections] for own, part in self._by_class(at)]
-        extra = np.zeros((len(points), RESIDUAL_ORDER * count))
-        for own, residual in zip(at, attached.residuals, strict=True):
+        at = self._observe(points)
+        count, modes = len(attached.points), len(self.eigenvalues)
+        basis = np.zeros((len(points), modes + RESIDUAL_ORDER * count))
+        basis[:, :modes] = at.shapes
+        extra = basis[:, modes:]
+        for own, residual in zip(at.deflections, attached.residuals, strict=True):
             extra += own @ residual.transpose(2, 1, 0).reshape(own.shape[1], -1 if count else 0)
-        extra[:, :count] += self._local(points, attached.points)
-        return np.hstack([*shapes, extra])
+        extra[:, :count] += self._local(at, self._observe(attached.points))
+        return basis
 
-    def _by_class(self, at: tuple[FloatArray, ...]) -> "zip[tuple[FloatArray, SpectralClass]]":
-        return zip(at, self._classes, strict=True)
+    def _solve_alone(self, points: FloatArray, at: _Observed) -> PointSolutions:
+        """Solve for these points, without the operators."""
+        residuals = []
+        truncated_terms = np.zeros((2 * RESIDUAL_ORDER, len(points), len(points)))
+        for own, part in zip(at.deflections, self._classes, strict=True):
+            solved = part.residuals(own, terms=RESIDUAL_ORDER, scale=self.largest_truncated)
+            deflection = solved[:, :, : own.shape[1]]
+            truncated_terms += _sums(solved, own @ deflection[0].T)
+            residuals.append(deflection.swapaxes(0, 1))
+        truncated_terms[0] += self._local(at, at)
+        return PointSolutions(points, at.shapes, tuple(residuals), truncated_terms)
 
-    def _local(self, points: FloatArray, others: FloatArray) -> FloatArray:
+    def _solved_operators(self) -> tuple[FloatArray, ...]:
+        """Residual operators between the polynomials, by class (2 RESIDUAL_ORDER, m, m)."""
+        if self._operators is None:
+            operators = []
+            for part in self._classes:
+                unit = np.eye(part.deflections)
+                solved = part.residuals(unit, terms=RESIDUAL_ORDER, scale=self.largest_truncated)
+                operators.append(_sums(solved, solved[0, :, : part.deflections]))
+            self._operators = tuple(operators)
+        return self._operators
+
+    def _local(self, own: _Observed, other: _Observed) -> FloatArray:
         """Compliance in waves that the polynomials do not resolve, in units of u_c."""
-        degrees = (self._mesh.nx, self._mesh.ny)
-        missing = local_compliance(self._plate, degrees, points, others)
+        missing = compliance_between(self._plate, own.unresolved, other.unresolved)
         return missing / self.largest_truncated
 
-    @cached_property
-    def _operators(self) -> tuple[FloatArray, ...]:
-        """Residual operators between the polynomials, by class (2 RESIDUAL_ORDER, m, m)."""
-        return tuple(
-            part.residual_operators(terms=2 * RESIDUAL_ORDER, scale=self.largest_truncated)
-            for part in self._classes
-        )
-
-    def _deflections(self, points: FloatArray) -> tuple[FloatArray, ...]:
-        """Polynomials of the deflection at points or footprints on the plate, by class (p, m)."""
+    def _observe(self, points: FloatArray) -> _Observed:
+        """What is known of points or footprints on the plate, cached."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
         key = points.tobytes()
         if key not in self._known:
             check_on_plate(points, length=self._mesh.length, width=self._mesh.width)
             if len(self._known) >= _MAX_CACHED:
                 self._known.pop(next(iter(self._known)))
-            self._known[key] = tuple(part.deflection_at(points) for part in self._classes)
+            deflections = deflections_by_class(self._plate, *self._directions, points)
+            pairs = zip(deflections, self._classes, strict=True)
+            self._known[key] = _Observed(
+                deflections,
+                np.hstack([own @ part.vectors[: part.deflections] for own, part in pairs]),
+                unresolved_at(self._plate, (self._mesh.nx, self._mesh.ny), points),
+            )
         return self._known[key]
+
+
+def _sums(solved: FloatArray, first: FloatArray) -> FloatArray:
+    """Sums over the truncated modes between k forces, (2 RESIDUAL_ORDER, k, k).
+
+    solved (RESIDUAL_ORDER, k, n): their residual vectors, of which the sums of powers i + j are
+    inner products; first (k, k): that of power one, a product with the forces.
+    """
+    sums = np.empty((2 * RESIDUAL_ORDER, *first.shape))
+    sums[0] = first
+    for power in range(2, 2 * RESIDUAL_ORDER + 1):
+        sums[power - 1] = solved[power // 2 - 1] @ solved[(power + 1) // 2 - 1].T
+    return sums
 
 
 def spectral_modes(

@@ -12,10 +12,12 @@ exactly. A Taylor series, the usual residual flexibility with its higher terms, 
 1 / |s u_c| with each term; this polynomial about four times as much.
 """
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.polynomial import chebyshev
 
-from model.arrays import ComplexArray
+from model.arrays import ComplexArray, FloatArray
 
 
 def truncation_weights(
@@ -25,8 +27,16 @@ def truncation_weights(
 
     shifted_eigenvalue: s (f,) [rad²/s²], |s u_c| below 1; largest: u_c. Weights have its unit.
     """
-    # Where T_k is zero the approximation is exact: interpolate u / (1 - s u) / u there.
-    v = (chebyshev.chebpts1(terms) + 1) / 2
+    v, inverse = _interpolation(terms)
     exact = 1 / (1 - largest * shifted_eigenvalue[:, None] * v)
-    inverse = np.linalg.inv(np.vander(v, terms, increasing=True))
     return np.asarray(largest * exact @ inverse.T)
+
+
+@lru_cache(maxsize=16)
+def _interpolation(terms: int) -> tuple[FloatArray, FloatArray]:
+    """Zeros of T_k, where the approximation is exact, and the inverse of their Vandermonde matrix.
+
+    u / (1 - s u) / u is interpolated there.
+    """
+    v = (chebyshev.chebpts1(terms) + 1) / 2
+    return v, np.asarray(np.linalg.inv(np.vander(v, terms, increasing=True)))

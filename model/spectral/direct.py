@@ -9,7 +9,7 @@ from model.fem.plate_mesh import check_frequencies
 from model.fem.symmetry import CLASSES
 from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
-from model.spectral.modes import deflection_at
+from model.spectral.modes import deflections_by_class
 from model.spectral.stiffness import class_stiffness
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
@@ -42,9 +42,8 @@ def direct_spectral_acceleration(
     degrees = (mesh.nx, mesh.ny)
     receptance = np.empty((len(omega), len(everywhere), len(attached)), dtype=complex)
     receptance[:] = local_compliance(plate, degrees, everywhere, attached) / loss
-    for parity in CLASSES:
+    for parity, shapes in zip(CLASSES, deflections_by_class(plate, x, y, everywhere), strict=True):
         K = class_stiffness(plate, x, y, parity)
-        shapes = deflection_at(plate, x, y, parity, everywhere)
         forces = np.zeros((len(K), len(attached)))
         forces[: shapes.shape[1]] = shapes[: len(attached)].T
         for number, each in enumerate(omega):

@@ -8,6 +8,7 @@ one more function in each direction, exp(-k x) +- exp(-k (L - x)).
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import TypeAlias
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
@@ -25,6 +26,10 @@ _LAYER_POINTS = 14
 _NEGLIGIBLE = 1e-6
 
 
+Integrals: TypeAlias = dict[int, FloatArray]
+"""Integrals over the length of products of two functions, by parity of the first, (n, m)."""
+
+
 @dataclass(frozen=True, eq=False)
 class Direction:
     """Orthonormal functions of x in (0, length) [m], by parity: EVEN or ODD about the middle.
@@ -39,98 +44,114 @@ class Direction:
 
     def polynomial_count(self, parity: int) -> int:
         """Number of polynomials of a parity; these are its first functions."""
-        return (self.degree - _first(parity)) // 2 + 1
+        return (self.degree - first_degree(parity)) // 2 + 1
 
     def count(self, parity: int) -> int:
         """Number of functions of a parity."""
         return len(self.slope_squares[parity])
 
-    def polynomials(self, parity: int, x: FloatArray) -> FloatArray:
-        """Values [1/sqrt(m)] of the polynomials of a parity at x [m] (p,), (p, n)."""
-        first = _first(parity)
-        every = legvander(2 * x / self.length - 1, self.degree)
-        return np.asarray(every[:, first::2] * self._norms[first::2])
+    def polynomials(self, x: FloatArray) -> FloatArray:
+        """Values [1/sqrt(m)] of all polynomials, by degree, at x [m] (p,), (p, degree + 1)."""
+        angle = np.arccos(np.clip(1 - 2 * x / self.length, -1, 1))
+        cosines = np.cos(np.multiply.outer(angle, np.arange(self.degree + 1)))
+        values = cosines @ _polynomials_in_cosines(self.degree)
+        return np.asarray(values / np.sqrt(self.length))
 
-    @property
-    def slope_products(self) -> dict[int, FloatArray]:
+    @cached_property
+    def slope_products(self) -> Integrals:
         """By parity: integrals of f' g over the length, f of the parity, g of the other, (n, m)."""
-        return self._integrals[0]
+        products, _ = _unit_integrals(self.degree, self.decay * self.length)
+        return {parity: each / self.length for parity, each in products.items()}
 
-    @property
-    def slope_squares(self) -> dict[int, FloatArray]:
+    @cached_property
+    def slope_squares(self) -> Integrals:
         """By parity: integrals of f' g' over the length, both of the parity, (n, n)."""
-        return self._integrals[1]
+        _, squares = _unit_integrals(self.degree, self.decay * self.length)
+        return {parity: each / self.length**2 for parity, each in squares.items()}
 
-    @cached_property
-    def _norms(self) -> FloatArray:
-        """Factors that make Legendre polynomials orthonormal over the length, (degree + 1,)."""
-        return np.sqrt((2 * np.arange(self.degree + 1) + 1) / self.length)
 
-    @cached_property
-    def _integrals(self) -> tuple[dict[int, FloatArray], dict[int, FloatArray]]:
-        x, weights = self._quadrature()
-        xi = 2 * x / self.length - 1
-        legendre = np.asarray(legvander(xi, self.degree), dtype=float)
-        slopes = np.zeros_like(legendre)
-        for n in range(1, self.degree + 1):
-            slopes[:, n] = (2 * n - 1) * legendre[:, n - 1]
-            if n > 1:
-                slopes[:, n] += slopes[:, n - 2]
-        legendre *= self._norms
-        slopes *= self._norms * (2 / self.length)
-        near, far = np.exp(-self.decay * x), np.exp(-self.decay * (self.length - x))
-        values, derivatives = {}, {}
-        for parity in (EVEN, ODD):
-            own = slice(_first(parity), None, 2)
-            values[parity], derivatives[parity] = self._with_layer(
-                legendre[:, own],
-                slopes[:, own],
-                near + parity * far,
-                self.decay * (parity * far - near),
-                weights,
-            )
-        weighted = {parity: 2 * weights * each.T for parity, each in derivatives.items()}
-        products = {parity: each @ values[-parity] for parity, each in weighted.items()}
-        squares = {parity: each @ derivatives[parity] for parity, each in weighted.items()}
-        return products, squares
+def first_degree(parity: int) -> int:
+    """Degree of the first polynomial of a parity."""
+    return (1 - parity) // 2
 
-    def _quadrature(self) -> tuple[FloatArray, FloatArray]:
-        """Gauss points [m] on half of the length, and their weights; twice that is the whole."""
-        half = self.length / 2
-        ends = _LAYER_PIECES / self.decay
-        ends = np.append(ends[ends < half], half)
-        points, weights = _gauss(max(_LAYER_POINTS, self.degree + 1))
-        start, size = ends[:-1, None], np.diff(ends)[:, None]
-        return (start + size * (1 + points) / 2).ravel(), (size * weights / 2).ravel()
 
-    @staticmethod
-    def _with_layer(
-        values: FloatArray,
-        slopes: FloatArray,
-        layer: FloatArray,
-        layer_slope: FloatArray,
-        weights: FloatArray,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Append the layer, orthonormal to polynomials with these values and slopes (q, n)."""
-        weighted = 2 * weights * values.T
-        whole = 2 * weights @ layer**2
-        for _ in range(2):  # twice because of rounding
-            projection = weighted @ layer
-            layer, layer_slope = layer - values @ projection, layer_slope - slopes @ projection
-        norm = np.sqrt(2 * weights @ layer**2)
-        if norm < _NEGLIGIBLE * np.sqrt(whole):
-            return values, slopes
-        return (
-            np.column_stack([values, layer / norm]),
-            np.column_stack([slopes, layer_slope / norm]),
+@lru_cache(maxsize=64)
+def _polynomials_in_cosines(degree: int) -> FloatArray:
+    """Coefficients (degree + 1, degree + 1) of orthonormal polynomials at -cos(angle).
+
+    Rows are cos(n angle), columns polynomials on a unit length: P_n(cos a) is the sum of
+    c_k c_(n-k) cos((n - 2 k) a), c_k = (2 k - 1)!! / (2 k)!!, all positive, so nothing cancels.
+    """
+    k = np.arange(1, degree + 1)
+    c = np.concatenate([[1.0], np.cumprod((2 * k - 1) / (2 * k))])
+    coefficients = np.zeros((degree + 1, degree + 1))
+    for n in range(degree + 1):
+        np.add.at(coefficients[:, n], abs(n - 2 * np.arange(n + 1)), c[: n + 1] * c[n::-1])
+    signs = (-1.0) ** np.arange(degree + 1)
+    return coefficients * signs * np.sqrt(2 * np.arange(degree + 1) + 1)
+
+
+@lru_cache(maxsize=64)
+def _unit_integrals(degree: int, decay: float) -> tuple[Integrals, Integrals]:
+    """`Direction.slope_products` and `slope_squares` of a unit length."""
+    x, weights = _quadrature(degree, decay)
+    legendre = np.asarray(legvander(2 * x - 1, degree), dtype=float)
+    slopes = np.zeros_like(legendre)
+    for n in range(1, degree + 1):
+        slopes[:, n] = (2 * n - 1) * legendre[:, n - 1]
+        if n > 1:
+            slopes[:, n] += slopes[:, n - 2]
+    norms = np.sqrt(2 * np.arange(degree + 1) + 1)
+    legendre *= norms
+    slopes *= 2 * norms
+    near, far = np.exp(-decay * x), np.exp(-decay * (1 - x))
+    values, derivatives = {}, {}
+    for parity in (EVEN, ODD):
+        own = slice(first_degree(parity), None, 2)
+        values[parity], derivatives[parity] = _with_layer(
+            legendre[:, own],
+            slopes[:, own],
+            near + parity * far,
+            decay * (parity * far - near),
+            weights,
         )
+    weighted = {parity: 2 * weights * each.T for parity, each in derivatives.items()}
+    products = {parity: each @ values[-parity] for parity, each in weighted.items()}
+    squares = {parity: each @ derivatives[parity] for parity, each in weighted.items()}
+    return products, squares
+
+
+def _quadrature(degree: int, decay: float) -> tuple[FloatArray, FloatArray]:
+    """Gauss points on half of a unit length, and their weights; twice that is the whole."""
+    ends = _LAYER_PIECES / decay
+    ends = np.append(ends[ends < 0.5], 0.5)
+    points, weights = _gauss(max(_LAYER_POINTS, degree + 1))
+    start, size = ends[:-1, None], np.diff(ends)[:, None]
+    return (start + size * (1 + points) / 2).ravel(), (size * weights / 2).ravel()
+
+
+def _with_layer(
+    values: FloatArray,
+    slopes: FloatArray,
+    layer: FloatArray,
+    layer_slope: FloatArray,
+    weights: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Append the layer, orthonormal to polynomials with these values and slopes (q, n)."""
+    weighted = 2 * weights * values.T
+    whole = 2 * weights @ layer**2
+    for _ in range(2):  # twice because of rounding
+        projection = weighted @ layer
+        layer, layer_slope = layer - values @ projection, layer_slope - slopes @ projection
+    norm = np.sqrt(2 * weights @ layer**2)
+    if norm < _NEGLIGIBLE * np.sqrt(whole):
+        return values, slopes
+    return (
+        np.column_stack([values, layer / norm]),
+        np.column_stack([slopes, layer_slope / norm]),
+    )
 
 
 @lru_cache(maxsize=32)
 def _gauss(count: int) -> tuple[FloatArray, FloatArray]:
     return leggauss(count)
-
-
-def _first(parity: int) -> int:
-    """Degree of the first polynomial of a parity."""
-    return (1 - parity) // 2

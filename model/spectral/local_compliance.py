@@ -24,7 +24,7 @@ from numpy.polynomial.legendre import leggauss
 from scipy import special
 
 from model.arrays import FloatArray
-from model.fem.elements.element import rigidities
+from model.fem.elements.element import SHEAR_CORRECTION
 from model.structure.footprint import as_footprints, mean_over
 from model.structure.plate import Plate
 
@@ -53,9 +53,27 @@ def local_compliance(
     Also of points (n, 2). Between two points it falls with their distance d as 2 ∫ J0(k d t) / t³
     dt from t = 1 on; a footprint of radius a multiplies the integrand by 2 J1(k a t) / (k a t).
     """
-    places, others = as_footprints(places), as_footprints(others)
-    own, other = _at(plate, degrees, places), _at(plate, degrees, others)
-    distance = np.linalg.norm(places[:, None, :2] - others[:, :2], axis=2)
+    own, other = (unresolved_at(plate, degrees, each) for each in (places, others))
+    return compliance_between(plate, own, other)
+
+
+@dataclass(frozen=True, eq=False)
+class Unresolved:
+    """At n footprints [m] (n, 3): compliance of a point force in bending and in shear [m/N] (n,).
+
+    wavenumber [1/m] (n,): where it begins.
+    """
+
+    footprints: FloatArray
+    bending: FloatArray
+    shear: FloatArray
+    wavenumber: FloatArray
+
+
+def compliance_between(plate: Plate, own: Unresolved, other: Unresolved) -> FloatArray:
+    """Unresolved compliance [m/N] (n, m); see `local_compliance`."""
+    places, others = own.footprints, other.footprints
+    distance = np.hypot(*(places[:, None, :2] - others[:, :2]).transpose(2, 0, 1))
     wavenumber = np.sqrt(np.multiply.outer(own.wavenumber, other.wavenumber))
     result = np.zeros(distance.shape)
     i, j = np.nonzero(distance * wavenumber < _FAR)
@@ -74,28 +92,20 @@ def local_compliance(
     return result
 
 
-@dataclass(frozen=True, eq=False)
-class _Unresolved:
-    """At n points: compliance of a point force in bending and in shear [m/N] (n,), each.
-
-    wavenumber [1/m] (n,): where it begins.
-    """
-
-    bending: FloatArray
-    shear: FloatArray
-    wavenumber: FloatArray
-
-
-def _at(plate: Plate, degrees: tuple[int, int], places: FloatArray) -> _Unresolved:
-    centroids = mean_over(np.asarray, places, length=plate.length, width=plate.width)
-    points = places[:, :2] + _TO_CENTROID * (centroids - places[:, :2])
-    _, shear, _ = rigidities(plate)
-    D, nu = plate.flexural_rigidity, plate.material.nu
+def unresolved_at(plate: Plate, degrees: tuple[int, int], places: FloatArray) -> Unresolved:
+    """What polynomials of these degrees do not resolve at footprints (n, 3) or points (n, 2)."""
+    places = as_footprints(places)
+    points = places[:, :2]
+    if places[:, 2].any():
+        centroids = mean_over(np.asarray, places, length=plate.length, width=plate.width)
+        points = points + _TO_CENTROID * (centroids - points)
+    D, nu, h = plate.flexural_rigidity, plate.material.nu, plate.thickness
+    shear = SHEAR_CORRECTION * plate.material.shear_modulus * h
     sides = np.array([plate.length, plate.width])
     p = np.array(degrees)
-    sine = np.sqrt(np.clip(1 - (2 * points / sides - 1) ** 2, (_LEAST_SINE / p) ** 2, None))
+    sine = np.sqrt(np.maximum(1 - (2 * points / sides - 1) ** 2, (_LEAST_SINE / p) ** 2))
     resolved = 2 * (p - _UNRESOLVED) / (sides * sine)
-    to_edge = np.clip(np.minimum(points, sides - points), 0, None)
+    to_edge = np.maximum(np.minimum(points, sides - points), 0)
     # Of waves along the edge x = 0, whose distance is along x.
     wavelengths2 = np.maximum(_COS2 / resolved[:, :1] ** 2, _SIN2 / resolved[:, 1:] ** 2)
     ratio_at_edge = 8 / ((1 - nu) * (3 + nu)) - 1
@@ -103,10 +113,13 @@ def _at(plate: Plate, degrees: tuple[int, int], places: FloatArray) -> _Unresolv
     at_corner = edge.prod(axis=1) / ratio_at_edge**2
     bending = 1 + edge.sum(axis=1) + (_CORNER - 1 - 2 * ratio_at_edge) * at_corner
     mean = wavelengths2.mean(axis=1)
-    logarithm = np.log(np.maximum(1, np.sqrt(wavelengths2) / plate.thickness)).mean(axis=1)
+    logarithm = np.log(np.maximum(1, wavelengths2 / h**2)).mean(axis=1) / 2
     images = (1 + edge / ratio_at_edge).prod(axis=1)
-    return _Unresolved(
-        bending * mean / (4 * np.pi * D), images * logarithm / (2 * np.pi * shear), mean**-0.5
+    return Unresolved(
+        places,
+        bending * mean / (4 * np.pi * D),
+        images * logarithm / (2 * np.pi * shear),
+        mean**-0.5,
     )
 
 

@@ -6,16 +6,19 @@ from functools import partial
 import numpy as np
 from scipy import linalg
 
-from model.arrays import FloatArray
-from model.spectral.functions import Direction
+from model.arrays import FloatArray, IntArray
+from model.fem.symmetry import CLASSES
+from model.spectral.functions import Direction, first_degree
 from model.spectral.stiffness import class_stiffness
 from model.structure.footprint import mean_over
 from model.structure.plate import Plate
 
-# Blocks of the Krylov space, each of half of the modes wanted and a few more: eigenvalues are then
-# as accurate as those of a full solution.
-_BLOCKS = 5
-_SPARE = 1
+# Blocks of the Krylov space: so many before it is tried whether the modes have converged.
+_LEAST_BLOCKS = 4
+
+# Residuals relative to u = 1 / (lambda + shift): of a mode that is kept, whose eigenvalue is then
+# accurate to about the square, and of the first one beyond.
+_CONVERGED, _FOUND = 1e-4, 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,68 +27,60 @@ class SpectralClass:
 
     eigenvalues omega² (r,) [rad²/s²]; vectors (n, r), orthonormal; largest_truncated:
     1 / (lambda + shift) of the lowest truncated mode [s²/rad²]; factor: Cholesky's of K + shift,
-    lower.
+    lower; deflections: m.
     """
 
-    plate: Plate
-    x: Direction
-    y: Direction
-    parity: tuple[int, int]
-    shift: float
+    deflections: int
     factor: FloatArray
     eigenvalues: FloatArray
     vectors: FloatArray
     largest_truncated: float
 
-    @property
-    def deflections(self) -> int:
-        """Number of unknowns of the deflection, m."""
-        a, b = self.parity
-        return self.x.polynomial_count(a) * self.y.polynomial_count(b)
+    def residuals(self, forces: FloatArray, *, terms: int, scale: float) -> FloatArray:
+        """Residual vectors of forces on the deflection (k, m): (terms, k, n).
 
-    def deflection_at(self, points: FloatArray) -> FloatArray:
-        """Basis of the deflection at points or footprints [m] (p, 2 or 3), (p, m) [1/sqrt(kg)]."""
-        return deflection_at(self.plate, self.x, self.y, self.parity, points)
-
-    def residual_operators(self, *, terms: int, scale: float) -> FloatArray:
-        """Residuals R_j (terms, m, m) between unknowns of the deflection, j from 1 on.
-
-        R_j is the sum of phi phi^T (u / scale)^j over the truncated modes, u = 1 / (lambda +
-        shift): R_1 of the inverse of K + shift less the kept modes, R_(i+j) = Y_i^T Y_j.
+        The j-th term is the sum of phi (phi . force) (u / scale)^j over the truncated modes, u =
+        1 / (lambda + shift), j from 1 on.
         """
-        m = self.deflections
-        kept = self.vectors / np.sqrt(self.eigenvalues + self.shift)
-        inverse, _ = linalg.lapack.dpotri(self.factor, lower=1)
-        inverse = np.tril(inverse) + np.tril(inverse, -1).T
-        inverse -= kept @ kept.T
-        inverse /= scale
-        powers = [inverse[:, :m]]
-        for _ in range((terms - 1) // 2):
-            powers.append(inverse @ powers[-1])
-        operators = np.empty((terms, m, m))
-        operators[0] = powers[0][:m]
-        for power in range(2, terms + 1):
-            operators[power - 1] = powers[power // 2 - 1].T @ powers[(power + 1) // 2 - 1]
-        return operators
+        count, m = forces.shape
+        residuals = np.empty((terms, count, len(self.factor)))
+        force = np.zeros((len(self.factor), count), order="F")
+        force[:m] = forces.T
+        for term in range(terms):
+            force, _ = linalg.lapack.dpotrs(self.factor, force, lower=1)
+            force -= self.vectors @ (self.vectors.T @ force)
+            force /= scale
+            residuals[term] = force.T
+        return residuals
 
 
-def deflection_at(
-    plate: Plate, x: Direction, y: Direction, parity: tuple[int, int], points: FloatArray
-) -> FloatArray:
-    """Basis of the deflection of a class at points [m] (p, 2), (p, m) [1/sqrt(kg)].
+def deflections_by_class(
+    plate: Plate, x: Direction, y: Direction, points: FloatArray
+) -> tuple[FloatArray, ...]:
+    """Basis of the deflection by class at points [m] (p, 2), each (p, m) [1/sqrt(kg)].
 
     At footprints (p, 3) its mean.
     """
-    if points.shape[1] == 3:
-        evaluate = partial(deflection_at, plate, x, y, parity)
-        return mean_over(evaluate, points, length=plate.length, width=plate.width)
-    along_x, along_y = (
-        x.polynomials(parity[0], points[:, 0]),
-        y.polynomials(parity[1], points[:, 1]),
-    )
-    basis = along_x[:, :, None] * along_y[:, None, :]
+    evaluate = partial(_deflections, x, y)
+    basis = mean_over(evaluate, points, length=plate.length, width=plate.width)
     basis /= np.sqrt(plate.material.rho * plate.thickness)
-    return np.asarray(basis.reshape(len(points), along_x.shape[1] * along_y.shape[1]))
+    ends = np.cumsum([x.polynomial_count(a) * y.polynomial_count(b) for a, b in CLASSES[:-1]])
+    return tuple(np.split(basis, ends, axis=1))
+
+
+def _deflections(x: Direction, y: Direction, points: FloatArray) -> FloatArray:
+    """Products of polynomials of x and y at points (p, 2), class after class, (p, n)."""
+    along_x, along_y = x.polynomials(points[:, 0]), y.polynomials(points[:, 1])
+    basis = np.empty((len(points), along_x.shape[1] * along_y.shape[1]))
+    start = 0
+    for a, b in CLASSES:
+        of_x, of_y = along_x[:, first_degree(a) :: 2], along_y[:, first_degree(b) :: 2]
+        shape = (len(points), of_x.shape[1], of_y.shape[1])
+        stop = start + shape[1] * shape[2]
+        out = basis[:, start:stop].reshape(shape, copy=False)
+        np.multiply(of_x[:, :, None], of_y[:, None, :], out=out)
+        start = stop
+    return basis
 
 
 def solve_class(
@@ -100,25 +95,23 @@ def solve_class(
 ) -> SpectralClass:
     """Solve a symmetry class for all modes below the cut [rad²/s²].
 
-    count: number of modes to compute at first; more where they do not reach the cut.
+    count: about how many they are.
     """
     K = class_stiffness(plate, x, y, parity)
     K[np.diag_indices_from(K)] += shift
     factor, _ = linalg.lapack.dpotrf(K, lower=1)
-    while True:
-        shifted, vectors = _lowest(K, factor, count)
-        if shifted[-1] >= cut + shift or len(shifted) == len(K):
-            break
-        count += count // 3 + 1
+    deflections = x.polynomial_count(parity[0]) * y.polynomial_count(parity[1])
+    width = min(count // 2 + 2, deflections)
+    if _LEAST_BLOCKS * width < len(K) / 2:
+        start = _long_waves(x, y, parity, width)
+        shifted, vectors = _lowest(factor, start, cut + shift)
+    else:
+        shifted, vectors = linalg.eigh(K, check_finite=False)
     eigenvalues = shifted - shift
     kept = int(np.searchsorted(eigenvalues, cut))
     eigenvalues[np.abs(eigenvalues) < 1e-6 * shift] = 0.0
     return SpectralClass(
-        plate,
-        x,
-        y,
-        parity,
-        shift,
+        deflections,
         factor,
         eigenvalues[:kept],
         vectors[:, :kept],
@@ -126,28 +119,48 @@ def solve_class(
     )
 
 
-def _lowest(shifted: FloatArray, factor: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """The lowest eigenpairs of a positive definite matrix (n, n), from its Cholesky factor.
+def _long_waves(x: Direction, y: Direction, parity: tuple[int, int], count: int) -> IntArray:
+    """Numbers of the polynomials of the deflection of a class that have the longest waves."""
+    along_x, along_y = (
+        np.arange(first_degree(each), direction.degree + 1, 2) / direction.length
+        for each, direction in zip(parity, (x, y), strict=True)
+    )
+    return np.argsort((along_x[:, None] ** 2 + along_y**2).ravel(), kind="stable")[:count]
 
-    Rayleigh-Ritz on a block Krylov space of the inverse.
+
+def _lowest(factor: FloatArray, start: IntArray, cut: float) -> tuple[FloatArray, FloatArray]:
+    """Eigenpairs of a positive definite matrix (n, n) below a cut, and some more, ascending.
+
+    Rayleigh-Ritz on a block Krylov space of the inverse, from the Cholesky factor (n, n). It starts
+    from forces on the unknowns of these numbers (w,), mixed, since one may be a mode by itself.
     """
-    n = len(shifted)
-    width = count // 2 + _SPARE
-    if _BLOCKS * width >= n / 2:
-        lowest = [0, min(count, n) - 1]
-        eigenvalues, vectors = linalg.eigh(shifted, subset_by_index=lowest, check_finite=False)
-        return eigenvalues, vectors
-    block = np.asarray(np.random.default_rng(0).standard_normal((n, width)))
-    basis = np.empty((n, _BLOCKS * width), dtype=float)
-    for number in range(_BLOCKS):
-        block = linalg.lapack.dpotrs(factor, block, lower=1)[0]
-        known = basis[:, : number * width]
-        block -= known @ (known.T @ block)
-        block = linalg.qr(block, mode="economic", check_finite=False)[0]
-        basis[:, number * width : (number + 1) * width] = block
-    basis = linalg.qr(basis, mode="economic", overwrite_a=True, check_finite=False)[0]
-    solved, _ = linalg.lapack.dpotrs(factor, basis, lower=1)
-    u, mixture = linalg.eigh(basis.T @ solved, check_finite=False)
-    u, mixture = u[: -count - 1 : -1].copy(), mixture[:, : -count - 1 : -1]
-    vectors = solved @ (mixture / u)
+    n, width = len(factor), len(start)
+    number = np.arange(width)
+    block = np.zeros((n, width), order="F")
+    block[start] = np.cos(np.pi / width * np.multiply.outer(number + 0.5, number))
+    basis = np.empty((n, n // width * width), order="F")
+    solved = np.empty_like(basis)
+    for size in range(width, basis.shape[1] + 1, width):
+        known = basis[:, : size - width]
+        for _ in range(
+            2 if size > width else 1
+        ):  # twice: a mode found exactly leaves only rounding
+            block, _ = np.linalg.qr(block - known @ (known.T @ block))
+        basis[:, size - width : size] = block
+        solved[:, size - width : size], _ = linalg.lapack.dpotrs(factor, block, lower=1)
+        if size < _LEAST_BLOCKS * width:
+            block = solved[:, size - width : size]
+            continue
+        own, block = basis[:, :size], solved[:, size - width : size]
+        projected = own.T @ solved[:, :size]
+        u, mixture = np.linalg.eigh(projected)
+        kept = int(np.searchsorted(-u[::-1], -1 / cut))
+        # The inverse leaves the space only from its last block.
+        outside = (block - own @ projected[:, -width:]) @ mixture[-width:, : -kept - 2 : -1]
+        residuals = np.linalg.norm(outside, axis=0) / u[: -kept - 2 : -1]
+        if (residuals[:kept] < _CONVERGED).all() and (residuals[kept:] < _FOUND).any():
+            break
+    u, mixture = u[::-1].copy(), mixture[:, ::-1]
+    u, mixture = u[: kept + 1], mixture[:, : kept + 1]
+    vectors = solved[:, :size] @ (mixture / u)
     return 1 / u, vectors / np.linalg.norm(vectors, axis=0)

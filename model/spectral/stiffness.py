@@ -1,10 +1,13 @@
 """Stiffness of the free Reissner-Mindlin plate in the functions of both directions."""
 
+import math
+from itertools import pairwise
+
 import numpy as np
 
 from model.arrays import FloatArray
 from model.fem.elements.element import rigidities
-from model.spectral.functions import EVEN, ODD, Direction
+from model.spectral.functions import Direction
 from model.structure.plate import Plate
 
 
@@ -22,22 +25,53 @@ def class_stiffness(
     bending, shear, inertia = rigidities(plate)
     D, coupled, twist = bending[0, 0], bending[0, 1], bending[2, 2]
     a, b = parity
-    nx, ny = x.polynomial_count(a), y.polynomial_count(b)
-    unit_x = {each: np.eye(x.count(each)) for each in (EVEN, ODD)}
-    unit_y = {each: np.eye(y.count(each)) for each in (EVEN, ODD)}
+    of_w = x.polynomial_count(a), y.polynomial_count(b)
+    of_x, of_y = (x.count(-a), y.count(b)), (x.count(a), y.count(-b))
     squares_x, squares_y = x.slope_squares, y.slope_squares
     products_x, products_y = x.slope_products, y.slope_products
-    ww = shear * (
-        np.kron(squares_x[a][:nx, :nx], np.eye(ny)) + np.kron(np.eye(nx), squares_y[b][:ny, :ny])
+    w, beta_x, beta_y = _blocks(of_w, of_x, of_y)
+    K = np.zeros((beta_y.stop, beta_y.stop))
+
+    # Products with the unit matrix along y fill the diagonals of blocks of y, and so on.
+    deflection, rotation = inertia[0, 0], inertia[1, 1]
+    ww, xx, yy = (
+        K[block, block].reshape(*shape, *shape)
+        for block, shape in ((w, of_w), (beta_x, of_x), (beta_y, of_y))
     )
-    wx = -shear * np.kron(products_x[a][:nx], unit_y[b][:ny])
-    wy = -shear * np.kron(unit_x[a][:nx], products_y[b][:ny])
-    xx = D * np.kron(squares_x[-a], unit_y[b]) + twist * np.kron(unit_x[-a], squares_y[b])
-    yy = D * np.kron(unit_x[a], squares_y[-b]) + twist * np.kron(squares_x[a], unit_y[-b])
-    for rotation in (xx, yy):
-        rotation[np.diag_indices_from(rotation)] += shear
-    xy = coupled * np.kron(products_x[-a], products_y[-b].T)
-    xy += twist * np.kron(products_x[a].T, products_y[b])
-    K = np.block([[ww, wx, wy], [wx.T, xx, xy], [wy.T, xy.T, yy]])
-    scale = np.repeat(1 / np.sqrt(np.diag(inertia)), [len(ww), len(xx), len(yy)])
-    return np.asarray(K * scale[:, None] * scale)
+    nx, ny = of_w
+    _along_x(ww)[:] += shear / deflection * squares_x[a][:nx, :nx, None]
+    _along_y(ww)[:] += shear / deflection * squares_y[b][:ny, :ny]
+    _along_x(xx)[:] += D / rotation * squares_x[-a][:, :, None]
+    _along_y(xx)[:] += twist / rotation * squares_y[b]
+    _along_x(yy)[:] += twist / rotation * squares_x[a][:, :, None]
+    _along_y(yy)[:] += D / rotation * squares_y[-b]
+    rotations = np.arange(w.stop, len(K))
+    K[rotations, rotations] += shear / rotation
+
+    mixed = -shear / math.sqrt(deflection * rotation)
+    wx = K[w, beta_x].reshape(*of_w, *of_x)
+    _along_x(wx[..., :ny])[:] = mixed * products_x[a][:nx, :, None]
+    wy = K[w, beta_y].reshape(*of_w, *of_y)
+    _along_y(wy[:, :, :nx])[:] = mixed * products_y[b][:ny]
+    xy = K[beta_x, beta_y]
+    xy += np.kron(coupled / rotation * products_x[-a], products_y[-b].T)
+    xy += np.kron(twist / rotation * products_x[a].T, products_y[b])
+    for rows, columns in ((w, beta_x), (w, beta_y), (beta_x, beta_y)):
+        K[columns, rows] = K[rows, columns].T
+    return K
+
+
+def _blocks(*shapes: tuple[int, int]) -> list[slice]:
+    """Rows of the unknowns with these numbers of functions along x and y."""
+    ends = np.cumsum([0, *(nx * ny for nx, ny in shapes)]).tolist()
+    return [slice(*each) for each in pairwise(ends)]
+
+
+def _along_x(block: FloatArray) -> FloatArray:
+    """View of a block (nx, ny, mx, ny) between the same functions of y, (nx, mx, ny)."""
+    return np.asarray(np.einsum("ijkj->ikj", block))
+
+
+def _along_y(block: FloatArray) -> FloatArray:
+    """View of a block (nx, ny, nx, my) between the same functions of x, (nx, ny, my)."""
+    return np.asarray(np.einsum("ijik->ijk", block))

@@ -6,17 +6,21 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy import linalg
 
 from model.errors import InputError
 from model.fem.elements import Q5
 from model.fem.mesh import Mesh
 from model.fem.plate_mesh import PlateMesh
+from model.fem.symmetry import CLASSES
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
+from model.reduction.spectral_modes import spectral_modes
 from model.rig.meshes import mesh_from_dict, mesh_of
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
+from model.spectral.stiffness import class_stiffness
 from model.structure.actuator import Era
 from model.structure.plate import Material, Plate
 from model.structure.point_load import PointLoad, footprints_of
@@ -121,18 +125,43 @@ def test_response_on_feet_is_that_of_fine_elements(layout, foot):
     assert np.linalg.norm(high - exact) / size < 0.001
 
 
+@pytest.mark.parametrize("before", [[], ["edges"]], ids=["first layout", "further layout"])
+@pytest.mark.parametrize("foot", [0.0, 0.004])
 @pytest.mark.parametrize("layout", ["corners", "inside", "close together"])
-def test_reduction_equals_direct_solution(layout):
-    """Modes and residual operators against a solution of all unknowns at each frequency, 1e-5."""
-    eras, loads = _on_plate(PAPER, LAYOUTS[layout]), [PointLoad(0.1, 0.05, 2e3, 1.0, 0.01)]
+def test_reduction_equals_direct_solution(layout, foot, before):
+    """Modes and truncated ones against a solution of all unknowns at each frequency, 1e-5.
+
+    Places of the first layout are solved for, those of others come from residual operators.
+    """
+    eras = [replace(era, foot=foot) for era in _on_plate(PAPER, LAYOUTS[layout])]
+    loads = [PointLoad(0.1, 0.05, 2e3, 1.0, 0.01)]
     frequencies = np.array([45.0, 106.4, 250.0, 480.0])
     points = np.random.default_rng(1).uniform(0.01, 0.2, (25, 2))
     mesh = SpectralMesh(12, 9, PAPER.length, PAPER.width)
     free = solve_free_plate(PAPER, mesh, frequency_max=500.0)
+    for other in before:
+        free.acceleration(_on_plate(PAPER, LAYOUTS[other]), frequencies, points)
     found = free.acceleration(eras, frequencies, points, loads=loads)
     exact = direct_spectral_acceleration(PAPER, mesh, eras, frequencies, points, loads=loads)
     error = np.linalg.norm(found - exact, axis=2) / np.linalg.norm(exact, axis=2)
     assert error.max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("plate", "degrees", "frequency"),
+    [("paper", (12, 9), 640.0), ("glass panel", (18, 12), 1000.0), ("strip", (16, 6), 2000.0)],
+)
+def test_modes_are_those_of_a_full_eigen_solution(plate, degrees, frequency):
+    """LAPACK on all unknowns of each class finds the same modes below a cut-off, and no others."""
+    of = PLATES[plate]
+    mesh = SpectralMesh(*degrees, of.length, of.width)
+    modes = spectral_modes(of, mesh, shift=(2 * math.pi * 30) ** 2, cutoff_frequency=frequency)
+    every = np.concatenate(
+        [linalg.eigvalsh(class_stiffness(of, *mesh.directions(of), each)) for each in CLASSES]
+    )
+    expected = np.sqrt(np.maximum(every, 0)) / (2 * math.pi)
+    found = np.sqrt(np.sort(modes.eigenvalues)) / (2 * math.pi)
+    np.testing.assert_allclose(found, np.sort(expected[expected < frequency]), rtol=1e-5, atol=0.1)
 
 
 def test_static_vectors_carry_the_local_compliance():

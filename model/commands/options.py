@@ -9,7 +9,7 @@ RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g.
 TableArgument = Annotated[Path, typer.Argument(metavar="TABLE", help="Table file, e.g. T.npz.")]
 MeshOption = Annotated[
     str | None,
-    typer.Option(metavar="NXxNY", help="Elements along x and y, or '12x9 ELEMENT'; default: rig."),
+    typer.Option(metavar="NXxNY", help="Mesh, as in a rig: auto, 12x9, '12x9 Q3'; default: rig."),
 ]
 FolderOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write into.")

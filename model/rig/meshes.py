@@ -4,31 +4,41 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from model.config.units import LENGTH, quantity
 from model.errors import InputError
 from model.fem.element_registry import element_of
 from model.fem.mesh import PAPER_ELEMENT, Mesh
 from model.fem.plate_mesh import PlateMesh
-from model.spectral.mesh import POLYNOMIALS, SpectralMesh
+from model.spectral.mesh import MAX_POLYNOMIALS, POLYNOMIALS, SpectralMesh
 from model.structure.plate import Plate
 
 _MAX_ELEMENTS_PER_SIDE = 1000
 _MIN_PERCENT, _MAX_PERCENT = 0.05, 10.0
+_DEFAULT_ACCURACY = 0.01  # places within 0.1 mm of an ERA's change the response as much
 _MAX_AUTO_NODES = 300_000  # a million degrees of freedom: minutes, and most of a machine's memory
+
+_STRIPS = " with strips of "
 
 
 def mesh_of(text: str, plate: Plate, *, frequency_max: float, stiffness: float = 0.0) -> PlateMesh:
     """The mesh `auto` or `auto A %`, accurate up to a frequency [Hz], or that of `parse_mesh`.
 
-    `auto` is of finite elements, `auto A %` of polynomials over the plate for an error of the
-    response of A %. stiffness [N/m]: of the stiffest ERA.
+    Both are of polynomials over the plate for an error of the response of A %, by default 1 %;
+    `auto` of finite elements where there would be too many. stiffness [N/m]: of the stiffest ERA.
     """
     words = text.split()
     if words[:1] != ["auto"]:
         return parse_mesh(text, plate)
-    if len(words) > 1:
-        accuracy = _accuracy(" ".join(words[1:]))
-        return SpectralMesh.accurate(
-            plate, frequency_max=frequency_max, accuracy=accuracy, stiffness=stiffness
+    accuracy = _accuracy(" ".join(words[1:])) if words[1:] else _DEFAULT_ACCURACY
+    polynomials = SpectralMesh.accurate(
+        plate, frequency_max=frequency_max, accuracy=accuracy, stiffness=stiffness
+    )
+    if polynomials is not None:
+        return polynomials
+    if words[1:]:
+        raise InputError(
+            f"mesh: {text} must need at most {MAX_POLYNOMIALS} polynomials, got more up to "
+            f"{frequency_max:g} Hz; use auto, then of finite elements, or less accuracy"
         )
     mesh = Mesh.accurate(plate, frequency_max=frequency_max)
     if mesh.node_count > _MAX_AUTO_NODES:
@@ -54,23 +64,31 @@ def _accuracy(text: str) -> float:
 def parse_mesh(text: str, plate: Plate) -> PlateMesh:
     """The mesh `NXxNY`, or `NXxNY ELEMENT`, over a plate; with Legendre the numbers are degrees.
 
-    Raises InputError for other text, an unknown element, and too many elements.
+    Elements may be `with strips of` a length, as a mesh is printed. Raises InputError for other
+    text, an unknown element, and too many elements.
     """
-    match = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})(?:\s+(\S{1,40}))?\s*", text, re.ASCII)
+    match = re.fullmatch(
+        rf"\s*(\d{{1,6}})\s*[xX×]\s*(\d{{1,6}})(?:\s+(\S{{1,40}}))?(?:{_STRIPS}(.{{1,40}}))?\s*",
+        text,
+        re.ASCII,
+    )
     if match is None:
         raise InputError(
             f"mesh must be auto, auto 1 %, or NXxNY with an optional element, for example 48x36 "
             f"or 12x9 Q3, got {text[:40]!r}"
         )
     nx, ny = int(match[1]), int(match[2])
+    strip = quantity(match[4], LENGTH) if match[4] else 0.0
     if match[3] == POLYNOMIALS:
+        if strip:
+            raise InputError(f"mesh of polynomials must be without strips, got {text[:40]!r}")
         return SpectralMesh(nx, ny, plate.length, plate.width)
     if not 1 <= min(nx, ny) <= max(nx, ny) <= _MAX_ELEMENTS_PER_SIDE:
         raise InputError(
             f"mesh must have 1 to {_MAX_ELEMENTS_PER_SIDE} elements a side, got {nx}x{ny}"
         )
     element = element_of(match[3]) if match[3] else PAPER_ELEMENT
-    return Mesh(nx=nx, ny=ny, length=plate.length, width=plate.width, element=element)
+    return Mesh(nx=nx, ny=ny, length=plate.length, width=plate.width, element=element, strip=strip)
 
 
 def mesh_from_dict(values: Mapping[str, Any]) -> PlateMesh:

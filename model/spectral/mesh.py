@@ -28,9 +28,11 @@ _ACCURATE = 6
 _ERROR_PER_DENT = 0.2
 
 _FINER = 4  # further degrees to compare with
-_MAX_POLYNOMIALS = 2500  # of the deflection; the cost grows with their third power
 
-_POINTS_PER_DEGREE = 2  # of the raster that shows a field
+MAX_POLYNOMIALS = 2500
+"""Of the deflection; the cost grows with their third power."""
+
+_POINTS_PER_DEGREE = 8  # of the raster that shows a field: fifty to a wavelength
 
 
 @dataclass(frozen=True)
@@ -55,11 +57,11 @@ class SpectralMesh:
     @classmethod
     def accurate(
         cls, plate: Plate, *, frequency_max: float, accuracy: float, stiffness: float
-    ) -> Self:
+    ) -> Self | None:
         """Choose degrees for a relative L2 error of the response up to a frequency [Hz].
 
         accuracy: that error, 0.01 for 1 %; stiffness [N/m]: of the stiffest ERA, whose force dents
-        the plate under it. Raises InputError where finite elements would cost less.
+        the plate under it. None where more than MAX_POLYNOMIALS would be needed.
         """
         half = plate.bending_wavelength(frequency_max) / math.pi
         more = _ACCURATE + max(0, math.ceil(math.log2(0.01 / accuracy)))
@@ -69,12 +71,8 @@ class SpectralMesh:
                 max(MIN_DEGREE, math.ceil(side / half) + more)
                 for side in (plate.length, plate.width)
             )
-            if (nx + 1) * (ny + 1) > _MAX_POLYNOMIALS:
-                raise InputError(
-                    f"mesh: auto {100 * accuracy:g} % needs degrees {nx}x{ny} up to "
-                    f"{frequency_max:g} Hz, above {_MAX_POLYNOMIALS} polynomials; use auto, which "
-                    "is of finite elements, or less accuracy"
-                )
+            if (nx + 1) * (ny + 1) > MAX_POLYNOMIALS or max(nx, ny) > MAX_DEGREE:
+                return None
             dent = local_compliance(plate, (nx, ny), centre, centre)[0, 0]
             if _ERROR_PER_DENT * stiffness * dent <= accuracy:
                 return cls(nx, ny, plate.length, plate.width)

@@ -73,13 +73,13 @@ class Convergence:
 
 
 def meshes_to_compare(rig: Rig) -> tuple[PlateMesh, ...]:
-    """List four MITC4 meshes, one of Q5 with strips, the automatic one, and the rig's own."""
+    """List four MITC4 meshes, `mesh: auto`, one of Q5 with strips, and the rig's own."""
     plate, high = rig.plate, rig.limits.frequency_max
     size = plate.bending_wavelength(high) / _COARSEST_PER_WAVELENGTH
     nx, ny = (max(1, math.ceil(side / size)) for side in (plate.length, plate.width))
     plain = [Mesh(nx << n, ny << n, plate.length, plate.width) for n in range(_DOUBLINGS + 1)]
     stiffness = max(era.stiffness for era in rig.eras)
-    automatic = mesh_of("auto 1 %", plate, frequency_max=high, stiffness=stiffness)
+    automatic = mesh_of("auto", plate, frequency_max=high, stiffness=stiffness)
     chosen = [*plain, automatic, Mesh.accurate(plate, frequency_max=high), rig.mesh]
     return tuple(dict.fromkeys(chosen))
 

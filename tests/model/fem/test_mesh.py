@@ -1,4 +1,4 @@
-"""Meshes: nodes, interpolation, automatic choice and refused values."""
+"""Meshes: nodes, interpolation, choice for a frequency and refused values."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from model.errors import InputError
 from model.fem.elements import ELEMENTS
 from model.fem.mesh import Mesh
-from model.rig.meshes import mesh_from_dict
+from model.rig.meshes import mesh_from_dict, parse_mesh
 from model.structure.plate import Plate
 from paper_plate import ALUMINIUM, LENGTH, WIDTH
 
@@ -49,7 +49,20 @@ def test_mesh_strips_lie_along_every_edge():
     np.testing.assert_allclose(y, [0, 0.003, 0.003 + 0.194 / 3, 0.003 + 2 * 0.194 / 3, 0.197, 0.2])
 
 
-def test_auto_mesh_follows_the_bending_wavelength():
+def test_mesh_is_read_as_it_is_printed():
+    """By elements, with strips, and by degrees, as commands and pages name meshes."""
+    plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
+    for text in ("12x9", "12x9 Q3", "10x8 Q5 with strips of 3 mm", "14x12 Legendre"):
+        assert str(parse_mesh(text, plate)) == text
+    assert parse_mesh("10x8 Q5 with strips of 3 mm", plate) == Mesh.accurate(
+        plate, frequency_max=500.0
+    )
+    for text in ("14x12 Legendre with strips of 3 mm", "12x9 Q5 with strips of 3 kg", "12x9 with"):
+        with pytest.raises(InputError):
+            parse_mesh(text, plate)
+
+
+def test_accurate_mesh_follows_the_bending_wavelength():
     """At twice the frequency the wave is 1.41 times shorter, at four times half as long."""
     plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
     low, high = (Mesh.accurate(plate, frequency_max=f) for f in (500.0, 2000.0))
@@ -58,7 +71,7 @@ def test_auto_mesh_follows_the_bending_wavelength():
     assert low.strip == high.strip == 0.003
 
 
-def test_auto_mesh_has_no_strips_when_plate_is_thick():
+def test_accurate_mesh_has_no_strips_when_plate_is_thick():
     """Where the edge's layer is as wide as an element, the element follows it already."""
     assert Mesh.accurate(Plate(0.2, 0.1, 0.02, ALUMINIUM), frequency_max=500.0).strip == 0
 

@@ -20,7 +20,7 @@ from paper_plate import make_paper_rig
 
 @pytest.fixture(scope="module")
 def free_plate():
-    """The paper's plate on its automatic mesh, up to the highest of the 27 frequencies."""
+    """The paper's plate on high-order elements, up to the highest of the 27 frequencies."""
     plate = make_paper_rig(12, 9).plate
     return solve_free_plate(plate, Mesh.accurate(plate, frequency_max=500.0), frequency_max=320.0)
 

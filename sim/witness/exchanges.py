@@ -70,7 +70,7 @@ class Exchanges:
                 if not message.problem and (
                     message.kind in STATE_CHANGING or message.kind is RequestKind.PING
                 ):
-                    session.amplifier.watchdog.may_feed(time)
+                    session.amplifier.may_feed(time)
 
     def damaged(
         self,
@@ -120,7 +120,7 @@ class Exchanges:
         """Process a broadcast, a host's heartbeat on CAN, or an SDO transfer."""
         if request.kind is RequestKind.PING and session.amplifier.state is not None:
             if session.is_disturbed(time):
-                session.amplifier.watchdog.may_feed(time)
+                session.amplifier.may_feed(time)
             else:
                 session.amplifier.feed(time)
         elif request.kind is RequestKind.HELLO:
@@ -133,7 +133,7 @@ class Exchanges:
 
     def _process_reply(self, session: AmplifierSession, time: float, reply: Reply) -> None:
         if reply.key == "objects":
-            session.amplifier.watchdog.may_feed(time)
+            session.amplifier.may_feed(time)
             return
         if reply.problem == REPLY_TO_DAMAGED_FRAME:
             session.report("damage", time, f"{session.name} executed a damaged frame")

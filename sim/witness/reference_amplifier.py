@@ -23,6 +23,7 @@ from sim.witness.reference_outputs import ReferenceOutputs
 from sim.witness.watchdog import Watchdog
 
 SILENCING_RAMP = 0.005  # s; along which the watchdog and faults silence
+_CARRIED_OUT = 0.010  # s; within which a request is carried out, replied to or not
 _REMEMBERED = 16  # tokens since Arm
 _WARM = 60.0  # °C; from here on an amplifier may derate
 _ENABLED, _STOPPED, _REACTING, _FAULT = 4, 5, 6, 7
@@ -111,6 +112,10 @@ class ReferenceAmplifier:
         if self.state == _ENABLED:
             self.watchdog.feed((time, time))
 
+    def may_feed(self, time: float) -> None:
+        """Note a request that feeds its watchdog unless refused or lost, carried out soon."""
+        self.watchdog.may_feed(time + _CARRIED_OUT)
+
     def advance(self, time: float) -> None:
         """Apply what must have happened without a request until now."""
         self._outputs.advance(time)
@@ -126,7 +131,8 @@ class ReferenceAmplifier:
         """Apply a request sent at `begin` and granted by a reply at `end` [s]."""
         self.advance(begin)
         self._check_state_allows(request, end)
-        if request.kind in WATCHDOG_FEEDING:
+        is_late = reply.status is not None and reply.status.state in (_REACTING, _FAULT)
+        if request.kind in WATCHDOG_FEEDING and not is_late:  # else it may have expired before
             self.watchdog.feed((begin, end))
         match request.kind:
             case RequestKind.ARM:
@@ -189,8 +195,8 @@ class ReferenceAmplifier:
         self.advance(time)
         if self.state is None:
             return
-        self.watchdog.may_feed(time)
-        soon = (time, time + 0.010)  # as a reply would take
+        self.may_feed(time)
+        soon = (time, time + _CARRIED_OUT)
         if request.kind is RequestKind.STOP:
             self._states_before = ({self.state}, soon[1])
             self._broadcast_stop, self._stopped_between = request, soon
@@ -321,7 +327,8 @@ class ReferenceAmplifier:
         here, now = self.state, reported.state
         trips = now in (_REACTING, _FAULT) and here not in (None, *_OFF, _REACTING, _FAULT)
         states, until = self._states_before
-        if end <= until and any(now in _possible_states(state) for state in states):
+        is_earlier = end <= until and any(now in _possible_states(state) for state in states)
+        if is_earlier and now not in _possible_states(here or 0):
             return  # reported before the broadcast stop
         if trips:
             self.last_fault = end

@@ -151,3 +151,38 @@ def test_reference_expects_a_broadcast_stop_within_10_ms(time: float, broken: li
     watched.amplifier.broadcast_sent(STOP_ALL, 1.1)
     watched.amplifier.event_received(ENABLED, 0, time)
     assert watched.broken == broken
+
+
+def test_reference_follows_a_fault_that_crosses_a_broadcast_stop() -> None:
+    """FAULT reported while the Stop is on its way; Clear then leads out of it."""
+    watched = Watched()
+    watched.grants(ARM, 1.0, ENABLED)
+    watched.amplifier.event_received(REACTING, WATCHDOG, 1.255)
+    watched.amplifier.broadcast_sent(STOP_ALL, 1.2552)
+    watched.amplifier.event_received(FAULT, WATCHDOG, 1.2553)
+    watched.grants(Request(RequestKind.CLEAR, 1, key=6), 1.4, 1)
+    assert watched.broken == []
+
+
+@pytest.mark.parametrize(("silent_at", "broken"), [(1.262, []), (1.272, ["watchdog"])])
+def test_reference_allows_10_ms_for_a_request_without_a_reply(
+    silent_at: float, broken: list[str]
+) -> None:
+    """Sent at 1.000 s, it may feed until 1.010 s: silent from 1.260 s and a ramp of 5 ms on."""
+    watched = Watched()
+    watched.grants(ARM, 0.8, ENABLED)
+    watched.amplifier.request_granted(BRIEF, Reply(1, 3), 0.9, 0.902)
+    watched.amplifier.may_feed(1.0)
+    watched.amplifier.check_sensors((0.1,), {}, silent_at)
+    assert [rule for rule in watched.broken if rule != "plays"] == broken
+
+
+@pytest.mark.parametrize(("stopped_at", "broken"), [(1.253, []), (1.1, ["watchdog"])])
+def test_reference_expects_no_feed_from_a_request_after_the_watchdog(
+    stopped_at: float, broken: list[str]
+) -> None:
+    """A reply that reports the watchdog's fault tells of what was before its request."""
+    watched = Watched()
+    watched.grants(ARM, 1.0, ENABLED)
+    watched.grants(STOP, stopped_at, REACTING, WATCHDOG)
+    assert watched.broken == broken

@@ -1,10 +1,12 @@
 """What all tests share: one thread for linear algebra, the paper's plate, the order of files."""
 
 import fcntl
+import gc
 import os
 import signal
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
+from types import SimpleNamespace
 
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"  # before numpy loads: two threads are slower here, and erratic
@@ -17,6 +19,7 @@ import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 import preloaded  # noqa: E402
+from drivers.operation import garbage_collection  # noqa: E402
 from model.reduction import finite_element_modes  # noqa: E402
 from model.reduction.class_modes import finite_element_classes  # noqa: E402
 from model.rig.file import example_rig_path, load_rig  # noqa: E402
@@ -65,6 +68,9 @@ settings.load_profile("short")
 
 finite_element_modes.finite_element_classes = lru_cache(24)(finite_element_classes)
 """Free plates are solved once in a process: hundreds of tests are of the same ones."""
+
+garbage_collection.gc = SimpleNamespace(**vars(gc) | {"collect": partial(gc.collect, 1)})  # type: ignore[attr-defined]
+"""A daemon in a test starts without visiting all objects of the suite: a fifth of a second each."""
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -27,15 +27,15 @@ class Budget:
         # Sets that were delayed on their way arrive closer together than they were sent.
         self._window = max(_RATE_WINDOW, allowed / limits.rate) + COMMIT_DELAY
         self._sent: deque[float] = deque(maxlen=allowed)
-        self._vibrations: deque[tuple[float, float]] = deque()  # ended ones: begin, end
-        self._begin: float | None = None  # earliest begin of the present one
+        self._vibrations: deque[tuple[float, float]] = deque()  # ended ones: start, end
+        self._start: float | None = None  # earliest start of the current one
         self._end = 0.0  # its latest end
 
     def remaining(self, now: float, *, fade: float, delay: float = CHECK_DELAY) -> float:
         """Longest valid_for [s] of a vibration that is sent now, infinite if unlimited.
 
         fade [s]: how long it takes to end after that; delay [s]: allowance until it is played,
-        while the present vibration goes on. Raises CommandRefused if no time is left or the rate is
+        while the current vibration goes on. Raises CommandRefused if no time is left or the rate is
         exceeded.
         """
         if len(self._sent) == self._sent.maxlen and now < self._sent[0] + self._window:
@@ -44,49 +44,49 @@ class Budget:
                 "the limit stops runaway loops",
                 until=self._sent[0] + self._window,
             )
-        is_vibrating = self._begin is not None and now < self._end
+        is_vibrating = self._start is not None and now < self._end
         spent = fade + (delay if is_vibrating else 0.0)
-        used = now - self._begin if is_vibrating and self._begin is not None else 0.0
+        used = now - self._start if is_vibrating and self._start is not None else 0.0
         return min(
             _left("on-time limit", used, self._limits.on_time, spent),
             _left(f"duty limit over {DUTY_WINDOW:g} s", self._used(now), self._duty_time, spent),
         )
 
     def fade_left(self, now: float) -> float:
-        """Longest time [s] in which the present vibration may fade if silence is sent now."""
-        if self._begin is None or now >= self._end:
+        """Longest time [s] in which the current vibration may fade if silence is sent now."""
+        if self._start is None or now >= self._end:
             return float("inf")
-        used = max(self._used(now) - self._duty_time, now - self._begin - self._limits.on_time)
+        used = max(self._used(now) - self._duty_time, now - self._start - self._limits.on_time)
         return max(0.0, -used - COMMIT_DELAY)
 
     def sent(self, now: float, *, lasts: float) -> None:
         """Note a set that vibrates for at most a time [s], its fade included."""
         self._sent.append(now)
         self._close(now)
-        if self._begin is None:
-            self._begin, self._end = now, now
+        if self._start is None:
+            self._start, self._end = now, now
         self._end = max(self._end, now + COMMIT_DELAY + lasts)
 
     def confirm(self, since: float, now: float, *, end: float) -> None:
         """Note that the set sent at a time [s] plays, and ends at another at the latest."""
         self._close(now)
-        if self._begin is None and now < end:
-            self._begin = since
+        if self._start is None and now < end:
+            self._start = since
         self._end = end
 
     def _close(self, now: float) -> None:
-        """File the present vibration once it has ended."""
-        if self._begin is not None and self._end <= now:
-            self._vibrations.append((self._begin, self._end))
-            self._begin = None
+        """Store the current vibration once it has ended."""
+        if self._start is not None and self._end <= now:
+            self._vibrations.append((self._start, self._end))
+            self._start = None
         while self._vibrations and self._vibrations[0][1] < now - DUTY_WINDOW:
             self._vibrations.popleft()
 
     def _used(self, now: float) -> float:
         """Vibration time within the window before now [s]."""
         opened = now - DUTY_WINDOW
-        present = () if self._begin is None else ((self._begin, min(now, self._end)),)
-        spans = [end - max(begin, opened) for begin, end in (*self._vibrations, *present)]
+        current = () if self._start is None else ((self._start, min(now, self._end)),)
+        spans = [end - max(start, opened) for start, end in (*self._vibrations, *current)]
         return sum((max(0.0, span) for span in spans), start=0.0)
 
 

@@ -15,8 +15,8 @@ from drivers.guard.channel_state import (
     ChannelState,
     Interval,
     duration,
-    followed_by,
-    unknown_between,
+    state_after,
+    union_of,
 )
 from drivers.protocol.messages import Achieved, AmplifierState, Status
 from registry.limits import GuardLimits
@@ -126,7 +126,7 @@ class PlayRecord:
         before = self._states(self._pending[:number], when)
         played = _played(sent)
         if self._limits.slew == math.inf and not self._is_shaped(sent.command_set):
-            self._confirmed = _highest_after(before, played, when)
+            self._confirmed = _upper_bounds_after(before, played, when)
         else:
             self._confirmed = states_after(before, played, when, self.slots)[0]
         self._confirmed_token = token
@@ -183,7 +183,7 @@ class PlayRecord:
             raise
 
     def _allowed_from(self, command_set: CommandSet, now: float) -> float | None:
-        """Return the time [s] from which a set is allowed, if only present fades forbid it."""
+        """Return the time [s] from which a set is allowed, if only current fades forbid it."""
         if self._pending or self._may_be_silent:
             return None
         settled = max(state.commit.latest + state.settled_after for state in self._confirmed)
@@ -209,7 +209,7 @@ class PlayRecord:
                 )
         if not self._is_shaped(command_set):
             return
-        levels = [state.worst for state in after]
+        levels = [state.max_level for state in after]
         for channel, level in enumerate(levels):
             if level > limits.level * _ROUNDING:
                 raise CommandRefused(
@@ -228,7 +228,10 @@ class PlayRecord:
         """Whether a channel may follow an envelope during this set or at its end."""
         return (
             any(command.onset or command.ending for command in command_set.commands)
-            or any(state.ending or state.is_shaped or state.keeps_rest for state in self._confirmed)
+            or any(
+                state.ending or state.is_shaped or state.fading_may_hold
+                for state in self._confirmed
+            )
             or any(
                 command.ending for sent in self._pending for command in sent.command_set.commands
             )
@@ -240,11 +243,9 @@ class PlayRecord:
         for sent in pending:
             committed = Interval(sent.since, max(sent.since, when.latest))
             after, _ = states_after(states, _played(sent), committed, self.slots)
-            states = tuple(
-                unknown_between(both, committed) for both in zip(states, after, strict=True)
-            )
+            states = tuple(union_of(both, committed) for both in zip(states, after, strict=True))
         if self._may_be_silent:
-            states = tuple(unknown_between((state, _SILENT), when) for state in states)
+            states = tuple(union_of((state, _SILENT), when) for state in states)
         return states
 
     def _fade(self, command_set: CommandSet, ramp: float) -> float:
@@ -287,7 +288,7 @@ def states_after(
         command = commands.get(channel) or DriveCommand(channel, 0.0, 0.0)
         # A slot may hold one of several envelopes while one is being loaded.
         several = [
-            followed_by(
+            state_after(
                 state,
                 command,
                 when,
@@ -300,12 +301,12 @@ def states_after(
             for ending in slots.get(command.ending) or (None,)
         ]
         after = [one for one, _ in several]
-        following.append(after[0] if len(after) == 1 else unknown_between(after, when))
+        following.append(after[0] if len(after) == 1 else union_of(after, when))
         slopes.append(max(slope for _, slope in several))
     return tuple(following), slopes
 
 
-def _highest_after(states: States, command_set: CommandSet, when: Interval) -> States:
+def _upper_bounds_after(states: States, command_set: CommandSet, when: Interval) -> States:
     """Return states after a set of ramps that bound its levels from above only."""
     tones = {command.channel: command for command in command_set.commands}
     ramp, valid_for = command_set.ramp, command_set.valid_for or math.inf
@@ -315,7 +316,7 @@ def _highest_after(states: States, command_set: CommandSet, when: Interval) -> S
             path=(0j, complex(tones[channel].level if channel in tones else 0.0)),
             step=ramp,
             commit=when,
-            rest=state.high(when),
+            fading=state.high(when),
             fade=ramp,
             valid_for=valid_for,
         )

@@ -25,7 +25,7 @@ MEASURING_ERROR = 0.002
 CYCLE = 0.002
 """Longest time [s] by which what an amplifier plays and reports may lag behind its commit."""
 
-_WEAK = 0.25  # share of a weak level that a measuring error may be
+_WEAK = 0.25  # largest measuring error, relative to a weak level
 _ROUNDING = 1e-9
 _Q = PROTOCOL.quantities
 _WATCHDOG_ERROR = PROTOCOL.reaction + _Q.watchdog_left.step  # s
@@ -97,7 +97,7 @@ class PlausibilityCheck:
             unknown, _ = states_after(self._unknown_states(when), asked, when, slots)
             # Where there are endings, earlier fades may go on beside them.
             fade = max(self._fade, asked.settled_after) if slots else asked.ramp
-            self._states = tuple(_long_rest(state, fade) for state in unknown)
+            self._states = tuple(_with_longer_fade(state, fade) for state in unknown)
         self._known, self._unconfirmed = (), set()
         self._tokens = {asked.token}
         self._fed = Interval(sent_at, now)
@@ -189,7 +189,7 @@ class PlausibilityCheck:
         """Return states of channels that may play any level until a set replaces it."""
         return tuple(
             ChannelState(
-                rest=self._capabilities.level_max,
+                fading=self._capabilities.level_max,
                 step=math.inf,
                 fade=math.inf,
                 frequencies=frozenset(frequencies),
@@ -242,8 +242,8 @@ class PlausibilityCheck:
         tolerance = 2 * step
         for channel, (state, level) in enumerate(zip(self._states, status.levels, strict=False)):
             low, high = state.low(when), state.high(when)
-            # Tones that fade may cancel the one that lasts, but not to zero twice in a row.
-            if level == 0 and state.own_low(when) > 0.75 * step:
+            # Fading tones may cancel the lasting one, but not to zero twice in a row.
+            if level == 0 and state.lasting_low(when) > 0.75 * step:
                 yield f"level of channel {channel} must be above 0, got 0"
             low -= tolerance + min(MEASURING_ERROR, _WEAK * low)
             high += tolerance + min(MEASURING_ERROR, _WEAK * high)
@@ -254,7 +254,7 @@ class PlausibilityCheck:
     def _shows_levels(self, when: Interval) -> bool:
         """Whether every channel that plays must report a level."""
         return bool(self._states) and all(
-            not state.is_lasting(when) or state.own_low(when) > 0 for state in self._states
+            not state.is_lasting(when) or state.lasting_low(when) > 0 for state in self._states
         )
 
     def _raise_if_fault(self, contradictions: int, problem: str | None) -> None:
@@ -265,11 +265,11 @@ class PlausibilityCheck:
             )
 
 
-def _long_rest(state: ChannelState, lasts: float) -> ChannelState:
-    """Return a state in which what played before may last for a time [s], as along its ending."""
+def _with_longer_fade(state: ChannelState, lasts: float) -> ChannelState:
+    """Return a state whose fading tones may last for a time [s], as along an ending."""
     if lasts <= state.fade:
         return state
-    return replace(state, fade=lasts, keeps_rest=True)
+    return replace(state, fade=lasts, fading_may_hold=True)
 
 
 def _tolerance(quantity: Quantity, step: float) -> float:

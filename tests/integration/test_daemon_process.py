@@ -23,6 +23,8 @@ from daemon_process import (
 from drivers.protocol.messages import AmplifierState
 from model.table.file import save_table
 
+pytestmark = pytest.mark.real_time
+
 
 async def test_second_daemon_is_refused_while_first_plays_on(tmp_path: Path) -> None:
     """Exit status 2 with the process id of the first; at another socket it waits for the link."""

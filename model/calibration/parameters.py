@@ -113,7 +113,7 @@ def responses_at(
     is_factor = np.array([parameter.is_factor for parameter in parameters])
     values = np.where(is_factor, prior * np.exp(np.where(is_factor, x, 0.0)), step * x)
     eras = values[..., 2:].reshape(*values.shape[:-1], -1, 3)
-    return plate.responses_of(values[..., 0], values[..., 1], eras, rig.masses)
+    return plate.receptances(values[..., 0], values[..., 1]).responses(eras, rig.masses)
 
 
 def rig_with(rig: Rig, parameters: Sequence[Parameter], x: FloatArray) -> Rig:

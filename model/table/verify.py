@@ -202,7 +202,7 @@ def _check_content(
 
     omega = 2 * np.pi * table.frequencies[chosen]
     modal = ParametricPlate(
-        rig.plate.material.E,
+        rig.plate,
         table.omega**2,
         table.attachment_shapes,
         table.shapes.astype(float),

@@ -31,7 +31,7 @@ from ruamel.yaml import YAML
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.cli.main import run
-from gateway_bench import real_daemon
+from gateway_bench import real_daemon, wait_for
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "reference" / "errors.md"
@@ -122,7 +122,7 @@ def provoke(case: Case, folder: Path, shelf: Path) -> Outcome:
     out, err = io.StringIO(), io.StringIO()
     with _at_home(folder), contextlib.ExitStack() as stack:
         if case.before:
-            _BEFORE[case.before](stack)
+            _BEFORE[case.before](stack, out)
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             program, *arguments = shlex.split(case.run)
             assert program == "era"
@@ -179,7 +179,7 @@ def _at_home(folder: Path) -> Iterator[None]:
         os.environ.update(environment)
 
 
-def _without_uvicorn(stack: contextlib.ExitStack) -> None:
+def _without_uvicorn(stack: contextlib.ExitStack, _: io.StringIO) -> None:
     stack.callback(sys.modules.__setitem__, "uvicorn", import_module("uvicorn"))
     sys.modules["uvicorn"] = None  # type: ignore[assignment]  # as where it is not installed
 
@@ -197,16 +197,15 @@ def _disarmed(stack: contextlib.ExitStack) -> Client:
     return client
 
 
-def _armed_by_another(stack: contextlib.ExitStack) -> None:
+def _armed_by_another(stack: contextlib.ExitStack, _: io.StringIO) -> None:
     _disarmed(stack).arm("another")
 
 
-def _stopped_once_armed(stack: contextlib.ExitStack) -> None:
+def _stopped_once_armed(stack: contextlib.ExitStack, out: io.StringIO) -> None:
     client = _disarmed(stack)
 
     def stop() -> None:
-        while client.status().state != "OPERATION_ENABLED":
-            time.sleep(0.005)
+        wait_for(out.getvalue)  # it says so once it is armed
         client.stop()
 
     thread = threading.Thread(target=stop)
@@ -214,7 +213,7 @@ def _stopped_once_armed(stack: contextlib.ExitStack) -> None:
     stack.callback(thread.join)
 
 
-_BEFORE: dict[str, Callable[[contextlib.ExitStack], None]] = {
+_BEFORE: dict[str, Callable[[contextlib.ExitStack, io.StringIO], None]] = {
     "without_uvicorn": _without_uvicorn,
     "armed_by_another": _armed_by_another,
     "stopped_once_armed": _stopped_once_armed,

@@ -6,7 +6,7 @@ One browser and one daemon for all tests; each opens a tab of its own.
 import asyncio
 import logging
 import re
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -103,6 +103,12 @@ async def settled(page: Page, era: Client) -> None:
             await asyncio.sleep(0.1)
 
 
+async def show_on(page: Page, screen: Screen) -> None:
+    """Show the open page on another screen."""
+    await page.fit(screen.width, screen.height, is_phone=screen.is_phone)
+    await page.evaluate("new Promise(done => requestAnimationFrame(() => setTimeout(done)))")
+
+
 async def until_state(era: Client, *states: str) -> None:
     """Wait for a state of the daemon while the browser runs."""
     await asyncio.to_thread(wait_for_state, era, *states)
@@ -112,6 +118,13 @@ async def contacts(era: Client, count: int) -> list[tuple[float, float]]:
     """The daemon's contacts [m], as soon as there are so many."""
     await asyncio.to_thread(wait_for, lambda: len(era.status().contacts) == count)
     return [(contact.x_m, contact.y_m) for contact in era.status().contacts]
+
+
+async def until_last(era: Client, accepts: Callable[[float], bool]) -> None:
+    """Wait until the last contact's x [m] is accepted; on a busy machine it may lapse meanwhile."""
+    await asyncio.to_thread(
+        wait_for, lambda: any(accepts(contact.x_m) for contact in era.status().contacts[-1:])
+    )
 
 
 async def arm(page: Page, era: Client) -> None:
@@ -153,10 +166,10 @@ async def test_page_shows_the_rig_without_console_messages(page: Page) -> None:
     assert page.complaints == []
 
 
-async def test_plate_is_to_scale_on_every_screen(page: Page, gateway: GatewayProcess) -> None:
+async def test_plate_is_to_scale_on_every_screen(page: Page) -> None:
     """Its aspect ratio is that in metres; nothing exceeds the screen."""
     for screen in SCREENS:
-        await open_dashboard(page, gateway, screen)
+        await show_on(page, screen)
         width, height, overflow = await page.evaluate(
             "(({width, height}) => [width, height, document.documentElement.scrollWidth - "
             "innerWidth])(document.querySelector('#plate').getBoundingClientRect())"
@@ -208,9 +221,7 @@ async def test_touches_become_contacts_of_the_daemon(page: Page, era: Client) ->
             lambda text: re.search(r"\b2\b.* dB SL.* dB ", text) is not None,
         )
         await page.touch("touchMove", await on_plate(page, (0.2, 0.7), (0.6, 0.5)))
-        await asyncio.to_thread(
-            wait_for, lambda: abs(era.status().contacts[1].x_m - 0.6 * LENGTH) < 1e-3
-        )
+        await until_last(era, lambda x: abs(x - 0.6 * LENGTH) < 1e-3)
     assert await contacts(era, 0) == []
     await page.until("document.querySelectorAll('.contact').length === 0")
     await page.until(
@@ -258,7 +269,7 @@ async def test_mouse_is_a_finger_while_its_button_is_down(page: Page, era: Clien
     ((seen, _),) = await contacts(era, 1)
     assert seen == pytest.approx(0.25 * LENGTH, abs=1e-3)
     await page.mouse("mouseMoved", x + 2000, y)  # dragged off the plate: at its edge
-    await asyncio.to_thread(wait_for, lambda: era.status().contacts[0].x_m > LENGTH - 1e-3)
+    await until_last(era, lambda x: x > LENGTH - 1e-3)
     await page.mouse("mouseReleased", x + 2000, y)
     assert await contacts(era, 0) == []
 
@@ -322,29 +333,27 @@ async def test_lease_is_renewed_while_the_page_is_open(page: Page, era: Client) 
     assert any(re.match(r"disarmed by '(http|web:\d+) 127", cause) for cause in causes)
 
 
-@pytest.mark.parametrize(
-    "focus", ["body", "#disarm", "#motion", "#log", "#plate", "#effects button"]
-)
-async def test_space_bar_stops_with_any_focus(page: Page, era: Client, focus: str) -> None:
+async def test_space_bar_stops_with_any_focus(page: Page, era: Client) -> None:
     """It has no other effect there."""
-    await arm(page, era)
-    await page.evaluate(f"document.querySelector({focus!r}).focus()")
-    scrolled = await page.evaluate("scrollY")
-    await page.press(" ", "Space")
-    await until_state(era, STOPPED)
-    assert await page.evaluate("document.querySelector('#motion').checked") is False
-    assert "disarmed by 'g" not in await page.evaluate("document.querySelector('#log').innerText")
-    assert await page.evaluate("scrollY") == scrolled
+    for focus in ("body", "#disarm", "#motion", "#log", "#plate", "#effects button"):
+        await arm(page, era)
+        await page.evaluate(f"document.querySelector({focus!r}).focus()")
+        scrolled = await page.evaluate("scrollY")
+        await page.press(" ", "Space")
+        await until_state(era, STOPPED)
+        assert await page.evaluate("document.querySelector('#motion').checked") is False, focus
+        log = await page.evaluate("document.querySelector('#log').innerText")
+        assert "disarmed by 'g" not in log, focus
+        assert await page.evaluate("scrollY") == scrolled, focus
+        await settled(page, era)
 
 
-async def test_stop_button_is_uncovered_on_every_screen(
-    page: Page, gateway: GatewayProcess
-) -> None:
+async def test_stop_button_is_uncovered_on_every_screen(page: Page) -> None:
     """Wholly within the screen at any scroll position."""
     uncovered = f"({PROBES}).isUncovered('#stop')"
     zoomed = Screen("400 %", 320, 215)
     for screen in (*SCREENS, Screen("wide", 1920, 1080), Screen("narrow", 360, 640), zoomed):
-        await open_dashboard(page, gateway, screen)
+        await show_on(page, screen)
         bottom = await page.evaluate("document.documentElement.scrollHeight")
         for scrolled in range(0, bottom, max(200, screen.height // 2)):
             await page.evaluate(f"window.scrollTo(0, {scrolled})")
@@ -353,9 +362,9 @@ async def test_stop_button_is_uncovered_on_every_screen(
     assert await page.evaluate(uncovered)
 
 
-async def test_touch_targets_are_large_enough(page: Page, gateway: GatewayProcess) -> None:
+async def test_touch_targets_are_large_enough(page: Page) -> None:
     """Every button and switch is 44 pixels wide and high on a phone."""
-    await open_dashboard(page, gateway, PHONE)
+    await show_on(page, PHONE)
     small = await page.evaluate(
         "[...document.querySelectorAll('button, .switch, input:not([type=checkbox])')]"
         ".filter(e => e.checkVisibility()).map(e => [e, e.getBoundingClientRect()])"

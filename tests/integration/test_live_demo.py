@@ -8,26 +8,21 @@ from pathlib import Path
 
 from typer.testing import CliRunner
 
+import live_demonstration
 from controller.api.client import Client
 from controller.cli.demo import app
 from model.errors import InputError
 
-LIVE = """\
-import asyncio
-from controller.demo.live import run_live
-from model.rig.file import example_rig_path
-from small_table import small_table
-asyncio.run(run_live(example_rig_path(), small_table(), wire="serial", dashboard="127.0.0.1:0"))
-"""
-
 
 def test_page_and_daemon(tmp_path: Path) -> None:
     """It says where its page is, its daemon is disarmed and answers; Ctrl-C leaves nothing."""
-    support = Path(__file__).parents[1] / "support"
-    environment = os.environ | {"XDG_RUNTIME_DIR": str(tmp_path), "PYTHONPATH": str(support)}
+    environment = os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}
     socket = tmp_path / "era-haptics" / "daemon.sock"
     with subprocess.Popen(
-        [sys.executable, "-c", LIVE], env=environment, stdout=subprocess.PIPE, text=True
+        [sys.executable, live_demonstration.__file__],
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as process:
         try:
             assert process.stdout is not None

@@ -25,6 +25,7 @@ FLAGS = (
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
+    "--disable-features=SpareRendererForSitePerProcess",  # a process more for every page
     "--no-first-run",
     "--remote-debugging-port=0",
     "about:blank",
@@ -92,6 +93,15 @@ class Page:
         """Go to a URL with a screen of a size, that of a phone or a desktop."""
         for domain in ("Page", "Runtime", "Log"):
             await self.call(f"{domain}.enable")
+        await self.fit(width, height, is_phone=is_phone)
+        await self.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=10)
+        # Another fragment alone would not load the page anew.
+        await self.call("Page.navigate", url="about:blank")
+        await self.call("Page.navigate", url=url)
+        await self.until("location.protocol !== 'about:' && document.readyState === 'complete'")
+
+    async def fit(self, width: int, height: int, *, is_phone: bool = False) -> None:
+        """Take a screen of a size, in CSS pixels."""
         await self.call(
             "Emulation.setDeviceMetricsOverride",
             width=width,
@@ -99,11 +109,6 @@ class Page:
             deviceScaleFactor=2 if is_phone else 1,
             mobile=is_phone,
         )
-        await self.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=10)
-        # Another fragment alone would not load the page anew.
-        await self.call("Page.navigate", url="about:blank")
-        await self.call("Page.navigate", url=url)
-        await self.until("location.protocol !== 'about:' && document.readyState === 'complete'")
 
     async def dark(self, is_dark: bool) -> None:
         """Prefer dark or light colours."""

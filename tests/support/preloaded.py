@@ -1,4 +1,4 @@
-"""`era` and `python -P -m sim`, forked off one process that has loaded all that they need.
+"""`era`, `python -P -m sim` and programs of the tests, forked off one process that has loaded them.
 
 Loading takes most of the time of a short command, and the suite starts about two hundred. Whoever
 starts one of them by `subprocess` or asyncio gets a process as usual: with its pipes, environment
@@ -11,6 +11,7 @@ import gc
 import inspect
 import json
 import os
+import runpy
 import signal
 import socket
 import subprocess
@@ -24,6 +25,11 @@ from typing import Any, BinaryIO, cast
 
 ERA = str(Path(sys.executable).with_name("era"))
 SIM = [sys.executable, "-P", "-m", "sim"]
+PROGRAMS = {
+    (sys.executable, str(Path(__file__).with_name(name)))
+    for name in ("interrupted.py", "live_demonstration.py", "planted_daemon.py")
+}
+"""Programs of the tests that do with `era` what no user can."""
 _LOADED = (
     "controller.daemon.run",
     "controller.gateway.serving",
@@ -117,7 +123,11 @@ _PIPES = ("p2cread", "p2cwrite", "c2pread", "c2pwrite", "errread", "errwrite")
 def _is_known(words: Any) -> bool:
     if not isinstance(words, list | tuple):
         return False
-    return str(words[0]) == ERA or [str(word) for word in words[: len(SIM)]] == SIM
+    return (
+        str(words[0]) == ERA
+        or [str(word) for word in words[: len(SIM)]] == SIM
+        or tuple(str(word) for word in words[:2]) in PROGRAMS
+    )
 
 
 def _adopt_orphans(adopts: bool) -> None:
@@ -195,10 +205,15 @@ def main() -> int:
         from controller.cli.main import main as era
 
         return era()
-    sys.argv = [words[0], *words[len(SIM) :]]
-    from sim.__main__ import main as sim
+    if words[: len(SIM)] == SIM:
+        sys.argv = [words[0], *words[len(SIM) :]]
+        from sim.__main__ import main as sim
 
-    return sim()
+        return sim()
+    sys.argv = words[1:]
+    sys.path.insert(0, str(Path(__file__).parent))
+    runpy.run_path(words[1], run_name="__main__")
+    return 0
 
 
 if __name__ == "__main__":

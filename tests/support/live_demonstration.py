@@ -1,0 +1,10 @@
+"""The demonstration to be touched, with a small table: python live_demonstration.py."""
+
+import asyncio
+
+from controller.demo.live import run_live
+from model.rig.file import example_rig_path
+from small_table import small_table
+
+if __name__ == "__main__":
+    asyncio.run(run_live(example_rig_path(), small_table(), wire="serial", dashboard="127.0.0.1:0"))

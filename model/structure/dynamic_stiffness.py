@@ -39,7 +39,11 @@ def base_stiffness(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:
 
 def drive_forces(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:
     """Force of each ERA at full stroke, its own gain included [N], (f, eras) (paper Eq. 25)."""
+    return np.asarray(base_stiffness(eras, omega) * full_strokes(eras, omega))
+
+
+def full_strokes(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:
+    """Amplitude of each ERA's base at full stroke, its own gain included [m], (f, eras)."""
     strokes = np.array([era.stroke for era in eras])
-    gains = np.array([era.gain(omega / (2 * np.pi)) for era in eras])
-    gains = gains.reshape(len(eras), len(omega)).T
-    return np.asarray(base_stiffness(eras, omega) * strokes * gains)
+    gains = np.array([era.gain(omega / (2 * np.pi)) for era in eras], dtype=complex)
+    return np.asarray(strokes * gains.reshape(len(eras), len(omega)).T)

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg import eigh
 
 from model.arrays import FloatArray
 from model.errors import InputError
@@ -24,12 +23,26 @@ def rigid_body_frequencies(
     p p' with p = (1, x - L/2, y - W/2). A mode that no spring holds has frequency 0.
     """
     attached = [*(PointLoad.of_era(era) for era in eras), *loads]
+    mounts = [(at.x, at.y, at.stiffness, at.mass) for at in attached]
+    x, y, stiffness, mass = np.array(mounts, dtype=float).reshape(-1, 4).T
+    return rigid_body_frequencies_of(plate, np.stack([x, y], axis=-1), stiffness, mass)
+
+
+def rigid_body_frequencies_of(
+    plate: Plate, places: FloatArray, stiffness: FloatArray, mass: FloatArray
+) -> FloatArray:
+    """As `rigid_body_frequencies`, (..., 3), of many layouts at once.
+
+    places [m] (..., n, 2), stiffness [N/m] and mass [kg] (..., n) of what is attached.
+    """
     # In units of the plate's sides both tilts have the size of the heave.
-    p = np.array([[1.0, at.x / plate.length - 0.5, at.y / plate.width - 0.5] for at in attached])
-    p = p.reshape(-1, 3)
-    K = (p.T * [at.stiffness for at in attached]) @ p
-    M = plate.mass * np.diag([1.0, 1 / 12, 1 / 12]) + (p.T * [at.mass for at in attached]) @ p
-    eigenvalues = eigh(K, M, eigvals_only=True)
+    tilts = places / [plate.length, plate.width] - 0.5
+    p = np.concatenate([np.ones_like(tilts[..., :1]), tilts], axis=-1)
+    K = (p * stiffness[..., None]).swapaxes(-1, -2) @ p
+    M = (p * mass[..., None]).swapaxes(-1, -2) @ p
+    M += plate.mass * np.diag([1.0, 1 / 12, 1 / 12])
+    inverse = np.linalg.inv(np.linalg.cholesky(M))
+    eigenvalues = np.linalg.eigvalsh(inverse @ K @ inverse.swapaxes(-1, -2))
     return np.asarray(np.sqrt(np.maximum(eigenvalues, 0.0)) / (2 * np.pi))
 
 

@@ -1,6 +1,5 @@
 """Cases of a study: layouts of ERAs, each with a stiffness."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -38,7 +37,7 @@ class Cases:
     def __len__(self) -> int:
         return len(self.places)
 
-    def take(self, numbers: IntArray | range) -> "Cases":
+    def take(self, numbers: IntArray | Sequence[int]) -> "Cases":
         """The cases of these numbers."""
         rows = np.asarray(numbers)
         names = tuple(self.names[row] for row in rows)
@@ -63,12 +62,25 @@ class Cases:
         positions = self.positions_of(case)
         stay = self.names[case] == OWN or not all_alike(tuple(like))
         eras = place_eras(like, positions) if stay else alike(like[0], positions)
-        factor = float(self.stiffness_factors[case])
-        damping = math.sqrt(factor * len(like) / len(positions))
+        mounts = self.take([case]).mounts(like)[0].tolist()
         return tuple(
-            replace(era, stiffness=era.stiffness * factor, damping=era.damping * damping)
-            for era in eras
+            replace(era, stiffness=stiffness, damping=damping)
+            for era, (stiffness, damping, _) in zip(eras, mounts, strict=False)
         )
+
+    def mounts(self, like: Sequence[Era]) -> FloatArray:
+        """Stiffness, damping and bolt mass of all ERAs, (n, most eras, 3), zero where VACANT.
+
+        As `eras_of` makes them.
+        """
+        count = self.places.shape[1]
+        own = [like[0]] * count if all_alike(tuple(like)) else like
+        mounts = np.array([[era.stiffness, era.damping, era.bolt_mass] for era in own])
+        taken = self.places != VACANT
+        factor = self.stiffness_factors
+        damping = np.sqrt(factor * len(like) / taken.sum(axis=1))
+        factors = np.stack([factor, damping, np.ones_like(factor)], axis=-1)
+        return np.asarray(factors[:, None] * mounts * taken[:, :, None])
 
 
 @cache

@@ -9,7 +9,7 @@ from model.arrays import FloatArray, IntArray
 from model.counting import counted
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.structure.support import support_problem
+from model.structure.support import MIN_RIGID_BODY_FREQUENCY, rigid_body_frequencies_of
 from model.studies.cases import OWN, VACANT, Cases
 from model.studies.solve import CaseResults
 from model.vibration.activation import MEDIAN
@@ -91,18 +91,27 @@ def rank(rig: Rig, cases: Cases, results: CaseResults, *, drive: int) -> Ranking
     # Rounded, so that cases equal by symmetry stay in their order.
     rounded = np.array([float(f"{median:.9g}") for median in medians[ranked]])
     order = ranked[np.argsort(-rounded, kind="stable")]
-    supported = np.array([is_supported(rig, cases, case) for case in range(len(cases))])
-    return Ranking(cases, results, drive, order, supported)
+    return Ranking(cases, results, drive, order, are_supported(rig, cases))
 
 
-def is_supported(rig: Rig, cases: Cases, case: int) -> bool:
-    """Whether the ERAs of a case support the plate."""
-    return support_problem(rig.plate, cases.eras_of(case, rig.eras), loads=rig.masses) is None
+def are_supported(rig: Rig, cases: Cases) -> NDArray[np.bool_]:
+    """Which cases have ERAs that support the plate, (n,)."""
+    mounts = cases.mounts(rig.eras)
+    at = cases.positions[cases.places]  # of VACANT any, without stiffness and mass
+    loads = [[load.x, load.y, load.stiffness, load.mass] for load in rig.masses]
+    attached = np.concatenate([at, mounts[:, :, [0, 2]]], axis=2)
+    carried = np.array(loads, dtype=float).reshape(-1, 4)
+    carried = np.broadcast_to(carried, (len(cases), *carried.shape))
+    attached = np.concatenate([attached, carried], axis=1)
+    lowest = rigid_body_frequencies_of(
+        rig.plate, attached[..., :2], attached[..., 2], attached[..., 3]
+    )[:, 0]
+    return np.asarray(lowest >= MIN_RIGID_BODY_FREQUENCY)
 
 
 def check_supported_cases(rig: Rig, cases: Cases) -> None:
     """Raise InputError if no case supports the plate, so that none could be recommended."""
-    if not any(is_supported(rig, cases, case) for case in range(len(cases))):
+    if not are_supported(rig, cases).any():
         raise InputError(
             f"none of {counted(len(cases), 'layout')} supports the plate; give the rig at least "
             "three ERAs, stiff enough, or allow more --layouts"

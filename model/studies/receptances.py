@@ -12,7 +12,7 @@ from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.structure.actuator import Era
-from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
+from model.structure.dynamic_stiffness import dynamic_stiffness, full_strokes
 from model.structure.low_rank import coupled_forces, on_diagonal
 
 # More than this [bytes] and the machine is likely to run out of memory.
@@ -43,15 +43,31 @@ class Receptances:
         places (eras,): candidate position of each ERA, in place of its own. buffer: reused between
         calls, since allocating costs more than the sums; holds the result.
         """
-        if buffer is None:
-            buffer = self.buffer(len(eras))
+        mounts = np.array([(era.stiffness, era.damping, era.bolt_mass) for era in eras])
+        strokes = full_strokes(eras, 2 * np.pi * self.frequencies)
+        (forces,) = self.forces(places[None], mounts[None], strokes)
+        return self.fields(places, forces, self.buffer(len(eras)) if buffer is None else buffer)
+
+    def forces(self, places: IntArray, mounts: FloatArray, strokes: ComplexArray) -> ComplexArray:
+        """Forces on the plate for each ERA alone, times -omega² [N/s²], (n, f, eras, eras).
+
+        places (n, eras): of n layouts; mounts (n, eras, 3): stiffness, damping and bolt mass;
+        strokes (f, eras): amplitudes of the bases [m]. Driven ERAs are the first of the last two.
+        """
         omega = 2 * np.pi * self.frequencies
-        at_eras = self.between[:, places[:, None], places]
-        applied = on_diagonal(drive_forces(eras, omega), rows=len(eras))
-        forces = coupled_forces(at_eras, attached_stiffness(eras, (), omega), applied)
-        scaled = -(omega**2)[:, None, None] * forces.transpose(0, 2, 1)
+        k, c, m = (mounts[:, None, :, number] for number in range(3))
+        at_eras = self.between.transpose(1, 2, 0)[places[:, :, None], places[:, None]]
+        base = dynamic_stiffness(k, c, 0.0, omega[:, None])
+        applied = on_diagonal(base * strokes, rows=places.shape[1])
+        forces = coupled_forces(
+            at_eras.transpose(0, 3, 1, 2), dynamic_stiffness(k, c, m, omega[:, None]), applied
+        )
+        return np.asarray(-(omega**2)[:, None, None] * forces.swapaxes(-1, -2))
+
+    def fields(self, places: IntArray, forces: ComplexArray, buffer: ComplexArray) -> ComplexArray:
+        """Acceleration (f, eras, p) of one layout from its `forces` (f, eras, eras)."""
         np.take(self.to_points, places, axis=1, out=buffer[0], mode="clip")  # others copy
-        acceleration: ComplexArray = np.matmul(scaled, buffer[0], out=buffer[1])
+        acceleration: ComplexArray = np.matmul(forces, buffer[0], out=buffer[1])
         return acceleration
 
 

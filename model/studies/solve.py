@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
 from model.fem.plate_mesh import check_frequencies
 from model.rig.rig import Rig
 from model.structure.actuator import Era
-from model.studies.cases import Cases
+from model.structure.dynamic_stiffness import full_strokes
+from model.studies.cases import VACANT, Cases, all_alike
 from model.studies.receptances import Receptances, solve_receptances
 from model.version import NUMERICS_VERSION
 from model.vibration.activation import (
@@ -97,24 +98,39 @@ def study_problem(rig: Rig, cases: Cases, frequencies: FloatArray) -> StudyProbl
 
 def solve_cases(receptances: Receptances, eras: tuple[Era, ...], cases: Cases) -> CaseResults:
     """Solve cases with ERAs like those of the rig; none depends on another."""
-    felt = felt_acceleration(receptances.frequencies)
     results = empty_results(len(cases))
-    buffers: dict[int, ComplexArray] = {}
-    for case in range(len(cases)):
-        placed = cases.eras_of(case, eras)
-        if len(placed) not in buffers:
-            buffers[len(placed)] = receptances.buffer(len(placed))
-        acceleration = receptances.acceleration(
-            cases.places_of(case), placed, buffer=buffers[len(placed)]
-        )
-        every = cumulative_statistics(acceleration, felt=felt)
-        sets = activation_sets(len(placed))
-        for drive, size in enumerate((1, 2, len(placed))):
-            rows = [row for row, members in enumerate(sets) if len(members) == size]
-            if not rows:
+    mounts, counts = cases.mounts(eras), (cases.places != VACANT).sum(axis=1)
+    omega = 2 * np.pi * receptances.frequencies
+    for count in np.unique(counts).tolist():
+        rows = np.flatnonzero(counts == count)
+        driven = eras[:1] * count if all_alike(eras) else eras
+        places = cases.places[rows, :count].astype(np.int64)
+        forces = receptances.forces(places, mounts[rows, :count], full_strokes(driven, omega))
+        _solve_layouts(receptances, rows, places, forces, results)
+    return results
+
+
+def _solve_layouts(
+    receptances: Receptances,
+    rows: IntArray,
+    places: IntArray,
+    forces: ComplexArray,
+    results: CaseResults,
+) -> None:
+    """Fill in these rows of the results, of layouts with the same number of ERAs."""
+    felt = felt_acceleration(receptances.frequencies)
+    sets = activation_sets(places.shape[1])
+    buffer = receptances.buffer(places.shape[1])
+    of_size = [
+        [number for number, members in enumerate(sets) if len(members) == size]
+        for size in (1, 2, places.shape[1])
+    ]
+    for case, at, force in zip(rows.tolist(), places, forces, strict=True):
+        every = cumulative_statistics(receptances.fields(at, force, buffer), felt=felt)
+        for drive, numbers in enumerate(of_size):
+            if not numbers:
                 continue
             # Of sets that are equal by symmetry the first, not the one that rounding favours.
-            best = max(rows, key=lambda row: float(f"{every[row, MEDIAN]:.9g}"))
+            best = max(numbers, key=lambda number: float(f"{every[number, MEDIAN]:.9g}"))
             results.statistics[case, drive] = every[best]
             results.active[case, drive] = sum(1 << era for era in sets[best])
-    return results

@@ -66,12 +66,21 @@ def cumulative_statistics(
     together = np.empty((frequency_count, point_count), dtype=complex)
     amplitudes = np.empty((frequency_count, point_count))
     for row, active in enumerate(sets):
-        np.copyto(together, acceleration[:, active[0]])
+        fields = acceleration[:, active[0]]
         for era in active[1:]:
-            together += acceleration[:, era]
-        np.abs(together, out=amplitudes)
+            fields = np.add(fields, acceleration[:, era], out=together)
+        np.abs(fields, out=amplitudes)
         peaks[row] = amplitudes.sum(axis=0)
         if felt is not None:
             result[row, -1] = np.count_nonzero(amplitudes < felt[:, None]) / amplitudes.size
-    result[:, :-1] = np.quantile(peaks, np.linspace(0, 1, 5), axis=-1).T
+    result[:, :-1] = _quartiles(peaks)
     return result
+
+
+def _quartiles(values: FloatArray) -> FloatArray:
+    """Minimum, quartiles and maximum of each row (n, p), (n, 5), as `np.quantile`, but faster."""
+    ordered = np.sort(values, axis=-1)
+    at = np.linspace(0, values.shape[1] - 1, 5)
+    low = np.floor(at).astype(int)
+    high = np.ceil(at).astype(int)
+    return np.asarray(ordered[:, low] + (at - low) * (ordered[:, high] - ordered[:, low]))

@@ -66,38 +66,36 @@ def _quadrature(
     places: FloatArray, length: float, width: float
 ) -> tuple[FloatArray, sparse.csr_array]:
     """Points (p, 2) on footprints, and weights of each footprint's mean, (n, p)."""
-    points: list[FloatArray] = []
-    values: list[FloatArray] = []
-    for x, y, radius in places:
-        if radius == 0:
-            points.append(np.array([[x, y]]))
-            values.append(np.ones(1))
-        else:
-            on_disc, weights = _on_disc(x, y, radius, length, width)
-            points.append(on_disc)
-            values.append(weights / weights.sum())
-    ends = np.cumsum([0, *map(len, values)])
-    shape = (len(places), int(ends[-1]))
-    means = sparse.csr_array((np.concatenate(values), np.arange(ends[-1]), ends), shape=shape)
-    return np.concatenate(points), means
+    is_disc = places[:, 2] > 0
+    counts = np.where(is_disc, _ACROSS * _ALONG, 1)
+    ends = np.concatenate([[0], np.cumsum(counts)])
+    points = np.repeat(places[:, :2], counts, axis=0)
+    values = np.ones(len(points))
+    on_discs = np.repeat(is_disc, counts)
+    points[on_discs], values[on_discs] = _on_discs(places[is_disc], length, width)
+    shape = (len(places), len(points))
+    return points, sparse.csr_array((values, np.arange(len(points)), ends), shape=shape)
 
 
-def _on_disc(
-    x: float, y: float, radius: float, length: float, width: float
-) -> tuple[FloatArray, FloatArray]:
-    """Gauss points (p, 2) on the part of a disc that is on the plate, and their weights (p,)."""
+def _on_discs(discs: FloatArray, length: float, width: float) -> tuple[FloatArray, FloatArray]:
+    """Gauss points (p, 2) on the parts of discs (n, 3) on the plate, and their weights (p,).
+
+    Weights of a disc add up to 1.
+    """
     across, across_weights = _gauss(_ACROSS)
     along, along_weights = _gauss(_ALONG)
+    x, y, radius = discs[:, :, None].transpose(1, 0, 2)
     # x + radius sin(angle): the ends of the chords are then smooth in the angle.
     first = np.arcsin(np.clip(-x / radius, -1, 1))
     last = np.arcsin(np.clip((length - x) / radius, -1, 1))
     angles = (first + last) / 2 + (last - first) / 2 * across
     half = radius * np.cos(angles)
     low, high = np.maximum(y - half, 0.0), np.minimum(y + half, width)
-    chord_y = (low + high)[:, None] / 2 + (high - low)[:, None] / 2 * along
-    chord_x = np.broadcast_to((x + radius * np.sin(angles))[:, None], chord_y.shape)
-    weights = (across_weights * half * (high - low))[:, None] * along_weights
-    return np.column_stack([chord_x.ravel(), chord_y.ravel()]), weights.ravel()
+    chord_y = (low + high)[..., None] / 2 + (high - low)[..., None] / 2 * along
+    chord_x = np.broadcast_to((x + radius * np.sin(angles))[..., None], chord_y.shape)
+    weights = (across_weights * half * (high - low))[..., None] * along_weights
+    weights /= weights.sum(axis=(1, 2), keepdims=True)
+    return np.stack([chord_x, chord_y], axis=-1).reshape(-1, 2), weights.ravel()
 
 
 @lru_cache(maxsize=4)

@@ -33,7 +33,7 @@ class PlateControl:
             with contextlib.suppress(OSError):
                 await streams[1].wait_closed()
 
-    async def ask(self, request: dict[str, Any]) -> dict[str, Any]:
+    async def request(self, request: dict[str, Any]) -> dict[str, Any]:
         """Return the reply to a request; raises LinkError if there is none or it is an error."""
         async with self._lock:
             try:

@@ -102,14 +102,14 @@ async def drive(
     async with _opened(url, take_over=True) as amplifier:
         guard = Guard(ceiling, amplifier.capabilities)
         wanted = DriveCommand(channel=channel, frequency=frequency, level=level)
-        asked = CommandSet(
+        requested = CommandSet(
             token=amplifier.next_token(),
             commands=(wanted,),
             ramp=min(_RAMP, amplifier.capabilities.ramp_max),
             valid_for=duration,
         )
         try:
-            safe = guard.check(asked)
+            safe = guard.check(requested)
         except CommandRefused as refused:
             raise CommandError(str(refused)) from refused  # bad input, not a refusal
         watchdog = max(WATCHDOG, amplifier.capabilities.watchdog_min)

@@ -11,7 +11,7 @@ from drivers import clock, trace
 from drivers.backend import Backend
 from drivers.errors import CommandError, DriverError, FrameError, LinkError
 from drivers.guard import SafeCommandSet, SafeEnvelope, require_safe
-from drivers.guard.recorder import Recorder
+from drivers.guard.recorder import PlayRecorder
 from drivers.link.link import REPLY_TIMEOUT, Link, ReplyT
 from drivers.link.refusals import PROTOCOL_VIOLATION
 from drivers.protocol.definition import PROTOCOL, random_token, token_after
@@ -80,7 +80,7 @@ class Amplifier:
             on_event=self._notify,
             silent_from=self._silent_from,
         )
-        self._recorder = Recorder()
+        self._recorder = PlayRecorder()
         self._serial_number = serial_number
         self._listeners: list[Callable[[AmplifierEvent], None]] = []
         self._token = 0
@@ -186,7 +186,7 @@ class Amplifier:
 
     async def identify(self) -> None:
         """Read identity and capabilities; raises LinkError for another amplifier or version."""
-        identity = await self._ask(Hello(), expect=Identity, timeout=OPEN_TIMEOUT)
+        identity = await self._request(Hello(), expect=Identity, timeout=OPEN_TIMEOUT)
         if identity.protocol_version != PROTOCOL.version:
             raise LinkError(
                 f"protocol version must be {PROTOCOL.version}, got {identity.protocol_version} "
@@ -198,7 +198,9 @@ class Amplifier:
                 f"serial number must be {self._serial_number}, got {identity.serial_number}; "
                 "connect the expected amplifier, or restart with this one"
             )
-        self._capabilities = await self._ask(GetCaps(), expect=Capabilities, timeout=OPEN_TIMEOUT)
+        self._capabilities = await self._request(
+            GetCaps(), expect=Capabilities, timeout=OPEN_TIMEOUT
+        )
         self._identity = identity
         self._serial_number = identity.serial_number
         self._link.allow_longest_exchange(self.round_trip())
@@ -220,13 +222,13 @@ class Amplifier:
                 f"{watchdog:g} s"
             )
         self._watchdog = max(watchdog, self._watchdog or 0.0)
-        status = await self._ask(Arm(watchdog=watchdog), expect=Status)
+        status = await self._request(Arm(watchdog=watchdog), expect=Status)
         self._watchdog = watchdog
         return status
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> Status:
-        """Fall silent along a ramp [s], then switch the high voltage off; overtakes the queue."""
-        return await self._ask(Disarm(ramp=self._ramp(ramp)), expect=Status)
+        """Ramp [s] to silence, then switch the high voltage off; overtakes the queue."""
+        return await self._request(Disarm(ramp=self._ramp(ramp)), expect=Status)
 
     async def stop(self, ramp: float = STOP_RAMP) -> Status:
         """Quick stop along a ramp [s], latched until clear; overtakes the queue.
@@ -236,14 +238,14 @@ class Amplifier:
         CommandRefused, or is repeated afterwards if it is of the stop class. A request that is not
         on the wire yet is preempted at once.
         """
-        return await self._ask(Stop(ramp=self._ramp(ramp)), expect=Status)
+        return await self._request(Stop(ramp=self._ramp(ramp)), expect=Status)
 
     async def load_envelope(self, safe: SafeEnvelope) -> None:
         """Load an envelope into its slot, for later sets; at any time, armed or not.
 
         Raises CommandRefused if the amplifier does not support envelopes.
         """
-        loaded = await self._ask(LoadEnvelope(safe), expect=Loaded)
+        loaded = await self._request(LoadEnvelope(safe), expect=Loaded)
         if (loaded.slot, loaded.knots) != (safe.slot, len(safe.knots)):
             raise FrameError(
                 f"the amplifier must load {len(safe.knots)} knots into slot {safe.slot}, got "
@@ -255,7 +257,7 @@ class Amplifier:
 
         Raises CommandRefused if a newer set, a stop or a disarm came first.
         """
-        achieved = await self._ask(Stage(safe), expect=Achieved)
+        achieved = await self._request(Stage(safe), expect=Achieved)
         return _of_token(achieved, safe.token)
 
     async def commit(self, token: int) -> Achieved:
@@ -263,7 +265,7 @@ class Amplifier:
 
         Raises CommandRefused if a newer set, a stop or a disarm came first.
         """
-        achieved = await self._ask(Commit(token=token), expect=Achieved)
+        achieved = await self._request(Commit(token=token), expect=Achieved)
         return _of_token(achieved, token)
 
     async def apply(self, safe: SafeCommandSet) -> Achieved:
@@ -272,22 +274,22 @@ class Amplifier:
         A silent set overtakes the queue as a stop does. Raises CommandRefused if a newer set or a
         stop superseded it.
         """
-        return _of_token(await self._ask(Apply(safe), expect=Achieved), safe.token)
+        return _of_token(await self._request(Apply(safe), expect=Achieved), safe.token)
 
     async def status(self) -> Status:
         """Read the status; does not feed the watchdog."""
-        return await self._ask(GetStatus(), expect=Status)
+        return await self._request(GetStatus(), expect=Status)
 
     async def faults(self) -> tuple[FaultRecord, ...]:
         """Read latched and past faults, newest first."""
-        return (await self._ask(GetFaults(), expect=FaultList)).faults
+        return (await self._request(GetFaults(), expect=FaultList)).faults
 
     async def clear(self) -> Status:
         """Acknowledge a stop, or faults whose cause is gone; the amplifier stays disarmed.
 
         Raises CommandRefused if another stop came first: that one is not acknowledged.
         """
-        return await self._ask(Clear(), expect=Status)
+        return await self._request(Clear(), expect=Status)
 
     async def heartbeat(self) -> Status:
         """Feed the watchdog; called by the control loop itself, after it has run.
@@ -295,12 +297,12 @@ class Amplifier:
         On a degraded link it only reads the status, so that the watchdog expires without replies.
         """
         request = GetStatus() if self.is_degraded else Ping()
-        return await self._ask(request, expect=Status)
+        return await self._request(request, expect=Status)
 
     def abort_unsent(self) -> None:
-        """Do not send unsent requests, and retry none.
+        """Discard unsent requests and retry none: they raise Preempted.
 
-        Such requests raise Preempted; stop-class requests are sent and retried as usual.
+        Stop-class requests are exempt.
         """
         self._link.abort_unsent()
 
@@ -331,7 +333,7 @@ class Amplifier:
         if status.state is AmplifierState.SWITCHED_ON:
             await asyncio.sleep(DISARM_RAMP)
 
-    async def _ask(
+    async def _request(
         self,
         request: Request,
         *,
@@ -346,7 +348,7 @@ class Amplifier:
         outcome: object = "cancelled"
         try:
             with feeding:
-                reply = await self._link.ask(request, expect=expect, timeout=timeout)
+                reply = await self._link.request(request, expect=expect, timeout=timeout)
             outcome = reply
         except DriverError as error:
             outcome = error

@@ -127,7 +127,7 @@ class BlockingAmplifier:
     ) -> Achieved:
         """Play these commands for a time [s], feed the watchdog and wait for the end.
 
-        Raises CommandRefused if the amplifier stops by itself, or contradicts what was asked.
+        Raises CommandRefused if the amplifier stops by itself, or its replies contradict requests.
         """
         achieved = self.apply(commands, ramp=ramp, valid_for=duration)
         self._wait(keep_alive(self._checked, duration, interval=HEARTBEAT))

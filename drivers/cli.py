@@ -93,25 +93,27 @@ def discover(
     json_: Json = False,
 ) -> None:
     """List serial ports, CAN interfaces and the amplifiers on them."""
-    from drivers.discovery.search import ask, candidates, with_slcan
+    from drivers.discovery.search import candidates, identify_all, with_slcan
 
-    places = [with_slcan(place) if slcan else place for place in candidates()]
-    asked = [place for place in places if place.remedy is None and not place.is_slcan]
-    usable = [one for place in asked for one in place.urls]
-    found = _run(ask([*(url or []), *(usable if probe else [])]), trace)
+    places = [with_slcan(candidate) if slcan else candidate for candidate in candidates()]
+    probed = [
+        candidate for candidate in places if candidate.remedy is None and not candidate.is_slcan
+    ]
+    usable = [one for candidate in probed for one in candidate.urls]
+    found = _run(identify_all([*(url or []), *(usable if probe else [])]), trace)
     who = {one.url: one.identity for one in found if one.identity is not None}
     unusable = {one.url: one.problem for one in found if not one.was_asked}
     rows = [
         {
-            "place": place.place,
-            "description": place.description,
-            "urls": list(place.urls),
-            "heard": list(place.urls) if place.is_slcan else [],
-            "answers": [one for one in place.urls if one in who],
-            "remedy": place.remedy
-            or next((unusable[one] for one in place.urls if one in unusable), None),
+            "place": candidate.name,
+            "description": candidate.description,
+            "urls": list(candidate.urls),
+            "heard": list(candidate.urls) if candidate.is_slcan else [],
+            "answers": [one for one in candidate.urls if one in who],
+            "remedy": candidate.remedy
+            or next((unusable[one] for one in candidate.urls if one in unusable), None),
         }
-        for place in places
+        for candidate in places
     ]
     amplifiers = [
         {
@@ -136,7 +138,7 @@ def discover(
             print(f"{one.url}: {one.problem}")
     for amplifier in amplifiers:
         print("  ".join(str(value) for value in amplifier.values()))
-    heard = [one for place in places if place.is_slcan for one in place.urls]
+    heard = [one for candidate in places if candidate.is_slcan for one in candidate.urls]
     if not amplifiers and heard:
         print(f"Next: era amp identify {shlex.quote(heard[0])}")
     elif not amplifiers:
@@ -187,11 +189,11 @@ def stop(url: Url, trace: Trace = None, json_: Json = False) -> None:
     Exit status 0 only if the amplifier confirms that it is silent, else 3.
     """
     from drivers import amp_actions
-    from drivers.operation.silence import Silence
+    from drivers.operation.silence import SilenceStatus
 
     result = _run(amp_actions.stop(url), trace, needs_trace=False)
     _show(result, as_json=json_)
-    if result["silence"] != Silence.CONFIRMED:
+    if result["silence"] != SilenceStatus.CONFIRMED:
         raise typer.Exit(EXIT_STATUS[LinkError])
     if not json_:
         print(f"Next: era amp clear {shlex.quote(url)}")

@@ -55,10 +55,10 @@ def frame(direction: Direction, data: bytes, where: str, decode: Callable[[], st
         _wire.debug("%s %s %s  %s", where, direction, _Lazy(lambda: data.hex(" ")), _Lazy(decode))
 
 
-def request(asked: object, outcome: object, duration: float) -> None:
+def request(requested: object, outcome: object, duration: float) -> None:
     """Trace a request with its reply or error, and its duration [s]."""
     if _request.isEnabledFor(logging.DEBUG):
-        _request.debug("%r -> %r in %.1f ms", asked, outcome, duration * 1e3)
+        _request.debug("%r -> %r in %.1f ms", requested, outcome, duration * 1e3)
 
 
 @contextmanager

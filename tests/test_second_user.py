@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pytest
 
 from drivers.amplifier import Amplifier
-from drivers.backends.sole_host import SoleHost
+from drivers.backends.host_lock import HostLock
 from drivers.errors import LinkError
 from drivers.protocol.messages import AmplifierState
 from drivers.registry import open_backend
@@ -46,8 +46,8 @@ async def test_second_host_is_refused_until_the_first_closes(
 def held_by_another_program(name: str) -> Iterator[None]:
     """Run a process that holds the right to arm, and kill it at the end."""
     hold = (
-        "import sys; from drivers.backends.sole_host import SoleHost; "
-        f"host = SoleHost({name!r}); host.claim(); print('held', flush=True); sys.stdin.read()"
+        "import sys; from drivers.backends.host_lock import HostLock; "
+        f"host = HostLock({name!r}); host.acquire(); print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(
         [sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -77,16 +77,16 @@ async def test_one_process_arms_over_tcp_and_any_may_stop(coarse_rig: Rig) -> No
         await amplifier.close()
 
 
-def test_sole_host_claim_is_exclusive_until_released() -> None:
-    """Claims are by name; claim and release are idempotent."""
-    one, same, other = SoleHost("here:1/1"), SoleHost("here:1/1"), SoleHost("here:1/2")
-    one.claim()
-    one.claim()
-    other.claim()
+def test_host_lock_is_exclusive_until_released() -> None:
+    """Locks are by name; acquire and release are idempotent."""
+    one, same, other = HostLock("here:1/1"), HostLock("here:1/1"), HostLock("here:1/2")
+    one.acquire()
+    one.acquire()
+    other.acquire()
     with pytest.raises(LinkError, match="here:1/1"):
-        same.claim()
+        same.acquire()
     one.release()
     one.release()
-    same.claim()
+    same.acquire()
     same.release()
     other.release()

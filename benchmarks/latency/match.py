@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.latency.touches import FLOODING, HELD, Work, places
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.intent import NewestBuzzes
+from controller.loop.intent import BuzzNewestContact
 from controller.loop.routing import route
 from controller.loop.selection import MOVE_TOLERANCE, Selector
 from controller.sources.contacts import Contact, ContactKey
@@ -158,7 +158,7 @@ class Expected:
                 Contact(ContactKey("bench", number), x, y, since=float(number))
                 for number, (x, y) in enumerate([*self._others, self._places[touch]])
             ]
-            intent = NewestBuzzes().intent(contacts, 0.0)
+            intent = BuzzNewestContact().intent(contacts, 0.0)
             pattern = Selector(self._table).select(contacts, intent, self._capabilities).pattern
             commands: Sequence[DriveCommand] = ()
             if pattern is not None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.guard import Guard, GuardLimits, SafeCommandSet
-from drivers.operation.simultaneous import at_one_moment
+from drivers.operation.simultaneous import simultaneous_commits
 from drivers.protocol.messages import Capabilities
 from drivers.registry import open_backend
 
@@ -121,7 +121,7 @@ async def sent_apart(urls: Sequence[str], count: int) -> list[float]:
     for safe in make_sets(amplifiers[0].capabilities, count, channels=1):
         await asyncio.gather(*(amplifier.stage(safe) for amplifier in amplifiers))
         commits = [(one.wire_times.commit(), partial(one.commit, safe.token)) for one in amplifiers]
-        await asyncio.gather(*at_one_moment(commits))
+        await asyncio.gather(*simultaneous_commits(commits))
         sent = [amplifier.last_sent_at for amplifier in amplifiers]
         apart.append(max(sent) - min(sent))
     for amplifier in amplifiers:

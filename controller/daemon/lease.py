@@ -17,7 +17,7 @@ class Lease:
 
 
 class LeaseHolder:
-    """Holds the current lease; reads no clock, so every method takes the time [s]."""
+    """Holds the current lease; times [s] are arguments."""
 
     def __init__(self) -> None:
         self._lease: Lease | None = None

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 from collections.abc import Mapping
 
-from controller.group.tasks import persistently
+from controller.group.tasks import retry_while_degraded
 from drivers.amplifier import Amplifier
 from drivers.errors import Preempted
 from drivers.operation.silence import is_silent
@@ -19,7 +19,9 @@ async def read_statuses(amplifiers: Mapping[str, Amplifier]) -> dict[str, Status
     """Read the status of each amplifier, again if preempted or on a degraded link."""
     while True:
         with contextlib.suppress(Preempted):
-            return {name: await persistently(each.status) for name, each in amplifiers.items()}
+            return {
+                name: await retry_while_degraded(each.status) for name, each in amplifiers.items()
+            }
         await asyncio.sleep(READ_BACK_INTERVAL)
 
 

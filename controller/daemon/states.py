@@ -66,7 +66,7 @@ class Action(Enum):
     VERIFY = auto()  # disarm what still plays, read all back: VERIFIED or FAULT
     ARM = auto()  # ARMED or FAULT
     DISARM = auto()
-    STOP = auto()  # quick stop of all amplifiers, blindly of lost ones
+    STOP = auto()  # quick stop of all amplifiers, lost ones included
     REACT = auto()  # quick stop, then REACTION_DONE
     CLEAR = auto()  # acknowledge at the amplifiers, read all back: VERIFIED or FAULT
     RECONNECT = auto()  # with growing pauses: RECONNECTED

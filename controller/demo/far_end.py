@@ -39,11 +39,11 @@ class SimulatedPlate:
 
     async def place_fingers(self, positions: Mapping[str, Place]) -> None:
         """Place fingers at positions [m] by id; all others are removed."""
-        await self._control.ask({"op": "fingers", "fingers": dict(positions)})
+        await self._control.request({"op": "fingers", "fingers": dict(positions)})
 
     async def vibration(self, since: float, until: float) -> dict[str, FingerVibration]:
         """Vibration of each finger by id between two times [s] of time.monotonic()."""
-        reply = await self._control.ask({"op": "felt", "since_s": since, "until_s": until})
+        reply = await self._control.request({"op": "felt", "since_s": since, "until_s": until})
         return {
             id: FingerVibration(
                 frequencies=np.array(felt["frequencies_hz"], dtype=float),

@@ -47,7 +47,7 @@ class ChannelSweep:
     ) -> None:
         self._rig = rig
         self._amplifiers = amplifiers
-        self._group = AmplifierGroup(amplifiers, has_own_time=sensors.is_virtual)
+        self._group = AmplifierGroup(amplifiers, is_time_stepped=sensors.is_virtual)
         self._sensors = sensors
         self._level, self._settle, self._listen = level, settle, listen
         self._on_step = on_step
@@ -141,15 +141,17 @@ class ChannelSweep:
         frequency = None
         for name, commands in wanted.items():
             plays = {command.channel: command for command in played.achieved[name].commands}
-            for asked in commands.commands:
-                if not asked.level:
+            for requested in commands.commands:
+                if not requested.level:
                     continue
-                found = plays.get(asked.channel)
+                found = plays.get(requested.channel)
                 level = 0.0 if found is None else found.level
-                if found is None or not math.isclose(asked.level, level, rel_tol=_LEVEL_TOLERANCE):
+                if found is None or not math.isclose(
+                    requested.level, level, rel_tol=_LEVEL_TOLERANCE
+                ):
                     raise CommandRefused(
-                        f"amplifier {name}: level of channel {asked.channel} must be "
-                        f"{asked.level:g}, got {level:g}; let it cool down, or choose another "
+                        f"amplifier {name}: level of channel {requested.channel} must be "
+                        f"{requested.level:g}, got {level:g}; let it cool down, or choose another "
                         "--level"
                     )
                 frequency = found.frequency

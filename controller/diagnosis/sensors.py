@@ -55,17 +55,17 @@ class SimulatedSensors(Sensors):
     async def wait(self, seconds: float) -> None:
         """Wait [s]: by the event loop, or by stepping a plate in virtual time."""
         if self.is_virtual:
-            await self._plate.ask({"op": "step", "seconds": seconds})
+            await self._plate.request({"op": "step", "seconds": seconds})
         else:
             await asyncio.sleep(seconds)
 
     async def time(self) -> float:
         """Return the time of the plate [s]."""
-        return float((await self._plate.ask({"op": "state"}))["time_s"])
+        return float((await self._plate.request({"op": "state"}))["time_s"])
 
     async def tone(self, frequency: float, *, since: float, until: float) -> ComplexArray:
         """Return complex amplitudes (s,) [m/s²] of a tone [Hz] over a window [s]."""
-        heard = await self._plate.ask(
+        heard = await self._plate.request(
             {"op": "tones", "since_s": since, "until_s": until, "frequencies_hz": [frequency]}
         )
         found = [heard["sensors"][name] for name in self.names]
@@ -86,7 +86,7 @@ async def simulated_sensors(
     )
     plate = PlateControl(control, remedy=remedy)
     try:
-        hello = await plate.ask({"op": "hello"})
+        hello = await plate.request({"op": "hello"})
         if hello.get("version", 0) < _VERSION:
             raise LinkError(
                 f"version of the simulated plate must be at least {_VERSION} to have sensors; "
@@ -99,7 +99,7 @@ async def simulated_sensors(
             name: {"at_m": point, "noise_m_s2_rthz": noise}
             for name, point in zip(sensors.names, sensors.points.tolist(), strict=True)
         }
-        await plate.ask({"op": "sensors", "sensors": placed})
+        await plate.request({"op": "sensors", "sensors": placed})
         yield sensors
     finally:
         await plate.close()

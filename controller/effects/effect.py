@@ -36,13 +36,13 @@ class Sensation:
     """Target of one finger from now on.
 
     level_db_sl: None for as strong as the neighbours allow. until: when [s] that may change though
-    the finger does nothing; None for never. or_less: where the plate cannot reach the level, as
-    strong as the neighbours allow instead of nothing.
+    the finger does nothing; None for never. allow_weaker: where the plate cannot reach the level,
+    play as strong as the neighbours allow instead of nothing.
     """
 
     level_db_sl: float | None
     until: float | None = None
-    or_less: bool = False
+    allow_weaker: bool = False
 
 
 @dataclass(frozen=True, slots=True)

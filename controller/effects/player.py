@@ -38,7 +38,7 @@ class _Finger:
 
 
 class EffectPlayer:
-    """Plays the effects of a layout. Deterministic: reads no clock.
+    """Plays the effects of a layout. Deterministic: times are arguments.
 
     A finger feels its newest play; when that is over, the one before continues. Only the fingers of
     highest priority are driven, as many as the layout allows; ties go to the newest. All others are
@@ -70,7 +70,7 @@ class EffectPlayer:
         chosen = [one for one in felt if one[0] == felt[0][0]][: self.layout.most_at_once]
         return HapticIntent(
             tuple(
-                Target(contact.key, sensation.level_db_sl, or_less=sensation.or_less)
+                Target(contact.key, sensation.level_db_sl, allow_weaker=sensation.allow_weaker)
                 for _, _, contact, sensation in chosen
             ),
             "no effect plays for the contacts on the plate",
@@ -114,12 +114,12 @@ class EffectPlayer:
             if finger is None:
                 self._add(contact, now)
                 continue
-            place = (contact.x, contact.y)
-            if math.dist(place, finger.entered) < _NOISE:
+            position = (contact.x, contact.y)
+            if math.dist(position, finger.entered) < _NOISE:
                 continue
-            region = self.layout.region_at(*place)
+            region = self.layout.region_at(*position)
             if finger.region is not region:
-                left, finger.region, finger.entered = finger.region, region, place
+                left, finger.region, finger.entered = finger.region, region, position
                 finger.plays = [
                     play for play in finger.plays if play.priority == REQUESTED_PRIORITY
                 ]
@@ -129,8 +129,8 @@ class EffectPlayer:
 
     def _add(self, contact: Contact, now: float) -> _Finger:
         """Add a new finger and start its effects."""
-        place = (contact.x, contact.y)
-        finger = _Finger(self.layout.region_at(*place), place)
+        position = (contact.x, contact.y)
+        finger = _Finger(self.layout.region_at(*position), position)
         self._fingers[contact.key] = finger
         self._enter(finger, contact, now)
         if contact.key in self._already_pressed:
@@ -187,7 +187,7 @@ class EffectPlayer:
     ) -> tuple[_Play | None, Sensation | None]:
         """Return the play that a finger feels now and its sensation; add all `until` to ends.
 
-        All its plays are called, because those for motion must know the finger's way.
+        All its plays are called, because those for motion follow the finger.
         """
         finger = self._fingers[contact.key]
         felt: tuple[_Play | None, Sensation | None] = (None, None)

@@ -63,9 +63,9 @@ class _RampRun(EffectRun):
         """Return the level of the current step."""
         index = max(0, int((now - self.start) / self.step))
         if index >= len(self.levels) - 1 and self.is_held:
-            return Sensation(self.levels[-1], or_less=True)
+            return Sensation(self.levels[-1], allow_weaker=True)
         if index >= len(self.levels):
             return None
-        # Without or_less a ramp beyond the reach of the plate would break off instead of saturate.
+        # Without allow_weaker a ramp would stop at the highest level of the plate, not saturate.
         until = self.start + (index + 1) * self.step
-        return Sensation(self.levels[index], until, or_less=True)
+        return Sensation(self.levels[index], until, allow_weaker=True)

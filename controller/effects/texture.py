@@ -65,10 +65,10 @@ class _TextureRun(EffectRun):
 
     def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
         """Return the level of the speed over the last 60 ms."""
-        before, *place = self._path[-1]
-        if math.dist((contact.x, contact.y), place) >= _NOISE:
+        before, *position = self._path[-1]
+        if math.dist((contact.x, contact.y), position) >= _NOISE:
             if now - before >= _REST_TIMEOUT:  # it was at rest there until now
-                self._path = deque([(now - _SPEED_WINDOW, place[0], place[1])])
+                self._path = deque([(now - _SPEED_WINDOW, position[0], position[1])])
             self._path.append((now, contact.x, contact.y))
         while len(self._path) > 2 and now - self._path[1][0] >= _SPEED_WINDOW:
             self._path.popleft()
@@ -78,21 +78,21 @@ class _TextureRun(EffectRun):
         speed = self._speed(contact, now)
         if speed < self._texture.slow:
             return NoSensation(until=rests_from)
-        return Sensation(self._level_at(speed), until=rests_from, or_less=True)
+        return Sensation(self._level_at(speed), until=rests_from, allow_weaker=True)
 
     def _speed(self, contact: Contact, now: float) -> float:
         """Return the mean speed [m/s] along the stored path up to the finger."""
-        places = [*((x, y) for _, x, y in self._path), (contact.x, contact.y)]
-        way = sum(math.dist(one, after) for one, after in pairwise(places))
-        return way / max(now - self._path[0][0], _MIN_REPORT_INTERVAL)
+        positions = [*((x, y) for _, x, y in self._path), (contact.x, contact.y)]
+        distance = sum(math.dist(one, after) for one, after in pairwise(positions))
+        return distance / max(now - self._path[0][0], _MIN_REPORT_INTERVAL)
 
     def _level_at(self, speed: float) -> float | None:
         """Return the level [dB SL] of a speed [m/s], linear in log speed, in steps of 2 dB."""
         if self._level is None:
             return None
         slow, fast = self._texture.slow, self._texture.fast
-        share = math.log(min(speed, fast) / slow) / math.log(fast / slow)
-        attenuation = (1 - share) * self._texture.range
+        fraction = math.log(min(speed, fast) / slow) / math.log(fast / slow)
+        attenuation = (1 - fraction) * self._texture.range
         if self._attenuation is None or abs(attenuation - self._attenuation) > _LEVEL_HYSTERESIS:
             self._attenuation = round(attenuation / _LEVEL_STEP) * _LEVEL_STEP
         return self._level - self._attenuation

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from controller.group.quick_stops import QuickStops
 from controller.group.synchronized_play import Played, SynchronizedPlay
-from controller.group.tasks import gather_all, persistently, run_to_completion
+from controller.group.tasks import gather_all, retry_while_degraded, run_to_completion
 from drivers import clock
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import (
@@ -52,11 +52,13 @@ class AmplifierGroup:
     its caller is cancelled.
     """
 
-    def __init__(self, amplifiers: Mapping[str, Amplifier], *, has_own_time: bool = False) -> None:
+    def __init__(
+        self, amplifiers: Mapping[str, Amplifier], *, is_time_stepped: bool = False
+    ) -> None:
         self.state = GroupState.CLOSED
         self._amplifiers = dict(amplifiers)
         self._checked = {
-            name: CheckedAmplifier(amplifier, f"amplifier {name}", has_own_time=has_own_time)
+            name: CheckedAmplifier(amplifier, f"amplifier {name}", is_time_stepped=is_time_stepped)
             for name, amplifier in self._amplifiers.items()
         }
         self._playback = SynchronizedPlay(self._checked)
@@ -119,7 +121,9 @@ class AmplifierGroup:
             if number == self._arm_count:  # else a newer request may have armed them
                 self._leave_armed()
                 with self._silencing():
-                    await self._finish(persistently(amplifier.disarm) for amplifier in self._all)
+                    await self._finish(
+                        retry_while_degraded(amplifier.disarm) for amplifier in self._all
+                    )
             raise
         self._playback.forget()
         self.state = GroupState.ARMED
@@ -144,7 +148,7 @@ class AmplifierGroup:
 
         On a degraded link the status is read instead; an amplifier that replies again must still
         play its set. Raises DriverError, also for an amplifier that is not enabled any more or
-        that contradicts what was asked twice in a row.
+        whose replies contradict requests twice in a row.
         """
         return await self._exchange(self._heartbeat()) is not None
 
@@ -163,7 +167,9 @@ class AmplifierGroup:
         self._leave_armed()
         try:
             with self._silencing():
-                await self._gather(persistently(amplifier.disarm) for amplifier in self._all)
+                await self._gather(
+                    retry_while_degraded(amplifier.disarm) for amplifier in self._all
+                )
         except BaseException:
             await self.stop()
             raise
@@ -197,7 +203,7 @@ class AmplifierGroup:
                     await self._wind_down(silence)
                 elif self._may_be_armed:
                     reachable = [amplifier for amplifier in self._all if not amplifier.is_lost]
-                    await self._finish(persistently(each.disarm) for each in reachable)
+                    await self._finish(retry_while_degraded(each.disarm) for each in reachable)
             except BaseException as error:
                 await self.stop()
                 if not isinstance(error, DriverError):
@@ -209,18 +215,18 @@ class AmplifierGroup:
     async def _wind_down(self, silence: Mapping[str, SafeCommandSet]) -> None:
         """Play silence, wait until every amplifier reports level zero, and disarm."""
         await gather_all(
-            persistently(partial(self._amplifiers[name].apply, safe))
+            retry_while_degraded(partial(self._amplifiers[name].apply, safe))
             for name, safe in silence.items()
         )
         await asyncio.sleep(max(safe.ramp for safe in silence.values()))
         for _ in range(_READ_BACKS):
-            statuses = await self._gather(persistently(each.status) for each in self._all)
+            statuses = await self._gather(retry_while_degraded(each.status) for each in self._all)
             if not any(level for status in statuses for level in status.levels):
                 break
             await asyncio.sleep(_READ_BACK_INTERVAL)
         else:
             raise CommandRefused("an amplifier reports a level above zero after silence was played")
-        await gather_all(persistently(amplifier.disarm) for amplifier in self._all)
+        await gather_all(retry_while_degraded(amplifier.disarm) for amplifier in self._all)
 
     async def _heartbeat(self) -> bool:
         """Send a heartbeat to every amplifier; always True."""

@@ -7,7 +7,7 @@ from functools import partial
 
 from controller.group.tasks import CoalescedCalls
 from drivers.amplifier import Amplifier
-from drivers.operation.silence import Silence, StopOutcome, stop_and_confirm
+from drivers.operation.silence import SilenceStatus, StopOutcome, stop_and_confirm
 
 _logger = logging.getLogger(__name__)
 
@@ -15,9 +15,9 @@ _logger = logging.getLogger(__name__)
 class QuickStops:
     """Stops every amplifier once more for all requests that arrive while it is being stopped.
 
-    The first of these is sent at once, not only when the silence of the stop before is confirmed.
+    The first of these is sent at once, before the previous stop is confirmed.
 
-    Lost amplifiers are stopped blindly as long as their wires are open. Amplifiers that share a bus
+    Lost amplifiers are sent stops as long as their wires are open. Amplifiers that share a bus
     get one broadcast before each of them is stopped individually, so that none waits for the reply
     of another.
     """
@@ -61,10 +61,10 @@ class QuickStops:
 
 
 def _known(outcome: StopOutcome | BaseException) -> StopOutcome:
-    """The outcome of a stop; what it raised means that nothing is known."""
+    """The outcome of a stop; MAY_PLAY if it raised."""
     if isinstance(outcome, StopOutcome):
         return outcome
-    return StopOutcome(Silence.MAY_PLAY, None, f"{type(outcome).__name__}: {outcome}")
+    return StopOutcome(SilenceStatus.MAY_PLAY, None, f"{type(outcome).__name__}: {outcome}")
 
 
 def _by_shared_bus(amplifiers: Mapping[str, Amplifier]) -> list[list[Amplifier]]:

@@ -9,7 +9,7 @@ from controller.group.tasks import gather_all
 from drivers import clock
 from drivers.guard import SafeCommandSet, SafeEnvelope
 from drivers.operation.checked_amplifier import CheckedAmplifier
-from drivers.operation.simultaneous import at_one_moment
+from drivers.operation.simultaneous import simultaneous_commits
 from drivers.protocol.messages import Achieved
 
 
@@ -75,14 +75,14 @@ class SynchronizedPlay:
             if not may_play():
                 return None  # as above
             self.is_set_incomplete = True
-            since = clock.now()
+            sent_at = clock.now()
             for name, safe in sets.items():
                 self._amplifiers[name].expect_commit(safe)
             await gather_all(self._commits(sets, may_play))
             sent = self._last_sent_at  # before the statuses are read
             if not may_play():
                 return None
-            await self._confirm_commits(sets, since)
+            await self._confirm_commits(sets, sent_at)
         self.is_set_incomplete = False
         return Played(dict(zip(sets, achieved, strict=True)), sent, loading_time)
 
@@ -105,7 +105,7 @@ class SynchronizedPlay:
         for name, safe in sets.items():
             bus = self._amplifiers[name].amplifier.bus or name
             by_bus.setdefault((bus, safe.token), []).append(name)
-        return at_one_moment(
+        return simultaneous_commits(
             [
                 (
                     self._amplifiers[first].amplifier.wire_times.commit(),
@@ -121,10 +121,11 @@ class SynchronizedPlay:
             ]
         )
 
-    async def _confirm_commits(self, sets: Mapping[str, SafeCommandSet], since: float) -> None:
+    async def _confirm_commits(self, sets: Mapping[str, SafeCommandSet], sent_at: float) -> None:
         """Raise CommandRefused unless every amplifier reports that it plays its set."""
         await gather_all(
-            self._amplifiers[name].confirm_commit(safe, since=since) for name, safe in sets.items()
+            self._amplifiers[name].confirm_commit(safe, sent_at=sent_at)
+            for name, safe in sets.items()
         )
 
 

@@ -59,7 +59,7 @@ def _severity(error: BaseException) -> int:
     return 0 if isinstance(error, LinkError) else 1
 
 
-async def persistently(request: Callable[[], Awaitable[_T]]) -> _T:
+async def retry_while_degraded(request: Callable[[], Awaitable[_T]]) -> _T:
     """Repeat a request on a degraded link until it is answered or the link is lost."""
     while True:
         try:

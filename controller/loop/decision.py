@@ -30,11 +30,11 @@ from registry.plugins import failure_text
 # With no finger left on the plate the end may be short: zero within 20 ms of the lift.
 RELEASE_RAMP = 0.010
 
-# A vibration ends by itself on the amplifier unless it is renewed, which happens at half of its
-# time and only while its targets are confirmed by their sources. Not shorter than this [s], so that
-# a slow wire or a rate limit of one set a second does not interrupt it.
+# Shortest time [s] until a vibration ends by itself on the amplifier, so that a slow wire or a rate
+# limit of one set a second does not interrupt it. It is renewed at half its time while its targets
+# are confirmed.
 MIN_VALID_FOR = 2.0
-_VALIDITY_MARGIN = 0.2  # s; after the contact is lifted, so that a late frame makes no gap
+_VALIDITY_MARGIN = 0.2  # s; after the contact is lifted, for late frames
 
 _logger = logging.getLogger(__name__)
 
@@ -43,7 +43,7 @@ _logger = logging.getLogger(__name__)
 class Decision:
     """A selection and what the amplifiers are to play for it.
 
-    from_rest: whether nothing played before; since [s]: when the change arrived that led to it.
+    from_rest: whether nothing played before; triggered_at [s]: when the change arrived.
     sets: None if all channels are silent already; pattern: with the ramp and onset of the sets,
     None for silence; adds_endings_only: whether the sets only add endings to what plays; refusal:
     why a guard refused the pattern, which makes it silence; retry_at [s]: when the guard would pass
@@ -53,7 +53,7 @@ class Decision:
     contacts: tuple[Contact, ...]
     selection: Selection
     from_rest: bool
-    since: float
+    triggered_at: float
     sets: SafeSets | None = None
     pattern: Pattern | None = None
     adds_endings_only: bool = False
@@ -62,8 +62,8 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class _Playing:
-    """Known playback of the amplifiers since the last decision with sets.
+class _Playback:
+    """Playback of the amplifiers since the last decision with sets.
 
     confirmed_commands: by ERA; has_endings: whether endings were added; endings_due [s]: when
     endings can be added; retry_at [s]: when a guard would pass what it refused. confirmed_until
@@ -89,7 +89,7 @@ class _Playing:
 
 
 class Decider:
-    """Contacts, intent, selection and safe sets of one plate; reads no clock and never waits.
+    """Contacts, intent, selection and safe sets of one plate; synchronous, times are arguments.
 
     guards: one for each amplifier, by name; max_loading_time [s]: longest loading of envelopes. A
     decision never raises: it falls back to silence on any exception.
@@ -116,8 +116,8 @@ class Decider:
         self._selector = Selector(table)
         self._builder = SetBuilder(rig, guards, timing=timing)
         self._selected: Selection | None = None
-        self._playing = _Playing()
-        self._since: float | None = None
+        self._playing = _Playback()
+        self._triggered_at: float | None = None
 
     @property
     def capabilities(self) -> PlaybackCapabilities:
@@ -176,7 +176,7 @@ class Decider:
         """Whether the last contact has lifted and silence has not been commanded yet."""
         return not self._tracker.contacts and not self._playing.is_silent
 
-    def take(self, frame: TouchFrame) -> Change:
+    def update(self, frame: TouchFrame) -> Change:
         """Apply a touch frame to the contacts."""
         change = self._tracker.update(frame)
         self._note(change, frame.time)
@@ -189,9 +189,9 @@ class Decider:
         return change
 
     def forget(self) -> None:
-        """Treat what the amplifiers play as unknown: the next decision has sets."""
+        """Discard the known playback: the next decision has sets."""
         self._selected = None
-        self._playing = _Playing()
+        self._playing = _Playback()
 
     def confirm(self, commands: Mapping[str, DriveCommand], *, now: float) -> None:
         """Note what the amplifiers play for the last decision, by ERA, without silent ones."""
@@ -207,10 +207,10 @@ class Decider:
             self._playing = replace(self._playing, endings_due=endings_due)
 
     def renewal(self, now: float) -> SafeSets | None:
-        """Return the sets by which what plays goes on, if that is due at a time [s]; else None.
+        """Return the sets that prolong the playback, if due at a time [s]; else None.
 
-        A vibration whose targets no source has confirmed since it was sent is not renewed, and ends
-        by itself. So does one that a guard has shortened: renewing it would circumvent the limit.
+        Only while sources confirm its targets; and not if a guard has shortened it, since renewal
+        would circumvent the limit. Then it ends by itself.
         """
         decision = self._playing.decision
         if decision is None or decision.sets is None:
@@ -220,7 +220,7 @@ class Decider:
         if self._confirmed_until(decision.selection) <= self._playing.confirmed_until:
             return None
         valid_for = self._valid_for(decision.selection, now)
-        return self._builder.renew(decision.sets, valid_for=valid_for)
+        return self._builder.build_renewal(decision.sets, valid_for=valid_for)
 
     def confirm_renewal(self, sets: SafeSets, *, now: float) -> None:
         """Note that the amplifiers have accepted the sets of a renewal."""
@@ -241,28 +241,28 @@ class Decider:
         """Decide at a time [s]; None if nothing changes."""
         self.expire(now)
         contacts, playing = self._tracker.contacts, self._playing
-        since = now if self._since is None else min(self._since, now)
-        self._since = None
+        triggered_at = now if self._triggered_at is None else min(self._triggered_at, now)
+        self._triggered_at = None
         decision, has_failed = None, False
         try:
             selection = self._select(contacts, now)
             is_new = selection != self._selected or _is_due(playing.retry_at, now)
-            decided = Decision(contacts, selection, not playing.confirmed_commands, since)
-            decision = self._play(decided, now) if is_new else self._add_endings(decided, now)
+            draft = Decision(contacts, selection, not playing.confirmed_commands, triggered_at)
+            decision = self._with_pattern(draft, now) if is_new else self._with_endings(draft, now)
         except Exception as error:
             has_failed = True
             selection = Selection((), contacts, None, failure_text(error))
             is_new = selection != self._selected
-            decided = Decision(contacts, selection, not playing.confirmed_commands, since)
+            draft = Decision(contacts, selection, not playing.confirmed_commands, triggered_at)
             if is_new:
                 _logger.exception("loop: decision failed, silencing all channels")
         if decision is None and is_new:
-            decision = decided
+            decision = draft
             if not playing.is_silent:
                 sets = self._end(contacts, along_endings=playing.has_endings and not has_failed)
-                decision = replace(decided, sets=sets)
+                decision = replace(draft, sets=sets)
         if decision is not None and decision.sets is not None:
-            self._playing = _Playing(decision, retry_at=decision.retry_at)
+            self._playing = _Playback(decision, retry_at=decision.retry_at)
         else:
             self._playing = replace(
                 playing,
@@ -274,7 +274,7 @@ class Decider:
 
     def silence(self, *, ramp: float) -> SafeSets:
         """Build the sets that ramp [s] every wired channel to zero; never fails."""
-        return self._builder.silence(ramp=ramp)
+        return self._builder.build_silence(ramp=ramp)
 
     def _capabilities_at(self, now: float) -> PlaybackCapabilities:
         """Return the capabilities at a time [s]: without envelopes while loading is too slow."""
@@ -289,48 +289,48 @@ class Decider:
         self._intent_due = intent.due(now)
         return self._selector.select(contacts, intent, self._capabilities_at(now))
 
-    def _play(self, decided: Decision, now: float) -> Decision | None:
-        """Complete a decision by the sets of its pattern; None without one."""
-        pattern, question = decided.selection.pattern, decided.selection.question
+    def _with_pattern(self, draft: Decision, now: float) -> Decision | None:
+        """Return a draft with the sets of its pattern; None without a pattern."""
+        pattern, question = draft.selection.pattern, draft.selection.question
         if pattern is None or question is None:
             return None
         is_shaped = self._capabilities_at(now).envelope_support.onsets
         try:
-            sets, played = self._builder.play(
+            sets, played = self._builder.build_pattern(
                 pattern,
                 question,
                 is_shaped=is_shaped,
                 playing=self._playing.confirmed_commands,
-                valid_for=self._valid_for(decided.selection, now),
+                valid_for=self._valid_for(draft.selection, now),
             )
         except CommandRefused as error:
             silence = self.silence(ramp=FADE_RAMP)
-            return replace(decided, sets=silence, refusal=str(error), retry_at=error.until)
-        return replace(decided, sets=sets, pattern=played)
+            return replace(draft, sets=silence, refusal=str(error), retry_at=error.until)
+        return replace(draft, sets=sets, pattern=played)
 
-    def _add_endings(self, decided: Decision, now: float) -> Decision | None:
-        """Complete a decision by the endings of what plays; None if they are not due or refused."""
-        pattern, question = decided.selection.pattern, decided.selection.question
+    def _with_endings(self, draft: Decision, now: float) -> Decision | None:
+        """Return a draft that adds endings to the playback; None if not due, or refused."""
+        pattern, question = draft.selection.pattern, draft.selection.question
         playing = self._playing
         if pattern is None or question is None or not playing.confirmed_commands:
             return None
         if not _is_due(playing.endings_due, now):
             return None
-        sets = self._builder.add_endings(
+        sets = self._builder.build_endings(
             pattern,
             question,
             playing=playing.confirmed_commands,
-            valid_for=self._valid_for(decided.selection, now),
+            valid_for=self._valid_for(draft.selection, now),
         )
         if sets is None:
             return None
-        return replace(decided, sets=sets, pattern=pattern, adds_endings_only=True)
+        return replace(draft, sets=sets, pattern=pattern, adds_endings_only=True)
 
     def _end(self, contacts: tuple[Contact, ...], *, along_endings: bool) -> SafeSets:
-        """Build the sets that end what plays: along endings only under fingers that stay."""
+        """Build the sets that end the playback: along endings only under fingers that stay."""
         if not contacts:
             return self.silence(ramp=RELEASE_RAMP)
-        return self._builder.end() if along_endings else self.silence(ramp=FADE_RAMP)
+        return self._builder.build_end() if along_endings else self.silence(ramp=FADE_RAMP)
 
     def _confirmed_until(self, selection: Selection) -> float:
         """Return when [s] the first target is lifted unless a frame arrives."""
@@ -343,7 +343,7 @@ class Decider:
         return min(max(lasts, MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
 
     def _note_validity(self, sets: SafeSets, selection: Selection, now: float) -> None:
-        """Note until when sets committed by now [s] last, and what is known of their targets."""
+        """Note until when sets committed by now [s] last and their targets are confirmed."""
         is_shortened = sets.valid_for < MIN_VALID_FOR
         self._playing = replace(
             self._playing,
@@ -354,8 +354,8 @@ class Decider:
 
     def _note(self, change: Change, time: float) -> None:
         """Remember when the first change since the last decision arrived."""
-        if change and self._since is None:
-            self._since = time
+        if change and self._triggered_at is None:
+            self._triggered_at = time
 
 
 def _is_due(moment: float | None, now: float) -> bool:

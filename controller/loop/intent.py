@@ -1,7 +1,6 @@
 """Haptic intent: which contacts shall feel something, how strongly, and until when.
 
-The interface between what touches mean and how that is played: all other contacts are kept quiet,
-and the rest, from the table to the wire, does not know why.
+The interface between the meaning of touches and their playback. All other contacts are kept quiet.
 """
 
 from collections.abc import Sequence
@@ -21,13 +20,13 @@ class Target:
     """A contact that shall feel something.
 
     level_db_sl: how strongly; None for as strongly as the neighbours allow. Among targets with a
-    level, one without gets the highest of theirs. or_less: where the plate cannot reach the level,
-    as strongly as the neighbours allow instead of nothing.
+    level, one without gets the highest of theirs. allow_weaker: where the plate cannot reach the
+    level, as strongly as the neighbours allow instead of nothing.
     """
 
     key: ContactKey
     level_db_sl: float | None = STRONG_DB_SL
-    or_less: bool = False
+    allow_weaker: bool = False
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class HapticIntent:
     until: float | None = None
 
     def due(self, now: float) -> float | None:
-        """Return when [s] to query again; an expired intent must not keep the loop busy."""
+        """Return when [s] to query again, at least a millisecond from now."""
         if self.until is None:
             return None
         return self.until if self.until > now else now + _MIN_WAIT
@@ -59,8 +58,8 @@ class IntentSource(Protocol):
         """
 
 
-class NewestBuzzes:
-    """The newest contact buzzes where it is; after it lifts, all is silent until the next one."""
+class BuzzNewestContact:
+    """Targets the newest contact; after it lifts, none until the next one."""
 
     def __init__(self, level_db_sl: float | None = STRONG_DB_SL) -> None:
         self._level = level_db_sl

@@ -12,7 +12,7 @@ from controller.group.synchronized_play import Played
 from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
 from controller.loop.decision import RELEASE_RAMP, Decider, Decision
 from controller.loop.envelopes import MAX_LOADING_TIME
-from controller.loop.intent import IntentSource, NewestBuzzes
+from controller.loop.intent import BuzzNewestContact, IntentSource
 from controller.loop.observer import Observer, applied_by, silenced_by
 from controller.loop.routing import commands_by_era
 from controller.loop.safe_sets import SafeSets
@@ -33,8 +33,7 @@ from model.table.table import LocalizationTable
 from model.table.timing import Timing
 from registry.plugins import failure_text
 
-# Closing is not urgent, so it fades out softly.
-CLOSING_RAMP = 0.050
+CLOSING_RAMP = 0.050  # s; not urgent, so longer than a release
 
 # s; the loop runs even with nothing to do, for a supervisor that checks whether it is alive.
 IDLE_INTERVAL = 0.5
@@ -79,7 +78,7 @@ class Controller:
         self._group = AmplifierGroup(amplifiers)
         self._sources = sources
         self._observer = observer or Observer()
-        self._intent_source = intent_source or NewestBuzzes()
+        self._intent_source = intent_source or BuzzNewestContact()
         self._timing = timing
         self._drive_mode = drive_mode
         self._max_loading_time = max_loading_time if timing is not None else 0.0
@@ -214,7 +213,7 @@ class Controller:
                     is_aborted = not await self._execute(decision)
             elif self.group_state is GroupState.ARMED and not self._group.degraded:
                 await self._renew(now)
-            # Half a set may play then: the next turn silences it, and the heartbeat comes after.
+            # The set may be incomplete then: the next cycle silences it, before the heartbeat.
             if self._is_heartbeat_due and not is_aborted and await self._group.heartbeat():
                 self._heartbeat_due = clock.now() + HEARTBEAT
         except LinkError as error:
@@ -226,8 +225,8 @@ class Controller:
             self._report_change(expired)
 
     def deliver(self, frame: TouchFrame) -> None:
-        """Take a touch frame; to be called in the loop's thread."""
-        change = self._decider.take(frame)
+        """Process a touch frame; to be called in the loop's thread."""
+        change = self._decider.update(frame)
         self._follow(change)
         for reason in change.rejected:
             self._rejects.count(reason, f"touch of {frame.source}")
@@ -300,7 +299,7 @@ class Controller:
         return True
 
     async def _renew(self, now: float) -> None:
-        """Let what plays go on if it is due; raises DriverError."""
+        """Prolong the playback if due; raises DriverError."""
         sets = self._decider.renewal(now)
         if sets is not None and await self._play(sets, is_pattern=True) is not None:
             self._decider.confirm_renewal(sets, now=clock.now())
@@ -310,7 +309,7 @@ class Controller:
         played = None
         try:
             if self._group.is_set_incomplete and is_pattern:
-                # Half a set is no pattern: silence goes before the next one.
+                # Silence an incomplete set before the next pattern.
                 silence = self._decider.silence(ramp=RELEASE_RAMP)
                 if await self._group.play(silence.sets) is None:
                     return None

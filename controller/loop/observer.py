@@ -77,7 +77,7 @@ def applied_by(
         quiet=decision.selection.quiet,
         pattern=pattern,
         drive=commands,
-        latency=sent - decision.since,
+        latency=sent - decision.triggered_at,
         time=sent,
         from_rest=decision.from_rest,
         question=decision.selection.question,
@@ -91,7 +91,7 @@ def silenced_by(decision: Decision, *, sent: float | None, now: float) -> Silenc
         contacts=decision.contacts,
         targets=tuple(contact for contact, _ in decision.selection.targets),
         reason=decision.refusal or decision.selection.reason or "",
-        latency=None if sent is None else sent - decision.since,
+        latency=None if sent is None else sent - decision.triggered_at,
         time=now,
     )
 

@@ -1,4 +1,4 @@
-"""Routing: from excitations (physics) to command sets (electricity), by the wiring of the rig.
+"""Routing of excitations [m, rad] to command sets by the wiring of the rig.
 
 `sim/bench/bench.py` translates back by the same wiring.
 """

@@ -62,7 +62,7 @@ class SetBuilder:
         self._timing = timing
         self._token = random_token()
 
-    def play(
+    def build_pattern(
         self,
         pattern: Pattern,
         question: Question,
@@ -101,7 +101,7 @@ class SetBuilder:
         sets = {name: safe for name, (safe, _) in checked.items()}
         return SafeSets(sets), _with_ramp(pattern, sets)
 
-    def add_endings(
+    def build_endings(
         self,
         pattern: Pattern,
         question: Question,
@@ -109,7 +109,7 @@ class SetBuilder:
         playing: Mapping[str, DriveCommand],
         valid_for: float,
     ) -> SafeSets | None:
-        """Build the sets that give shaped endings to what plays; None if a guard refuses any."""
+        """Build the sets that add shaped endings to the playback; None if a guard refuses any."""
         if self._timing is None:
             return None
         shaped = self._timing.with_envelopes(
@@ -126,13 +126,13 @@ class SetBuilder:
                 ramp=FADE_RAMP,
                 ending=shaped.ending,
             )
-            return SafeSets(self._checked(_lasting(sets, valid_for)), envelopes)
+            return SafeSets(self._checked(_with_valid_for(sets, valid_for)), envelopes)
         except CommandRefused as error:
             _logger.info("loop: plain ramp instead of an ending: %s", error)
             return None
 
-    def renew(self, played: SafeSets, *, valid_for: float) -> SafeSets | None:
-        """Build the sets by which played ones go on for a time [s]; None if a guard refuses one."""
+    def build_renewal(self, played: SafeSets, *, valid_for: float) -> SafeSets | None:
+        """Build the sets that prolong played ones for a time [s]; None if a guard refuses one."""
         token = self._next_token()
         sets = {
             name: CommandSet(
@@ -152,16 +152,16 @@ class SetBuilder:
             _logger.debug("loop: vibration not renewed: %s", error)
             return None
 
-    def end(self) -> SafeSets:
-        """Build the sets by which every ERA ends along its ending, or plain silence."""
+    def build_end(self) -> SafeSets:
+        """Build the sets that end every ERA along its ending; plain silence if refused."""
         sets = route_to_silence(self._rig, token=self._next_token(), ramp=FADE_RAMP)
         try:
             return SafeSets(self._checked(sets))
         except Exception as error:  # silence is right for every kind of failure
             _logger.warning("loop: silencing along a ramp, endings refused: %s", error)
-            return self.silence(ramp=FADE_RAMP)
+            return self.build_silence(ramp=FADE_RAMP)
 
-    def silence(self, *, ramp: float) -> SafeSets:
+    def build_silence(self, *, ramp: float) -> SafeSets:
         """Build the sets that ramp [s] every wired channel to zero; never fails."""
         token = self._next_token()
         return SafeSets(
@@ -187,7 +187,7 @@ class SetBuilder:
             playing=playing,
             onset=pattern.onset,
         )
-        return _lasting(sets, valid_for)
+        return _with_valid_for(sets, valid_for)
 
     def _checked(self, sets: Mapping[str, CommandSet]) -> dict[str, SafeCommandSet]:
         """Check every set by its guard; raises CommandRefused."""
@@ -207,8 +207,8 @@ class SetBuilder:
         return self._token
 
 
-def _lasting(sets: Mapping[str, CommandSet], valid_for: float) -> dict[str, CommandSet]:
-    """Return sets that vibrate for a time [s] at most."""
+def _with_valid_for(sets: Mapping[str, CommandSet], valid_for: float) -> dict[str, CommandSet]:
+    """Return sets with this valid_for [s]."""
     return {name: replace(each, valid_for=valid_for) for name, each in sets.items()}
 
 

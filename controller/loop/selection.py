@@ -25,8 +25,7 @@ from registry.plugins import failure_text
 MOVE_TOLERANCE = 0.008
 
 MAX_DB_SL = 26.0
-"""Upper bound of `as strongly as the neighbours allow`: twice a strong vibration, so that a finger
-without neighbours is not numbed."""
+"""Upper bound of `as strongly as the neighbours allow`: twice a strong vibration."""
 
 _logger = logging.getLogger(__name__)
 
@@ -142,7 +141,7 @@ class Selector:
         try:
             return question, self._table.query(question)
         except InputError:
-            if not all(target.or_less for target in targets):
+            if not all(target.allow_weaker for target in targets):
                 raise
         wanted = question.level_db_sl
         question = replace(question, level_db_sl=min(wanted, FELT_DB_SL))

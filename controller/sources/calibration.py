@@ -48,8 +48,8 @@ class TouchCalibration:
                 "(1, 0, 0) and (0, 1, 0) for a sensor aligned with the plate"
             )
 
-    def place(self, touch: Touch) -> Touch:
-        """Return the touch in coordinates 0..1 across the plate; NaN stays NaN."""
+    def apply(self, touch: Touch) -> Touch:
+        """Map a touch to coordinates 0..1 across the plate; NaN stays NaN."""
         (a, b, c), (d, e, f) = self.matrix
         return replace(
             touch,
@@ -76,27 +76,27 @@ def turned(degrees: int = 0, *, mirror: str | None = None) -> TouchCalibration:
     return TouchCalibration((x_row, y_row))
 
 
-def fitted(touched: Sequence[Point], places: Sequence[Point], plate: Plate) -> TouchCalibration:
+def fitted(touched: Sequence[Point], positions: Sequence[Point], plate: Plate) -> TouchCalibration:
     """Fit a calibration by least squares to at least three points.
 
-    touched: sensor coordinates 0..1; places: on the plate [m] from its south-west corner, y
+    touched: sensor coordinates 0..1; positions: on the plate [m] from its south-west corner, y
     upwards. Raises InputError for points on a line or residuals above 5 mm.
     """
-    if len(touched) != len(places) or len(touched) < 3:
+    if len(touched) != len(positions) or len(touched) < 3:
         raise InputError(
             "touch calibration must have at least three points, best near three corners, got "
-            f"{len(touched)} touches and {len(places)} places"
+            f"{len(touched)} touches and {len(positions)} positions"
         )
-    wanted = np.array([(x / plate.length, 1 - y / plate.width) for x, y in places])
-    known = np.column_stack((np.array(touched, dtype=float), np.ones(len(touched))))
-    if not (np.isfinite(known).all() and np.isfinite(wanted).all()):
+    expected = np.array([(x / plate.length, 1 - y / plate.width) for x, y in positions])
+    measured = np.column_stack((np.array(touched, dtype=float), np.ones(len(touched))))
+    if not (np.isfinite(measured).all() and np.isfinite(expected).all()):
         raise InputError("points of the touch calibration must be finite; touch them again")
-    if np.linalg.matrix_rank(known, tol=0.05) < 3:
+    if np.linalg.matrix_rank(measured, tol=0.05) < 3:
         raise InputError(
             "points of the touch calibration must not lie on a line; touch three corners"
         )
-    solution = np.linalg.lstsq(known, wanted, rcond=None)[0]
-    error = (known @ solution - wanted) * (plate.length, plate.width)
+    solution = np.linalg.lstsq(measured, expected, rcond=None)[0]
+    error = (measured @ solution - expected) * (plate.length, plate.width)
     distances = np.hypot(error[:, 0], error[:, 1])
     worst = int(np.argmax(distances))
     if distances[worst] > MAX_RESIDUAL:
@@ -121,14 +121,14 @@ class CalibratedSource(TouchSource):
 
         Its fingers are lifted as soon as it ends, fails or is cancelled.
         """
-        place = self._calibration.place
+        apply = self._calibration.apply
         touched: dict[str, TouchFrame] = {}
 
         def placed(frame: TouchFrame) -> None:
             touched.pop(frame.source, None)
             if frame.touches:
                 touched[frame.source] = frame
-            deliver(replace(frame, touches=tuple(map(place, frame.touches))))
+            deliver(replace(frame, touches=tuple(map(apply, frame.touches))))
 
         try:
             await self._source.run(placed)

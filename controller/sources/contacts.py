@@ -14,7 +14,7 @@ from model.structure.plate import Plate
 # contact that is not confirmed must not be driven.
 CONTACT_TIMEOUT = 0.150
 
-# s; a finger that rests longer without any sign of its sensor is not to be relied on.
+# s; no sensor may stay silent for longer under a resting finger.
 MAX_CONTACT_TIMEOUT = 60.0
 
 
@@ -72,7 +72,7 @@ class _Source:
 
 
 class ContactTracker:
-    """The contacts on one plate. Deterministic: reads no clock.
+    """The contacts on one plate. Deterministic: times are arguments.
 
     x = X L and y = (1 - Y) W, since touch sensors count Y downwards. Rejects touches that are off
     the plate (outside 0..1), have non-finite coordinates or repeat an id within a frame (the last

@@ -74,7 +74,7 @@ class EvdevSource(TouchSource):
         """Deliver the frames of a panel until it is unplugged; raises OSError then."""
         loop = asyncio.get_running_loop()
         reader = SlotReader(panel.ranges)
-        reader.adopt(panel.slots(), current=panel.current_slot)
+        reader.resynchronise(panel.slots(), current=panel.current_slot)
         self._deliver(deliver, reader.touches)
         readable = asyncio.Event()
         loop.add_reader(panel.fileno(), readable.set)
@@ -84,16 +84,16 @@ class EvdevSource(TouchSource):
                     async with asyncio.timeout(REPEAT_INTERVAL if reader.touches else None):
                         await readable.wait()
                 except TimeoutError:
-                    reader.adopt(panel.slots(), current=panel.current_slot)
+                    reader.resynchronise(panel.slots(), current=panel.current_slot)
                     self._deliver(deliver, reader.touches)
                     continue
                 readable.clear()
                 for event in panel.read():
-                    report = reader.take(event.kind, event.code, event.value)
+                    report = reader.feed(event.kind, event.code, event.value)
                     if report is None:
                         continue
                     if report.is_partial:
-                        reader.adopt(panel.slots(), current=panel.current_slot)
+                        reader.resynchronise(panel.slots(), current=panel.current_slot)
                         self._deliver(deliver, reader.touches)
                     else:
                         for touches in report.states:

@@ -80,7 +80,7 @@ def _frames(path: Path, events: list[_Event], reader: SlotReader) -> list[TouchF
     frames: list[TouchFrame] = []
     for event in events:
         try:
-            report = reader.take(event.type, event.code, event.value)
+            report = reader.feed(event.type, event.code, event.value)
         except EventError as error:
             raise InputError(f"{path}, line {event.line}: {error}") from error
         if report is not None:

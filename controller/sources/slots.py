@@ -20,7 +20,7 @@ Range: TypeAlias = tuple[int, int]  # lowest and highest value of an axis
 
 
 class EventError(ValueError):
-    """An event that is not of a panel of type B."""
+    """An invalid event of a type B panel."""
 
 
 @dataclass(frozen=True)
@@ -56,14 +56,14 @@ class SlotState:
 class _Slot:
     """The state of one slot; x and y are None until reported.
 
-    contact: id of the touch, None without a contact. is_certain: whether a tracking id was
-    reported; a slot that moves without one has had its contact since before the first event.
+    contact: id of the touch, None without a contact. has_reported_id: whether a
+    tracking id was reported; one that moves without it was touched before the first event.
     tool: MT_TOOL_FINGER for a finger; palms and pens are ignored. distance: above 0 while hovering,
     ignored.
     """
 
     contact: int | None = None
-    is_certain: bool = False
+    has_reported_id: bool = False
     x: float | None = None
     y: float | None = None
     tool: int = MT_TOOL_FINGER
@@ -82,7 +82,7 @@ class _Slot:
 
 
 class SlotReader:
-    """Events in, reports out; no device, no clock.
+    """Decoder of events into reports, without I/O.
 
     A contact appears once both its coordinates are known. A slot keeps the coordinates of its last
     contact, since the kernel omits values that did not change. Contacts that were down before the
@@ -106,13 +106,13 @@ class SlotReader:
         touches = (slot.touch for _, slot in sorted(self._slots.items()))
         return tuple(touch for touch in touches if touch is not None)
 
-    def take(self, kind: int, code: int, value: int) -> Report | None:
+    def feed(self, kind: int, code: int, value: int) -> Report | None:
         """Process one event (EV_..., code and value); return the report that it completes, or None.
 
         Raises EventError for events of type A and negative slots.
         """
         if kind == EV_ABS:
-            self._take_axis(code, value)
+            self._feed_axis(code, value)
         elif kind == EV_SYN and code == SYN_MT_REPORT:
             raise EventError(
                 "multi-touch protocol must be type B (slots), got type A (SYN_MT_REPORT); use "
@@ -124,19 +124,19 @@ class SlotReader:
             return self._report()
         return None
 
-    def adopt(self, slots: Mapping[int, SlotState], *, current: int) -> None:
+    def resynchronise(self, slots: Mapping[int, SlotState], *, current: int) -> None:
         """Replace all state by the kernel's, with the slot of the next event."""
         self._current = current
         self._slots = {
             number: _Slot(
                 contact=state.tracking_id if state.tracking_id >= 0 else None,
-                is_certain=True,
-                x=self._share(ABS_MT_POSITION_X, state.x),
-                y=self._share(ABS_MT_POSITION_Y, state.y),
+                has_reported_id=True,
+                x=self._normalised(ABS_MT_POSITION_X, state.x),
+                y=self._normalised(ABS_MT_POSITION_Y, state.y),
                 tool=state.tool,
                 distance=state.distance,
-                pressure=self._share(ABS_MT_PRESSURE, state.pressure),
-                touch_major=self._share(ABS_MT_TOUCH_MAJOR, state.touch_major),
+                pressure=self._normalised(ABS_MT_PRESSURE, state.pressure),
+                touch_major=self._normalised(ABS_MT_TOUCH_MAJOR, state.touch_major),
             )
             for number, state in slots.items()
         }
@@ -149,7 +149,7 @@ class SlotReader:
         self._pending, self._changed, self._dropped = [], set(), False
         return report
 
-    def _take_axis(self, code: int, value: int) -> None:
+    def _feed_axis(self, code: int, value: int) -> None:
         """Process one EV_ABS event."""
         slot = self._slots.setdefault(self._current, _Slot())
         if code == ABS_MT_SLOT:
@@ -161,26 +161,26 @@ class SlotReader:
                 self._pending.append(self.touches)
             self._changed.add(self._current)
             slot.contact = value if value >= 0 else None
-            slot.is_certain = True
+            slot.has_reported_id = True
         elif code in (ABS_MT_POSITION_X, ABS_MT_POSITION_Y):
-            if slot.contact is None and not slot.is_certain:
+            if slot.contact is None and not slot.has_reported_id:
                 self._anonymous += 1
                 slot.contact = -self._anonymous  # tracking ids are never negative
             if code == ABS_MT_POSITION_X:
-                slot.x = self._share(code, value)
+                slot.x = self._normalised(code, value)
             else:
-                slot.y = self._share(code, value)
+                slot.y = self._normalised(code, value)
         elif code == ABS_MT_TOOL_TYPE:
             slot.tool = value
         elif code == ABS_MT_DISTANCE:
             slot.distance = value
         elif code == ABS_MT_PRESSURE:
-            slot.pressure = self._share(code, value)
+            slot.pressure = self._normalised(code, value)
         elif code == ABS_MT_TOUCH_MAJOR:
-            slot.touch_major = self._share(code, value)
+            slot.touch_major = self._normalised(code, value)
 
-    def _share(self, code: int, value: int) -> float | None:
-        """Return a value relative to the range of its axis, 0..1 within it; None without one."""
+    def _normalised(self, code: int, value: int) -> float | None:
+        """Return a value relative to the range of its axis, 0..1; None without a range."""
         if code not in self._ranges:
             return None
         low, high = self._ranges[code]

@@ -66,7 +66,7 @@ class _Sender:
 
 
 class TuioReader:
-    """Datagrams in, touch frames out; no socket, no clock.
+    """Decoder of datagrams into touch frames, without I/O; times are arguments.
 
     Senders are distinguished by the name in their source message and their host, or without a name
     by host and port; where there are too many, a sender of the busiest peer is dropped. Every

@@ -87,16 +87,16 @@ class SharedLine(ABC, Generic[_OpenT]):
             raise LinkError(f"{self.name} is not open; open the amplifier first")
         return opened
 
-    def _lose(self, what: str) -> None:
+    def _lose(self, cause: str) -> None:
         """Notify the users of a loss; called in the event loop."""
         if self._loss is not None:
             return
-        self._loss = what
-        self._fail_pending(what)
+        self._loss = cause
+        self._fail_pending(cause)
         for number, on_loss in tuple(self._users.items()):
             if number not in self._notified:
                 self._notified.add(number)
-                on_loss(what)
+                on_loss(cause)
 
     async def _shut(self) -> None:
         opened, self._opened = self._opened, None
@@ -108,7 +108,7 @@ class SharedLine(ABC, Generic[_OpenT]):
     async def _open(self) -> _OpenT:
         """Open the port or adapter; raises LinkError."""
 
-    def _fail_pending(self, what: str) -> None:
+    def _fail_pending(self, cause: str) -> None:
         """Fail pending requests."""
         return
 

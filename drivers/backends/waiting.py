@@ -3,7 +3,7 @@
 import asyncio
 from typing import TypeVar
 
-SETTLE = 0.02  # s; for a second amplifier of the same address to reply
+DUPLICATE_WAIT = 0.02  # s; for a second amplifier of the same address to reply
 _LATE = 0.005  # s; a timer later than this means that this process was delayed
 _GRACE = 0.010  # s; for data received but not read yet, here or in a reader thread
 

@@ -37,17 +37,17 @@ class Bench:
 
     def tones(
         self,
-        *shares: float,
+        *fractions: float,
         token: int | None = None,
         ramp: float = 0.0,
         valid_for: float = 0.0,
         guard: Guard | None = None,
         first: int = 0,
     ) -> SafeCommandSet:
-        """Make a set that drives channels from `first` on at these shares of the test level."""
+        """Make a set that drives channels from `first` on at these fractions of the test level."""
         commands = tuple(
-            DriveCommand(first + number, self.frequency, share * self.level)
-            for number, share in enumerate(shares)
+            DriveCommand(first + number, self.frequency, fraction * self.level)
+            for number, fraction in enumerate(fractions)
         )
         return (guard or self.guard).check(
             CommandSet(
@@ -66,20 +66,21 @@ class Bench:
         """Read the levels back."""
         return (await self.amplifier.status()).levels
 
-    async def expect_levels(self, *shares: float, why: str) -> None:
-        """Require the first channels at these shares of the test level, all others silent."""
+    async def expect_levels(self, *fractions: float, why: str) -> None:
+        """Require the first channels at these fractions of the test level, all others silent."""
         levels = await self.levels()
-        wanted = [share * self.level for share in shares] + [0.0] * (len(levels) - len(shares))
-        is_met = all(abs(a - b) <= LEVEL_TOLERANCE for a, b in zip(levels, wanted, strict=True))
-        expect(is_met, f"{why}: levels must be {tuple(wanted)}, got {levels}")
+        expected = [fraction * self.level for fraction in fractions]
+        expected += [0.0] * (len(levels) - len(fractions))
+        is_met = all(abs(a - b) <= LEVEL_TOLERANCE for a, b in zip(levels, expected, strict=True))
+        expect(is_met, f"{why}: levels must be {tuple(expected)}, got {levels}")
 
     async def until(self, reached: Callable[[Status], bool], *, what: str, feed: bool) -> Status:
         """Poll until a status is reached; feed: whether polling feeds the watchdog."""
-        ask = self.amplifier.heartbeat if feed else self.amplifier.status
+        read = self.amplifier.heartbeat if feed else self.amplifier.status
         try:
             async with asyncio.timeout(EVENT_TIMEOUT):
                 while True:
-                    status = await ask()
+                    status = await read()
                     if reached(status):
                         return status
                     await asyncio.sleep(0.005)

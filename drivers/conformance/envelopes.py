@@ -10,8 +10,8 @@ async def envelopes(bench: Bench) -> None:
         return
     await bench.arm()
     step = min(max(0.1, bench.can.envelope_step_min), bench.can.envelope_step_max)
-    for slot, share in ((1, 0.5), (2, 0.25)):
-        shape = Envelope(slot, step, (Knot(share * bench.level, 0.0),) * 2)
+    for slot, fraction in ((1, 0.5), (2, 0.25)):
+        shape = Envelope(slot, step, (Knot(fraction * bench.level, 0.0),) * 2)
         await bench.amplifier.load_envelope(bench.guard.check_envelope(shape))
     shaped = DriveCommand(0, bench.frequency, bench.level, onset=1, ending=2)
     token = bench.amplifier.next_token()

@@ -21,10 +21,10 @@ async def plays_nothing_disarmed(bench: Bench) -> None:
 async def achieved(bench: Bench) -> None:
     """It reports what it really plays: the nearest steps; token and levels read back."""
     await bench.arm()
-    asked = DriveCommand(0, bench.frequency + 0.0049, bench.level * 0.987654, 12.3456)
+    requested = DriveCommand(0, bench.frequency + 0.0049, bench.level * 0.987654, 12.3456)
     token = bench.amplifier.next_token()
     achieved = await bench.amplifier.apply(
-        bench.guard.check(CommandSet(token, (asked,), ramp=0.0, valid_for=0.0))
+        bench.guard.check(CommandSet(token, (requested,), ramp=0.0, valid_for=0.0))
     )
     expect(
         [one.channel for one in achieved.commands] == [0],
@@ -33,9 +33,9 @@ async def achieved(bench: Bench) -> None:
     (played,) = achieved.commands
     can = bench.can
     for what, error, step in (
-        ("frequency", played.frequency - asked.frequency, can.frequency_step),
-        ("level", played.level - asked.level, can.level_step),
-        ("phase", (played.phase - asked.phase + 180) % 360 - 180, can.phase_step),
+        ("frequency", played.frequency - requested.frequency, can.frequency_step),
+        ("level", played.level - requested.level, can.level_step),
+        ("phase", (played.phase - requested.phase + 180) % 360 - 180, can.phase_step),
     ):
         expect(
             abs(error) <= step / 2 + 1e-9,

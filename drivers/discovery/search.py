@@ -11,7 +11,7 @@ from pathlib import Path
 from serial.tools.list_ports import comports
 
 from drivers.amplifier import Amplifier
-from drivers.discovery.slcan import ask_for_slcan
+from drivers.discovery.slcan import detect_slcan
 from drivers.errors import DriverError, FrameError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Identity
@@ -29,7 +29,7 @@ _GROUP_MAY = 0o060  # read and write
 class Candidate:
     """A port or interface: the URLs to try, and the remedy if it cannot be used."""
 
-    place: str
+    name: str
     description: str
     urls: tuple[str, ...]
     remedy: str | None = None
@@ -55,35 +55,36 @@ def candidates() -> list[Candidate]:
     return [*_serial_ports(), *_can_interfaces()]
 
 
-async def ask(urls: Iterable[str]) -> list[Found]:
+async def identify_all(urls: Iterable[str]) -> list[Found]:
     """Identify the amplifiers at these URLs, one after the other."""
-    return [await _ask(url) for url in urls]
+    return [await _identify(url) for url in urls]
 
 
-def with_slcan(place: Candidate) -> Candidate:
+def with_slcan(candidate: Candidate) -> Candidate:
     """Turn a serial port into a CAN adapter if it replies as one.
 
     Blocks; see `drivers.discovery.slcan` for what is sent. Its amplifiers are not identified.
     """
-    if not place.is_serial or place.remedy is not None:
-        return place
+    if not candidate.is_serial or candidate.remedy is not None:
+        return candidate
     try:
-        adapter = ask_for_slcan(place.place)
+        adapter = detect_slcan(candidate.name)
     except (OSError, ValueError) as problem:
-        return replace(place, remedy=f"{place.place} cannot be used: {problem}")
+        return replace(candidate, remedy=f"{candidate.name} cannot be used: {problem}")
     if adapter is None:
-        return place
+        return candidate
     heard = adapter.nodes or ("none",)
     what = adapter.problem or f"heartbeats of nodes: {', '.join(map(str, heard))}"
     bitrate = PROTOCOL.canopen["bitrate"]
     urls = tuple(
-        f"can+slcan://{_absolute(place.place)}?bitrate={bitrate}#{node}" for node in adapter.nodes
+        f"can+slcan://{_absolute(candidate.name)}?bitrate={bitrate}#{node}"
+        for node in adapter.nodes
     )
-    description = f"{place.description}: slcan adapter {adapter.version}, {what}"
-    return Candidate(place.place, description, urls, is_slcan=True)
+    description = f"{candidate.description}: slcan adapter {adapter.version}, {what}"
+    return Candidate(candidate.name, description, urls, is_slcan=True)
 
 
-async def _ask(url: str) -> Found:
+async def _identify(url: str) -> Found:
     try:
         amplifier = Amplifier(open_backend(url))
         await amplifier.open(take_over=False)

@@ -37,7 +37,7 @@ class SlcanAdapter:
     problem: str | None = None
 
 
-def ask_for_slcan(port: str) -> SlcanAdapter | None:
+def detect_slcan(port: str) -> SlcanAdapter | None:
     """Detect the adapter on a serial port; None if there is none. Blocks for half a second.
 
     Raises OSError if the port cannot be used.

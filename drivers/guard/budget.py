@@ -67,11 +67,11 @@ class Budget:
             self._start, self._end = now, now
         self._end = max(self._end, now + COMMIT_DELAY + lasts)
 
-    def confirm(self, since: float, now: float, *, end: float) -> None:
+    def confirm(self, sent_at: float, now: float, *, end: float) -> None:
         """Note that the set sent at a time [s] plays, and ends at another at the latest."""
         self._close(now)
         if self._start is None and now < end:
-            self._start = since
+            self._start = sent_at
         self._end = end
 
     def _close(self, now: float) -> None:

@@ -32,7 +32,7 @@ class _Sent:
     """A set that may play; since [s]: when it was sent."""
 
     command_set: CommandSet
-    since: float
+    sent_at: float
     achieved: tuple[DriveCommand, ...] = field(default=())
 
 
@@ -122,7 +122,7 @@ class PlayRecord:
             return
         number = tokens.index(token)
         sent = self._pending[number]
-        when = Interval(sent.since, now)
+        when = Interval(sent.sent_at, now)
         before = self._states(self._pending[:number], when)
         played = _played(sent)
         if self._limits.slew == math.inf and not self._is_shaped(sent.command_set):
@@ -133,7 +133,7 @@ class PlayRecord:
         self._pending = self._pending[number + 1 :]
         self._may_be_silent = False
         if not self._pending:
-            self._budget.confirm(sent.since, now, end=self._silent_at(sent.command_set, now))
+            self._budget.confirm(sent.sent_at, now, end=self._silent_at(sent.command_set, now))
 
     def silence_sent(self) -> None:
         """Record that a stop, a disarm or an arm is about to be sent."""
@@ -241,7 +241,7 @@ class PlayRecord:
         """Return the states in which the channels may be once the sets before have been sent."""
         states = self._confirmed
         for sent in pending:
-            committed = Interval(sent.since, max(sent.since, when.latest))
+            committed = Interval(sent.sent_at, max(sent.sent_at, when.latest))
             after, _ = states_after(states, _played(sent), committed, self.slots)
             states = tuple(union_of(both, committed) for both in zip(states, after, strict=True))
         if self._may_be_silent:
@@ -326,7 +326,9 @@ def _upper_bounds_after(states: States, command_set: CommandSet, when: Interval)
 
 def _played(sent: _Sent) -> CommandSet:
     """Return what a sent set plays, with the levels that the amplifier reported."""
-    asked = sent.command_set
+    requested = sent.command_set
     if not sent.achieved:
-        return asked
-    return CommandSet(asked.token, sent.achieved, ramp=asked.ramp, valid_for=asked.valid_for)
+        return requested
+    return CommandSet(
+        requested.token, sent.achieved, ramp=requested.ramp, valid_for=requested.valid_for
+    )

@@ -22,7 +22,7 @@ from drivers.protocol.messages import (
 _ARMING_RAMP = 0.005  # s; within it an amplifier that is armed while it plays falls silent
 
 
-class Recorder:
+class PlayRecorder:
     """Tells every guard about requests and replies; guards are known by their sets."""
 
     def __init__(self) -> None:

@@ -39,11 +39,11 @@ class Priority(IntEnum):
 
     @property
     def is_stop_class(self) -> bool:
-        """Whether it silences the amplifier, and is sent and retried whatever else waits."""
+        """Whether it silences the amplifier: sent and retried before all others."""
         return self <= Priority.SILENCE
 
     def preempts(self, other: "Priority") -> bool:
-        """Whether a request on the line of that priority is abandoned for this one."""
+        """Whether it abandons a request of that priority on the line."""
         return self.is_stop_class and self < other
 
     def supersedes(self, other: "Priority") -> bool:

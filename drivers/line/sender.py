@@ -25,8 +25,8 @@ SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
 _T = TypeVar("_T")
 
 
-class Again(Exception):
-    """Raised by an attempt that shall be repeated, at the earliest after a pause [s]."""
+class Retry(Exception):
+    """Raised by an attempt to be made again, at the earliest after a pause [s]."""
 
     def __init__(self, pause: float = 0.0) -> None:
         super().__init__(pause)
@@ -37,21 +37,21 @@ class Again(Exception):
 class _Entry:
     """A request from its queueing to its result.
 
-    number: order among requests of one amplifier; place: order among amplifiers, renewed by every
-    attempt; began_at [s]: of the present attempt; not_before [s]: of the next one.
+    number: order among requests of one amplifier; attempt_number: order among amplifiers, and
+    started_at [s]: of the current attempt; not_before [s]: of the next one.
     """
 
     __slots__ = (
         "attempt",
+        "attempt_number",
         "backend",
-        "began_at",
         "is_withdrawn",
         "not_before",
         "number",
-        "place",
         "priority",
         "queued_at",
         "result",
+        "started_at",
     )
 
     def __init__(
@@ -64,17 +64,17 @@ class _Entry:
         self.backend = backend
         self.priority = priority
         self.attempt = attempt
-        self.number = self.place = number
+        self.number = self.attempt_number = number
         self.not_before = 0.0
         self.queued_at = clock.now()
         self.result: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         self.is_withdrawn = False
-        self.began_at = 0.0
+        self.started_at = 0.0
 
     @property
     def is_unsent(self) -> bool:
-        """Whether nothing of the present attempt was sent."""
-        return self.backend.last_sent_at < self.began_at
+        """Whether nothing of the current attempt was sent."""
+        return self.backend.last_sent_at < self.started_at
 
     def rank(self, now: float) -> int:
         """Place in the queue at a time [s]; one that has waited long is a heartbeat's equal."""
@@ -113,7 +113,7 @@ class Sender:
     ) -> _T:
         """Queue a request of an amplifier and return the result of its last attempt.
 
-        attempt: sends it and awaits its reply; raises `Again` to be repeated. Raises Preempted if
+        attempt: sends it and awaits its reply; raises `Retry` to be repeated. Raises Preempted if
         another request of this amplifier supersedes it, or precedes its repetition.
         """
         entry = _Entry(backend, priority, attempt, next(self._numbers))
@@ -133,7 +133,7 @@ class Sender:
             raise
 
     def abort_unsent(self, backend: Backend) -> None:
-        """Send and repeat no request of an amplifier that is not of the stop class.
+        """Discard the unsent requests of an amplifier and retry none, except stop-class ones.
 
         Requests on the line keep waiting for their replies.
         """
@@ -178,9 +178,9 @@ class Sender:
             self._queue.clear()
 
     def _next(self) -> _Entry:
-        """Return the next request: of those that are first for their amplifiers, the first.
+        """Return the next request: the first of the first of each amplifier.
 
-        It may have to pause; of the stop class it does so although others need not.
+        It may have to pause; a stop-class request does so even if others are ready.
         """
         if len(self._queue) == 1:
             return self._queue[0]
@@ -188,13 +188,13 @@ class Sender:
         firsts: dict[Backend, _Entry] = {}
         for entry in sorted(self._queue, key=lambda one: (one.rank(now), one.number)):
             firsts.setdefault(entry.backend, entry)
-        first = min(firsts.values(), key=lambda one: (one.rank(now), one.place))
+        first = min(firsts.values(), key=lambda one: (one.rank(now), one.attempt_number))
         if first.not_before <= now or first.priority.is_stop_class:
             return first
         ready = [entry for entry in firsts.values() if entry.not_before <= now]
         if not ready:
             return min(firsts.values(), key=lambda one: one.not_before)
-        return min(ready, key=lambda one: (one.rank(now), one.place))
+        return min(ready, key=lambda one: (one.rank(now), one.attempt_number))
 
     async def _wait(self, until: float) -> None:
         """Wait until a time [s] or until a request is queued."""
@@ -214,7 +214,7 @@ class Sender:
 
     async def _carry_out(self, entry: _Entry) -> None:
         """Make one attempt."""
-        entry.began_at = clock.now()
+        entry.started_at = clock.now()
         self._current, self._is_preempted = entry, False
         try:
             result = await entry.attempt()
@@ -224,8 +224,8 @@ class Sender:
                 entry.result.cancel()
                 raise
             self._repeat(entry, 0.0)
-        except Again as again:
-            self._repeat(entry, again.pause)
+        except Retry as retry:
+            self._repeat(entry, retry.pause)
         except Exception as error:
             entry.fail(error)
         else:
@@ -247,12 +247,12 @@ class Sender:
         if not entry.priority.is_stop_class and (entry.is_withdrawn or is_overtaken):
             entry.fail(Preempted(SUPERSEDED))
             return
-        entry.place = next(self._numbers)
+        entry.attempt_number = next(self._numbers)
         entry.not_before = clock.now() + pause if pause else 0.0
         self._queue.append(entry)
 
     def _update_preemption(self) -> None:
-        """Abandon the exchange on the line now, later, or not, by what is queued."""
+        """Abandon the exchange on the line now, later, or not, by the queued priorities."""
         current = self._current
         if current is None:
             return

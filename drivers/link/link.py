@@ -12,7 +12,7 @@ from drivers import clock
 from drivers.backend import Backend
 from drivers.errors import FrameError, LinkDegraded, LinkError, LinkTimeout
 from drivers.line.priority import priority_of
-from drivers.line.sender import Again, Sender, sender_of
+from drivers.line.sender import Retry, Sender, sender_of
 from drivers.link.refusals import PROTOCOL_VIOLATION, is_busy, refusal
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
@@ -149,7 +149,7 @@ class Link:
         """Retry once less if the longest exchange on the wire [s] exceeds the timeout."""
         self._retries_allowed = retries_on(round_trip, reply_timeout=self._reply_timeout)
 
-    async def ask(
+    async def request(
         self, request: Request, *, expect: type[ReplyT], timeout: float | None = None
     ) -> ReplyT:
         """Send a request by its priority and return its reply; timeout [s]: None for the default.
@@ -177,9 +177,9 @@ class Link:
         return reply
 
     def abort_unsent(self) -> None:
-        """Do not send unsent requests, and repeat none: they raise Preempted.
+        """Discard unsent requests and retry none: they raise Preempted.
 
-        Requests of the stop class are exempt.
+        Stop-class requests are exempt.
         """
         self._sender.abort_unsent(self.backend)
 
@@ -203,18 +203,18 @@ class Link:
         self._unanswered += 1
         if self._unanswered <= self._retries_allowed:
             return None
-        what = f"{problem} (no reply to {self._unanswered} requests in a row)"
+        cause = f"{problem} (no reply to {self._unanswered} requests in a row)"
         if self._loss is None and clock.now() < self._silent_from():
-            return LinkDegraded(f"{what}{DEGRADED}")
-        return LinkTimeout(self._lose(what))
+            return LinkDegraded(f"{cause}{DEGRADED}")
+        return LinkTimeout(self._lose(cause))
 
-    def _on_idle_loss(self, what: str) -> None:
+    def _on_idle_loss(self, cause: str) -> None:
         """Note a loss found without a request."""
         if self._loss is None:
-            self._lose(what)
+            self._lose(cause)
 
-    def _lose(self, what: str) -> str:
-        self._loss = self._loss or f"{what}{ASSUME_ENERGISED}"
+    def _lose(self, cause: str) -> str:
+        self._loss = self._loss or f"{cause}{ASSUME_ENERGISED}"
         return self._loss
 
     def _raise_if_unusable(self, request: Request) -> None:
@@ -238,7 +238,7 @@ class _Attempts:
         self._made = self._busy = 0
 
     async def make_one(self) -> Reply:
-        """Send the request and return its reply; raises `Again` to repeat it."""
+        """Send the request and return its reply; raises `Retry` to repeat it."""
         link = self._link
         link._raise_if_unusable(self._request)  # it may have waited
         link._retries += self._made > 0
@@ -251,13 +251,13 @@ class _Attempts:
             is_last_stop = isinstance(self._request, Stop) and self._made > RETRIES
             if error is not None and (is_last_stop or not isinstance(self._request, Stop)):
                 raise error from problem
-            raise Again from problem
+            raise Retry from problem
         except LinkError as problem:
             raise LinkError(link._lose(str(problem))) from problem
         link._unanswered = 0
         link._last_round_trip = clock.now() - begin
         if is_busy(reply) and not link._is_persistently_busy and self._busy < RETRIES:
             self._busy += 1
-            raise Again(BUSY_PAUSE)
+            raise Retry(BUSY_PAUSE)
         link._is_persistently_busy = is_busy(reply)
         return reply

@@ -1,1 +1,1 @@
-"""Amplifiers in operation: commits, watchdog, comparison of replies with what was asked."""
+"""Amplifiers in operation: commits, watchdog, comparison of replies with requests."""

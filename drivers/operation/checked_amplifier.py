@@ -1,4 +1,4 @@
-"""An amplifier whose every reply is compared with what was asked, while it is armed."""
+"""An amplifier whose replies are compared with its requests while it is armed."""
 
 import math
 from collections.abc import Callable
@@ -10,23 +10,23 @@ from drivers.guard import SafeCommandSet
 from drivers.operation.plausibility import PlausibilityCheck
 from drivers.protocol.messages import Achieved, Status
 
-_RUNNING_SHARE = 0.05
-"""Share of the line's time for statuses that only show whether the watchdog runs down."""
+_MAX_STATUS_LOAD = 0.05
+"""Fraction of the line's time for statuses that show whether the watchdog runs down."""
 
 
 class CheckedAmplifier:
     """Arms, plays and feeds an open amplifier; arguments as `PlausibilityCheck`.
 
-    Raises CommandRefused if it contradicts what was asked twice in a row (`PlausibilityCheck`), or
-    is not enabled any more, and the errors of `Amplifier`.
+    Raises CommandRefused if its replies contradict requests twice in a row
+    (`PlausibilityCheck`) or it is no longer enabled, and the errors of `Amplifier`.
     """
 
     def __init__(
-        self, amplifier: Amplifier, name: str = "the amplifier", *, has_own_time: bool = False
+        self, amplifier: Amplifier, name: str = "the amplifier", *, is_time_stepped: bool = False
     ) -> None:
         self.amplifier = amplifier
         self._name = name
-        self._has_own_time = has_own_time
+        self._is_time_stepped = is_time_stepped
         self._check_if_used: PlausibilityCheck | None = None
         self._running_checked_at = -math.inf
 
@@ -64,7 +64,7 @@ class CheckedAmplifier:
         """Expect that a staged set may play from now on."""
         self._check.forget(safe)
 
-    async def confirm_commit(self, safe: SafeCommandSet, *, since: float) -> None:
+    async def confirm_commit(self, safe: SafeCommandSet, *, sent_at: float) -> None:
         """Read whether a set plays that was committed since a time [s], directly or by broadcast.
 
         Raises CommandRefused if it does not.
@@ -76,13 +76,13 @@ class CheckedAmplifier:
                 f"{self._name}: playing set must be {safe.token}, got {status.token}; clear and "
                 "arm again"
             )
-        check.expect(safe, sent_at=since, now=clock.now())
+        check.expect(safe, sent_at=sent_at, now=clock.now())
         check.check_status(status, sent_at=begin, now=clock.now())
 
     async def heartbeat(self, *, may_feed: Callable[[], bool] = lambda: True) -> Status | None:
         """Feed the watchdog; on a degraded link only once the amplifier has replied as expected.
 
-        may_feed: asked just before; None if that has become wrong.
+        may_feed: called just before; returns None if it is false.
         """
         if self.amplifier.is_degraded:
             status = await self._beat()
@@ -102,7 +102,7 @@ class CheckedAmplifier:
     async def _check_running(self, check: PlausibilityCheck) -> None:
         """Read a status just before the watchdog is fed, unless the wire is too slow for that."""
         begin, fed = clock.now(), self.amplifier.last_fed_at
-        pause = self.amplifier.round_trip() / _RUNNING_SHARE
+        pause = self.amplifier.round_trip() / _MAX_STATUS_LOAD
         if fed is None or begin - self._running_checked_at < pause:
             return
         self._running_checked_at = begin
@@ -117,5 +117,5 @@ class CheckedAmplifier:
 
     def _new_check(self) -> PlausibilityCheck:
         return PlausibilityCheck(
-            self.amplifier.capabilities, self._name, has_own_time=self._has_own_time
+            self.amplifier.capabilities, self._name, is_time_stepped=self._is_time_stepped
         )

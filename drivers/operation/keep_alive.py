@@ -12,8 +12,8 @@ async def keep_alive(
 ) -> None:
     """Send a heartbeat every `interval` [s] for a time [s].
 
-    Raises CommandRefused if the amplifier leaves OPERATION_ENABLED meanwhile, or contradicts what
-    was asked.
+    Raises CommandRefused if the amplifier leaves OPERATION_ENABLED meanwhile, or its
+    replies contradict requests.
     """
     end = clock.now() + duration
     while (left := end - clock.now()) > 0:

@@ -1,4 +1,4 @@
-"""Comparison of what an amplifier reports with what was asked of it.
+"""Comparison of an amplifier's reports with its requests.
 
 Tolerances are the amplifier's own steps. Levels are compared at any time, also while they change:
 they must be within the bounds of a transition whose commit is known as an interval.
@@ -23,7 +23,7 @@ MEASURING_ERROR = 0.002
 """Of full stroke; for amplifiers that measure their levels (`drivers.conformance`)."""
 
 CYCLE = 0.002
-"""Longest time [s] by which what an amplifier plays and reports may lag behind its commit."""
+"""Longest lag [s] of playback and reports behind a commit."""
 
 _WEAK = 0.25  # largest measuring error, relative to a weak level
 _ROUNDING = 1e-9
@@ -32,11 +32,11 @@ _WATCHDOG_ERROR = PROTOCOL.reaction + _Q.watchdog_left.step  # s
 
 
 class PlausibilityCheck:
-    """Compares every Status and Achieved of one armed amplifier with what was asked of it.
+    """Compares every Status and Achieved of one armed amplifier with its requests.
 
     name: of the amplifier, in messages. Times [s] are of the host's clock: sent_at of the request,
     now of its reply. Two contradictions in a row raise CommandRefused with the reason; an Achieved
-    that contradicts its set counts again with each Status until the next set. has_own_time: for
+    that contradicts its set counts again with each Status until the next set. is_time_stepped: for
     simulated amplifiers whose time is stepped, so that levels and watchdog cannot be compared.
     """
 
@@ -45,9 +45,9 @@ class PlausibilityCheck:
         capabilities: Capabilities,
         name: str = "the amplifier",
         *,
-        has_own_time: bool = False,
+        is_time_stepped: bool = False,
     ) -> None:
-        self._has_own_time = has_own_time
+        self._is_time_stepped = is_time_stepped
         self._capabilities = capabilities
         self._name = name
         self._states: tuple[ChannelState, ...] = ()  # empty: unknown
@@ -73,38 +73,38 @@ class PlausibilityCheck:
         self._achieved_problem = None
         self._contradictions = self._standing_watchdog = 0
 
-    def forget(self, asked: SafeCommandSet) -> None:
-        """Expect no levels: a set is sent, and until it is confirmed it may play or not."""
+    def forget(self, requested: SafeCommandSet) -> None:
+        """Expect no levels: until a set that is sent is confirmed it may play or not."""
         if self._states:
             self._known = self._states
             self._frequencies = [{state.frequency, *state.frequencies} for state in self._states]
             self._fade = max(state.settled_after for state in self._states)
-        self._unconfirmed.add(asked.token)
-        self._fade = max(self._fade, asked.settled_after)
-        for command in asked.commands:
+        self._unconfirmed.add(requested.token)
+        self._fade = max(self._fade, requested.settled_after)
+        for command in requested.commands:
             self._frequencies[command.channel].add(command.frequency)
         self._states = ()
         if self._tokens:
-            self._tokens.add(asked.token)
+            self._tokens.add(requested.token)
 
-    def expect(self, asked: SafeCommandSet, *, sent_at: float, now: float) -> None:
+    def expect(self, requested: SafeCommandSet, *, sent_at: float, now: float) -> None:
         """Expect a set that was confirmed; sent_at [s]: before its commit."""
         when = Interval(sent_at, now + CYCLE)
-        slots = asked.record.slots
-        if self._known and self._unconfirmed <= {asked.token}:
-            self._states, _ = states_after(self._known, asked, when, slots)
+        slots = requested.record.slots
+        if self._known and self._unconfirmed <= {requested.token}:
+            self._states, _ = states_after(self._known, requested, when, slots)
         else:
-            unknown, _ = states_after(self._unknown_states(when), asked, when, slots)
+            unknown, _ = states_after(self._unknown_states(when), requested, when, slots)
             # Where there are endings, earlier fades may go on beside them.
-            fade = max(self._fade, asked.settled_after) if slots else asked.ramp
+            fade = max(self._fade, requested.settled_after) if slots else requested.ramp
             self._states = tuple(_with_longer_fade(state, fade) for state in unknown)
         self._known, self._unconfirmed = (), set()
-        self._tokens = {asked.token}
+        self._tokens = {requested.token}
         self._fed = Interval(sent_at, now)
 
-    def check_achieved(self, asked: SafeCommandSet, achieved: Achieved) -> None:
-        """Compare what a set plays with what was asked."""
-        self._achieved_problem = next(self._achieved_problems(asked, achieved), None)
+    def check_achieved(self, requested: SafeCommandSet, achieved: Achieved) -> None:
+        """Compare an achieved set with the requested one."""
+        self._achieved_problem = next(self._achieved_problems(requested, achieved), None)
         if self._achieved_problem is not None:
             self._contradictions += 1
             self._is_of_level = False
@@ -118,10 +118,11 @@ class PlausibilityCheck:
         now: float,
         feeds: bool = False,
     ) -> None:
-        """Compare a status with what was asked; feeds: whether its request fed the watchdog.
+        """Compare a status with the requests; feeds: whether its request fed the watchdog.
 
-        Right after a commit hardly any level is a contradiction, so that agreement forgives none of
-        levels. Raises CommandRefused at once for an amplifier that is not enabled any more.
+        Right after a commit hardly any level is a contradiction, so agreement then does not reset
+        the count of level contradictions. Raises CommandRefused at once for an amplifier that is
+        no longer enabled.
         """
         if status.state is not AmplifierState.OPERATION_ENABLED:
             raise CommandRefused(
@@ -135,7 +136,7 @@ class PlausibilityCheck:
             or self._achieved_problem
         )
         level_problem = (
-            None if self._has_own_time else next(self._level_problems(status, when), None)
+            None if self._is_time_stepped else next(self._level_problems(status, when), None)
         )
         if problem or level_problem:
             self._contradictions += 1
@@ -150,7 +151,7 @@ class PlausibilityCheck:
 
         status: of a request that does not feed it.
         """
-        if self._watchdog is None or self._fed is None or self._has_own_time:
+        if self._watchdog is None or self._fed is None or self._is_time_stepped:
             return
         elapsed = sent_at - max(last_fed_at, self._fed.latest)
         if elapsed <= 2 * _WATCHDOG_ERROR:
@@ -166,7 +167,7 @@ class PlausibilityCheck:
 
     def _watchdog_problem(self, status: Status, when: Interval, *, feeds: bool) -> str | None:
         """Describe an impossible time that is left; notes that the watchdog was fed."""
-        if self._watchdog is None or self._fed is None or self._has_own_time:
+        if self._watchdog is None or self._fed is None or self._is_time_stepped:
             return None
         full = self._watchdog + _WATCHDOG_ERROR
         lowest = self._watchdog - (when.latest - self._fed.earliest) - _WATCHDOG_ERROR
@@ -198,15 +199,15 @@ class PlausibilityCheck:
             for frequencies in self._frequencies
         )
 
-    def _achieved_problems(self, asked: SafeCommandSet, achieved: Achieved) -> Iterator[str]:
-        if achieved.token != asked.token:
-            yield f"token achieved must be {asked.token}, got {achieved.token}"
-        wanted = {command.channel: command for command in asked.commands}
+    def _achieved_problems(self, requested: SafeCommandSet, achieved: Achieved) -> Iterator[str]:
+        if achieved.token != requested.token:
+            yield f"token achieved must be {requested.token}, got {achieved.token}"
+        commands = {command.channel: command for command in requested.commands}
         played = {command.channel: command for command in achieved.commands}
         can = self._capabilities
-        for channel in sorted(wanted.keys() | played.keys()):
+        for channel in sorted(commands.keys() | played.keys()):
             silent = DriveCommand(channel, 0.0, 0.0)
-            one, other = wanted.get(channel, silent), played.get(channel, silent)
+            one, other = commands.get(channel, silent), played.get(channel, silent)
             compared = [("level", one.level, other.level, _tolerance(_Q.level, can.level_step))]
             if one.level > 0:
                 phase = math.remainder(other.phase - one.phase, 360.0)
@@ -260,7 +261,7 @@ class PlausibilityCheck:
     def _raise_if_fault(self, contradictions: int, problem: str | None) -> None:
         if contradictions >= MAX_CONTRADICTIONS:
             raise CommandRefused(
-                f"{self._name} contradicts what was asked: {problem}; look for a derated or "
+                f"{self._name} contradicts its requests: {problem}; look for a derated or "
                 "broken channel, an exchanged cable or firmware, then clear and arm again"
             )
 

@@ -29,7 +29,7 @@ _LATCHED = (
 _logger = logging.getLogger(__name__)
 
 
-class Silence(StrEnum):
+class SilenceStatus(StrEnum):
     """Whether an amplifier is silent; MAY_PLAY: until its watchdog expires, if it has one."""
 
     CONFIRMED = "confirmed_silent"
@@ -45,14 +45,14 @@ class StopOutcome:
     cause: why silence is not confirmed; empty if it is.
     """
 
-    silence: Silence
+    silence: SilenceStatus
     may_play_until: float | None = None
     cause: str = ""
 
     @property
     def is_confirmed(self) -> bool:
         """Whether silence is confirmed."""
-        return self.silence is Silence.CONFIRMED
+        return self.silence is SilenceStatus.CONFIRMED
 
     def to_json(self, now: float) -> dict[str, str | float | None]:
         """Return the outcome as JSON at a time [s], with the time left that it may play."""
@@ -90,27 +90,27 @@ def stop_outcome(
     """
     if status is not None:
         if is_stopped(status):
-            return StopOutcome(Silence.CONFIRMED)
+            return StopOutcome(SilenceStatus.CONFIRMED)
         cause = f"status after the stop: state {status.state.name}, highest level " + (
             f"{max(status.levels, default=0.0):g}"
         )
     cause = cause or "no status was read after the stop"
     if watchdog is None:
         return StopOutcome(
-            Silence.MAY_PLAY, None, f"{cause}; no watchdog is known to end it: switch it off"
+            SilenceStatus.MAY_PLAY, None, f"{cause}; no watchdog is known to end it: switch it off"
         )
     if last_fed_at is None:
         return StopOutcome(
-            Silence.MAY_PLAY, None, f"{cause}; it is unknown when its watchdog was fed last"
+            SilenceStatus.MAY_PLAY, None, f"{cause}; it is unknown when its watchdog was fed last"
         )
     until = last_fed_at + watchdog + WATCHDOG_REACTION
     if now < until:
-        return StopOutcome(Silence.MAY_PLAY, until, cause)
+        return StopOutcome(SilenceStatus.MAY_PLAY, until, cause)
     if status is not None:  # something else feeds it
         return StopOutcome(
-            Silence.MAY_PLAY, None, f"{cause}; its watchdog has not ended it: switch it off"
+            SilenceStatus.MAY_PLAY, None, f"{cause}; its watchdog has not ended it: switch it off"
         )
-    return StopOutcome(Silence.WATCHDOG_ELAPSED, None, cause)
+    return StopOutcome(SilenceStatus.WATCHDOG_ELAPSED, None, cause)
 
 
 async def stop_and_confirm(

@@ -12,7 +12,7 @@ from drivers import clock
 _SLACK = 0.002  # s; timers are up to this late, so the rest of a wait is polled
 
 
-def at_one_moment(
+def simultaneous_commits(
     commits: Sequence[tuple[float, Callable[[], Awaitable[object]]]],
 ) -> list[Coroutine[Any, Any, object]]:
     """Schedule commits, each given with its wire time [s], so that all arrive together.
@@ -27,7 +27,7 @@ def at_one_moment(
 async def _commit_at(moment: float, commit: Callable[[], Awaitable[object]]) -> object:
     before = None
     while (left := moment - clock.now()) > 0:
-        # Time that stands still between two readings is virtual, and its timers are exact.
+        # Virtual time stands still between two readings; its timers are exact.
         await sleep(left if left == before else max(0.0, left - _SLACK))
         before = left
     return await commit()

@@ -54,8 +54,8 @@ async def test_refused_request_keeps_the_connection(
     answers = saying(b'{"error": "finger is 1; it must be a text"}\n', b'{"time_s": 1.5}\n')
     async with listening(tmp_path / "sock", answers) as control:
         with pytest.raises(LinkError, match=r"touch.*finger is 1"):
-            await control.ask({"op": "touch"})
-        assert await control.ask({"op": "state"}) == {"time_s": 1.5}
+            await control.request({"op": "touch"})
+        assert await control.request({"op": "state"}) == {"time_s": 1.5}
 
 
 @pytest.mark.parametrize("answer", [b"", b'{"time_s": '], ids=["nothing", "half a line"])
@@ -63,10 +63,10 @@ async def test_plate_control_reconnects_after_the_plate_ends(tmp_path: Path, ans
     """The error has a remedy; the next request opens a new connection."""
     async with listening(tmp_path / "sock", saying(answer)) as control:
         with pytest.raises(LinkError, match=f"{tmp_path}/sock.*; start it again"):
-            await control.ask(HELLO)
+            await control.request(HELLO)
     async with listening(tmp_path / "again", saying(b'{"version": 2}\n')):
         (tmp_path / "again").rename(tmp_path / "sock")
-        assert await control.ask(HELLO) == {"version": 2}
+        assert await control.request(HELLO) == {"version": 2}
         await control.close()
 
 
@@ -85,10 +85,10 @@ async def test_plate_control_times_out_when_the_plate_hangs(
 
     async with listening(tmp_path / "sock", serve) as control:
         with pytest.raises(LinkError, match=r"0.02 s; start it again"):
-            await control.ask({"op": "felt"})
+            await control.request({"op": "felt"})
         late.set()
         monkeypatch.setattr(plate_control, "_REPLY_TIMEOUT", 20.0)
-        assert await control.ask({"op": "state"}) == {"answer": "state"}
+        assert await control.request({"op": "state"}) == {"answer": "state"}
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ async def test_invalid_plate_reply_is_quoted_in_the_error(tmp_path: Path, said: 
     """The error quotes only the begin of a reply from another program."""
     async with listening(tmp_path / "sock", saying(said)) as control:
         with pytest.raises(LinkError, match=r"/sock: .*--control") as caught:
-            await control.ask(HELLO)
+            await control.request(HELLO)
     assert len(str(caught.value)) < 300
 
 

@@ -288,7 +288,7 @@ def test_discover_suggests_a_group_that_has_permission(
     port.chmod(mode)
     monkeypatch.setattr("drivers.discovery.search.comports", lambda: [ListPortInfo(str(port))])
     monkeypatch.setattr("drivers.discovery.search.os.access", lambda path, mode: False)
-    (place,) = [one for one in candidates() if one.place == str(port)]
+    (place,) = [one for one in candidates() if one.name == str(port)]
     assert place.description == "serial port"  # pyserial reports n/a
     assert ("usermod -aG" in (place.remedy or "")) == helps_group
     assert f"chmod a+rw {port}" in (place.remedy or "")

@@ -12,7 +12,7 @@ from drivers.backend import Backend
 from drivers.command import CommandSet
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
 from drivers.guard import SafeCommandSet
-from drivers.guard.recorder import Recorder
+from drivers.guard.recorder import PlayRecorder
 from drivers.line import priority
 from drivers.operation.watchdog import check_watchdog
 from drivers.protocol.messages import (
@@ -372,7 +372,7 @@ async def test_stop_and_disarm_depend_on_no_record(
     def fail(*_: object) -> None:
         raise ZeroDivisionError(broken)
 
-    monkeypatch.setattr(Recorder, broken, fail)
+    monkeypatch.setattr(PlayRecorder, broken, fail)
     await amplifier.stop()
     await amplifier.disarm()
     assert kinds(backend) == [Stop, Disarm]

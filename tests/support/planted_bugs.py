@@ -359,7 +359,7 @@ DRIVERS: dict[str, Bug] = {
         scenarios.slow_lift,
     ),
     "a stop is sent as a disarm": Bug("stop", replaced(Amplifier, "stop", Amplifier.disarm)),
-    "no amplifier is identified": Bug("identified", wrapped(Link, "ask", _knows_already)),
+    "no amplifier is identified": Bug("identified", wrapped(Link, "request", _knows_already)),
     "sets are sent without their SYNC": Bug(
         "answer", wrapped(can_backend, "encode_request", _without_sync), wire="slcan"
     ),

@@ -15,7 +15,7 @@ from controller.loop.loop import Controller
 from controller.sources.touch import Touch, TouchFrame
 from drivers.amplifier import Amplifier
 from drivers.errors import DriverError
-from drivers.operation.silence import Silence, StopOutcome
+from drivers.operation.silence import SilenceStatus, StopOutcome
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     AmplifierState,
@@ -127,7 +127,9 @@ class StopChain:
             self.found.append(f"{scene}: outcomes of {sorted(outcomes)} only")
         certain = [name for name, outcome in outcomes.items() if outcome.is_confirmed]
         self._check(certain, f"{scene}: confirmed silent, but")
-        over = [name for name, one in outcomes.items() if one.silence is Silence.WATCHDOG_ELAPSED]
+        over = [
+            name for name, one in outcomes.items() if one.silence is SilenceStatus.WATCHDOG_ELAPSED
+        ]
         self.granted.clear()
         await asyncio.sleep(_LATE)
         self._check([*certain, *over], f"{scene}: said to be silent, but afterwards")

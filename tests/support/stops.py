@@ -27,7 +27,7 @@ import drivers
 import sim
 from drivers import amp_actions
 from drivers.errors import DriverError
-from drivers.operation.silence import Silence, StopOutcome
+from drivers.operation.silence import SilenceStatus, StopOutcome
 from sim.faults.fault_window import FaultWindow
 from stop_chain import LONGEST, MAX_DELAY, WIRES, StopChain, stop_chain
 from virtual_loop import Stuck, run_virtual
@@ -60,7 +60,7 @@ class Tally:
 
     def table(self) -> str:
         """A row for each wire."""
-        columns = ("stops", *(silence.value for silence in Silence), "raised")
+        columns = ("stops", *(silence.value for silence in SilenceStatus), "raised")
         rows = [f"{'':<16}" + "".join(f"{name:>18}" for name in columns)]
         for wire in dict.fromkeys(wire for wire, _ in self.counts):
             cells = "".join(f"{self.counts[wire, name]:>18}" for name in columns)
@@ -205,9 +205,9 @@ async def _stop_by_command(wire: str, rng: random.Random, tally: Tally) -> list[
         for name, url in chain.urls.items():
             try:
                 rows = await amp_actions.stop(url)
-                outcomes[name] = StopOutcome(Silence(rows["silence"]))
+                outcomes[name] = StopOutcome(SilenceStatus(rows["silence"]))
             except DriverError as error:
-                outcomes[name] = StopOutcome(Silence.MAY_PLAY, None, str(error))
+                outcomes[name] = StopOutcome(SilenceStatus.MAY_PLAY, None, str(error))
         tally.add(wire, outcomes)
         await chain.judge(outcomes, scene="by command")
         return chain.found  # not what closing the killed host does

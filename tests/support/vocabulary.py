@@ -62,6 +62,12 @@ RETIRED_WORDS = {
     "nobody|somebody|anybody|everybody|whoever": "the component's name",
     "patience": "_TIMEOUT",
     "(?<!at_)most|longest|usual": "MAX_, DEFAULT_",
+    "persistently": "retry_while_degraded",
+    "own_time": "is_time_stepped",
+    "or_less": "allow_weaker",
+    "sole": "HostLock",
+    "sounding": "frequencies_at",
+    "at_one_moment": "simultaneous",
 }
 """Words within identifiers; they are split at underscores and capitals."""
 

@@ -73,9 +73,9 @@ class _ThreadedAdapter:
                 taken = send_some(self._bus, frames)
                 is_clear = flush(self._bus)
         except _CAN_ERRORS as problem:
-            what = self._loss_message(problem)
-            self._loop.call_soon_threadsafe(self._lose, what)
-            raise LinkError(what) from problem
+            cause = self._loss_message(problem)
+            self._loop.call_soon_threadsafe(self._lose, cause)
+            raise LinkError(cause) from problem
         if not is_clear:
             self._loop.call_soon_threadsafe(self._loop.call_later, FULL_PAUSE, self._flush)
         return taken
@@ -103,7 +103,7 @@ class _ThreadedAdapter:
                 message = self._bus.recv(timeout=_READ_TIMEOUT)
                 # A closed adapter may hang here while others have reopened the bus.
                 if message is not None and not self._closing.is_set():
-                    problem = self._take(message)
+                    problem = self._received(message)
         except _CAN_ERRORS as error:
             problem = error
         finally:
@@ -112,7 +112,7 @@ class _ThreadedAdapter:
             with contextlib.suppress(RuntimeError):  # of a closed loop
                 self._loop.call_soon_threadsafe(self._lose, self._loss_message(problem))
 
-    def _take(self, message: can.Message) -> str:
+    def _received(self, message: can.Message) -> str:
         """Pass a frame on; returns the problem that an error frame reports, if any."""
         if message.is_error_frame:
             return _BUS_OFF_MESSAGE if message.arbitration_id & _BUS_OFF else ""
@@ -121,12 +121,12 @@ class _ThreadedAdapter:
             self._on_frame(CanFrame(message.arbitration_id, data, fd=message.is_fd))
         return ""
 
-    def _lose(self, what: str) -> None:
+    def _lose(self, cause: str) -> None:
         if self._is_lost or self._closing.is_set():
             return
         self._is_lost = True
         self.close()
-        self._on_loss(what)
+        self._on_loss(cause)
 
     def _loss_message(self, problem: Exception | str) -> str:
         return (

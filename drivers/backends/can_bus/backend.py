@@ -25,7 +25,7 @@ from drivers.codec.can_bus.requests import (
     PdoRequest,
     encode_broadcast,
     encode_request,
-    wanted_commands,
+    requested_commands,
 )
 from drivers.codec.can_bus.timing import CanTimes
 from drivers.errors import LinkError, LinkTimeout
@@ -144,12 +144,12 @@ class CanBackend(WireBackend):
     async def _hello(self, request: Hello, timeout: float) -> Reply:
         heartbeat = round(self._url.heartbeat * 1000)
 
-        def ask(objects: ObjectClient, *, timeout: float) -> Reply:
+        def identify(objects: ObjectClient, *, timeout: float) -> Reply:
             identity = objects.identity(timeout=timeout)
             objects.set_heartbeat(heartbeat, timeout=timeout)
             return identity
 
-        identity = await self._objects_job(ask, request, timeout)
+        identity = await self._objects_job(identify, request, timeout)
         await self._send([self._start], request, timeout)
         self._node.start()
         return identity
@@ -173,7 +173,7 @@ class CanBackend(WireBackend):
         deadline = clock.now() + timeout
         await self._send(frames, request, timeout)
         try:
-            answer = await self._pending.reply_to(
+            can_reply = await self._pending.reply_to(
                 request, sequence=sequence, timeout=deadline - clock.now()
             )
         except LinkError:
@@ -183,25 +183,25 @@ class CanBackend(WireBackend):
                 f"no reply from node {self._url.node} on {bus} within {timeout * 1e3:g} ms; check "
                 "that the amplifier is switched on and that the bit rates agree"
             ) from None
-        reply = plain_reply(answer)
+        reply = plain_reply(can_reply)
         if reply is not None:
             return reply  # always, unless the request carries a set
-        return await self._achieved(request, answer, timeout)
+        return await self._achieved(request, can_reply, timeout)
 
-    async def _achieved(self, request: PdoRequest, answer: CanReply, timeout: float) -> Achieved:
+    async def _achieved(self, request: PdoRequest, can_reply: CanReply, timeout: float) -> Achieved:
         """Return what a set plays: the requested set if the reply is exact, else read it."""
-        wanted = None
+        requested = None
         if isinstance(request, Apply | Stage):
             token = request.command_set.token
-            wanted = Achieved(token, wanted_commands(request.command_set))
+            requested = Achieved(token, requested_commands(request.command_set))
         elif isinstance(request, Commit) and self._staged and self._staged.token == request.token:
-            wanted = self._staged
-        if wanted is not None and answer.exact:
-            achieved = wanted
+            requested = self._staged
+        if requested is not None and can_reply.exact:
+            achieved = requested
         else:
             achieved = await self._objects_job(ObjectClient.achieved, request, timeout)
-            if wanted is not None:
-                achieved = _in_order_of(wanted, achieved)
+            if requested is not None:
+                achieved = _in_order_of(requested, achieved)
         if isinstance(request, Apply | Stage):
             self._staged = achieved
         return achieved
@@ -241,22 +241,22 @@ class CanBackend(WireBackend):
         self._counters.events += 1
         self._on_event(event)
 
-    def _received(self, answer: CanReply) -> None:
-        if answer.sequence == UNSOLICITED:
-            self._notify(answer.event)
+    def _received(self, can_reply: CanReply) -> None:
+        if can_reply.sequence == UNSOLICITED:
+            self._notify(can_reply.event)
             return
-        if not self._pending.take(answer):
+        if not self._pending.resolve(can_reply):
             self._counters.unexpected_frames += 1
 
-    def _lose(self, what: str) -> None:
+    def _lose(self, cause: str) -> None:
         if self._loss is not None or self._joined is None:
             return
         self._node.stop()
-        self._fail(what)
-        self._on_loss(what)
+        self._fail(cause)
+        self._on_loss(cause)
 
-    def _fail(self, what: str) -> None:
-        self._loss = self._loss or what
+    def _fail(self, cause: str) -> None:
+        self._loss = self._loss or cause
         if self._joined is not None:
             self._joined.objects.close()
         self._pending.fail(self._loss)
@@ -265,9 +265,9 @@ class CanBackend(WireBackend):
         return self._require(self._joined, str(self._url.bus), request)
 
 
-def _in_order_of(wanted: Achieved, achieved: Achieved) -> Achieved:
+def _in_order_of(requested: Achieved, achieved: Achieved) -> Achieved:
     """Sort the achieved commands into the requested order."""
-    places = {command.channel: place for place, command in enumerate(wanted.commands)}
+    places = {command.channel: place for place, command in enumerate(requested.commands)}
     commands = sorted(
         achieved.commands, key=lambda command: places.get(command.channel, len(places))
     )

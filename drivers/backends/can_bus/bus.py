@@ -96,9 +96,9 @@ class CanBus(SharedLine[Adapter]):
             trace.frame(direction, frame.data, where, lambda: meaning(frame))
 
     async def _open(self) -> Adapter:
-        return await open_adapter(self.url, on_frame=self._take, on_loss=self._lose)
+        return await open_adapter(self.url, on_frame=self._received, on_loss=self._lose)
 
-    def _take(self, frame: CanFrame) -> None:
+    def _received(self, frame: CanFrame) -> None:
         """Pass a frame on, in the adapter's thread."""
         try:
             self._trace(Direction.IN, frame)

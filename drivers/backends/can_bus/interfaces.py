@@ -111,7 +111,7 @@ class _TextBus(can.BusABC):
     def _write_some(self, data: bytes) -> bytes:
         """Write what the adapter takes without waiting and return the rest."""
 
-    def _take(self, frames: Iterable[CanFrame]) -> None:
+    def _received(self, frames: Iterable[CanFrame]) -> None:
         self._messages.extend(map(_message, frames))
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
@@ -151,7 +151,7 @@ class _Socketcand(_TextBus):
                 element, text = self._element(text)
             if element.strip() != expected:
                 raise can.CanInitializationError(f"reply must be {expected!r}, got {element!r}")
-        self._take(self._reader.feed(text))
+        self._received(self._reader.feed(text))
 
     def _element(self, text: bytes) -> tuple[bytes, bytes]:
         """Read the next element, without its end; returns it and the following text."""
@@ -194,7 +194,7 @@ class _Socketcand(_TextBus):
             data = self._connection.recv(_READ_MAX)
             if not data:
                 raise can.CanOperationError("connection closed by the socketcand server")
-            self._take(self._reader.feed(data))
+            self._received(self._reader.feed(data))
 
 
 class _Slcan(_TextBus, slcanBus):
@@ -246,7 +246,7 @@ class _Slcan(_TextBus, slcanBus):
 
     def _read_text(self, timeout: float | None) -> None:
         port = self.serialPortOrig
-        self._take(self._reader.feed(port.read(max(1, port.in_waiting))))
+        self._received(self._reader.feed(port.read(max(1, port.in_waiting))))
         if self._is_ended:
             raise can.CanOperationError("adapter is being closed")
 

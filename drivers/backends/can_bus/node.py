@@ -117,12 +117,12 @@ class NodeWatch:
     def _reply_frame(self, can_id: int, data: bytearray, timestamp: float) -> None:
         self._counters.frames_in += 1
         try:
-            answer = self._reply_reader.feed(CanFrame(can_id, bytes(data)))
+            can_reply = self._reply_reader.feed(CanFrame(can_id, bytes(data)))
         except FrameError:
             self._counters.invalid_frames += 1
             return
-        if answer is not None:
-            self._post(self._on_reply, answer)
+        if can_reply is not None:
+            self._post(self._on_reply, can_reply)
 
     def _emergency(self, error: EmcyError) -> None:
         self._emergencies.reset()  # it keeps them all
@@ -137,15 +137,15 @@ class NodeWatch:
         if not self._is_watched:
             return
         if state == _BOOT_UP:
-            what = "has restarted, or another node with its number has"
+            cause = "has restarted, or another node with its number has"
         elif self._was_operational and state != _OPERATIONAL:
-            what = "was taken out of operation by another master"
+            cause = "was taken out of operation by another master"
         else:
             self._was_operational = self._was_operational or state == _OPERATIONAL
             return
         self._post(
             self._on_loss,
-            f"node {self._url.node} on {self._url.bus} {what}: open and arm it again",
+            f"node {self._url.node} on {self._url.bus} {cause}: open and arm it again",
         )
 
     def _other_host(self, can_id: int, data: bytearray, timestamp: float) -> None:

@@ -15,7 +15,7 @@ from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from drivers.backends.hardware import Worker
-from drivers.backends.waiting import SETTLE
+from drivers.backends.waiting import DUPLICATE_WAIT
 from drivers.codec.can_bus.frame import cob_id
 from drivers.codec.can_bus.objects import (
     CAPABILITY_ENTRIES,
@@ -204,7 +204,7 @@ class ObjectClient:
         object_named = struct.pack("<HB", index, subindex)
         self._client.send_request(b"\x40" + object_named + bytes(4))
         replies = {bytes(self._client.read_response())}
-        self._worker.sleep(SETTLE)
+        self._worker.sleep(DUPLICATE_WAIT)
         while True:
             try:
                 replies.add(self._client.responses.get_nowait())

@@ -17,7 +17,7 @@ class _Pending:
 
     action: int
     token: int | None
-    answer: asyncio.Future[CanReply]
+    can_reply: asyncio.Future[CanReply]
 
 
 class PendingRequests:
@@ -40,26 +40,26 @@ class PendingRequests:
             token = request.command_set.token
         elif isinstance(request, Commit):
             token = request.token
-        answer: asyncio.Future[CanReply] = asyncio.get_running_loop().create_future()
-        self._pending[sequence] = pending = _Pending(action_of(request), token, answer)
+        can_reply: asyncio.Future[CanReply] = asyncio.get_running_loop().create_future()
+        self._pending[sequence] = pending = _Pending(action_of(request), token, can_reply)
         try:
-            return await reply_within(answer, timeout)
+            return await reply_within(can_reply, timeout)
         finally:
             if self._pending.get(sequence) is pending:
                 del self._pending[sequence]
 
-    def take(self, answer: CanReply) -> bool:
+    def resolve(self, can_reply: CanReply) -> bool:
         """Deliver a reply; returns whether a request was waiting for it."""
-        pending = self._pending.get(answer.sequence)
-        if pending is None or pending.answer.done() or pending.action != answer.action:
+        pending = self._pending.get(can_reply.sequence)
+        if pending is None or pending.can_reply.done() or pending.action != can_reply.action:
             return False
-        if answer.refusal is None and pending.token not in (None, answer.token):
+        if can_reply.refusal is None and pending.token not in (None, can_reply.token):
             return False
-        pending.answer.set_result(answer)
+        pending.can_reply.set_result(can_reply)
         return True
 
-    def fail(self, what: str) -> None:
+    def fail(self, cause: str) -> None:
         """Fail all pending requests."""
         for pending in self._pending.values():
-            if not pending.answer.done():
-                pending.answer.set_exception(LinkError(what))
+            if not pending.can_reply.done():
+                pending.can_reply.set_exception(LinkError(cause))

@@ -12,10 +12,10 @@ import asyncio
 from collections.abc import Awaitable, Callable
 
 from drivers.backends.hardware import number_below
+from drivers.backends.host_lock import HostLock
 from drivers.backends.modbus.line import ModbusLine, modbus_line
-from drivers.backends.sole_host import SoleHost
 from drivers.backends.urls.modbus import ModbusUrl
-from drivers.backends.waiting import SETTLE
+from drivers.backends.waiting import DUPLICATE_WAIT
 from drivers.backends.wire_backend import WireBackend
 from drivers.codec.modbus import exchanges
 from drivers.codec.modbus.adu import ModbusResponse
@@ -56,13 +56,13 @@ class ModbusBackend(WireBackend):
         super().__init__()
         self._url = ModbusUrl.parse(url)
         self._line: ModbusLine | None = None
-        self._sole_host = SoleHost(f"{self._url.place}/{self._url.unit}")
+        self._host_lock = HostLock(f"{self._url.place}/{self._url.unit}")
         # A random start, so that a response to an earlier run does not match.
         self._tag = number_below(_TAGS)
         self._can_read_back = True
         self._channels = exchanges.CHANNELS_MAX
         self._last_state: tuple[AmplifierState, Fault] | None = None
-        self._is_asking = False
+        self._is_exchanging = False
 
     @property
     def bus(self) -> str:
@@ -94,7 +94,7 @@ class ModbusBackend(WireBackend):
             if line is not None:
                 await line.leave(self._url.unit)
         finally:  # also if cancelled
-            self._sole_host.release()
+            self._host_lock.release()
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send a request and wait for its reply; LinkTimeout, LinkError or FrameError.
@@ -102,18 +102,18 @@ class ModbusBackend(WireBackend):
         timeout [s]: of each transaction, extended on slow lines (see `ModbusLine`).
         """
         if isinstance(request, Arm) and not self._url.device:
-            self._sole_host.claim()
-        self._is_asking = True
+            self._host_lock.acquire()
+        self._is_exchanging = True
         try:
-            reply, registers = await self._ask(request, timeout)
+            reply, registers = await self._request(request, timeout)
             if isinstance(reply, Capabilities):
                 self._channels = reply.channels
             elif isinstance(reply, FaultList):
                 count = unpack_fault_count(registers)
                 if count > len(reply.faults):
-                    reply, _ = await self._ask(request, timeout, records=count)
+                    reply, _ = await self._request(request, timeout, records=count)
         finally:
-            self._is_asking = False
+            self._is_exchanging = False
         return reply
 
     async def broadcast(self, request: Broadcast) -> None:
@@ -123,7 +123,7 @@ class ModbusBackend(WireBackend):
 
     async def _check_alone(self, line: ModbusLine) -> None:
         """Wait for a second amplifier of this unit; LinkError if one responds."""
-        await asyncio.sleep(SETTLE)
+        await asyncio.sleep(DUPLICATE_WAIT)
         if line.has_duplicate_responder:
             raise LinkError(
                 f"several amplifiers respond as unit {self._url.unit} on {self._url.place}; give "
@@ -134,7 +134,7 @@ class ModbusBackend(WireBackend):
         self._tag = self._tag % _TAGS + 1
         return self._tag
 
-    async def _ask(
+    async def _request(
         self, request: Request, timeout: float, *, records: int = exchanges.RECORDS_FIRST
     ) -> tuple[Reply, tuple[int, ...]]:
         """Return the reply to a request, and its registers; records: number of faults to read."""
@@ -148,25 +148,25 @@ class ModbusBackend(WireBackend):
         ) -> ModbusResponse:
             return await self._transact(read, write, tag, request=request, timeout=timeout)
 
-        answer = await self._carry_out(exchange, tag, transact)
-        if answer.exception:
-            return await self._refusal(answer, tag, transact), ()
-        self._report_change(request, answer)
+        response = await self._carry_out(exchange, tag, transact)
+        if response.exception:
+            return await self._refusal(response, tag, transact), ()
+        self._report_change(request, response)
         if isinstance(request, Hello) and self._url.is_rtu:
             await self._check_alone(self._require(self._line, self._url.place, request))
-        return exchanges.decode_reply(request, answer.registers), answer.registers
+        return exchanges.decode_reply(request, response.registers), response.registers
 
     async def _carry_out(self, exchange: Exchange, tag: int, transact: _Transact) -> ModbusResponse:
         read, write = exchange.read, exchange.write
         if write is None:
             return await transact(read, None, None)
         if self._can_read_back:
-            answer = await transact(read, write, tag)
-            if answer.exception != _ILLEGAL_FUNCTION:
-                return answer
+            response = await transact(read, write, tag)
+            if response.exception != _ILLEGAL_FUNCTION:
+                return response
             self._can_read_back = False
-        answer = await transact(None, write, None)
-        return answer if answer.exception else await transact(read, None, tag)
+        response = await transact(None, write, None)
+        return response if response.exception else await transact(read, None, tag)
 
     async def _transact(
         self,
@@ -177,12 +177,12 @@ class ModbusBackend(WireBackend):
         request: Request,
         timeout: float,
     ) -> ModbusResponse:
-        def accept(answer: ModbusResponse) -> bool:
-            if answer.exception or read is None:
+        def accept(response: ModbusResponse) -> bool:
+            if response.exception or read is None:
                 return True
-            return exchanges.is_of(answer.registers, tag=tag)
+            return exchanges.is_of(response.registers, tag=tag)
 
-        answer = await self._require(self._line, self._url.place, request).transact(
+        response = await self._require(self._line, self._url.place, request).transact(
             read,
             write,
             unit=self._url.unit,
@@ -191,18 +191,18 @@ class ModbusBackend(WireBackend):
             sent=self._sent,
             is_stop=isinstance(request, Stop),
         )
-        if answer.exception in _GATEWAY:
+        if response.exception in _GATEWAY:
             raise LinkTimeout(
                 f"gateway {self._url.place}: no response from unit {self._url.unit}; "
                 "check that the amplifier is switched on and has this unit"
             )
-        return answer
+        return response
 
-    async def _refusal(self, answer: ModbusResponse, tag: int, transact: _Transact) -> Nak:
+    async def _refusal(self, response: ModbusResponse, tag: int, transact: _Transact) -> Nak:
         """Read the reason of a refused write, unless the exception is unambiguous."""
-        if answer.exception == _ILLEGAL_FUNCTION:
+        if response.exception == _ILLEGAL_FUNCTION:
             return Nak(NakCode.UNKNOWN_TYPE)
-        only = exchanges.nak_of_exception(answer.exception)
+        only = exchanges.nak_of_exception(response.exception)
         if only is not None and only.code is NakCode.BUSY:
             return only
         refusal = await transact(exchanges.refusal_read(), None, None)
@@ -211,13 +211,13 @@ class ModbusBackend(WireBackend):
             return nak
         # A late exception to an earlier write, so the response to this one is missing.
         raise LinkTimeout(
-            f"unit {self._url.unit} on {self._url.place}: Modbus exception {answer.exception} "
+            f"unit {self._url.unit} on {self._url.place}: Modbus exception {response.exception} "
             "without a reason for this request"
         )
 
-    def _report_change(self, request: Request, answer: ModbusResponse) -> None:
+    def _report_change(self, request: Request, response: ModbusResponse) -> None:
         """Report a change of state or fault as an event."""
-        state = exchanges.reported_state(request, answer.registers)
+        state = exchanges.reported_state(request, response.registers)
         if state is None or state == self._last_state:
             return
         before, self._last_state = self._last_state, state
@@ -227,7 +227,7 @@ class ModbusBackend(WireBackend):
     def _sent(self, time: float) -> None:
         self._last_sent_at = time
 
-    def _lost(self, what: str) -> None:
-        self._loss = what
-        if not self._is_asking:
-            self._on_loss(what)
+    def _lost(self, cause: str) -> None:
+        self._loss = cause
+        if not self._is_exchanging:
+            self._on_loss(cause)

@@ -45,7 +45,7 @@ class ModbusLine(SharedLine[Port]):
         self._transaction = 0
         self._request: RequestAdu | None = None
         self._accept: Callable[[ModbusResponse], bool] = _any
-        self._answer: asyncio.Future[ModbusResponse] | None = None
+        self._response: asyncio.Future[ModbusResponse] | None = None
         # Time at which a serial line is free, at the latest if a response is pending.
         self._free_from = 0.0
         self._is_response_pending = False
@@ -88,10 +88,10 @@ class ModbusLine(SharedLine[Port]):
             on_line += 2 * self._gap  # before the response, and at the end of the request
             self._send(request)
             sent(self._last_sent_at)
-            self._answer = asyncio.get_running_loop().create_future()
+            self._response = asyncio.get_running_loop().create_future()
             self._is_response_pending = True
             self._free_from = self._last_sent_at + on_line + _REACTION
-            return await reply_within(self._answer, max(timeout, on_line + _REACTION))
+            return await reply_within(self._response, max(timeout, on_line + _REACTION))
         except LinkError:
             raise
         except TimeoutError:
@@ -101,7 +101,7 @@ class ModbusLine(SharedLine[Port]):
                 + (f" and {self.url.baud} baud" if self.url.device else "")
             ) from None
         finally:
-            self._answer = None
+            self._response = None
             self._is_transacting = False
 
     async def broadcast(self, write: Write, sent: Callable[[float], None]) -> None:
@@ -154,26 +154,26 @@ class ModbusLine(SharedLine[Port]):
     def _received(self, data: bytes) -> None:
         replies = self._reader.feed(data, self._request)
         trace.frame(Direction.IN, data, self.name, lambda: ", ".join(map(repr, replies)))
-        for answer in replies:
-            if not self._accept(answer):
+        for response in replies:
+            if not self._accept(response):
                 self.counters.unexpected_frames += 1
                 continue
             self._is_response_pending = False
             self._response_received.set()
-            if self._answer is None or self._answer.done():
+            if self._response is None or self._response.done():
                 self.counters.unexpected_frames += 1
                 self.has_duplicate_responder = (
-                    self.has_duplicate_responder or answer != self._last_response
+                    self.has_duplicate_responder or response != self._last_response
                 )
             else:
-                self._last_response = answer
-                self._answer.set_result(answer)
+                self._last_response = response
+                self._response.set_result(response)
         if not self._is_response_pending:
             self._free_from = clock.now() + self._gap
 
-    def _fail_pending(self, what: str) -> None:
-        if self._answer is not None and not self._answer.done():
-            self._answer.set_exception(LinkError(what))
+    def _fail_pending(self, cause: str) -> None:
+        if self._response is not None and not self._response.done():
+            self._response.set_exception(LinkError(cause))
 
 
 def modbus_line(url: ModbusUrl) -> ModbusLine:
@@ -185,5 +185,5 @@ def _meaning(request: RequestAdu) -> str:
     return f"unit {request.unit}, function {request.function}: {request.read}, {request.write}"
 
 
-def _any(answer: ModbusResponse) -> bool:
+def _any(response: ModbusResponse) -> bool:
     return True

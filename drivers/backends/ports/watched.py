@@ -58,9 +58,9 @@ class WatchedPort:
         try:
             self._writer.write(data)
         except OSError as problem:
-            what = self._what_was_lost(problem)
-            self._lose(what)
-            raise LinkError(what) from problem
+            cause = self._what_was_lost(problem)
+            self._lose(cause)
+            raise LinkError(cause) from problem
 
     @property
     def is_blocked(self) -> bool:
@@ -124,12 +124,12 @@ class WatchedPort:
         if not self._closing.is_set():
             self._on_data(data)
 
-    def _lose(self, what: str) -> None:
+    def _lose(self, cause: str) -> None:
         if self._is_lost or self._closing.is_set():
             return
         self._is_lost = True
         self._ignore()
-        self._on_loss(what)
+        self._on_loss(cause)
 
     def _what_was_lost(self, problem: Exception | str) -> str:
         return (

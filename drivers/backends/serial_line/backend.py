@@ -11,7 +11,7 @@ from drivers import clock, trace
 from drivers.backends.hardware import number_below
 from drivers.backends.serial_line.line import SerialLine, serial_line
 from drivers.backends.urls.serial_line import SerialUrl
-from drivers.backends.waiting import SETTLE, reply_within
+from drivers.backends.waiting import DUPLICATE_WAIT, reply_within
 from drivers.backends.wire_backend import WireBackend
 from drivers.codec.serial_line.exchanges import decode_event, decode_reply, encode_request, is_event
 from drivers.codec.serial_line.frame import Frame, encode_frame
@@ -128,7 +128,7 @@ class SerialBackend(WireBackend):
 
     async def _check_alone(self) -> None:
         """Wait for a second amplifier of this address; LinkError if one replies."""
-        await asyncio.sleep(SETTLE)
+        await asyncio.sleep(DUPLICATE_WAIT)
         if self._has_duplicate_responder:
             raise LinkError(
                 f"several amplifiers reply at address {self._url.address} on {self._url.port}; "
@@ -182,12 +182,12 @@ class SerialBackend(WireBackend):
         self._counters.events += 1
         self._on_event(event)
 
-    def _lost(self, what: str) -> None:
-        self._loss = what
+    def _lost(self, cause: str) -> None:
+        self._loss = cause
         was_waiting = self._pending is not None
-        self._fail(LinkError(what))
+        self._fail(LinkError(cause))
         if not was_waiting:
-            self._on_loss(what)
+            self._on_loss(cause)
 
     def _fail(self, problem: LinkError) -> None:
         if self._pending is not None and not self._pending.reply.done():

@@ -108,31 +108,31 @@ class CanReplyReader:
             status=status,
         )
 
-    def _status(self, answer: dict[str, int], event: AmplifierEvent) -> Status | None:
+    def _status(self, reply: dict[str, int], event: AmplifierEvent) -> Status | None:
         """Return the status of a reply; None if a frame of it is missing."""
         condition = self._condition
         each = CANOPEN["channels_per_node"]
-        if condition.get("sequence") != answer["sequence"]:
+        if condition.get("sequence") != reply["sequence"]:
             return None
         count = condition["channel_count"]
         groups = [self._levels.get(group, {}) for group in range(-(-count // each))]
-        if any(group.get("sequence") != answer["sequence"] for group in groups):
+        if any(group.get("sequence") != reply["sequence"] for group in groups):
             return None
         levels = [group[f"level_{place}"] for group in groups for place in range(each)][:count]
         if not (
             _Q.channel_count.holds(count)
             and all(_Q.level.holds(level) for level in levels)
             and _Q.temperature.holds(condition["temperature"])
-            and _Q.watchdog_left.holds(answer["watchdog_left"])
+            and _Q.watchdog_left.holds(reply["watchdog_left"])
         ):
             raise FrameError("values of a status are out of range")
         return Status(
             state=event.state,
             fault=event.fault,
-            token=answer["active_token"],
+            token=reply["active_token"],
             high_voltage=bool(condition["high_voltage"]),
             temperature=_Q.temperature.from_wire(condition["temperature"]),
-            watchdog_left=_Q.watchdog_left.from_wire(answer["watchdog_left"]),
+            watchdog_left=_Q.watchdog_left.from_wire(reply["watchdog_left"]),
             levels=tuple(_Q.level.from_wire(level) for level in levels),
             voltage=_Q.voltage.from_wire(condition["voltage"]),
         )
@@ -154,9 +154,9 @@ def _event(values: dict[str, int]) -> AmplifierEvent:
     )
 
 
-def plain_reply(answer: CanReply) -> Reply | None:
+def plain_reply(reply: CanReply) -> Reply | None:
     """Return refusal or status; None for an accepted set."""
-    return answer.refusal or answer.status
+    return reply.refusal or reply.status
 
 
 def _refusal(result: int, event: AmplifierEvent) -> Nak | None:

@@ -65,10 +65,10 @@ def encode_request(
             return (beat, order)
         case Commit():
             return (order, SYNC)
-        case Apply(command_set=wanted) | Stage(command_set=wanted):
+        case Apply(command_set=requested) | Stage(command_set=requested):
             together = _in_fd_frames if fd else _in_classic_frames
-            shapes = _slots(wanted.commands, node, sequence)
-            return (*shapes, *together(order, wanted.commands, node, sequence), SYNC)
+            shapes = _slots(requested.commands, node, sequence)
+            return (*shapes, *together(order, requested.commands, node, sequence), SYNC)
         case _:
             return (order,)
 
@@ -79,7 +79,7 @@ def encode_broadcast(request: Broadcast) -> tuple[CanFrame, ...]:
     return (order, SYNC) if isinstance(request, Commit) else (order,)
 
 
-def wanted_commands(wanted: CommandSet) -> tuple[DriveCommand, ...]:
+def requested_commands(requested: CommandSet) -> tuple[DriveCommand, ...]:
     """Return the commands of a set, quantised as on the wire."""
     return tuple(
         replace(
@@ -88,7 +88,7 @@ def wanted_commands(wanted: CommandSet) -> tuple[DriveCommand, ...]:
             level=_Q.level.quantise(command.level),
             phase=_Q.phase.quantise(command.phase),
         )
-        for command in wanted.commands
+        for command in requested.commands
     )
 
 
@@ -102,12 +102,12 @@ def _order(request: PdoRequest, node: int, sequence: int, *, fd: bool = False) -
             fields = {"ramp": _Q.ramp.to_wire(ramp)}
         case Commit(token=token):
             fields = {"token": _Q.token.to_wire(token)}
-        case Apply(command_set=wanted) | Stage(command_set=wanted):
+        case Apply(command_set=requested) | Stage(command_set=requested):
             fields = {
-                "token": _Q.token.to_wire(wanted.token),
-                "ramp": _Q.ramp.to_wire(wanted.ramp),
-                "time": _Q.valid_for.to_wire(wanted.valid_for),
-                "count": len(wanted.commands),
+                "token": _Q.token.to_wire(requested.token),
+                "ramp": _Q.ramp.to_wire(requested.ramp),
+                "time": _Q.valid_for.to_wire(requested.valid_for),
+                "count": len(requested.commands),
             }
     data = LAYOUTS["order"].pack(action=action_of(request), sequence=sequence, **fields)
     return CanFrame(cob_id("order", node), data, fd=fd)

@@ -180,9 +180,9 @@ def _response(pdu: bytes, to: RequestAdu) -> ModbusResponse | None:
     if to.read is not None:
         return ModbusResponse(tuple(message.registers))
     assert to.write is not None  # noqa: S101  at least one
-    wanted = to.write.registers
-    echo = tuple(message.registers) if len(wanted) == 1 else message.count
-    is_echo = echo == (wanted if len(wanted) == 1 else len(wanted))
+    written = to.write.registers
+    echo = tuple(message.registers) if len(written) == 1 else message.count
+    is_echo = echo == (written if len(written) == 1 else len(written))
     return ModbusResponse() if is_echo and message.address == to.write.address else None
 
 

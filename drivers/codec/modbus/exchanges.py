@@ -94,9 +94,9 @@ def encode_request(
             return Exchange(
                 _read("status", beyond=channels), _block("control", tag, _control(request))
             )
-        case Stage(command_set=wanted) | Apply(command_set=wanted):
-            commit = wanted.token if isinstance(request, Apply) else 0
-            write = _block("set", tag, [commit, *_pack_set(wanted)])
+        case Stage(command_set=requested) | Apply(command_set=requested):
+            commit = requested.token if isinstance(request, Apply) else 0
+            write = _block("set", tag, [commit, *_pack_set(requested)])
             return Exchange(_read("achieved", beyond=channels * CHANNEL_SIZE), write)
         case Commit(token=token):
             write = _block("set", tag, [_Q.token.to_wire(token)])

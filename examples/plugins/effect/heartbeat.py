@@ -37,7 +37,7 @@ class Beating(EffectRun):
             return NoSensation(until=begin + SECOND)
         if into < SECOND + PULSE:
             weaker = None if self.level_db_sl is None else self.level_db_sl - WEAKER
-            return Sensation(weaker, until=begin + SECOND + PULSE, or_less=True)
+            return Sensation(weaker, until=begin + SECOND + PULSE, allow_weaker=True)
         return NoSensation(until=begin + self.period)
 
 

@@ -185,9 +185,9 @@ def test_calibrations_map_sensor_to_plate(folder: Path) -> None:
         "     {shown: [304.8 mm, 0.0286], at: [1 cm, 20 cm]}]}}\n",
     )
     a, b, c = (source.calibration for source in load_daemon_config(path).touch)
-    assert a.place(Touch(1, 0.0, 0.0)) == Touch(1, 1.0, 0.0)
-    assert b.place(Touch(1, 1.0, 0.5)) == Touch(1, 0.75, 0.5)
-    placed = c.place(Touch(1, 0.0, 1.0))  # shown at the south-west corner
+    assert a.apply(Touch(1, 0.0, 0.0)) == Touch(1, 1.0, 0.0)
+    assert b.apply(Touch(1, 1.0, 0.5)) == Touch(1, 0.75, 0.5)
+    placed = c.apply(Touch(1, 0.0, 1.0))  # shown at the south-west corner
     assert (placed.x * 0.3048, (1 - placed.y) * 0.2286) == pytest.approx((0.3148, 0.2286))
 
 

@@ -95,7 +95,7 @@ def test_ramp_holds_its_last_level() -> None:
     ramp = Ramp(start_level=6.0, duration=0.8, hold=True)
     for level in (20.0, None):
         felt = ramp.start(finger(1), 0.0, level_db_sl=level).feel(finger(1), 60.0)
-        assert felt == Sensation(level, or_less=True)
+        assert felt == Sensation(level, allow_weaker=True)
 
 
 def test_texture_level_follows_speed() -> None:

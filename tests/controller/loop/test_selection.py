@@ -159,9 +159,9 @@ def test_strongest_refuses_less_than_10_db_of_contrast() -> None:
         strongest(pattern, {"SW": 1.0})
 
 
-def or_less(level: float) -> HapticIntent:
+def allow_weaker(level: float) -> HapticIntent:
     """One level at contact 1, or less where the plate cannot reach it."""
-    return HapticIntent((Target(ContactKey("a", 1), level, or_less=True),))
+    return HapticIntent((Target(ContactKey("a", 1), level, allow_weaker=True),))
 
 
 def test_selector_saturates_a_level_or_less(table: Table) -> None:
@@ -174,12 +174,12 @@ def test_selector_saturates_a_level_or_less(table: Table) -> None:
     capabilities = replace(CAPABILITIES, max_amplitudes={"SW": 2e-6})
     contacts = (at(1, 0.1), at(2, 0.2))
     for wanted, level in ((14.0, 14.0), (30.0, 12 + 20 * math.log10(2)), (17.0, 17.0)):
-        selection = Selector(table).select(contacts, or_less(wanted), capabilities)
+        selection = Selector(table).select(contacts, allow_weaker(wanted), capabilities)
         assert selection.pattern is not None
         assert selection.predictions[0].level_db_sl == pytest.approx(level)
         assert selection.question is table.asked[-1]
     table.most = 11.0
-    selection = Selector(table).select(contacts, or_less(30.0), capabilities)
+    selection = Selector(table).select(contacts, allow_weaker(30.0), capabilities)
     assert (selection.pattern, selection.reason) == (None, "too loud")
 
 
@@ -187,7 +187,7 @@ def test_selector_saturates_at_full_stroke_on_a_plate() -> None:
     """60 dB SL is more than the ERAs of the paper reach."""
     table, full = small_table(), dict.fromkeys(("SW", "SE", "NE", "NW"), 0.0001)
     capabilities = PlaybackCapabilities("switched", ("switched",), (40.0, 500.0), full, RAMPS_ONLY)
-    selection = Selector(table).select((at(1, 0.1),), or_less(60.0), capabilities)
+    selection = Selector(table).select((at(1, 0.1),), allow_weaker(60.0), capabilities)
     assert selection.pattern is not None
     assert 12 < selection.predictions[0].level_db_sl < 60
     loudest = max(tone.amplitude for tone in selection.pattern.excitation.values())

@@ -26,7 +26,7 @@ async def receiving() -> AsyncIterator[Send]:
     """
     received: asyncio.Queue[tuple[bytes, float]] = asyncio.Queue()
 
-    def take(data: bytes, peer: Peer, arrived: float) -> None:
+    def feed(data: bytes, peer: Peer, arrived: float) -> None:
         assert peer == sender.getsockname()
         received.put_nowait((data, arrived))
 
@@ -37,7 +37,7 @@ async def receiving() -> AsyncIterator[Send]:
         async with asyncio.timeout(20):
             return [await received.get() for _ in datagrams]
 
-    line = await listen("127.0.0.1", 0, take, max_size=100)
+    line = await listen("127.0.0.1", 0, feed, max_size=100)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.bind(("127.0.0.1", 0))
         try:
@@ -90,12 +90,12 @@ async def test_receiver_may_close_within_its_callback() -> None:
     lines: list[Datagrams] = []
     done = asyncio.Event()
 
-    def take(data: bytes, peer: Peer, arrived: float) -> None:
+    def feed(data: bytes, peer: Peer, arrived: float) -> None:
         received.append(data)
         lines[0].close()
         done.set()
 
-    lines.append(await listen("127.0.0.1", 0, take, max_size=100))
+    lines.append(await listen("127.0.0.1", 0, feed, max_size=100))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for datagram in (b"1", b"2"):
             sender.sendto(datagram, ("127.0.0.1", lines[0].port))

@@ -34,9 +34,9 @@ def test_turned_maps_corners(
 ) -> None:
     """The sensor's upper corners lie on the plate where those of a turned sheet of paper lie."""
     calibration = turned(degrees, mirror=mirror)
-    for corner, place in (((0, 0), top_left), ((1, 0), top_right)):
-        placed = calibration.place(Touch(1, *corner))
-        assert (placed.x, placed.y) == pytest.approx(place)
+    for corner, apply in (((0, 0), top_left), ((1, 0), top_right)):
+        placed = calibration.apply(Touch(1, *corner))
+        assert (placed.x, placed.y) == pytest.approx(apply)
 
 
 def test_fitted_by_hand() -> None:
@@ -46,8 +46,8 @@ def test_fitted_by_hand() -> None:
     """
     touched = [(0.1, 0.1), (0.9, 0.1), (0.1, 0.9)]
     calibration = fitted(touched, [(0, 0.2), (0.4, 0.2), (0, 0)], PLATE)
-    middle = calibration.place(Touch(1, 0.5, 0.5))
-    corner = calibration.place(Touch(1, 0.1, 0.1))
+    middle = calibration.apply(Touch(1, 0.5, 0.5))
+    corner = calibration.apply(Touch(1, 0.1, 0.1))
     assert (middle.x, middle.y) == pytest.approx((0.5, 0.5))
     assert (corner.x, corner.y) == pytest.approx((0, 0), abs=1e-12)
 
@@ -62,9 +62,9 @@ def test_fitted_recovers_any_matrix(matrix: tuple[float, ...]) -> None:
     a, b, c, d, e, f = matrix
     truth = TouchCalibration(((a, b, c), (d, e, f)))
     touched = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)]
-    placed = [truth.place(Touch(1, *point)) for point in touched]
-    places = [(0.4 * touch.x, 0.2 * (1 - touch.y)) for touch in placed]
-    found = fitted(touched, places, PLATE)
+    placed = [truth.apply(Touch(1, *point)) for point in touched]
+    positions = [(0.4 * touch.x, 0.2 * (1 - touch.y)) for touch in placed]
+    found = fitted(touched, positions, PLATE)
     assert [*found.matrix[0], *found.matrix[1]] == pytest.approx(matrix, abs=1e-9)
 
 
@@ -77,7 +77,7 @@ def test_fitted_refuses_a_large_residual() -> None:
 
 
 @pytest.mark.parametrize(
-    ("touched", "places", "words"),
+    ("touched", "positions", "words"),
     [
         ([(0, 0), (1, 0)], [(0, 0), (0.4, 0)], "three points"),
         ([(0, 0), (1, 0), (0, 1)], [(0, 0), (0.4, 0)], "three points"),
@@ -87,11 +87,11 @@ def test_fitted_refuses_a_large_residual() -> None:
     ],
 )
 def test_fitted_refuses_insufficient_points(
-    touched: list[tuple[float, float]], places: list[tuple[float, float]], words: str
+    touched: list[tuple[float, float]], positions: list[tuple[float, float]], words: str
 ) -> None:
     """The error has the reason."""
     with pytest.raises(InputError, match=words):
-        fitted(touched, places, PLATE)
+        fitted(touched, positions, PLATE)
 
 
 def test_calibration_refuses_singular_matrices() -> None:

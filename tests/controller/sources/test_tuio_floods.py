@@ -80,12 +80,12 @@ async def test_listen_drops_superseded_bundles_of_a_flood() -> None:
     done = asyncio.Event()
     up = full("a")
 
-    def take(data: bytes, peer: Peer, arrived: float) -> None:
+    def feed(data: bytes, peer: Peer, arrived: float) -> None:
         received.append(data)
         if data == up:
             done.set()
 
-    line = await listen("127.0.0.1", 0, take, max_size=8192, drop_superseded=without_superseded)
+    line = await listen("127.0.0.1", 0, feed, max_size=8192, drop_superseded=without_superseded)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for number in range(200):
             sender.sendto(full("a", number), ("127.0.0.1", line.port))

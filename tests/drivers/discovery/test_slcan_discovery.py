@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from drivers.cli import app
 from drivers.codec.can_bus.frame import CanFrame
-from drivers.discovery.slcan import SlcanAdapter, ask_for_slcan
+from drivers.discovery.slcan import SlcanAdapter, detect_slcan
 from sim.far_ends.can_bus.bus import CanBus
 from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter as FarAdapter
 
@@ -89,7 +89,7 @@ def adapter() -> Iterator[Adapter]:
 def test_adapter_listens_and_is_closed(adapter: Adapter) -> None:
     """Its version, and the amplifiers' nodes that beat there, not the host's; L and no other
     opening, closed at the end, and not a frame of ours on the bus."""
-    assert ask_for_slcan(adapter.port) == SlcanAdapter("1013", nodes=(1, 5))
+    assert detect_slcan(adapter.port) == SlcanAdapter("1013", nodes=(1, 5))
     assert adapter.has_got(b"V\rC\rS6\rL\rC\r")
     assert {frame.id for frame in adapter.on_bus} == {0x701, 0x705, 0x77F, 0x181}
 
@@ -99,7 +99,7 @@ def test_other_device_receives_two_characters(adapter: Adapter) -> None:
     for answer in (b"", b"?\r", b"Version 2\r", b"V10"):
         adapter.said = b""
         adapter.receive = partial(reply, adapter, answer)
-        assert ask_for_slcan(adapter.port) is None
+        assert detect_slcan(adapter.port) is None
         assert adapter.said == b"V\r"
 
 
@@ -107,7 +107,7 @@ def test_adapter_without_listen_only_mode_is_not_opened(adapter: Adapter) -> Non
     """O is never sent."""
     usual = adapter.receive
     adapter.receive = lambda data: usual(data.replace(b"L\r", b"nonsense\r"))
-    found = ask_for_slcan(adapter.port)
+    found = detect_slcan(adapter.port)
     assert found is not None
     assert found.nodes == ()
     assert "listen-only" in (found.problem or "")

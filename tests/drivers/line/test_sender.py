@@ -9,7 +9,7 @@ from drivers import clock
 from drivers.backend import Backend
 from drivers.errors import LinkTimeout, Preempted
 from drivers.line.priority import PREEMPTION_GRACE, Priority
-from drivers.line.sender import Again, Sender, sender_of
+from drivers.line.sender import Retry, Sender, sender_of
 from drivers.protocol.messages import Reply, Request
 from drivers.protocol.wire_times import WireTimes
 from virtual_loop import in_virtual_time
@@ -210,7 +210,7 @@ async def test_withdrawn_stop_ends_the_grace() -> None:
 async def test_disarm_does_not_preempt_a_stop() -> None:
     """It waits for the reply to the stop, and to its repetition."""
     line = Line()
-    line.held, line.replies = {"stop"}, {"stop": [Again()]}
+    line.held, line.replies = {"stop"}, {"stop": [Retry()]}
     east = Amplifier(line)
     stop = east.ask("stop", Priority.STOP)
     await asyncio.sleep(0.002)
@@ -247,7 +247,7 @@ async def test_cancellation_frees_the_line(is_answered: bool) -> None:
 async def test_repetition_keeps_the_order_of_its_amplifier_and_lets_others_go() -> None:
     """A retry precedes later requests of its amplifier and follows those that others queued."""
     line = Line()
-    line.replies = {"retried": [Again()], "busy": [Again(0.005)]}
+    line.replies = {"retried": [Retry()], "busy": [Retry(0.005)]}
     east, west = Amplifier(line), Amplifier(line)
     tasks = [
         east.ask("retried", Priority.OTHER),
@@ -269,7 +269,7 @@ async def test_repetition_is_refused_behind_a_stop_and_when_aborted() -> None:
     """A stop-class request is repeated in any case."""
     for stop in (Priority.STOP, None):
         line = Line()
-        line.replies = {"first": [Again()]}
+        line.replies = {"first": [Retry()]}
         east, _, first = await line.first_is_sent()
         queued = east.ask("queued", Priority.HEARTBEAT)
         await asyncio.sleep(0)
@@ -282,7 +282,7 @@ async def test_repetition_is_refused_behind_a_stop_and_when_aborted() -> None:
             assert isinstance(await fate(task), Preempted)
         if stopping is not None:
             await stopping
-    line.replies = {"silence": [Again()], "stop": [Again()]}
+    line.replies = {"silence": [Retry()], "stop": [Retry()]}
     tasks = [east.ask("silence", Priority.SILENCE), east.ask("stop", Priority.STOP)]
     line.sender.abort_unsent(east)
     assert await asyncio.gather(*tasks) == ["silence", "stop"]
@@ -292,7 +292,7 @@ async def test_repetition_is_refused_behind_a_stop_and_when_aborted() -> None:
 async def test_pausing_stop_reserves_the_line() -> None:
     """Nothing is sent while an amplifier that is busy is given time for its stop."""
     line = Line()
-    line.replies = {"stop": [Again(0.005)]}
+    line.replies = {"stop": [Retry(0.005)]}
     east, west = Amplifier(line), Amplifier(line)
     await asyncio.gather(east.ask("stop", Priority.STOP), west.ask("beat", Priority.HEARTBEAT))
     assert line.sent == ["stop", "stop", "beat"]

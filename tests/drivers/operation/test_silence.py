@@ -12,7 +12,7 @@ from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import LinkError
 from drivers.guard import Guard, GuardLimits
-from drivers.operation.silence import Silence, StopOutcome, stop_and_confirm, stop_outcome
+from drivers.operation.silence import SilenceStatus, StopOutcome, stop_and_confirm, stop_outcome
 from drivers.protocol.messages import Status, Stop
 from lossy_backend import Fate, LossyBackend
 from sim.amplifier.amplifier import SimulatedAmplifier
@@ -27,30 +27,30 @@ SLACK = 0.026  # s; the protocol's 5 ms to fall silent, and an amplifier's react
 @pytest.mark.parametrize(
     ("status", "last_fed_at", "watchdog", "silence", "until"),
     [
-        (replace(STOPPED, levels=(0.0,) * 4), None, None, Silence.CONFIRMED, None),
-        (OFF, 99.9, WATCHDOG, Silence.MAY_PLAY, 100.15),  # cleared: a late Arm might follow
-        (replace(STOPPED, levels=(0.0,) * 4), 99.99, WATCHDOG, Silence.CONFIRMED, None),
-        (STOPPED, 99.9, WATCHDOG, Silence.MAY_PLAY, 100.15),  # still on its ramp
-        (ARMED, 99.9, WATCHDOG, Silence.MAY_PLAY, 100.15),  # silent, and ready to play
-        (PLAYING, 90.0, WATCHDOG, Silence.MAY_PLAY, None),  # another host feeds it
-        (None, 99.9, WATCHDOG, Silence.MAY_PLAY, 100.15),
-        (None, 99.7, WATCHDOG, Silence.WATCHDOG_ELAPSED, None),
-        (None, 90.0, WATCHDOG, Silence.WATCHDOG_ELAPSED, None),
-        (None, 90.0, None, Silence.MAY_PLAY, None),  # no watchdog
-        (None, None, WATCHDOG, Silence.MAY_PLAY, None),  # never reached
+        (replace(STOPPED, levels=(0.0,) * 4), None, None, SilenceStatus.CONFIRMED, None),
+        (OFF, 99.9, WATCHDOG, SilenceStatus.MAY_PLAY, 100.15),  # cleared: a late Arm might follow
+        (replace(STOPPED, levels=(0.0,) * 4), 99.99, WATCHDOG, SilenceStatus.CONFIRMED, None),
+        (STOPPED, 99.9, WATCHDOG, SilenceStatus.MAY_PLAY, 100.15),  # still on its ramp
+        (ARMED, 99.9, WATCHDOG, SilenceStatus.MAY_PLAY, 100.15),  # silent, and ready to play
+        (PLAYING, 90.0, WATCHDOG, SilenceStatus.MAY_PLAY, None),  # another host feeds it
+        (None, 99.9, WATCHDOG, SilenceStatus.MAY_PLAY, 100.15),
+        (None, 99.7, WATCHDOG, SilenceStatus.WATCHDOG_ELAPSED, None),
+        (None, 90.0, WATCHDOG, SilenceStatus.WATCHDOG_ELAPSED, None),
+        (None, 90.0, None, SilenceStatus.MAY_PLAY, None),  # no watchdog
+        (None, None, WATCHDOG, SilenceStatus.MAY_PLAY, None),  # never reached
     ],
 )
 def test_stop_outcome_by_status_and_watchdog(
     status: Status | None,
     last_fed_at: float | None,
     watchdog: float | None,
-    silence: Silence,
+    silence: SilenceStatus,
     until: float | None,
 ) -> None:
     """Only a status in a state that plays nothing confirms; only a known watchdog ends it."""
     outcome = stop_outcome(status, last_fed_at=last_fed_at, watchdog=watchdog, now=NOW)
     assert outcome.silence is silence
-    assert outcome.is_confirmed is (silence is Silence.CONFIRMED)
+    assert outcome.is_confirmed is (silence is SilenceStatus.CONFIRMED)
     assert (outcome.cause == "") is outcome.is_confirmed
     if until is None:
         assert outcome.may_play_until is None
@@ -61,11 +61,11 @@ def test_stop_outcome_by_status_and_watchdog(
 
 def test_outcome_as_json() -> None:
     """The time left is relative, and never negative."""
-    outcome = StopOutcome(Silence.MAY_PLAY, 100.2, "no reply")
+    outcome = StopOutcome(SilenceStatus.MAY_PLAY, 100.2, "no reply")
     expected = {"silence": "may_play", "may_play_for_s": 0.2, "cause": "no reply"}
     assert outcome.to_json(100.0) == expected
     assert outcome.to_json(101.0)["may_play_for_s"] == 0.0
-    assert StopOutcome(Silence.CONFIRMED).to_json(0.0)["may_play_for_s"] is None
+    assert StopOutcome(SilenceStatus.CONFIRMED).to_json(0.0)["may_play_for_s"] is None
 
 
 async def playing(backend: LossyBackend) -> Amplifier:
@@ -101,7 +101,7 @@ async def test_confirmed_silence_is_never_wrong(
     remaining = iter(fates)
     backend.fate = lambda request: next(remaining, last)
     outcome = await stop_and_confirm(amplifier)
-    if outcome.silence is Silence.MAY_PLAY:
+    if outcome.silence is SilenceStatus.MAY_PLAY:
         assert outcome.may_play_until is not None
         await asyncio.sleep(outcome.may_play_until - clock.now())
     far_end = backend.amplifier
@@ -155,7 +155,7 @@ async def test_outcome_long_after_a_loss() -> None:
         await amplifier.heartbeat()
     await asyncio.sleep(3600.0)
     outcome = await stop_and_confirm(amplifier)
-    assert outcome.silence is Silence.WATCHDOG_ELAPSED
+    assert outcome.silence is SilenceStatus.WATCHDOG_ELAPSED
     assert "the wire is cut" in outcome.cause
 
 
@@ -163,7 +163,7 @@ async def test_outcome_long_after_a_loss() -> None:
 async def test_never_armed_amplifier_may_play() -> None:
     """Another host may have armed it, and its watchdog is unknown."""
     outcome = await stop_and_confirm(Amplifier(simulated()))
-    assert (outcome.silence, outcome.may_play_until) == (Silence.MAY_PLAY, None)
+    assert (outcome.silence, outcome.may_play_until) == (SilenceStatus.MAY_PLAY, None)
 
 
 @in_virtual_time

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from drivers.operation.simultaneous import at_one_moment
+from drivers.operation.simultaneous import simultaneous_commits
 from virtual_loop import VirtualLoop, in_virtual_time
 
 
@@ -27,7 +27,7 @@ async def test_commits_arrive_together() -> None:
     """6.5, 2 and 0 ms on the wire: sent at once, after 4.5 and after 6.5 ms."""
     wires = [Wire(0.002), Wire(0.0), Wire(0.0065)]
     begin = asyncio.get_running_loop().time()
-    answers = await asyncio.gather(*at_one_moment([(w.takes, w.commit) for w in wires]))
+    answers = await asyncio.gather(*simultaneous_commits([(w.takes, w.commit) for w in wires]))
     assert answers == [0.0065, 0.002, 0.0]
     assert [wire.sent[0] - begin for wire in wires] == pytest.approx([0.0045, 0.0065, 0.0])
 
@@ -37,7 +37,8 @@ async def test_equal_wires_commit_at_once() -> None:
     """Within one iteration of the event loop."""
     wires = [Wire(0.003) for _ in range(4)]
     tasks = [
-        asyncio.ensure_future(each) for each in at_one_moment([(w.takes, w.commit) for w in wires])
+        asyncio.ensure_future(each)
+        for each in simultaneous_commits([(w.takes, w.commit) for w in wires])
     ]
     await asyncio.sleep(0)
     assert all(len(wire.sent) == 1 for wire in wires)
@@ -51,5 +52,5 @@ async def test_remainder_below_clock_resolution_ends() -> None:
     assert isinstance(loop, VirtualLoop)
     loop.now = begin = 4552.311810074659
     wires = [Wire(0.0), Wire(0.0020000000004)]
-    await asyncio.gather(*at_one_moment([(w.takes, w.commit) for w in wires]))
+    await asyncio.gather(*simultaneous_commits([(w.takes, w.commit) for w in wires]))
     assert [wire.sent[0] - begin for wire in wires] == pytest.approx([0.002, 0.0])

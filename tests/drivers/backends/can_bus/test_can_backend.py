@@ -534,7 +534,7 @@ async def test_exception_of_a_frame_callback_is_logged(
     bus = can_bus(CanUrl.parse("can+virtual://any#1").bus)
     bus.network.subscribe(0x123, fail)
     with caplog.at_level(logging.DEBUG, "drivers"):
-        bus._take(CanFrame(0x123, b""))
+        bus._received(CanFrame(0x123, b""))
     (record,) = [
         record for record in caplog.records if "can+virtual://any: frame 123" in record.getMessage()
     ]

@@ -18,7 +18,12 @@ from drivers.codec.can_bus.objects import (
     unpack_identity,
 )
 from drivers.codec.can_bus.replies import CanReplyReader, decode_emergency
-from drivers.codec.can_bus.requests import SYNC, encode_broadcast, encode_request, wanted_commands
+from drivers.codec.can_bus.requests import (
+    SYNC,
+    encode_broadcast,
+    encode_request,
+    requested_commands,
+)
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import FrameError
 from drivers.guard import Guard, GuardLimits, SafeCommandSet
@@ -101,7 +106,7 @@ def test_cantools_decodes_a_set_by_the_dbc(
     safe = guard.check(CommandSet(token=77, commands=(wanted,), ramp=0.25, valid_for=1.5))
     frames = encode_request(Apply(safe), node=1, sequence=5)
     command, order = (DATABASE.decode_message(frame.id, frame.data) for frame in frames[:2])
-    achieved = wanted_commands(safe)[0]
+    achieved = requested_commands(safe)[0]
     assert command["frequency"] == pytest.approx(achieved.frequency, abs=1e-9)
     assert command["level"] == pytest.approx(level, abs=0.51e-4)
     assert command["phase"] == pytest.approx(achieved.phase, abs=1e-9)

@@ -67,6 +67,7 @@ class AmplifierGroup:
         self._silence_count = 0  # disarms, stops and closes so far
         self._silencing_count = 0  # disarms and stops in progress
         self._arm_count = 0
+        self._stop_count = self._cleared_count = 0  # stops so far, and at the last clear
         self._may_be_armed = False  # since the amplifiers were opened
         self._limit: asyncio.Timeout | None = None  # of a play or heartbeat in progress
 
@@ -94,6 +95,7 @@ class AmplifierGroup:
             raise
         self.state = GroupState.DISARMED
         self._may_be_armed = False
+        self._cleared_count = self._stop_count  # each amplifier says itself what it has latched
 
     async def arm(self) -> None:
         """Switch the high voltage on at level zero: on all amplifiers, or none stays armed."""
@@ -102,6 +104,8 @@ class AmplifierGroup:
                 f"amplifiers must be open to be armed, got {self.state.name}; close and open all "
                 "of them again"
             )
+        if self._stop_count > self._cleared_count:  # an amplifier that restarted does not know
+            raise CommandRefused("a stop must be cleared before arming; clear, then arm again")
         if self._silencing_count:  # the result would depend on the order of frames
             raise CommandRefused(
                 "amplifiers are being stopped or disarmed; arm again if that is still wanted"
@@ -175,22 +179,25 @@ class AmplifierGroup:
             raise
 
     async def stop(self) -> Mapping[str, StopOutcome]:
-        """Quick-stop every amplifier, lost ones too; latched until `clear`.
+        """Quick-stop every amplifier, lost ones too; latched until `clear`, also if they restart.
 
         Returns what is known of the silence of each, by name. Concurrent requests share one further
         stop.
         """
         self._leave_armed()
+        self._stop_count += 1
         with self._silencing():
             return await run_to_completion(self._quick_stops.stop())
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone."""
+        count = self._stop_count
         try:
             await self._gather(amplifier.clear() for amplifier in self._all)
         except LinkError:
             await self.stop()
             raise
+        self._cleared_count = count
 
     async def close(self, silence: Mapping[str, SafeCommandSet]) -> None:
         """Play silence, confirm it by read-back, disarm and close; may be called twice."""

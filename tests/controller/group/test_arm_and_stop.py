@@ -161,10 +161,14 @@ async def test_refusal_of_one_guard_silences_all() -> None:
 
 @in_virtual_time
 async def test_stop_is_latched_until_clear() -> None:
-    """Arming is refused before it is acknowledged; touches are felt again after that."""
+    """Arming is refused before, even if the amplifier restarts; touches are felt after it."""
     async with running() as bench:
         await bench.controller.stop()
-        with pytest.raises(CommandRefused, match="stopped"):
+        with pytest.raises(CommandRefused):
+            await bench.controller.arm()
+        bench.far_end.amplifier.restart(asyncio.get_running_loop().time())
+        assert bench.far_end.state not in (STOPPED, ENABLED)
+        with pytest.raises(CommandRefused):
             await bench.controller.arm()
         assert bench.controller.group_state is GroupState.DISARMED
         await bench.controller.clear()

@@ -101,10 +101,10 @@ async def drive(
     ceiling = GuardLimits(FREQUENCY_FLOOR, FREQUENCY_CEILING, LEVEL_CEILING)
     async with _opened(url, take_over=True) as amplifier:
         guard = Guard(ceiling, amplifier.capabilities)
-        wanted = DriveCommand(channel=channel, frequency=frequency, level=level)
+        command = DriveCommand(channel=channel, frequency=frequency, level=level)
         requested = CommandSet(
             token=amplifier.next_token(),
-            commands=(wanted,),
+            commands=(command,),
             ramp=min(_RAMP, amplifier.capabilities.ramp_max),
             valid_for=duration,
         )

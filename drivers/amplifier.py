@@ -253,7 +253,7 @@ class Amplifier:
             )
 
     async def stage(self, safe: SafeCommandSet) -> Achieved:
-        """Keep a set ready under its token; returns what its commit would play.
+        """Keep a set ready under its token; returns what its commit would achieve.
 
         Raises CommandRefused if a newer set, a stop or a disarm came first.
         """
@@ -269,7 +269,7 @@ class Amplifier:
         return _of_token(achieved, token)
 
     async def apply(self, safe: SafeCommandSet) -> Achieved:
-        """Play a set now; returns what it really plays.
+        """Play a set now; returns the achieved set.
 
         A silent set overtakes the queue as a stop does. Raises CommandRefused if a newer set or a
         stop superseded it.
@@ -344,7 +344,7 @@ class Amplifier:
         feeding = nullcontext() if isinstance(request, _NOT_FEEDING) else self._feeding()
         with _errors_logged_for_stop(request):
             self._recorder.sending(request)
-        begin = clock.now()
+        started_at = clock.now()
         outcome: object = "cancelled"
         try:
             with feeding:
@@ -355,7 +355,7 @@ class Amplifier:
             raise
         finally:
             with _errors_logged_for_stop(request):
-                trace.request(request, outcome, clock.now() - begin)
+                trace.request(request, outcome, clock.now() - started_at)
         with _errors_logged_for_stop(request):
             self._recorder.replied(request, reply)
         return reply
@@ -395,7 +395,7 @@ class Amplifier:
 def _errors_logged_for_stop(request: Request) -> Iterator[None]:
     """Log errors in the block instead of raising them if the request is a Stop or Disarm.
 
-    So no bookkeeping can prevent it.
+    Bookkeeping must not prevent it.
     """
     try:
         yield

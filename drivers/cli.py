@@ -95,14 +95,16 @@ def discover(
     """List serial ports, CAN interfaces and the amplifiers on them."""
     from drivers.discovery.search import candidates, identify_all, with_slcan
 
-    places = [with_slcan(candidate) if slcan else candidate for candidate in candidates()]
+    found_ports = [with_slcan(candidate) if slcan else candidate for candidate in candidates()]
     probed = [
-        candidate for candidate in places if candidate.remedy is None and not candidate.is_slcan
+        candidate
+        for candidate in found_ports
+        if candidate.remedy is None and not candidate.is_slcan
     ]
     usable = [one for candidate in probed for one in candidate.urls]
     found = _run(identify_all([*(url or []), *(usable if probe else [])]), trace)
     who = {one.url: one.identity for one in found if one.identity is not None}
-    unusable = {one.url: one.problem for one in found if not one.was_asked}
+    unusable = {one.url: one.problem for one in found if not one.was_sent}
     rows = [
         {
             "place": candidate.name,
@@ -113,7 +115,7 @@ def discover(
             "remedy": candidate.remedy
             or next((unusable[one] for one in candidate.urls if one in unusable), None),
         }
-        for candidate in places
+        for candidate in found_ports
     ]
     amplifiers = [
         {
@@ -138,7 +140,7 @@ def discover(
             print(f"{one.url}: {one.problem}")
     for amplifier in amplifiers:
         print("  ".join(str(value) for value in amplifier.values()))
-    heard = [one for candidate in places if candidate.is_slcan for one in candidate.urls]
+    heard = [one for candidate in found_ports if candidate.is_slcan for one in candidate.urls]
     if not amplifiers and heard:
         print(f"Next: era amp identify {shlex.quote(heard[0])}")
     elif not amplifiers:

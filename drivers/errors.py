@@ -61,6 +61,6 @@ class CommandError(DriverError, ValueError):
     """An invalid request: bad URL, unknown channel, value out of range."""
 
 
-def system_message(problem: BaseException) -> str:
+def system_message(error: BaseException) -> str:
     """Return the operating system's message of an error, without its number."""
-    return re.sub(r"^.*\[Errno -?\d+\] ", "", str(problem), flags=re.DOTALL)
+    return re.sub(r"^.*\[Errno -?\d+\] ", "", str(error), flags=re.DOTALL)

@@ -34,9 +34,9 @@ async def in_thread(
         else:
             done.set_result(result)
 
-    def fail(problem: Exception) -> None:
+    def fail(error: Exception) -> None:
         if not done.cancelled():
-            done.set_exception(problem)
+            done.set_exception(error)
 
     def _undo(result: _T) -> None:
         if undo is not None:
@@ -45,8 +45,8 @@ async def in_thread(
     def run() -> None:
         try:
             result = work()
-        except Exception as problem:
-            _post(loop, fail, problem)
+        except Exception as error:
+            _post(loop, fail, error)
         else:
             if not _post(loop, give, result) and undo is not None:
                 undo(result)

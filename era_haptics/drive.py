@@ -1,4 +1,4 @@
-"""Drives in hertz, shares of full stroke and degrees, and their conversion to excitations."""
+"""Drives in hertz, fractions of full stroke and degrees, and their conversion to excitations."""
 
 import math
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ class Drive:
         for key in ("frequency", "level", "phase_deg"):
             if not isinstance(getattr(self, key), Real):
                 raise InputError(
-                    f"{key} of a drive must be a number, in hertz, share of the full stroke or "
+                    f"{key} of a drive must be a number, in hertz, fraction of full stroke or "
                     f"degrees, got {getattr(self, key)!r}"
                 )
         if not (0 < self.frequency < math.inf):

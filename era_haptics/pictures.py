@@ -6,7 +6,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 from numpy.lib.stride_tricks import sliding_window_view
 
 from era_haptics.drive import Drives, excitation_of
-from era_haptics.places import Places, as_points
+from era_haptics.positions import Positions, as_points
 from era_haptics.solved_plate import SolvedPlate
 from model.arguments import expect
 from model.arrays import FloatArray
@@ -29,7 +29,7 @@ def draw_map(plate: SolvedPlate, drive: Pattern | Drives, *, title: str = "") ->
 
 
 def draw_pattern(
-    table: LocalizationTable, pattern: Pattern, target: Places, *, quiet: Places = ()
+    table: LocalizationTable, pattern: Pattern, target: Positions, *, quiet: Positions = ()
 ) -> Figure:
     """Draw the level of a pattern over the plate [dB SL], and the fingers.
 
@@ -41,10 +41,10 @@ def draw_pattern(
     axes = figure.subplots()
     axes.set_axis_off()
     draw_levels(axes, table, pattern.excitation)
-    for place in as_points(target, what="target"):
-        draw_fingertip(axes, place, felt=True, level_db_sl=pattern.level_db_sl)
-    for place in as_points(quiet, what="quiet"):
-        draw_fingertip(axes, place, felt=False)
+    for position in as_points(target, what="target"):
+        draw_fingertip(axes, position, felt=True, level_db_sl=pattern.level_db_sl)
+    for position in as_points(quiet, what="quiet"):
+        draw_fingertip(axes, position, felt=False)
     if pattern.contrast_db is not None:
         axes.set_title(f"contrast {pattern.contrast_db:.1f} dB predicted", fontsize=11, pad=20)
     draw_level_scale(figure, [axes], shrink=0.8)

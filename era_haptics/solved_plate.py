@@ -7,7 +7,7 @@ import numpy as np
 
 from era_haptics.arguments import expect_rig
 from era_haptics.drive import Drives, excitation_of
-from era_haptics.places import Places, as_points
+from era_haptics.positions import Positions, as_points
 from model.arguments import expect, expect_number, is_whole, shown
 from model.errors import InputError
 from model.finger.load import FingerLoad
@@ -64,9 +64,9 @@ class SolvedPlate:
     def play(
         self,
         drive: Pattern | Drives,
-        target: Places,
+        target: Positions,
         *,
-        quiet: Places = (),
+        quiet: Positions = (),
         duration: float = 1.0,
         finger_load: FingerLoad | None = None,
     ) -> Playback:

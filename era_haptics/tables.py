@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 
 from era_haptics.arguments import expect_rig
-from era_haptics.places import Places, as_points
+from era_haptics.positions import Positions, as_points
 from model.arguments import expect, expect_number, shown
 from model.arrays import FloatArray
 from model.errors import InputError
@@ -38,28 +38,28 @@ def table(
     expect_rig(rig)
     expect(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
     _expect_mode(drive_mode)
-    wanted = None if frequencies is None else _as_frequencies(frequencies)
-    found, _ = cached_table(rig, frequencies=wanted, grid=grid, drive_mode=drive_mode)
+    chosen = None if frequencies is None else _as_frequencies(frequencies)
+    found, _ = cached_table(rig, frequencies=chosen, grid=grid, drive_mode=drive_mode)
     return found
 
 
 def query(
     table: LocalizationTable,
-    target: Places,
+    target: Positions,
     *,
-    quiet: Places = (),
+    quiet: Positions = (),
     level_db_sl: float = STRONG_DB_SL,
     drive_mode: str | None = None,
     envelopes: bool = False,
     measures: bool = True,
 ) -> Pattern:
-    """Find the best pattern for fingers at these places [m], with its predicted measures.
+    """Find the best pattern for fingers at these positions [m], with its predicted measures.
 
-    target: fingers to feel it; quiet: fingers not to feel it; each one place or several.
+    target: fingers to feel it; quiet: fingers not to feel it; each one position or several.
     level_db_sl: level at the target above its detection threshold, 20 dB is strong; drive_mode:
     the table's own if None; envelopes: for amplifiers that play shaped onsets and endings;
     measures: compute transient and robust contrast and concentration, too, some ten milliseconds.
-    Raises InputError for places off the plate or on top of each other, and a level that cannot be
+    Raises InputError for positions off the plate or at the same point, and a level that cannot be
     reached. The same as `era table query`.
     """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")

@@ -54,7 +54,7 @@ class Derived:
 class PluginRegistry(Generic[_T]):
     """Objects of one kind by name.
 
-    what: the kind, for error messages; group: of its entry points; wanted: requirement on these;
+    what: the kind, for error messages; group: of its entry points; required: of these;
     error: the class of errors raised; own: objects of this project without an entry point; called:
     returns the name of an object, if it has one; problem: returns what is wrong with an object, or
     None; hint: the end of the message for an unknown name. If the name is the scheme of a URL,
@@ -63,7 +63,7 @@ class PluginRegistry(Generic[_T]):
 
     what: str
     group: str
-    wanted: Instance | Derived
+    required: Instance | Derived
     _: KW_ONLY
     error: type[Exception]
     own: Mapping[str, _T] = field(default_factory=dict)
@@ -120,9 +120,9 @@ class PluginRegistry(Generic[_T]):
     def _loaded(self, point: EntryPoint, within: str) -> _T:
         with self._attributed(point, within):
             loaded: _T = point.load()
-        if not self.wanted.is_met_by(loaded):
+        if not self.required.is_met_by(loaded):
             leads = loaded.__name__ if isinstance(loaded, type) else type(loaded).__name__
-            self._refuse(point, within, f"leads to {leads}, not to {self.wanted}")
+            self._refuse(point, within, f"leads to {leads}, not to {self.required}")
         with self._attributed(point, within):
             called = point.name if self.called is None else self.called(loaded)
             problem = None if self.problem is None else self.problem(loaded)
@@ -153,11 +153,13 @@ class PluginRegistry(Generic[_T]):
 class WrongResultError(TypeError):
     """A plug-in's function that returned a value of the wrong type."""
 
-    def __init__(self, plugin: object, result: object, wanted: type) -> None:
+    def __init__(self, plugin: object, result: object, required: type) -> None:
         """plugin: the object whose method returned the result."""
         self.module = type(plugin).__module__
         returned = type(result).__name__
-        super().__init__(f"{type(plugin).__name__} returned {returned}, must be {wanted.__name__}")
+        super().__init__(
+            f"{type(plugin).__name__} returned {returned}, must be {required.__name__}"
+        )
 
 
 def failure_text(error: BaseException) -> str:

@@ -21,8 +21,8 @@ from controller.api.client_protocol import (
     LeaseLost,
     Notification,
     Unreachable,
+    as_position,
     make_params,
-    position,
     read_result,
     touch_params,
 )
@@ -153,19 +153,21 @@ class AsyncClient:
         """Acknowledge a stop, or a fault whose cause is gone."""
         await self.call("clear", RequestedBy(), Empty)
 
-    async def touch(self, places: Sequence[tuple[float, float]], *, source: str = "python") -> None:
+    async def touch(
+        self, positions: Sequence[tuple[float, float]], *, source: str = "python"
+    ) -> None:
         """Report all fingers of a source, at x, y [m]; valid for 150 ms, so repeat it."""
-        await self.call("touch", touch_params(places, source), Empty)
+        await self.call("touch", touch_params(positions, source), Empty)
 
     async def effects(self) -> EffectsResult:
         """List the effects."""
         return await self.call("effects", Empty(), EffectsResult)
 
     async def play(
-        self, effect: str, place: tuple[float, float], *, level_db_sl: float | None = None
+        self, effect: str, position: tuple[float, float], *, level_db_sl: float | None = None
     ) -> None:
         """Play an effect at the finger nearest to x, y [m]."""
-        x, y = position(place)
+        x, y = as_position(position)
         params = make_params(PlayParams, effect=effect, x_m=x, y_m=y, level_db_sl=level_db_sl)
         await self.call("play", params, Empty)
 

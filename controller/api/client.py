@@ -114,19 +114,19 @@ class Client:
         """Acknowledge a stop, or a fault whose cause is gone."""
         self._run(self._client.clear())
 
-    def touch(self, places: Sequence[tuple[float, float]], *, source: str = "python") -> None:
+    def touch(self, positions: Sequence[tuple[float, float]], *, source: str = "python") -> None:
         """Report all fingers of a source, at x, y [m]; valid for 150 ms, so repeat it."""
-        self._run(self._client.touch(places, source=source))
+        self._run(self._client.touch(positions, source=source))
 
     def effects(self) -> EffectsResult:
         """List the effects."""
         return self._run(self._client.effects())
 
     def play(
-        self, effect: str, place: tuple[float, float], *, level_db_sl: float | None = None
+        self, effect: str, position: tuple[float, float], *, level_db_sl: float | None = None
     ) -> None:
         """Play an effect at the finger nearest to x, y [m]."""
-        self._run(self._client.play(effect, place, level_db_sl=level_db_sl))
+        self._run(self._client.play(effect, position, level_db_sl=level_db_sl))
 
     def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:
         """Receive notifications of topics; see `events`."""

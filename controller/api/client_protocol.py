@@ -107,23 +107,25 @@ def make_params(model: type[_MessageT], **values: object) -> _MessageT:
         raise InputError(f"{method}: {key} {problem}, got {shown(value)}") from None
 
 
-def touch_params(places: Iterable[tuple[float, float]], source: str) -> TouchParams:
+def touch_params(positions: Iterable[tuple[float, float]], source: str) -> TouchParams:
     """A touch frame with fingers at x, y [m]; raises InputError."""
-    if not isinstance(places, Iterable):
-        raise InputError(f"touch: places must be a list of x, y in metres, got {shown(places)}")
-    positions = [position(place) for place in places]
-    touches = [TouchPoint(id=id, x_m=x, y_m=y) for id, (x, y) in enumerate(positions, start=1)]
+    if not isinstance(positions, Iterable):
+        raise InputError(
+            f"touch: positions must be a list of x, y in metres, got {shown(positions)}"
+        )
+    points = [as_position(position) for position in positions]
+    touches = [TouchPoint(id=id, x_m=x, y_m=y) for id, (x, y) in enumerate(points, start=1)]
     return make_params(TouchParams, source=source, touches=touches)
 
 
-def position(place: object) -> tuple[float, float]:
+def as_position(position: object) -> tuple[float, float]:
     """A finger's x, y [m]; raises InputError."""
     try:
-        x, y = (float(each) for each in cast("Iterable[float]", place))
+        x, y = (float(each) for each in cast("Iterable[float]", position))
     except (TypeError, ValueError):
         raise InputError(
-            "a finger's place must be x, y in metres from the plate's south-west corner, such as "
-            f"(0.10, 0.05), got {shown(place)}"
+            "a finger's position must be x, y in metres from the plate's south-west corner, such "
+            f"as (0.10, 0.05), got {shown(position)}"
         ) from None
     return x, y
 

@@ -38,7 +38,7 @@ class Connection(asyncio.Protocol):
         self.name = "unnamed client"
         self.received_at = clock()  # s; when the last bytes arrived
         self.has_spoken = False  # whether it has sent a complete line
-        self.is_reserve = False  # whether it has a place in reserve
+        self.is_reserve = False  # whether it is in reserve
         self.excess = 0  # requests beyond the rate since its last pause
         self.is_paused = False  # whether the server pauses to serve it
         self.is_urgent = False  # whether its last bytes may hold a stop
@@ -80,7 +80,7 @@ class Connection(asyncio.Protocol):
         return self._line_end >= 0 or len(self._input) >= MAX_LINE_LENGTH
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Store the transport and take a place at the server."""
+        """Store the transport and ask the server for admission."""
         self._transport = cast(asyncio.Transport, transport)
         # Output is bounded here, by the size of the write buffer.
         self._transport.set_write_buffer_limits(high=MAX_UNREAD_BYTES)

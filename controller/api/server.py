@@ -14,6 +14,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from controller.api.admission import RESERVE_METHODS, Admission
 from controller.api.connection import Connection
 from controller.api.jsonrpc import (
     ErrorCode,
@@ -27,7 +28,6 @@ from controller.api.jsonrpc import (
     unknown_method,
 )
 from controller.api.methods import METHODS, TouchParams
-from controller.api.places import RESERVE_METHODS, Places
 from controller.api.schema import Message
 from controller.group.tasks import CoalescedCalls
 from drivers import clock
@@ -95,7 +95,7 @@ class ApiServer:
         self._handlers = handlers
         self._on_disconnect = on_disconnect
         self._clock = clock
-        self._places = Places(is_kept=is_kept, is_subscribed=is_subscribed, clock=clock)
+        self._admission = Admission(is_kept=is_kept, is_subscribed=is_subscribed, clock=clock)
         self._stops: dict[Connection, CoalescedCalls[Message]] = {}
         self._waiting: deque[Connection] = deque()
         self._is_turn_scheduled = False
@@ -114,23 +114,23 @@ class ApiServer:
         if self._server is None:
             return
         self._server.close()
-        for connection in list(self._places.taken):
+        for connection in list(self._admission.admitted):
             connection.close()
         await asyncio.sleep(0)
-        for connection in list(self._places.taken):
+        for connection in list(self._admission.admitted):
             connection.abort()
         await self._server.wait_closed()
 
     def _make_connection(self) -> Connection:
         return Connection(
-            on_connect=self._places.take,
+            on_connect=self._admission.admit,
             on_lines=self._lines_received,
             on_disconnect=self._disconnected,
             clock=self._clock,
         )
 
     def _disconnected(self, connection: Connection) -> None:
-        self._places.taken.discard(connection)
+        self._admission.admitted.discard(connection)
         self._stops.pop(connection, None)
         self._on_disconnect(connection)
 
@@ -249,10 +249,10 @@ class ApiServer:
         connection.close_if_finished()
 
     def _call(self, connection: Connection, call: _Call) -> Message | Awaitable[Message]:
-        if call.method not in RESERVE_METHODS and not self._places.promote(connection):
+        if call.method not in RESERVE_METHODS and not self._admission.promote(connection):
             raise RpcError(
                 ErrorCode.BUSY,
-                f"too many clients; this place serves {', '.join(sorted(RESERVE_METHODS))} only",
+                f"too many clients; only {', '.join(sorted(RESERVE_METHODS))} are served here",
                 remedy="try again later",
             )
         if call.method == "stop":

@@ -1,1 +1,1 @@
-"""The `era` command and the controller's share of it."""
+"""The `era` command and the controller's subcommands."""

@@ -165,15 +165,15 @@ def touch(
     """Put fingers on the plate for a while. The last one is the target, the others are quiet."""
     from model.config.points import parse_point
 
-    places = [parse_point(text, what="era touch") for text in at]
+    positions = [parse_point(text, what="era touch") for text in at]
     with _client(socket) as era:
-        _check_places(places, era.hello("era").rig)
-        era.touch(places, source="era touch")
+        _check_positions(positions, era.hello("era").rig)
+        era.touch(positions, source="era touch")
         end = time.monotonic() + duration
         time.sleep(min(duration, 2 * _REPEAT_INTERVAL))
         status = era.status()
         while (left := end - time.monotonic()) > 0:
-            era.touch(places, source="era touch")
+            era.touch(positions, source="era touch")
             time.sleep(min(left, _REPEAT_INTERVAL))
         era.touch([], source="era touch")
     typer.echo(status.model_dump_json() if as_json else show_status(status))
@@ -202,15 +202,15 @@ def watch(
     from controller.api.schema import Topic
     from controller.api.topics import TOPICS
 
-    wanted = topics or _DEFAULT_TOPICS
-    unknown = [topic for topic in wanted if topic not in TOPICS]
+    selected = topics or _DEFAULT_TOPICS
+    unknown = [topic for topic in selected if topic not in TOPICS]
     if unknown:
         raise InputError(
             f"unknown topic {unknown[0]!r}; {did_you_mean(unknown[0], TOPICS)}"
             f"choose from {', '.join(TOPICS)}"
         )
     with _client(socket) as era:
-        era.subscribe(*cast("list[Topic]", wanted), rate_hz=rate)
+        era.subscribe(*cast("list[Topic]", selected), rate_hz=rate)
         now = era.status()
         for event in era.events():
             if as_json:
@@ -244,11 +244,11 @@ def _print_lease(granted: "ArmResult", how_long: str, *, as_json: bool) -> None:
         typer.echo(f"armed {how_long}; era stop stops everything at once")
 
 
-def _check_places(places: "list[tuple[float, float]]", rig: "RigSummary") -> None:
+def _check_positions(positions: "list[tuple[float, float]]", rig: "RigSummary") -> None:
     """Refuse fingers beyond the plate, which the daemon would only reject and count."""
     from model.config.points import in_metres
 
-    for x, y in places:
+    for x, y in positions:
         if not (0 <= x <= rig.length_m and 0 <= y <= rig.width_m):
             raise InputError(
                 f"era touch must be on the plate of {rig.length_m:g} m by {rig.width_m:g} m, got "

@@ -119,8 +119,8 @@ def _group(app: typer.Typer) -> TyperGroup:
     return get_group(app)
 
 
-def _show_version(wanted: bool) -> None:
-    if wanted:
+def _show_version(is_requested: bool) -> None:
+    if is_requested:
         typer.echo(f"era-haptics {version('era-haptics')}")
         raise typer.Exit
 

@@ -13,7 +13,7 @@ from controller.loop.selection import MAX_DB_SL
 from controller.sources.contacts import Contact, ContactKey
 
 PLAY_RADIUS = 0.020
-"""Largest distance [m] from the place of a requested effect to the finger that feels it."""
+"""Largest distance [m] from the position of a requested effect to the finger that feels it."""
 
 
 class ActiveLayout:
@@ -49,9 +49,9 @@ class ActiveLayout:
         )
 
     def play(self, params: PlayParams, contacts: Iterable[Contact], *, now: float) -> None:
-        """Start an effect at the contact nearest to a place, at its own level or below.
+        """Start an effect at the contact nearest to a position, at its own level or below.
 
-        Raises RpcError for an unknown effect, a level above the effect's own, and a place without a
+        Raises RpcError for an unknown effect, a level above its own, and a position without a
         contact within `PLAY_RADIUS`.
         """
         effect = self._player.layout.effects.get(params.effect)

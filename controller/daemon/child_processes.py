@@ -38,7 +38,7 @@ class ChildProcesses:
     async def _keep_running(self, module: str, arguments: tuple[str, ...]) -> None:
         backoff = Backoff(first=1.0, maximum=_MAX_PAUSE)
         while True:
-            begin = clock.now()
+            started_at = clock.now()
             try:
                 process = await asyncio.create_subprocess_exec(
                     # -P: do not import a folder named controller in the working directory
@@ -51,7 +51,7 @@ class ChildProcesses:
                 _logger.warning("%s: start failed: %s", module, error)
             else:
                 _logger.warning("%s: exited with status %d", module, await self._wait(process))
-            pause = backoff.pause(ran_for=clock.now() - begin)
+            pause = backoff.pause(ran_for=clock.now() - started_at)
             _logger.info("%s: restarting in %g s", module, pause)
             await asyncio.sleep(pause)
 

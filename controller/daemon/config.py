@@ -251,7 +251,7 @@ def _calibration(section: CalibrationSection, rig: Rig | None) -> TouchCalibrati
 def _check_folders(
     validation: Validation[DaemonSection], log: Path | None, dumps: Path | None
 ) -> None:
-    """Check the places of files that are written later.
+    """Check the paths of files that are written later.
 
     The folder of the log must exist; that of the dumps is created when needed.
     """

@@ -52,7 +52,7 @@ LevelDbSl = Annotated[float, Quantity(RATIO, at_least=-20, at_most=60)]
 
 
 class CalibrationPoint(Section):
-    """A touched point: as shown by `era status` without calibration, and its true place."""
+    """A touched point: as shown by `era status` without calibration, and its true position."""
 
     shown: _POINT
     at: _POINT

@@ -105,7 +105,7 @@ class Supervisor:
                 observer.refused(reason)
 
         def cycle_completed() -> None:
-            self._check_phase()
+            self._check_own_stop()
             self._check_degraded()
             self._alive()
             observer.cycle_completed()
@@ -205,7 +205,7 @@ class Supervisor:
         return actions
 
     def _report_transition(self, before: StateMachine) -> None:
-        """Tell the observers of the current state, if it is another, a moment later."""
+        """Notify the observers of a new state, deferred."""
         if self.machine.state is not before.state:
             for observer in self._state_observers:
                 self._reports.add(partial(observer, before, self.machine))
@@ -442,8 +442,8 @@ class Supervisor:
                     _rate_limited_logger.error("stop repeated: %s", problem)
                     await self._stop()
 
-    def _check_phase(self) -> None:
-        """Post a fault if the control loop has stopped the amplifiers on its own."""
+    def _check_own_stop(self) -> None:
+        """Post a fault if the control loop has stopped the amplifiers by itself."""
         if self._has_stopped_itself:
             cause = self._refusal or "an amplifier refused a command"
             self.post(DaemonEvent(Trigger.FAULT, cause, ACKNOWLEDGE))

@@ -41,12 +41,12 @@ class TouchInputs:
 
     async def replace(self, inputs: Iterable[TouchInput]) -> None:
         """Run exactly these sources; those that are running already are not restarted."""
-        wanted = list(inputs)
-        for old in [each for each in self._running if each not in wanted]:
+        configured = list(inputs)
+        for old in [each for each in self._running if each not in configured]:
             task = self._running.pop(old)
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
-        for new in wanted:
+        for new in configured:
             if new not in self._running:
                 self._running[new] = asyncio.create_task(self._run(new), name=f"touch {new.name}")
 
@@ -62,7 +62,7 @@ class TouchInputs:
 
         backoff = Backoff(_MIN_PAUSE, _MAX_PAUSE)
         while True:
-            begin = clock.now()
+            started_at = clock.now()
             try:
                 source = await in_thread(touch_input.make, name="touch source")  # reads recordings
                 await source.run(deliver)
@@ -72,7 +72,7 @@ class TouchInputs:
                 _logger.info("touch source %s: finished", touch_input.name)
                 return
             # A panel may be plugged in later, a port be released.
-            await asyncio.sleep(backoff.pause(ran_for=clock.now() - begin))
+            await asyncio.sleep(backoff.pause(ran_for=clock.now() - started_at))
 
 
 class ApiTouches:

@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from controller.demo.touch_row import FingerVibration, Place
+from controller.demo.touch_row import FingerVibration, Position
 from controller.plate_control import PlateControl
 from drivers.errors import LinkError
 
@@ -37,7 +37,7 @@ class SimulatedPlate:
         self.urls = urls
         self._control = control
 
-    async def place_fingers(self, positions: Mapping[str, Place]) -> None:
+    async def place_fingers(self, positions: Mapping[str, Position]) -> None:
         """Place fingers at positions [m] by id; all others are removed."""
         await self._control.request({"op": "fingers", "fingers": dict(positions)})
 

@@ -54,8 +54,8 @@ def _draw_touch(axes: Axes, table: LocalizationTable, row: TouchRow) -> None:
         draw_levels(axes, table, row.pattern.excitation)
     level = row.levels_db_sl.get(row.target_id)
     draw_fingertip(axes, row.targets_m[0], felt=True, level_db_sl=level)
-    for id, place in row.quiet.items():
-        draw_fingertip(axes, place, felt=False, level_db_sl=row.levels_db_sl.get(id))
+    for id, position in row.quiet.items():
+        draw_fingertip(axes, position, felt=False, level_db_sl=row.levels_db_sl.get(id))
     contrast = row.measured_contrast_db
     title = "one finger alone" if contrast is None else f"contrast {contrast:.1f} dB measured"
     axes.set_title(title, fontsize=11, pad=20)

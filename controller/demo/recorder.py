@@ -9,7 +9,7 @@ from typing import Any
 from controller.demo.far_end import SimulatedPlate
 from controller.demo.touch_row import (
     FingerVibration,
-    Place,
+    Position,
     TouchRow,
     peak_contrast_db,
     steady_contrast_db,
@@ -39,7 +39,7 @@ class _Touch:
     """A touch and the patterns that were played for it."""
 
     contact: Contact
-    quiet: Mapping[str, Place]
+    quiet: Mapping[str, Position]
     until: float = math.inf
     patterns: list["_Playing"] = field(default_factory=list)
     reason: str = "another finger came down at the same moment and was the target"
@@ -66,7 +66,7 @@ class _Playing:
 class TouchRecorder:
     """Collects a row per touch: pass `observer` to the controller and await `finish` at the end.
 
-    Times of rows count from `begin`. on_row is called with each row once the touch was lifted and
+    Times of rows count from `start`. on_row is called with each row once the touch was lifted and
     its pattern measured.
     """
 
@@ -78,7 +78,7 @@ class TouchRecorder:
         self._start = clock.now()
         self._touches: dict[ContactKey, _Touch] = {}
         self._playing: _Playing | None = None
-        self._sensors: dict[str, Place] = {}
+        self._sensors: dict[str, Position] = {}
         self._tasks: set[asyncio.Task[Any]] = set()
 
     @property
@@ -93,7 +93,7 @@ class TouchRecorder:
             source_failed=self._failed,
         )
 
-    def begin(self) -> None:
+    def start(self) -> None:
         """Set the start of the recording to now."""
         self._start = clock.now()
 
@@ -161,10 +161,10 @@ class TouchRecorder:
         """Make the plate's sensors follow the fingers."""
         sensors = {}
         for contact in contacts:
-            place = (contact.x, contact.y)
+            position = (contact.x, contact.y)
             before = self._sensors.get(_id(contact), (math.inf, math.inf))
-            is_at_rest = math.dist(before, place) < MIN_MOVEMENT
-            sensors[_id(contact)] = before if is_at_rest else place
+            is_at_rest = math.dist(before, position) < MIN_MOVEMENT
+            sensors[_id(contact)] = before if is_at_rest else position
         if sensors != self._sensors:
             self._sensors = sensors
             self._run(self._plate.place_fingers(sensors))

@@ -109,7 +109,7 @@ async def run_demo(
 
 async def _play(play: Play, recorder: TouchRecorder) -> None:
     """Play the touches and wait until the last one counts as lifted and the plate is at rest."""
-    recorder.begin()
+    recorder.start()
     await play()
     await asyncio.sleep(CONTACT_TIMEOUT + DECAY)
 

@@ -11,7 +11,7 @@ from model.finger.contrast import contrast_db, mean_level_db_sl
 from model.table.pattern import Pattern
 from model.vibration.peak import peak_acceleration
 
-Place: TypeAlias = tuple[float, float]
+Position: TypeAlias = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class TouchRow:
     target_id: str
     time_s: float
     until_s: float
-    targets_m: Sequence[Place]
-    quiet: Mapping[str, Place]
+    targets_m: Sequence[Position]
+    quiet: Mapping[str, Position]
     reason: str | None = None
     drive: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     mode: str | None = None

@@ -123,8 +123,8 @@ class ChannelSweep:
         """Measure acceleration per commanded displacement (s,) [1/s²] in the steady state."""
         eras = [self._rig.eras[number] for number in numbers]
         stroke = min(era.stroke for era in eras)
-        wanted = {era.name: Tone(frequency, self._level * stroke) for era in eras}
-        frequency = await self._play(wanted) or frequency
+        excitation = {era.name: Tone(frequency, self._level * stroke) for era in eras}
+        frequency = await self._play(excitation) or frequency
         await self._wait(self._ramp + self._settle + self._listen)
         now = await self._sensors.time()
         heard = await self._sensors.tone(frequency, since=now - self._listen, until=now)
@@ -133,13 +133,13 @@ class ChannelSweep:
     async def _play(self, excitation: Excitation) -> float | None:
         """Play on all amplifiers; return the achieved frequency [Hz], None for silence."""
         self._token = token_after(self._token)
-        wanted = route(excitation, self._rig, token=self._token, ramp=RAMP)
-        self._ramp = max(commands.ramp for commands in wanted.values())
-        safe = {name: self._guards[name].check(commands) for name, commands in wanted.items()}
+        routed = route(excitation, self._rig, token=self._token, ramp=RAMP)
+        self._ramp = max(commands.ramp for commands in routed.values())
+        safe = {name: self._guards[name].check(commands) for name, commands in routed.items()}
         played = await self._group.play(safe)
         assert played is not None  # noqa: S101  nothing else silences them
         frequency = None
-        for name, commands in wanted.items():
+        for name, commands in routed.items():
             plays = {command.channel: command for command in played.achieved[name].commands}
             for requested in commands.commands:
                 if not requested.level:

@@ -269,7 +269,7 @@ class AmplifierGroup:
             ):
                 return None
             self._leave_armed()
-            with self._silencing():  # lost amplifiers are stopped on, but not waited for
+            with self._silencing():  # lost amplifiers are stopped, too, but not waited for
                 await run_to_completion(self._quick_stops.stop(waits_for_lost=False))
             raise
 
@@ -325,7 +325,7 @@ class AmplifierGroup:
 
 
 async def _heartbeat(checked: CheckedAmplifier, may_feed: Callable[[], bool]) -> None:
-    """Send a heartbeat, unless its link is degraded or it is to be silent by now."""
+    """Send a heartbeat unless its link is degraded or `may_feed` is false."""
     with suppress(LinkDegraded):
         await checked.heartbeat(may_feed=may_feed)
 

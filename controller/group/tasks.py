@@ -13,7 +13,7 @@ _T = TypeVar("_T")
 
 @final
 class CoalescedCalls(Generic[_T]):
-    """Runs an action at least once after each request for it, never twice at a time.
+    """Runs an action after each request, one run at a time.
 
     All requests that arrive while it runs share one further run.
     """

@@ -77,9 +77,9 @@ class Selector:
         capabilities: PlaybackCapabilities,
     ) -> Selection:
         """Return the selection for contacts in their order of arrival; the same object if kept."""
-        wanted = {target.key: target for target in intent.targets}
-        targets = tuple((each, wanted[each.key]) for each in contacts if each.key in wanted)
-        quiet = tuple(each for each in contacts if each.key not in wanted)
+        by_key = {target.key: target for target in intent.targets}
+        targets = tuple((each, by_key[each.key]) for each in contacts if each.key in by_key)
+        quiet = tuple(each for each in contacts if each.key not in by_key)
         if not self._still_fits(intent, targets, quiet):
             self._current = self._choose(intent, targets, quiet, capabilities)
         return self._current
@@ -143,9 +143,9 @@ class Selector:
         except InputError:
             if not all(target.allow_weaker for target in targets):
                 raise
-        wanted = question.level_db_sl
-        question = replace(question, level_db_sl=min(wanted, FELT_DB_SL))
-        return question, strongest(self._table.query(question), max_amplitudes, max_db_sl=wanted)
+        level = question.level_db_sl
+        question = replace(question, level_db_sl=min(level, FELT_DB_SL))
+        return question, strongest(self._table.query(question), max_amplitudes, max_db_sl=level)
 
     def _predict(
         self,

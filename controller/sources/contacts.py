@@ -77,8 +77,8 @@ class ContactTracker:
     x = X L and y = (1 - Y) W, since touch sensors count Y downwards. Rejects touches that are off
     the plate (outside 0..1), have non-finite coordinates or repeat an id within a frame (the last
     one counts); a contact whose touch is rejected is lifted. Where the maximum number of contacts
-    is reached, a contact of the input, origin or source that has most is evicted until both have
-    equal shares; else the touch is rejected.
+    is reached, a contact of the input, origin or source with most is evicted if it has at least
+    two more than that of the touch; else the touch is rejected.
     """
 
     def __init__(self, plate: Plate) -> None:
@@ -155,7 +155,7 @@ class ContactTracker:
         )
 
     def _contact_to_evict(self, newcomer: ContactKey) -> ContactKey | None:
-        """Return the contact to lift for another one; None if all shares are equal.
+        """Return the contact to lift for another one, if any.
 
         The newest contact of the input, then the origin, then the source with most contacts, if it
         has at least two more than the newcomer's.

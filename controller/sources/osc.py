@@ -24,11 +24,11 @@ def osc_messages(datagram: bytes, *, address: str) -> list[tuple[str | int | flo
     Arguments may be string, int32 and float32; messages to other addresses are skipped. Raises
     OscError for a datagram that must be ignored as a whole.
     """
-    wanted = _padded(address)
+    expected = _padded(address)
     return [
-        _arguments(element, len(wanted))
+        _arguments(element, len(expected))
         for element in _elements(datagram)
-        if element.startswith(wanted)
+        if element.startswith(expected)
     ]
 
 

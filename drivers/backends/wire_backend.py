@@ -41,10 +41,10 @@ class WireBackend(Backend):
         """See `Backend.listen`."""
         self._on_event, self._on_loss = on_event, on_loss
 
-    def _require(self, line: _LineT | None, place: str, request: Request) -> _LineT:
+    def _require(self, line: _LineT | None, name: str, request: Request) -> _LineT:
         """Return the open line; LinkError if it is not open, or lost, except for a Stop."""
         if line is None or (self._loss is not None and not isinstance(request, Stop)):
-            raise LinkError(self._loss or f"{place} is not open; open the amplifier first")
+            raise LinkError(self._loss or f"{name} is not open; open the amplifier first")
         return line
 
 

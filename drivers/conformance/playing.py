@@ -113,7 +113,7 @@ async def ramps(bench: Bench) -> None:
     ramp = min(0.5, bench.can.ramp_max)
     await bench.amplifier.apply(bench.tones(1.0, ramp=ramp))
     level = (await bench.levels())[0]
-    expect(level < bench.level * 0.9, f"level must rise along the ramp, got {level:g} at its begin")
+    expect(level < bench.level * 0.9, f"level must rise along the ramp, got {level:g} at its start")
     await bench.until(
         lambda status: abs(status.levels[0] - bench.level) <= LEVEL_TOLERANCE,
         what="end of a ramp",
@@ -124,9 +124,9 @@ async def ramps(bench: Bench) -> None:
 async def cancelled_requests(bench: Bench) -> None:
     """It gives a request its own reply after one that was cancelled."""
     for _ in range(3):
-        asking = asyncio.create_task(bench.amplifier.faults())
+        requesting = asyncio.create_task(bench.amplifier.faults())
         await asyncio.sleep(0)
-        asking.cancel()
-        await asyncio.gather(asking, return_exceptions=True)
+        requesting.cancel()
+        await asyncio.gather(requesting, return_exceptions=True)
         status = await bench.arm()
         bench.expect_state(status, AmplifierState.OPERATION_ENABLED, after="Arm")

@@ -47,7 +47,7 @@ class Found:
     url: str
     identity: Identity | None
     problem: str | None = None
-    was_asked: bool = True
+    was_sent: bool = True
 
 
 def candidates() -> list[Candidate]:
@@ -89,8 +89,8 @@ async def _identify(url: str) -> Found:
         amplifier = Amplifier(open_backend(url))
         await amplifier.open(take_over=False)
     except DriverError as problem:
-        was_asked = isinstance(problem, LinkTimeout | FrameError)
-        return Found(url, None, str(problem), was_asked=was_asked)
+        was_sent = isinstance(problem, LinkTimeout | FrameError)
+        return Found(url, None, str(problem), was_sent=was_sent)
     identity = amplifier.identity
     await amplifier.close()
     return Found(url, identity)

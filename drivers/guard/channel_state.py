@@ -95,8 +95,8 @@ class ChannelState:
             )
             highest += kept
         if self.ending is not None and end > self.valid_for:
-            begun = abs(self.path[0]) if last < self.settled_after else 0.0  # fades by itself
-            highest = max(highest, self._highest_knot + begun + self.fading_at(last))
+            interrupted = abs(self.path[0]) if last < self.settled_after else 0.0  # fades by itself
+            highest = max(highest, self._highest_knot + interrupted + self.fading_at(last))
         return highest
 
     @property

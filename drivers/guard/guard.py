@@ -119,7 +119,7 @@ class Guard:
         """Check a set. Raises CommandRefused with channel and reason.
 
         It is checked as the wire rounds it, ramps upward. valid_for is shortened to the on-time and
-        duty that are left; a set that is sent later than at once is checked again by then.
+        duty that are left; a set that is sent later is checked again then.
         """
         check_set(command_set, self._context)
         rounded = self._rounded(command_set)
@@ -128,7 +128,7 @@ class Guard:
         valid_for = rounded.valid_for
         if vibrates(rounded) and remaining != float("inf"):
             valid_for = min(valid_for or remaining, remaining, _VALID_FOR.high)
-            # Rounded down; 0 on the wire would be without end.
+            # Rounded down; 0 on the wire means without end.
             valid_for = math.floor(valid_for * _VALID_FOR.per_unit) / _VALID_FOR.per_unit
             if valid_for <= 0:
                 raise CommandRefused("on-time or duty limit reached; pause the vibration")
@@ -186,11 +186,11 @@ class Guard:
         """
         try:
             return self.check(command_set), None
-        except Exception as problem:  # every failure means silence
+        except Exception as error:  # every failure means silence
             reason = (
-                problem
-                if isinstance(problem, CommandRefused)
-                else CommandRefused(f"{type(problem).__name__}: {problem}")
+                error
+                if isinstance(error, CommandRefused)
+                else CommandRefused(f"{type(error).__name__}: {error}")
             )
             token = getattr(command_set, "token", 0)
             return self.silence(token, range(self._capabilities.channels), ramp=ramp), reason
@@ -233,7 +233,7 @@ class Guard:
                 for command in command_set.commands
             ),
             ramp=min(_rounded_up(command_set.ramp), self._capabilities.ramp_max),
-            # Rounded to 0 it would be without end.
+            # Must not be rounded to 0, which means without end.
             valid_for=max(_VALID_FOR.quantise(valid_for), _VALID_FOR.step) if valid_for else 0.0,
         )
 

@@ -64,7 +64,7 @@ def _whole_steps(value: float, quantity: Quantity) -> float:
 
 
 def capabilities_in_force(capabilities: Capabilities) -> Capabilities:
-    """Reduce an amplifier's ramps and channels to those that the protocol can express."""
+    """Limit an amplifier's ramps and channels to the range of the protocol."""
     quantities = PROTOCOL.quantities
     return replace(
         capabilities,

@@ -1,7 +1,7 @@
 """Playback of an amplifier as known to the host: confirmed sets, and those that were only sent.
 
-A set that was sent and not confirmed may play or not, since any moment since then; what is checked
-next must be allowed in either case. `Amplifier` records what it sends and what replies confirm.
+A set that was sent and not confirmed may or may not play since then; the next set must be allowed
+in either case. `Amplifier` records what it sends and what replies confirm.
 """
 
 import math
@@ -175,7 +175,7 @@ class PlayRecord:
 
     def _check_transition(self, command_set: CommandSet, now: float) -> None:
         if self._limits.slew == math.inf and not self._is_shaped(command_set):
-            return  # along one ramp nothing exceeds both what played and what will play
+            return  # along one ramp no level exceeds both the old and the new one
         try:
             self._check_from(self._states(self._pending, Interval(now, now)), command_set, now)
         except CommandRefused as refused:
@@ -266,12 +266,12 @@ class PlayRecord:
 
 
 def vibrates(command_set: CommandSet) -> bool:
-    """Whether a set drives any channel, and be it by an onset only."""
+    """Whether a set drives any channel, if only by an onset."""
     return any(command.level > 0 or command.onset for command in command_set.commands)
 
 
 def skips_endings(command_set: CommandSet) -> bool:
-    """Whether a silent set lets no channel follow an earlier ending."""
+    """Whether a silent set skips earlier endings on all channels."""
     return all(command.skip_ending for command in command_set.commands)
 
 
@@ -307,7 +307,7 @@ def states_after(
 
 
 def _upper_bounds_after(states: States, command_set: CommandSet, when: Interval) -> States:
-    """Return states after a set of ramps that bound its levels from above only."""
+    """Return states after a set of ramps, with upper bounds of its levels only."""
     tones = {command.channel: command for command in command_set.commands}
     ramp, valid_for = command_set.ramp, command_set.valid_for or math.inf
     return tuple(

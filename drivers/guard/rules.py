@@ -2,7 +2,7 @@
 
     token -> times -> channels -> finite -> level -> frequency -> slots -> power
 
-Every rule may rely on those before it. What depends on what plays is in `drivers.guard.record`.
+Every rule may rely on those before it. Rules that depend on the playback: `drivers.guard.record`.
 """
 
 import math

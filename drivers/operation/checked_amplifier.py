@@ -32,24 +32,24 @@ class CheckedAmplifier:
 
     async def arm(self, watchdog: float = WATCHDOG) -> Status:
         """Arm with a watchdog [s]; what was expected before is forgotten."""
-        begin = clock.now()
+        started_at = clock.now()
         status = await self.amplifier.arm(watchdog)
         check = self._new_check()
-        check.expect_armed(watchdog, sent_at=begin, now=clock.now())
+        check.expect_armed(watchdog, sent_at=started_at, now=clock.now())
         self._check_if_used = check
         return status
 
     async def apply(self, safe: SafeCommandSet) -> Achieved:
-        """Play a set now; returns what it really plays."""
-        check, begin = self._check, clock.now()
+        """Play a set now; returns the achieved set."""
+        check, started_at = self._check, clock.now()
         check.forget(safe)
         achieved = await self.amplifier.apply(safe)
-        check.expect(safe, sent_at=begin, now=clock.now())
+        check.expect(safe, sent_at=started_at, now=clock.now())
         check.check_achieved(safe, achieved)
         return achieved
 
     async def stage(self, safe: SafeCommandSet) -> Achieved:
-        """Keep a set ready under its token; returns what its commit would play."""
+        """Keep a set ready under its token; returns what its commit would achieve."""
         check = self._check
         achieved = await self.amplifier.stage(safe)
         check.check_achieved(safe, achieved)
@@ -65,11 +65,11 @@ class CheckedAmplifier:
         self._check.forget(safe)
 
     async def confirm_commit(self, safe: SafeCommandSet, *, sent_at: float) -> None:
-        """Read whether a set plays that was committed since a time [s], directly or by broadcast.
+        """Confirm by a status that a committed set plays; sent_at [s]: of its commit.
 
         Raises CommandRefused if it does not.
         """
-        check, begin = self._check, clock.now()
+        check, started_at = self._check, clock.now()
         status = await self.amplifier.status()
         if status.token != safe.token:
             raise CommandRefused(
@@ -77,7 +77,7 @@ class CheckedAmplifier:
                 "arm again"
             )
         check.expect(safe, sent_at=sent_at, now=clock.now())
-        check.check_status(status, sent_at=begin, now=clock.now())
+        check.check_status(status, sent_at=started_at, now=clock.now())
 
     async def heartbeat(self, *, may_feed: Callable[[], bool] = lambda: True) -> Status | None:
         """Feed the watchdog; on a degraded link only once the amplifier has replied as expected.
@@ -94,20 +94,20 @@ class CheckedAmplifier:
 
     async def _beat(self) -> Status:
         """Send a heartbeat and compare the status."""
-        check, begin, feeds = self._check, clock.now(), not self.amplifier.is_degraded
+        check, started_at, feeds = self._check, clock.now(), not self.amplifier.is_degraded
         status = await self.amplifier.heartbeat()
-        check.check_status(status, sent_at=begin, now=clock.now(), feeds=feeds)
+        check.check_status(status, sent_at=started_at, now=clock.now(), feeds=feeds)
         return status
 
     async def _check_running(self, check: PlausibilityCheck) -> None:
         """Read a status just before the watchdog is fed, unless the wire is too slow for that."""
-        begin, fed = clock.now(), self.amplifier.last_fed_at
+        started_at, fed = clock.now(), self.amplifier.last_fed_at
         pause = self.amplifier.round_trip() / _MAX_STATUS_LOAD
-        if fed is None or begin - self._running_checked_at < pause:
+        if fed is None or started_at - self._running_checked_at < pause:
             return
-        self._running_checked_at = begin
+        self._running_checked_at = started_at
         status = await self.amplifier.status()
-        check.check_running(status, sent_at=begin, last_fed_at=fed)
+        check.check_running(status, sent_at=started_at, last_fed_at=fed)
 
     @property
     def _check(self) -> PlausibilityCheck:

@@ -31,7 +31,7 @@ def no_long_collections() -> Iterator[None]:
 def without_collections() -> Iterator[None]:
     """Create objects, as in a thread: no collection visits them, nor afterwards if they are many.
 
-    Few are not excluded for good, as what is garbage by then would never be freed.
+    Few are collected as usual: excluded garbage is never freed.
     """
     with _building:
         is_outermost = gc.isenabled()

@@ -61,8 +61,8 @@ class PlausibilityCheck:
         self._fed: Interval | None = None
         self._achieved_problem: str | None = None
         self._contradictions = 0
-        self._is_of_level = False  # the last contradiction
-        self._standing_watchdog = 0  # statuses in a row in which it did not run down
+        self._was_about_level = False  # the last contradiction
+        self._stalled_watchdog_count = 0  # statuses in a row in which it did not run down
 
     def expect_armed(self, watchdog: float, *, sent_at: float, now: float) -> None:
         """Expect silence and a full watchdog [s] after an Arm was confirmed."""
@@ -71,7 +71,7 @@ class PlausibilityCheck:
         self._watchdog = _Q.watchdog.quantise(watchdog)
         self._fed = Interval(sent_at, now)
         self._achieved_problem = None
-        self._contradictions = self._standing_watchdog = 0
+        self._contradictions = self._stalled_watchdog_count = 0
 
     def forget(self, requested: SafeCommandSet) -> None:
         """Expect no levels: until a set that is sent is confirmed it may play or not."""
@@ -107,7 +107,7 @@ class PlausibilityCheck:
         self._achieved_problem = next(self._achieved_problems(requested, achieved), None)
         if self._achieved_problem is not None:
             self._contradictions += 1
-            self._is_of_level = False
+            self._was_about_level = False
             self._raise_if_fault(self._contradictions, self._achieved_problem)
 
     def check_status(
@@ -140,8 +140,8 @@ class PlausibilityCheck:
         )
         if problem or level_problem:
             self._contradictions += 1
-            self._is_of_level = problem is None
-        elif self._shows_levels(when) or not self._is_of_level:
+            self._was_about_level = problem is None
+        elif self._shows_levels(when) or not self._was_about_level:
             self._contradictions = 0
         problem = problem or level_problem
         self._raise_if_fault(self._contradictions, problem)
@@ -158,9 +158,9 @@ class PlausibilityCheck:
             return
         highest = self._watchdog - elapsed + _WATCHDOG_ERROR
         is_standing = status.watchdog_left > highest
-        self._standing_watchdog = self._standing_watchdog + 1 if is_standing else 0
+        self._stalled_watchdog_count = self._stalled_watchdog_count + 1 if is_standing else 0
         self._raise_if_fault(
-            self._standing_watchdog,
+            self._stalled_watchdog_count,
             f"watchdog left must be at most {highest:.3f} s {elapsed:.3f} s after it was fed, got "
             f"{status.watchdog_left:.3f} s",
         )

@@ -125,7 +125,7 @@ class SimulatedDevice:
         self._timers.clear()
 
     def _schedule(self, window: FaultWindow) -> None:
-        """Schedule the begin, middle and end of a fault window."""
+        """Schedule the start, middle and end of a fault window."""
         begin = self.faults.begin + window.at - clock.now()
         edges: dict[_Edge, float] = {
             "begin": begin,

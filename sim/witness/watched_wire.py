@@ -67,5 +67,5 @@ class WatchedWire:
         return time <= self._disturbed_until
 
     def set_disturbed(self, time: float, *, is_on: bool) -> None:
-        """Note the begin or the end of injected faults."""
+        """Note the start or the end of injected faults."""
         self._disturbed_until = math.inf if is_on else time + _RECOVERY

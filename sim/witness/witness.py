@@ -137,7 +137,7 @@ class Witness:
         self._host.set_stalled(time if is_stalled else None)
 
     def faults(self, time: float, link: str, *, are_on: bool) -> None:
-        """Note the begin or the end of injected faults on a wire or its amplifiers."""
+        """Note the start or the end of injected faults on a wire or its amplifiers."""
         self._advance(time)
         self._wires[link].set_disturbed(time, is_on=are_on)
         if not are_on:  # what amplifiers did meanwhile may be unseen

@@ -102,7 +102,7 @@ async def test_plate_control_times_out_when_the_plate_hangs(
     ids=["the daemon", "a web server", "no object", "no line"],
 )
 async def test_invalid_plate_reply_is_quoted_in_the_error(tmp_path: Path, said: bytes) -> None:
-    """The error quotes only the begin of a reply from another program."""
+    """The error quotes only the start of a reply from another program."""
     async with listening(tmp_path / "sock", saying(said)) as control:
         with pytest.raises(LinkError, match=r"/sock: .*--control") as caught:
             await control.request(HELLO)

@@ -52,7 +52,7 @@ class Signals:
 
 @dataclass(frozen=True)
 class Heard:
-    """A situation as it was on the plate, from begin to end on time.monotonic() [s].
+    """A situation as it was on the plate, from start to end on time.monotonic() [s].
 
     patterns: as the daemon reported them, the first after a delay [s]; steady,
     onset: what fingertips felt in the end and in the first 100 ms, by place; phasors (f, s) [m/s²]:

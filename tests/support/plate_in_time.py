@@ -73,7 +73,7 @@ def stepped_acceleration(
             slope, (start, stop), x, "DOP853", moments, rtol=1e-10, atol=1e-15, max_step=1e-4
         )
         for column, index in enumerate(inside):
-            # Just inside the piece, so that a jump at its begin has happened.
+            # Just inside the piece, so that a jump at its start has happened.
             result[index] = acceleration(max(times[index], start + 1e-12), solved.y[:, column])
         x = solved.y[:, -1]
     return result

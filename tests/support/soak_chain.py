@@ -75,7 +75,7 @@ class Trace:
         return self._hash.hexdigest()
 
     def note(self, time: float, *words: object) -> None:
-        """One line; time [s] since the begin."""
+        """One line; time [s] since the start."""
         line = f"{time:.9f} {' '.join(map(str, words))}\n"
         self._hash.update(line.encode())
         if self._file is not None:

@@ -71,6 +71,16 @@ RETIRED_WORDS = {
 }
 """Words within identifiers; they are split at underscores and capitals."""
 
+RETIRED_IN_DRIVERS = {
+    "asks?|asked|asking": "request, requested",
+    "wanted": "requested, expected",
+    "begin|begun": "start, started_at",
+    "places": "positions",
+}
+"""Words within identifiers of the packages that follow a touch to the wire."""
+
+DRIVER_PACKAGES = ("controller/", "drivers/", "era_haptics/", "registry/")
+
 CONTACT_PACKAGES = ("controller/sources/", "controller/loop/", "sim/")
 """Where `lease`, the word of arming, would mean the timeout of a contact."""
 
@@ -82,6 +92,8 @@ ALLOWED = {
     "most_at_once": "a key of the configuration file",
     "longest_lease": "a key of the configuration file",
     "hold": "a parameter of the effect `ramp`: the last level is held",
+    "places": "JSON of `era amp discover`",
+    "begin_armed": "a method of the public client",
     "CLOSE": "an event and an action of the daemon: it closes its amplifiers",
 }
 """Identifiers in which the word has its ordinary meaning, and which."""
@@ -130,6 +142,10 @@ def _replacement(name: str, file: str) -> str | None:
     for pattern, instead in RETIRED_WORDS.items():
         if re.search(rf"(?:^|_)(?:{pattern})(?:_|$)", words):
             return instead
+    if file.startswith(DRIVER_PACKAGES):
+        for pattern, instead in RETIRED_IN_DRIVERS.items():
+            if re.search(rf"(?:^|_)(?:{pattern})(?:_|$)", words):
+                return instead
     if file.startswith(CONTACT_PACKAGES) and re.search(r"(?:^|_)leases?(?:_|$)", words):
         return "contact_timeout"
     return None

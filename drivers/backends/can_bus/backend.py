@@ -214,8 +214,8 @@ class CanBackend(WireBackend):
         try:
             async with asyncio.timeout(_MAX_SDO_RESPONSES * timeout):
                 result = await asyncio.shield(future)
-        except TimeoutError as problem:
-            if isinstance(problem, LinkError):
+        except TimeoutError as error:
+            if isinstance(error, LinkError):
                 raise
             objects.abandon()
             future.add_done_callback(_forget)
@@ -267,10 +267,8 @@ class CanBackend(WireBackend):
 
 def _in_order_of(requested: Achieved, achieved: Achieved) -> Achieved:
     """Sort the achieved commands into the requested order."""
-    places = {command.channel: place for place, command in enumerate(requested.commands)}
-    commands = sorted(
-        achieved.commands, key=lambda command: places.get(command.channel, len(places))
-    )
+    order = {command.channel: number for number, command in enumerate(requested.commands)}
+    commands = sorted(achieved.commands, key=lambda command: order.get(command.channel, len(order)))
     return Achieved(achieved.token, tuple(commands))
 
 

@@ -86,7 +86,7 @@ def wake(bus: can.BusABC) -> None:
 class _TextBus(can.BusABC):
     """A bus with frames as text."""
 
-    def _begin(self) -> None:
+    def _reset(self) -> None:
         self._messages: deque[can.Message] = deque()
         self._unsent = b""
 
@@ -128,7 +128,7 @@ class _Socketcand(_TextBus):
     """A socketcand server."""
 
     def __init__(self, url: CanBusUrl) -> None:
-        self._begin()
+        self._reset()
         self._reader = SocketcandReader()
         self.channel_info = f"socketcand on {url.channel}@{url.host}:{url.port}"
         self._connection = socket.create_connection((url.host, url.port), timeout=_CONNECT_TIMEOUT)
@@ -201,7 +201,7 @@ class _Slcan(_TextBus, slcanBus):
     """A serial adapter with exclusive use of its port."""
 
     def __init__(self, url: CanBusUrl) -> None:
-        self._begin()
+        self._reset()
         self._reader = SlcanReader()
         self._is_ended = False
         slcanBus.__init__(

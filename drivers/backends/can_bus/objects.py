@@ -98,8 +98,8 @@ class ObjectClient:
 
     def feed(self, can_id: int, data: bytearray, timestamp: float) -> None:
         """Take a reply."""
-        is_wanted = self._busy and self._client.responses.qsize() < _WAITING_MAX
-        if is_wanted and len(data) == _LENGTH:
+        is_expected = self._busy and self._client.responses.qsize() < _WAITING_MAX
+        if is_expected and len(data) == _LENGTH:
             self._client.on_response(can_id, data, timestamp)
         else:
             self._counters.unexpected_frames += 1
@@ -122,8 +122,8 @@ class ObjectClient:
         def read() -> Identity:
             self._check_alone(timeout)
             texts = {
-                name: self._client.upload(index_of("texts"), place)
-                for place, name in enumerate(TEXTS, start=1)
+                name: self._client.upload(index_of("texts"), index)
+                for index, name in enumerate(TEXTS, start=1)
             }
             version = CAPABILITY_ENTRIES[0]
             data = self._client.upload(version.index, version.subindex)
@@ -231,14 +231,14 @@ class ObjectClient:
                 raise self._missed() from abort
             self._broken = False
             raise FrameError(f"node {self._node} refuses an SDO transfer ({abort})") from abort
-        except SdoCommunicationError as problem:
+        except SdoCommunicationError as error:
             raise LinkTimeout(
-                f"no reply from node {self._node} within {timeout * 1e3:g} ms ({problem}); "
+                f"no reply from node {self._node} within {timeout * 1e3:g} ms ({error}); "
                 "check that the amplifier is on, has this number, and that the bit rates agree"
-            ) from problem
-        except (RuntimeError, ValueError, struct.error) as problem:
+            ) from error
+        except (RuntimeError, ValueError, struct.error) as error:
             # `canopen` fails if the node has missed a part of the last block.
-            raise self._missed() from problem
+            raise self._missed() from error
         finally:
             self._busy = False
         self._broken = False

@@ -56,7 +56,7 @@ class ModbusBackend(WireBackend):
         super().__init__()
         self._url = ModbusUrl.parse(url)
         self._line: ModbusLine | None = None
-        self._host_lock = HostLock(f"{self._url.place}/{self._url.unit}")
+        self._host_lock = HostLock(f"{self._url.endpoint}/{self._url.unit}")
         # A random start, so that a response to an earlier run does not match.
         self._tag = number_below(_TAGS)
         self._can_read_back = True
@@ -67,7 +67,7 @@ class ModbusBackend(WireBackend):
     @property
     def bus(self) -> str:
         """The line: a broadcast reaches all its units."""
-        return f"modbus {self._url.place}"
+        return f"modbus {self._url.endpoint}"
 
     @property
     def wire_times(self) -> WireTimes:
@@ -118,7 +118,7 @@ class ModbusBackend(WireBackend):
 
     async def broadcast(self, request: Broadcast) -> None:
         """Write a commit or a stop to all units of the line."""
-        line = self._require(self._line, self._url.place, request)
+        line = self._require(self._line, self._url.endpoint, request)
         await line.broadcast(exchanges.encode_broadcast(request), self._sent)
 
     async def _check_alone(self, line: ModbusLine) -> None:
@@ -126,8 +126,8 @@ class ModbusBackend(WireBackend):
         await asyncio.sleep(DUPLICATE_WAIT)
         if line.has_duplicate_responder:
             raise LinkError(
-                f"several amplifiers respond as unit {self._url.unit} on {self._url.place}; give "
-                "each its own unit"
+                f"several amplifiers respond as unit {self._url.unit} on {self._url.endpoint}; "
+                "give each its own unit"
             )
 
     def _next_tag(self) -> int:
@@ -153,7 +153,7 @@ class ModbusBackend(WireBackend):
             return await self._refusal(response, tag, transact), ()
         self._report_change(request, response)
         if isinstance(request, Hello) and self._url.is_rtu:
-            await self._check_alone(self._require(self._line, self._url.place, request))
+            await self._check_alone(self._require(self._line, self._url.endpoint, request))
         return exchanges.decode_reply(request, response.registers), response.registers
 
     async def _carry_out(self, exchange: Exchange, tag: int, transact: _Transact) -> ModbusResponse:
@@ -182,7 +182,7 @@ class ModbusBackend(WireBackend):
                 return True
             return exchanges.is_of(response.registers, tag=tag)
 
-        response = await self._require(self._line, self._url.place, request).transact(
+        response = await self._require(self._line, self._url.endpoint, request).transact(
             read,
             write,
             unit=self._url.unit,
@@ -193,7 +193,7 @@ class ModbusBackend(WireBackend):
         )
         if response.exception in _GATEWAY:
             raise LinkTimeout(
-                f"gateway {self._url.place}: no response from unit {self._url.unit}; "
+                f"gateway {self._url.endpoint}: no response from unit {self._url.unit}; "
                 "check that the amplifier is switched on and has this unit"
             )
         return response
@@ -211,7 +211,7 @@ class ModbusBackend(WireBackend):
             return nak
         # A late exception to an earlier write, so the response to this one is missing.
         raise LinkTimeout(
-            f"unit {self._url.unit} on {self._url.place}: Modbus exception {response.exception} "
+            f"unit {self._url.unit} on {self._url.endpoint}: Modbus exception {response.exception} "
             "without a reason for this request"
         )
 

@@ -34,7 +34,7 @@ class ModbusLine(SharedLine[Port]):
     address_term = "unit"
 
     def __init__(self, url: ModbusUrl) -> None:
-        super().__init__(url.place)
+        super().__init__(url.endpoint)
         self.url = url
         self.counters = WireCounters()
         self._last_sent_at = 0.0

@@ -37,9 +37,9 @@ class _Connection(asyncio.Protocol):
     """A TCP connection."""
 
     def __init__(
-        self, place: str, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+        self, endpoint: str, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
     ) -> None:
-        self._place = place
+        self._endpoint = endpoint
         self._on_data = on_data
         self._on_loss = on_loss
         self._is_closed = False
@@ -57,8 +57,8 @@ class _Connection(asyncio.Protocol):
             self._is_closed = True
             why = str(exc) if exc else "closed by the other side"
             self._on_loss(
-                f"the Modbus connection to {self._place} was lost ({why}): check the amplifier and "
-                "the network, then open the amplifier again"
+                f"the Modbus connection to {self._endpoint} was lost ({why}): check the amplifier "
+                "and the network, then open the amplifier again"
             )
 
     @property
@@ -67,7 +67,7 @@ class _Connection(asyncio.Protocol):
 
     def write(self, data: bytes) -> None:
         if self._transport.get_write_buffer_size() > _UNSENT_MAX:
-            raise LinkTimeout(f"{self._place}: write blocked; check the network")
+            raise LinkTimeout(f"{self._endpoint}: write blocked; check the network")
         self._transport.write(data)
 
     def close(self) -> None:
@@ -83,17 +83,19 @@ async def _connect(
 ) -> Port:
     try:
         async with asyncio.timeout(_CONNECT_TIMEOUT):
-            return await _first_to_answer(line, lambda: _Connection(line.place, on_data, on_loss))
+            return await _first_to_answer(
+                line, lambda: _Connection(line.endpoint, on_data, on_loss)
+            )
     except TimeoutError:
         raise LinkError(
-            f"{line.place}: no connection within {_CONNECT_TIMEOUT:g} s; check the address, the "
+            f"{line.endpoint}: no connection within {_CONNECT_TIMEOUT:g} s; check the address, the "
             "network and that the amplifier is switched on"
         ) from None
-    except OSError as problem:
+    except OSError as error:
         raise LinkError(
-            f"{line.place}: Modbus connection refused; check the address and the port, and that "
-            f"the amplifier is switched on (the system says: {system_message(problem)})"
-        ) from problem
+            f"{line.endpoint}: Modbus connection refused; check the address and the port, and that "
+            f"the amplifier is switched on (the system says: {system_message(error)})"
+        ) from error
 
 
 async def _first_to_answer(line: ModbusUrl, make: Callable[[], _Connection]) -> Port:

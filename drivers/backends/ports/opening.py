@@ -46,8 +46,8 @@ async def open_port(
         port = await in_thread(
             lambda: _open_port(name, baud, parity, stop), name=f"era-open {name}", undo=close_port
         )
-    except _FAILURES as problem:
-        raise LinkError(_why_not_open(name, problem)) from problem
+    except _FAILURES as error:
+        raise LinkError(_why_not_open(name, error)) from error
     return WatchedPort(port, name, on_data, on_loss)
 
 
@@ -76,13 +76,13 @@ def _open_port(name: str, baud: int, parity: str, stop: int) -> serial.Serial:
     return port
 
 
-def _why_not_open(port: str, problem: Exception) -> str:
-    remedy = remedy_of(problem)
+def _why_not_open(port: str, error: Exception) -> str:
+    remedy = remedy_of(error)
     if remedy is None and port.startswith(("socket://", "rfc2217://")):
         remedy = "no server there; check the address, and that the serial server runs"
     elif remedy is None and port.startswith("hwgrep://"):
         remedy = "no port matches; list them: python -m serial.tools.list_ports -v"
     elif remedy is None:
         remedy = "check its name, the plug, its speed and its parity"
-    said = system_message(problem)
+    said = system_message(error)
     return f"serial port {port} cannot be opened: {remedy} (the system says: {said})"

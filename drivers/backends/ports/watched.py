@@ -46,7 +46,7 @@ class WatchedPort:
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._descriptor = descriptor(port)
-        self._writer = make_writer(port, lambda error: self._lose(self._what_was_lost(error)))
+        self._writer = make_writer(port, lambda error: self._lose(self._loss_message(error)))
         if self._descriptor is not None:
             self._loop.add_reader(self._descriptor, self._readable)
             return
@@ -57,10 +57,10 @@ class WatchedPort:
         """Send bytes, as soon as the port takes them; raises LinkError."""
         try:
             self._writer.write(data)
-        except OSError as problem:
-            cause = self._what_was_lost(problem)
+        except OSError as error:
+            cause = self._loss_message(error)
             self._lose(cause)
-            raise LinkError(cause) from problem
+            raise LinkError(cause) from error
 
     @property
     def is_blocked(self) -> bool:
@@ -92,13 +92,13 @@ class WatchedPort:
             data = os.read(self._descriptor, _READ_MAX)
         except BlockingIOError:
             return
-        except OSError as problem:
-            self._lose(self._what_was_lost(problem))
+        except OSError as error:
+            self._lose(self._loss_message(error))
             return
         if data:
             self._on_data(data)
         else:
-            self._lose(self._what_was_lost("end of file"))
+            self._lose(self._loss_message("end of file"))
 
     def _ignore(self) -> None:
         self._writer.close()
@@ -116,9 +116,9 @@ class WatchedPort:
                     if data:
                         data += port.read(port.in_waiting)
                         post(self._received, data)
-            except (OSError, TypeError) as problem:  # TypeError: closed during a read
+            except (OSError, TypeError) as error:  # TypeError: closed during a read
                 if not self._closing.is_set():
-                    post(self._lose, self._what_was_lost(problem))
+                    post(self._lose, self._loss_message(error))
 
     def _received(self, data: bytes) -> None:
         if not self._closing.is_set():
@@ -131,9 +131,9 @@ class WatchedPort:
         self._ignore()
         self._on_loss(cause)
 
-    def _what_was_lost(self, problem: Exception | str) -> str:
+    def _loss_message(self, error: Exception | str) -> str:
         return (
-            f"serial line {self._name} was lost ({problem}): check the cable and the adapter, "
+            f"serial line {self._name} was lost ({error}): check the cable and the adapter, "
             "then open the amplifier again"
         )
 
@@ -154,9 +154,9 @@ def connection_of(port: serial.Serial) -> socket.socket | None:
     return getattr(port, "_socket", None) if is_server else None
 
 
-def remedy_of(problem: Exception) -> str | None:
+def remedy_of(error: Exception) -> str | None:
     """Return the remedy for an opening error by its error code, if there is one."""
-    cause: BaseException | None = problem
+    cause: BaseException | None = error
     code = None
     while cause is not None and code is None:
         code = getattr(cause, "errno", None)

@@ -147,9 +147,9 @@ class SerialBackend(WireBackend):
 
     def _received(self, frame: Frame) -> None:
         if trace.is_active():
-            asked = self._pending.request if self._pending is not None else None
+            request = self._pending.request if self._pending is not None else None
             data = encode_frame(frame)
-            trace.frame(Direction.IN, data, self._url.port, lambda: _meaning(frame, asked))
+            trace.frame(Direction.IN, data, self._url.port, lambda: _meaning(frame, request))
         self._counters.frames_in += 1
         if frame.address == self._url.address and is_event(frame):
             self._notify(frame)
@@ -170,8 +170,8 @@ class SerialBackend(WireBackend):
         self._last_reply = frame
         try:
             pending.reply.set_result(decode_reply(frame, pending.request))
-        except DriverError as problem:
-            pending.reply.set_exception(problem)
+        except DriverError as error:
+            pending.reply.set_exception(error)
 
     def _notify(self, frame: Frame) -> None:
         try:
@@ -189,9 +189,9 @@ class SerialBackend(WireBackend):
         if not was_waiting:
             self._on_loss(cause)
 
-    def _fail(self, problem: LinkError) -> None:
+    def _fail(self, error: LinkError) -> None:
         if self._pending is not None and not self._pending.reply.done():
-            self._pending.reply.set_exception(problem)
+            self._pending.reply.set_exception(error)
 
 
 def _meaning(frame: Frame, request: Frame | None) -> str:

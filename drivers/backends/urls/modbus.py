@@ -38,7 +38,7 @@ class ModbusUrl:
         return replace(self, unit=0)
 
     @property
-    def place(self) -> str:
+    def endpoint(self) -> str:
         """Name of the line in messages."""
         return self.device or f"{self.host}:{self.port}"
 

@@ -17,8 +17,8 @@ def split_url(url: str, *, kind: str, forms: str, has_port: bool = True) -> Spli
     try:
         parts = urlsplit(url)
         _ = has_port and parts.port
-    except ValueError as problem:
-        raise CommandError(f"{url!r} must be {kind} URL: {problem}; use {forms}") from None
+    except ValueError as error:
+        raise CommandError(f"{url!r} must be {kind} URL: {error}; use {forms}") from None
     return parts
 
 

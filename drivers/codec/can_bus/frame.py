@@ -92,7 +92,7 @@ def command_id(node: int, channel: int) -> int:
 _FUNCTION = 0x780  # bits of a COB-ID besides the node
 _KINDS: Mapping[int, str] = {
     **{base: kind for kind, base in CANOPEN["cob_ids"].items() if kind != "sync"},
-    **{cob_id("command") + 0x100 * place: "command" for place in range(4)},
+    **{cob_id("command") + 0x100 * index: "command" for index in range(4)},
 }
 
 

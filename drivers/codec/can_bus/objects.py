@@ -111,9 +111,9 @@ def unpack_achieved(data: bytes) -> Achieved:
     count = cursor.integer(_Q.channel_count)
     commands = []
     each = BLOCK + 2
-    for begin in range(3, 3 + each * count, each):
-        values = LAYOUTS["command"].unpack(data[begin : begin + BLOCK])
-        slots = data[begin + BLOCK : begin + each]
+    for start in range(3, 3 + each * count, each):
+        values = LAYOUTS["command"].unpack(data[start : start + BLOCK])
+        slots = data[start + BLOCK : start + each]
         if values is None or len(slots) < 2:
             raise FrameError(f"invalid achieved set: {data.hex(' ')}")
         checked = (

@@ -85,8 +85,8 @@ class CanReplyReader:
             self._condition = _unpack("condition", data[BLOCK : 2 * BLOCK])
             count = min(self._condition["channel_count"], _Q.channel_count.maximum)
             for group in range(-(-count // CANOPEN["channels_per_node"])):
-                begin = (2 + group) * BLOCK
-                self._levels[group] = _unpack("levels", data[begin : begin + BLOCK])
+                start = (2 + group) * BLOCK
+                self._levels[group] = _unpack("levels", data[start : start + BLOCK])
         values = _unpack("answer", data[:BLOCK])
         sequence, action, result = values["sequence"], values["action"], values["result"]
         if result not in (0, _INCOMPLETE_SET) and result not in _NAKS:
@@ -118,7 +118,7 @@ class CanReplyReader:
         groups = [self._levels.get(group, {}) for group in range(-(-count // each))]
         if any(group.get("sequence") != reply["sequence"] for group in groups):
             return None
-        levels = [group[f"level_{place}"] for group in groups for place in range(each)][:count]
+        levels = [group[f"level_{index}"] for group in groups for index in range(each)][:count]
         if not (
             _Q.channel_count.holds(count)
             and all(_Q.level.holds(level) for level in levels)

@@ -161,10 +161,10 @@ def _slots(commands: tuple[DriveCommand, ...], node: int, sequence: int) -> list
     groups: dict[int, dict[str, int]] = {}
     for command in commands:
         if command.onset or command.ending:
-            group, place = divmod(command.channel, each)
+            group, index = divmod(command.channel, each)
             slots = groups.setdefault(group, {})
-            slots[f"onset_{place}"] = _Q.envelope_slot.to_wire(command.onset)
-            slots[f"ending_{place}"] = _Q.envelope_slot.to_wire(command.ending)
+            slots[f"onset_{index}"] = _Q.envelope_slot.to_wire(command.onset)
+            slots[f"ending_{index}"] = _Q.envelope_slot.to_wire(command.ending)
     return [
         CanFrame(
             cob_id("slots", node),

@@ -126,7 +126,7 @@ class ResponseReader:
             int.from_bytes(self._buffer[at : at + 2], "big") for at in (0, 2, 4)
         )
         if protocol != 0 or not 2 <= length <= _LENGTH_MAX:
-            self.clear()  # the begin of the next frame is unknown
+            self.clear()  # the start of the next frame is unknown
             return None
         end = _MBAP - 1 + length
         if len(self._buffer) < end:

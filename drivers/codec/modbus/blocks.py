@@ -28,7 +28,7 @@ from drivers.protocol.messages import (
 
 _MAP = PROTOCOL.modbus
 _Q = PROTOCOL.quantities
-HEAD = len(_MAP["head"])  # registers at the begin of every block
+HEAD = len(_MAP["head"])  # registers at the start of every block
 CHANNEL_SIZE: int = _MAP["channel_registers"]
 FAULT_SIZE: int = _MAP["fault_registers"]
 TEXT_SIZE: int = _MAP["text_registers"]
@@ -148,8 +148,8 @@ def unpack_achieved(registers: Sequence[int]) -> Achieved:
 def _command(channel: int, group: Sequence[int]) -> DriveCommand:
     frequency, level, phase, flags = group
     shape = {
-        name: flags >> place["bit"] & (1 << place["bits"]) - 1
-        for name, place in _MAP["flags"].items()
+        name: flags >> index["bit"] & (1 << index["bits"]) - 1
+        for name, index in _MAP["flags"].items()
     }
     return DriveCommand(
         channel=channel,

@@ -8,10 +8,10 @@ from typing import cast
 
 import pytest
 
+from controller.api.admission import MAX_CONNECTIONS, Admission
 from controller.api.connection import MAX_REQUEST_RATE, MAX_UNREAD_BYTES, Connection
 from controller.api.hub import Hub
 from controller.api.methods import METHODS
-from controller.api.places import MAX_CONNECTIONS, Places
 from controller.api.schema import MAX_RATE, Message
 from controller.api.server import ApiServer
 from controller.api.topics import ContactsEvent
@@ -208,7 +208,7 @@ def test_place_is_taken_from_the_silent_then_idle_subscribers_then_the_idle(
 ) -> None:
     """Never from a holder of the lease or one that waits; kind and silence [s] of each client."""
     made: list[tuple[Connection, str]] = []
-    places = Places(
+    admission = Admission(
         is_kept=lambda one: (one, "kept") in made,
         is_subscribed=lambda one: (one, "subscribed") in made,
         clock=lambda: 100.0,
@@ -218,11 +218,11 @@ def test_place_is_taken_from_the_silent_then_idle_subscribers_then_the_idle(
         connection.has_spoken = kind != "silent"
         connection.pending = {cast("asyncio.Task[None]", None)} if kind == "pending" else set()
         made.append((connection, kind))
-        places.taken.add(connection)
+        admission.admitted.add(connection)
     new, _ = connect(lambda: 100.0)
-    places.take(new)
+    admission.admit(new)
     assert new.is_reserve is (dropped is None)
-    gone = [number for number, (one, _) in enumerate(made) if one not in places.taken]
+    gone = [number for number, (one, _) in enumerate(made) if one not in admission.admitted]
     assert gone == ([] if dropped is None else [dropped])
 
 

@@ -69,7 +69,7 @@ async def test_client_connects_again_with_subscriptions_and_lease(tmp_path: Path
     async with ready_daemon(tmp_path) as (bench, era):
 
         async def drop() -> None:
-            for connection in list(bench.daemon._server._places.taken):
+            for connection in list(bench.daemon._server._admission.admitted):
                 connection.abort()
             await asyncio.sleep(0)
 
@@ -262,9 +262,9 @@ def test_client_refuses_invalid_arguments(tmp_path: Path) -> None:
     with responding(tmp_path / "s", HELLO), Client.connect(tmp_path / "s") as era:
         for call, words in [
             (lambda: era.arm("me", lease_s=0.5), "arm: lease_s .*got 0.5"),
-            (lambda: era.touch(0.1), "touch: places .*got 0.1"),  # type: ignore[arg-type]
-            (lambda: era.touch((0.1, 0.05)), "place .*got 0.1"),  # type: ignore[arg-type]
-            (lambda: era.play("tap", (0.1, 0.1, 0.1)), "place "),  # type: ignore[arg-type]
+            (lambda: era.touch(0.1), "touch: positions .*got 0.1"),  # type: ignore[arg-type]
+            (lambda: era.touch((0.1, 0.05)), "position .*got 0.1"),  # type: ignore[arg-type]
+            (lambda: era.play("tap", (0.1, 0.1, 0.1)), "position "),  # type: ignore[arg-type]
             (lambda: era.subscribe("weather"), "subscribe: topics.0"),  # type: ignore[arg-type]
             (lambda: Client.connect(tmp_path / "s", name="a\nb"), r"client .*got 'a\\nb'$"),
         ]:

@@ -231,7 +231,7 @@ def test_power_counts_tones_that_fade_below_envelopes() -> None:
 
 
 def test_slew_limits_the_rise_of_knots() -> None:
-    """Within an envelope, from its begin, and from its last knot to the command's level."""
+    """Within an envelope, from its start, and from its last knot to the command's level."""
     strict = guard(slew=10.0)
     with pytest.raises(CommandRefused, match=r"slot 1: .*0\.2"):
         strict.check_envelope(Envelope(1, 0.01, (Knot(0.1, 0.0), Knot(0.3, 0.0))))

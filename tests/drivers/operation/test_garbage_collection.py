@@ -6,7 +6,7 @@ from drivers.operation.garbage_collection import no_long_collections, without_co
 
 
 def test_present_objects_are_frozen_during_the_context() -> None:
-    """All objects present at its begin, and none afterwards."""
+    """All objects present at its start, and none afterwards."""
     with no_long_collections():
         assert gc.get_freeze_count() > 1000
     assert gc.get_freeze_count() == 0

@@ -290,4 +290,4 @@ async def test_honest_amplifier_is_never_contradicted(seed: int) -> None:
             # The next pauses are not longer than half the watchdog time.
             overdue = clock.now() - (bench.amplifier.last_fed_at or 0.0) > WATCHDOG / 2
             await bench.read(feeds=overdue or rng.random() < 0.7)
-            assert bench.check._contradictions == bench.check._standing_watchdog == 0
+            assert bench.check._contradictions == bench.check._stalled_watchdog_count == 0

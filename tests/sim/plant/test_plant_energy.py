@@ -32,7 +32,7 @@ PERIODS: list[tuple[float, Sequence[PointLoad]]] = [
 
 @dataclass(frozen=True, eq=False)
 class Books:
-    """Energies [J] of a stretch of time: put in by the bases, lost; stored at its begin and end."""
+    """Energies [J] of a stretch of time: put in by the bases, lost; stored at its start and end."""
 
     put_in: float
     lost: float

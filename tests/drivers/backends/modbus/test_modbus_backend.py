@@ -269,7 +269,7 @@ async def test_damaged_response_is_discarded(far: Peer, backend: ModbusBackend, 
         assert await backend.exchange(Ping(), timeout=PATIENCE / 10) == ARMED
     except LinkTimeout:
         assert not far.is_rtu
-        assert place == 5  # a greater length includes the begin of the next frame
+        assert place == 5  # a greater length includes the start of the next frame
     counters = backend.counters
     assert counters.invalid_frames + counters.unexpected_frames >= 1
     far.answer = far.usual

@@ -1,22 +1,22 @@
-"""Places of clients at the API server: some for all methods, and some in reserve to silence.
+"""Admission of clients to the API server, with connections in reserve for methods that silence.
 
-However many clients there are, `stop` finds a place. A client that has sent nothing yet is evicted
-first, then an idle subscriber, then any idle client; one that holds the arming lease, or waits for
-a response, never is. Among reserved places, a silent client is evicted first.
+However many clients there are, another one can connect and `stop`. A client that has sent nothing
+yet is evicted first, then an idle subscriber, then any idle client; never one that holds the arming
+lease or waits for a response. In reserve, a silent client is evicted first.
 """
 
 from collections.abc import Callable
 
 from controller.api.connection import Connection
 
-MAX_CONNECTIONS = 32  # places for all methods
-RESERVE = 8  # places for RESERVE_METHODS alone
+MAX_CONNECTIONS = 32  # for all methods
+RESERVE = 8  # further ones, for RESERVE_METHODS alone
 RESERVE_METHODS = frozenset({"hello", "status", "stop", "disarm"})
 IDLE_TIMEOUT = 1.0  # s; without a request, after which a client may be evicted
 SILENT_TIMEOUT = 0.1  # s; the same for one that has sent nothing yet
 
 
-class Places:
+class Admission:
     """The connected clients; is_kept: holds the lease; is_subscribed: has subscriptions."""
 
     def __init__(
@@ -26,32 +26,32 @@ class Places:
         is_subscribed: Callable[[Connection], bool],
         clock: Callable[[], float],
     ) -> None:
-        self.taken: set[Connection] = set()
+        self.admitted: set[Connection] = set()
         self._is_kept = is_kept
         self._is_subscribed = is_subscribed
         self._clock = clock
 
-    def take(self, new: Connection) -> None:
-        """Give a new client a place, if necessary another one's, or close it if there is none."""
-        new.is_reserve = not self._has_full_place()
+    def admit(self, new: Connection) -> None:
+        """Admit a new client, if necessary in place of another, or close it."""
+        new.is_reserve = not self._has_room()
         if new.is_reserve:
-            reserve = [each for each in self.taken if each.is_reserve]
+            reserve = [each for each in self.admitted if each.is_reserve]
             waiting = [each for each in reserve if not each.pending]
             if len(reserve) >= RESERVE and not waiting:
                 new.abort()
                 return
             if len(reserve) >= RESERVE:
                 self._drop(min(waiting, key=lambda each: (each.has_spoken, each.received_at)))
-        self.taken.add(new)
+        self.admitted.add(new)
 
     def promote(self, one: Connection) -> bool:
-        """Whether a client now has a place for all methods."""
-        if one.is_reserve and self._has_full_place():
+        """Whether a client is now served all methods."""
+        if one.is_reserve and self._has_room():
             one.is_reserve = False
         return not one.is_reserve
 
-    def _has_full_place(self) -> bool:
-        full = [each for each in self.taken if not each.is_reserve]
+    def _has_room(self) -> bool:
+        full = [each for each in self.admitted if not each.is_reserve]
         if len(full) < MAX_CONNECTIONS:
             return True
         candidates = [each for each in full if not each.pending and not self._is_kept(each)]
@@ -68,5 +68,5 @@ class Places:
         return True
 
     def _drop(self, one: Connection) -> None:
-        self.taken.discard(one)
+        self.admitted.discard(one)
         one.abort()

@@ -8,14 +8,14 @@ import numpy as np
 from model.errors import InputError
 from model.table.question import Point
 
-Places: TypeAlias = Sequence[float] | Sequence[Sequence[float]]
+Positions: TypeAlias = Sequence[float] | Sequence[Sequence[float]]
 """One position x, y [m], or several; also an array of shape (2,) or (n, 2)."""
 
 
-def as_points(places: Places, *, what: str) -> tuple[Point, ...]:
+def as_points(positions: Positions, *, what: str) -> tuple[Point, ...]:
     """Positions for a question; what: the argument, for the InputError."""
     try:
-        found = np.asarray(places, dtype=float)
+        found = np.asarray(positions, dtype=float)
     except (TypeError, ValueError):
         found = np.empty(1)
     if found.size == 0:
@@ -23,6 +23,6 @@ def as_points(places: Places, *, what: str) -> tuple[Point, ...]:
     if found.ndim > 2 or found.shape[-1:] != (2,):
         raise InputError(
             f"{what} must be x, y in metres from the corner SW, such as (0.08, 0.06), or a list of "
-            f"these, got {places!r}"
+            f"these, got {positions!r}"
         )
     return tuple((float(x), float(y)) for x, y in found.reshape(-1, 2))

@@ -4,6 +4,7 @@ import fcntl
 import gc
 import os
 import signal
+from collections.abc import Iterator
 from functools import lru_cache, partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -84,6 +85,16 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if asked not in ("alone", "real_time") or collection_path.suffix != ".py":
         return None
     return True if f"mark.{asked}" not in collection_path.read_text("utf-8") else None
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Collect no garbage while tests are collected: there is hardly any."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

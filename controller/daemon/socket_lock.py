@@ -55,7 +55,7 @@ class SocketLock:
     def bind(self) -> socket.socket:
         """Bind a socket with mode 0600, or 0660 in a folder that is accessible to a group only.
 
-        Raises InputError.
+        It listens: a client that sees the file is not refused. Raises InputError.
         """
         bound = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
         # systemd's RuntimeDirectoryMode=0750 shares the folder with the service's group.
@@ -64,6 +64,7 @@ class SocketLock:
         before = os.umask(0o117 if is_shared else 0o177)
         try:
             bound.bind(str(self.path))
+            bound.listen()
         except OSError as error:
             bound.close()
             raise InputError(f"{self.path}: bind failed: {error.strerror}; {_REMEDY}") from error

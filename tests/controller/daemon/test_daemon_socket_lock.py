@@ -1,6 +1,7 @@
 """The daemon's socket: reserved for one daemon, with permissions, in a safe place."""
 
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -25,6 +26,14 @@ def test_socket_is_for_its_user_only(tmp_path: Path) -> None:
         assert not lock.path.exists()
     finally:
         os.umask(before)
+
+
+def test_client_that_sees_the_socket_is_not_refused(tmp_path: Path) -> None:
+    """It waits until the daemon serves."""
+    lock = SocketLock(tmp_path / "era.sock")
+    with lock.bind(), socket.socket(socket.AF_UNIX) as client:
+        client.connect(str(lock.path))
+    lock.release()
 
 
 @pytest.mark.parametrize(("folder", "mode"), [(0o750, 0o660), (0o755, 0o600), (0o710, 0o660)])

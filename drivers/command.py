@@ -3,11 +3,11 @@
     Pattern          model: an `Excitation` in Hz, metres and radians per ERA, with its measures
     CommandSet       routing turns an excitation into one `DriveCommand` per channel
     SafeCommandSet   a command set that a guard has checked; the only one that is encoded
-    Achieved         the reply: what the amplifier really plays
+    Achieved         the reply: the set as the amplifier quantises it
 
 An envelope shapes the transition of a channel: its complex amplitude (level and phase) is linear
 between knots a fixed step apart, starts at the present amplitude, and reaches that of the command
-one step after the last knot. So the output never jumps.
+one step after the last knot. So the output is continuous.
 """
 
 import cmath

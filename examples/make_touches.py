@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from controller.sources.capture import Datagram, write_capture
+from controller.sources.capture import RecordedDatagram, write_capture
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
 
@@ -63,7 +63,7 @@ def main() -> None:
                 x, y = place + roll * max(0.0, 1 - (time - down) / SETTLING)
                 alive.append(Touch(id, float(x / LENGTH), float(1 - y / WIDTH)))
         frame = TouchFrame("demo", float(time), tuple(alive))
-        datagrams.append(Datagram(float(time), tuio_datagram(frame, number)))
+        datagrams.append(RecordedDatagram(float(time), tuio_datagram(frame, number)))
     write_capture(Path(__file__).with_name("touches.tuio"), datagrams)
     print(f"{len(touches)} touches in {end:.1f} s")
 

@@ -14,7 +14,7 @@ import pytest
 from controller.cli.main import run
 from controller.effects.buzz import Buzz
 from controller.effects.effect import Effect
-from controller.effects.layout import Layout
+from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.registry import effect_kind, effect_kinds
 from controller.sources.contacts import Contact, ContactKey
@@ -70,7 +70,7 @@ class Kind:
 
 def play_effect(kind: type[Effect]) -> None:
     """Touch a plate whose layout has this effect everywhere."""
-    layout = Layout((), effects={"it": kind()}, elsewhere="it")
+    layout = SurfaceLayout((), effects={"it": kind()}, elsewhere="it")
     EffectPlayer(layout).intent([Contact(ContactKey("s", 1), 0.1, 0.1, 0.0)], 0.0)
 
 

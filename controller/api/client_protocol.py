@@ -49,7 +49,7 @@ class Unreachable(LinkError):
 
 
 class LeaseLost(RpcError):
-    """The lease of `armed` ended within its block: nothing is felt any more."""
+    """The lease of `armed` ended within its block: vibration has stopped."""
 
     def __init__(self, what: str) -> None:
         super().__init__(ErrorCode.LEASE, f"lease lost: {what}", remedy="arm again")

@@ -71,7 +71,7 @@ class Hub:
     def publish(self, topic: Topic, make_data: Callable[[], Message | None]) -> None:
         """Send to all subscribers; make_data is called only if there are any.
 
-        Nothing is sent if it returns None: the data is out of date by then.
+        Nothing is sent if it returns None, for outdated data.
         """
         if topic not in _COALESCED:
             self._send(self._subscribers(topic), topic, make_data)

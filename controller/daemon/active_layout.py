@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import EffectsResult, PlayParams
 from controller.api.schema import EffectDescription
-from controller.effects.layout import Layout
+from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.loop.intent import HapticIntent
 from controller.loop.selection import MAX_DB_SL
@@ -19,14 +19,14 @@ PLAY_RADIUS = 0.020
 class ActiveLayout:
     """Plays the effects of a layout, and effects requested by name."""
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: SurfaceLayout) -> None:
         self._player = EffectPlayer(layout)
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
         """Return which contacts shall feel what at a time [s]; see `IntentSource`."""
         return self._player.intent(contacts, now)
 
-    def replace(self, layout: Layout) -> None:
+    def replace(self, layout: SurfaceLayout) -> None:
         """Replace the layout; effects of a press are not repeated for fingers that rest."""
         self._player = EffectPlayer(layout, already_pressed=self._player.fingers)
 

@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 from controller.api.socket_path import default_socket
 from controller.daemon.config_sections import CalibrationSection, DaemonSection, TouchSection
-from controller.effects.layout import Layout, default_effects
+from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.layout_file import is_layout_document, load_layout
 from controller.sources.calibration import CalibratedSource, TouchCalibration, fitted, turned
 from controller.sources.registry import open_source
@@ -56,16 +56,16 @@ class DaemonConfig:
     rig_text: str
     urls: Mapping[str, str]
     table: Path | None
-    layout: Layout | None
+    layout: SurfaceLayout | None
     touch: tuple[TouchInput, ...]
     socket: Path
     log_file: Path | None
     dump_folder: Path | None
 
     @cached_property
-    def effective_layout(self) -> Layout:
+    def effective_layout(self) -> SurfaceLayout:
         """The layout, or one that buzzes at every touch if none is configured."""
-        return self.layout or Layout(effects=default_effects(self.section.level_db_sl))
+        return self.layout or SurfaceLayout(effects=default_effects(self.section.level_db_sl))
 
 
 def load_daemon_config(path: Path) -> DaemonConfig:
@@ -152,7 +152,7 @@ def _rig(validation: Validation[DaemonSection], file: Path | None) -> tuple[Rig 
 
 def _layout(
     validation: Validation[DaemonSection], document: Document, rig: Rig | None
-) -> Layout | None:
+) -> SurfaceLayout | None:
     """Load the surface layout; problems are reported at the key that names it."""
     file = _file(document, "layout")
     if file is None:

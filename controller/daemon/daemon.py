@@ -16,7 +16,7 @@ from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.dashboard_token import write_token
 from controller.daemon.fault_dumps import FaultDumps
 from controller.daemon.log import LogThread
-from controller.daemon.message_recorder import RecordedBackend, Recorder
+from controller.daemon.message_recorder import MessageRecorder, RecordedBackend
 from controller.daemon.publisher import EventPublisher
 from controller.daemon.reload import DEFERRED, changed_keys, plan_reload
 from controller.daemon.service_manager import ServiceManager
@@ -69,7 +69,7 @@ class Daemon:
         self._is_reload_pending = False
         self._shutdown = asyncio.Event()
         self._shutdown_cause = "the daemon is shutting down"
-        self._recorder = Recorder()
+        self._recorder = MessageRecorder()
         self._dumps = FaultDumps(self._recorder)
         backends = self._make_backends(config)
         amplifiers = {

@@ -10,7 +10,7 @@ from dataclasses import asdict, is_dataclass
 from enum import Enum
 from pathlib import Path
 
-from controller.daemon.message_recorder import Record, Recorder
+from controller.daemon.message_recorder import MessageRecord, MessageRecorder
 from drivers import clock
 
 DUMP_PATTERN = "era-fault-*.jsonl"
@@ -27,7 +27,7 @@ class FaultDumps:
     One dump at a time, so that a hanging disk costs one thread.
     """
 
-    def __init__(self, recorder: Recorder) -> None:
+    def __init__(self, recorder: MessageRecorder) -> None:
         self._recorder = recorder
         self._written_at = float("-inf")
         self._writer: threading.Thread | None = None
@@ -53,7 +53,7 @@ class FaultDumps:
         self._writer.start()
 
 
-def write_dump(folder: Path, records: Iterable[Record], *, cause: str, keep: int) -> Path:
+def write_dump(folder: Path, records: Iterable[MessageRecord], *, cause: str, keep: int) -> Path:
     """Write records to a new file and delete the oldest dumps beyond `keep`; raises OSError.
 
     A file that cannot be written completely is deleted.
@@ -82,18 +82,18 @@ def _owner_only(path: str, flags: int) -> int:
     return os.open(path, flags, 0o600)
 
 
-def _as_json(record: Record) -> dict[str, object]:
-    what = record.what
+def _as_json(record: MessageRecord) -> dict[str, object]:
+    message = record.message
     line: dict[str, object] = {
         "time_s": round(record.time, 6),
         "link": record.link,
-        "way": record.way,
-        "message": type(what).__name__,
+        "way": record.direction,
+        "message": type(message).__name__,
     }
-    if is_dataclass(what) and not isinstance(what, type):
-        line["content"] = _plain(asdict(what))
-    elif what:
-        line["content"] = str(what)
+    if is_dataclass(message) and not isinstance(message, type):
+        line["content"] = _plain(asdict(message))
+    elif message:
+        line["content"] = str(message)
     return line
 
 

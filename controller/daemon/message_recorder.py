@@ -16,26 +16,26 @@ from drivers.statistics import WireCounters
 MAX_RECORDS = 400  # over all links: the last seconds under load, ten seconds at rest
 
 
-class Record(NamedTuple):
+class MessageRecord(NamedTuple):
     """One message: time [s], link, direction, and the message (a dataclass) or a text."""
 
     time: float
     link: str
-    way: str
-    what: object
+    direction: str
+    message: object
 
 
-class Recorder:
+class MessageRecorder:
     """Keeps the last messages unformatted."""
 
     def __init__(self) -> None:
-        self._records: deque[Record] = deque(maxlen=MAX_RECORDS)
+        self._records: deque[MessageRecord] = deque(maxlen=MAX_RECORDS)
 
-    def add(self, link: str, way: str, what: object) -> None:
+    def add(self, link: str, direction: str, message: object) -> None:
         """Add a message, replacing the oldest if full."""
-        self._records.append(Record(clock.now(), link, way, what))
+        self._records.append(MessageRecord(clock.now(), link, direction, message))
 
-    def records(self) -> list[Record]:
+    def records(self) -> list[MessageRecord]:
         """All records, oldest first."""
         return list(self._records)
 
@@ -47,7 +47,7 @@ class RecordedBackend(Backend):
     the last attempt to open it or to exchange a message failed.
     """
 
-    def __init__(self, inner: Backend, name: str, recorder: Recorder) -> None:
+    def __init__(self, inner: Backend, name: str, recorder: MessageRecorder) -> None:
         self.status: Status | None = None
         self.status_at: float | None = None
         self.is_missing = False
@@ -55,9 +55,9 @@ class RecordedBackend(Backend):
         self._name = name
         self._recorder = recorder
 
-    def _record(self, way: str, what: object) -> None:
+    def _record(self, direction: str, message: object) -> None:
         """Record a message; a stop depends on no record."""
-        call_guarded(partial(self._recorder.add, self._name, way, what))
+        call_guarded(partial(self._recorder.add, self._name, direction, message))
 
     async def open(self) -> None:
         """Open the backend."""

@@ -20,7 +20,7 @@ from controller.daemon.api_views import PlateView
 from controller.daemon.latency import LatencyStatistics
 from controller.daemon.reconnect import LinkChange
 from controller.daemon.states import DaemonState, StateMachine
-from controller.effects.layout import Layout
+from controller.effects.layout import SurfaceLayout
 from controller.loop.observer import Applied, Observer, Silenced
 from controller.sources.contacts import Change, Contact, ContactKey
 from drivers import clock
@@ -44,7 +44,7 @@ class EventPublisher:
         amplifiers: Callable[[], list[AmplifierStatus]],
         effect_of: Callable[[ContactKey], str | None],
         ramp_only_reason: Callable[[], str | None],
-        layout: Layout | None,
+        layout: SurfaceLayout | None,
     ) -> None:
         self.view = PlateView(effect_of)
         self.latencies = LatencyStatistics()
@@ -78,7 +78,7 @@ class EventPublisher:
         )
 
     def state_changed(self, old: StateMachine, new: StateMachine) -> None:
-        """Publish a transition; outside OPERATION_ENABLED nothing plays any more."""
+        """Publish a transition; outside OPERATION_ENABLED nothing plays."""
         self.hub.publish(
             "state",
             lambda: StateEvent(
@@ -93,7 +93,7 @@ class EventPublisher:
             )
             self.hub.publish("silence", lambda: silence)
 
-    def layout_changed(self, layout: Layout | None) -> None:
+    def layout_changed(self, layout: SurfaceLayout | None) -> None:
         """Publish another surface layout; None for the same effect everywhere."""
         self._layout = layout
         self.hub.publish("layout", self.layout_event)

@@ -307,7 +307,7 @@ class Supervisor:
         number = self._arm_count
         try:
             await self._controller.arm()
-        except LinkDegraded:  # disarmed by then, and not lost
+        except LinkDegraded:  # disarmed, but not lost
             await self.handle(DaemonEvent(Trigger.DISARM, "an amplifier did not reply to arm"))
             raise
         except LinkError as error:

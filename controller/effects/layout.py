@@ -52,7 +52,7 @@ def default_effects(level_db_sl: float = STRONG_DB_SL) -> dict[str, Effect]:
 
 
 @dataclass(frozen=True)
-class Layout:
+class SurfaceLayout:
     """Regions, later ones on top of earlier ones, and effects by name.
 
     elsewhere: the effect outside of all regions, None for none; most_at_once: number of fingers

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from pydantic import Field, Strict
 
 from controller.effects.effect import Effect, Level
-from controller.effects.layout import BUZZ, Layout, Region, default_effects
+from controller.effects.layout import BUZZ, Region, SurfaceLayout, default_effects
 from controller.effects.registry import effect_kind
 from controller.effects.shapes import Circle, Polygon, Rectangle, Shape
 from model.config.document import Document, KeyPath, read_document
@@ -65,7 +65,9 @@ class LayoutSection(Section):
     most_at_once: Annotated[int, Field(ge=1, le=4)] = 1
 
 
-def load_layout(path: Path, plate: Plate | None, *, level_db_sl: float = STRONG_DB_SL) -> Layout:
+def load_layout(
+    path: Path, plate: Plate | None, *, level_db_sl: float = STRONG_DB_SL
+) -> SurfaceLayout:
     """Read a layout; raises ConfigError with every problem of the file.
 
     plate: must contain all regions, None for any. level_db_sl: of the default effects.
@@ -75,7 +77,7 @@ def load_layout(path: Path, plate: Plate | None, *, level_db_sl: float = STRONG_
 
 def layout_of(
     document: Document, plate: Plate | None, *, level_db_sl: float = STRONG_DB_SL
-) -> Layout:
+) -> SurfaceLayout:
     """Make the layout of a document; arguments and errors as of `load_layout`."""
     _check_kind(document)
     validation = Validation(document, LayoutSection)
@@ -85,7 +87,7 @@ def layout_of(
     elsewhere = validation.field(("elsewhere",), LayoutSection)
     _check_use(validation, ("elsewhere",), elsewhere, effects, is_for_motion=None)
     section = validation.finish()
-    return Layout(
+    return SurfaceLayout(
         regions=tuple(_region(name, region) for name, region in section.regions.items()),
         effects={name: effect for name, effect in effects.items() if effect is not None},
         elsewhere=section.elsewhere,

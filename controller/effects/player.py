@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from controller.effects.effect import EffectRun, NoSensation, Sensation
-from controller.effects.layout import Layout, Region
+from controller.effects.layout import Region, SurfaceLayout
 from controller.loop.intent import NO_CONTACTS, HapticIntent, Target
 from controller.sources.contacts import Contact, ContactKey
 from registry.plugins import WrongResultError
@@ -30,7 +30,7 @@ class _Play:
 
 @dataclass
 class _Finger:
-    """The region of a finger, where it entered it, and what plays for it."""
+    """The region of a finger, where it entered, and its plays."""
 
     region: Region | None
     entered: tuple[float, float]
@@ -49,7 +49,9 @@ class EffectPlayer:
     or without an end start.
     """
 
-    def __init__(self, layout: Layout, *, already_pressed: Iterable[ContactKey] = ()) -> None:
+    def __init__(
+        self, layout: SurfaceLayout, *, already_pressed: Iterable[ContactKey] = ()
+    ) -> None:
         self.layout = layout
         self._already_pressed = set(already_pressed)
         self._fingers: dict[ContactKey, _Finger] = {}

@@ -294,7 +294,7 @@ async def arm_for(
     if await has_left():
         raise RpcError(ErrorCode.LEASE, "the client has left", remedy="stay to renew the lease")
     result = await daemon.call("arm", params)
-    if await has_left():  # the lease cannot be renewed any more
+    if await has_left():  # the lease can no longer be renewed
         await daemon.call("disarm", DisarmParams(lease=result["lease"]))
     return result
 

@@ -151,7 +151,7 @@ class AmplifierGroup:
         """Feed the watchdogs; False where `play` would return None.
 
         On a degraded link the status is read instead; an amplifier that replies again must still
-        play its set. Raises DriverError, also for an amplifier that is not enabled any more or
+        play its set. Raises DriverError, also for an amplifier that is no longer enabled or
         whose replies contradict requests twice in a row.
         """
         return await self._exchange(self._heartbeat()) is not None
@@ -298,7 +298,7 @@ class AmplifierGroup:
 
     @contextmanager
     def _detecting_loss(self) -> Iterator[None]:
-        """Enter the state LOST on a lost link, so that nothing is played any more."""
+        """Enter the state LOST on a lost link, in which nothing is played."""
         try:
             yield
         except LinkDegraded:
@@ -318,7 +318,7 @@ class AmplifierGroup:
             self._silencing_count -= 1
 
     def _leave_armed(self) -> None:
-        """Play nothing more from here on; lost or closed amplifiers stay that."""
+        """Leave ARMED for DISARMED, if armed, so that nothing more is played."""
         self._silence_count += 1
         if self.state is GroupState.ARMED:
             self.state = GroupState.DISARMED

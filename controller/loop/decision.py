@@ -45,7 +45,7 @@ class Decision:
 
     from_rest: whether nothing played before; triggered_at [s]: when the change arrived.
     sets: None if all channels are silent already; pattern: with the ramp and onset of the sets,
-    None for silence; adds_endings_only: whether the sets only add endings to what plays; refusal:
+    None for silence; adds_endings_only: whether the sets only add endings to the playback; refusal:
     why a guard refused the pattern, which makes it silence; retry_at [s]: when the guard would pass
     it, None for never.
     """
@@ -353,7 +353,7 @@ class Decider:
         )
 
     def _note(self, change: Change, time: float) -> None:
-        """Remember when the first change since the last decision arrived."""
+        """Note when the first change since the last decision arrived."""
         if change and self._triggered_at is None:
             self._triggered_at = time
 

@@ -181,7 +181,7 @@ class Controller:
     async def run(self) -> None:
         """Run the loop until `close` or cancellation; raises LinkError when an amplifier is lost.
 
-        All others have been stopped by then. A source that fails or ends does not end the loop.
+        All others are stopped first. A source that fails or ends does not end the loop.
         While disarmed the loop sends nothing: a lost link then shows in the next request, which
         raises, and in `group_state`; the daemon's supervisor checks both.
         """
@@ -315,7 +315,7 @@ class Controller:
                     return None
             played = await self._group.play(sets.sets, envelopes=sets.envelopes)
         finally:
-            if played is None:  # what the amplifiers play is unknown from here on
+            if played is None:  # the playback is unknown now
                 self._decider.forget()
         return played
 
@@ -328,7 +328,7 @@ class Controller:
             self._report(self._observer.source_failed, failure_text(error))
 
     async def _wait_for_event(self) -> None:
-        """Wait for a change, a heartbeat, a timeout of a source or the end of an intent."""
+        """Wait for a change, a heartbeat, the timeout of a source or the expiry of an intent."""
         now = clock.now()
         moments = [now + IDLE_INTERVAL]
         if self._decider.due is not None:

@@ -1,6 +1,6 @@
 """Redaction of texts for a report: known keys with their values, numbers and own words remain.
 
-Anything else is hidden: what is secret cannot be recognised, what is not can. A hidden word has the
+Anything else is hidden, since secrets cannot be recognised. A hidden word has the
 same number throughout a report, so that it can still be followed.
 """
 

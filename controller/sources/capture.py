@@ -25,20 +25,20 @@ _MAX_DATAGRAM = 65_507  # bytes; UDP over IPv4
 
 
 @dataclass(frozen=True, slots=True)
-class Datagram:
+class RecordedDatagram:
     """One datagram and when it was sent [s] from the start of the capture."""
 
     time: float
     payload: bytes
 
 
-def read_capture(path: Path | str) -> list[Datagram]:
+def read_capture(path: Path | str) -> list[RecordedDatagram]:
     """Read a capture; raises InputError with file and line."""
     path = Path(path)
     lines = recorded_lines(path, what="a TUIO capture")
     if not lines or lines[0] != HEADER:
         raise InputError(f"{path}, line 1: must be {HEADER!r} for a TUIO capture")
-    datagrams: list[Datagram] = []
+    datagrams: list[RecordedDatagram] = []
     for number, line in enumerate(lines[1:], start=2):
         if line.startswith("#"):
             continue
@@ -48,7 +48,7 @@ def read_capture(path: Path | str) -> list[Datagram]:
                 f"{path}, line {number}: must be seconds, a space and the datagram in lower-case "
                 f"hexadecimal, got {line[:60]!r}"
             )
-        datagram = Datagram(float(match.group(1)), bytes.fromhex(match.group(2)))
+        datagram = RecordedDatagram(float(match.group(1)), bytes.fromhex(match.group(2)))
         if len(datagram.payload) > _MAX_DATAGRAM:
             raise InputError(
                 f"{path}, line {number}: datagram must have at most {_MAX_DATAGRAM} bytes, got "
@@ -62,7 +62,7 @@ def read_capture(path: Path | str) -> list[Datagram]:
     return datagrams
 
 
-def write_capture(path: Path | str, datagrams: Iterable[Datagram]) -> None:
+def write_capture(path: Path | str, datagrams: Iterable[RecordedDatagram]) -> None:
     """Write a capture, times to a microsecond; raises InputError for an invalid one."""
     lines = [HEADER]
     last = 0.0
@@ -77,7 +77,7 @@ def write_capture(path: Path | str, datagrams: Iterable[Datagram]) -> None:
     Path(path).write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
-async def replay_capture(datagrams: Sequence[Datagram], host: str, port: int) -> None:
+async def replay_capture(datagrams: Sequence[RecordedDatagram], host: str, port: int) -> None:
     """Send datagrams to a UDP port at their recorded pace, on the event loop's clock.
 
     Raises LinkError if the port is closed.

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 from drivers.codec.can_bus.frame import CANOPEN, LAYOUTS, Field, cob_id, command_id
 from drivers.codec.can_bus.requests import host_number
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 
 _HOST, _AMPLIFIER, _BYTES = "Host", "Amplifier", 8
-_QUANTITIES: Mapping[str, Quantity] = vars(PROTOCOL.quantities)
+_QUANTITIES: Mapping[str, WireQuantity] = vars(PROTOCOL.quantities)
 _ALIASES = {
     "time": "valid_for",
     "token": "active_token",
@@ -94,7 +94,7 @@ def _signal(field: Field, receiver: str) -> str:
     )
 
 
-def _quantity(field: Field) -> Quantity | None:
+def _quantity(field: Field) -> WireQuantity | None:
     """Return the quantity of a field, if any."""
     name = field.name.rstrip("0123456789").rstrip("_")
     if name == "channel":  # 255 is none

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from drivers.codec.can_bus.frame import CANOPEN, cob_id, command_id
 from drivers.codec.can_bus.objects import index_of
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 
 _TYPES = {"u8": 0x5, "u16": 0x6, "u32": 0x7, "u64": 0x1B, "i16": 0x3, "text": 0x9, "domain": 0xF}
 _MANDATORY = (0x1000, 0x1001, 0x1018)
@@ -29,7 +29,7 @@ class Entry:
     access: str
     alone: bool
     mappable: bool
-    quantity: Quantity | None
+    quantity: WireQuantity | None
 
 
 def entries(channels: int) -> Iterator[Entry]:

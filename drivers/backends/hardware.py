@@ -34,7 +34,7 @@ class Port(Protocol):
         """
 
     def close(self) -> None:
-        """Close it; no callback is called any more."""
+        """Close it; no callback is called afterwards."""
 
     async def wait_closed(self) -> None:
         """Wait until it is closed."""
@@ -50,7 +50,7 @@ class Adapter(Protocol):
         """
 
     def close(self) -> None:
-        """Close it; no callback is called any more."""
+        """Close it; no callback is called afterwards."""
 
     async def wait_closed(self) -> None:
         """Wait until it is closed."""

@@ -9,7 +9,7 @@ from enum import IntEnum
 from typing import TypeVar
 
 from drivers.errors import FrameError
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import NakCode
 
 _CHANNEL = PROTOCOL.quantities.channel
@@ -36,18 +36,18 @@ class Cursor:
         self._payload = payload
         self._at = 0
 
-    def integer(self, quantity: Quantity) -> int:
+    def integer(self, quantity: WireQuantity) -> int:
         """Read an integer."""
         value = self._raw(quantity.struct_code)
         if not quantity.holds(value):
             raise _out_of_range(quantity, value)
         return value
 
-    def number(self, quantity: Quantity) -> float:
+    def number(self, quantity: WireQuantity) -> float:
         """Read a value in its unit."""
         return quantity.from_wire(self.integer(quantity))
 
-    def nearest(self, quantity: Quantity) -> float:
+    def nearest(self, quantity: WireQuantity) -> float:
         """Read a value in its unit, clipped into range: for what must never be refused."""
         value = self._raw(quantity.struct_code)
         return quantity.from_wire(min(max(value, quantity.minimum), quantity.maximum))
@@ -112,7 +112,7 @@ class Cursor:
         return piece
 
 
-def _out_of_range(quantity: Quantity, value: int) -> Malformed:
+def _out_of_range(quantity: WireQuantity, value: int) -> Malformed:
     code = {"channel": NakCode.BAD_CHANNEL, "token": NakCode.BAD_TOKEN}.get(quantity.name)
     return Malformed(
         f"{quantity.name} must be {quantity.minimum} to {quantity.maximum}, got {value}",
@@ -131,7 +131,7 @@ def read_text(raw: bytes, name: str) -> str:
     return text
 
 
-def pack(*pairs: tuple[Quantity, float]) -> bytes:
+def pack(*pairs: tuple[WireQuantity, float]) -> bytes:
     """Pack values in their units; CommandError for one out of range."""
     return b"".join(
         [_LAYOUTS[quantity.struct_code].pack(quantity.to_wire(value)) for quantity, value in pairs]

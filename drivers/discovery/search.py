@@ -38,7 +38,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Found:
+class IdentifyResult:
     """Result of an identify request at a URL: the identity, or the problem.
 
     was_asked: whether the request was sent, so that the problem is a missing reply.
@@ -55,7 +55,7 @@ def candidates() -> list[Candidate]:
     return [*_serial_ports(), *_can_interfaces()]
 
 
-async def identify_all(urls: Iterable[str]) -> list[Found]:
+async def identify_all(urls: Iterable[str]) -> list[IdentifyResult]:
     """Identify the amplifiers at these URLs, one after the other."""
     return [await _identify(url) for url in urls]
 
@@ -84,16 +84,16 @@ def with_slcan(candidate: Candidate) -> Candidate:
     return Candidate(candidate.name, description, urls, is_slcan=True)
 
 
-async def _identify(url: str) -> Found:
+async def _identify(url: str) -> IdentifyResult:
     try:
         amplifier = Amplifier(open_backend(url))
         await amplifier.open(take_over=False)
     except DriverError as problem:
         was_sent = isinstance(problem, LinkTimeout | FrameError)
-        return Found(url, None, str(problem), was_sent=was_sent)
+        return IdentifyResult(url, None, str(problem), was_sent=was_sent)
     identity = amplifier.identity
     await amplifier.close()
-    return Found(url, identity)
+    return IdentifyResult(url, identity)
 
 
 def _serial_ports() -> Iterator[Candidate]:

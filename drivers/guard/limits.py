@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 from drivers.errors import CommandError
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import Capabilities
 from registry.limits import GuardLimits
 
@@ -58,7 +58,7 @@ def limits_in_force(configured: GuardLimits, capabilities: Capabilities) -> Guar
     return limits
 
 
-def _whole_steps(value: float, quantity: Quantity) -> float:
+def _whole_steps(value: float, quantity: WireQuantity) -> float:
     """Round a value down to a step of the wire."""
     return math.floor(value * quantity.per_unit + _SLACK) / quantity.per_unit
 

@@ -77,7 +77,7 @@ class PlayRecord:
     def send(self, command_set: CommandSet) -> None:
         """Record a set that is about to be sent, again or for the first time.
 
-        Raises CommandRefused if it must not play by now, because of what was sent since its check.
+        Raises CommandRefused if sets sent since its check forbid it.
         """
         self.last_token = token = command_set.token
         if token == self._confirmed_token or any(
@@ -115,7 +115,7 @@ class PlayRecord:
                 sent.achieved = achieved.commands
 
     def confirm(self, token: int) -> None:
-        """Record that the set of this token plays by now, and none that was sent before it."""
+        """Record that the set of this token plays, and none that was sent before it."""
         now = self._clock()
         tokens = [sent.command_set.token for sent in self._pending]
         if token not in tokens:
@@ -169,7 +169,7 @@ class PlayRecord:
             self.slots[envelope.slot] = (*others, envelope)
 
     def load(self, envelope: Envelope) -> None:
-        """Record the envelope that a slot holds by now."""
+        """Record the envelope that a slot holds."""
         if envelope.knots:
             self.slots[envelope.slot] = (envelope,)
 

@@ -31,7 +31,7 @@ class PlayRecorder:
     def sending(self, request: Request) -> None:
         """Record a request that is about to be sent.
 
-        Raises CommandRefused for a set that must not play any more.
+        Raises CommandRefused for a set that must no longer play.
         """
         match request:
             case Apply(command_set=SafeCommandSet() as safe):

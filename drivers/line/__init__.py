@@ -1,1 +1,1 @@
-"""The sender of one physical line: the priority queue of its requests."""
+"""The sender of one line: the priority queue of its requests."""

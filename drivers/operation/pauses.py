@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-FIRST_PAUSE = 0.1  # s; a loose contact has recovered by then
+FIRST_PAUSE = 0.1  # s; a loose contact recovers within it
 MAX_PAUSE = 5.0  # s; the longest wait after an adapter was plugged in again
 
 

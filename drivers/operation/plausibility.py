@@ -13,7 +13,7 @@ from drivers.errors import CommandRefused
 from drivers.guard import SafeCommandSet
 from drivers.guard.channel_state import ChannelState, Interval
 from drivers.guard.record import states_after
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import Achieved, AmplifierState, Capabilities, Status
 
 MAX_CONTRADICTIONS = 2
@@ -273,6 +273,6 @@ def _with_longer_fade(state: ChannelState, lasts: float) -> ChannelState:
     return replace(state, fade=lasts, fading_may_hold=True)
 
 
-def _tolerance(quantity: Quantity, step: float) -> float:
+def _tolerance(quantity: WireQuantity, step: float) -> float:
     """Return the rounding error of an amplifier with a step, and of the wire."""
     return (step + quantity.step) / 2

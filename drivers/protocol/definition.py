@@ -19,7 +19,7 @@ _TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
-class Quantity:
+class WireQuantity:
     """A kind of number on the wire: an integer of `per_unit` steps per unit, within a range.
 
     wire: u8, u16, u32 or i16; minimum, maximum: as integers; wraps: an angle, modulo 360.
@@ -90,31 +90,31 @@ class Quantity:
 class Quantities:
     """Every quantity of the protocol, by name."""
 
-    frequency: Quantity
-    level: Quantity
-    phase: Quantity
-    phase_step: Quantity
-    ramp: Quantity
-    valid_for: Quantity
-    watchdog: Quantity
-    watchdog_left: Quantity
-    token: Quantity
-    active_token: Quantity
-    channel: Quantity
-    channel_count: Quantity
-    fault_count: Quantity
-    envelope_knots: Quantity
-    envelope_slots: Quantity
-    envelope_slot: Quantity
-    envelope_step: Quantity
-    temperature: Quantity
-    voltage: Quantity
-    age: Quantity
-    protocol_version: Quantity
+    frequency: WireQuantity
+    level: WireQuantity
+    phase: WireQuantity
+    phase_step: WireQuantity
+    ramp: WireQuantity
+    valid_for: WireQuantity
+    watchdog: WireQuantity
+    watchdog_left: WireQuantity
+    token: WireQuantity
+    active_token: WireQuantity
+    channel: WireQuantity
+    channel_count: WireQuantity
+    fault_count: WireQuantity
+    envelope_knots: WireQuantity
+    envelope_slots: WireQuantity
+    envelope_slot: WireQuantity
+    envelope_step: WireQuantity
+    temperature: WireQuantity
+    voltage: WireQuantity
+    age: WireQuantity
+    protocol_version: WireQuantity
 
 
 @dataclass(frozen=True)
-class SerialLine:
+class SerialDefaults:
     """Defaults and bounds of the serial wire."""
 
     baud: int
@@ -134,7 +134,7 @@ class Protocol:
 
     version: int
     reaction: float
-    serial: SerialLine
+    serial: SerialDefaults
     types: Mapping[str, int]
     states: Mapping[str, int]
     faults: Mapping[str, int]
@@ -151,14 +151,14 @@ def _load() -> Protocol:
     return Protocol(
         version=raw["version"],
         reaction=raw["reaction"],
-        serial=SerialLine(**raw["serial"]),
+        serial=SerialDefaults(**raw["serial"]),
         types=raw["types"],
         states=raw["states"],
         faults=raw["faults"],
         naks=raw["naks"],
         quantities=Quantities(
             **{
-                field.name: Quantity(name=field.name, **listed[field.name])
+                field.name: WireQuantity(name=field.name, **listed[field.name])
                 for field in fields(Quantities)
             }
         ),

@@ -2,7 +2,7 @@
 
 Every request has exactly one reply: the one listed with it here, or a `Nak`.
 An `AmplifierEvent` comes unsolicited, on wires on which an amplifier may speak first. Codecs turn
-these into bytes and back; nothing here deals with bytes.
+these into bytes and back.
 
     Hello       Identity            identify the amplifier
     GetCaps     Capabilities        read what it can play

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import Achieved, Capabilities, Loaded, Nak, NakCode
 from sim.amplifier.channels import PlayableSet
 
@@ -131,7 +131,7 @@ def _quantised(command: DriveCommand, capabilities: Capabilities) -> DriveComman
     return played
 
 
-def _in_steps(quantity: Quantity, value: float, *, channel: int | None = None) -> float:
+def _in_steps(quantity: WireQuantity, value: float, *, channel: int | None = None) -> float:
     try:
         return quantity.quantise(value)
     except CommandError as error:

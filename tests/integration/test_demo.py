@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from controller.cli.main import run
-from controller.sources.capture import Datagram, write_capture
+from controller.sources.capture import RecordedDatagram, write_capture
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
 
@@ -37,7 +37,7 @@ def capture(tmp_path_factory):
         now = number * FRAME
         touches = tuple(Touch(i, x, y) for i, down, up, x, y in SCHEDULE if down <= now < up)
         frame = TouchFrame("test", now, touches)
-        datagrams.append(Datagram(now, tuio_datagram(frame, number + 1)))
+        datagrams.append(RecordedDatagram(now, tuio_datagram(frame, number + 1)))
     path = tmp_path_factory.mktemp("touches") / "touches.tuio"
     write_capture(path, datagrams)
     return path

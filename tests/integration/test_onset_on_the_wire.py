@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from controller.demo.run import read_touches, run_demo
-from controller.sources.capture import Datagram, write_capture
+from controller.sources.capture import RecordedDatagram, write_capture
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
 from model.rig.file import example_rig_path, load_rig
@@ -26,7 +26,9 @@ def touches(tmp_path):
     for number in range(int(END / FRAME)):
         now = number * FRAME
         down = tuple(Touch(*finger) for finger in FINGERS) if DOWN <= now < UP else ()
-        datagrams.append(Datagram(now, tuio_datagram(TouchFrame("test", now, down), number + 1)))
+        datagrams.append(
+            RecordedDatagram(now, tuio_datagram(TouchFrame("test", now, down), number + 1))
+        )
     path = tmp_path / "touches.tuio"
     write_capture(path, datagrams)
     return read_touches(path)

@@ -39,7 +39,7 @@ from drivers.guard import rules
 from drivers.line import priority
 from drivers.line.sender import Sender
 from drivers.link.link import Link
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import AmplifierState, Apply, Disarm, Hello, Identity, Stage, Status
 from sim.amplifier import amplifier as simulated
 from sim.amplifier.amplifier import SimulatedAmplifier
@@ -253,11 +253,11 @@ def _without(rule: Any) -> Plant:
     )
 
 
-def _nan_as_integer(to_wire: Any, quantity: Quantity, value: float) -> int:
+def _nan_as_integer(to_wire: Any, quantity: WireQuantity, value: float) -> int:
     return -0x8000 if math.isnan(value) else to_wire(quantity, value)
 
 
-def _nan_unrounded(quantise: Any, quantity: Quantity, value: float) -> float:
+def _nan_unrounded(quantise: Any, quantity: WireQuantity, value: float) -> float:
     return value if math.isnan(value) else quantise(quantity, value)
 
 
@@ -319,8 +319,8 @@ DRIVERS: dict[str, Bug] = {
         both(
             _without(rules._check_finite),
             both(
-                wrapped(Quantity, "quantise", _nan_unrounded),
-                wrapped(Quantity, "to_wire", _nan_as_integer),
+                wrapped(WireQuantity, "quantise", _nan_unrounded),
+                wrapped(WireQuantity, "to_wire", _nan_as_integer),
             ),
         ),
         scenarios.not_a_number,

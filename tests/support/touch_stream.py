@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from controller.sources.capture import Datagram, read_capture, write_capture
+from controller.sources.capture import RecordedDatagram, read_capture, write_capture
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
 
@@ -72,7 +72,7 @@ class Stream:
                 for id, name in (down[0] if down else {}).items()
             )
             frame = TouchFrame("table", now, touches)
-            datagrams.append(Datagram(now, tuio_datagram(frame, number + 1)))
+            datagrams.append(RecordedDatagram(now, tuio_datagram(frame, number + 1)))
         write_capture(path, datagrams)
 
 

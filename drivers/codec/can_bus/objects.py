@@ -9,7 +9,7 @@ from drivers.codec.payload import Cursor, pack, read_text
 from drivers.command import DriveCommand
 from drivers.errors import FrameError
 from drivers.guard import require_safe
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import (
     Achieved,
     Capabilities,
@@ -22,7 +22,7 @@ from drivers.protocol.messages import (
 )
 
 _Q = PROTOCOL.quantities
-_QUANTITIES: Mapping[str, Quantity] = vars(_Q)
+_QUANTITIES: Mapping[str, WireQuantity] = vars(_Q)
 _OBJECTS: Mapping[str, Mapping[str, Any]] = CANOPEN["objects"]
 _NAKS = {code: NakCode[name] for name, code in CANOPEN["aborts"].items()}
 _WIDTHS = {"u8": 1, "u16": 2, "u32": 4, "i16": 2}
@@ -37,7 +37,7 @@ class Entry:
     subindex: int
     name: str
     type: str
-    quantity: Quantity | None
+    quantity: WireQuantity | None
 
 
 def index_of(name: str) -> int:

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from drivers.codec.payload import read_text
 from drivers.command import DriveCommand
 from drivers.errors import FrameError
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import (
     Achieved,
     AmplifierState,
@@ -35,7 +35,7 @@ TEXT_SIZE: int = _MAP["text_registers"]
 _NO_CHANNEL = 255
 
 # By register, from protocol.yaml; registers of channels and faults have their quantities' names.
-_QUANTITIES: dict[str, Quantity] = vars(_Q) | {
+_QUANTITIES: dict[str, WireQuantity] = vars(_Q) | {
     register: vars(_Q)[kind]
     for block in (*_MAP["input"].values(), *_MAP["holding"].values())
     for register, kind in block["registers"].items()

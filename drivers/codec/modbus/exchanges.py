@@ -14,7 +14,7 @@ from drivers.codec.modbus import blocks
 from drivers.codec.modbus.blocks import CHANNEL_SIZE, FAULT_SIZE, HEAD, TEXT_SIZE
 from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.guard import require_safe
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import (
     AmplifierState,
     Apply,
@@ -190,7 +190,7 @@ def _control(request: Arm | Disarm | Stop | Clear) -> list[int]:
     return [word, _Q.watchdog.to_wire(watchdog), _Q.ramp.to_wire(ramp)]
 
 
-def _unsigned(*pairs: tuple[Quantity, float]) -> list[int]:
+def _unsigned(*pairs: tuple[WireQuantity, float]) -> list[int]:
     return [quantity.to_wire(value) & 0xFFFF for quantity, value in pairs]
 
 

@@ -30,7 +30,7 @@ from drivers.codec.serial_line.sets import (
     unpack_set,
 )
 from drivers.guard import require_safe
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import (
     Achieved,
     AmplifierEvent,
@@ -75,7 +75,7 @@ class _Layout:
 
 
 def _numbers(
-    message: type[Any], *, read: Callable[[Cursor, Quantity], float], **quantities: Quantity
+    message: type[Any], *, read: Callable[[Cursor, WireQuantity], float], **quantities: WireQuantity
 ) -> _Layout:
     """Return the layout of a message that consists of these numbers."""
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from drivers.codec.payload import Cursor, pack, pack_optional_channel, pack_text
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import (
     AmplifierState,
     Capabilities,
@@ -21,7 +21,7 @@ from drivers.protocol.messages import (
 _Q = PROTOCOL.quantities
 _HIGH_VOLTAGE = 0x01
 _EVENTS = 0x01
-_CAPABILITIES: Mapping[str, Quantity] = {  # in the order of the payload; a flags byte follows
+_CAPABILITIES: Mapping[str, WireQuantity] = {  # in the order of the payload; a flags byte follows
     "channels": _Q.channel_count,
     "frequency_min": _Q.frequency,
     "frequency_max": _Q.frequency,

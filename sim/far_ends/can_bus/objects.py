@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from drivers.command import Envelope, Knot
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import FaultList, GetFaults, LoadEnvelope, Nak, NakCode
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.sdo import (
@@ -249,7 +249,7 @@ def _envelope_of(slot: int, data: bytes) -> Envelope:
     return Envelope(slot, step / 10_000, knots)
 
 
-def _scaled(quantity: Quantity, value: float) -> bytes:
+def _scaled(quantity: WireQuantity, value: float) -> bytes:
     return _pack(quantity.wire, quantity.to_wire(min(max(value, quantity.low), quantity.high)))
 
 

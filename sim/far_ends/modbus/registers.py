@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import (
     Achieved,
     Apply,
@@ -45,7 +45,7 @@ def checksum(words: Sequence[int]) -> int:
     return binascii.crc_hqx(struct.pack(f">{len(words)}H", *words), 0xFFFF) or 0xFFFF
 
 
-def value_of(quantity: Quantity, word: int, *, channel: int | None = None) -> float:
+def value_of(quantity: WireQuantity, word: int, *, channel: int | None = None) -> float:
     """The value [unit] in a word; raises RefusedWrite where it is out of range."""
     number = word - 0x10000 if quantity.minimum < 0 and word >= 0x8000 else word
     if not quantity.minimum <= number <= quantity.maximum:
@@ -54,7 +54,7 @@ def value_of(quantity: Quantity, word: int, *, channel: int | None = None) -> fl
     return number / quantity.per_unit
 
 
-def word_of(quantity: Quantity, value: float) -> int:
+def word_of(quantity: WireQuantity, value: float) -> int:
     """The word of a value [unit], clipped to the range."""
     nearest = min(max(round(value * quantity.per_unit), quantity.minimum), quantity.maximum)
     return nearest % 0x10000

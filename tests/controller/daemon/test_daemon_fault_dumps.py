@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from controller.daemon.fault_dumps import DUMP_PATTERN, FaultDumps
-from controller.daemon.message_recorder import Recorder
+from controller.daemon.message_recorder import MessageRecorder
 from drivers import clock
 
 
@@ -31,7 +31,7 @@ def wait_for_writers() -> None:
 
 def test_dump_is_written_once_per_second(tmp_path: Path, now: list[float]) -> None:
     """Faults within a second of a dump are part of it."""
-    dumps = FaultDumps(Recorder())
+    dumps = FaultDumps(MessageRecorder())
     for now[0], files in ((0.0, 1), (0.5, 1), (1.0, 2)):
         dumps.write(tmp_path, cause="arc", keep=5)
         wait_for_writers()
@@ -43,7 +43,7 @@ def test_dump_that_fails_is_only_logged(
 ) -> None:
     """A file in place of the folder raises nothing at the daemon."""
     (tmp_path / "dumps").write_text("in the way", "utf-8")
-    FaultDumps(Recorder()).write(tmp_path / "dumps", cause="arc", keep=5)
+    FaultDumps(MessageRecorder()).write(tmp_path / "dumps", cause="arc", keep=5)
     wait_for_writers()
     (warning,) = caplog.messages
     assert str(tmp_path / "dumps") in warning
@@ -63,7 +63,7 @@ def test_dumps_use_one_thread_when_disk_hangs(
         released.wait(20)
         return tmp_path
 
-    dumps = FaultDumps(Recorder())
+    dumps = FaultDumps(MessageRecorder())
     with monkeypatch.context() as patched, caplog.at_level(logging.WARNING):
         patched.setattr("controller.daemon.fault_dumps.write_dump", hang)
         for now[0] in (0.0, 10.0, 20.0):

@@ -16,7 +16,7 @@ import pytest
 from controller.daemon.fault_dumps import write_dump
 from controller.daemon.latency import LatencyStatistics
 from controller.daemon.log import JsonFormatter, LogHandler, LogThread, RateLimitFilter
-from controller.daemon.message_recorder import Record, RecordedBackend, Recorder
+from controller.daemon.message_recorder import MessageRecord, MessageRecorder, RecordedBackend
 from controller.daemon.service_manager import ServiceManager
 from controller_bench import FarEnd
 from drivers.backend import Backend
@@ -215,9 +215,9 @@ def test_dump_is_json_lines_for_owner_only(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "folder"
     status = Status(AmplifierState.FAULT, Fault.ARC, 7, False, 25.0, 0.0, (0.5, 0.0), 0.0)
     records = [
-        Record(1.5, "main", "out", Arm(watchdog=0.25)),
-        Record(1.6, "main", "in", status),
-        Record(1.7, "main", "none", "LinkTimeout: no reply"),
+        MessageRecord(1.5, "main", "out", Arm(watchdog=0.25)),
+        MessageRecord(1.6, "main", "in", status),
+        MessageRecord(1.7, "main", "none", "LinkTimeout: no reply"),
     ]
     for _ in range(4):
         path = write_dump(folder, records, cause="arc\nx", keep=2)
@@ -255,7 +255,7 @@ def test_recorded_backend_forwards_every_member() -> None:
 async def test_failing_recorder_prevents_no_stop() -> None:
     """The wire gets the Stop, and the caller its reply."""
 
-    class FailingRecorder(Recorder):
+    class FailingRecorder(MessageRecorder):
         def add(self, link: str, way: str, what: object) -> None:
             raise MemoryError
 

@@ -11,7 +11,7 @@ from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.detents import Detents
 from controller.effects.effect import Effect, EffectRun, NoSensation, Sensation
-from controller.effects.layout import Layout, Region
+from controller.effects.layout import Region, SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.ramp import Ramp
 from controller.effects.shapes import Circle, Polygon, Rectangle
@@ -38,7 +38,7 @@ def wanted(
 
 def test_click_ends_after_its_duration() -> None:
     """A click lasts for 40 ms; the intent expires then."""
-    player = EffectPlayer(Layout(effects={"click": Click(level=18.0)}, elsewhere="click"))
+    player = EffectPlayer(SurfaceLayout(effects={"click": Click(level=18.0)}, elsewhere="click"))
     here = [finger(1)]
     intent = player.intent(here, 10.0)
     assert [target.level_db_sl for target in intent.targets] == [18.0]
@@ -50,7 +50,7 @@ def test_click_ends_after_its_duration() -> None:
 
 def test_buzz_lasts_while_the_finger_stays() -> None:
     """A buzz without a duration goes on; a new finger starts it again."""
-    player = EffectPlayer(Layout())
+    player = EffectPlayer(SurfaceLayout())
     assert wanted(player, [finger(1)], 0.0) == {1: 20.0}
     assert player.intent([finger(1)], 100.0).until is None
     assert wanted(player, [], 101.0) == {}
@@ -149,7 +149,7 @@ def test_player_keeps_the_region_of_a_finger_on_an_edge() -> None:
     """Noise of half a millimetre across an edge is no crossing; a millimetre of way is."""
     regions = (Region("left", LEFT, on_press="tick"), Region("right", RIGHT, on_press="tock"))
     effects: dict[str, Effect] = {"tick": Click(level=10.0), "tock": Click(level=15.0)}
-    player = EffectPlayer(Layout(regions, effects, elsewhere=None))
+    player = EffectPlayer(SurfaceLayout(regions, effects, elsewhere=None))
     assert wanted(player, [finger(1, 0.0999)], 0.0) == {1: 10.0}
     for step in range(1, 20):
         assert wanted(player, [finger(1, 0.0999 + 0.0005 * (step % 2))], 0.1 * step) == {}
@@ -161,11 +161,11 @@ def test_player_keeps_the_region_of_a_finger_on_an_edge() -> None:
 def test_layout_max_level() -> None:
     """The first level of a ramp counts too, also where a region lowers its last."""
     falling = Ramp(start_level=40.0, level=12.0)
-    assert Layout(effects={"fall": falling}).max_db_sl == 40.0
+    assert SurfaceLayout(effects={"fall": falling}).max_db_sl == 40.0
     region = Region("pad", LEFT, on_press="soft", level_db_sl=30.0, has_level=True)
-    assert Layout((region,), {"soft": Click(level=10.0)}).max_db_sl == 30.0
+    assert SurfaceLayout((region,), {"soft": Click(level=10.0)}).max_db_sl == 30.0
     free = Region("pad", LEFT, on_press="soft", level_db_sl=None, has_level=True)
-    assert Layout((free,), {"soft": Click(level=10.0)}).max_db_sl == float("inf")
+    assert SurfaceLayout((free,), {"soft": Click(level=10.0)}).max_db_sl == float("inf")
 
 
 def test_detents_click_once_per_detent() -> None:
@@ -194,7 +194,7 @@ def test_player_follows_a_sliding_finger_through_regions() -> None:
         "hard": Click(level=24.0),
         "buzz": Buzz(level=16.0),
     }
-    player = EffectPlayer(Layout(regions, effects, elsewhere=None))
+    player = EffectPlayer(SurfaceLayout(regions, effects, elsewhere=None))
     assert wanted(player, [finger(1, 0.05)], 0.0) == {1: 10.0}
     assert wanted(player, [finger(1, 0.06)], 0.1) == {}
     assert wanted(player, [finger(1, 0.15)], 0.2) == {1: 24.0}  # left's release, on right
@@ -209,7 +209,9 @@ def test_player_prefers_priority_then_the_newest() -> None:
         Region("left", LEFT, on_press="buzz"),
         Region("right", RIGHT, on_press="click", priority=1),
     )
-    player = EffectPlayer(Layout(regions, {"buzz": Buzz(), "click": Click(level=12.0)}, None))
+    player = EffectPlayer(
+        SurfaceLayout(regions, {"buzz": Buzz(), "click": Click(level=12.0)}, None)
+    )
     first, second, urgent = finger(1, 0.02), finger(2, 0.08), finger(3, 0.15)
     assert wanted(player, [first], 0.0) == {1: 20.0}
     assert wanted(player, [first, second], 0.1) == {2: 20.0}
@@ -222,7 +224,7 @@ def test_intent_expires_at_the_first_end() -> None:
     """A detent of 30 ms ends before a click of 40 ms at another finger."""
     slider = Region("slider", LEFT, on_move="dots")
     effects: dict[str, Effect] = {"dots": Detents(duration=0.03), "click": Click(duration=0.04)}
-    player = EffectPlayer(Layout((slider,), effects, elsewhere="click"))
+    player = EffectPlayer(SurfaceLayout((slider,), effects, elsewhere="click"))
     player.intent([finger(1, 0.05)], 0.0)
     fingers = [finger(1, 0.056), finger(2, 0.15)]
     assert player.intent(fingers, 1.0).until == pytest.approx(1.03)
@@ -234,7 +236,7 @@ def test_player_plays_several_fingers_at_once() -> None:
     """Where the layout allows two, the two newest of the highest priority feel their own levels."""
     region = Region("left", LEFT, on_press="soft", on_move=None)
     player = EffectPlayer(
-        Layout((region,), {"soft": Buzz(level=9.0), "buzz": Buzz()}, most_at_once=2)
+        SurfaceLayout((region,), {"soft": Buzz(level=9.0), "buzz": Buzz()}, most_at_once=2)
     )
     fingers = [finger(1, 0.15), finger(2, 0.05), finger(3, 0.16)]
     assert wanted(player, fingers, 0.0) == {2: 9.0, 3: 20.0}
@@ -243,7 +245,7 @@ def test_player_plays_several_fingers_at_once() -> None:
 def test_player_ignores_plays_without_sensation() -> None:
     """A finger between detents of a region of high priority leaves the others what they feel."""
     slider = Region("slider", LEFT, on_move="detents", priority=9)
-    player = EffectPlayer(Layout((slider,), {"detents": Detents(), "buzz": Buzz()}))
+    player = EffectPlayer(SurfaceLayout((slider,), {"detents": Detents(), "buzz": Buzz()}))
     other = finger(1, 0.15)
     assert wanted(player, [other, finger(2, 0.05)], 0.0) == {1: 20.0}
     assert wanted(player, [other, finger(2, 0.056)], 0.1) == {2: 20.0}
@@ -252,7 +254,7 @@ def test_player_ignores_plays_without_sensation() -> None:
 
 def test_player_plays_an_effect_by_name() -> None:
     """A requested effect has priority over all regions, at its level, until it ends."""
-    player = EffectPlayer(Layout(effects={"buzz": Buzz(), "alert": Click(duration=0.1)}))
+    player = EffectPlayer(SurfaceLayout(effects={"buzz": Buzz(), "alert": Click(duration=0.1)}))
     here, other = finger(1), finger(2)
     assert wanted(player, [here, other], 0.0) == {2: 20.0}
     player.play("alert", here, 0.05, level_db_sl=24.0)
@@ -267,7 +269,7 @@ def test_requested_effect_ends_with_its_finger() -> None:
     """It goes on through other regions, unlike what a region has for it."""
     regions = (Region("left", LEFT, on_press="hum"), Region("right", RIGHT))
     effects: dict[str, Effect] = {"hum": Buzz(level=9.0), "alert": Buzz(level=18.0)}
-    player = EffectPlayer(Layout(regions, effects, elsewhere=None))
+    player = EffectPlayer(SurfaceLayout(regions, effects, elsewhere=None))
     assert wanted(player, [finger(1, 0.05)], 0.0) == {1: 9.0}
     player.play("alert", finger(1, 0.05), 0.1, level_db_sl=None)
     assert wanted(player, [finger(1, 0.15)], 0.2) == {1: 18.0}
@@ -292,7 +294,7 @@ def test_requested_effect_restarts_when_requested_again() -> None:
         def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
             return Felt()
 
-    player = EffectPlayer(Layout(effects={"hum": Endless()}, elsewhere=None))
+    player = EffectPlayer(SurfaceLayout(effects={"hum": Endless()}, elsewhere=None))
     for number in range(1000):
         player.play("hum", finger(1), 0.001 * number, level_db_sl=None)
     assert wanted(player, [finger(1)], 2.0) == {1: 20.0}
@@ -303,7 +305,7 @@ def test_requested_effect_restarts_when_requested_again() -> None:
 
 def test_requested_effect_plays_for_an_unknown_finger() -> None:
     """What its place has for it begins all the same, and goes on when the other is over."""
-    player = EffectPlayer(Layout(effects={"buzz": Buzz(), "alert": Click(duration=0.1)}))
+    player = EffectPlayer(SurfaceLayout(effects={"buzz": Buzz(), "alert": Click(duration=0.1)}))
     player.play("alert", finger(1), 0.0, level_db_sl=12.0)
     assert wanted(player, [finger(1)], 0.0) == {1: 12.0}
     assert wanted(player, [finger(1)], 0.2) == {1: 20.0}
@@ -316,10 +318,12 @@ def test_new_layout_repeats_no_press() -> None:
     """
     effects: dict[str, Effect] = {"buzz": Buzz(level=10.0), "click": Click(), "dots": Detents()}
     clicks = Region("left", LEFT, on_press="click", on_move="dots")
-    before = EffectPlayer(Layout((clicks,), effects))
+    before = EffectPlayer(SurfaceLayout((clicks,), effects))
     fingers = [finger(1, 0.05), finger(2, 0.15)]
     assert wanted(before, fingers, 0.0) == {2: 10.0}
-    after = EffectPlayer(Layout((clicks,), effects, most_at_once=2), already_pressed=before.fingers)
+    after = EffectPlayer(
+        SurfaceLayout((clicks,), effects, most_at_once=2), already_pressed=before.fingers
+    )
     again = EffectPlayer(
         after.layout, already_pressed=after.fingers
     )  # exchanged twice before it is asked
@@ -361,7 +365,7 @@ def test_player_invariants_for_any_movement(
         "texture": Texture(),
         "detents": Detents(),
     }
-    players = [EffectPlayer(Layout(regions, effects, most_at_once=2)) for _ in range(2)]
+    players = [EffectPlayer(SurfaceLayout(regions, effects, most_at_once=2)) for _ in range(2)]
     now = 0.0
     for pause, places in steps:
         now += pause
@@ -416,7 +420,9 @@ def test_effect_kinds_include_plug_ins() -> None:
         beats: tuple[float, ...] = (0.1, 0.2)
         count: int = 3
 
-    listed = ActiveLayout(Layout(effects={"buzz": Buzz(), "rhythm": Rhythm()})).effects().effects
+    listed = (
+        ActiveLayout(SurfaceLayout(effects={"buzz": Buzz(), "rhythm": Rhythm()})).effects().effects
+    )
     (_, rhythm) = (each.model_dump(mode="json") for each in listed)
     assert rhythm["description"] == "Beats of one's own."
     assert (rhythm["parameters"]["beats"], rhythm["parameters"]["count"]) == ([0.1, 0.2], 3)

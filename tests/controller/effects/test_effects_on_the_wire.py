@@ -6,7 +6,7 @@ import logging
 import pytest
 
 from controller.effects.click import Click
-from controller.effects.layout import Layout
+from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.tuio import TuioReader
@@ -19,7 +19,7 @@ from virtual_loop import in_virtual_time
 @in_virtual_time
 async def test_click_ends_on_time_when_the_finger_rests(duration: float) -> None:
     """Silence is sent within a millisecond of its end, not with the next heartbeat."""
-    layout = Layout(effects={"click": Click(duration=duration)}, elsewhere="click")
+    layout = SurfaceLayout(effects={"click": Click(duration=duration)}, elsewhere="click")
     async with running(intent_source=EffectPlayer(layout)) as bench:
         loop = asyncio.get_running_loop()
         bench.touch(FINGER)
@@ -36,7 +36,7 @@ async def test_click_ends_on_time_when_the_finger_rests(duration: float) -> None
 @in_virtual_time
 async def test_resting_finger_of_a_silent_sender_feels_one_click() -> None:
     """The reference sender says nothing for two seconds; its next bundle is no new press."""
-    layout = Layout(effects={"click": Click()}, elsewhere="click")
+    layout = SurfaceLayout(effects={"click": Click()}, elsewhere="click")
     sender, reader = ReferenceSender(), TuioReader(RejectCounter(logging.getLogger("test")))
     async with running(intent_source=EffectPlayer(layout)) as bench:
         loop = asyncio.get_running_loop()

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from controller.sources.capture import (
     HEADER,
-    Datagram,
+    RecordedDatagram,
     read_capture,
     replay_capture,
     write_capture,
@@ -30,7 +30,7 @@ def test_capture_round_trip(
 ) -> None:
     """What was written to a microsecond comes back, malformed datagrams too."""
     path = tmp_path_factory.mktemp("capture") / "stream.tuio"
-    datagrams = [Datagram(micros / 1e6, payload) for micros, payload in sorted(sent)]
+    datagrams = [RecordedDatagram(micros / 1e6, payload) for micros, payload in sorted(sent)]
     write_capture(path, datagrams)
     assert read_capture(path) == datagrams
 
@@ -39,7 +39,10 @@ def test_read_capture_reads_the_documented_format(tmp_path: Path) -> None:
     """The format as documented, comments included, is read."""
     path = tmp_path / "golden.tuio"
     path.write_text(f"{HEADER}\n# two fingers\n0 2f00ff\n1.5 0a\n", encoding="ascii")
-    assert read_capture(path) == [Datagram(0.0, b"\x2f\x00\xff"), Datagram(1.5, b"\n")]
+    assert read_capture(path) == [
+        RecordedDatagram(0.0, b"\x2f\x00\xff"),
+        RecordedDatagram(1.5, b"\n"),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -73,14 +76,14 @@ def test_read_capture_names_file_and_line(tmp_path: Path, text: str | None, plac
 @pytest.mark.parametrize(
     "datagrams",
     [
-        [Datagram(1.0, b"a"), Datagram(0.5, b"b")],
-        [Datagram(-1.0, b"a")],
-        [Datagram(float("nan"), b"a")],
-        [Datagram(0.0, b"")],
+        [RecordedDatagram(1.0, b"a"), RecordedDatagram(0.5, b"b")],
+        [RecordedDatagram(-1.0, b"a")],
+        [RecordedDatagram(float("nan"), b"a")],
+        [RecordedDatagram(0.0, b"")],
     ],
 )
 def test_write_capture_refuses_unreadable_captures(
-    tmp_path: Path, datagrams: list[Datagram]
+    tmp_path: Path, datagrams: list[RecordedDatagram]
 ) -> None:
     """What the reader would refuse is refused when it is written, and no file is left."""
     path = tmp_path / "bad.tuio"
@@ -97,7 +100,11 @@ async def test_replay_capture_keeps_times_over_udp() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
         receiver.setblocking(False)
-        datagrams = [Datagram(0.0, b"one"), Datagram(0.25, b"two"), Datagram(1.0, b"three")]
+        datagrams = [
+            RecordedDatagram(0.0, b"one"),
+            RecordedDatagram(0.25, b"two"),
+            RecordedDatagram(1.0, b"three"),
+        ]
         port = receiver.getsockname()[1]
         replay = asyncio.create_task(replay_capture(datagrams, "127.0.0.1", port))
         received = [(await loop.sock_recv(receiver, 100), loop.time() - start) for _ in datagrams]
@@ -112,11 +119,13 @@ async def test_replay_capture_raises_when_the_port_is_closed() -> None:
         closed.bind(("127.0.0.1", 0))
         port = closed.getsockname()[1]
     with pytest.raises(LinkError, match=rf"127.0.0.1:{port} \(Connection refused\)"):
-        await replay_capture([Datagram(t, b"x") for t in (0.0, 0.1, 0.2)], "127.0.0.1", port)
+        await replay_capture(
+            [RecordedDatagram(t, b"x") for t in (0.0, 0.1, 0.2)], "127.0.0.1", port
+        )
 
 
 @in_virtual_time_on_sockets
 async def test_replay_capture_raises_when_the_system_refuses() -> None:
     """An address to which the system may not send is reported at once."""
     with pytest.raises(LinkError, match=r"255\.255\.255\.255:3333 \(Perm"):
-        await replay_capture([Datagram(0.0, b"x")], "255.255.255.255", 3333)
+        await replay_capture([RecordedDatagram(0.0, b"x")], "255.255.255.255", 3333)

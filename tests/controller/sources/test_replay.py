@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.sources.capture import Datagram, write_capture
+from controller.sources.capture import RecordedDatagram, write_capture
 from controller.sources.registry import open_source
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
@@ -18,7 +18,7 @@ def write(path: Path, *moments: tuple[float, tuple[Touch, ...]], source: str = "
     write_capture(
         path,
         [
-            Datagram(time, tuio_datagram(TouchFrame(source, time, touches), number))
+            RecordedDatagram(time, tuio_datagram(TouchFrame(source, time, touches), number))
             for number, (time, touches) in enumerate(moments, start=1)
         ],
     )
@@ -71,6 +71,6 @@ def test_replay_source_refuses_bad_options(tmp_path: Path, options: str) -> None
 
 def test_replay_source_refuses_a_capture_without_touches(tmp_path: Path) -> None:
     """The error names the file."""
-    write_capture(tmp_path / "noise.tuio", [Datagram(0.0, b"noise")])
+    write_capture(tmp_path / "noise.tuio", [RecordedDatagram(0.0, b"noise")])
     with pytest.raises(InputError, match=r"noise.tuio"):
         open_source(f"replay:{tmp_path}/noise.tuio")

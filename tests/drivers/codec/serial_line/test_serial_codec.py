@@ -19,7 +19,7 @@ from drivers.codec.serial_line.frame import REPLY, Frame, encode_frame
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError
 from drivers.guard import Guard, GuardLimits
-from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import (
     Achieved,
     AmplifierState,
@@ -44,7 +44,7 @@ from drivers.protocol.messages import (
 from vendor_pages import plain
 
 Q = PROTOCOL.quantities
-FREQUENCIES = Quantity("frequency", "u16", 100, "Hz", 2000, 60000)  # within the limits
+FREQUENCIES = WireQuantity("frequency", "u16", 100, "Hz", 2000, 60000)  # within the limits
 
 
 WIDE = Capabilities(16, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1)
@@ -74,7 +74,7 @@ def test_set_is_these_bytes(wrap: Callable[[CommandSet], Request], code: int) ->
     assert type(decoded.command_set) is CommandSet
 
 
-def largest(pick: Callable[[Quantity], float]) -> tuple[list[Request], dict[int, Reply]]:
+def largest(pick: Callable[[WireQuantity], float]) -> tuple[list[Request], dict[int, Reply]]:
     """Requests, and replies by request type, of full length with an end of every range."""
     value = {name: pick(quantity) for name, quantity in vars(Q).items()}
     whole = {name: int(number) for name, number in value.items()}

@@ -167,11 +167,8 @@ HEAVY = {
 }
 
 
-@pytest.mark.parametrize("name", HEAVY)
-async def test_no_callback_takes_longer_than_two_milliseconds(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of its thread's processor time, for whatever bytes a client may send at once."""
+async def longest_callback(data: bytes) -> float:
+    """Longest processor time [s] of a callback while a client's data is handled."""
     _, connection, _ = serve([])
     times: list[float] = []
     run = asyncio.Handle._run
@@ -181,16 +178,29 @@ async def test_no_callback_takes_longer_than_two_milliseconds(
         run(handle)
         times.append(time.thread_time() - begin)
 
-    with no_long_collections():
-        monkeypatch.setattr(asyncio.Handle, "_run", timed)
-        asyncio.get_running_loop().call_soon(connection.data_received, HEAVY[name])
+    with no_long_collections(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(asyncio.Handle, "_run", timed)
+        asyncio.get_running_loop().call_soon(connection.data_received, data)
         for _ in range(300):
             await asyncio.sleep(0)
-        monkeypatch.undo()
     connection.abort()
     await asyncio.gather(*connection.pending)
     assert len(times) > 300
-    assert max(times) < 0.002
+    return max(times)
+
+
+@pytest.mark.parametrize("name", HEAVY)
+async def test_no_callback_takes_longer_than_two_milliseconds(name: str) -> None:
+    """Of its thread's processor time, for whatever bytes a client may send at once.
+
+    A virtual machine counts what its host takes as well, in one run of some hundreds; the same data
+    is long in each of three.
+    """
+    longest = await longest_callback(HEAVY[name])
+    for _ in range(2):
+        if longest >= 0.002:
+            longest = min(longest, await longest_callback(HEAVY[name]))
+    assert longest < 0.002
 
 
 @pytest.mark.parametrize(

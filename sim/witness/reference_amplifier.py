@@ -108,9 +108,9 @@ class ReferenceAmplifier:
         self._last_status = time
 
     def feed(self, time: float) -> None:
-        """Feed its watchdog."""
+        """Feed its watchdog by a frame that has no reply, carried out soon."""
         if self.state == _ENABLED:
-            self.watchdog.feed((time, time))
+            self.watchdog.feed((time, time + _CARRIED_OUT))
 
     def may_feed(self, time: float) -> None:
         """Note a request that feeds its watchdog unless refused or lost, carried out soon."""
@@ -256,7 +256,7 @@ class ReferenceAmplifier:
     def _applied(self, request: Request, reply: Reply, begin: float, end: float) -> None:
         if request.token == self._token:
             return
-        if request.token in self._played_tokens:
+        if self._token is not None and request.token in self._played_tokens:
             self._report_always(
                 "token", end, f"{self._name} accepted set {request.token} again after others"
             )

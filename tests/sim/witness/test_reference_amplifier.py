@@ -186,3 +186,32 @@ def test_reference_expects_no_feed_from_a_request_after_the_watchdog(
     watched.grants(ARM, 1.0, ENABLED)
     watched.grants(STOP, stopped_at, REACTING, WATCHDOG)
     assert watched.broken == broken
+
+
+def test_reference_allows_a_set_again_once_the_active_one_is_unknown() -> None:
+    """Its reply, late, and that of its repetition, both grant one set."""
+    watched = Watched()
+    watched.grants(ARM, 1.0, ENABLED)
+    watched.amplifier.request_granted(BRIEF, Reply(1, 3), 1.1, 1.102)
+    watched.amplifier.forget_state()
+    watched.amplifier.request_granted(BRIEF, Reply(1, 3), 1.12, 1.122)
+    assert watched.broken == []
+
+
+def test_reference_allows_10_ms_for_a_heartbeat_without_a_reply() -> None:
+    """Sent at 1.000 s; 3 ms after 1.250 s the fade of 5 ms may have begun or not."""
+    watched = Watched()
+    watched.grants(ARM, 0.8, ENABLED)
+    watched.amplifier.request_granted(
+        Request(
+            RequestKind.APPLY, 1, key=3, token=1, commands={0: ChannelCommand(110.0, 0.2, 0.0)}
+        ),
+        Reply(1, 3),
+        0.9,
+        0.902,
+    )
+    watched.amplifier.feed(1.0)
+    watched.grants(STOP, 1.252, REACTING, WATCHDOG)
+    watched.amplifier.check_sensors((0.19,), {}, 1.2535)
+    watched.amplifier.check_sensors((0.0,), {}, 1.258)
+    assert watched.broken == []

@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint format docs fuzz kill-test fault-test stop-test soak bench bench-latency \
+.PHONY: demo test lint format docs fuzz kill-test fault-test stop-test estimate-test soak bench bench-latency \
 	bench-localization bench-plant bench-wires dist smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -52,6 +52,12 @@ stop-test: .venv/installed-test
 # Others: make soak SOAK='--hours 10 --wire serial', or one again: make soak SOAK='--seed 17'
 soak: .venv/installed-test
 	$(BIN)/python tests/support/soak.py $(SOAK)
+
+# True errors of responses in polynomials against their estimates, on 23 plates with 20 layouts;
+# some minutes. `make test` takes four plates with five.
+estimate-test: .venv/installed-test
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/support/error_estimates.py \
+		--write docs/measured/accuracy.md
 
 format: .venv/installed-test
 	$(BIN)/ruff check --fix .

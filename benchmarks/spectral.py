@@ -26,7 +26,7 @@ from model.rig.file import example_rig_path, load_rig  # noqa: E402
 from model.rig.meshes import mesh_of  # noqa: E402
 from model.structure.actuator import Era  # noqa: E402
 from model.structure.plate import Material, Plate  # noqa: E402
-from model.vibration.convergence import reference_mesh  # noqa: E402
+from model.vibration.discretisation import reference_mesh  # noqa: E402
 from model.vibration.parametric_plate import parametric_plate  # noqa: E402
 
 RIG = load_rig(example_rig_path())

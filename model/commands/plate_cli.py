@@ -184,6 +184,9 @@ def convergence(
                 "is_the_rigs": error.mesh == rig.mesh,
                 "natural_frequency_error_percent": (100 * error.frequency).tolist(),
                 "response_error_percent": (100 * error.response).tolist(),
+                "estimated_response_error_percent": (
+                    None if error.estimate is None else (100 * error.estimate).tolist()
+                ),
             }
             for error in study.errors
         ]
@@ -215,6 +218,9 @@ def convergence(
         columns = "".join(f"{value:10.3f} %" for value in errors)
         mine = "  <- the rig's" if error.mesh == rig.mesh else ""
         print(f"{mesh_text:>9}{error.mesh.element_name:>9}{strip:>8}{error.dof:>8}{columns}{mine}")
+        if error.estimate is not None:
+            columns = "".join(f"{value:10.3f} %" for value in 100 * error.estimate)
+            print(f"{'estimated without the reference':>46}{columns}")
     print()
     print("for comparison, what the same response changes by if every ERA")
     changes = {

@@ -105,6 +105,9 @@ def build(
         f"{counted(len(table.frequencies), 'frequency', plural='frequencies')} for "
         f"{counted(table.grid.cell_count, 'cell')}, built in {elapsed:.2f} s"
     )
-    print(f"mesh {table.mesh}: fields within {error:.3g} % of a finer one ({table.reference_mesh})")
+    print(
+        f"mesh {table.mesh}: error of the fields {error:.3g} %, estimated with "
+        f"{table.reference_mesh}"
+    )
     print(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
     print(next_line("era", "table", "show", output))

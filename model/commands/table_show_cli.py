@@ -128,8 +128,9 @@ def _show_summary(summary: dict[str, Any]) -> None:
         ),
         (
             "mesh",
-            f"{summary['mesh_name']}, fields within "
-            f"{summary['discretisation_error_percent']:.3g} % of {summary['reference_mesh']}",
+            f"{summary['mesh_name']}, error of the fields "
+            f"{summary['discretisation_error_percent']:.3g} %, estimated with "
+            f"{summary['reference_mesh']}",
         ),
         ("raster", summary["raster"]),
         ("built by", f"era-haptics {summary['code_version']}"),

@@ -13,7 +13,12 @@ import numpy as np
 from model.arrays import FloatArray
 from model.fem.symmetry import CLASSES
 from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
-from model.spectral.local_compliance import Unresolved, compliance_between, unresolved_at
+from model.spectral.local_compliance import (
+    Unresolved,
+    compliance_between,
+    uncertain_compliance,
+    unresolved_at,
+)
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import SpectralClass, deflections_by_class, solve_class
 from model.structure.footprint import check_on_plate
@@ -81,6 +86,13 @@ class SpectralModes:
             extra += own @ residual.transpose(2, 1, 0).reshape(own.shape[1], -1 if count else 0)
         extra[:, :count] += self._local(at, self._observe(attached.points))
         return basis
+
+    def uncertain(self, points: FloatArray, others: FloatArray) -> FloatArray:
+        """By how much `truncated_terms` of the first power may be too low, (n, m)."""
+        own, other = self._observe(points), self._observe(others)
+        return uncertain_compliance(self._plate, own.unresolved, other.unresolved) / (
+            self.largest_truncated
+        )
 
     def _solve_alone(self, points: FloatArray, at: _Observed) -> PointSolutions:
         """Solve for these points, without the operators."""

@@ -37,6 +37,7 @@ _TO_CENTROID = 0.5  # where a disc that is cut by an edge acts, between its cent
 _LEAST_SINE = 1.5  # times 1 / p: nearest to its end that a polynomial resolves ever finer
 _DIRECTIONS = (np.arange(32) + 0.5) * np.pi / 64
 _COS2, _SIN2 = np.cos(_DIRECTIONS) ** 2, np.sin(_DIRECTIONS) ** 2
+_UNCERTAIN = 0.2  # share by which it may be higher: twice its error, for the estimate of errors
 _FAR = 12.0  # k d beyond which forces share no unresolved wave
 
 # Gauss points of ln t, t = 1 to 30, for integrals over dt / t: footprints leave little beyond.
@@ -61,13 +62,14 @@ def local_compliance(
 class Unresolved:
     """At n footprints [m] (n, 3): compliance of a point force in bending and in shear [m/N] (n,).
 
-    wavenumber [1/m] (n,): where it begins.
+    wavenumber [1/m] (n,): where it begins; decade [m/N] (n,): of shear in ten times shorter waves.
     """
 
     footprints: FloatArray
     bending: FloatArray
     shear: FloatArray
     wavenumber: FloatArray
+    decade: FloatArray
 
 
 def compliance_between(plate: Plate, own: Unresolved, other: Unresolved) -> FloatArray:
@@ -90,6 +92,17 @@ def compliance_between(plate: Plate, own: Unresolved, other: Unresolved) -> Floa
             bending[on_discs] * shares[0] + shear[on_discs] * shares[1]
         )
     return result
+
+
+def uncertain_compliance(plate: Plate, own: Unresolved, other: Unresolved) -> FloatArray:
+    """By how much the unresolved compliance may be too low [m/N] (n, m).
+
+    A share of it, and for a point, of which shear has no limit, ten times shorter waves.
+    """
+    same = (own.footprints[:, None] == other.footprints).all(axis=2)
+    points = same & (own.footprints[:, 2] == 0)[:, None]
+    decade = np.where(points, np.sqrt(np.multiply.outer(own.decade, other.decade)), 0.0)
+    return np.asarray(_UNCERTAIN * compliance_between(plate, own, other) + decade)
 
 
 def unresolved_at(plate: Plate, degrees: tuple[int, int], places: FloatArray) -> Unresolved:
@@ -120,6 +133,7 @@ def unresolved_at(plate: Plate, degrees: tuple[int, int], places: FloatArray) ->
         bending * mean / (4 * np.pi * D),
         images * logarithm / (2 * np.pi * shear),
         mean**-0.5,
+        images * math.log(10) / (2 * np.pi * shear),
     )
 
 

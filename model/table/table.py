@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import Complex64Array, FloatArray, IntArray
+from model.arrays import Complex64Array, ComplexArray, FloatArray, IntArray
 from model.drive_modes.exact_search import pattern_count
 from model.drive_modes.fields import Fields
 from model.drive_modes.sources import (
@@ -70,8 +70,8 @@ class LocalizationTable:
     - shapes: (points, r) [1/sqrt(kg)], its shapes on the raster
     - cell_sources: (sources, cells) [m/s²], mean peak acceleration over each cell of the sources
       of `switched` patterns (`model.drive_modes.sources`)
-    - discretisation_error: (f,), relative L2 error of the fields over the raster against the
-      reference mesh, maximum over the ERAs
+    - discretisation_error: (f,), estimated relative L2 error of the fields over the raster
+      (`model.vibration.discretisation`), maximum over the ERAs
     """
 
     plate: Plate
@@ -185,6 +185,17 @@ class LocalizationTable:
         coherent = np.einsum("fe,pfe->pf", weights, self.acceleration[:, rows])
         found = self.raster.at(np.ascontiguousarray(coherent).view(np.float32), points)
         return frequencies, np.abs(found.view(np.complex64)).T.astype(float)
+
+    def error_amplitude(self, frequency: float, base: ComplexArray) -> float:
+        """Root mean square over the plate [m/s²] of the error of a tone's discretised field.
+
+        frequency [Hz]: one of the table's; base (eras,): motion of the ERAs' bases [m]. The errors
+        of the ERAs are taken as independent.
+        """
+        row = int(np.searchsorted(self.frequencies, frequency))
+        weights = base / [era.stroke for era in self.eras]
+        fields = np.linalg.norm(self.acceleration[:, row] * weights)
+        return float(self.discretisation_error[row] * fields / math.sqrt(self.raster.point_count))
 
     def shapes_at(self, points: Sequence[Point]) -> FloatArray:
         """Shapes of the reduced plate at points [m] of it, (p, r)."""

@@ -10,11 +10,13 @@ from model.arrays import ComplexArray, FloatArray, lattice
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.fem.plate_mesh import PlateMesh
-from model.reduction.free_plate import solve_free_plate
+from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
+from model.spectral.mesh import SpectralMesh
 from model.structure.actuator import Era
 from model.structure.plate import Plate
+from model.vibration.discretisation import estimate_error, reference_mesh
 from model.vibration.natural_modes import natural_modes
 
 MAP_FREQUENCIES = (110.0, 250.0)
@@ -46,13 +48,15 @@ class MeshError:
     """Discretisation error of a mesh, relative to the reference.
 
     frequency: of the natural frequencies that are compared, signed, (n,); response: of the
-    acceleration field at each frequency, relative L2 over the plate, the worst driven ERA, (f,).
+    acceleration field at each frequency, relative L2 over the plate, the worst driven ERA, (f,);
+    estimate: of that error, without the reference, of polynomials only.
     """
 
     mesh: PlateMesh
     dof: int
     frequency: FloatArray
     response: FloatArray
+    estimate: FloatArray | None
 
 
 @dataclass(frozen=True)
@@ -84,13 +88,6 @@ def meshes_to_compare(rig: Rig) -> tuple[PlateMesh, ...]:
     return tuple(dict.fromkeys(chosen))
 
 
-def reference_mesh(plate: Plate, *, frequency_max: float) -> Mesh:
-    """Half as many elements again along both sides as an accurate mesh, in strips half as wide."""
-    auto = Mesh.accurate(plate, frequency_max=frequency_max)
-    nx, ny = (math.ceil(1.5 * count) for count in (auto.nx, auto.ny))
-    return Mesh(nx, ny, auto.length, auto.width, auto.element, auto.strip / 2)
-
-
 def default_frequencies(rig: Rig) -> FloatArray:
     """Those of the paper's maps [Hz] as far as they are within the rig's limit, else the limit."""
     high = rig.limits.frequency_max
@@ -120,12 +117,13 @@ def study_convergence(
     reference = reference_mesh(rig.plate, frequency_max=high)
     exact = _natural_frequencies(rig, reference)
     supported = exact > _MIN_FREQUENCY_RATIO * rig.plate.lowest_bending_frequency
-    (exact_response,) = _responses(rig, reference, rig.eras, frequencies=checked)
+    (exact_response,) = _responses(rig, _solved(rig, reference), rig.eras, frequencies=checked)
     size = np.linalg.norm(exact_response, axis=2)
     errors = []
     for done, mesh in enumerate(meshes, start=1):
         progress(done, 1 + len(meshes))
-        (response,) = _responses(rig, mesh, rig.eras, frequencies=checked)
+        free = _solved(rig, mesh)
+        (response,) = _responses(rig, free, rig.eras, frequencies=checked)
         difference = np.linalg.norm(response - exact_response, axis=2)
         errors.append(
             MeshError(
@@ -133,6 +131,7 @@ def study_convergence(
                 dof=mesh.dof,
                 frequency=_natural_frequencies(rig, mesh)[supported] / exact[supported] - 1,
                 response=(difference / size).max(axis=1),
+                estimate=_estimate(rig, free, checked),
             )
         )
     progress(1 + len(meshes), 1 + len(meshes))
@@ -164,7 +163,8 @@ def _nearer_the_middle(era: Era, plate: Plate) -> Era:
 def _changes(rig: Rig, *layouts: Sequence[Era], frequencies: FloatArray) -> tuple[FloatArray, ...]:
     """Change of the response by other ERAs, relative L2, the worst driven ERA, (f,) for each."""
     mesh = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)
-    before, *others = _responses(rig, mesh, rig.eras, *layouts, frequencies=frequencies)
+    free = _solved(rig, mesh)
+    before, *others = _responses(rig, free, rig.eras, *layouts, frequencies=frequencies)
     size = np.linalg.norm(before, axis=2)
     return tuple(
         np.asarray((np.linalg.norm(after - before, axis=2) / size).max(axis=1)) for after in others
@@ -176,11 +176,28 @@ def _natural_frequencies(rig: Rig, mesh: PlateMesh) -> FloatArray:
 
 
 def _responses(
-    rig: Rig, mesh: PlateMesh, *layouts: Sequence[Era], frequencies: FloatArray
+    rig: Rig, free: FreePlate, *layouts: Sequence[Era], frequencies: FloatArray
 ) -> list[ComplexArray]:
     """Acceleration fields of a plate on each layout, (f, eras, points)."""
-    x = np.linspace(0, rig.plate.length, _RASTER[0])
-    y = np.linspace(0, rig.plate.width, _RASTER[1])
-    points = lattice(x, y)
-    free = solve_free_plate(rig.plate, mesh, frequency_max=rig.limits.frequency_max)
+    points = _raster(rig.plate)
     return [free.acceleration(eras, frequencies, points, loads=rig.masses) for eras in layouts]
+
+
+def _estimate(rig: Rig, free: FreePlate, frequencies: FloatArray) -> FloatArray | None:
+    """Estimated error of the response, the worst driven ERA (f,)."""
+    if not isinstance(free.mesh, SpectralMesh):
+        return None
+    error = estimate_error(
+        free, free.mesh.finer(), rig.eras, frequencies, _raster(rig.plate), loads=rig.masses
+    )
+    return np.asarray(error.max(axis=1))
+
+
+def _solved(rig: Rig, mesh: PlateMesh) -> FreePlate:
+    return solve_free_plate(rig.plate, mesh, frequency_max=rig.limits.frequency_max)
+
+
+def _raster(plate: Plate) -> FloatArray:
+    x = np.linspace(0, plate.length, _RASTER[0])
+    y = np.linspace(0, plate.width, _RASTER[1])
+    return lattice(x, y)

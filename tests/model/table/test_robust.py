@@ -25,6 +25,7 @@ MEMBERS = Ensemble(
         [[1, 1, 1, 1], [1.05, 0.96, 1.02, np.exp(0.1j)], [np.exp(-0.08j), 1, 0.93, 1]],
         dtype=complex,
     ),
+    deviation=np.zeros((3, 3), dtype=complex),
 )
 
 
@@ -96,16 +97,56 @@ def test_robust_contrast_is_the_tenth_percentile_of_the_same_plates():
     question = Question((TARGET,), QUIET, drive_mode="phased")
     table = smooth_table()
     pattern = with_robust_contrast(table, question, table.query(question))
-    contrasts = ensemble_contrast_db(table, question, pattern.excitation, draw_ensemble(4))
+    contrasts = ensemble_contrast_db(
+        table, question, pattern.excitation, draw_ensemble(4, contact_count=3)
+    )
     assert (contrasts > pattern.robust_contrast_db).mean() == pytest.approx(0.9, abs=0.006)
     assert with_robust_contrast(table, question, pattern) == pattern
     alone = Question((TARGET,))
     assert with_robust_contrast(table, alone, table.query(alone)).robust_contrast_db is None
 
 
+def test_discretisation_error_enters_the_robust_contrast():
+    """An error that drowns one finger's response trades places with it; twice the error is 6 dB.
+
+    Far above the response it is the whole amplitude D there: D over quiet and target over D make
+    target over quiet.
+    """
+    question = Question((TARGET,), QUIET[:1], drive_mode="phased")
+    table = smooth_table()
+    excitation = table.query(question).excitation
+    deviation = 1e6 * np.array([[0, 0], [1, 0], [0, 1j]])
+    plates = replace(
+        draw_ensemble(4, contact_count=2),
+        thickness=np.ones(3),
+        damping=np.ones(3),
+        stiffness=np.ones((3, 4)),
+        gain=np.ones((3, 4)),
+        deviation=deviation,
+    )
+    right, at_target, at_quiet = ensemble_contrast_db(table, question, excitation, plates)
+    assert at_target + at_quiet == pytest.approx(right, abs=0.01)
+    worse = replace(table, discretisation_error=2 * table.discretisation_error)
+    twice = ensemble_contrast_db(worse, question, excitation, plates)
+    assert twice - [right, at_target, at_quiet] == pytest.approx([0, 6.02, -6.02], abs=0.01)
+
+
+def test_error_amplitude_is_the_error_of_the_direct_field():
+    """One ERA driven: its field over the plate by the direct solve, root mean square, times it."""
+    rig, table = smooth_rig(), smooth_table()
+    frequency = float(table.frequencies[8])
+    base = 40e-6 * np.exp(1j) * np.array([0, 1, 0, 0])
+    direct = direct_acceleration(
+        assemble(rig.plate, rig.mesh), rig.eras, np.array([frequency]), table.raster.points
+    )[0, 1]
+    rms = np.sqrt((np.abs(direct) ** 2).mean()) * 40e-6 / rig.eras[1].stroke
+    expected = table.discretisation_error[8] * rms
+    assert table.error_amplitude(frequency, base) == pytest.approx(expected, rel=1e-3)
+
+
 def test_ensemble_has_the_documented_tolerances():
     """Gains 5 %, phases 5 degrees, k_b within 10 %, thickness within 2 %, damping half to twice."""
-    ensemble = draw_ensemble(1000)
+    ensemble = draw_ensemble(1000, contact_count=2)
     assert np.abs(ensemble.gain).std() == pytest.approx(0.05, rel=0.05)
     assert np.degrees(np.angle(ensemble.gain)).std() == pytest.approx(5.0, rel=0.05)
     for values, low, high in (

@@ -102,17 +102,19 @@ def test_default_frequencies_are_those_of_the_papers_maps(limit, expected):
 
 
 def test_page_shows_the_errors_of_the_study(study):
-    """The page on the plate model prints each mesh with its errors, and both changes."""
+    """The page on the plate model prints each mesh with its errors, an estimate and changes."""
     page = Path(__file__).parents[3] / "docs" / "concepts" / "plate-model.md"
-    rows = re.findall(r"^ +(\d+x\d+) +\S+ .*?((?: +[\d.]+ %){3})", page.read_text(), re.MULTILINE)
+    text = page.read_text(encoding="utf-8")
+    rows = re.findall(r"^ +(\d+x\d+) +\S+ .*?((?: +[\d.]+ %){3})", text, re.MULTILINE)
     assert len(rows) == len(study.errors)
     for (mesh, printed), error in zip(rows, study.errors, strict=True):
         assert mesh == f"{error.mesh.nx}x{error.mesh.ny}"
         figures = [np.abs(error.frequency).max(), *error.response]
         shown = [float(value) for value in re.findall(r"[\d.]+", printed)]
         np.testing.assert_allclose(shown, 100 * np.array(figures), rtol=1e-3, atol=2e-3)
-    lines = re.findall(
-        r"^    (?:is|has) [^%]*?([\d.]+) % +([\d.]+) %$", page.read_text(), re.MULTILINE
-    )
+    (estimate,) = re.findall(r"^ +estimated .*?([\d.]+) % +([\d.]+) %$", text, re.MULTILINE)
+    shown = np.array(estimate, dtype=float)
+    np.testing.assert_allclose(shown, 100 * study.errors[-2].estimate, rtol=2e-3, atol=2e-3)
+    lines = re.findall(r"^    (?:is|has) [^%]*?([\d.]+) % +([\d.]+) %$", text, re.MULTILINE)
     shown = np.array(lines, dtype=float)
     np.testing.assert_allclose(shown, 100 * np.array([study.by_place, study.by_foot]), rtol=2e-3)

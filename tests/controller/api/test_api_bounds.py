@@ -191,16 +191,12 @@ async def longest_callback(data: bytes) -> float:
 
 @pytest.mark.parametrize("name", HEAVY)
 async def test_no_callback_takes_longer_than_two_milliseconds(name: str) -> None:
-    """Of its thread's processor time, for whatever bytes a client may send at once.
+    """Of its thread's processor time, whatever a client sends at once; the median of three runs.
 
-    A virtual machine counts what its host takes as well, in one run of some hundreds; the same data
-    is long in each of three.
+    A virtual machine counts what its host takes as well, in one run of some hundreds.
     """
-    longest = await longest_callback(HEAVY[name])
-    for _ in range(2):
-        if longest >= 0.002:
-            longest = min(longest, await longest_callback(HEAVY[name]))
-    assert longest < 0.002
+    longest = [await longest_callback(HEAVY[name]) for _ in range(3)]
+    assert sorted(longest)[1] < 0.002
 
 
 @pytest.mark.parametrize(

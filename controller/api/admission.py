@@ -17,17 +17,17 @@ SILENT_TIMEOUT = 0.1  # s; the same for one that has sent nothing yet
 
 
 class Admission:
-    """The connected clients; is_kept: holds the lease; is_subscribed: has subscriptions."""
+    """The connected clients; holds_lease, is_subscribed: whether a client does or is."""
 
     def __init__(
         self,
         *,
-        is_kept: Callable[[Connection], bool],
+        holds_lease: Callable[[Connection], bool],
         is_subscribed: Callable[[Connection], bool],
         clock: Callable[[], float],
     ) -> None:
         self.admitted: set[Connection] = set()
-        self._is_kept = is_kept
+        self._holds_lease = holds_lease
         self._is_subscribed = is_subscribed
         self._clock = clock
 
@@ -54,7 +54,7 @@ class Admission:
         full = [each for each in self.admitted if not each.is_reserve]
         if len(full) < MAX_CONNECTIONS:
             return True
-        candidates = [each for each in full if not each.pending and not self._is_kept(each)]
+        candidates = [each for each in full if not each.pending and not self._holds_lease(each)]
         now, timeout = self._clock(), SILENT_TIMEOUT
         idle = [each for each in candidates if not each.has_spoken]
         if not idle:

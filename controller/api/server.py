@@ -79,8 +79,8 @@ class ApiServer:
     """Serves the methods of the API.
 
     handlers: of all METHODS, called with the client and the parameters; on_disconnect: called with
-    every client that disconnects; is_kept: whether a client must not be evicted, since it holds the
-    lease; is_subscribed: whether it has subscriptions; clock [s].
+    every client that disconnects; holds_lease: whether a client does, and must not be evicted;
+    is_subscribed: whether it has subscriptions; clock [s].
     """
 
     def __init__(
@@ -88,14 +88,16 @@ class ApiServer:
         handlers: Mapping[str, Handler],
         *,
         on_disconnect: Callable[[Connection], None],
-        is_kept: Callable[[Connection], bool],
+        holds_lease: Callable[[Connection], bool],
         is_subscribed: Callable[[Connection], bool],
         clock: Callable[[], float] = clock.now,
     ) -> None:
         self._handlers = handlers
         self._on_disconnect = on_disconnect
         self._clock = clock
-        self._admission = Admission(is_kept=is_kept, is_subscribed=is_subscribed, clock=clock)
+        self._admission = Admission(
+            holds_lease=holds_lease, is_subscribed=is_subscribed, clock=clock
+        )
         self._stops: dict[Connection, CoalescedCalls[Message]] = {}
         self._waiting: deque[Connection] = deque()
         self._is_turn_scheduled = False

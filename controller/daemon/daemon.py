@@ -124,7 +124,7 @@ class Daemon:
         self._server = ApiServer(
             self._api.handlers(),
             on_disconnect=self._api.client_left,
-            is_kept=self._api.holds_lease,
+            holds_lease=self._api.holds_lease,
             is_subscribed=self._publisher.hub.is_subscribed,
             clock=clock.now,
         )

@@ -17,12 +17,12 @@ from drivers.protocol.messages import Achieved
 class Played:
     """Sets that amplifiers play, by name.
 
-    sent [s]: when the last byte of the set left for any amplifier, by the event loop's clock;
+    sent_at [s]: when the last byte of the set left for any amplifier, by the event loop's clock;
     loading_time [s]: how long loading the envelopes before it took, None without envelopes.
     """
 
     achieved: Mapping[str, Achieved]
-    sent: float
+    sent_at: float
     loading_time: float | None
 
 
@@ -67,7 +67,7 @@ class SynchronizedPlay:
             achieved = await gather_all(
                 self._amplifiers[name].apply(safe) for name, safe in sets.items()
             )
-            sent = self._last_sent_at
+            sent_at = self._last_sent_at
         else:
             achieved = await gather_all(
                 self._amplifiers[name].stage(safe) for name, safe in sets.items()
@@ -75,16 +75,16 @@ class SynchronizedPlay:
             if not may_play():
                 return None  # as above
             self.is_set_incomplete = True
-            sent_at = clock.now()
+            committed_at = clock.now()
             for name, safe in sets.items():
                 self._amplifiers[name].expect_commit(safe)
             await gather_all(self._commits(sets, may_play))
-            sent = self._last_sent_at  # before the statuses are read
+            sent_at = self._last_sent_at  # before the statuses are read
             if not may_play():
                 return None
-            await self._confirm_commits(sets, sent_at)
+            await self._confirm_commits(sets, committed_at)
         self.is_set_incomplete = False
-        return Played(dict(zip(sets, achieved, strict=True)), sent, loading_time)
+        return Played(dict(zip(sets, achieved, strict=True)), sent_at, loading_time)
 
     @property
     def _last_sent_at(self) -> float:
@@ -121,10 +121,12 @@ class SynchronizedPlay:
             ]
         )
 
-    async def _confirm_commits(self, sets: Mapping[str, SafeCommandSet], sent_at: float) -> None:
+    async def _confirm_commits(
+        self, sets: Mapping[str, SafeCommandSet], committed_at: float
+    ) -> None:
         """Raise CommandRefused unless every amplifier reports that it plays its set."""
         await gather_all(
-            self._amplifiers[name].confirm_commit(safe, sent_at=sent_at)
+            self._amplifiers[name].confirm_commit(safe, sent_at=committed_at)
             for name, safe in sets.items()
         )
 

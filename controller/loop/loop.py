@@ -275,12 +275,12 @@ class Controller:
         False if silence came in between.
         """
         commands: Mapping[str, DriveCommand] = {}
-        sent = None
+        sent_at = None
         if decision.sets is not None:
             played = await self._play(decision.sets, is_pattern=decision.pattern is not None)
             if played is None:
                 return False
-            commands, sent = commands_by_era(played.achieved, self._rig), played.sent
+            commands, sent_at = commands_by_era(played.achieved, self._rig), played.sent_at
             self._decider.confirm(commands, now=clock.now())
             if played.loading_time is not None:
                 self._decider.note_loading_time(played.loading_time, now=clock.now())
@@ -288,13 +288,13 @@ class Controller:
             self._report(self._observer.refused, decision.refusal)
         if decision.adds_endings_only:
             return True  # what is felt stays the same
-        if decision.pattern is not None and sent is not None:
+        if decision.pattern is not None and sent_at is not None:
             applied = applied_by(
-                decision, decision.pattern, commands=commands, sent=sent, timing=self._timing
+                decision, decision.pattern, commands=commands, sent_at=sent_at, timing=self._timing
             )
             self._report(self._observer.pattern_applied, applied)
         else:
-            silenced = silenced_by(decision, sent=sent, now=clock.now())
+            silenced = silenced_by(decision, sent_at=sent_at, now=clock.now())
             self._report(self._observer.silenced, silenced)
         return True
 

@@ -67,31 +67,31 @@ def applied_by(
     pattern: Pattern,
     *,
     commands: Mapping[str, DriveCommand],
-    sent: float,
+    sent_at: float,
     timing: Timing | None,
 ) -> Applied:
-    """Report a decision whose pattern plays; sent [s]: its last byte."""
+    """Report a decision whose pattern plays; sent_at [s]: of its last byte."""
     return Applied(
         contacts=decision.contacts,
         targets=decision.selection.predictions,
         quiet=decision.selection.quiet,
         pattern=pattern,
         drive=commands,
-        latency=sent - decision.triggered_at,
-        time=sent,
+        latency=sent_at - decision.triggered_at,
+        time=sent_at,
         from_rest=decision.from_rest,
         question=decision.selection.question,
         timing=timing,
     )
 
 
-def silenced_by(decision: Decision, *, sent: float | None, now: float) -> Silenced:
-    """Report a decision for silence; sent [s]: its last byte, None if nothing was sent."""
+def silenced_by(decision: Decision, *, sent_at: float | None, now: float) -> Silenced:
+    """Report a decision for silence; sent_at [s]: of its last byte, None if nothing was sent."""
     return Silenced(
         contacts=decision.contacts,
         targets=tuple(contact for contact, _ in decision.selection.targets),
         reason=decision.refusal or decision.selection.reason or "",
-        latency=None if sent is None else sent - decision.triggered_at,
+        latency=None if sent_at is None else sent_at - decision.triggered_at,
         time=now,
     )
 

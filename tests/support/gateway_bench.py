@@ -107,7 +107,7 @@ class ScriptedDaemon:
         server = ApiServer(
             {name: self._handler(name) for name in METHODS},
             on_disconnect=self._hub.forget,
-            is_kept=lambda client: False,
+            holds_lease=lambda client: False,
             is_subscribed=self._hub.is_subscribed,
         )
         bound = socket.socket(socket.AF_UNIX)

@@ -188,7 +188,7 @@ class ModbusBackend(WireBackend):
             unit=self._url.unit,
             timeout=timeout,
             accept=accept,
-            sent=self._sent,
+            on_sent=self._sent,
             is_stop=isinstance(request, Stop),
         )
         if response.exception in _GATEWAY:

@@ -68,14 +68,14 @@ class ModbusLine(SharedLine[Port]):
         unit: int,
         timeout: float,
         accept: Callable[[ModbusResponse], bool],
-        sent: Callable[[float], None] = lambda time: None,
+        on_sent: Callable[[float], None] = lambda time: None,
         is_stop: bool = False,
     ) -> ModbusResponse:
         """Write, read, or both in one transaction, and wait for the response.
 
         timeout [s]: of the whole transaction, extended on slow lines; accept: whether a well-formed
-        response matches; sent: called with the time when the request was sent; is_stop: send it for
-        an amplifier that has not been reopened since a loss, too. Raises LinkTimeout, LinkError.
+        response matches; on_sent: called with the time when the request was sent; is_stop: send it
+        for an amplifier not reopened since a loss, too. Raises LinkTimeout, LinkError.
         """
         self._is_transacting = True
         try:
@@ -87,7 +87,7 @@ class ModbusLine(SharedLine[Port]):
             on_line = self._time_of(len(request.frame) + _RTU_OVERHEAD + request.response_size)
             on_line += 2 * self._gap  # before the response, and at the end of the request
             self._send(request)
-            sent(self._last_sent_at)
+            on_sent(self._last_sent_at)
             self._response = asyncio.get_running_loop().create_future()
             self._is_response_pending = True
             self._free_from = self._last_sent_at + on_line + _REACTION
@@ -104,7 +104,7 @@ class ModbusLine(SharedLine[Port]):
             self._response = None
             self._is_transacting = False
 
-    async def broadcast(self, write: Write, sent: Callable[[float], None]) -> None:
+    async def broadcast(self, write: Write, on_sent: Callable[[float], None]) -> None:
         """Write to all units; there are no responses.
 
         Raises LinkError during a transaction over RTU, with whose response it would collide.
@@ -116,7 +116,7 @@ class ModbusLine(SharedLine[Port]):
         if self.url.is_rtu:
             self._request = None
         self._send(request)
-        sent(self._last_sent_at)
+        on_sent(self._last_sent_at)
         self._free_from = self._last_sent_at + self._time_of(len(request.frame)) + self._gap
 
     def _make(self, read: Read | None, write: Write | None, *, unit: int) -> RequestAdu:

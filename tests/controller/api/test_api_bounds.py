@@ -99,7 +99,7 @@ def serve(served: list[str]) -> tuple[ApiServer, Connection, Wire]:
     server = ApiServer(
         {name: handler(name) for name in METHODS},
         on_disconnect=lambda client: None,
-        is_kept=lambda client: True,
+        holds_lease=lambda client: True,
         is_subscribed=lambda client: False,
         clock=lambda: 0.0,
     )
@@ -215,7 +215,7 @@ def test_place_is_taken_from_the_silent_then_idle_subscribers_then_the_idle(
     """Never from a holder of the lease or one that waits; kind and silence [s] of each client."""
     made: list[tuple[Connection, str]] = []
     admission = Admission(
-        is_kept=lambda one: (one, "kept") in made,
+        holds_lease=lambda one: (one, "kept") in made,
         is_subscribed=lambda one: (one, "subscribed") in made,
         clock=lambda: 100.0,
     )

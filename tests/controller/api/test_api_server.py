@@ -104,7 +104,7 @@ async def serving(folder: Path) -> AsyncIterator[Served]:
             "effects": lambda client, params: EffectsResult(effects=[]),
         },
         on_disconnect=served.disconnected.append,
-        is_kept=lambda client: False,
+        holds_lease=lambda client: False,
         is_subscribed=hub.is_subscribed,
     )
     bound = socket.socket(socket.AF_UNIX)

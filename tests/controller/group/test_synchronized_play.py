@@ -67,4 +67,4 @@ async def test_play_reports_when_the_last_commit_was_sent() -> None:
     )
     assert last - first == pytest.approx(0.010)
     assert played is not None
-    assert played.sent == last
+    assert played.sent_at == last

@@ -1,11 +1,13 @@
 """Polynomials over the plate: time and error of three plates, and of parameters that change live.
 
-    python -m benchmarks.spectral [--repeats 15]
+    python -m benchmarks.spectral [--repeats 15] [--large]
 
 Processor time on one thread, medians: from nothing to 27 frequencies of four ERAs at 20 points, and
 a further layout at places never seen before. What depends on degrees and h / L alone, integrals of
 one dimension, is kept between repeats. Error: relative L2 over frequencies, ERAs and points against
 elements of fifth order, half as many again along both sides as an accurate mesh has, with strips.
+--large adds a plate of fourteen wavelengths a side, once, with an accurate mesh of elements beside
+it, which takes minutes.
 """
 
 import argparse
@@ -21,6 +23,7 @@ use_one_thread()
 import numpy as np  # noqa: E402
 
 from model.arrays import FloatArray  # noqa: E402
+from model.fem.mesh import Mesh  # noqa: E402
 from model.reduction.free_plate import solve_free_plate  # noqa: E402
 from model.rig.file import example_rig_path, load_rig  # noqa: E402
 from model.rig.meshes import mesh_of  # noqa: E402
@@ -62,7 +65,9 @@ CASES = (
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.spectral", description=__doc__)
     parser.add_argument("--repeats", type=int, default=15)
-    repeats = parser.parse_args().repeats
+    parser.add_argument("--large", action="store_true")
+    options = parser.parse_args()
+    repeats = options.repeats
     print("| plate | mesh | from nothing | further layout | error: corners | inset | edges |")
     print("|---|---|---|---|---|---|---|")
     for case in CASES:
@@ -72,6 +77,21 @@ def main() -> None:
     print("|---|---|")
     for what, milliseconds in _live(repeats).items():
         print(f"| {what} | {milliseconds:.3f} ms |")
+    if options.large:
+        print("\n| 3600 x 2400 x 4 mm glass to 500 Hz | from nothing |\n|---|---|")
+        _compare_large()
+
+
+def _compare_large() -> None:
+    plate, high = Plate(3.6, 2.4, 0.004, GLASS), 500.0
+    polynomials = mesh_of("auto", plate, frequency_max=high, stiffness=RIG.eras[0].stiffness)
+    eras = _on(plate, np.array(LAYOUTS["inset"]), 0.0)
+    points = np.random.default_rng(1).uniform(0.03, 0.97, (20, 2)) * [plate.length, plate.width]
+    for mesh in (polynomials, Mesh.accurate(plate, frequency_max=high)):
+        started = time.process_time()
+        solved = solve_free_plate(plate, mesh, frequency_max=high)
+        solved.acceleration(eras, np.linspace(60.0, high, 27), points)
+        print(f"| {mesh} | {time.process_time() - started:.2f} s |", flush=True)
 
 
 def _row(case: Case, repeats: int) -> str:

@@ -9,7 +9,7 @@ from model.errors import InputError
 from model.fem.element_registry import element_of
 from model.fem.mesh import PAPER_ELEMENT, Mesh
 from model.fem.plate_mesh import PlateMesh
-from model.spectral.mesh import MAX_POLYNOMIALS, POLYNOMIALS, SpectralMesh
+from model.spectral.mesh import MAX_DEGREE, MAX_POLYNOMIALS, POLYNOMIALS, SpectralMesh
 from model.structure.plate import Plate
 
 _MAX_ELEMENTS_PER_SIDE = 1000
@@ -37,8 +37,9 @@ def mesh_of(text: str, plate: Plate, *, frequency_max: float, stiffness: float =
         return polynomials
     if words[1:]:
         raise InputError(
-            f"mesh: {text} must need at most {MAX_POLYNOMIALS} polynomials, got more up to "
-            f"{frequency_max:g} Hz; use auto, then of finite elements, or less accuracy"
+            f"mesh: {text} must need at most {MAX_POLYNOMIALS} polynomials up to degree "
+            f"{MAX_DEGREE}, got more up to {frequency_max:g} Hz; use auto, then of elements, "
+            "or less accuracy"
         )
     mesh = Mesh.accurate(plate, frequency_max=frequency_max)
     if mesh.node_count > _MAX_AUTO_NODES:

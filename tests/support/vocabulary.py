@@ -7,6 +7,7 @@ import ast
 import re
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -135,13 +136,9 @@ def _replacement(name: str, file: str) -> str | None:
     plain = name.strip("_")
     if plain in ALLOWED:
         return None
-    for pattern, instead in RETIRED.items():
-        if re.fullmatch(pattern, plain):
-            return instead
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", plain).lower()
-    for pattern, instead in RETIRED_WORDS.items():
-        if re.search(rf"(?:^|_)(?:{pattern})(?:_|$)", words):
-            return instead
+    if (instead := _replacement_anywhere(plain)) is not None:
+        return instead
+    words = _words(plain)
     if file.startswith(DRIVER_PACKAGES):
         for pattern, instead in RETIRED_IN_DRIVERS.items():
             if re.search(rf"(?:^|_)(?:{pattern})(?:_|$)", words):
@@ -149,6 +146,23 @@ def _replacement(name: str, file: str) -> str | None:
     if file.startswith(CONTACT_PACKAGES) and re.search(r"(?:^|_)leases?(?:_|$)", words):
         return "contact_timeout"
     return None
+
+
+@cache
+def _replacement_anywhere(plain: str) -> str | None:
+    for pattern, instead in RETIRED.items():
+        if re.fullmatch(pattern, plain):
+            return instead
+    words = _words(plain)
+    for pattern, instead in RETIRED_WORDS.items():
+        if re.search(rf"(?:^|_)(?:{pattern})(?:_|$)", words):
+            return instead
+    return None
+
+
+@cache
+def _words(plain: str) -> str:
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", plain).lower()
 
 
 if __name__ == "__main__":

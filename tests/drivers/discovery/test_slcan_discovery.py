@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from drivers.cli import app
 from drivers.codec.can_bus.frame import CanFrame
+from drivers.discovery import slcan
 from drivers.discovery.slcan import SlcanAdapter, detect_slcan
 from sim.far_ends.can_bus.bus import CanBus
 from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter as FarAdapter
@@ -86,6 +87,13 @@ def adapter() -> Iterator[Adapter]:
     adapter.close()
 
 
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The adapter here is a thread on a machine that may be busy: it is given time to reply."""
+    monkeypatch.setattr(slcan, "_REPLY_TIMEOUT", 5.0)
+
+
+@pytest.mark.usefixtures("patient")
 def test_adapter_listens_and_is_closed(adapter: Adapter) -> None:
     """Its version, and the amplifiers' nodes that beat there, not the host's; L and no other
     opening, closed at the end, and not a frame of ours on the bus."""
@@ -103,6 +111,7 @@ def test_other_device_receives_two_characters(adapter: Adapter) -> None:
         assert adapter.said == b"V\r"
 
 
+@pytest.mark.usefixtures("patient")
 def test_adapter_without_listen_only_mode_is_not_opened(adapter: Adapter) -> None:
     """O is never sent."""
     usual = adapter.receive

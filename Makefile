@@ -17,8 +17,7 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: .venv/installed
 	$(BIN)/era demo
 
-# What needs the processors, a worker each; what waits in real time, more of them than processors;
-# what loads the processors itself.
+# What needs the processors; what plays in real time; what loads the processors itself.
 test: .venv/installed-test
 	$(BIN)/pytest -m 'not real_time and not alone' --numprocesses auto --dist loadfile --no-loadscope-reorder
 	$(BIN)/pytest -m 'real_time and not alone' --numprocesses 3 --dist loadfile --no-loadscope-reorder

@@ -79,6 +79,12 @@ def pytest_configure(config: pytest.Config) -> None:
     config.add_cleanup(preloaded.install().close)
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """One worker more than processors: many tests wait for timeouts or for other processes."""
+    return len(os.sched_getaffinity(0)) + 1
+
+
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Skip files without a test that is asked for by its mark: importing all takes seconds."""
     asked = config.option.markexpr.partition(" ")[0]

@@ -191,7 +191,7 @@ def ensemble_section(sets: int, seed: int) -> Section:
         notes=[
             "nine of ten plates have more. They vary in gains, phases, stiffness of each ERA",
             "(10 %), thickness (2 %) and damping (half to twice), with fingers that press on the",
-            "plate. Patterns are chosen for a plain ramp.",
+            "plate, and in the table's discretisation error. Patterns are chosen for a plain ramp.",
         ],
     )
 

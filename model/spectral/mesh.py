@@ -66,7 +66,7 @@ class SpectralMesh:
         half = plate.bending_wavelength(frequency_max) / math.pi
         more = _ACCURATE + max(0, math.ceil(math.log2(0.01 / accuracy)))
         x, y = plate.length / 2, plate.width / 2
-        most = np.array([(x, y), (x, 0), (0, y)])  # places where the polynomials resolve least
+        places = np.array([(x, y), (x, 0), (0, y)])  # where the polynomials resolve least
         while True:
             nx, ny = (
                 max(MIN_DEGREE, math.ceil(side / half) + more)
@@ -74,7 +74,7 @@ class SpectralMesh:
             )
             if (nx + 1) * (ny + 1) > MAX_POLYNOMIALS or max(nx, ny) > MAX_DEGREE:
                 return None
-            dent = np.diagonal(local_compliance(plate, (nx, ny), most, most)).max()
+            dent = np.diagonal(local_compliance(plate, (nx, ny), places, places)).max()
             if _ERROR_PER_DENT / min(nx, ny) * stiffness * dent <= accuracy:
                 return cls(nx, ny, plate.length, plate.width)
             more += 1

@@ -11,6 +11,7 @@ from sim.witness.deadlines import Deadlines, KnownInputs
 from sim.witness.decoded import WATCHDOG_FEEDING, ChannelCommand, Request, RequestKind
 from sim.witness.set_rules import ExpectedSets, check_envelope, check_set
 
+_IN_FLIGHT = 0.001  # s; from the host's write until a frame is seen
 _REORDER_WINDOW = 0.020  # s; of two commands given within it the earlier may still be sent first
 _UNORDERED = (RequestKind.READ, RequestKind.HELLO, RequestKind.CAPABILITIES)
 
@@ -131,8 +132,8 @@ class HostRules:
     def _check_stop(self, session: AmplifierSession, time: float, request: Request) -> None:
         requested_at = session.stop_requested_at
         is_other = request.kind is not RequestKind.STOP and request.kind not in _UNORDERED
-        # Requests made at the same moment as the stop may precede it.
-        if requested_at is None or time <= requested_at or not is_other:
+        # Requests written at the same moment as the stop may precede it.
+        if requested_at is None or time <= requested_at + _IN_FLIGHT or not is_other:
             return
         if (
             request.kind is RequestKind.DISARM

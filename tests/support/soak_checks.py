@@ -6,6 +6,7 @@ they are the table's own.
 
 import asyncio
 import math
+from collections import deque
 from collections.abc import Callable, Mapping
 
 from drivers.protocol.messages import (
@@ -32,6 +33,7 @@ RELEASE = 0.020  # s; from the last finger up to zero
 # s; three unanswered requests, then the watchdog, and a heartbeat that was on its way.
 RELEASE_WITH_FAULTS = 3 * 0.15 + WATCHDOG + 0.1
 TOGETHER = 0.6  # s; until all are silent after one of them has a fault
+_REMEMBERED = 16  # tokens since Arm, as docs/reference/wire-protocol.md has it
 STEP = 0.020  # s; check interval while a channel vibrates
 IDLE_STEP = 1.0
 _NON_FEEDING_REQUESTS = (Hello, GetCaps, GetStatus, GetFaults)
@@ -77,7 +79,9 @@ class Checks:
         self._starving: dict[str, asyncio.TimerHandle] = {}
         self._releasing: asyncio.TimerHandle | None = None
         self._is_closed = False
-        self._tokens: dict[str, set[int]] = {name: set() for name in bench.amplifiers}
+        self._tokens: dict[str, deque[int]] = {
+            name: deque(maxlen=_REMEMBERED) for name in bench.amplifiers
+        }
         self._token = dict.fromkeys(bench.amplifiers, 0)
         self._faulted: dict[str, float] = {}
         self._loop = asyncio.get_running_loop()
@@ -129,7 +133,7 @@ class Checks:
             self._token[name] = token
             if token in self._tokens[name]:
                 self.violate(f"{name} has played token {token} twice")
-            self._tokens[name].add(token)
+            self._tokens[name].append(token)
         self._check_limits(name)
         if not isinstance(request, _NON_FEEDING_REQUESTS):
             self._fed[name] = now

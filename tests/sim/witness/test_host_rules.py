@@ -84,10 +84,21 @@ def test_host_rules_require_silence_before_another_set() -> None:
         assert watched.broken == broken
 
 
+def test_host_rules_accept_a_request_on_its_way_at_the_stop() -> None:
+    """Seen less than a millisecond after the stop was requested, it was written before."""
+    watched = Watched()
+    watched.host.operator_command(1.010, "stop")
+    watched.host.check_request(
+        watched.sessions["west"], 1.0108, Request(RequestKind.STATUS, 1, key=9)
+    )
+    watched.host.check_request(watched.sessions["west"], 1.014, STOP)
+    assert watched.broken == []
+
+
 def test_host_rules_report_a_disarm_before_a_stop() -> None:
     """A stop is requested, but a disarm with ten times the ramp is sent first."""
     watched = Watched()
     watched.host.operator_command(1.010, "stop")
-    watched.host.check_request(watched.sessions["west"], 1.011, DISARM)
-    watched.host.check_request(watched.sessions["west"], 1.013, STOP)
+    watched.host.check_request(watched.sessions["west"], 1.012, DISARM)
+    watched.host.check_request(watched.sessions["west"], 1.014, STOP)
     assert watched.broken == ["stop"]

@@ -33,7 +33,7 @@ class WatchedWire:
         self.kind = kind
         self.sessions = sessions
         self.recent: deque[Data] = deque(maxlen=_COPIES)
-        self._disturbed_until = -math.inf
+        self._faults_until = self._disturbed_until = -math.inf
         self.reset()
 
     def reset(self) -> None:
@@ -55,8 +55,13 @@ class WatchedWire:
     def feed(
         self, direction: Direction, time: float, data: Data
     ) -> list[tuple[float, DecodedFrame]]:
-        """Decode bytes; returns frames, each with the time [s] of its first byte."""
+        """Decode bytes; returns frames, each with the time [s] of its first byte.
+
+        Bytes that follow a frame cut by a fault are read as its rest, and are a disturbance too.
+        """
         begun = self._begun.pop(direction, time)
+        if begun < time and begun <= self._faults_until < time:
+            self._disturbed_until = max(self._disturbed_until, time + _RECOVERY)
         found = self.decoder.feed(direction, time, data)
         if self.decoder.has_partial_frame(direction):
             self._begun[direction] = time if found else begun
@@ -68,4 +73,5 @@ class WatchedWire:
 
     def set_disturbed(self, time: float, *, is_on: bool) -> None:
         """Note the start or the end of injected faults."""
-        self._disturbed_until = math.inf if is_on else time + _RECOVERY
+        self._faults_until = math.inf if is_on else time
+        self._disturbed_until = self._faults_until + _RECOVERY

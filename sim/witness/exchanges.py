@@ -162,7 +162,7 @@ class Exchanges:
             return
         if reply.refusal:
             if reply.status is not None and not is_overtaken:
-                session.amplifier.status_reported(reply.status, at, time)
+                session.amplifier.refusal_received(reply.status, at, time)
             return
         if request.kind in STATE_CHANGING:
             # The first attempt may have been executed and its reply lost.

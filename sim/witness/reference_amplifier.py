@@ -280,8 +280,12 @@ class ReferenceAmplifier:
 
     def event_received(self, state: int, fault: int, time: float) -> None:
         """Compare an unsolicited state event."""
-        was_answered = self.is_answered and state == self.state
-        self.status_reported(Status(state, fault), time, time)
+        self.refusal_received(Status(state, fault), time, time)
+
+    def refusal_received(self, status: Status, begin: float, end: float) -> None:
+        """Compare the status in a refusal, of which hosts need to read the reason only."""
+        was_answered = self.is_answered and status.state == self.state
+        self.status_reported(status, begin, end)
         self.is_answered = was_answered
 
     def _check_condition(self, reported: Status, begin: float, end: float) -> None:

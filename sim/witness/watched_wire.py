@@ -61,7 +61,7 @@ class WatchedWire:
         """
         begun = self._begun.pop(direction, time)
         if begun < time and begun <= self._faults_until < time:
-            self._disturbed_until = max(self._disturbed_until, time + _RECOVERY)
+            self.disturb(time)
         found = self.decoder.feed(direction, time, data)
         if self.decoder.has_partial_frame(direction):
             self._begun[direction] = time if found else begun
@@ -70,6 +70,10 @@ class WatchedWire:
     def is_disturbed(self, time: float) -> bool:
         """Whether faults are injected at a time [s], or were shortly before."""
         return time <= self._disturbed_until
+
+    def disturb(self, time: float) -> None:
+        """Count as disturbed for a while from a time [s] on."""
+        self._disturbed_until = max(self._disturbed_until, time + _RECOVERY)
 
     def set_disturbed(self, time: float, *, is_on: bool) -> None:
         """Note the start or the end of injected faults."""

@@ -105,6 +105,8 @@ class Witness:
     def closed(self, link: str, time: float) -> None:
         """Note that the host has closed or lost a wire."""
         self._advance(time)
+        if any(session.pending for session in self._wires[link].sessions.values()):
+            self._wires[link].disturb(time)  # the next host may receive their replies
         for session in self._wires[link].sessions.values():
             session.is_open = False
             if any(request.kind in STATE_CHANGING for _, request in session.pending.values()):

@@ -55,7 +55,6 @@ class Truth:
 
     def fields(self, heard: Heard, points: FloatArray) -> tuple[FloatArray, ComplexArray]:
         """Frequencies (f,) [Hz] of the reported pattern, and its acceleration (f, p) [m/s²]."""
-        assert heard.patterns, "no pattern was reported"
         drive = heard.patterns[-1]["drive"]
         frequencies = np.array(sorted({tone["frequency_hz"] for tone in drive.values()}))
         alone = direct_acceleration(
@@ -236,7 +235,10 @@ def rounding(played: Played, truth: Truth) -> list[float]:
 
 
 def _touched(played: Played) -> list[Heard]:
-    return [heard for heard in played.heard if heard.situation.fingers]
+    """Situations with fingers, each of which must have a pattern."""
+    touched = [heard for heard in played.heard if heard.situation.fingers]
+    assert all(heard.patterns for heard in touched)
+    return touched
 
 
 def _apart(got: ComplexArray, wanted: ComplexArray) -> float:

@@ -215,3 +215,15 @@ def test_reference_allows_10_ms_for_a_heartbeat_without_a_reply() -> None:
     watched.amplifier.check_sensors((0.19,), {}, 1.2535)
     watched.amplifier.check_sensors((0.0,), {}, 1.258)
     assert watched.broken == []
+
+
+def test_reference_knows_that_hosts_need_not_read_the_state_in_a_refusal() -> None:
+    """The fault is known from then on, but not as answered; a reply makes it so."""
+    watched = Watched()
+    watched.grants(ARM, 1.0, ENABLED)
+    watched.amplifier.refusal_received(Status(FAULT, WATCHDOG), 1.251, 1.255)
+    assert watched.amplifier.is_in_fault
+    assert not watched.amplifier.is_answered
+    watched.amplifier.status_reported(Status(FAULT, WATCHDOG), 1.26, 1.262)
+    assert watched.amplifier.is_answered
+    assert watched.broken == []

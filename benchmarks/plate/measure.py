@@ -1,72 +1,88 @@
-"""One measurement in a process of its own: prints a JSON object with seconds and peak memory.
+"""Errors and times of programs: processor time on one thread, all programs in turns."""
 
-    python -m benchmarks.plate.measure PROGRAM TASK NX NY
-
-PROGRAM is a module below benchmarks. TASK is one of
-
-    answers   the response at the common raster on two layouts, nothing timed
-    nothing   from nothing to 27 frequencies and four drives at all nodes of the mesh
-    layout    another layout on a plate that has been solved already
-    places    the same, at places of a raster that has been solved for (ours alone)
-
-Imports are not timed, since a program that is running has them behind it.
-"""
-
-import importlib
-import json
-import resource
-import sys
+import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from types import ModuleType
 
 import numpy as np
-from numpy.typing import NDArray
 
-from benchmarks.plate.problem import CORNERS, INSET, LENGTH, RASTER, WIDTH
+from benchmarks.plate.peers.meshes import Elements
+from benchmarks.plate.peers.ways import Direct
+from benchmarks.plate.problem import CORNERS, OTHERS, Case, difference
+from benchmarks.plate.programs import Setting, Solved, reference, settings
+from model.arrays import FloatArray
 
-REPEATS = 20
-
-
-def main() -> None:
-    program = importlib.import_module(f"benchmarks.plate.{sys.argv[1]}")
-    task, nx, ny = sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
-    result = {"name": program.NAME, "method": program.METHOD}
-    started = time.perf_counter()
-    plate = program.Plate(nx, ny)
-    first = plate.sweep(CORNERS, RASTER if task == "answers" else plate.points)
-    result["seconds"] = time.perf_counter() - started
-    result["dof"] = plate.dof
-    if task == "answers":
-        both = np.array([first, plate.sweep(INSET, RASTER)])
-        result["answers"] = [both.real.tolist(), both.imag.tolist()]
-    elif task == "layout":
-        result["seconds"] = _time(lambda places: plate.sweep(places, RASTER))
-    elif task == "places":
-        x, y = np.meshgrid(np.linspace(0, LENGTH, 13), np.linspace(0, WIDTH, 13))
-        candidates = program.Candidates(plate, np.column_stack([x.ravel(), y.ravel()]), RASTER)
-        rng = np.random.default_rng(0)
-        layouts = [rng.choice(len(candidates.places), 4, replace=False) for _ in range(REPEATS)]
-        candidates.sweep(layouts[0])
-        started = time.perf_counter()
-        for layout in layouts:
-            candidates.sweep(layout)
-        result["seconds"] = (time.perf_counter() - started) / len(layouts)
-    kilobytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    print(json.dumps(result | {"peak_mb": kilobytes / 1024}))
+SLOW = 0.3  # s; a setting that takes longer is measured in the first rounds alone
+SLOW_ROUNDS = 3
+SAME_MESH = Elements(6, 4, 3, (0.004,))
+"""On which peers have to give the same."""
 
 
-def _time(sweep: Callable[[NDArray[np.float64]], object]) -> float:
-    """Seconds a layout: of one where that takes long, else the mean of many, each elsewhere."""
-    started = time.perf_counter()
-    sweep(INSET)
-    once = time.perf_counter() - started
-    if once > 0.1:
-        return once
-    started = time.perf_counter()
-    for number in range(REPEATS):
-        sweep(INSET * (1 - 0.01 * (number + 1)))  # never seen before
-    return (time.perf_counter() - started) / REPEATS
+@dataclass
+class Measured:
+    """Relative L2 errors of a setting at the corners, and the largest elsewhere; seconds."""
+
+    setting: Setting
+    corners: float
+    elsewhere: float
+    all_nothing: list[float] = field(default_factory=list)
+    all_further: list[float] = field(default_factory=list)
+
+    @property
+    def anywhere(self) -> float:
+        """The larger of both errors."""
+        return max(self.corners, self.elsewhere)
+
+    @property
+    def nothing(self) -> float:
+        """Median seconds from nothing to the sweep of one layout."""
+        return statistics.median(self.all_nothing)
+
+    @property
+    def further(self) -> float:
+        """Median seconds of a further layout at four places never seen before."""
+        return statistics.median(self.all_further)
 
 
-if __name__ == "__main__":
-    main()
+def measure(case: Case, peers: list[ModuleType], rounds: int) -> list[Measured]:
+    """All settings of a case: errors against the reference of the first peer, and times."""
+    exact = reference(case, peers[0])
+    layouts = (CORNERS, *OTHERS)
+    expected = exact.sweeps(layouts)
+    found, solved = [], []
+    for setting in settings(case, peers):
+        plate = setting.solve()
+        errors = [
+            difference(each, answer)
+            for each, answer in zip(plate.sweeps(layouts), expected, strict=True)
+        ]
+        found.append(Measured(setting, errors[0], max(errors[1:])))
+        solved.append(plate)
+    rng = np.random.default_rng(0)
+    for number in range(rounds):
+        layout = rng.uniform(0, 1, (4, 2))
+        for each, plate in zip(found, solved, strict=True):
+            if number < SLOW_ROUNDS or each.nothing < SLOW:
+                _run(each, plate, layout)
+    return found
+
+
+def peers_agree(case: Case, peers: Sequence[ModuleType]) -> float | None:
+    """Difference of two peers on one mesh, None for a single one."""
+    if len(peers) < 2:
+        return None
+    first, second = (
+        Direct(case, peer.Matrices(case, SAME_MESH)).sweep(CORNERS) for peer in peers[:2]
+    )
+    return difference(second, first)
+
+
+def _run(measured: Measured, solved: Solved, layout: FloatArray) -> None:
+    started = time.process_time()
+    measured.setting.solve().sweep(CORNERS)
+    measured.all_nothing.append(time.process_time() - started)
+    started = time.process_time()
+    solved.sweep(layout)
+    measured.all_further.append(time.process_time() - started)

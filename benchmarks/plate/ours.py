@@ -1,59 +1,48 @@
-"""era-haptics: the free plate solved once, on a peer's mesh or of order 5 with strips."""
+"""era-haptics: the free plate in polynomials solved once, on `mesh: auto A %`."""
 
-from benchmarks.plate.problem import (
-    DAMPING,
-    FREQUENCIES,
-    LENGTH,
-    LOSS_FACTOR,
-    NU,
-    RHO,
-    STIFFNESS,
-    STROKE,
-    THICKNESS,
-    WIDTH,
-    E,
-)  # fmt: skip
-from model.arrays import ComplexArray, FloatArray, IntArray
-from model.fem.mesh import Mesh
+from collections.abc import Sequence
+
+from benchmarks.plate.problem import DAMPING, STIFFNESS, STROKE, Case
+from model.arrays import ComplexArray, FloatArray
+from model.reduction import truncation
 from model.reduction.free_plate import solve_free_plate
+from model.rig.meshes import mesh_of
+from model.spectral import functions
 from model.structure.actuator import Era
-from model.structure.plate import Material
-from model.structure.plate import Plate as PlateOf
-from model.studies.receptances import Receptances
 
 NAME = "era-haptics"
-METHOD = "Reissner-Mindlin, MITC4"
 
 
-class Plate:
-    """The free plate on nx by ny elements; 0 by 0: 10x8 of order 5 with strips."""
+class Spectral:
+    """The solved plate, for an accuracy as `1 %`."""
 
-    def __init__(self, nx: int, ny: int) -> None:
-        plate = PlateOf(LENGTH, WIDTH, THICKNESS, Material("aluminium", E, RHO, NU), LOSS_FACTOR)
-        mesh = Mesh(nx, ny, LENGTH, WIDTH) if nx else Mesh.accurate(plate, frequency_max=500.0)
-        self.free = solve_free_plate(plate, mesh)
-        self.points = mesh.nodes
-        self.dof = 3 * mesh.node_count
+    def __init__(self, case: Case, accuracy: str) -> None:
+        self.case = case
+        high = case.highest
+        mesh = mesh_of(f"auto {accuracy}", case.plate, frequency_max=high, stiffness=STIFFNESS)
+        self.free = solve_free_plate(case.plate, mesh, frequency_max=high)
 
-    def sweep(self, places: FloatArray, observed: FloatArray) -> ComplexArray:
-        return self.free.acceleration(eras_at(places), FREQUENCIES, observed)
+    def sweep(self, shares: FloatArray) -> ComplexArray:
+        """Acceleration (f, eras, p) with ERAs at shares (n, 2) of the sides."""
+        eras = eras_at(self.case, shares)
+        return self.free.acceleration(eras, self.case.frequencies, self.case.points)
 
-
-class Candidates:
-    """The same plate, solved for a raster of positions before the first layout."""
-
-    def __init__(self, plate: Plate, places: FloatArray, observed: FloatArray) -> None:
-        self.places = places
-        between, to_points = plate.free.receptances(places, observed, FREQUENCIES)
-        self.receptances = Receptances(FREQUENCIES, between, to_points)
-
-    def sweep(self, numbers: IntArray) -> ComplexArray:
-        return self.receptances.acceleration(numbers, tuple(eras_at(self.places[numbers])))
+    def sweeps(self, layouts: Sequence[FloatArray]) -> list[ComplexArray]:
+        """The same for several layouts."""
+        return [self.sweep(layout) for layout in layouts]
 
 
-def eras_at(places: FloatArray) -> list[Era]:
-    """ERAs at places (n, 2) [m]."""
+def eras_at(case: Case, shares: FloatArray) -> list[Era]:
+    """ERAs at shares (n, 2) of the sides."""
     return [
-        Era(f"E{number}", x, y, STIFFNESS, DAMPING, 0.0, STROKE)
-        for number, (x, y) in enumerate(places.tolist())
+        Era(f"E{number}", x, y, STIFFNESS, DAMPING, 0.0, STROKE, foot=foot)
+        for number, (x, y, foot) in enumerate(case.footprints(shares).tolist())
     ]
+
+
+def forget() -> None:
+    """Forget what is kept from one plate to the next: integrals of one dimension, weights."""
+    for module in (functions, truncation):
+        for kept in vars(module).values():
+            if hasattr(kept, "cache_clear"):
+                kept.cache_clear()

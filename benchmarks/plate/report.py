@@ -2,148 +2,198 @@
 
 import os
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeAlias
 
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from benchmarks.page import write_parts
+from benchmarks.plate import ours
+from benchmarks.plate.measure import Measured
+from benchmarks.plate.peers.ways import Direct
+from benchmarks.plate.problem import CAR, PAPER, PAPER_ON_FEET, TABLE, Case
+from benchmarks.plate.programs import ACCURACIES, CASES
 
-OURS_COLOR, PEER_COLOR = "#d62728", "#7f7f7f"
-VERSIONS = ("numpy", "scipy", "scikit-fem", "pyfe3d", "ngsolve")
+PACKAGES = ("numpy", "scipy", "scikit-fem", "ngsolve")
+COLORS = {"era-haptics": "#d62728", "NGSolve": "#1f77b4", "scikit-fem": "#7f7f7f"}
 
-Result: TypeAlias = dict[Any, Any]
-"""Output of one measurement, or the median of several."""
+Read = Callable[[Measured], float]
+
+TABLES: dict[str, tuple[str, Read, Read]] = {
+    "corners": ("from nothing, corners", lambda m: m.corners, lambda m: m.nothing),
+    "anywhere": ("from nothing, anywhere", lambda m: m.anywhere, lambda m: m.nothing),
+    "further": ("further layout", lambda m: m.anywhere, lambda m: m.further),
+}
+"""Heading, error and time of each kind of measurement."""
 
 
 def write_report(
-    measured: Mapping[str, Result],
-    agreement: Sequence[Result],
-    *,
-    peers: Sequence[str],
-    fastest: str,
-    loads: Sequence[float],
+    measured: Mapping[Case, Sequence[Measured]],
+    live: Mapping[str, float],
+    study: float | None,
+    notes: Sequence[str],
     folder: Path,
 ) -> None:
-    """Write measured/benchmarks.md and pictures/benchmarks.png; measured holds medians by name."""
-    ours = measured["nothing ours"]
-    peer_first = measured[f"nothing {fastest}"]
-    peer_again = measured[f"layout {fastest}"]
-    name = peer_first["name"]
-    places, study = measured["places ours 48"], measured["study"]
-    finest, peer_finest = measured["nothing ours 192"], measured["nothing peer finest"]
-    high_order = measured["nothing ours 0"]
-    new = measured["layout ours"]
+    """Write measured/benchmarks.md and pictures/benchmarks.png."""
+    parts = {"machine": "\n".join([_machine(), *notes])}
+    for name in TABLES:
+        parts[name] = "\n\n".join(_table(case, measured[case], name) for case in _with_errors())
+    parts["goals"] = _goals(measured, study)
+    parts["settings"] = _settings(measured)
+    rows = [f"| {what} | {_time(seconds)} |" for what, seconds in live.items()]
+    parts["live"] = "\n".join(["| changed | time |", "|---|---|", *rows])
+    write_parts(folder / "measured" / "benchmarks.md", parts)
+    figure = _picture(measured)
+    FigureCanvasAgg(figure)
+    figure.savefig(folder / "pictures" / "benchmarks.png", dpi=110)
 
-    def row(what: str, each: Result, ratio: str = "") -> str:
-        spread = f"{_time(each['least'])} to {_time(each['most'])}"
-        return (
-            f"| {what} | {_time(each['seconds'])} | {spread} | {each['peak_mb']:.0f} MB | {ratio} |"
-        )
 
-    def times(slow: Result, quick: Result) -> str:
-        return f"{slow['seconds'] / quick['seconds']:.0f}"
+def best(found: Sequence[Measured], target: float, error: Read, seconds: Read) -> Measured | None:
+    """The quickest with an error of at most a target in per cent."""
+    enough = [each for each in found if error(each) <= target / 100]
+    return min(enough, key=seconds, default=None)
 
-    head = [
-        "| | median | range | peak memory | speed-up over the fastest peer |",
+
+def _with_errors() -> list[Case]:
+    """Cases with all errors to reach."""
+    return [case for case, targets in CASES.items() if targets == ACCURACIES]
+
+
+def _split(found: Sequence[Measured]) -> tuple[list[Measured], list[Measured]]:
+    """Ours, and the peers'."""
+    own = [each for each in found if each.setting.program == ours.NAME]
+    return own, [each for each in found if each.setting.program != ours.NAME]
+
+
+def _table(case: Case, found: Sequence[Measured], name: str) -> str:
+    """Times of every program in every way by the error to reach."""
+    _, error, seconds = TABLES[name]
+    own, peers = _split(found)
+    ways = list(dict.fromkeys(each.setting.name for each in peers))
+    head = ["error at most", "era-haptics", *ways, "best peer by ours"]
+    lines = [f"| {case.name}: {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for target, mine in zip(ACCURACIES, own, strict=True):
+        cells = [_cell([mine], target, error, seconds)]
+        cells += [
+            _cell([each for each in peers if each.setting.name == way], target, error, seconds)
+            for way in ways
+        ]
+        cells.append(_ratio([mine], peers, target, error, seconds))
+        lines.append(f"| {target:g} % | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _cell(found: Sequence[Measured], target: float, error: Read, seconds: Read) -> str:
+    quickest = best(found, target, error, seconds)
+    if quickest is None:
+        return f"not reached ({100 * min(map(error, found)):.2g} %)"
+    return f"{_time(seconds(quickest))} ({100 * error(quickest):.2g} %)"
+
+
+def _ratio(
+    own: Sequence[Measured], peers: Sequence[Measured], target: float, error: Read, seconds: Read
+) -> str:
+    mine, other = (best(each, target, error, seconds) for each in (own, peers))
+    return f"{seconds(other) / seconds(mine):.0f}" if mine and other else ""
+
+
+def _goals(measured: Mapping[Case, Sequence[Measured]], study: float | None) -> str:
+    """Goals with what is reached."""
+    rows: list[tuple[str, str, Case, float, str]] = [
+        ("from nothing, corners, 1 %", "5 ms, 40 times the best peer", PAPER, 1.0, "corners"),
+        ("from nothing, anywhere, 1 %", "7 ms", PAPER, 1.0, "anywhere"),
+        ("from nothing, anywhere, 0.5 %", "20 ms", PAPER, 0.5, "anywhere"),
+        ("from nothing, corners on feet, 0.1 %", "8 ms, 100 times the best peer",
+         PAPER_ON_FEET, 0.1, "corners"),
+        ("further layout, 1 %", "0.8 ms; 300 times a factor per frequency, 6 times modes",
+         PAPER, 1.0, "further"),
+        ("car cover glass, anywhere, 1 %", "30 ms", CAR, 1.0, "anywhere"),
+        ("table plate to 500 Hz, anywhere, 1 %", "40 ms", TABLE, 1.0, "anywhere"),
+    ]  # fmt: skip
+    lines = [
+        "| | goal | reached (error) | best peer, factor per frequency | best peer, modes |",
         "|---|---|---|---|---|",
     ]
-    from_nothing = [
-        row("era-haptics, 48x36", ours, times(peer_first, ours)),
-        row("era-haptics, 10x8 elements of order 5 with strips", high_order,
-            times(peer_first, high_order)),
-        *(row(f"{measured[f'nothing {p}']['name']}, {measured[f'nothing {p}']['dof']} unknowns",
-              measured[f"nothing {p}"]) for p in peers),
-        row("era-haptics, 192x144", finest, times(peer_finest, finest)),
-        row(f"{name}, {peer_finest['dof']} unknowns (one run)", peer_finest),
-    ]  # fmt: skip
-    further = [
-        row("era-haptics, known positions of a raster", places, times(peer_again, places)),
-        row("era-haptics, new positions", new, times(peer_again, new)),
-        *(row(f"{measured[f'layout {p}']['name']}, factorised again", measured[f"layout {p}"])
-          for p in peers),
-    ]  # fmt: skip
-    hours = 10_000 * peer_again["seconds"] / 2 / 3600
-    checks = [
-        f"| {each['name']} | {each['method']} | "
-        + " | ".join(
-            f"{each[mesh]['all']:.1%} ({each[mesh]['median']:.1%})" for mesh in ((48, 36), (96, 72))
-        )
-        + " |"
-        for each in agreement
+    for what, goal, case, target, name in rows:
+        _, error, seconds = TABLES[name]
+        own, peers = _split(measured[case])
+        mine = [each for each in own if each.setting.mesh == f"auto {target:g} %"]
+        missed = "" if error(mine[0]) <= target / 100 else ", missed"
+        cells = [f"{_time(seconds(mine[0]))} ({100 * error(mine[0]):.3g} %{missed})"]
+        for is_direct in (True, False):
+            way = [each for each in peers if (each.setting.way == Direct.way) == is_direct]
+            ratio = _ratio(mine, way, target, error, seconds)
+            other = _cell(way, target, error, seconds) if way else "not measured"
+            cells.append(other + (f": {ratio} times ours" if ratio else ""))
+        lines.append(f"| {what} | {goal} | {' | '.join(cells)} |")
+    if study is not None:
+        lines.append(f"| ten thousand layouts, two processes | 3 s | {_time(study)} | | |")
+    return "\n".join(lines)
+
+
+def _settings(measured: Mapping[Case, Sequence[Measured]]) -> str:
+    """All that was measured."""
+    lines = [
+        "| plate | program | mesh | error: corners | elsewhere | from nothing | further layout |",
+        "|---|---|---|---|---|---|---|",
     ]
-    machine = (
-        f"Medians of {len(loads)} runs in {len(loads)} processes. Machine: {_machine()}.\n"
-        f"{_versions()}.\nLoad average during the measurement, including the benchmark's own one "
-        f"to two: {min(loads):.1f} to {max(loads):.1f}."
-    )
-    agreed = ["| | plate and element | 48x36 | 96x72 |", "|---|---|---|---|", *checks]
-    again = (
-        f"Factorising every layout again, {name} would take {hours:.1f} hours on both cores, by "
-        "its time above."
-    )
-    write_parts(
-        folder / "measured" / "benchmarks.md",
-        {
-            "machine": machine,
-            "agreement": "\n".join(agreed),
-            "nothing": "\n".join(head + from_nothing),
-            "layouts": "\n".join(head + further),
-            "study": "\n".join([*head, row("era-haptics, two processes", study), "", again]),
-        },
-    )
-    figure = _picture(measured, peers)
-    FigureCanvasAgg(figure)
-    figure.savefig(folder / "pictures" / "benchmarks.png", dpi=130)
+    for case, found in measured.items():
+        lines += [
+            f"| {case.name} | {each.setting.name} | {each.setting.mesh} | "
+            f"{100 * each.corners:.2g} % | {100 * each.elsewhere:.2g} % | "
+            f"{_time(each.nothing)} | {_time(each.further)} |"
+            for each in found
+        ]
+    return "\n".join(lines)
 
 
-def _picture(measured: Mapping[str, Result], peers: Sequence[str]) -> Figure:
-    titles = {
-        "nothing": "27 frequencies x 4 drives\ncomplete solution, 48x36",
-        "layout": "every further layout\non the same plate",
-    }
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    panels = figure.subplots(1, 2)
-    for axes, (task, title) in zip(panels, titles.items(), strict=True):
-        entries = [(measured[f"{task} {peer}"], PEER_COLOR) for peer in peers]
-        entries.sort(key=lambda entry: -entry[0]["seconds"])
-        labels = [entry[0]["name"] for entry in entries]
-        if task == "nothing":
-            entries.append((measured["nothing ours"], OURS_COLOR))
-            labels.append("era-haptics")
-        else:
-            entries += [
-                (measured["layout ours"], OURS_COLOR),
-                (measured["places ours 48"], OURS_COLOR),
-            ]
-            labels += ["era-haptics,\nnew positions", "era-haptics,\nknown positions"]
-        seconds = [entry[0]["seconds"] for entry in entries]
-        colors = [entry[1] for entry in entries]
-        axes.hlines(labels, 1e-6, seconds, colors="#dddddd", zorder=0)
-        axes.scatter(seconds, labels, color=colors, s=70)
-        for number, value in enumerate(seconds):
-            axes.annotate(
-                _time(value), (value, number), (9, 0), textcoords="offset points", va="center"
-            )
-        axes.set_xscale("log")
-        axes.set_xlim(min(seconds) / 3, max(seconds) * 8)
-        axes.set_ylim(-0.6, len(seconds) - 0.4)
-        axes.set_xlabel("time / s")
-        axes.set_title(title)
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
+def _picture(measured: Mapping[Case, Sequence[Measured]]) -> Figure:
+    """Error against time: a line through the settings that no other beats in both."""
+    figure = Figure(figsize=(11, 7.5), layout="constrained")
+    cases = _with_errors()
+    panels = figure.subplots(len(cases), len(TABLES), sharex=True, squeeze=False)
+    for row, case in zip(panels, cases, strict=True):
+        for axes, (title, error, seconds) in zip(row, TABLES.values(), strict=True):
+            _draw(axes, measured[case], error, seconds)
+            axes.set_title(f"{case.name}:\n{title}", fontsize=10)
+        row[0].set_ylabel("processor time / ms")
+    for axes in panels[-1]:
+        axes.set_xlabel("error / %")
+    handles, labels = panels[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 
+def _draw(axes: Axes, found: Sequence[Measured], error: Read, seconds: Read) -> None:
+    for name in dict.fromkeys(each.setting.name for each in found):
+        own = [each for each in found if each.setting.name == name]
+        own = [
+            each
+            for each in own
+            if not any(
+                error(other) <= error(each) and seconds(other) < seconds(each) for other in own
+            )
+        ]
+        own.sort(key=error)
+        setting = own[0].setting
+        axes.loglog(
+            [100 * error(each) for each in own],
+            [1e3 * seconds(each) for each in own],
+            "o--" if setting.way == Direct.way else "o-",
+            color=COLORS[setting.program],
+            label=name,
+        )
+    axes.grid(alpha=0.3)
+    axes.set_xlim(12, 0.008)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
 def _time(seconds: float) -> str:
-    if seconds < 0.9995e-3:
-        return f"{1e6 * seconds:.0f} µs"
-    if seconds < 0.9995:
-        return f"{1e3 * seconds:.3g} ms"
-    return f"{seconds:.3g} s"
+    return f"{1e3 * seconds:.3g} ms" if seconds < 0.9995 else f"{seconds:.3g} s"
 
 
 def _machine() -> str:
@@ -152,10 +202,13 @@ def _machine() -> str:
     if cpuinfo.exists():
         lines = cpuinfo.read_text().splitlines()
         model = next((each.split(":")[1].strip() for each in lines if "model name" in each), model)
+    versions = []
+    for name in PACKAGES:
+        try:
+            versions.append(f"{name} {metadata.version(name)}")
+        except metadata.PackageNotFoundError:
+            continue
     return (
-        f"{model}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"
+        f"Machine: {model}, {os.cpu_count()} cores, {platform.system()}, "
+        f"Python {platform.python_version()}, {', '.join(versions)}."
     )
-
-
-def _versions() -> str:
-    return ", ".join(f"{name} {metadata.version(name)}" for name in VERSIONS)

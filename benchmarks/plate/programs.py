@@ -1,0 +1,124 @@
+"""Programs with the settings that are measured, from coarse to fine.
+
+Settings of peers were chosen by trial on the paper's plate, among orders 3 to 10, one to eight
+elements a side, strips of 0 to 5 mm and 12 to 60 modes.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
+from typing import Protocol
+
+from benchmarks.plate import ours
+from benchmarks.plate.peers.meshes import Elements
+from benchmarks.plate.peers.ways import Direct, Modes
+from benchmarks.plate.problem import CAR, PAPER, PAPER_ON_FEET, TABLE, Case
+from model.arrays import ComplexArray, FloatArray
+
+PEERS = {"ngsolve": "ngsolve_plate", "skfem": "scikit_fem_plate"}
+"""Modules by the package that each imports."""
+
+ACCURACIES = (2.0, 1.0, 0.5, 0.1)
+"""Errors to reach, in per cent."""
+
+CASES = {PAPER: ACCURACIES, PAPER_ON_FEET: ACCURACIES, CAR: (1.0,), TABLE: (1.0,)}
+"""Problems with the errors to reach."""
+
+# order, elements along x and y, strips in thirds of the thickness (1.5 mm: 0.5 mm), modes
+_MODES: dict[Case, list[tuple[int, int, int, tuple[int, ...], int]]] = {
+    PAPER: [
+        (5, 2, 2, (8,), 18), (6, 2, 2, (6,), 24), (6, 2, 2, (6,), 32), (6, 3, 3, (2, 8), 24),
+        (6, 4, 3, (8,), 20), (6, 4, 4, (8,), 20), (6, 6, 5, (8,), 32),
+    ],
+    CAR: [(6, 4, 3, (8,), 48), (6, 5, 4, (8,), 56), (7, 6, 4, (8,), 64)],
+    TABLE: [(6, 4, 3, (8,), 48), (6, 5, 4, (8,), 56), (7, 6, 4, (8,), 64)],
+}  # fmt: skip
+_DIRECT: dict[Case, list[tuple[int, int, int, tuple[int, ...]]]] = {
+    PAPER: [(4, 3, 3, (8,)), (5, 2, 2, (8,)), (6, 2, 2, (8,)), (6, 4, 4, (8,)), (6, 6, 5, (8,))],
+}
+_REFERENCE = (6, 8, 8, (1.4, 3, 8))
+
+
+class Solved(Protocol):
+    """A plate that was solved, or of which there are matrices."""
+
+    def sweep(self, shares: FloatArray) -> ComplexArray:
+        """Acceleration (f, eras, p) with ERAs at shares (n, 2) of the sides."""
+
+    def sweeps(self, layouts: Sequence[FloatArray]) -> list[ComplexArray]:
+        """The same for several layouts of equally many ERAs."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One program in one way with one mesh; solve begins with nothing."""
+
+    program: str
+    way: str
+    mesh: str
+    solve: Callable[[], Solved]
+
+    @property
+    def name(self) -> str:
+        """Program and way."""
+        return f"{self.program}, {self.way}" if self.way else self.program
+
+
+def installed_peers() -> tuple[list[ModuleType], list[str]]:
+    """Modules of the peers that are installed, and a sentence on each that is not."""
+    found, missing = [], []
+    for package, module in PEERS.items():
+        try:
+            found.append(import_module(f"benchmarks.plate.peers.{module}"))
+        except ImportError as error:
+            missing.append(f"{package} is missing, so it was not measured: {error}.")
+    return found, missing
+
+
+def settings(case: Case, peers: list[ModuleType]) -> list[Setting]:
+    """All that is measured on a case, ours first."""
+
+    def by_us(accuracy: float) -> Setting:
+        def solve() -> Solved:
+            ours.forget()
+            return ours.Spectral(case, f"{accuracy:g} %")
+
+        return Setting(ours.NAME, "", f"auto {accuracy:g} %", solve)
+
+    def direct(peer: ModuleType, order: int, nx: int, ny: int, strips: tuple[int, ...]) -> Setting:
+        elements = _elements(case, order, nx, ny, strips)
+        return Setting(
+            peer.NAME,
+            Direct.way,
+            f"{elements}",
+            lambda: Direct(case, peer.Matrices(case, elements)),
+        )
+
+    def modes(
+        peer: ModuleType, order: int, nx: int, ny: int, strips: tuple[int, ...], count: int
+    ) -> Setting:
+        elements = _elements(case, order, nx, ny, strips)
+        return Setting(
+            peer.NAME,
+            Modes.way,
+            f"{elements}, {count} modes",
+            lambda: Modes(case, peer.Matrices(case, elements), count),
+        )
+
+    like = PAPER if case is PAPER_ON_FEET else case
+    found = [by_us(accuracy) for accuracy in CASES[case]]
+    for peer in peers:
+        found += [direct(peer, *each) for each in _DIRECT.get(like, [])]
+        found += [modes(peer, *each) for each in _MODES[like]]
+    return found
+
+
+def reference(case: Case, peer: ModuleType) -> Direct:
+    """The graded reference, by a peer."""
+    return Direct(case, peer.Matrices(case, _elements(case, *_REFERENCE)))
+
+
+def _elements(case: Case, order: int, nx: int, ny: int, strips: tuple[float, ...]) -> Elements:
+    unit = case.plate.thickness / 3
+    return Elements(order, nx, ny, tuple(unit * width for width in strips))

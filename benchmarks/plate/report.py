@@ -33,7 +33,7 @@ TABLES: dict[str, tuple[str, Read, Read]] = {
 def write_report(
     measured: Mapping[Case, Sequence[Measured]],
     live: Mapping[str, float],
-    study: float | None,
+    study: tuple[float, float] | None,
     notes: Sequence[str],
     folder: Path,
 ) -> None:
@@ -100,7 +100,7 @@ def _ratio(
     return f"{seconds(other) / seconds(mine):.0f}" if mine and other else ""
 
 
-def _goals(measured: Mapping[Case, Sequence[Measured]], study: float | None) -> str:
+def _goals(measured: Mapping[Case, Sequence[Measured]], study: tuple[float, float] | None) -> str:
     """Goals with what is reached."""
     rows: list[tuple[str, str, Case, float, str]] = [
         ("from nothing, corners, 1 %", "5 ms, 40 times the best peer", PAPER, 1.0, "corners"),
@@ -130,7 +130,9 @@ def _goals(measured: Mapping[Case, Sequence[Measured]], study: float | None) -> 
             cells.append(other + (f": {ratio} times ours" if ratio else ""))
         lines.append(f"| {what} | {goal} | {' | '.join(cells)} |")
     if study is not None:
-        lines.append(f"| ten thousand layouts, two processes | 3 s | {_time(study)} | | |")
+        elapsed, used = map(_time, study)
+        cell = f"{elapsed}, {used} of processor time"
+        lines.append(f"| ten thousand layouts, two processes | 3 s | {cell} | | |")
     return "\n".join(lines)
 
 

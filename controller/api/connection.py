@@ -112,7 +112,7 @@ class Connection(asyncio.Protocol):
         self._on_disconnect(self)
 
     def next_line(self) -> bytes | None:
-        """Take the next line, None if there is none; raises InvalidRequest if it is too long."""
+        """Take the next line, or None; raises InvalidRequest if it is too long."""
         if not self.is_open or not self._has_line:
             return None
         end = self._line_end

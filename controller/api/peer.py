@@ -41,7 +41,7 @@ def check_peer(
 
 
 def _uid(user: str) -> int | None:
-    """The id of a user by name; None if there is none."""
+    """The id of a user by name, or None."""
     try:
         return pwd.getpwnam(user).pw_uid
     except KeyError:

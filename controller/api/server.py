@@ -189,7 +189,7 @@ class ApiServer:
             self._lines_received(connection)
 
     def _next(self, connection: Connection) -> _Call | None:
-        """The next call of a client, None if there is none."""
+        """The next call of a client, or None."""
         ahead: _Call | None = connection.ahead
         connection.ahead = None
         return ahead or self._read(connection)

@@ -65,7 +65,7 @@ class SurfaceLayout:
     most_at_once: int = 1
 
     def region_at(self, x: float, y: float) -> Region | None:
-        """Return the topmost region at a position [m], None if there is none."""
+        """Return the topmost region at a position [m], or None."""
         return next(
             (region for region in reversed(self.regions) if region.shape.contains(x, y)), None
         )

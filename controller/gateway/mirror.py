@@ -54,7 +54,7 @@ class DaemonMirror:
             tasks.create_task(self._update_field())
 
     def current(self, topic: str) -> str | bytes | None:
-        """The latest frame of a topic, None if there is none."""
+        """The latest frame of a topic, or None."""
         return self._frames.get(topic)
 
     def _hello(self, hello: Mapping[str, Any] | None) -> None:

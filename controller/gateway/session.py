@@ -64,7 +64,7 @@ class SessionTopics(Message):
 class Session:
     """An accepted WebSocket; see `run`.
 
-    current: the current frame of a topic, sent on subscription; None if there is none.
+    current: the current frame of a topic, sent on subscription, or None.
     """
 
     def __init__(

@@ -124,7 +124,7 @@ class TuioReader:
         return self._senders[name]
 
     def _sender_to_evict(self, peer: Peer, now: float) -> str | None:
-        """Return the sender to drop for a new sender of this peer; None if there is none.
+        """Return the sender to drop for a new sender of this peer, or None.
 
         It is the one not heard from for longest if that has been idle, or else of the busiest peer.
         """

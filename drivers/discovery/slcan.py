@@ -38,7 +38,7 @@ class SlcanAdapter:
 
 
 def detect_slcan(port: str) -> SlcanAdapter | None:
-    """Detect the adapter on a serial port; None if there is none. Blocks for half a second.
+    """Detect the adapter on a serial port, or None. Blocks for half a second.
 
     Raises OSError if the port cannot be used.
     """

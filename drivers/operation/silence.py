@@ -84,7 +84,7 @@ def stop_outcome(
 ) -> StopOutcome:
     """Derive the outcome of a stop at a time [s].
 
-    status: read after the Stop was sent, None if there is none; last_fed_at [s]: when a request
+    status: read after the Stop was sent, or None; last_fed_at [s]: when a request
     that feeds the watchdog may have reached the amplifier for the last time, None if unknown;
     watchdog [s]: None without one; cause: why there is no status.
     """

@@ -19,6 +19,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.calibration.variable_projection import modal_assurance
 from model.diagnosis.plate_match import Match, match_plate
 from model.errors import InputError
+from model.fem.plate_mesh import stretched
 from model.rig.rig import Rig
 from model.vibration.parametric_plate import ParametricPlate, parametric_plate
 
@@ -215,7 +216,7 @@ def _stretched(rig: Rig, along_x: float, along_y: float) -> Rig:
     plate = replace(rig.plate, length=rig.plate.length * along_x, width=rig.plate.width * along_y)
     eras = tuple(replace(era, x=era.x * along_x, y=era.y * along_y) for era in rig.eras)
     masses = tuple(replace(mass, x=mass.x * along_x, y=mass.y * along_y) for mass in rig.masses)
-    mesh = rig.mesh.stretched(plate)
+    mesh = stretched(rig.mesh, plate)
     return replace(rig, plate=plate, eras=eras, masses=masses, mesh=mesh)
 
 

@@ -1,7 +1,7 @@
 """A structured mesh of rectangles over the plate."""
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Self
 
@@ -198,17 +198,6 @@ class Mesh:
     def resolving(self, plate: Plate, frequency: float) -> Self:
         """The coarsest mesh of its element, without strips, that resolves a frequency [Hz]."""
         return self.coarsest(plate, frequency=frequency, element=self.element)
-
-    def stretched(self, plate: Plate) -> Self:
-        """A mesh of elements as large, or smaller, on a plate of another size."""
-        nx, ny = (
-            math.ceil(count * max(new / old, 1.0))
-            for count, new, old in (
-                (self.nx, plate.length, self.length),
-                (self.ny, plate.width, self.width),
-            )
-        )
-        return replace(self, nx=nx, ny=ny, length=plate.length, width=plate.width)
 
     def interpolation_error(self, plate: Plate, frequency: float) -> float:
         """By how much its shape functions may deviate from a wave between nodes, relative to it.

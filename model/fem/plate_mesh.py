@@ -1,6 +1,8 @@
 """Discretisation of a plate: finite elements, or polynomials over the whole plate."""
 
-from typing import Any, Protocol, Self
+import math
+from dataclasses import replace
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -50,9 +52,6 @@ class PlateMesh(Protocol):
     def resolving(self, plate: Plate, frequency: float) -> Self:
         """The coarsest of its kind that resolves a frequency [Hz]."""
 
-    def stretched(self, plate: Plate) -> Self:
-        """One that resolves the same on a plate of another size."""
-
     def interpolation_error(self, plate: Plate, frequency: float) -> float:
         """By how much it may deviate from a wave [Hz] between its points, relative to the wave."""
 
@@ -61,6 +60,23 @@ class PlateMesh(Protocol):
 
     def to_dict(self) -> dict[str, Any]:
         """Its fields for a file."""
+
+
+MeshT = TypeVar("MeshT", bound=PlateMesh)
+
+
+def stretched(mesh: MeshT, plate: Plate) -> MeshT:
+    """A mesh of its kind that resolves the same on a plate of another size."""
+    nx, ny = (
+        math.ceil(count * max(new / old, 1.0))
+        for count, new, old in (
+            (mesh.nx, plate.length, mesh.length),
+            (mesh.ny, plate.width, mesh.width),
+        )
+    )
+    values: Any = mesh  # a frozen dataclass
+    resized: MeshT = replace(values, nx=nx, ny=ny, length=plate.length, width=plate.width)
+    return resized
 
 
 def check_frequencies(plate: Plate, mesh: PlateMesh, frequencies: FloatArray) -> None:

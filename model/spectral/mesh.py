@@ -120,17 +120,6 @@ class SpectralMesh:
         )
         return type(self)(nx, ny, plate.length, plate.width)
 
-    def stretched(self, plate: Plate) -> Self:
-        """Degrees that resolve the same on a plate of another size."""
-        nx, ny = (
-            math.ceil(count * max(new / old, 1.0))
-            for count, new, old in (
-                (self.nx, plate.length, self.length),
-                (self.ny, plate.width, self.width),
-            )
-        )
-        return replace(self, nx=nx, ny=ny, length=plate.length, width=plate.width)
-
     def interpolation_error(self, plate: Plate, frequency: float) -> float:
         """0: its polynomials are evaluated wherever they are asked for."""
         return 0.0

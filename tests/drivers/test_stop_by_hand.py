@@ -19,6 +19,15 @@ from wires import far_side, tones
 KINDS = ["serial", "modbus-rtu", "modbus-tcp", "socketcand", "slcan"]
 
 
+async def leave_playing(url: str) -> None:
+    """Arm an amplifier and play, and close the wire."""
+    earlier = Amplifier(open_backend(url))
+    await earlier.open()
+    await earlier.arm(2.0)
+    await earlier.apply(tones(earlier, 0.5))
+    await earlier.close()
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_stop_is_sent_before_anything_is_read(kind: str, coarse_rig: Rig, tmp_path: Path) -> None:
     """Silent while it plays; identity, capabilities and status are read afterwards."""
@@ -26,11 +35,7 @@ def test_stop_is_sent_before_anything_is_read(kind: str, coarse_rig: Rig, tmp_pa
     async def run() -> None:
         live_in_memory()
         async with far_side(Wire(kind), coarse_rig) as far:
-            earlier = Amplifier(open_backend(far.url))
-            await earlier.open()
-            await earlier.arm(2.0)
-            await earlier.apply(tones(earlier, 0.5))
-            await earlier.close()
+            await leave_playing(far.url)
             with tracing(tmp_path / "trace"):
                 result = await amp_actions.stop(far.url)
             assert (result["silence"], result["cause"]) == ("confirmed_silent", "")
@@ -54,11 +59,7 @@ def test_opening_disarms_unless_the_caller_only_looks(
     async def run() -> None:
         live_in_memory()
         async with far_side(Wire(kind), coarse_rig) as far:
-            earlier = Amplifier(open_backend(far.url))
-            await earlier.open()
-            await earlier.arm(2.0)
-            await earlier.apply(tones(earlier, 0.5))
-            await earlier.close()
+            await leave_playing(far.url)
             amplifier = Amplifier(open_backend(far.url))
             await amplifier.open(take_over=take_over)
             status = await amplifier.status()

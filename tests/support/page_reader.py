@@ -64,7 +64,7 @@ class Reader:
             "COLUMNS": "100",
             "PATH": ":".join([*first, str(Path(sys.executable).parent), os.environ["PATH"]]),
             "PYTHONUNBUFFERED": "1",
-            # Figures depend on the processor that OpenBLAS is told to assume, by 1e-10.
+            # Figures depend by 1e-10 on the processor for which OpenBLAS is set.
             **{name: value for name, value in os.environ.items() if name.startswith("OPENBLAS_")},
             "OPENBLAS_NUM_THREADS": "1",
             "TMPDIR": str(home),

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
@@ -15,6 +15,7 @@ from controller.sources.touch import Touch, TouchFrame
 from drivers.amplifier import Amplifier
 from drivers.protocol.messages import Reply, Request
 from drivers.registry import open_backend
+from lies import Lie
 from memory_machine import live_in_memory
 from model.table.pattern import Pattern
 from model.table.question import Question
@@ -32,8 +33,6 @@ LEVELS = {"SW": 0.2, "NE": 0.4}
 """Commanded levels; SW is channel 0 of the first amplifier, NE channel 1 of the last one."""
 
 SETTLES = 0.3  # s; from opening until it is ready
-
-Lie = Callable[[Reply], Reply]
 
 
 class Changing(OneTable):

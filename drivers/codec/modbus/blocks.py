@@ -196,7 +196,7 @@ def unpack_loaded(registers: Sequence[int]) -> Loaded:
 
 
 def unpack_refusal(registers: Sequence[int]) -> tuple[Nak, int] | None:
-    """Decode the last refusal and its tag; None if there is none."""
+    """Decode the last refusal and its tag, or None."""
     found, _ = _fields(_MAP["input"]["refusal"]["registers"], registers)
     if not found["nak"]:
         return None

@@ -3,48 +3,20 @@
 import random
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
 from controller.daemon.states import DaemonState
 from drivers.operation.watchdog import HEARTBEAT
-from drivers.protocol.messages import Achieved, Reply, Status
+from drivers.protocol.messages import Reply, Status
+from lies import Lie, achieved, status
 from stop_chain import WIRES
-from supervised_chain import ENABLED, Lie, supervised_chain
+from supervised_chain import ENABLED, supervised_chain
 from virtual_loop import run_virtual
 
 ONE, TWO = ("main",), ("west", "east")
 TOUCHES = 0.012  # s; faster than a ramp
 SILENCE = 0.1  # s; from a fault to silence
-
-
-def status(**changes: Any) -> Lie:
-    """Alter every status; a callable changes the value."""
-
-    def lie(reply: Reply) -> Reply:
-        if not isinstance(reply, Status):
-            return reply
-        altered = {
-            name: change(getattr(reply, name)) if callable(change) else change
-            for name, change in changes.items()
-        }
-        return replace(reply, **altered)
-
-    return lie
-
-
-def achieved(**changes: Callable[[float], float]) -> Lie:
-    """Alter the first command of every Achieved."""
-
-    def lie(reply: Reply) -> Reply:
-        if not isinstance(reply, Achieved):
-            return reply
-        first, *others = reply.commands
-        altered = {name: change(getattr(first, name)) for name, change in changes.items()}
-        return replace(reply, commands=(replace(first, **altered), *others))
-
-    return lie
 
 
 def frozen_watchdog() -> Lie:

@@ -85,7 +85,7 @@ async def test_page_server_checks_requests(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 async def test_page_server_closes_oldest_of_too_many_connections() -> None:
-    """A hundred silent ones keep nobody out, and all but eight of them are closed."""
+    """A hundred silent ones keep no other client out, and all but eight of them are closed."""
 
     async def page() -> bytes:
         return b"here"

@@ -3,10 +3,7 @@
 import asyncio
 import contextlib
 import random
-from collections.abc import Callable
 from dataclasses import replace
-from itertools import count
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -18,14 +15,14 @@ from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, GuardLimits
 from drivers.operation.plausibility import PlausibilityCheck
-from drivers.protocol.messages import Achieved, AmplifierState, Fault, Reply, Request, Status
+from drivers.protocol.messages import AmplifierState, Fault, Reply, Request
+from lies import Lie, achieved, status
 from lossy_backend import LossyBackend
 from sim.amplifier.amplifier import SimulatedAmplifier
 from virtual_loop import in_virtual_time
 
 WATCHDOG = 0.25
 BEAT = 0.05  # s
-Lie = Callable[[Reply, int], Reply]
 
 
 class LyingBackend(LossyBackend):
@@ -33,46 +30,17 @@ class LyingBackend(LossyBackend):
 
     def __init__(self, lie: Lie) -> None:
         super().__init__(SimulatedAmplifier("main", channels=3))
-        self.lie: Lie = lambda reply, number: reply
+        self.lie: Lie = lambda reply: reply
         self.told = lie
-        self._numbers = count()
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
-        return self.lie(await super().exchange(request, timeout=timeout), next(self._numbers))
-
-
-def status(**changes: Any) -> Lie:
-    """Alter every status; a callable changes the value."""
-
-    def lie(reply: Reply, number: int) -> Reply:
-        if not isinstance(reply, Status):
-            return reply
-        altered = {
-            name: change(getattr(reply, name)) if callable(change) else change
-            for name, change in changes.items()
-        }
-        return replace(reply, **altered)
-
-    return lie
-
-
-def achieved(**changes: Callable[[Any], Any]) -> Lie:
-    """Alter the first command of every Achieved."""
-
-    def lie(reply: Reply, number: int) -> Reply:
-        if not isinstance(reply, Achieved):
-            return reply
-        first, *others = reply.commands
-        altered = {name: change(getattr(first, name)) for name, change in changes.items()}
-        return replace(reply, commands=(replace(first, **altered), *others))
-
-    return lie
+        return self.lie(await super().exchange(request, timeout=timeout))
 
 
 class Bench:
     """A guard, an amplifier and its check, with commands as the control loop gives them."""
 
-    def __init__(self, lie: Lie = lambda reply, number: reply) -> None:
+    def __init__(self, lie: Lie = lambda reply: reply) -> None:
         self.backend = LyingBackend(lie)
         self.amplifier = Amplifier(self.backend)
 
@@ -263,7 +231,7 @@ async def test_honest_amplifier_is_never_contradicted(seed: int) -> None:
     for slot in (1, 2):
         knots = tuple(Knot(rng.choice([0.1, 0.4]), rng.choice([0.0, 90.0])) for _ in range(3))
         await bench.amplifier.load_envelope(bench.guard.check_envelope(Envelope(slot, 0.01, knots)))
-    bench.backend.lie = lambda reply, number: reply
+    bench.backend.lie = lambda reply: reply
     for _ in range(40):
         tones = [
             DriveCommand(

@@ -180,7 +180,7 @@ def test_more_accuracy_and_stiffer_eras_take_higher_degrees():
 
 
 def test_plate_of_many_wavelengths_is_of_elements():
-    """4 m of glass 0.7 mm thick have 34 wavelengths; whoever states an accuracy is told so."""
+    """4 m of glass 0.7 mm thick have 34 wavelengths; a stated accuracy is refused."""
     large = Plate(4.0, 0.1, 0.0007, GLASS)
     assert mesh_of("auto", large, frequency_max=500.0) == Mesh.accurate(large, frequency_max=500.0)
     with pytest.raises(InputError):

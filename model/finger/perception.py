@@ -8,6 +8,10 @@ import numpy as np
 
 from model.arrays import FloatArray
 
+DEFAULT_THRESHOLD = "vibrotactile-probe"
+THRESHOLDS = {DEFAULT_THRESHOLD: "perception.csv"}
+"""Files of detection thresholds in model/data by the name of the set."""
+
 FELT_DB_SL = 12.0
 STRONG_DB_SL = 20.0
 
@@ -15,7 +19,11 @@ STRONG_DB_SL = 20.0
 @cache
 def _thresholds() -> tuple[FloatArray, FloatArray]:
     """Logarithms of frequency and of threshold, as tabulated."""
-    text = resources.files("model").joinpath("data/perception.csv").read_text(encoding="utf-8")
+    text = (
+        resources.files("model")
+        .joinpath("data", THRESHOLDS[DEFAULT_THRESHOLD])
+        .read_text(encoding="utf-8")
+    )
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     rows = list(csv.DictReader(lines))
     frequency = np.array([float(row["frequency_hz"]) for row in rows])

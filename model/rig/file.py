@@ -9,7 +9,15 @@ from model.config.sections import Validation
 from model.errors import InputError
 from model.rig.checks import check_across
 from model.rig.meshes import mesh_of
-from model.rig.parts import era_of, laminate_of, limits_of, mass_of, plate_of
+from model.rig.parts import (
+    era_of,
+    fingertip_of,
+    laminate_of,
+    limits_of,
+    mass_of,
+    plate_of,
+    uncertainty_of,
+)
 from model.rig.rig import Channel, Rig
 from model.rig.sections import RigSection
 
@@ -54,6 +62,9 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
         limits=limits_of(section.limits),
         masses=tuple(mass_of(mass, plate) for mass in section.masses.values()),
         laminate=laminate_of(section.plate),
+        uncertainty=uncertainty_of(section.uncertainty),
+        fingertip=fingertip_of(section.fingertip),
+        threshold=section.threshold,
     )
 
 

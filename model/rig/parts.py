@@ -2,8 +2,18 @@
 
 import math
 
-from model.rig.sections import EraSection, LimitsSection, MassSection, MaterialSection, PlateSection
+from model.rig.sections import (
+    EraSection,
+    FingertipSection,
+    LimitsSection,
+    MassSection,
+    MaterialSection,
+    PlateSection,
+    UncertaintySection,
+)
+from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era, damping_from_ratio
+from model.structure.fingertip import Fingertip
 from model.structure.laminate import Laminate, Layer, equivalent_plate
 from model.structure.plate import Material, Plate
 from model.structure.point_load import PointLoad
@@ -71,6 +81,16 @@ def limits_of(section: LimitsSection) -> GuardLimits:
     low, high = section.frequency
     given = section.model_dump(exclude={"frequency"}, exclude_none=True)
     return GuardLimits(frequency_min=low, frequency_max=high, **given)
+
+
+def uncertainty_of(section: UncertaintySection | None) -> Uncertainty:
+    """The standard deviations of the rig's parameters; those not measured without a section."""
+    return Uncertainty() if section is None else Uncertainty(**section.model_dump())
+
+
+def fingertip_of(section: FingertipSection | str) -> Fingertip | None:
+    """The load of a fingertip; None for weightless ones."""
+    return None if isinstance(section, str) else Fingertip(**section.model_dump())
 
 
 def _material(section: MaterialSection) -> Material:

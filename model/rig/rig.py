@@ -4,12 +4,16 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from numbers import Real
 
 from model.errors import InputError
 from model.fem.plate_mesh import PlateMesh
+from model.finger.fingertip import FINGERTIP_RADIUS
+from model.finger.perception import DEFAULT_THRESHOLD
+from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era
+from model.structure.fingertip import Fingertip
 from model.structure.laminate import Laminate
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
@@ -32,7 +36,9 @@ class Rig:
     """A plate on its ERAs, with wiring and limits.
 
     wiring: channel by the name of the ERA; amplifiers: URL by name; masses: on the plate; laminate:
-    of which the plate is the equivalent, for display.
+    of which the plate is the equivalent, for display; uncertainty: of its parameters; fingertip:
+    load of each finger on the plate, None for weightless ones; threshold: name of the set of
+    detection thresholds (`model.finger.perception`).
     """
 
     plate: Plate
@@ -43,6 +49,9 @@ class Rig:
     limits: GuardLimits
     masses: tuple[PointLoad, ...] = ()
     laminate: Laminate | None = None
+    uncertainty: Uncertainty = field(default_factory=Uncertainty)
+    fingertip: Fingertip | None = field(default_factory=Fingertip)
+    threshold: str = DEFAULT_THRESHOLD
 
     def __post_init__(self) -> None:
         """Check that ERAs and masses are on the plate, and places and names of ERAs unique."""
@@ -76,16 +85,30 @@ class Rig:
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint of the plate on its ERAs; see `physics_fingerprint`."""
-        return physics_fingerprint(self.plate, self.eras, masses=self.masses)
+        """Fingerprint of all that decides what is felt; see `physics_fingerprint`."""
+        return physics_fingerprint(
+            self.plate,
+            self.eras,
+            masses=self.masses,
+            uncertainty=self.uncertainty,
+            fingertip=self.fingertip,
+            threshold=self.threshold,
+        )
 
 
 def physics_fingerprint(
-    plate: Plate, eras: Sequence[Era], *, masses: Sequence[PointLoad] = ()
+    plate: Plate,
+    eras: Sequence[Era],
+    *,
+    masses: Sequence[PointLoad],
+    uncertainty: Uncertainty,
+    fingertip: Fingertip | None,
+    threshold: str,
 ) -> str:
-    """SHA-256 over plate, ERAs and masses, which decide the plate's response; not mesh or wiring.
+    """SHA-256 over all that decides what fingers feel; not mesh or wiring.
 
-    Rigs with the same fingerprint share localization tables, also with other names of materials.
+    Over plate, ERAs, masses, their uncertainty, and load, contact and thresholds of a finger. Rigs
+    with the same fingerprint share localization tables, also with other names of materials.
     """
     numbers = asdict(plate)
     del numbers["material"]["name"]
@@ -98,6 +121,10 @@ def physics_fingerprint(
         "plate": numbers,
         "eras": held,
         "masses": sorted(list(map(float, mass.numbers.values())) for mass in masses),
+        "uncertainty": asdict(uncertainty),
+        "fingertip": None if fingertip is None else asdict(fingertip),
+        "fingertip_radius": FINGERTIP_RADIUS,
+        "threshold": threshold,
     }
     return hashlib.sha256(canonical_json(physics).encode()).hexdigest()
 

@@ -5,7 +5,7 @@ Bounds are wide: they catch values in the wrong unit.
 
 import re
 from itertools import pairwise
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -31,8 +31,10 @@ from model.config.units import (
     STIFFNESS,
     TIME,
 )
+from model.finger.perception import DEFAULT_THRESHOLD, THRESHOLDS
 from model.structure.laminate import Bond
 from model.structure.materials import material, material_names
+from registry.suggestions import did_you_mean
 
 
 class _MaterialByName:
@@ -88,6 +90,15 @@ def _gains(rows: list[tuple[float, float, float]]) -> list[tuple[float, float, f
     if any(low[0] >= high[0] for low, high in pairwise(rows)):
         raise ValueError("frequencies must ascend; sort the rows by the first number")
     return rows
+
+
+def _threshold(name: str) -> str:
+    if name not in THRESHOLDS:
+        raise ValueError(
+            f"unknown set of thresholds {name}; {did_you_mean(name, THRESHOLDS)}known are "
+            f"{', '.join(THRESHOLDS)}"
+        )
+    return name
 
 
 GainRow = Annotated[tuple[float, float, float], Strict(strict=False)]  # a list in the file
@@ -170,6 +181,28 @@ class AmplifierSection(Section):
     url: Annotated[str, AfterValidator(_url)]
 
 
+class UncertaintySection(Section):
+    """Standard deviations of a rig's parameters, see `Uncertainty`; a key left out means none."""
+
+    gain: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
+    phase_deg: Annotated[float, Quantity(RATIO, at_least=0, at_most=60)] = 0.0
+    thickness: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.03)] = 0.0
+    stiffness: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
+    damping: Annotated[float, Quantity(RATIO, at_least=1, at_most=4)] = 1.0
+    fingertip: Annotated[float, Quantity(RATIO, at_least=0, at_most=1)] = 0.0
+
+
+class FingertipSection(Section):
+    """The load of a fingertip, see `Fingertip`; a key left out has the default's value."""
+
+    stiffness: Annotated[float, Quantity(STIFFNESS, at_least=0, at_most=1e6)] = 1000.0
+    damping: Annotated[float, Quantity(DAMPING, above=0, at_most=1e4)] = 2.0
+    contact_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=0.1)] = 0.0002
+    phalanx_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=1)] = 0.005
+    joint_stiffness: Annotated[float, Quantity(STIFFNESS, at_least=0, at_most=1e6)] = 500.0
+    joint_damping: Annotated[float, Quantity(DAMPING, at_least=0, at_most=1e4)] = 2.0
+
+
 class LimitsSection(Section):
     """Limits of commands, see `GuardLimits`; all but the frequencies are unlimited by default.
 
@@ -188,7 +221,11 @@ class LimitsSection(Section):
 
 
 class RigSection(Section):
-    """A rig file. mesh: auto, auto 1 %, NXxNY, or NXxNY ELEMENT."""
+    """A rig file.
+
+    mesh: auto, auto 1 %, NXxNY, or NXxNY ELEMENT; uncertainty: without it that of a plate which was
+    not measured; fingertip: none for weightless fingers; threshold: a set of detection thresholds.
+    """
 
     plate: PlateSection
     mesh: str = "auto"
@@ -196,3 +233,6 @@ class RigSection(Section):
     masses: Annotated[dict[Identifier, MassSection], Field(max_length=64, default_factory=dict)]
     amplifiers: Annotated[dict[Identifier, AmplifierSection], Field(min_length=1)]
     limits: LimitsSection = LimitsSection()
+    uncertainty: UncertaintySection | None = None
+    fingertip: FingertipSection | Literal["none"] = FingertipSection()
+    threshold: Annotated[str, AfterValidator(_threshold)] = DEFAULT_THRESHOLD

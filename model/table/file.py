@@ -21,7 +21,9 @@ from model.errors import InputError, first_problem
 from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
 from model.finger.grid import Grid
 from model.rig.meshes import mesh_from_dict
+from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era
+from model.structure.fingertip import Fingertip
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 from model.table.raster import Raster
@@ -31,7 +33,7 @@ FORMAT = "era-haptics localization table"
 ZIP = b"PK\x03\x04"
 """Magic number of .npz files."""
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 
 # A table of the paper's plate has 1.4 MB, one of eight ERAs and a fine grid about 100 MB.
 MAX_BYTES = 2 << 30
@@ -79,6 +81,9 @@ class _Header(BaseModel):
     plate: Plate
     eras: tuple[Era, ...]
     masses: tuple[PointLoad, ...]
+    uncertainty: Uncertainty
+    fingertip: Fingertip | None
+    threshold: str
     mesh: _Mesh
     reference_mesh: _Mesh
     discretisation_error: list[float]
@@ -101,6 +106,9 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
         "plate": asdict(table.plate),
         "eras": [asdict(era) for era in table.eras],
         "masses": [mass.numbers for mass in table.masses],
+        "uncertainty": asdict(table.uncertainty),
+        "fingertip": None if table.fingertip is None else asdict(table.fingertip),
+        "threshold": table.threshold,
         "mesh": table.mesh.to_dict(),
         "reference_mesh": table.reference_mesh.to_dict(),
         "discretisation_error": table.discretisation_error.tolist(),
@@ -161,7 +169,7 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
     if fingerprint is not None and fingerprint != table.fingerprint:
         raise InputError(
             f"{path}: fingerprint must be the rig's, {fingerprint[:12]}, got "
-            f"{table.fingerprint[:12]}, of another plate; {rebuild}"
+            f"{table.fingerprint[:12]}, of another plate, uncertainty or fingertip; {rebuild}"
         )
     return table
 
@@ -186,6 +194,9 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
         plate=header.plate,
         eras=header.eras,
         masses=header.masses,
+        uncertainty=header.uncertainty,
+        fingertip=header.fingertip,
+        threshold=header.threshold,
         mesh=mesh_from_dict(header.mesh.model_dump()),
         reference_mesh=mesh_from_dict(header.reference_mesh.model_dump()),
         discretisation_error=np.array(header.discretisation_error, dtype=float),

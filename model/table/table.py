@@ -28,7 +28,9 @@ from model.finger.contrast import is_background
 from model.finger.grid import Grid
 from model.finger.perception import decibels, detection_threshold
 from model.rig.rig import physics_fingerprint
+from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era
+from model.structure.fingertip import Fingertip
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 from model.table.pattern import ONSET_RAMP, Pattern
@@ -77,6 +79,9 @@ class LocalizationTable:
     plate: Plate
     eras: tuple[Era, ...]
     masses: tuple[PointLoad, ...]
+    uncertainty: Uncertainty
+    fingertip: Fingertip | None
+    threshold: str
     mesh: PlateMesh
     raster: Raster
     grid: Grid
@@ -101,8 +106,15 @@ class LocalizationTable:
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint of the plate on its ERAs that this table is for."""
-        return physics_fingerprint(self.plate, self.eras, masses=self.masses)
+        """Fingerprint of the rig that this table is for."""
+        return physics_fingerprint(
+            self.plate,
+            self.eras,
+            masses=self.masses,
+            uncertainty=self.uncertainty,
+            fingertip=self.fingertip,
+            threshold=self.threshold,
+        )
 
     @property
     def pattern_count(self) -> int:

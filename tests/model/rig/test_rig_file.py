@@ -9,6 +9,8 @@ from model.rig.file import example_rig_path, load_rig, parse_rig, rig_schema
 from model.rig.kind import RIG
 from model.rig.meshes import parse_mesh
 from model.rig.rig import Channel
+from model.rig.uncertainty import Uncertainty
+from model.structure.fingertip import Fingertip
 from model.structure.materials import material
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
@@ -282,6 +284,33 @@ def test_load_rig_reads_masses_and_fingerprints_them(tmp_path: Path) -> None:
         write(tmp_path, (GOOD + "masses:\n" + camera + plug).replace("20 g", "21 g"))
     )
     assert len({bare.fingerprint, rig.fingerprint, heavier.fingerprint}) == 3
+
+
+def test_load_rig_reads_uncertainty(tmp_path: Path) -> None:
+    """Without the section a plate that was not measured; in it, a key left out means none."""
+    assert load_rig(write(tmp_path, GOOD)).uncertainty == Uncertainty(
+        gain=0.05, phase_deg=5, thickness=0.02, stiffness=0.1, damping=1.5, fingertip=0.5
+    )
+    known = load_rig(write(tmp_path, GOOD + "uncertainty: {gain: 1 %, phase_deg: 1}\n"))
+    assert known.uncertainty == Uncertainty(0.01, 1.0, 0.0, 0.0, 1.0, 0.0)
+    for wrong in ("damping: 0.5", "thickness: 0.1", "gain: -0.1", "mass: 1"):
+        with pytest.raises(ConfigError):
+            load_rig(write(tmp_path, GOOD + f"uncertainty: {{{wrong}}}\n"))
+
+
+def test_load_rig_reads_fingertip_and_threshold(tmp_path: Path) -> None:
+    """A finger that presses lightly by default, one by its values, or none; all are answers'."""
+    light = load_rig(write(tmp_path, GOOD))
+    assert light.fingertip == Fingertip(1000, 2, 0.0002, 0.005, 500, 2)
+    firm = load_rig(write(tmp_path, GOOD + "fingertip: {stiffness: 2 kN/m, contact_mass: 0.3 g}\n"))
+    assert firm.fingertip == Fingertip(2000, 2, 0.0003, 0.005, 500, 2)
+    none = load_rig(write(tmp_path, GOOD + "fingertip: none\n"))
+    assert none.fingertip is None
+    known = load_rig(write(tmp_path, GOOD + "uncertainty: {}\n"))
+    assert len({rig.fingerprint for rig in (light, firm, none, known)}) == 4
+    for wrong in ("fingertip: heavy", "fingertip: {damping: 0}", "threshold: nobody"):
+        with pytest.raises(ConfigError):
+            load_rig(write(tmp_path, GOOD + wrong + "\n"))
 
 
 def test_load_rig_moves_an_era_within_rounding_onto_the_edge(tmp_path: Path) -> None:

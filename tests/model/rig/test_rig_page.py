@@ -14,12 +14,14 @@ from model.rig.file import load_rig
 from model.rig.sections import (
     AmplifierSection,
     EraSection,
+    FingertipSection,
     LayerSection,
     LimitsSection,
     MassSection,
     MaterialSection,
     PlateSection,
     RigSection,
+    UncertaintySection,
 )
 from model.structure.materials import KNOWN_MATERIALS
 
@@ -34,6 +36,8 @@ SECTIONS = {
     "masses": MassSection,
     "amplifiers": AmplifierSection,
     "limits": LimitsSection,
+    "uncertainty": UncertaintySection,
+    "fingertip": FingertipSection,
 }
 
 

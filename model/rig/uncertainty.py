@@ -1,0 +1,36 @@
+"""How well a rig knows its plate, its ERAs, its amplifiers and the fingers on it."""
+
+import math
+from dataclasses import dataclass, fields
+
+from model.errors import InputError
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """One standard deviation of each parameter; independent of each other.
+
+    gain: of each channel, relative; phase_deg: of each channel [degrees]; thickness: of the plate,
+    relative; stiffness: of each ERA, relative; damping: a factor, of the ERAs' damping and of the
+    plate's loss factor, 1 for none; fingertip: of the logarithm of each finger's load. The defaults
+    are those of a plate as built from its drawing and not measured.
+    """
+
+    gain: float = 0.05
+    phase_deg: float = 5.0
+    thickness: float = 0.02
+    stiffness: float = 0.1
+    damping: float = 1.5
+    fingertip: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse values that are not finite, negative ones, and a factor below 1."""
+        for key in (field.name for field in fields(self)):
+            least, value = (1.0 if key == "damping" else 0.0), getattr(self, key)
+            if not (math.isfinite(value) and value >= least):
+                raise InputError(f"uncertainty: {key} must be at least {least:g}, got {value}")
+
+    @classmethod
+    def none(cls) -> "Uncertainty":
+        """A rig whose every parameter is known exactly."""
+        return cls(0.0, 0.0, 0.0, 0.0, 1.0, 0.0)

@@ -1,0 +1,65 @@
+"""The mechanical load of a resting fingertip on the plate.
+
+Pressed on the plate, a fingertip is a contact mass that moves with it, and a spring and a damper
+(the pulp) to the phalanx, which a joint holds. The phalanx is not at rest: at 60, 100 and 250 Hz
+the real part of the dynamic stiffness is 69, -87 and -358 N/m where a phalanx at rest gives 972,
+921 and 507.
+"""
+
+import math
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.errors import InputError
+
+
+@dataclass(frozen=True)
+class Fingertip:
+    """Load of one fingertip.
+
+    stiffness [N/m], damping [N s/m]: of the pulp; contact_mass [kg]: moves with the plate;
+    phalanx_mass [kg], joint_stiffness [N/m], joint_damping [N s/m]: of the bone behind the pulp and
+    of the joint that holds it to the rest plane. The defaults are those of a finger that presses
+    lightly.
+    """
+
+    stiffness: float = 1000.0
+    damping: float = 2.0
+    contact_mass: float = 0.0002
+    phalanx_mass: float = 0.005
+    joint_stiffness: float = 500.0
+    joint_damping: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Refuse values that are not finite or negative, and a pulp without damping."""
+        for key in (field.name for field in fields(self)):
+            value = getattr(self, key)
+            if not (math.isfinite(value) and value >= 0):
+                raise InputError(f"fingertip: {key} must be finite and at least 0, got {value}")
+        if self.damping == 0:
+            raise InputError("fingertip: damping must be above 0 N s/m, got 0")
+
+    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """Force on the plate per displacement of the contact at omega [rad/s], of its shape [N/m].
+
+        D = -omega² m_c + Z_p Z_b / (Z_p + Z_b), with Z_p = k + i omega c of the pulp and
+        Z_b = k_j + i omega c_j - omega² m_p of the phalanx on its joint.
+        """
+        w = np.asarray(omega, dtype=float)
+        pulp = self.stiffness + 1j * w * self.damping
+        phalanx = self.joint_stiffness + 1j * w * self.joint_damping - w**2 * self.phalanx_mass
+        return np.asarray(pulp * phalanx / (pulp + phalanx) - w**2 * self.contact_mass)
+
+    def scaled(self, factor: float) -> "Fingertip":
+        """The fingertip with a contact larger by a factor: its pulp and contact mass scale.
+
+        Phalanx and joint stay, and so does the ratio of damping to stiffness of the pulp.
+        """
+        return replace(
+            self,
+            stiffness=factor * self.stiffness,
+            damping=factor * self.damping,
+            contact_mass=factor * self.contact_mass,
+        )

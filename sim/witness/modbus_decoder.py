@@ -145,6 +145,8 @@ class ModbusDecoder:
             return Reply(adu.unit, problem=problem)
         key = request.key
         if pdu[0] & 0x80:
+            if len(pdu) != 2:
+                return Damaged(f"an exception must have two bytes, got {len(pdu)}")
             del self._open[adu.number]
             return Reply(adu.unit, key, refusal=pdu[1])
         try:

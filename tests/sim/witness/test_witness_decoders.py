@@ -195,6 +195,17 @@ def test_modbus_decoder_matches_a_refusal_of_an_earlier_write() -> None:
         assert (answer.key == request.key) is is_answer
 
 
+def test_modbus_decoder_reports_an_exception_cut_short() -> None:
+    """Modbus TCP with a length damaged on its way: an exception without its code is no reply."""
+    decoder = ModbusDecoder(over_tcp=True)
+    ((_, request),) = decoder.feed("amplifier", 0.0, bytes.fromhex("000100000006010300000002"))
+    ((_, cut),) = decoder.feed("host", 0.01, bytes.fromhex("0001000000020183"))
+    assert isinstance(cut, Damaged)
+    ((_, whole),) = decoder.feed("host", 0.02, bytes.fromhex("000100000003018302"))
+    assert isinstance(request, Request)
+    assert whole == Reply(1, request.key, refusal=2)
+
+
 @pytest.mark.parametrize("are_on", [False, True])
 def test_witness_reports_a_stale_refusal_unless_disturbed(are_on: bool) -> None:
     """While disturbed it is excused, and the next request violates nothing."""

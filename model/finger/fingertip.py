@@ -3,6 +3,7 @@
 import numpy as np
 
 from model.arrays import FloatArray
+from model.finger.disc import FINE_POINTS, DiscRule
 from model.structure.plate import Plate
 
 # Contact of an adult's index finger pressed lightly is 10 to 15 mm across; the disc takes in the
@@ -33,3 +34,17 @@ def fingertip_points(x: float, y: float, plate: Plate) -> FloatArray:
     points = np.array([x, y]) + FINGERTIP_RADIUS * UNIT_DISC
     on_plate = (points >= 0).all(axis=1) & (points <= [plate.length, plate.width]).all(axis=1)
     return points[on_plate]
+
+
+def fingertips_on(
+    centres: FloatArray, plate: Plate, rule: DiscRule = FINE_POINTS
+) -> tuple[FloatArray, FloatArray]:
+    """Points [m] (k, p, 2) under fingertips centred at (k, 2) [m] on the plate, weights (k, p).
+
+    The weighted sum over a fingertip's points is the mean over its disc, or over the part of it
+    that is on the plate. All points are on the plate and under the fingertip.
+    """
+    low = -centres / FINGERTIP_RADIUS
+    high = ([plate.length, plate.width] - centres) / FINGERTIP_RADIUS
+    points, weights = rule.cut(low, high)
+    return centres[:, None] + FINGERTIP_RADIUS * points, weights

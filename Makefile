@@ -11,7 +11,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test lint format docs fuzz kill-test fault-test stop-test estimate-test soak bench bench-latency \
-	bench-localization bench-plant bench-wires dist smoke smoke-lowest sbom licences clean
+	bench-localization bench-plant bench-promise bench-wires dist smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
 demo: .venv/installed
@@ -69,6 +69,11 @@ bench: .venv/installed-peers
 # Ten minutes, on a machine that is left alone.
 bench-latency: .venv/installed-test
 	$(BIN)/python -m benchmarks.latency --report
+
+# Half an hour: contrast on plates that deviate, by NGSolve, beside an independent optimum.
+# Others: make bench-promise PROMISE='--sets 20'
+bench-promise: .venv/installed-peers
+	$(BIN)/python -m benchmarks.promise --report $(PROMISE)
 
 bench-localization: .venv/installed
 	$(BIN)/python -m benchmarks.localization --report

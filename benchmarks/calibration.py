@@ -14,7 +14,7 @@ from examples.make_measured import FREQUENCIES, SENSOR, true_rig
 from model.calibration.calibrate import calibrate
 from model.calibration.calibration_result import Calibration
 from model.finger.contrast import contrast_db
-from model.finger.fingertip import fingertip_points
+from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.build import build_table
@@ -58,7 +58,8 @@ def reached(
         points = fingertip_points(*place, truth.plate)
         return np.asarray(truth.amplitudes(excitation, points)[1].sum(axis=0))
 
-    return float(contrast_db([peak(target)], np.concatenate([peak(place) for place in quiet])))
+    loudest = np.concatenate([peak(place) for place in quiet])
+    return float(contrast_db([peak(target)], loudest, [fingertip_weights(*target, truth.plate)]))
 
 
 def show_contrast(rig: Rig, truth: Rig, found: Calibration) -> None:

@@ -63,7 +63,7 @@ def draw_playback(playback: Playback) -> Figure:
     period = 1 / min(playback.frequencies)
     for number, record in enumerate(playback.targets, start=1):
         times, peaks = _peaks(record, period)
-        axes.plot(1000 * times, peaks.mean(axis=1), label=f"target {number}", lw=2)
+        axes.plot(1000 * times, peaks @ record.weights, label=f"target {number}", lw=2)
     for number, record in enumerate(playback.quiet, start=1):
         times, peaks = _peaks(record, period)
         axes.plot(1000 * times, peaks.max(axis=1), label=f"quiet {number}", lw=1.2)

@@ -146,12 +146,11 @@ if not status.drive:
 # Amplitudes of different frequencies add; a target counts by its mean, a quiet finger by its
 # loudest point, as in the predictions.
 peak = {name: np.sum(each["amplitude_m_s2"], axis=0) for name, each in felt.items()}
-felt_contrast_db = 20 * np.log10(peak["target"].mean() / peak["quiet"].max())
+at_target = peak["target"] @ felt["target"]["weights"]
+felt_contrast_db = 20 * np.log10(at_target / peak["quiet"].max())
 predicted_contrast_db = status.predicted_contrast_db
 print("played:", {name: f"{tone.frequency_hz:g} Hz" for name, tone in status.drive.items()})
-print(
-    f"target {peak['target'].mean():.2f} m/s², quiet finger {peak['quiet'].max():.3f} m/s² at most"
-)
+print(f"target {at_target:.2f} m/s², quiet finger {peak['quiet'].max():.3f} m/s² at most")
 print(f"contrast {felt_contrast_db:.1f} dB felt, {predicted_contrast_db:.1f} dB predicted")
 
 # %%

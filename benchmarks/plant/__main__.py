@@ -3,7 +3,7 @@
     python -m benchmarks.plant [--seconds 2] [--repeats 3]
 
 The founding paper's plate on its four ERAs, each driven by a tone that is begun anew twice a
-second, two fingertips of 19 points that are sampled at the sensors' rate, all moved on by steps of
+second, two fingertips of 21 points that are sampled at the sensors' rate, all moved on by steps of
 10 ms as a far end in real time does. Then one thing at a time is more or less. Times are the
 thread's own, which other work lengthens least; the best of the repeats counts, and ratios are to
 the first line of the same run. Exits with 1 where that is not fifty times faster than real time.

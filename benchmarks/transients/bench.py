@@ -16,7 +16,7 @@ from benchmarks.transients.cases import (
     with_errors,
 )
 from model.finger.contrast import contrast_db
-from model.finger.fingertip import fingertip_points
+from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.point_load import footprints_of
@@ -171,7 +171,8 @@ class Bench:
             duration=last + ENDING_WINDOW,
             after=excitation,
         )
-        return float(contrast_db(targets, np.abs(quiet).max(axis=0)))
+        tips = [fingertip_weights(*each, self.rig.plate) for each in case.targets]
+        return float(contrast_db(targets, np.abs(quiet).max(axis=0), tips))
 
     def _left(self, excitation: Excitation, bases: Bases) -> float:
         return self.clock("level left", lambda: self.transients.residual_db(excitation, bases))

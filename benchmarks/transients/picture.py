@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from benchmarks.transients.cases import Case
 from model.arrays import FloatArray
 from model.finger.contrast import contrast_db
-from model.finger.fingertip import fingertip_points
+from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.rig.rig import Rig
 from model.table.pattern import ONSET_RAMP
 from model.transients.envelope import Bases, ramped_ending, ramped_onset, shaped
@@ -46,7 +46,8 @@ def draw(plate: PlateInTime, rig: Rig, cases: list[list[Case]], path: Path) -> N
         ("shaped", shaped(onset, rig.eras), "shaped, quietly", shaped(ending, rig.eras)),
     ]
     points = [fingertip_points(*each, rig.plate) for each in case.contacts]
-    count = len(points[0])
+    weights = fingertip_weights(*case.contacts[0], rig.plate)
+    count = len(weights)
     figure = Figure(figsize=(10, 7), layout="constrained")
     axes = figure.subplots(3, 2, sharex=True, sharey="col")
     for (left, right), (start_name, start, end_name, end) in zip(axes, rows, strict=True):
@@ -69,7 +70,7 @@ def draw(plate: PlateInTime, rig: Rig, cases: list[list[Case]], path: Path) -> N
             loudest = int(np.abs(quiet).max(axis=0).argmax())
             axis.plot(times, felt[:, 0], color="0.65", linewidth=0.8, label="target")
             axis.plot(times, quiet[:, loudest], color="C3", linewidth=1.0, label="quiet finger")
-            axis.set_title(f"{name}: {_remark(felt, count, start=axis is left)}", fontsize=10)
+            axis.set_title(f"{name}: {_remark(felt, weights, start=axis is left)}", fontsize=10)
             axis.grid(alpha=0.3)
         left.set_ylabel("acceleration in m/s²")
     axes[0, 0].legend(loc="upper right", fontsize=9)
@@ -83,10 +84,10 @@ def draw(plate: PlateInTime, rig: Rig, cases: list[list[Case]], path: Path) -> N
     figure.savefig(path, dpi=110)
 
 
-def _remark(felt: FloatArray, count: int, *, start: bool) -> str:
+def _remark(felt: FloatArray, weights: FloatArray, *, start: bool) -> str:
     if start:
         peak = np.abs(felt[: round(0.1 * SAMPLE_RATE)]).max(axis=0)
-        contrast = contrast_db([peak[:count]], peak[count:])
+        contrast = contrast_db([peak[: len(weights)]], peak[len(weights) :], [weights])
         return f"contrast {contrast:.0f} dB in the first 100 ms"
-    late = np.abs(felt[round(0.04 * SAMPLE_RATE) :, :count]).max()
+    late = np.abs(felt[round(0.04 * SAMPLE_RATE) :, : len(weights)]).max()
     return f"target moves up to {late:.2g} m/s² after 40 ms"

@@ -51,6 +51,7 @@ class SimulatedPlate:
                     len(felt["frequencies_hz"]), len(felt["peak_m_s2"])
                 ),
                 peaks=np.array(felt["peak_m_s2"], dtype=float),
+                weights=np.array(felt["weights"], dtype=float),
             )
             for id, felt in reply["fingers"].items()
         }

@@ -19,17 +19,19 @@ class FingerVibration:
     """Measured vibration of one fingertip over a window.
 
     frequencies (f,) [Hz]; amplitudes (f, p) [m/s²] of the steady part at each point of the tip;
-    peaks (p,) [m/s²], the largest acceleration there, transients included.
+    peaks (p,) [m/s²], the largest acceleration there, transients included; weights (p,) of the
+    points in the mean over the tip.
     """
 
     frequencies: FloatArray
     amplitudes: FloatArray
     peaks: FloatArray
+    weights: FloatArray
 
     @property
     def level_db_sl(self) -> float:
         """Sensation level, mean over the tip; -inf without vibration."""
-        return mean_level_db_sl(self.frequencies, self.amplitudes)
+        return mean_level_db_sl(self.frequencies, self.amplitudes, self.weights)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,9 +82,11 @@ def steady_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]
     if not quiet:
         return None
     others = np.concatenate([peak_acceleration(finger.amplitudes) for finger in quiet])
-    return float(contrast_db([peak_acceleration(target.amplitudes)], others))
+    felt = peak_acceleration(target.amplitudes)
+    return float(contrast_db([felt], others, [target.weights]))
 
 
 def peak_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]) -> float:
     """Contrast of the peaks [dB], as `model.transients.measures` predicts for an onset."""
-    return float(contrast_db([target.peaks], np.concatenate([finger.peaks for finger in quiet])))
+    others = np.concatenate([finger.peaks for finger in quiet])
+    return float(contrast_db([target.peaks], others, [target.weights]))

@@ -12,7 +12,7 @@ from controller.loop.intent import HapticIntent, Target
 from controller.sources.contacts import Contact
 from model.errors import InputError
 from model.finger.contrast import contrast_db, mean_level_db_sl
-from model.finger.fingertip import fingertip_points
+from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import FELT_DB_SL, decibels
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, Pattern
 from model.table.question import Question
@@ -163,14 +163,17 @@ class Selector:
         ends = np.cumsum([len(disc) for disc in discs])[: len(targets)]
         *fields, at_quiet = np.split(all_fields, ends, axis=1)
         loudest = peak_acceleration(at_quiet)
-        return tuple(
-            Prediction(
-                contact,
-                mean_level_db_sl(frequencies, field),
-                float(contrast_db([peak_acceleration(field)], loudest)) if quiet else None,
+        predictions = []
+        for (contact, _), field in zip(targets, fields, strict=True):
+            weights = fingertip_weights(contact.x, contact.y, self._table.plate)
+            level = mean_level_db_sl(frequencies, field, weights)
+            contrast = (
+                contrast_db([peak_acceleration(field)], loudest, [weights]) if quiet else None
             )
-            for (contact, _), field in zip(targets, fields, strict=True)
-        )
+            predictions.append(
+                Prediction(contact, level, None if contrast is None else float(contrast))
+            )
+        return tuple(predictions)
 
 
 def _question(

@@ -28,24 +28,34 @@ def is_background(points: FloatArray, targets: Sequence[tuple[float, float]]) ->
     return beyond if beyond.any() else ~beyond
 
 
-def contrast_ratio(targets: Sequence[FloatArray], quiet: FloatArray) -> FloatArray:
+def contrast_ratio(
+    targets: Sequence[FloatArray],
+    quiet: FloatArray,
+    weights: Sequence[FloatArray] | None = None,
+) -> FloatArray:
     """Contrast of peak amplitudes as a ratio: the weakest target to the loudest quiet point.
 
-    A target counts by the mean over its points. targets (..., p) each, quiet (..., q) -> (...).
+    A target counts by the mean over its points, by weights (p,) each; None where all points count
+    alike. targets (..., p) each, quiet (..., q) -> (...).
     """
-    peak = np.minimum.reduce([target.mean(axis=-1) for target in targets])
-    return np.asarray(peak / quiet.max(axis=-1))
+    each = weights or [np.full(len(target.T), 1 / len(target.T)) for target in targets]
+    means = [target @ weight for target, weight in zip(targets, each, strict=True)]
+    return np.asarray(np.minimum.reduce(means) / quiet.max(axis=-1))
 
 
-def contrast_db(targets: Sequence[FloatArray], quiet: FloatArray) -> FloatArray:
+def contrast_db(
+    targets: Sequence[FloatArray],
+    quiet: FloatArray,
+    weights: Sequence[FloatArray] | None = None,
+) -> FloatArray:
     """Return `contrast_ratio` in dB."""
-    return decibels(contrast_ratio(targets, quiet))
+    return decibels(contrast_ratio(targets, quiet, weights))
 
 
-def mean_level_db_sl(frequencies: FloatArray, amplitudes: FloatArray) -> float:
-    """Level [dB SL] over a region: mean over its points of amplitude to threshold.
+def mean_level_db_sl(frequencies: FloatArray, amplitudes: FloatArray, weights: FloatArray) -> float:
+    """Level [dB SL] over a fingertip: mean over its points of amplitude to threshold.
 
-    frequencies (f,) [Hz], amplitudes (f, p) [m/s²].
+    frequencies (f,) [Hz], amplitudes (f, p) [m/s²], weights (p,) of the points.
     """
     above = 10 ** (sensation_level(frequencies, amplitudes) / 20)
-    return float(decibels(above.mean()))
+    return float(decibels(above @ weights))

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from model.arrays import FloatArray, lattice
 from model.finger.contrast import is_beyond
-from model.finger.fingertip import fingertip_points
+from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import decibels
 from model.structure.plate import Plate
 from model.table.pattern import Concentration, Pattern
@@ -22,8 +22,11 @@ def with_concentration(table: LocalizationTable, question: Question, pattern: Pa
     """Add the concentration to a pattern without quiet fingers; takes some milliseconds."""
     if question.quiet:
         return pattern
-    discs = [fingertip_points(*target, table.plate) for target in question.targets]
-    felt = [table.amplitudes(pattern.excitation, disc)[1].sum(axis=0).mean() for disc in discs]
+    felt = [
+        table.amplitudes(pattern.excitation, fingertip_points(*target, table.plate))[1].sum(axis=0)
+        @ fingertip_weights(*target, table.plate)
+        for target in question.targets
+    ]
     points = cell_centres(table.plate)
     frequencies, amplitudes = table.amplitudes(pattern.excitation, points)
     near = ~is_beyond(points, question.targets)

@@ -14,15 +14,13 @@ from numpy.typing import NDArray
 
 from model.arrays import FloatArray, IntArray, lattice
 from model.errors import InputError
-from model.finger.fingertip import FINGERTIP_RADIUS, UNIT_DISC
+from model.finger.fingertip import FINGERTIP_RADIUS, fingertips_on
 from model.structure.footprint import mean_over
 from model.structure.plate import Plate
 
 POINTS_PER_WAVELENGTH = 20
 MAX_SPACING, MIN_SPACING = 0.008, 0.003  # m
 PATCH = 6  # points along a side of an interpolation, at least
-
-_DISC = FINGERTIP_RADIUS * UNIT_DISC
 
 
 @dataclass(frozen=True)
@@ -71,10 +69,8 @@ class Raster:
 
     def fingertips(self, centres: FloatArray) -> "Fingertips":
         """Interpolation at the discs of fingertips centred at (k, 2) [m] on the plate."""
-        discs = centres[:, None, :] + _DISC
-        within = np.minimum(np.maximum(discs, 0.0), (self.length, self.width))
-        index, weights = self._patches(centres, within)
-        return Fingertips(index, weights, (within == discs).all(axis=2))
+        points, means = fingertips_on(centres, length=self.length, width=self.width)
+        return Fingertips(*self._patches(centres, points), means)
 
     def at(self, values: NDArray[np.float32], points: FloatArray) -> NDArray[np.float32]:
         """Values (point_count, c) at points [m] (n, 2) of the plate: (n, c).
@@ -135,24 +131,23 @@ class Raster:
 class Fingertips:
     """Points under fingertips, finger after finger, with their interpolation weights.
 
-    The points are those of `fingertip_points`: all of the disc (k, p) that is on_plate. index
-    (k, patch): raster points around each finger; weights (k, p, patch).
+    The points are those of `fingertip_points`. index (k, patch): raster points around each finger;
+    weights (k, p, patch); means (k, p): weights of the points in the mean over each fingertip.
     """
 
     index: IntArray
     weights: NDArray[np.float32]
-    on_plate: NDArray[np.bool_]
+    means: FloatArray
 
     @cached_property
     def ends(self) -> list[int]:
         """End of the points of each finger among all points."""
-        return [int(end) for end in self.on_plate.sum(axis=1).cumsum()]
+        fingers, points = self.means.shape
+        return [points * (finger + 1) for finger in range(fingers)]
 
     def read(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Values (point_count, c) of the raster at all points: (n, c)."""
-        found = self.weights @ values.take(self.index, axis=0)
-        whole = self.ends[-1] == self.on_plate.size
-        return found.reshape(-1, values.shape[1]) if whole else found[self.on_plate]
+        return (self.weights @ values.take(self.index, axis=0)).reshape(-1, values.shape[1])
 
 
 @dataclass(frozen=True, eq=False)

@@ -89,7 +89,7 @@ def ensemble_contrast_db(
 ) -> FloatArray:
     """Contrast [dB] of an excitation at the weakest target on each plate, (m,)."""
     contacts = (*question.targets, *question.quiet)
-    shapes, ends = table.shapes_at_fingertips(contacts)
+    shapes, ends, means = table.shapes_at_fingertips(contacts)
     deviation = np.repeat(ensemble.deviation, np.diff(ends, prepend=0), axis=1)
     tones = zip(*base_amplitudes(excitation, table.eras), strict=True)
     peak = np.sum(
@@ -103,7 +103,7 @@ def ensemble_contrast_db(
         axis=0,
     )
     *targets, quiet = np.split(peak, ends[: len(question.targets)], axis=1)
-    return contrast_db(targets, quiet)
+    return contrast_db(targets, quiet, list(means[: len(question.targets)]))
 
 
 def _acceleration(

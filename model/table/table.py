@@ -176,7 +176,9 @@ class LocalizationTable:
         return Fields(
             targets=tuple(
                 np.ascontiguousarray(found[:, :, start:end] * gain)
-                for start, end, gain in zip((0, *ends), ends[:count], question.gains, strict=False)
+                for start, end, gain in zip(
+                    (0, *ends), ends[:count], _gains(question, fingertips), strict=False
+                )
             ),
             quiet=np.ascontiguousarray(quiet),
             has_no_quiet_contacts=not question.quiet,
@@ -213,10 +215,12 @@ class LocalizationTable:
         """Shapes of the reduced plate at points [m] of it, (p, r)."""
         return self.raster.at(self.shapes, np.array(points)).astype(float)
 
-    def shapes_at_fingertips(self, contacts: Sequence[Point]) -> tuple[FloatArray, list[int]]:
-        """Shapes under fingertips (p, r), and where the points of each one end."""
+    def shapes_at_fingertips(
+        self, contacts: Sequence[Point]
+    ) -> tuple[FloatArray, list[int], FloatArray]:
+        """Shapes under fingertips (p, r), where the points of each one end, and their weights."""
         fingertips = self.raster.fingertips(np.array(contacts))
-        return fingertips.read(self.shapes).astype(float), fingertips.ends
+        return fingertips.read(self.shapes).astype(float), fingertips.ends, fingertips.means
 
     def drive_of(self, excitation: Excitation) -> dict[str, dict[str, float]]:
         """Frequency, level 0..1 of the stroke and phase of an excitation, by ERA."""
@@ -291,8 +295,10 @@ class LocalizationTable:
                 playable[rows],
                 weights,
                 targets=[
-                    shapes[start:end] * gain
-                    for start, end, gain in zip((0, *ends), ends, question.gains, strict=False)
+                    shapes[start:end] * gain[:, None]
+                    for start, end, gain in zip(
+                        (0, *ends), ends, _gains(question, fingertips), strict=False
+                    )
                 ],
                 quiet=shapes[ends[len(question.targets) - 1] :],
             )
@@ -302,3 +308,10 @@ class LocalizationTable:
     def _by_frequency(self, values: NDArray[np.float32]) -> Complex64Array:
         fields = values.view(np.complex64).reshape(len(values), len(self.frequencies), -1)
         return np.ascontiguousarray(fields.transpose(1, 2, 0))
+
+
+def _gains(question: Question, fingertips: Fingertips) -> NDArray[np.float32]:
+    """Factors (targets, p) that make the mean of a target's points its weighted one at its gain."""
+    count = len(question.targets)
+    means = fingertips.means[:count] * fingertips.means.shape[1]
+    return np.asarray(means * np.array(question.gains)[:, None], dtype=np.float32)

@@ -21,7 +21,7 @@ from model.arrays import FloatArray
 from model.drive_modes.sources import magnitudes_of_sources
 from model.errors import InputError
 from model.finger.contrast import contrast_db, mean_level_db_sl
-from model.finger.fingertip import fingertip_points
+from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.grid import CELL_SAMPLES, Grid
 from model.finger.perception import decibels
 from model.reduction.reduced_plate import reduce_plate
@@ -242,7 +242,8 @@ class _AnswerChecker:
         rig = self._rig
         contacts = (*question.targets, *question.quiet)
         discs = np.concatenate([fingertip_points(*each, rig.plate) for each in contacts])
-        count = len(fingertip_points(*contacts[0], rig.plate))
+        weights = fingertip_weights(*contacts[0], rig.plate)
+        count = len(weights)
         points = np.concatenate([discs, _ALL_OVER.centres(rig.plate)])
         frequencies, everywhere = tone_amplitudes(
             pattern.excitation,
@@ -254,16 +255,16 @@ class _AnswerChecker:
         peak = peak_acceleration(direct)
         error = field_error(self._table, float(frequencies[-1]))
         error *= math.sqrt(float((peak_acceleration(rest) ** 2).mean()))
-        at_target = float(decibels(1 + error / peak[:count].mean()))
+        at_target = float(decibels(1 + error / (peak[:count] @ weights)))
         at_quiet = float(decibels(1 + error / peak[count:].max()))
         contrast = pattern.contrast_db
         return AnswerCheck(
             question,
             pattern,
             predicted_contrast_db=math.nan if contrast is None else contrast,
-            direct_level_db_sl=mean_level_db_sl(frequencies, direct[:, :count]),
-            direct_contrast_db=_contrast(direct, count),
-            contrast_in_time_db=_contrast(in_time, count),
+            direct_level_db_sl=mean_level_db_sl(frequencies, direct[:, :count], weights),
+            direct_contrast_db=_contrast(direct, weights),
+            contrast_in_time_db=_contrast(in_time, weights),
             level_tolerance_db=ROUNDING_DB + at_target,
             contrast_tolerance_db=ROUNDING_DB + at_target + at_quiet,
         )
@@ -286,9 +287,10 @@ def steady_in_time(
     return np.asarray(np.hypot(*np.split(fitted, 2)))
 
 
-def _contrast(amplitudes: FloatArray, at_target: int) -> float:
-    peak = peak_acceleration(amplitudes)
-    return float(contrast_db([peak[:at_target]], peak[at_target:]))
+def _contrast(amplitudes: FloatArray, weights: FloatArray) -> float:
+    """Contrast [dB] of a target, whose points with their weights come first."""
+    target, quiet = np.split(peak_acceleration(amplitudes), [len(weights)])
+    return float(contrast_db([target], quiet, [weights]))
 
 
 def _random_answer(

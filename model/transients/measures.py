@@ -9,7 +9,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.finger.contrast import contrast_db
-from model.finger.fingertip import fingertip_points
+from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.transients.base_motion import Term
 from model.transients.envelope import Bases
 from model.transients.hats import mean_square, steady_states
@@ -53,7 +53,9 @@ class Transients:
         acceleration = self.acceleration(bases, np.concatenate(discs))
         ends = np.cumsum([len(disc) for disc in discs])[:-1]
         peaks = np.split(np.abs(acceleration).max(axis=0), ends)
-        return float(contrast_db(peaks[: len(targets)], np.concatenate(peaks[len(targets) :])))
+        weights = [fingertip_weights(*each, plate) for each in targets]
+        count = len(targets)
+        return float(contrast_db(peaks[:count], np.concatenate(peaks[count:]), weights))
 
     def acceleration(
         self,

@@ -20,7 +20,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.finger.contrast import is_background
-from model.finger.fingertip import FINGERTIP_RADIUS, fingertip_points
+from model.finger.fingertip import FINGERTIP_RADIUS, fingertip_points, fingertip_weights
 from model.finger.grid import Grid
 from model.transients.envelope import BaseEnvelope, Envelopes
 from model.transients.hats import mean_square
@@ -147,11 +147,14 @@ class Shaper:
         for bending waves much longer than the fingertip.
         """
         rows = []
+        plate = self._plate.reduced.plate
         for x, y in positions:
-            points = fingertip_points(x, y, self._plate.reduced.plate)
+            points = fingertip_points(x, y, plate)
+            root = np.sqrt(fingertip_weights(x, y, plate))[:, None]
             u, v = ((points - [x, y]) / FINGERTIP_RADIUS).T
-            basis, _ = np.linalg.qr(np.column_stack([np.ones(len(u)), u, v, u * u, u * v, v * v]))
-            rows.append(basis.T @ self._plate.reduced.at(points) / math.sqrt(len(points)))
+            powers = np.column_stack([np.ones(len(u)), u, v, u * u, u * v, v * v])
+            basis, _ = np.linalg.qr(root * powers)
+            rows.append(basis.T @ (root * self._plate.reduced.at(points)))
         return np.concatenate(rows)
 
     def _surroundings(self, targets: Sequence[Position]) -> FloatArray:

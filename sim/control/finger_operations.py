@@ -61,6 +61,7 @@ async def _felt(context: SimulationContext, request: Request, now: float) -> Res
         "fingers": {
             id: {
                 "points_m": one.points.tolist(),
+                "weights": one.weights.tolist(),
                 "frequencies_hz": list(one.frequencies),
                 "amplitude_m_s2": one.amplitude.tolist(),
                 "peak_m_s2": one.peak.tolist(),

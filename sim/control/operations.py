@@ -12,7 +12,8 @@
     {"op": "touch", "finger": ID, "at_m": [x, y]}      add one; "move": move one
     {"op": "lift", "finger": ID}                       remove one
     {"op": "felt", "since_s": t0, "until_s": t1}
-        {"fingers": {ID: {"points_m": [[x, y], ...], "frequencies_hz": [f, ...],
+        {"fingers": {ID: {"points_m": [[x, y], ...], "weights": [one per point, sum 1],
+                          "frequencies_hz": [f, ...],
                           "amplitude_m_s2": [[one per point], one row per frequency],
                           "peak_m_s2": [one per point]}}}
 

@@ -11,9 +11,13 @@ from sim.plant.fingers import Record
 
 @dataclass(frozen=True)
 class Felt:
-    """points (p, 2) [m]; frequencies (f,) [Hz]; amplitude (f, p) [m/s²]; peak (p,) [m/s²]."""
+    """points (p, 2) [m]; frequencies (f,) [Hz]; amplitude (f, p) [m/s²]; peak (p,) [m/s²].
+
+    weights (p,): of the points in the mean over the fingertip.
+    """
 
     points: FloatArray
+    weights: FloatArray
     frequencies: tuple[float, ...]
     amplitude: FloatArray
     peak: FloatArray
@@ -33,7 +37,7 @@ def measure_vibration(record: Record, frequencies: Sequence[float]) -> Felt:
     else:
         amplitude = np.abs(fit_tones(times - times[0], samples, frequencies))
         peak = np.abs(samples).max(axis=0)
-    return Felt(record.points, tuple(frequencies), amplitude, peak)
+    return Felt(record.points, record.weights, tuple(frequencies), amplitude, peak)
 
 
 def fit_tones(

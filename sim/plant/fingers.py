@@ -14,7 +14,7 @@ import numpy as np
 from model.arrays import FloatArray
 from model.config.points import in_metres
 from model.errors import InputError
-from model.finger.fingertip import fingertip_points
+from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import ReducedPlate
 from model.structure.plate import Plate
 
@@ -28,11 +28,13 @@ Position: TypeAlias = tuple[float, float]
 class FingerPositions:
     """Positions of fingers, the points of their tips (p, 2) [m], and the shapes there.
 
-    shapes (p, r); columns: the points of each finger.
+    weights (p,): of the points in the mean over their tip; shapes (p, r); columns: the points of
+    each finger.
     """
 
     positions: Mapping[str, Position]
     points: FloatArray
+    weights: FloatArray
     shapes: FloatArray
     columns: Mapping[str, slice]
 
@@ -41,10 +43,12 @@ class FingerPositions:
 class Record:
     """Accelerations under one finger while it stayed at one position.
 
-    points (p, 2) [m]; times (n,) [s]; accelerations (n, p) [m/s²].
+    points (p, 2) [m], weights (p,) in the mean over the tip; times (n,) [s]; accelerations (n, p)
+    [m/s²].
     """
 
     points: FloatArray
+    weights: FloatArray
     times: FloatArray
     accelerations: FloatArray
 
@@ -112,14 +116,17 @@ class Fingers:
         }
 
     def _lay_out(self, positions: Mapping[str, Position]) -> FingerPositions:
-        columns, parts, start = {}, [np.zeros((0, 2))], 0
-        for name, (x, y) in positions.items():
-            part = fingertip_points(x, y, self._reduced.plate)
-            columns[name] = slice(start, start + len(part))
-            start += len(part)
-            parts.append(part)
-        points = np.concatenate(parts)
-        return FingerPositions(dict(positions), points, self._reduced.at(points), columns)
+        plate, columns = self._reduced.plate, {}
+        points, weights = [np.zeros((0, 2))], [np.zeros(0)]
+        start = 0
+        for name, at in positions.items():
+            points.append(fingertip_points(*at, plate))
+            weights.append(fingertip_weights(*at, plate))
+            columns[name] = slice(start, start + len(points[-1]))
+            start += len(points[-1])
+        together = np.concatenate(points)
+        shapes = self._reduced.at(together)
+        return FingerPositions(dict(positions), together, np.concatenate(weights), shapes, columns)
 
 
 def _join(
@@ -142,6 +149,7 @@ def _join(
     stay.reverse()
     return Record(
         points=last.points[last.columns[name]],
+        weights=last.weights[last.columns[name]],
         times=np.concatenate([times for times, _ in stay]),
         accelerations=np.concatenate([part for _, part in stay]).astype(np.float64),
     )

@@ -12,7 +12,7 @@ from model.arrays import FloatArray
 from model.counting import counted
 from model.errors import InputError
 from model.finger.contrast import contrast_db, mean_level_db_sl
-from model.finger.fingertip import fingertip_points
+from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.load import FingerLoad
 from model.finger.perception import sensation_level
 from model.reduction.reduced_plate import ReducedPlate
@@ -56,7 +56,10 @@ class Playback:
     @property
     def level_db_sl(self) -> float:
         """Steady level at the target [dB SL], mean over its fingertip; minimum over targets."""
-        return min(mean_level_db_sl(*_tones(felt)) for felt in self._felt[: len(self.targets)])
+        return min(
+            mean_level_db_sl(*_tones(felt), felt.weights)
+            for felt in self._felt[: len(self.targets)]
+        )
 
     @property
     def quiet_level_db_sl(self) -> float | None:
@@ -83,7 +86,8 @@ class Playback:
         count = len(self.targets)
         if len(peaks) == count:
             return None
-        return float(contrast_db(peaks[:count], np.concatenate(peaks[count:])))
+        weights = [record.weights for record in self.targets]
+        return float(contrast_db(peaks[:count], np.concatenate(peaks[count:]), weights))
 
     @cached_property
     def _felt(self) -> tuple[Felt, ...]:
@@ -96,7 +100,8 @@ class Playback:
     def _last(self, record: Record) -> Record:
         since = max(self.settled, record.times[-1] - STEADY)
         inside = record.times >= since
-        return Record(record.points, record.times[inside], record.accelerations[inside])
+        times, accelerations = record.times[inside], record.accelerations[inside]
+        return Record(record.points, record.weights, times, accelerations)
 
 
 def play(
@@ -137,8 +142,8 @@ def play(
     )
     ends = np.cumsum([len(disc) for disc in discs])[:-1]
     records = tuple(
-        Record(disc, times, part)
-        for disc, part in zip(discs, np.split(felt, ends, axis=1), strict=True)
+        Record(disc, fingertip_weights(*at, rig.plate), times, part)
+        for at, disc, part in zip(contacts, discs, np.split(felt, ends, axis=1), strict=True)
     )
     count = len(fingers.targets)
     return Playback(tuple(frequencies.tolist()), records[:count], records[count:], settled)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 import era_haptics as era
 from model.cli import app
 from model.finger.contrast import mean_level_db_sl
-from model.finger.fingertip import fingertip_points
+from model.finger.fingertip import fingertip_points, fingertip_weights
 
 TARGET, QUIET = (0.08, 0.06), [(0.22, 0.16), (0.25, 0.04)]
 
@@ -68,7 +68,10 @@ def test_query_serves_several_targets_and_a_lone_finger(table: era.LocalizationT
     targets = [(0.25, 0.2), TARGET]
     both = era.query(table, targets, quiet=(0.15, 0.11))
     levels = [
-        mean_level_db_sl(*table.amplitudes(both.excitation, fingertip_points(*target, table.plate)))
+        mean_level_db_sl(
+            *table.amplitudes(both.excitation, fingertip_points(*target, table.plate)),
+            fingertip_weights(*target, table.plate),
+        )
         for target in targets
     ]
     assert min(levels) == pytest.approx(20.0, abs=0.1)

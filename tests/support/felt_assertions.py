@@ -108,7 +108,7 @@ def localization_matches_prediction(played: Played, truth: Truth) -> None:
     """Contrast within 1 dB up to 25 dB, level within 1 dB, of daemon and solver."""
     for heard in _touched(played):
         target = heard.steady[heard.situation.felt_at]
-        level = mean_level_db_sl(target.frequencies, target.amplitudes)
+        level = mean_level_db_sl(target.frequencies, target.amplitudes, target.weights)
         (contact,) = [one for one in heard.patterns[-1]["contacts"] if one["role"] == "target"]
         assert math.isclose(level, LEVEL_DB_SL, abs_tol=1)
         assert math.isclose(level, contact["level_db_sl"], abs_tol=1)
@@ -122,8 +122,12 @@ def localization_matches_prediction(played: Played, truth: Truth) -> None:
         measured = _contrast(
             {place: felt.amplitudes.sum(axis=0) for place, felt in heard.steady.items()},
             heard.situation,
+            target.weights,
         )
-        for predicted in (contact["contrast_db"], _contrast(by_model, heard.situation)):
+        for predicted in (
+            contact["contrast_db"],
+            _contrast(by_model, heard.situation, target.weights),
+        ):
             judged = min(predicted, JUDGED_UP_TO)
             assert abs(min(measured, JUDGED_UP_TO) - judged) <= 1, (measured, predicted)
 
@@ -138,7 +142,11 @@ def onset_matches_prediction(played: Played, truth: Truth) -> None:
         pattern = timing.with_envelopes(question, pattern, ending=False)
     predicted = timing.with_transient_measures(question, pattern).transient_contrast_db
     assert predicted is not None
-    measured = _contrast({p: felt.peaks for p, felt in first.onset.items()}, first.situation)
+    measured = _contrast(
+        {p: felt.peaks for p, felt in first.onset.items()},
+        first.situation,
+        first.onset[first.situation.felt_at].weights,
+    )
     judged = min(predicted, JUDGED_UP_TO)
     assert abs(min(measured, JUDGED_UP_TO) - judged) <= 2, (measured, predicted)
 
@@ -249,7 +257,10 @@ def _apart(got: ComplexArray, wanted: ComplexArray) -> float:
     return float((np.abs(turned - wanted).max(axis=1) / np.abs(wanted).max(axis=1)).max())
 
 
-def _contrast(peaks: Mapping[str, FloatArray], situation: Situation) -> float:
-    """From the target to the loudest quiet point, of peaks (p,) by place [dB]."""
+def _contrast(peaks: Mapping[str, FloatArray], situation: Situation, weights: FloatArray) -> float:
+    """From the target to the loudest quiet point, of peaks (p,) by place [dB].
+
+    weights (p,): of the points in the mean over the target.
+    """
     quiet = np.concatenate([peaks[place] for place in situation.quiet])
-    return float(contrast_db([peaks[situation.felt_at]], quiet))
+    return float(contrast_db([peaks[situation.felt_at]], quiet, [weights]))

@@ -35,11 +35,15 @@ ONSET = 0.1  # s; over which an onset is judged
 
 @dataclass(frozen=True)
 class Felt:
-    """Vibration of a fingertip: frequencies (f,) [Hz], amplitudes (f, p) and peaks (p,) [m/s²]."""
+    """Vibration of a fingertip: frequencies (f,) [Hz], amplitudes (f, p) and peaks (p,) [m/s²].
+
+    weights (p,): of the points in the mean over the tip.
+    """
 
     frequencies: FloatArray
     amplitudes: FloatArray
     peaks: FloatArray
+    weights: FloatArray
 
 
 @dataclass(frozen=True)
@@ -149,6 +153,7 @@ async def _felt(control: Control, since: float, until: float) -> dict[str, Felt]
                 len(felt["frequencies_hz"]), len(felt["peak_m_s2"])
             ),
             np.array(felt["peak_m_s2"], dtype=float),
+            np.array(felt["weights"], dtype=float),
         )
         for place, felt in answer["fingers"].items()
     }

@@ -24,7 +24,9 @@ KEYS = (
 def vibration(amplitudes, frequencies=(100.0, 250.0)):
     """A finger with amplitudes (f, p) at its points."""
     amplitudes = np.array(amplitudes, dtype=float).reshape(len(frequencies), -1)
-    return FingerVibration(np.array(frequencies), amplitudes, amplitudes.sum(axis=0))
+    count = amplitudes.shape[1]
+    weights = np.full(count, 1 / count)
+    return FingerVibration(np.array(frequencies), amplitudes, amplitudes.sum(axis=0), weights)
 
 
 def row(time, *, contrast, others):
@@ -59,7 +61,7 @@ def test_level_of_tone_ten_times_above_threshold_is_20_db():
     """A tone of ten times the detection threshold has 20 dB SL; no tone has minus infinity."""
     threshold = detection_threshold(np.array([100.0, 250.0]))
     assert vibration([[10 * threshold[0]], [0.0]]).level_db_sl == pytest.approx(20.0)
-    nothing = FingerVibration(np.zeros(0), np.zeros((0, 3)), np.zeros(3))
+    nothing = FingerVibration(np.zeros(0), np.zeros((0, 3)), np.zeros(3), np.full(3, 1 / 3))
     assert nothing.level_db_sl == -np.inf
 
 

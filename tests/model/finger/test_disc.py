@@ -66,7 +66,7 @@ def test_fingertips_on_keeps_every_point_on_the_plate_and_under_the_finger() -> 
     rng = np.random.default_rng(1)
     size = np.array([PLATE.length, PLATE.width])
     centres = np.concatenate([rng.uniform(0, size, (100, 2)), [[0, 0], size, [0, size[1]]]])
-    points, weights = fingertips_on(centres, PLATE)
+    points, weights = fingertips_on(centres, length=PLATE.length, width=PLATE.width)
     assert ((points >= -1e-15) & (points <= size + 1e-15)).all()
     assert np.linalg.norm(points - centres[:, None], axis=2).max() <= FINGERTIP_RADIUS + 1e-12
     np.testing.assert_allclose(weights.sum(axis=1), 1)

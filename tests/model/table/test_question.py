@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
-from model.finger.fingertip import fingertip_points
+from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold
 from model.table.pattern import Pattern
 from model.table.pattern_choice import UnreachableLevel
@@ -146,7 +146,7 @@ def test_query_reaches_the_level_at_both_targets(softer):
         points = fingertip_points(*place, table.plate)
         frequencies, amplitudes = table.amplitudes(pattern.excitation, points)
         above = np.sqrt(((amplitudes.T / detection_threshold(frequencies)) ** 2).sum(axis=1))
-        levels.append(20 * np.log10(above.mean()))
+        levels.append(20 * np.log10(above @ fingertip_weights(*place, table.plate)))
     assert min(np.array(levels) + softer) == pytest.approx(15.0, abs=0.01)
 
 
@@ -167,7 +167,9 @@ def test_query_without_quiet_fingers_contrasts_with_the_plate_around(targets, mo
     *felt, around = (
         table.amplitudes(pattern.excitation, points)[1].sum(axis=0) for points in (*discs, far)
     )
-    ratio = 20 * np.log10(min(peak.mean() for peak in felt) / np.sqrt((around**2).mean()))
+    weights = [fingertip_weights(*each, table.plate) for each in targets]
+    least = min(peak @ each for peak, each in zip(felt, weights, strict=True))
+    ratio = 20 * np.log10(least / np.sqrt((around**2).mean()))
     assert pattern.surroundings_contrast_db == pytest.approx(ratio, abs=0.01)
     assert pattern.contrast_db is None
     assert pattern.quiet_level_db_sl is None

@@ -14,7 +14,7 @@ CONTACTS = [(0.15, 0.11), (0.0, 0.0), (0.3048, 0.1), (0.2, 0.225), (0.006, 0.003
 
 
 def test_fingertips_reads_the_points_of_the_disc():
-    """Reading x and y themselves gives back the disc's points, finger after finger, edges cut."""
+    """Reading x and y themselves gives back the disc's points, finger after finger."""
     plate = smooth_rig().plate
     raster = Raster.for_plate(plate, frequency_max=500.0)
     places = raster.points.astype(np.float32)

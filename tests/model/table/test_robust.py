@@ -7,7 +7,7 @@ import pytest
 
 from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
-from model.finger.fingertip import fingertip_points
+from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.structure.point_load import PointLoad
 from model.table.build import build_table
 from model.table.question import Question
@@ -59,7 +59,10 @@ def directly(rig, pattern, member, *, targets=1):
     weights = bases / [era.stroke for era in rig.eras] * MEMBERS.gain[member]
     peak = np.abs(np.einsum("fe,fep->fp", weights, unit)).sum(axis=0)
     peaks = np.split(peak, np.cumsum([len(disc) for disc in discs])[:-1])
-    felt = min(each.mean() for each in peaks[:targets])
+    felt = min(
+        each @ fingertip_weights(*place, rig.plate)
+        for each, place in zip(peaks[:targets], (TARGET, *QUIET), strict=False)
+    )
     return 20 * np.log10(felt / max(each.max() for each in peaks[targets:]))
 
 

@@ -31,11 +31,15 @@ def test_ramped_onset_contrast_equals_sampled_contrast(ramp, within):
         rows = rng.integers(len(FREQUENCIES), size=3)
         weights = (rng.uniform(-1, 1, (3, 4)) + 1j * rng.uniform(-1, 1, (3, 4))) / 2
         weights = weights.astype(np.complex64)
-        shapes = [table.shapes_at_fingertips([place])[0].astype(np.float32) for place in places]
+        read = [table.shapes_at_fingertips([place]) for place in places]
+        shapes = [each.astype(np.float32) for each, _, _ in read]
+        felt = [
+            len(each) * tip.T * each.astype(np.float32) for each, _, tip in read[: len(targets)]
+        ]
         found = onsets.contrast(
             rows,
             weights,
-            targets=shapes[: len(targets)],
+            targets=felt,
             quiet=np.concatenate(shapes[len(targets) :]),
         )
         for row, weight, contrast in zip(rows, weights, found, strict=True):

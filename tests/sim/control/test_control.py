@@ -48,9 +48,9 @@ async def test_control_places_fingers_and_returns_felt_and_state(coarse_rig: Rig
     felt = (await ask(bench, 6.0, op="felt", since_s=5.5, until_s=6.0))["fingers"]
     assert felt.keys() == {"7", "x"}
     assert felt["7"]["frequencies_hz"] == [110.0]
-    assert len(felt["7"]["points_m"]) == 19
+    assert len(felt["7"]["points_m"]) == 21
     assert felt["7"]["points_m"][0] == [0.1, 0.08]
-    assert len(felt["7"]["amplitude_m_s2"][0]) == len(felt["7"]["peak_m_s2"]) == 19
+    assert len(felt["7"]["amplitude_m_s2"][0]) == len(felt["7"]["peak_m_s2"]) == 21
     assert min(felt["7"]["peak_m_s2"]) > 0
     state = await ask(bench, 6.5, op="state")
     assert state == {

@@ -27,18 +27,22 @@ def test_feel_separates_driven_frequencies() -> None:
         + np.outer(np.cos(2 * np.pi * 170 * times - 2.0), second)
         + ringing[:, None]
     )
-    felt = measure_vibration(Record(np.zeros((2, 2)), times, samples), [110.0, 170.0])
+    felt = measure_vibration(
+        Record(np.zeros((2, 2)), np.full(2, 0.5), times, samples), [110.0, 170.0]
+    )
     np.testing.assert_allclose(felt.amplitude, [first, second], atol=0.03)
     np.testing.assert_allclose(felt.peak, np.abs(samples).max(axis=0))
     clean = measure_vibration(
-        Record(np.zeros((2, 2)), times, samples - ringing[:, None]), [110.0, 170.0]
+        Record(np.zeros((2, 2)), np.full(2, 0.5), times, samples - ringing[:, None]), [110.0, 170.0]
     )
     np.testing.assert_allclose(clean.amplitude, [first, second], atol=1e-7)
 
 
 def test_feel_without_frequencies() -> None:
     """Without a frequency there is a peak only."""
-    felt = measure_vibration(Record(np.zeros((1, 2)), np.arange(5.0), np.full((5, 1), -3.0)), [])
+    felt = measure_vibration(
+        Record(np.zeros((1, 2)), np.ones(1), np.arange(5.0), np.full((5, 1), -3.0)), []
+    )
     assert felt.amplitude.shape == (0, 1)
     assert felt.peak == [3.0]
 
@@ -48,7 +52,7 @@ def test_fingers_felt_uses_the_last_position(coarse_rig: Rig) -> None:
     fingers = Fingers(flat_plate(coarse_rig))
     fingers.place({"a": (0.1, 0.1), "b": (0.0, 0.0)})
     old = len(fingers.layout.points)
-    assert old == 19 + len(fingertip_points(0.0, 0.0, coarse_rig.plate))
+    assert old == 2 * 21
     fingers.record(np.array([1.0, 2.0]), np.ones((2, old)))
     fingers.place({"a": (0.2, 0.1), "b": (0.0, 0.0)})
     fingers.record(np.array([3.0, 4.0]), np.full((2, old), 5.0))
@@ -64,9 +68,9 @@ def test_fingers_felt_until_lifted(coarse_rig: Rig) -> None:
     """One finger goes while another stays: both have their samples, each from its own time."""
     fingers = Fingers(flat_plate(coarse_rig))
     fingers.place({"a": (0.1, 0.1), "b": (0.2, 0.1)})
-    fingers.record(np.array([1.0, 2.0]), np.ones((2, 38)))
+    fingers.record(np.array([1.0, 2.0]), np.ones((2, 42)))
     fingers.place({"b": (0.2, 0.1)})
-    fingers.record(np.array([3.0]), np.ones((1, 19)))
+    fingers.record(np.array([3.0]), np.ones((1, 21)))
     felt = fingers.felt(0.0, 4.0)
     assert felt["a"].times.tolist() == [1.0, 2.0]
     assert felt["b"].times.tolist() == [1.0, 2.0, 3.0]
@@ -76,8 +80,8 @@ def test_fingers_discard_old_samples(coarse_rig: Rig) -> None:
     """Ten seconds are kept, also of fingers that were lifted since."""
     fingers = Fingers(flat_plate(coarse_rig))
     fingers.place({"a": (0.1, 0.1)})
-    fingers.record(np.array([0.0]), np.ones((1, 19)))
-    fingers.record(np.array([6.0]), np.ones((1, 19)))
+    fingers.record(np.array([0.0]), np.ones((1, 21)))
+    fingers.record(np.array([6.0]), np.ones((1, 21)))
     fingers.place({})
     fingers.record(np.array([11.0]), np.ones((1, 0)))
     assert fingers.felt(-1.0, 20.0)["a"].times.tolist() == [6.0]

@@ -9,7 +9,7 @@ from model.errors import InputError
 from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
 from model.finger.contrast import mean_level_db_sl
-from model.finger.fingertip import fingertip_points
+from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.load import FingerLoad
 from model.finger.perception import detection_threshold
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
@@ -53,11 +53,12 @@ def test_playback_steady_measures_agree_with_the_frequency_domain(
     played = play(coarse_rig, reduced, EXCITATION, FINGERS, duration=1.2, finger_load=finger_load)
     loads = [finger_load.at(*at) for at in (TARGET, QUIET)] if finger_load else []
     at_target, at_quiet = (steady(coarse_rig, at, *loads) for at in (TARGET, QUIET))
-    level = mean_level_db_sl(np.array([110.0, 250.0]), at_target)
-    contrast = 20 * math.log10(at_target.sum(axis=0).mean() / at_quiet.sum(axis=0).max())
+    weights = fingertip_weights(*TARGET, coarse_rig.plate)
+    level = mean_level_db_sl(np.array([110.0, 250.0]), at_target, weights)
+    contrast = 20 * math.log10(at_target.sum(axis=0) @ weights / at_quiet.sum(axis=0).max())
     assert played.level_db_sl == pytest.approx(level, abs=0.1)
     assert played.contrast_db == pytest.approx(contrast, abs=0.1)
-    free = mean_level_db_sl(np.array([110.0, 250.0]), steady(coarse_rig, TARGET))
+    free = mean_level_db_sl(np.array([110.0, 250.0]), steady(coarse_rig, TARGET), weights)
     assert (abs(level - free) > 1) is (finger_load is not None)
 
 
@@ -69,7 +70,9 @@ def test_playback_measures_of_several_targets() -> None:
     def record(*amplitudes: float) -> Record:
         wave = np.sin(2 * np.pi * 100 * times)
         early = np.where(times <= 0.1, 0.5, 1.0)  # half as strong while it starts
-        return Record(points, times, (wave * early)[:, None] * np.array(amplitudes))
+        return Record(
+            points, np.full(2, 0.5), times, (wave * early)[:, None] * np.array(amplitudes)
+        )
 
     quiet = record(0.1, 0.2)
     quiet.accelerations[500] = 1.0  # a peak at 50 ms
@@ -121,7 +124,7 @@ def test_playback_reads_steady_measures_at_the_end() -> None:
     """Ten times as much until a quarter of a second before the end does not count."""
     times = np.arange(10_000) / 10_000.0
     tone = np.where(times < 0.75, 10.0, 1.0) * np.sin(2 * np.pi * 100.0 * times)
-    record = Record(np.array([[0.1, 0.1]]), times, tone[:, None])
+    record = Record(np.array([[0.1, 0.1]]), np.ones(1), times, tone[:, None])
     playback = Playback((100.0,), (record,), (), settled=0.04)
     expected = -20 * np.log10(detection_threshold(np.array([100.0]))[0])
     assert playback.level_db_sl == pytest.approx(expected, abs=0.01)

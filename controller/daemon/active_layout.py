@@ -9,7 +9,7 @@ from controller.api.schema import EffectDescription
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.loop.intent import HapticIntent
-from controller.loop.selection import MAX_DB_SL
+from controller.loop.table_query import MAX_DB_SL
 from controller.sources.contacts import Contact, ContactKey
 
 PLAY_RADIUS = 0.020

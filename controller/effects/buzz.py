@@ -4,6 +4,7 @@ from typing import Annotated, ClassVar
 
 from controller.effects.effect import Effect, EffectRun
 from controller.effects.steady import MAX_DURATION, MIN_DURATION, SteadyRun
+from controller.loop.intent import Pulse
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import TIME
@@ -21,7 +22,8 @@ class Buzz(Effect):
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start a steady vibration."""
-        return SteadyRun(level_db_sl, None if self.duration is None else now + self.duration)
+        pulse = None if self.duration is None else Pulse(self.duration, now)
+        return SteadyRun(level_db_sl, pulse)
 
     @property
     def has_end(self) -> bool:

@@ -4,6 +4,7 @@ from typing import Annotated, ClassVar
 
 from controller.effects.effect import Effect, EffectRun
 from controller.effects.steady import MIN_DURATION, SteadyRun
+from controller.loop.intent import Pulse
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import TIME
@@ -19,4 +20,4 @@ class Click(Effect):
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start a vibration of its duration."""
-        return SteadyRun(level_db_sl, now + self.duration)
+        return SteadyRun(level_db_sl, Pulse(self.duration, now))

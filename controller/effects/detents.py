@@ -5,6 +5,7 @@ from typing import Annotated, ClassVar, Literal
 
 from controller.effects.effect import Effect, EffectRun, NoSensation, Sensation
 from controller.effects.steady import MIN_DURATION
+from controller.loop.intent import Pulse
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import LENGTH, TIME
@@ -42,7 +43,7 @@ class _DetentsRun(EffectRun):
         self._detents = detents
         self._middle = start  # of the two detents around the finger
         self._level = level_db_sl
-        self._end = -math.inf
+        self._pulse: Pulse | None = None  # of the last detent
 
     def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
         """Return a click from each passing on; several passed at once are one click."""
@@ -51,7 +52,7 @@ class _DetentsRun(EffectRun):
         passed = math.floor((abs(away) - _HYSTERESIS) / spacing + 0.5)
         if passed > 0:
             self._middle += math.copysign(passed * spacing, away)
-            self._end = now + self._detents.duration
-        if now < self._end:
-            return Sensation(self._level, until=self._end)
+            self._pulse = Pulse(self._detents.duration, now)
+        if self._pulse is not None and now < self._pulse.end:
+            return Sensation(self._level, until=self._pulse.end, pulse=self._pulse)
         return NoSensation()

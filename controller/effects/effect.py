@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 
 from pydantic import BeforeValidator
 
+from controller.loop.intent import Pulse
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity, Section
 from model.config.units import RATIO
@@ -37,12 +38,14 @@ class Sensation:
 
     level_db_sl: None for as strong as the neighbours allow. until: when [s] that may change though
     the finger does nothing; None for never. allow_weaker: where the plate cannot reach the level,
-    play as strong as the neighbours allow instead of nothing.
+    play as strong as the neighbours allow instead of nothing. pulse: for a vibration of limited
+    duration, which the amplifiers end by themselves.
     """
 
     level_db_sl: float | None
     until: float | None = None
     allow_weaker: bool = False
+    pulse: Pulse | None = None
 
 
 @dataclass(frozen=True, slots=True)

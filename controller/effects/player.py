@@ -72,7 +72,12 @@ class EffectPlayer:
         chosen = [one for one in felt if one[0] == felt[0][0]][: self.layout.most_at_once]
         return HapticIntent(
             tuple(
-                Target(contact.key, sensation.level_db_sl, allow_weaker=sensation.allow_weaker)
+                Target(
+                    contact.key,
+                    sensation.level_db_sl,
+                    allow_weaker=sensation.allow_weaker,
+                    pulse=sensation.pulse,
+                )
                 for _, _, contact, sensation in chosen
             ),
             "no effect plays for the contacts on the plate",

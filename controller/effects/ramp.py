@@ -12,6 +12,7 @@ from controller.effects.effect import (
     Sensation,
 )
 from controller.effects.steady import MAX_DURATION, MIN_DURATION
+from controller.loop.intent import Pulse
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import RATIO, TIME
@@ -38,7 +39,8 @@ class Ramp(Effect):
         count = max(1, min(round(abs(span) / RAMP_STEP_DB), int(self.duration / MIN_DURATION) - 1))
         rise = [self.start_level + span * index / count for index in range(count)]
         levels = (*rise, level_db_sl)
-        return _RampRun(now, levels, self.duration / len(levels), self.hold)
+        pulse = Pulse(self.duration, now, is_raised=False)
+        return _RampRun(pulse, levels, self.duration / len(levels), self.hold)
 
     @property
     def has_end(self) -> bool:
@@ -52,20 +54,21 @@ class Ramp(Effect):
 
 @dataclass(frozen=True)
 class _RampRun(EffectRun):
-    """Levels [dB SL] for equal steps of time [s]; the last one may be held."""
+    """Levels [dB SL] for equal steps of time [s] from the start; the last one may be held."""
 
-    start: float
+    pulse: Pulse
     levels: tuple[float | None, ...]
     step: float
     is_held: bool
 
     def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
         """Return the level of the current step."""
-        index = max(0, int((now - self.start) / self.step))
+        index = max(0, int((now - self.pulse.start) / self.step))
         if index >= len(self.levels) - 1 and self.is_held:
             return Sensation(self.levels[-1], allow_weaker=True)
         if index >= len(self.levels):
             return None
         # Without allow_weaker a ramp would stop at the highest level of the plate, not saturate.
-        until = self.start + (index + 1) * self.step
-        return Sensation(self.levels[index], until, allow_weaker=True)
+        until = self.pulse.start + (index + 1) * self.step
+        pulse = None if self.is_held else self.pulse
+        return Sensation(self.levels[index], until, allow_weaker=True, pulse=pulse)

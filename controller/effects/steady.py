@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from controller.effects.effect import EffectRun, NoSensation, Sensation
+from controller.loop.intent import Pulse
 from controller.sources.contacts import Contact
 
 MIN_DURATION = 0.020
@@ -13,13 +14,15 @@ MAX_DURATION = 10.0
 
 @dataclass(frozen=True)
 class SteadyRun(EffectRun):
-    """A level until a time [s], None for as long as the finger stays."""
+    """A level for one pulse, None for as long as the finger stays."""
 
     level_db_sl: float | None
-    end: float | None
+    pulse: Pulse | None
 
     def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
-        """Return the level until the end."""
-        if self.end is not None and now >= self.end:
+        """Return the level until the end of the pulse."""
+        if self.pulse is None:
+            return Sensation(self.level_db_sl)
+        if now >= self.pulse.end:
             return None
-        return Sensation(self.level_db_sl, until=self.end)
+        return Sensation(self.level_db_sl, until=self.pulse.end, pulse=self.pulse)

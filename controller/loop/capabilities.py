@@ -1,5 +1,6 @@
 """Capabilities of the open amplifiers of a rig together, in the terms of the table."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -21,7 +22,8 @@ class PlaybackCapabilities:
 
     drive_mode: of the questions to the table; playable: the drive modes that every amplifier can
     play; frequencies: the lowest and highest [Hz]; max_amplitudes [m] by ERA;
-    envelope_support: which envelopes every amplifier plays.
+    envelope_support: which envelopes every amplifier plays; max_power: sum of squared levels of
+    all ERAs; slew [1/s]: highest rise of a level.
     """
 
     drive_mode: str
@@ -29,6 +31,8 @@ class PlaybackCapabilities:
     frequencies: tuple[float, float]
     max_amplitudes: Mapping[str, float]
     envelope_support: EnvelopeSupport
+    max_power: float = math.inf
+    slew: float = math.inf
 
 
 def playback_capabilities(
@@ -67,4 +71,6 @@ def playback_capabilities(
             era.name: era.stroke * limits[rig.wiring[era.name].amplifier].level for era in rig.eras
         },
         envelope_support=envelope_support(rig, amplifiers, max_loading_time=max_loading_time),
+        max_power=min(one.power for one in limits.values()),
+        slew=min(one.slew for one in limits.values()),
     )

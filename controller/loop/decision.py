@@ -15,6 +15,7 @@ from controller.loop.intent import IntentSource
 from controller.loop.loading_times import LoadingTimes
 from controller.loop.safe_sets import FADE_RAMP, SafeSets, SetBuilder
 from controller.loop.selection import Selection, Selector
+from controller.loop.table_query import is_short
 from controller.sources.contacts import MAX_CONTACT_TIMEOUT, Change, Contact, ContactTracker
 from controller.sources.touch import TouchFrame
 from drivers.command import DriveCommand
@@ -35,6 +36,8 @@ RELEASE_RAMP = 0.010
 # are confirmed.
 MIN_VALID_FOR = 2.0
 _VALIDITY_MARGIN = 0.2  # s; after the contact is lifted, for late frames
+_MIN_LEFT = 0.001  # s; of a pulse that is about to end
+_ENDINGS_MARGIN = 0.1  # s; endings are loaded and committed in less
 
 _logger = logging.getLogger(__name__)
 
@@ -113,7 +116,7 @@ class Decider:
         self._tracker = ContactTracker(rig.plate)
         self._intent_source = intent_source
         self._intent_due: float | None = None  # when the intent may change without a touch
-        self._selector = Selector(table)
+        self._selector = Selector(table, None if timing is None else timing.levels)
         self._builder = SetBuilder(rig, guards, timing=timing)
         self._selected: Selection | None = None
         self._playing = _Playback()
@@ -193,18 +196,28 @@ class Decider:
         self._selected = None
         self._playing = _Playback()
 
-    def confirm(self, commands: Mapping[str, DriveCommand], *, now: float) -> None:
-        """Note what the amplifiers play for the last decision, by ERA, without silent ones."""
+    def confirm(
+        self, commands: Mapping[str, DriveCommand], *, now: float, sent_at: float | None = None
+    ) -> None:
+        """Note what the amplifiers play for the last decision, by ERA, without silent ones.
+
+        sent_at [s]: when the last byte of the commit was sent; pulses start with it.
+        """
         self._playing = replace(self._playing, confirmed_commands=commands)
         decision = self._playing.decision
         if decision is None or decision.sets is None or decision.pattern is None:
             return
+        for _, target in decision.selection.targets:
+            if target.pulse is not None and target.pulse.started_at is None:
+                target.pulse.started_at = now if sent_at is None else sent_at
         self._note_validity(decision.sets, decision.selection, now)
         if decision.adds_endings_only:
             self._playing = replace(self._playing, has_endings=True)
         elif self._capabilities_at(now).envelope_support.endings and self._timing is not None:
             endings_due = now + decision.sets.settled_after
-            self._playing = replace(self._playing, endings_due=endings_due)
+            # A commit after the end of a pulse would start it again.
+            if endings_due + _ENDINGS_MARGIN < _first_end(decision.selection):
+                self._playing = replace(self._playing, endings_due=endings_due)
 
     def renewal(self, now: float) -> SafeSets | None:
         """Return the sets that prolong the playback, if due at a time [s]; else None.
@@ -294,7 +307,8 @@ class Decider:
         pattern, question = draft.selection.pattern, draft.selection.question
         if pattern is None or question is None:
             return None
-        is_shaped = self._capabilities_at(now).envelope_support.onsets
+        support = self._capabilities_at(now).envelope_support
+        is_shaped = support.onsets and not is_short(draft.selection.targets)
         try:
             sets, played = self._builder.build_pattern(
                 pattern,
@@ -338,9 +352,19 @@ class Decider:
         return min(expiries, default=-math.inf)
 
     def _valid_for(self, selection: Selection, now: float) -> float:
-        """Return for how long [s] a vibration at a time [s] may last by itself."""
+        """Return for how long [s] a vibration at a time [s] may last by itself.
+
+        The amplifiers end a pulse; the last one, where several play.
+        """
         lasts = self._confirmed_until(selection) - now + _VALIDITY_MARGIN
-        return min(max(lasts, MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
+        valid_for = min(max(lasts, MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
+        pulses = [target.pulse for _, target in selection.targets]
+        left = [
+            pulse.duration if pulse.started_at is None else max(pulse.end - now, _MIN_LEFT)
+            for pulse in pulses
+            if pulse is not None
+        ]
+        return min(valid_for, max(left)) if left and len(left) == len(pulses) else valid_for
 
     def _note_validity(self, sets: SafeSets, selection: Selection, now: float) -> None:
         """Note until when sets committed by now [s] last and their targets are confirmed."""
@@ -356,6 +380,12 @@ class Decider:
         """Note when the first change since the last decision arrived."""
         if change and self._triggered_at is None:
             self._triggered_at = time
+
+
+def _first_end(selection: Selection) -> float:
+    """Return when [s] the first pulse ends; infinite without any."""
+    pulses = [target.pulse for _, target in selection.targets]
+    return min((pulse.end for pulse in pulses if pulse is not None), default=math.inf)
 
 
 def _is_due(moment: float | None, now: float) -> bool:

@@ -4,7 +4,7 @@ The interface between the meaning of touches and their playback. All other conta
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from controller.sources.contacts import Contact, ContactKey
@@ -15,18 +15,46 @@ _MIN_WAIT = 0.001  # s
 NO_CONTACTS = "no contact on the plate"
 
 
+@dataclass(slots=True, unsafe_hash=True)
+class Pulse:
+    """A vibration of limited duration [s], requested at a time [s]; a later one is another.
+
+    Its duration counts from started_at [s], when the amplifiers have been sent its commit; until
+    then, and if they never are, from requested_at. is_raised: whether the drive is raised so
+    that the level is felt over the duration, onset included; else the level is the steady one.
+    """
+
+    duration: float
+    requested_at: float
+    is_raised: bool = True
+    started_at: float | None = field(default=None, init=False, compare=False)
+
+    @property
+    def start(self) -> float:
+        """When [s] its duration starts, as far as known."""
+        return self.requested_at if self.started_at is None else self.started_at
+
+    @property
+    def end(self) -> float:
+        """When [s] it ends, as far as known."""
+        return self.start + self.duration
+
+
 @dataclass(frozen=True, slots=True)
 class Target:
     """A contact that shall feel something.
 
     level_db_sl: how strongly; None for as strongly as the neighbours allow. Among targets with a
     level, one without gets the highest of theirs. allow_weaker: where the plate cannot reach the
-    level, as strongly as the neighbours allow instead of nothing.
+    level, as strongly as the neighbours allow instead of nothing. pulse: None without an end of its
+    own. band: lowest and highest frequency [Hz]; equal ones stand for the nearest of the table.
     """
 
     key: ContactKey
     level_db_sl: float | None = STRONG_DB_SL
     allow_weaker: bool = False
+    pulse: Pulse | None = None
+    band: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -281,7 +281,7 @@ class Controller:
             if played is None:
                 return False
             commands, sent_at = commands_by_era(played.achieved, self._rig), played.sent_at
-            self._decider.confirm(commands, now=clock.now())
+            self._decider.confirm(commands, now=clock.now(), sent_at=sent_at)
             if played.loading_time is not None:
                 self._decider.note_loading_time(played.loading_time, now=clock.now())
         if decision.refusal is not None:

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import replace
 
+from model.table.effect_level import EffectLevels
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.table import LocalizationTable
@@ -15,10 +16,12 @@ class Timing:
     """Shapes and rates patterns on the plate of a table in time.
 
     Takes about ten milliseconds to make, and one more at the first use of each frequency.
+    levels: of vibrations of limited duration.
     """
 
     def __init__(self, table: LocalizationTable) -> None:
         self._eras = table.eras
+        self.levels: EffectLevels | None = EffectLevels(table)
         self._shaper, self._transients = Shaper(table.in_time), Transients(table.in_time)
 
     def prepare(self, frequencies: Iterable[float]) -> None:

@@ -32,7 +32,7 @@ class RampedOnsets:
         times = ONSET_WINDOW - (ONSET_WINDOW - ramp / 2) * np.linspace(1, 0, TIME_COUNT) ** 1.2
         self._eras = len(plate.eras)
         batches = np.split(2 * np.pi * frequencies, range(BATCH, len(frequencies), BATCH))
-        parts = [_ramp_responses(plate, omega, times, ramp) for omega in batches]
+        parts = [ramp_responses(plate, omega, times, ramp) for omega in batches]
         self._parts = np.concatenate(parts, dtype=np.complex64, casting="same_kind")
 
     def contrast(
@@ -59,13 +59,19 @@ class RampedOnsets:
         return contrast_ratio(at_targets, at_quiet).astype(float)
 
 
-def _ramp_responses(
-    plate: PlateInTime, omega: FloatArray, times: FloatArray, ramp: float
+def ramp_responses(
+    plate: PlateInTime,
+    omega: FloatArray,
+    times: FloatArray,
+    ramp: float,
+    *,
+    with_steady: bool = False,
 ) -> ComplexArray:
     """Acceleration of the reduced coordinates to each ERA's ramp alone, (f, eras, n, r).
 
     Demodulated: without the factor exp(i omega t). Before the ramp is over the base moves as the
-    sum of three exponentials, see `model.transients.base_motion.fade`.
+    sum of three exponentials, see `model.transients.base_motion.fade`. with_steady: one time more,
+    the steady state.
     """
     f, eras = len(omega), len(plate.eras)
     side = np.pi / ramp
@@ -89,4 +95,7 @@ def _ramp_responses(
     later = np.exp((times[:, None] - ramp) * rates[:, None, :])[:, None]
     free = start[:, :, None] * decay
     free[:, :, ~rising] += end[:, :, None] * later[:, :, ~rising]
-    return np.asarray(forced + free @ plate.acceleration.T)
+    responses = forced + free @ plate.acceleration.T
+    if with_steady:
+        responses = np.concatenate([responses, accelerations[:, :, :1]], axis=2)
+    return np.asarray(responses)

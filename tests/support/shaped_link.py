@@ -19,6 +19,8 @@ from stub_wire_times import StubWireTimes
 class Shapes:
     """A timing whose envelopes are straight lines: up in 21 knots, down in 8."""
 
+    levels = None
+
     def __init__(self) -> None:
         self.prepared: list[float] = []
         self.largest = 1.0

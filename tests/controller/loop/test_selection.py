@@ -9,7 +9,8 @@ import pytest
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.envelopes import RAMPS_ONLY
 from controller.loop.intent import HapticIntent, Target
-from controller.loop.selection import Selector, strongest
+from controller.loop.selection import Selector
+from controller.loop.table_query import strongest
 from controller.sources.contacts import Contact, ContactKey
 from model.arrays import FloatArray
 from model.errors import InputError

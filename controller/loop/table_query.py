@@ -1,0 +1,223 @@
+"""Questions to the table for an intent, and the pattern to play for its answer."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from controller.loop.capabilities import PlaybackCapabilities
+from controller.loop.intent import Target
+from controller.sources.contacts import Contact
+from model.arrays import FloatArray
+from model.errors import InputError
+from model.finger.perception import FELT_DB_SL, decibels
+from model.table.effect_level import SHAPED_FROM, DriveLimits, EffectLevels
+from model.table.pattern import IMPERCEPTIBLE_DB_SL, Pattern
+from model.table.pattern_choice import UnreachableLevel
+from model.table.question import MAX_LEVEL_DB_SL, Question
+from model.table.table import LocalizationTable
+
+MAX_DB_SL = 26.0
+"""Upper bound of `as strongly as the neighbours allow`: twice a strong vibration."""
+
+_SHORT_OF = 0.1  # dB; a level closer to the wanted one is reached
+
+
+@dataclass(frozen=True)
+class TableAnswer:
+    """The question that was finally answered, its pattern, and the level felt of it [dB SL].
+
+    felt_db_sl: over the duration of a pulse whose level is felt, onset included; else the steady
+    level.
+    """
+
+    question: Question
+    pattern: Pattern
+    felt_db_sl: float
+
+
+def query_table(
+    table: LocalizationTable,
+    targets: Sequence[tuple[Contact, Target]],
+    quiet: Sequence[Contact],
+    capabilities: PlaybackCapabilities,
+    levels: EffectLevels | None,
+) -> TableAnswer:
+    """Query a table for targets, and scale its answer to what each shall feel.
+
+    levels: None for steady levels only. Raises InputError where nothing can be played.
+    """
+    question = _question(targets, quiet, capabilities, table.frequencies)
+    if all(target.level_db_sl is None for _, target in targets):
+        pattern = strongest(table.query(question), capabilities.max_amplitudes)
+        return TableAnswer(question, pattern, pattern.level_db_sl)
+    if all(target.allow_weaker for _, target in targets):
+        return _as_neighbours_allow(table, question, capabilities)
+    is_fixed = any(target.band is not None for _, target in targets)
+    duration = _felt_duration(targets)
+    if duration is None or levels is None:
+        allow_weaker = is_fixed or duration is not None
+        question, pattern = _query(table, question, allow_weaker=allow_weaker)
+        return TableAnswer(question, pattern, pattern.level_db_sl)
+    return _over_duration(table, question, duration, capabilities, levels)
+
+
+def is_short(targets: Sequence[tuple[Contact, Target]]) -> bool:
+    """Whether the vibration of some targets ends before a shaped onset would have settled."""
+    return all(target.pulse and target.pulse.duration < SHAPED_FROM for _, target in targets)
+
+
+def _question(
+    targets: Sequence[tuple[Contact, Target]],
+    quiet: Sequence[Contact],
+    capabilities: PlaybackCapabilities,
+    frequencies: FloatArray,
+) -> Question:
+    """Return the question that puts an intent to the table."""
+    given = [target.level_db_sl for _, target in targets if target.level_db_sl is not None]
+    level = max(given, default=FELT_DB_SL)
+    levels = [level if t.level_db_sl is None else t.level_db_sl for _, t in targets]
+    return Question(
+        targets=tuple((contact.x, contact.y) for contact, _ in targets),
+        quiet=tuple((contact.x, contact.y) for contact in quiet),
+        level_db_sl=level,
+        softer_db=tuple(level - each for each in levels),
+        drive_mode=capabilities.drive_mode,
+        playable=capabilities.playable,
+        frequencies=_frequencies(targets, capabilities.frequencies, frequencies),
+        envelopes=capabilities.envelope_support.onsets and not is_short(targets),
+    )
+
+
+def _frequencies(
+    targets: Sequence[tuple[Contact, Target]],
+    playable: tuple[float, float],
+    frequencies: FloatArray,
+) -> tuple[float, float]:
+    """Return the lowest and highest frequency [Hz] that all targets allow.
+
+    The band of a target that shares none with those before it is ignored.
+    """
+    low, high = playable
+    for _, target in targets:
+        if target.band is None:
+            continue
+        band = band_of_table(target.band, frequencies)
+        together = max(low, band[0]), min(high, band[1])
+        if ((frequencies >= together[0]) & (frequencies <= together[1])).any():
+            low, high = together
+    return low, high
+
+
+def band_of_table(band: tuple[float, float], frequencies: FloatArray) -> tuple[float, float]:
+    """Return a band [Hz] that has frequencies of a table: itself, or the nearest of them alone."""
+    low, high = band
+    if low < high and ((frequencies >= low) & (frequencies <= high)).any():
+        return band
+    middle = np.sqrt(low * high)
+    nearest = float(frequencies[np.argmin(np.abs(np.log(frequencies / middle)))])
+    return nearest, nearest
+
+
+def _felt_duration(targets: Sequence[tuple[Contact, Target]]) -> float | None:
+    """Return the duration [s] over which the level is felt; None where it is the steady one."""
+    pulses = [target.pulse for _, target in targets]
+    durations = [pulse.duration for pulse in pulses if pulse is not None and pulse.is_raised]
+    return min(durations) if durations and len(durations) == len(pulses) else None
+
+
+def _over_duration(
+    table: LocalizationTable,
+    question: Question,
+    duration: float,
+    capabilities: PlaybackCapabilities,
+    levels: EffectLevels,
+) -> TableAnswer:
+    """Return a pattern whose level is felt over a duration [s].
+
+    Where the drive of the first answer cannot be raised enough, the table is asked for as much
+    more, which another frequency may reach.
+    """
+    limits = DriveLimits(capabilities.max_amplitudes, capabilities.max_power, capabilities.slew)
+    level = question.level_db_sl
+
+    def answer(question: Question) -> TableAnswer:
+        question, pattern = _query(table, question, allow_weaker=True)
+        raised, felt = levels.raised(
+            pattern,
+            level_db_sl=level,
+            duration=duration,
+            targets=question.targets,
+            limits=limits,
+            is_shaped=question.envelopes,
+        )
+        return TableAnswer(question, raised, felt)
+
+    first = answer(question)
+    missing = level - first.felt_db_sl
+    if missing < _SHORT_OF:
+        return first
+    requested = min(first.pattern.level_db_sl + missing, MAX_LEVEL_DB_SL)
+    second = answer(replace(question, level_db_sl=requested))
+    return max(first, second, key=lambda each: each.felt_db_sl)
+
+
+def _query(
+    table: LocalizationTable, question: Question, *, allow_weaker: bool
+) -> tuple[Question, Pattern]:
+    """Query a table; allow_weaker: for the highest level where the stroke allows no more."""
+    try:
+        return question, table.query(question)
+    except UnreachableLevel as error:
+        if not allow_weaker or error.reachable_db_sl >= question.level_db_sl:
+            raise
+        question = replace(question, level_db_sl=error.reachable_db_sl)
+        return question, table.query(question)
+
+
+def _as_neighbours_allow(
+    table: LocalizationTable, question: Question, capabilities: PlaybackCapabilities
+) -> TableAnswer:
+    """Return the pattern of a level, or one as strong as the neighbours allow."""
+    try:
+        pattern = table.query(question)
+    except InputError:
+        level = question.level_db_sl
+        question = replace(question, level_db_sl=min(level, FELT_DB_SL))
+        pattern = strongest(table.query(question), capabilities.max_amplitudes, max_db_sl=level)
+    return TableAnswer(question, pattern, pattern.level_db_sl)
+
+
+def strongest(
+    pattern: Pattern, max_amplitudes: Mapping[str, float], *, max_db_sl: float = MAX_DB_SL
+) -> Pattern:
+    """Scale a pattern to as strong as the neighbours allow.
+
+    Quiet fingers do not feel it then, no ERA exceeds its largest amplitude [m], by name, and no
+    target exceeds max_db_sl [dB SL]. Raises InputError if nothing remains to be felt.
+    """
+    headroom = [
+        float(decibels(max_amplitudes[name] / tone.amplitude))
+        for name, tone in pattern.excitation.items()
+        if tone.amplitude > 0
+    ]
+    gain = min([max_db_sl - pattern.level_db_sl, *headroom])
+    quiet = pattern.quiet_level_db_sl
+    if quiet is not None:
+        gain = min(gain, IMPERCEPTIBLE_DB_SL - quiet)
+    level = pattern.level_db_sl + gain
+    if level <= 0:
+        raise InputError(
+            "a quiet finger must not feel the pattern, but every one that reaches the target does; "
+            "lift or move that finger away"
+        )
+    factor = 10 ** (gain / 20)
+    return replace(
+        pattern,
+        excitation={
+            name: replace(tone, amplitude=tone.amplitude * factor)
+            for name, tone in pattern.excitation.items()
+        },
+        level_db_sl=level,
+        quiet_level_db_sl=None if quiet is None else quiet + gain,
+    )

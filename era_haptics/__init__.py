@@ -38,11 +38,12 @@ if TYPE_CHECKING:
     from era_haptics.tables import table as table
     from model.errors import InputError as InputError
     from model.finger.grid import Grid as Grid
-    from model.finger.load import FingerLoad as FingerLoad
     from model.reduction.supported_modes import SupportedModes as SupportedModes
     from model.rig.file import example_rig_path as example_rig_path
     from model.rig.file import load_rig as load_rig
     from model.rig.rig import Rig as Rig
+    from model.rig.uncertainty import Uncertainty as Uncertainty
+    from model.structure.fingertip import Fingertip as Fingertip
     from model.table.file import load_table as load_table
     from model.table.file import save_table as save_table
     from model.table.pattern import Pattern as Pattern
@@ -67,10 +68,11 @@ _NAMES = {
     "era_haptics.tables": "query table",
     "model.errors": "InputError",
     "model.finger.grid": "Grid",
-    "model.finger.load": "FingerLoad",
     "model.reduction.supported_modes": "SupportedModes",
     "model.rig.file": "example_rig_path load_rig",
     "model.rig.rig": "Rig",
+    "model.rig.uncertainty": "Uncertainty",
+    "model.structure.fingertip": "Fingertip",
     "model.table.file": "load_table save_table",
     "model.table.pattern": "Pattern",
     "model.table.table": "LocalizationTable",

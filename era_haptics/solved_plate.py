@@ -8,9 +8,8 @@ import numpy as np
 from era_haptics.arguments import expect_rig
 from era_haptics.drive import Drives, excitation_of
 from era_haptics.positions import Positions, as_points
-from model.arguments import expect, expect_number, is_whole, shown
+from model.arguments import expect_number, is_whole, shown
 from model.errors import InputError
-from model.finger.load import FingerLoad
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import ReducedPlate, reduce_free_plate
 from model.reduction.supported_modes import SupportedModes, supported_modes
@@ -68,18 +67,15 @@ class SolvedPlate:
         *,
         quiet: Positions = (),
         duration: float = 1.0,
-        finger_load: FingerLoad | None = None,
     ) -> Playback:
         """Compute what fingers at positions [m] feel during a duration [s], from rest.
 
-        A pattern starts with its envelopes or its ramp, other drives with a ramp of 40 ms.
-        finger_load: load of each finger on the plate, None for weightless ones. The plate in time
-        is solved exactly, without steps (`docs/concepts/plant.md`). Raises InputError for fingers
-        off the plate, and a duration too short for a steady state.
+        A pattern starts with its envelopes or its ramp, other drives with a ramp of 40 ms. Fingers
+        load the plate as the rig's fingertip. The plate in time is solved exactly, without steps
+        (`docs/concepts/plant.md`). Raises InputError for fingers off the plate, and a duration too
+        short for a steady state.
         """
         expect_number(duration, what="duration", unit="seconds")
-        if finger_load is not None:
-            expect(finger_load, FingerLoad, what="finger_load", made_by="era.FingerLoad()")
         fingers = Question(as_points(target, what="target"), as_points(quiet, what="quiet"))
         return play(
             self.rig,
@@ -89,7 +85,6 @@ class SolvedPlate:
             duration=duration,
             ramp=drive.ramp if isinstance(drive, Pattern) else ONSET_RAMP,
             onset=drive.onset if isinstance(drive, Pattern) else None,
-            finger_load=finger_load,
         )
 
     def _excitation(self, drive: Pattern | Drives) -> Excitation:

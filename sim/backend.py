@@ -1,7 +1,8 @@
 """The backend of `sim://`: a simulated amplifier in this process.
 
-Each backend has a plate of its own; several amplifiers under one plate need `era sim`. Not
-modelled: transmission time.
+The plate deviates from the rig's within its uncertainty, as that of `era sim`. Each backend has a
+plate of its own; several amplifiers under one plate need `era sim`. Not modelled: transmission
+time.
 """
 
 import asyncio
@@ -18,27 +19,36 @@ from drivers.protocol.messages import AmplifierEvent, Reply, Request
 from drivers.statistics import WireCounters
 from model.errors import InputError
 from model.rig.file import load_rig
+from model.rig.rig import Rig
 from sim.bench.bench import Bench, keep_time
 from sim.control.context import SimulationContext
 from sim.control.server import control_socket
+from sim.plant.imperfections import Imperfections, draw_imperfections
 
-_FORM = "sim://RIG.yaml, optionally with ?control=PATH and &amplifier=NAME"
+_FORM = "sim://RIG.yaml, optionally with ?control=PATH, &amplifier=NAME, and &seed=N or &exact"
 
 
 class SimulatedBackend(Backend):
-    """An amplifier of the rig in a URL `sim://RIG.yaml[?control=PATH][&amplifier=NAME]`."""
+    """An amplifier of the rig in a URL `sim://RIG.yaml[?control=PATH][&amplifier=NAME][&seed=N]`.
+
+    `&exact` in place of a seed: the rig's own plate, with no deviation.
+    """
 
     def __init__(self, url: str) -> None:
         self._url = url
         path, _, query = url.removeprefix("sim://").partition("?")
         options = dict(parse_qsl(query, keep_blank_values=True))
-        unknown = sorted(options.keys() - {"control", "amplifier"})
+        unknown = sorted(options.keys() - {"control", "amplifier", "seed", "exact"})
         if not url.startswith("sim://") or not path or unknown:
             what = f"unknown option {', '.join(unknown)}" if unknown else "no rig file"
             raise CommandError(f"{url!r}: {what}; use {_FORM}")
         self._rig = Path(unquote(path))
         self._control = Path(options["control"]) if options.get("control") else None
         self._amplifier = options.get("amplifier")
+        self._is_exact, seed = "exact" in options, options.get("seed", "0")
+        if not seed.isdecimal() or (self._is_exact and "seed" in options):
+            raise CommandError(f"{url!r}: seed must be a whole number, without exact; use {_FORM}")
+        self._seed = int(seed)
         self._open: contextlib.AsyncExitStack | None = None
         self._bench: Bench | None = None
         self._name = ""
@@ -69,7 +79,7 @@ class SimulatedBackend(Backend):
         try:
             rig = load_rig(self._rig)
             name = self._select(tuple(rig.amplifiers))
-            bench = await asyncio.to_thread(Bench, rig, now=clock.now())
+            bench = await asyncio.to_thread(self._bench_of, rig)
         except (InputError, OSError) as error:
             raise CommandError(f"{self._url}: {error}") from error
         async with contextlib.AsyncExitStack() as stack:
@@ -99,6 +109,12 @@ class SimulatedBackend(Backend):
         self._counters.frames_out += 1
         self._counters.frames_in += 1
         return self._bench.exchange(self._name, request, now=self._last_sent_at)
+
+    def _bench_of(self, rig: Rig) -> Bench:
+        imperfections = (
+            Imperfections() if self._is_exact else draw_imperfections(rig, seed=self._seed)
+        )
+        return Bench(rig, now=clock.now(), imperfections=imperfections)
 
     def _forward(self, event: AmplifierEvent, moment: float) -> None:
         self._counters.events += 1

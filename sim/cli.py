@@ -78,11 +78,15 @@ def sim(
         list[str] | None,
         typer.Option(metavar="X,Y", help="Place a finger [m]; repeatable."),
     ] = None,
-    finger_load: Annotated[
-        str | None,
+    exact: Annotated[
+        bool, typer.Option("--exact", help="Simulate the rig's own plate, with no deviation.")
+    ] = False,
+    seed: Annotated[
+        int | None,
         typer.Option(
-            metavar="LOAD",
-            help="Let fingers load the plate: light, or N/m,N s/m,kg.",
+            metavar="N",
+            help="Draw another plate, ERAs, channels and fingers within the rig's uncertainty.",
+            min=0,
         ),
     ] = None,
     sensor: Annotated[
@@ -108,16 +112,19 @@ def sim(
         typer.Option("--until-eof", help="Exit at the end of standard input."),
     ] = False,
 ) -> None:
-    """Simulate the amplifiers of a rig on real wires. Print a URL for each; Ctrl-C ends."""
+    """Simulate the amplifiers of a rig on real wires. Print a URL for each; Ctrl-C ends.
+
+    The plate deviates from the rig within the rig's uncertainty, the same for the same --seed.
+    """
     from sim.process.early_exit import exit_on_signal
 
     with exit_on_signal():
         from model.config.points import parse_point
-        from model.finger.load import parse_finger_load
         from model.rig.file import load_rig
         from sim.far_ends.wire_assignment import assign_wires
         from sim.far_ends.wires import Wire
         from sim.faults.fault_file import FaultFile, load_faults
+        from sim.plant.imperfections import Imperfections, draw_imperfections
         from sim.process.simulation import Simulation
 
         defaults = Wire("serial", speed=speed, shared=shared, unpluggable=faults is not None)
@@ -133,6 +140,8 @@ def sim(
         )
         if virtual_time and control is None:
             raise InputError("--virtual-time needs --control PATH, which advances the time")
+        if exact and seed is not None:
+            raise InputError("--exact and --seed exclude each other; give one")
         loaded = load_rig(rig)
         _check_rate(rate, frequency_max=loaded.limits.frequency_max)
         simulation = Simulation(
@@ -143,9 +152,7 @@ def sim(
                 str(number): parse_point(text, what="--finger")
                 for number, text in enumerate(finger or [], start=1)
             },
-            finger_load=(
-                parse_finger_load(finger_load, what="--finger-load") if finger_load else None
-            ),
+            imperfections=Imperfections() if exact else draw_imperfections(loaded, seed=seed or 0),
             sensors=[_sensor(text) for text in sensor or []],
             sample_rate=rate,
             control=control,

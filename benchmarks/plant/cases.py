@@ -1,7 +1,7 @@
 """What the benchmark of the plate in time runs: plants and benches, ready to go on for a while."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -12,11 +12,11 @@ from benchmarks.setting import RIG
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.messages import Achieved, Apply, Arm
 from model.finger.fingertip import fingertip_points
-from model.finger.load import FingerLoad, finger_loads
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.file import load_rig
 from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
+from model.structure.fingertip import Fingertip, FingertipLoad
 from model.structure.point_load import footprints_of
 from model.transients.base_motion import fade
 from sim.bench.bench import Bench
@@ -68,7 +68,7 @@ class Rigs:
     def _plant(self, case: Case) -> Callable[[float], None]:
         plant = Plant(self.reduced(case.eras, case.frequency_max), self.eras(case.eras))
         if case.loading:
-            plant.set_contacts(finger_loads(FINGERS[: case.fingers]))
+            plant.set_contacts(_resting(FINGERS[: case.fingers]))
         tips = [fingertip_points(*at, self._paper.plate) for at in FINGERS[: case.fingers]]
         points = np.vstack([np.zeros((0, 2)), *tips])
         shapes = plant.reduced.at(points)
@@ -83,7 +83,7 @@ class Rigs:
                     _new_tones(plant, case.eras)
                 if case.taps and number % round(1 / case.taps / case.step) == 0:
                     taps += 1
-                    plant.set_contacts(finger_loads([FINGERS[taps % 10]]))
+                    plant.set_contacts(_resting([FINGERS[taps % 10]]))
                     shapes = plant.reduced.at(points)
                 plant.advance(now + case.step, sample_rate=SAMPLE_RATE, shapes=shapes)
 
@@ -92,8 +92,8 @@ class Rigs:
 
     def _bench(self, case: Case) -> Callable[[float], None]:
         rig = self.rig(case)
-        load = FingerLoad() if case.loading else None
-        bench = Bench(rig, now=0.0, finger_load=load)
+        tip = Fingertip() if case.loading else None
+        bench = Bench(replace(rig, fingertip=tip), now=0.0)
         bench.place_fingers({str(n): FINGERS[n] for n in range(case.fingers)}, now=0.0)
         token = 0
         for name in bench.amplifiers:
@@ -121,6 +121,10 @@ class Rigs:
         return go_on
 
 
+def _resting(places: Sequence[tuple[float, float]]) -> dict[str, FingertipLoad]:
+    return {str(number): FingertipLoad(*at, Fingertip()) for number, at in enumerate(places)}
+
+
 def _new_tones(plant: Plant, eras: int) -> None:
     for number in range(eras):
         omega = 2 * np.pi * FREQUENCIES[number % 4]
@@ -139,13 +143,13 @@ def contact_times(rigs: Rigs) -> Iterator[tuple[str, float]]:
                 at = [(x + shift * (number + 1), y) for x, y in FINGERS[:count]]
                 plant.skip(plant.time + 1.0)
                 if not shift:
-                    plant.set_contacts(finger_loads(at))
+                    plant.set_contacts(_resting(at))
                     plant.skip(plant.time + 0.1)
-                    plant.set_contacts(())
+                    plant.set_contacts({})
                     plant.skip(plant.time + 1.0)
                 used = time.thread_time()
-                plant.set_contacts(finger_loads(at))
+                plant.set_contacts(_resting(at))
                 times.append(time.thread_time() - used)
                 plant.skip(plant.time + 0.1)
-                plant.set_contacts(())
+                plant.set_contacts({})
             yield f"{count} at once, {what}", float(np.median(times))

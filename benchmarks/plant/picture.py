@@ -2,12 +2,12 @@
 
     python -m benchmarks.plant.picture FILE.png
 
-The plate of the founding paper, one ERA at 110 Hz. The finger loads it (`model.finger.load`); grey
-is what would be there if it only felt.
+The plate of the founding paper, one ERA at 110 Hz. The finger loads it (`Fingertip`); grey is what
+would be there if it only felt.
 """
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +16,11 @@ from matplotlib.figure import Figure
 
 from benchmarks.setting import RIG
 from model.arrays import FloatArray
-from model.finger.load import finger_loads
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.file import load_rig
 from model.rig.rig import Rig
-from model.structure.point_load import PointLoad, footprints_of
+from model.structure.fingertip import Fingertip, FingertipLoad
+from model.structure.point_load import footprints_of
 from model.transients.base_motion import fade
 from sim.plant.plant import Plant
 
@@ -44,8 +44,8 @@ def main() -> None:
     y = np.linspace(0, rig.plate.width, 46)
     raster = np.array([[a, b] for b in y for a in x])
     points = np.vstack([[FINGER, OTHER], raster])
-    times, loaded = vibrate(rig, points, finger_loads([FINGER]))
-    _, bare = vibrate(rig, points, ())
+    times, loaded = vibrate(rig, points, {"finger": FingertipLoad(*FINGER, Fingertip())})
+    _, bare = vibrate(rig, points, {})
     figure = draw(times, loaded, bare, x, y)
     FigureCanvasAgg(figure)
     figure.savefig(file, dpi=110)
@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def vibrate(
-    rig: Rig, points: FloatArray, contacts: Sequence[PointLoad]
+    rig: Rig, points: FloatArray, contacts: Mapping[str, FingertipLoad]
 ) -> tuple[FloatArray, FloatArray]:
     """Times (n,) [s] and accelerations (n, p) [m/s²] from long before the touch to its end."""
     reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras))
@@ -62,7 +62,7 @@ def vibrate(
     stroke = 0.2 * rig.eras[1].stroke
     plant.set_input(1, fade(stroke + 0j, omega=omega, start=0.0, ramp=0.02, gains=(0.0, 1.0)))
     times, felt = [], []
-    for until, then in ((LANDS, contacts), (GOES, ()), (ENDS, ())):
+    for until, then in ((LANDS, contacts), (GOES, {}), (ENDS, {})):
         shapes = plant.reduced.at(points)
         moments, accelerations = plant.advance(until, sample_rate=RATE, shapes=shapes)
         times.append(moments)

@@ -40,6 +40,17 @@ def demo(
         typer.Option(metavar="FILE", help="TUIO capture, or evemu recording (.events)."),
     ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the picture.")] = Path("out"),
+    exact: Annotated[
+        bool, typer.Option("--exact", help="Simulate the table's own plate, with no deviation.")
+    ] = False,
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Draw another plate, ERAs, channels and fingers within the rig's uncertainty.",
+            min=0,
+        ),
+    ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object and nothing else.")
     ] = False,
@@ -50,7 +61,10 @@ def demo(
         ),
     ] = False,
 ) -> None:
-    """Play recorded touches on a simulated plate; measure contrast."""
+    """Play recorded touches on a simulated plate; measure contrast.
+
+    The plate deviates from the table's within the rig's uncertainty, the same for the same --seed.
+    """
     import asyncio
     import time
 
@@ -68,6 +82,9 @@ def demo(
         raise InputError(f"--wire must be one of {', '.join(WIRES)}, got {wire}")
     if dashboard and (touches is not None or as_json):
         raise InputError("--dashboard takes its touches from the page; omit --touches and --json")
+    if exact and seed is not None:
+        raise InputError("--exact and --seed exclude each other; give one")
+    drawn = None if exact else seed or 0
     recorded = read_touches(touches or example_touches_path())
     rig_file = example_rig_path()
     rig = load_rig(rig_file)
@@ -78,7 +95,7 @@ def demo(
         from controller.demo.live import run_live
 
         print("Open the URL below, press Arm, and touch the plate; Ctrl-C ends it.", flush=True)
-        asyncio.run(run_live(rig_file, table, wire=wire, dashboard=DASHBOARD))
+        asyncio.run(run_live(rig_file, table, wire=wire, dashboard=DASHBOARD, seed=drawn))
         return
     if not as_json:
         print(
@@ -93,6 +110,7 @@ def demo(
             wire=wire,
             touches=recorded,
             on_row=lambda row: None if as_json else print(_line(row), flush=True),
+            seed=drawn,
         )
     )
     files = write_picture(table, rows, out)

@@ -59,12 +59,13 @@ class SimulatedPlate:
 
 @contextlib.asynccontextmanager
 async def simulated_plate(
-    rig_file: Path, amplifiers: Collection[str], *, wire: str
+    rig_file: Path, amplifiers: Collection[str], *, wire: str, seed: int | None = 0
 ) -> AsyncIterator[SimulatedPlate]:
     """Simulate the amplifiers of a rig file for the duration of the context.
 
-    wire: a key of `SIM_OPTIONS` for a process of their own, "sim" for a plate in this process.
-    Raises LinkError if the process does not start.
+    wire: a key of `SIM_OPTIONS` for a process of their own, "sim" for a plate in this process;
+    seed: of the plate within the rig's uncertainty, None for the rig's own. Raises LinkError if the
+    process does not start.
     """
     with tempfile.TemporaryDirectory(prefix="era-") as folder:
         path = Path(folder) / "control"
@@ -72,19 +73,23 @@ async def simulated_plate(
             control = PlateControl(path, remedy=_REMEDY)
             stack.push_async_callback(control.close)
             if wire == "sim":
-                base = f"sim://{quote(str(rig_file))}?control={quote(str(path))}&amplifier="
+                plate = "exact" if seed is None else f"seed={seed}"
+                base = f"sim://{quote(str(rig_file))}?control={quote(str(path))}&{plate}&amplifier="
                 urls = {name: base + quote(name) for name in amplifiers}
             else:
-                process = await _start(rig_file, wire=wire, control=path)
+                process = await _start(rig_file, wire=wire, control=path, seed=seed)
                 stack.push_async_callback(_terminate, process)
                 urls = await _read_urls(process, count=len(amplifiers))
             yield SimulatedPlate(control, urls)
 
 
-async def _start(rig_file: Path, *, wire: str, control: Path) -> asyncio.subprocess.Process:
+async def _start(
+    rig_file: Path, *, wire: str, control: Path, seed: int | None
+) -> asyncio.subprocess.Process:
     return await asyncio.create_subprocess_exec(
         # -P: do not import a folder named sim in the working directory
         *(sys.executable, "-P", "-m", "sim", str(rig_file), *SIM_OPTIONS[wire]),
+        *(("--exact",) if seed is None else ("--seed", str(seed))),
         *("--control", str(control)),
         "--until-eof",  # ends with the pipe below, however this process ends
         stdin=asyncio.subprocess.PIPE,

@@ -16,10 +16,17 @@ from model.rig.file import load_rig
 from model.table.table import LocalizationTable
 
 
-async def run_live(rig_file: Path, table: LocalizationTable, *, wire: str, dashboard: str) -> None:
+async def run_live(
+    rig_file: Path,
+    table: LocalizationTable,
+    *,
+    wire: str,
+    dashboard: str,
+    seed: int | None = 0,
+) -> None:
     """Serve the dashboard of a rig over a wire until Ctrl-C; starts disarmed.
 
-    wire: as for `run_demo`; dashboard: HOST:PORT of the loopback. The daemon uses the default
+    wire, seed: as for `run_demo`; dashboard: HOST:PORT of the loopback. The daemon uses the default
     socket, so that `era status` and others reach it. Raises InputError if one runs already or
     the gateway is not installed, and LinkError.
     """
@@ -35,7 +42,7 @@ async def run_live(rig_file: Path, table: LocalizationTable, *, wire: str, dashb
         log = start_log(None, level=config.section.log.level)
         stack.callback(log.close)
         plate = await stack.enter_async_context(
-            simulated_plate(rig_file, rig.amplifiers, wire=wire)
+            simulated_plate(rig_file, rig.amplifiers, wire=wire, seed=seed)
         )
         daemon = Daemon(
             replace(config, urls=plate.urls),

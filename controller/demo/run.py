@@ -68,14 +68,16 @@ async def run_demo(
     wire: str,
     touches: RecordedTouches,
     on_row: Callable[[TouchRow], None],
+    seed: int | None = 0,
 ) -> list[TouchRow]:
     """Play recorded touches into a controller, over a wire, onto a simulated plate.
 
-    wire: one of WIRES; touches: from `read_touches`; on_row: called with each row when complete.
-    Return all rows in order of time. Raises LinkError if the far end is lost.
+    wire: one of WIRES; touches: from `read_touches`; on_row: called with each row when complete;
+    seed: of the plate within the rig's uncertainty, None for the rig's own. Return all rows in
+    order of time. Raises LinkError if the far end is lost.
     """
     rig = load_rig(rig_file)
-    async with simulated_plate(rig_file, rig.amplifiers, wire=wire) as plate:
+    async with simulated_plate(rig_file, rig.amplifiers, wire=wire, seed=seed) as plate:
         source, play = await touches()
         recorder = TouchRecorder(plate, on_row=on_row)
         controller = Controller(

@@ -17,7 +17,7 @@ from model.fem.factorisation import factorise
 from model.fem.plate_mesh import check_frequencies
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
-from model.structure.point_load import PointLoad, footprints_of
+from model.structure.point_load import Load, footprints_of
 
 
 def direct_acceleration(
@@ -26,7 +26,7 @@ def direct_acceleration(
     frequencies: FloatArray,
     points: FloatArray,
     *,
-    loads: Sequence[PointLoad] = (),
+    loads: Sequence[Load] = (),
 ) -> ComplexArray:
     """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and driven ERA: (f, eras, p).
 

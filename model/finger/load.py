@@ -10,8 +10,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from model.arguments import expect_number
-from model.config.units import DAMPING, MASS, STIFFNESS, quantity
-from model.errors import InputError
 from model.structure.point_load import PointLoad
 
 
@@ -46,26 +44,3 @@ class FingerLoad:
 def finger_loads(contacts: Iterable[tuple[float, float]]) -> tuple[PointLoad, ...]:
     """Loads of light fingers at contacts [m]."""
     return tuple(FingerLoad().at(x, y) for x, y in contacts)
-
-
-def parse_finger_load(text: str, *, what: str) -> FingerLoad:
-    """Parse `light` or stiffness, damping and mass of a finger, `1 kN/m,2 N s/m,0.2 g`.
-
-    Bare numbers are N/m, N s/m and kg; what names the option in the error.
-    """
-    if text.strip() == "light":
-        return FingerLoad()
-    parts = text.split(",")
-    if len(parts) != 3:
-        raise InputError(
-            f"{what} {text!r}: write light, or stiffness, damping and mass of a finger, as in "
-            f"{what} '1 kN/m,2 N s/m,0.2 g'"
-        )
-    try:
-        numbers = [
-            quantity(part, dimension)
-            for part, dimension in zip(parts, (STIFFNESS, DAMPING, MASS), strict=True)
-        ]
-        return FingerLoad(*numbers)
-    except InputError as error:
-        raise InputError(f"{what} {text!r}: {error}") from None

@@ -27,7 +27,7 @@ from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 from model.structure.footprint import as_footprints
 from model.structure.low_rank import coupled_forces, on_diagonal
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad, footprints_of
+from model.structure.point_load import Load, footprints_of
 
 FREQUENCY_MARGIN = 2.0
 """Modes are kept up to this multiple of frequency_max."""
@@ -52,7 +52,7 @@ class FreePlate:
         frequencies: FloatArray,
         points: FloatArray,
         *,
-        loads: Sequence[PointLoad] = (),
+        loads: Sequence[Load] = (),
     ) -> ComplexArray:
         """Acceleration [m/s²] at points [m] (p, 2) per frequency [Hz] (f,) and ERA: (f, eras, p).
 
@@ -78,7 +78,7 @@ class FreePlate:
         points: FloatArray,
         frequencies: FloatArray,
         *,
-        loads: Sequence[PointLoad] = (),
+        loads: Sequence[Load] = (),
     ) -> tuple[ComplexArray, ComplexArray]:
         """Receptances [m/N] between places [m] (c, 2), (f, c, c), and to points (p, 2), (f, c, p).
 

@@ -1,7 +1,9 @@
 """Mass, damping and stiffness matrices of the plate on its ERAs, in reduced coordinates.
 
 M = I + sum m_b phi phi^T, K = diag(omega²) + sum k_b phi phi^T, C = C_s + sum c phi phi^T; phi are
-the free plate's shapes at an ERA. Point masses and fingers add to M, K and C in the same way.
+the free plate's shapes at an ERA. Point masses add in the same way. A fingertip adds its contact
+mass, and one coordinate, the displacement x [m] of its phalanx: m_p x'' + c_j x' + k_j x is the
+force of the pulp, a spring and a damper between the plate and the phalanx.
 
 Structural damping. The frequency domain uses a hysteretic stiffness (1 + i eta) diag(omega²),
 which no causal equation in time has. C_s is its viscous equivalent: in the modes psi_j, omega_j of
@@ -21,6 +23,7 @@ from scipy import linalg
 
 from model.arrays import FloatArray
 from model.structure.actuator import Era
+from model.structure.fingertip import Fingertip, FingertipLoad
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, footprints_of
 from model.structure.support import check_supported
@@ -49,18 +52,19 @@ def modal_matrices(
     eras: Sequence[Era],
     *,
     loads: Sequence[PointLoad] = (),
-    contacts: Sequence[PointLoad] = (),
+    contacts: Sequence[FingertipLoad] = (),
     attachment_shapes: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """M, C, K (r, r) of the plate on its ERAs, with what it carries and the fingers in contact.
+    """M, C, K (r + n, r + n) of the plate on its ERAs with its loads under n fingertips.
 
-    attachment_shapes: shapes at the ERAs, loads and contacts (n, r) where known already. Raises
-    InputError for ERAs that do not support the plate.
+    The last n coordinates are the phalanges', in the order of contacts. attachment_shapes: shapes
+    at the ERAs, loads and contacts where known already. Raises InputError for ERAs that do not
+    support the plate.
     """
     check_supported(reduced.plate, eras, loads=loads)
     fixed = [*(PointLoad.of_era(era) for era in eras), *loads]
     phi = (
-        reduced.at(footprints_of([*fixed, *contacts]))
+        reduced.at(footprints_of(fixed, contacts))
         if attachment_shapes is None
         else attachment_shapes
     )
@@ -73,8 +77,7 @@ def modal_matrices(
     viscous = reduced.plate.loss_factor * (psi.T @ elastic @ psi) / np.sqrt(np.outer(omega, omega))
     mass_weighted_modes = M @ psi
     C += mass_weighted_modes @ viscous @ mass_weighted_modes.T
-    contribution = _contribution(phi[len(fixed) :], contacts)
-    return M + contribution[0], C + contribution[1], K + contribution[2]
+    return _under_fingertips((M, C, K), phi[len(fixed) :], [each.fingertip for each in contacts])
 
 
 def _contribution(
@@ -84,3 +87,24 @@ def _contribution(
     mass = (phi.T * [load.mass for load in loads]) @ phi
     damping = (phi.T * [load.damping for load in loads]) @ phi
     return mass, damping, (phi.T * [load.stiffness for load in loads]) @ phi
+
+
+def _under_fingertips(
+    plate: tuple[FloatArray, FloatArray, FloatArray],
+    phi: FloatArray,
+    fingertips: Sequence[Fingertip],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """M, C, K (r + n, r + n) with n fingertips at points of shapes phi (n, r)."""
+    n = len(fingertips)
+    M, C, K = (np.pad(matrix, (0, n)) for matrix in plate)
+    for phalanx, (shape, tip) in enumerate(zip(phi, fingertips, strict=True), start=len(phi.T)):
+        contact = np.pad(shape, (0, n))
+        pulp = contact.copy()
+        pulp[phalanx] = -1.0  # its stretch is the displacement of the plate less the phalanx's
+        M += tip.contact_mass * np.outer(contact, contact)
+        C += tip.damping * np.outer(pulp, pulp)
+        K += tip.stiffness * np.outer(pulp, pulp)
+        M[phalanx, phalanx] += tip.phalanx_mass
+        C[phalanx, phalanx] += tip.joint_damping
+        K[phalanx, phalanx] += tip.joint_stiffness
+    return M, C, K

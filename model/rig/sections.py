@@ -198,7 +198,7 @@ class FingertipSection(Section):
     stiffness: Annotated[float, Quantity(STIFFNESS, at_least=0, at_most=1e6)] = 1000.0
     damping: Annotated[float, Quantity(DAMPING, above=0, at_most=1e4)] = 2.0
     contact_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=0.1)] = 0.0002
-    phalanx_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=1)] = 0.005
+    phalanx_mass: Annotated[float, Quantity(MASS, at_least=1e-5, at_most=1)] = 0.005
     joint_stiffness: Annotated[float, Quantity(STIFFNESS, at_least=0, at_most=1e6)] = 500.0
     joint_damping: Annotated[float, Quantity(DAMPING, at_least=0, at_most=1e4)] = 2.0
 

@@ -16,7 +16,7 @@ from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 from model.structure.footprint import as_footprints
 from model.structure.low_rank import coupled_forces, on_diagonal
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad, footprints_of
+from model.structure.point_load import Load, footprints_of
 
 
 def direct_spectral_acceleration(
@@ -26,7 +26,7 @@ def direct_spectral_acceleration(
     frequencies: FloatArray,
     points: FloatArray,
     *,
-    loads: Sequence[PointLoad] = (),
+    loads: Sequence[Load] = (),
 ) -> ComplexArray:
     """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and driven ERA: (f, eras, p).
 

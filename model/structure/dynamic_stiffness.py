@@ -1,4 +1,4 @@
-"""Dynamic stiffness of what is attached to the plate at points: ERAs, fingers and point masses."""
+"""Dynamic stiffness of what is attached to the plate at points: ERAs, fingertips and masses."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.structure.actuator import Era
-from model.structure.point_load import PointLoad
+from model.structure.point_load import Load
 
 
 def dynamic_stiffness(
@@ -21,13 +21,13 @@ def dynamic_stiffness(
 
 
 def attached_stiffness(
-    eras: Sequence[Era], loads: Sequence[PointLoad], omega: FloatArray
+    eras: Sequence[Era], loads: Sequence[Load], omega: FloatArray
 ) -> ComplexArray:
     """Dynamic stiffness [N/m] of ERAs and loads at omega (f,) [rad/s], (f, eras + loads)."""
     parameters = [(era.stiffness, era.damping, era.bolt_mass) for era in eras]
-    parameters += [(load.stiffness, load.damping, load.mass) for load in loads]
     stiffness, damping, mass = np.array(parameters, dtype=float).reshape(-1, 3).T
-    return dynamic_stiffness(stiffness, damping, mass, omega[:, None])
+    at_eras = dynamic_stiffness(stiffness, damping, mass, omega[:, None])
+    return np.column_stack([at_eras, *(load.dynamic_stiffness(omega) for load in loads)])
 
 
 def base_stiffness(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:

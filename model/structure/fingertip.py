@@ -7,7 +7,7 @@ the real part of the dynamic stiffness is 69, -87 and -358 N/m where a phalanx a
 """
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
 
@@ -33,13 +33,14 @@ class Fingertip:
     joint_damping: float = 2.0
 
     def __post_init__(self) -> None:
-        """Refuse values that are not finite or negative, and a pulp without damping."""
+        """Refuse values not finite or negative, no damping of the pulp, and no phalanx."""
         for key in (field.name for field in fields(self)):
             value = getattr(self, key)
             if not (math.isfinite(value) and value >= 0):
                 raise InputError(f"fingertip: {key} must be finite and at least 0, got {value}")
-        if self.damping == 0:
-            raise InputError("fingertip: damping must be above 0 N s/m, got 0")
+        for key, unit in (("damping", "N s/m"), ("phalanx_mass", "kg")):
+            if getattr(self, key) == 0:
+                raise InputError(f"fingertip: {key} must be above 0 {unit}, got 0")
 
     def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
         """Force on the plate per displacement of the contact at omega [rad/s], of its shape [N/m].
@@ -63,3 +64,25 @@ class Fingertip:
             damping=factor * self.damping,
             contact_mass=factor * self.contact_mass,
         )
+
+    def multiplied(self, factor: float) -> "Fingertip":
+        """The fingertip with a dynamic stiffness larger by a factor at every frequency."""
+        return Fingertip(**{key: factor * value for key, value in asdict(self).items()})
+
+
+@dataclass(frozen=True)
+class FingertipLoad:
+    """A fingertip that rests on the plate at x, y [m]; it acts at a point."""
+
+    x: float
+    y: float
+    fingertip: Fingertip
+
+    @property
+    def foot(self) -> float:
+        """Radius of the disc on which it acts [m]: 0, a point."""
+        return 0.0
+
+    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """Dynamic stiffness [N/m] at omega [rad/s], of the same shape."""
+        return self.fingertip.dynamic_stiffness(omega)

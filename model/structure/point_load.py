@@ -1,14 +1,38 @@
-"""Passive loads of the plate at a point: a mass, a resting finger."""
+"""Passive loads of the plate at a point: what they have in common, and a mass on a mount."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.structure.actuator import Era
+
+
+class Located(Protocol):
+    """What is attached to the plate at x, y [m], on a disc of radius foot [m], 0 for a point."""
+
+    @property
+    def x(self) -> float:
+        """Position along the length [m]."""
+
+    @property
+    def y(self) -> float:
+        """Position along the width [m]."""
+
+    @property
+    def foot(self) -> float:
+        """Radius of the disc on which it acts [m]."""
+
+
+class Load(Located, Protocol):
+    """A passive load: a point mass, a fingertip."""
+
+    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """Force on it per displacement of the plate [N/m] at omega [rad/s], of the same shape."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +66,17 @@ class PointLoad:
         mount = {"stiffness": self.stiffness, "damping": self.damping}
         return mass | mount if any(mount.values()) else mass
 
+    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """D = k + i omega c - omega² m [N/m], of the shape of omega [rad/s]."""
+        return np.asarray(self.stiffness + 1j * omega * self.damping - omega**2 * self.mass)
+
     @classmethod
     def of_era(cls, era: Era) -> "PointLoad":
         """An ERA at rest, as a load of the plate."""
         return cls(era.x, era.y, era.stiffness, era.damping, era.bolt_mass, era.foot)
 
 
-def footprints_of(*attached: Sequence[Era] | Sequence[PointLoad]) -> FloatArray:
+def footprints_of(*attached: Iterable[Located]) -> FloatArray:
     """Footprints x, y, radius [m] of ERAs and loads, one group after the other, (n, 3)."""
     places = [[each.x, each.y, each.foot] for group in attached for each in group]
     return np.array(places, dtype=float).reshape(-1, 3)

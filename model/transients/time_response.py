@@ -2,8 +2,9 @@
 
     M q'' + C q' + K q = sum over ERAs of phi (k_b y + c y')
 
-q are the coordinates of the reduced free plate, phi its shapes at an ERA, y the motion of the
-ERA's base; M, C and K are those of `model.reduction.modal_matrices`. The first-order system is
+q are the coordinates of the reduced free plate and the displacements of the phalanges of fingers
+on it, phi the shapes at an ERA, y the motion of the ERA's base; M, C and K are those of
+`model.reduction.modal_matrices`. The first-order system is
 diagonalised once for each set of attachments; the base moves in terms with closed-form
 particular solutions (`model.transients.base_motion`), so no step size enters and no error grows
 with time.
@@ -25,6 +26,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.reduction.modal_matrices import Reduced, modal_matrices
 from model.structure.actuator import Era
+from model.structure.fingertip import FingertipLoad
 from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import Term
 
@@ -57,7 +59,8 @@ class PlateInTime:
     """The plate on its ERAs as z' = diag(eigenvalues) z + participation f, f [N] per ERA.
 
     eigenvalues (2 r,) [1/s], in conjugate pairs; vectors (2 r, 2 r): displacement and velocity of
-    the reduced coordinates are vectors @ z; inverse: of the vectors; participation (2 r, eras).
+    the r coordinates, the reduced plate's and one for each phalanx, are vectors @ z; inverse: of
+    the vectors; participation (2 r, eras).
     """
 
     reduced: Reduced
@@ -66,6 +69,11 @@ class PlateInTime:
     vectors: ComplexArray
     inverse: ComplexArray
     participation: ComplexArray
+
+    def with_phalanges(self, shapes: FloatArray) -> FloatArray:
+        """Shapes (p, r) of all coordinates, from those of the reduced plate's, which come first."""
+        phalanges = len(self.vectors) // 2 - shapes.shape[1]
+        return np.hstack([shapes, np.zeros((len(shapes), phalanges))])
 
     @cached_property
     def displacement(self) -> ComplexArray:
@@ -166,12 +174,12 @@ def plate_in_time(
     eras: Sequence[Era],
     *,
     loads: Sequence[PointLoad] = (),
-    contacts: Sequence[PointLoad] = (),
+    contacts: Sequence[FingertipLoad] = (),
     attachment_shapes: FloatArray | None = None,
 ) -> PlateInTime:
     """Diagonalise the equations of motion of a reduced plate on its ERAs, with what it carries.
 
-    contacts: fingers that rest on it now; attachment_shapes: shapes at the ERAs, loads and contacts
+    contacts: fingertips that rest on it; attachment_shapes: shapes at the ERAs, loads and contacts
     (n, r) where known already. Raises InputError for ERAs that do not hold the plate (fewer than
     three, or all in one line), and for a mode that is damped critically.
     """
@@ -191,7 +199,9 @@ def plate_in_time(
             "the plate's equations of motion cannot be separated into modes: a mode is damped "
             "critically; change an ERA's damping by a per mille"
         )
-    input_matrix = np.vstack([np.zeros((r, len(eras))), inverse @ attachment_shapes[: len(eras)].T])
+    input_shapes = np.zeros((r, len(eras)))
+    input_shapes[: attachment_shapes.shape[1]] = attachment_shapes[: len(eras)].T
+    input_matrix = np.vstack([np.zeros((r, len(eras))), inverse @ input_shapes])
     return PlateInTime(
         reduced, tuple(eras), eigenvalues, vectors, inverse_vectors, inverse_vectors @ input_matrix
     )

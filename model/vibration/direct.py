@@ -13,7 +13,7 @@ from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
 from model.structure.actuator import Era
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad
+from model.structure.point_load import Load
 
 
 class Responder(Protocol):
@@ -25,7 +25,7 @@ class Responder(Protocol):
         frequencies: FloatArray,
         points: FloatArray,
         *,
-        loads: Sequence[PointLoad] = (),
+        loads: Sequence[Load] = (),
     ) -> ComplexArray:
         """Solve for one tone of each ERA alone at full stroke."""
 

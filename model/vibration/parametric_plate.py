@@ -20,7 +20,7 @@ from model.rig.rig import Rig
 from model.structure.dynamic_stiffness import attached_stiffness, dynamic_stiffness
 from model.structure.low_rank import coupled_forces, on_diagonal
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad, footprints_of
+from model.structure.point_load import Load, footprints_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class FreeReceptances:
     to_points: ComplexArray
     omega: FloatArray
 
-    def responses(self, eras: FloatArray, loads: Sequence[PointLoad]) -> ComplexArray:
+    def responses(self, eras: FloatArray, loads: Sequence[Load]) -> ComplexArray:
         """Acceleration per base displacement [1/s²] of each ERA without its gain, (..., f, e, p).
 
         eras (..., e, 3): stiffness, damping and bolt mass of those at the first attachments; loads:

@@ -16,10 +16,10 @@ from drivers import clock
 from drivers.protocol.messages import Reply, Request
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
-from model.finger.load import FingerLoad
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.actuator import Era
+from model.structure.fingertip import FingertipLoad
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import Term
@@ -51,8 +51,8 @@ class Probe(Protocol):
 class Bench:
     """A simulated rig at rest at time now [s]; sample_rate [Hz]: of sensors and fingers.
 
-    probes: listeners beside the fingers; finger_load: None for fingers without weight;
-    imperfections: errors of amplifiers and channels. Raises InputError for unknown channels.
+    Fingers load the plate as the rig's fingertip. probes: listeners beside them; imperfections: in
+    what the bench differs from the rig. Raises InputError for unknown channels.
     """
 
     def __init__(
@@ -61,22 +61,22 @@ class Bench:
         *,
         now: float,
         sample_rate: float = SAMPLE_RATE,
-        finger_load: FingerLoad | None = None,
         imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
     ) -> None:
         imperfections.check(rig)
         self.rig = rig
         self.sample_rate = sample_rate
-        self.finger_load = finger_load
         self.imperfections = imperfections
         self.probes: list[Probe] = []
+        real = imperfections.plate.realised(rig)
         reduced = _reduced(
-            rig.plate, rig.mesh, tuple(rig.eras), tuple(rig.masses), rig.limits.frequency_max
+            real.plate, real.mesh, tuple(real.eras), tuple(real.masses), rig.limits.frequency_max
         )
         self.fingers = Fingers(reduced)
+        self.observers: frozenset[str] = frozenset()  # fingers without weight
         self._time = now
         # Advanced only where its drive changes or its motion is sampled.
-        self._plant = Plant(reduced, rig.eras, loads=rig.masses, time=now)
+        self._plant = Plant(reduced, real.eras, loads=real.masses, time=now)
         self.amplifiers: Mapping[str, SimulatedAmplifier] = {
             name: SimulatedAmplifier(name, channels=_channel_count(rig, name))
             for name in rig.amplifiers
@@ -129,12 +129,17 @@ class Bench:
         """
         self.fingers.check(positions)
         self.advance(now)
-        load = self.finger_load
-        if load is not None:
+        self.observers = frozenset(observers) & positions.keys()
+        fingertip = self.rig.fingertip
+        if fingertip is not None:
             self._plant.skip(self._time)
             before = self._plant.reduced
             self._plant.set_contacts(
-                [load.at(*at) for name, at in positions.items() if name not in observers]
+                {
+                    name: FingertipLoad(*at, self.imperfections.load_of(name, fingertip))
+                    for name, at in positions.items()
+                    if name not in self.observers
+                }
             )
             if self._plant.reduced is not before:
                 self._shapes_at.cache_clear()

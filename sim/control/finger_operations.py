@@ -1,7 +1,7 @@
 """Control operations on fingers."""
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from model.errors import InputError
 from sim.control.context import SimulationContext
@@ -24,7 +24,10 @@ async def _fingers(context: SimulationContext, request: Request, now: float) -> 
     positions = {
         name: parse_position(at, what=f"finger {name[:40]!r}") for name, at in fingers.items()
     }
-    return _placed(context, positions, now)
+    observers = request.get("observers", [])
+    if not (isinstance(observers, list) and all(name in list(positions) for name in observers)):
+        raise InputError('observers must be a list of ids of these fingers, as in ["1"]')
+    return _placed(context, positions, now, observers=observers)
 
 
 async def _touch_or_move(context: SimulationContext, request: Request, now: float) -> Response:
@@ -33,18 +36,25 @@ async def _touch_or_move(context: SimulationContext, request: Request, now: floa
         state = "already" if name in present else "not"
         raise InputError(f"finger {name!r} is {state} on the plate")
     at = parse_position(request.get("at_m"), what=f"finger {name!r}")
-    return _placed(context, {**present, name: at}, now)
+    return _placed(context, {**present, name: at}, now, observers=context.bench.observers)
 
 
 async def _lift(context: SimulationContext, request: Request, now: float) -> Response:
     name, present = parse_finger(request), context.bench.fingers.layout.positions
     if name not in present:
         raise InputError(f"finger {name!r} is not on the plate")
-    return _placed(context, {id: at for id, at in present.items() if id != name}, now)
+    rest = {id: at for id, at in present.items() if id != name}
+    return _placed(context, rest, now, observers=context.bench.observers)
 
 
-def _placed(context: SimulationContext, positions: Mapping[str, Position], now: float) -> Response:
-    context.bench.place_fingers(positions, now=now)
+def _placed(
+    context: SimulationContext,
+    positions: Mapping[str, Position],
+    now: float,
+    *,
+    observers: Collection[str] = (),
+) -> Response:
+    context.bench.place_fingers(positions, now=now, observers=observers)
     return {"ok": True, "time_s": context.bench.time}
 
 

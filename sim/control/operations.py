@@ -8,7 +8,9 @@
                                                 "high_voltage", "levels"}}}
 
     fingers, positions [x, y] in metres
-    {"op": "fingers", "fingers": {ID: [x, y]}} replace all fingers: {"ok": true, "time_s"}
+    {"op": "fingers", "fingers": {ID: [x, y]}, "observers": [ID, ...]}
+                                               replace all fingers; observers load nothing:
+                                               {"ok": true, "time_s"}
     {"op": "touch", "finger": ID, "at_m": [x, y]}      add one; "move": move one
     {"op": "lift", "finger": ID}                       remove one
     {"op": "felt", "since_s": t0, "until_s": t1}

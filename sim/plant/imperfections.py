@@ -1,20 +1,30 @@
-"""Imperfections of amplifiers: errors of gain and phase, noise, latency and skew.
+"""Imperfections of a bench: of its amplifiers, its plate and ERAs, and the fingers on it.
 
-Not modelled: clock drift, distortion, drifting errors.
+Errors of gain and phase, noise, latency and skew of the amplifiers; a plate and ERAs that differ
+from the rig's, and fingers that do not weigh alike. Not modelled: clock drift, distortion, drifting
+errors, ERAs in other places.
 """
 
 import cmath
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from zlib import crc32
 
 import numpy as np
 
 from model.errors import InputError
+from model.fem.plate_mesh import PlateMesh
+from model.rig.meshes import mesh_of
 from model.rig.rig import Channel, Rig
+from model.structure.actuator import Era
+from model.structure.fingertip import Fingertip
 from model.transients.base_motion import Term
-from model.vibration.excitation import GAIN_ERROR, PHASE_ERROR
+from model.vibration.discretisation import finer_mesh
 from sim.waveform import Output
+
+_MAX_LOSS_FACTOR = 0.99
+_MIN_FACTOR = 0.05  # of a normal draw about 1, which may be negative
 
 NOISE_LINES = 32
 NOISE_LOW, NOISE_HIGH = 10.0, 1000.0  # Hz
@@ -37,16 +47,50 @@ class ChannelErrors:
 
 
 @dataclass(frozen=True)
+class PlateErrors:
+    """A plate on its ERAs relative to the rig's: factors, by default 1.
+
+    stiffness: by ERA; era_damping: of all ERAs; mesh: on which it is solved, None for the rig's.
+    """
+
+    thickness: float = 1.0
+    loss_factor: float = 1.0
+    era_damping: float = 1.0
+    stiffness: Mapping[str, float] = field(default_factory=dict)
+    mesh: PlateMesh | None = None
+
+    def realised(self, rig: Rig) -> Rig:
+        """The rig whose plate and ERAs have these errors."""
+
+        def of(era: Era) -> Era:
+            return replace(
+                era,
+                stiffness=self.stiffness.get(era.name, 1.0) * era.stiffness,
+                damping=self.era_damping * era.damping,
+            )
+
+        plate = replace(
+            rig.plate,
+            thickness=self.thickness * rig.plate.thickness,
+            loss_factor=min(self.loss_factor * rig.plate.loss_factor, _MAX_LOSS_FACTOR),
+        )
+        return replace(rig, plate=plate, eras=tuple(map(of, rig.eras)), mesh=self.mesh or rig.mesh)
+
+
+@dataclass(frozen=True)
 class Imperfections:
     """Imperfections of a bench, by default none.
 
     channels: errors by channel; latency [s]: from a command to the base motion; skew [s]: added to
-    the latency, by amplifier; seed: of the noise.
+    the latency, by amplifier; plate: errors of the plate and its ERAs; fingertip: standard
+    deviation of the logarithm of a finger's load; seed: of the noise and of these loads.
     """
 
     channels: Mapping[Channel, ChannelErrors] = field(default_factory=dict)
     latency: float = 0.0
     skew: Mapping[str, float] = field(default_factory=dict)
+    plate: PlateErrors = field(default_factory=PlateErrors)
+    fingertip: float = 0.0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -78,31 +122,55 @@ class Imperfections:
         """Delay from a command of this amplifier to the base motion [s]."""
         return self.latency + self.skew.get(amplifier, 0.0)
 
+    def load_of(self, finger: str, fingertip: Fingertip) -> Fingertip:
+        """The load of a finger by its id, always the same."""
+        if self.fingertip == 0:
+            return fingertip
+        rng = np.random.default_rng([self.seed, crc32(finger.encode())])
+        return fingertip.multiplied(math.exp(self.fingertip * rng.standard_normal()))
+
 
 def draw_imperfections(
-    rig: Rig,
-    *,
-    gain: float = GAIN_ERROR,
-    phase: float = PHASE_ERROR,
-    noise: float = 0.0,
-    latency: float = 0.0,
-    skew: float = 0.0,
-    seed: int = 0,
+    rig: Rig, *, noise: float = 0.0, latency: float = 0.0, skew: float = 0.0, seed: int = 0
 ) -> Imperfections:
-    """Draw errors for all channels and amplifiers of a rig.
+    """Draw the plate, ERAs, channels and fingers of a rig within its uncertainty, all normal.
 
-    gain, phase [rad]: standard deviations, by default those of the robust contrast; noise: rms of
-    every channel; latency [s]; skew [s]: maximum, uniformly distributed.
+    noise: rms of every channel; latency [s]; skew [s]: maximum, uniformly distributed over the
+    amplifiers. The plate is solved on another mesh than the rig's, as accurate as `mesh: auto`.
     """
     rng = np.random.default_rng(seed)
+    std = rig.uncertainty
+
+    def relative(deviation: float) -> float:
+        return max(_MIN_FACTOR, 1 + deviation * rng.standard_normal())
+
     channels = {
         channel: ChannelErrors(
-            max(0.0, 1 + gain * rng.standard_normal()), phase * rng.standard_normal(), noise
+            relative(std.gain), math.radians(std.phase_deg) * rng.standard_normal(), noise
         )
         for channel in rig.wiring.values()
     }
     late = {name: float(rng.uniform(0, skew)) for name in rig.amplifiers}
-    return Imperfections(channels, latency, late, seed)
+    plate = PlateErrors(
+        thickness=relative(std.thickness),
+        loss_factor=std.damping ** rng.standard_normal(),
+        era_damping=std.damping ** rng.standard_normal(),
+        stiffness={era.name: relative(std.stiffness) for era in rig.eras},
+        mesh=_other_mesh(rig),
+    )
+    return Imperfections(channels, latency, late, plate, std.fingertip, seed)
+
+
+def _other_mesh(rig: Rig) -> PlateMesh:
+    """A mesh as accurate as `mesh: auto` or more, and not the rig's."""
+    highest = rig.limits.frequency_max
+    stiffest = max(era.stiffness for era in rig.eras)
+    mesh = finer_mesh(
+        rig.plate,
+        mesh_of("auto", rig.plate, frequency_max=highest, stiffness=stiffest),
+        frequency_max=highest,
+    )
+    return mesh if mesh != rig.mesh else finer_mesh(rig.plate, mesh, frequency_max=highest)
 
 
 def delayed(output: Output, delay: float) -> Output:

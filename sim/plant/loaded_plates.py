@@ -1,8 +1,8 @@
 """The plate's equations of motion under fingers, solved once for each set of contacts.
 
-A finger is a mass, a spring and a damper at a point: a low-rank change. The reduced basis is
-extended by the static vectors of the point, and the small system diagonalised again. Solutions are
-cached. Structural damping remains that of the plate on its ERAs.
+A fingertip acts at a point, and its phalanx moves: a low-rank change and one more coordinate. The
+reduced basis is extended by the static vectors of the point, and the small system diagonalised
+again. Solutions are cached. Structural damping remains that of the plate on its ERAs.
 """
 
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ import numpy as np
 from model.arrays import FloatArray
 from model.reduction.reduced_plate import ReducedPlate
 from model.structure.actuator import Era
+from model.structure.fingertip import FingertipLoad
 from model.structure.point_load import PointLoad
 from model.transients.time_response import PlateInTime, plate_in_time
 
@@ -34,7 +35,7 @@ _MAX_SOLVED = 32  # sets of contacts, of about a megabyte each
 class LoadedPlate:
     """The plate under a set of contacts, reduced for forces at them."""
 
-    contacts: tuple[PointLoad, ...]
+    contacts: tuple[FingertipLoad, ...]
     reduced: ReducedPlate
     plate: PlateInTime
     _tables: dict[float, FloatArray] = field(default_factory=dict)
@@ -65,7 +66,7 @@ class LoadedPlateCache:
         self._solved = lru_cache(_MAX_SOLVED)(self._solve)
         self._reduced_at = lru_cache(_MAX_SOLVED)(self._reduce)
 
-    def under(self, contacts: Sequence[PointLoad], *, time: float) -> LoadedPlate:
+    def under(self, contacts: Sequence[FingertipLoad], *, time: float) -> LoadedPlate:
         """The plate under these contacts from a time [s]; calls must be in order of time."""
         resting = tuple(sorted({(each.x, each.y, each.foot) for each in contacts}))
         for point in self._resting:
@@ -80,7 +81,9 @@ class LoadedPlateCache:
         self._lifted = {point: self._lifted[point] for point in recent}
         return self._solved((*resting, *sorted(recent)), tuple(contacts))
 
-    def _solve(self, points: tuple[Footprint, ...], contacts: tuple[PointLoad, ...]) -> LoadedPlate:
+    def _solve(
+        self, points: tuple[Footprint, ...], contacts: tuple[FingertipLoad, ...]
+    ) -> LoadedPlate:
         if not points:
             unloaded = _solve_unloaded(self._unloaded, self._eras, self._loads)
             return LoadedPlate(contacts, self._unloaded, unloaded)

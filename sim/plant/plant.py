@@ -4,7 +4,7 @@ The exact solutions are those of `model.transients.time_response`; the plant add
 present base motion, and the free vibration that remains after each change.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from model.arrays import FloatArray
 from model.reduction.reduced_plate import ReducedPlate
 from model.structure.actuator import Era
+from model.structure.fingertip import FingertipLoad
 from model.structure.point_load import PointLoad
 from model.transients.base_motion import Term
 from model.transients.time_response import ParticularSolution
@@ -42,6 +43,7 @@ class Plant:
         self.time = time
         self._plates = LoadedPlateCache(reduced, eras, loads)
         self._current: LoadedPlate = self._plates.under((), time=time)
+        self._contacts: Mapping[str, FingertipLoad] = {}
         self._free = np.zeros(len(self._current.plate.decay), dtype=complex)
         self._particular: list[list[ParticularSolution]] = [[] for _ in eras]
 
@@ -51,18 +53,23 @@ class Plant:
         return self._current.reduced
 
     @property
-    def contacts(self) -> tuple[PointLoad, ...]:
-        """The present contacts."""
-        return self._current.contacts
+    def contacts(self) -> Mapping[str, FingertipLoad]:
+        """The present contacts by id of the finger."""
+        return self._contacts
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
         """Present displacement and velocity, (r,) each, in the coordinates of `reduced`."""
-        x = (self._current.plate.free_state @ self._free).real
-        for solution in self._active():
-            x = x + solution.state(self.time)
-        r = len(x) // 2
-        return x[:r], x[r:]
+        q, v = self._state()
+        r = len(self.reduced.omega)
+        return q[:r], v[:r]
+
+    @property
+    def phalanges(self) -> tuple[FloatArray, FloatArray]:
+        """Present displacement [m] and velocity [m/s] of each contact's phalanx, (n,) each."""
+        q, v = self._state()
+        r = len(self.reduced.omega)
+        return q[r:], v[r:]
 
     def set_input(self, era: int, terms: Sequence[Term]) -> None:
         """Set the base motion of an ERA from now on; terms may start later."""
@@ -79,25 +86,28 @@ class Plant:
         ]
         self._exchange(self._active_of(gone), self._active_of(new))
 
-    def set_contacts(self, contacts: Sequence[PointLoad]) -> None:
-        """Replace the contacts; each finger's spring is relaxed at the rest plane.
+    def set_contacts(self, contacts: Mapping[str, FingertipLoad]) -> None:
+        """Replace the contacts, by id of the finger; a new finger's phalanx is at rest.
 
-        Displacement and velocity of the plate are continuous; energy in the spring and mass of a
-        finger comes and goes with it.
+        Displacement and velocity of the plate, and of the phalanges of fingers that stay, are
+        continuous; energy in pulp, masses and joint of a finger comes and goes with it.
         """
-        if tuple(contacts) == self.contacts:
+        if contacts == self._contacts:
             return
+        phalanges = dict(zip(self._contacts, np.transpose(self.phalanges), strict=True))
         q, v = self.state
         before = self._current.reduced
-        self._current = self._plates.under(contacts, time=self.time)
+        self._current = self._plates.under(tuple(contacts.values()), time=self.time)
+        self._contacts = dict(contacts)
         if self._current.reduced is not before:
             carried = self._current.reduced.projection_from(before)
             q, v = carried @ q, carried @ v
+        x, dx = np.reshape([phalanges.get(id, (0.0, 0.0)) for id in contacts], (-1, 2)).T
         self._particular = [
             self._current.plate.particular_solutions(era, [solution.term for solution in solutions])
             for era, solutions in enumerate(self._particular)
         ]
-        remainder = np.concatenate([q, v])
+        remainder = np.concatenate([q, x, v, dx])
         for solution in self._active():
             remainder = remainder - solution.state(self.time)
         self._free = self._current.plate.to_free @ remainder
@@ -113,6 +123,7 @@ class Plant:
         first = np.floor(self.time * sample_rate) + 1
         last = np.floor(to_time * sample_rate)
         times = np.arange(first, last + 1) / sample_rate
+        shapes = self._current.plate.with_phalanges(shapes)
         # Few points are sampled directly, many by way of the coordinates.
         points = shapes if len(shapes) < 2 * shapes.shape[1] else np.eye(shapes.shape[1])
         samples = np.empty((len(times), len(points)))
@@ -133,6 +144,14 @@ class Plant:
         for boundary in self._boundaries(to_time):
             self._cross_boundary(boundary)
         self._propagate_free(to_time)
+
+    def _state(self) -> tuple[FloatArray, FloatArray]:
+        """Displacement and velocity of all coordinates, the phalanges' last."""
+        x = (self._current.plate.free_state @ self._free).real
+        for solution in self._active():
+            x = x + solution.state(self.time)
+        r = len(x) // 2
+        return x[:r], x[r:]
 
     def _active(self) -> list[ParticularSolution]:
         return [

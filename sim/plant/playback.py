@@ -13,10 +13,10 @@ from model.counting import counted
 from model.errors import InputError
 from model.finger.contrast import contrast_db, mean_level_db_sl
 from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.load import FingerLoad
 from model.finger.perception import sensation_level
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
+from model.structure.fingertip import FingertipLoad
 from model.table.pattern import ONSET_RAMP
 from model.table.question import Question
 from model.transients.envelope import Envelopes, ramped_onset, shaped
@@ -113,12 +113,11 @@ def play(
     duration: float,
     ramp: float = ONSET_RAMP,
     onset: Envelopes | None = None,
-    finger_load: FingerLoad | None = None,
 ) -> Playback:
     """Play an excitation for a duration [s] on a plate at rest, under these fingers.
 
-    reduced: the rig's plate for forces at its ERAs and loads; ramp [s], or onset in its place;
-    finger_load: None for fingers without weight. Raises InputError for fingers off the plate, an
+    The fingers load the plate as the rig's fingertip. reduced: the rig's plate for forces at its
+    ERAs and loads; ramp [s], or onset in its place. Raises InputError for fingers off the plate, an
     excitation that the rig cannot play, and a duration out of range.
     """
     fingers.check_on(rig.plate)
@@ -131,8 +130,9 @@ def play(
         )
     plant = Plant(reduced, rig.eras, loads=rig.masses)
     contacts = (*fingers.targets, *fingers.quiet)
-    if finger_load is not None:
-        plant.set_contacts([finger_load.at(*at) for at in contacts])
+    if rig.fingertip is not None:
+        tip = rig.fingertip
+        plant.set_contacts({str(n): FingertipLoad(*at, tip) for n, at in enumerate(contacts)})
     bases = shaped(onset, rig.eras) if onset else ramped_onset(excitation, rig.eras, ramp=ramp)
     for number, terms in enumerate(bases):
         plant.set_input(number, terms)

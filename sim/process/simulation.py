@@ -12,7 +12,6 @@ from pathlib import Path
 
 from drivers import clock
 from drivers.operation.garbage_collection import no_long_collections
-from model.finger.load import FingerLoad
 from model.rig.rig import Rig
 from sim.bench.bench import Bench, keep_time
 from sim.bench.simulated_device import SimulatedDevice
@@ -22,6 +21,7 @@ from sim.far_ends.wire_assignment import WireAssignment
 from sim.far_ends.wires import open_wires
 from sim.faults.fault_file import FaultFile
 from sim.plant.fingers import Position
+from sim.plant.imperfections import Imperfections
 from sim.plant.plant import SAMPLE_RATE
 from sim.process.virtual_time import SteppedLoop
 from sim.sensors.accelerometer import Accelerometer
@@ -34,16 +34,16 @@ class Simulation:
     """A rig and the wires of its amplifiers, by name.
 
     faults: with times from when the URLs are printed; fingers: initial positions [m];
-    finger_load: None for fingers without weight; sample_rate [Hz]: of sensors and fingers; control:
-    path of the control socket; record: file for the readings of the whole run; until_eof: end with
-    standard input.
+    imperfections: in what the bench differs from the rig; sample_rate [Hz]: of sensors and fingers;
+    control: path of the control socket; record: file for the readings of the whole run; until_eof:
+    end with standard input.
     """
 
     rig: Rig
     wires: Mapping[str, WireAssignment]
     faults: FaultFile = field(default_factory=lambda: FaultFile(()))
     fingers: Mapping[str, Position] = field(default_factory=dict)
-    finger_load: FingerLoad | None = None
+    imperfections: Imperfections = field(default_factory=Imperfections)
     sensors: Sequence[Accelerometer] = ()
     sample_rate: float = SAMPLE_RATE
     control: Path | None = None
@@ -74,7 +74,7 @@ async def run_simulation(
         simulation.rig,
         now=clock.now(),
         sample_rate=simulation.sample_rate,
-        finger_load=simulation.finger_load,
+        imperfections=simulation.imperfections,
     )
     if ended.is_set():
         return None

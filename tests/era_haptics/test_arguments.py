@@ -26,7 +26,6 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     PLATE.map: {"drive": DRIVE, "raster": (3, 3)},
     PLATE.play: {
         "drive": DRIVE, "target": TARGET, "quiet": (), "duration": 0.3,
-        "finger_load": era.FingerLoad(),
     },
     era.draw_map: {"plate": PLATE, "drive": DRIVE},
     era.draw_pattern: {"table": None, "pattern": PATTERN, "target": TARGET, "quiet": ()},
@@ -34,7 +33,6 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.open_amplifier: {"rig": RIG, "name": "main", "url": "sim://"},
     era.commands_for: {"rig": RIG, "drive": DRIVE},
     era.Drive: {"frequency": 110.0, "level": 1.0, "phase_deg": 0.0},
-    era.FingerLoad: {"stiffness": 1.0, "damping": 1.0, "mass": 0.0, "foot": 0.005},
     era.Grid: {"nx": 4, "ny": 3},
 }  # fmt: skip
 """Valid arguments by function; None: a small table."""

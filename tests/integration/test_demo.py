@@ -57,7 +57,9 @@ def demo(environment, tmp_path, monkeypatch, capsys):
 
     def run_demo(*arguments):
         commands = entry_points(group="era_haptics.commands")
-        status = run(["demo", *map(str, arguments), "--out", str(tmp_path), "--json"], commands)
+        status = run(
+            ["demo", "--exact", *map(str, arguments), "--out", str(tmp_path), "--json"], commands
+        )
         printed = capsys.readouterr()
         assert status == 0, printed.err
         return json.loads(printed.out)

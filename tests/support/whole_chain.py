@@ -108,7 +108,7 @@ class Chain:
     async def _place(self, stream: Stream) -> None:
         """Place fingers and sensors."""
         fingers = {name: list(at) for name, at in stream.places.items()}
-        await self.control.ask("fingers", fingers=fingers)
+        await self.control.ask("fingers", fingers=fingers, observers=list(fingers))
         sensors = {name: {"at_m": list(at)} for name, at in SENSORS.items()}
         await self.control.ask("sensors", sensors=sensors)
         await self.daemon.client.subscribe("pattern")
@@ -193,7 +193,7 @@ async def running_chain(
         path = folder / "plate"
         witness = None
         if wires is None:
-            urls = {"main": f"sim://{quote(str(truth))}?control={quote(str(path))}"}
+            urls = {"main": f"sim://{quote(str(truth))}?control={quote(str(path))}&exact"}
         else:
             wired = [o for name, wire in wires.items() for o in ("--wire", f"{name}={wire}")]
             far_end = await stack.enter_async_context(

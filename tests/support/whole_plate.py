@@ -5,7 +5,7 @@ and structural damping is made of all modes of the supported plate by the formul
 documentation; none of it is the code of the plate in time.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +15,8 @@ from model.arrays import ComplexArray, FloatArray
 from model.fem.assembly import PlateMatrices, assemble
 from model.fem.mesh import Mesh
 from model.structure.actuator import Era
+from model.structure.fingertip import FingertipLoad
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad
 
 Motion = Callable[[float], tuple[float, float]]
 """Displacement [m] and velocity [m/s] of a base at a time [s]."""
@@ -34,19 +34,31 @@ class WholePlate:
     hold: FloatArray
 
     def with_contacts(
-        self, contacts: Sequence[PointLoad]
+        self, contacts: Mapping[str, FingertipLoad]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """M, C, K with fingers on it."""
-        M, C, K = self.M.copy(), self.C.copy(), self.K.copy()
-        for each in contacts:
-            touch = self.matrices.deflection_at(np.array([[each.x, each.y]])).toarray()
-            M += each.mass * touch.T @ touch
-            C += each.damping * touch.T @ touch
-            K += each.stiffness * touch.T @ touch
+        """M, C, K (dof + n, dof + n) with n fingers on it, the phalanges' displacements last."""
+        dof, n = len(self.M), len(contacts)
+        M, C, K = (np.pad(each, (0, n)) for each in (self.M, self.C, self.K))
+        for number, each in enumerate(contacts.values(), start=dof):
+            tip = each.fingertip
+            touch = np.zeros(dof + n)
+            touch[:dof] = self.matrices.deflection_at(np.array([[each.x, each.y]])).toarray()[0]
+            squeezed = touch.copy()
+            squeezed[number] = -1.0
+            M += tip.contact_mass * np.outer(touch, touch)
+            C += tip.damping * np.outer(squeezed, squeezed)
+            K += tip.stiffness * np.outer(squeezed, squeezed)
+            M[number, number] += tip.phalanx_mass
+            C[number, number] += tip.joint_damping
+            K[number, number] += tip.joint_stiffness
         return M, C, K
 
     def steady(
-        self, driven: int, frequency: float, points: FloatArray, contacts: Sequence[PointLoad]
+        self,
+        driven: int,
+        frequency: float,
+        points: FloatArray,
+        contacts: Mapping[str, FingertipLoad],
     ) -> ComplexArray:
         """Acceleration per base amplitude [1/s²] at points, one ERA driven as sin, solved whole."""
         M, C, K = self.with_contacts(contacts)
@@ -54,13 +66,14 @@ class WholePlate:
         push = (self.eras[driven].stiffness + 1j * w * self.eras[driven].damping) * self.hold[
             driven
         ]
-        answer = linalg.solve(K + 1j * w * C - w**2 * M, push)
+        dynamic = K + 1j * w * C - w**2 * M
+        answer = linalg.solve(dynamic, np.pad(push, (0, len(contacts))))[: len(push)]
         return np.asarray(-(w**2) * self.matrices.deflection_at(points) @ answer)
 
     def stepped(
         self,
         bases: Sequence[Motion],
-        contacts: Sequence[tuple[float, Sequence[PointLoad]]],
+        contacts: Sequence[tuple[float, Mapping[str, FingertipLoad]]],
         *,
         until: float,
         step: float,
@@ -69,12 +82,13 @@ class WholePlate:
         """Displacement, velocity and acceleration (n, dof) from rest, every so many steps.
 
         By Newmark's method of the mean acceleration. step [s]; contacts: from when on which fingers
-        rest on the plate, at multiples of the step. A sample at such a moment is still of the plate
-        as it was before.
+        rest on the plate, at multiples of the step; those that stay take their phalanx along, new
+        ones come with it at rest. A sample at such a moment is still of the plate as it was before.
         """
-        count = round(until / step)
+        count, dof = round(until / step), len(self.M)
         begins = {round(begin / step): fingers for begin, fingers in contacts}
-        M, C, K = self.with_contacts(begins.pop(0, ()))
+        resting = begins.pop(0, {})
+        M, C, K = self.with_contacts(resting)
         u, v = np.zeros(len(M)), np.zeros(len(M))
 
         def force(number: int) -> FloatArray:
@@ -83,20 +97,28 @@ class WholePlate:
                 era.stiffness * y + era.damping * dy
                 for era, (y, dy) in zip(self.eras, motion, strict=True)
             ]
-            return np.asarray(np.array(size) @ self.hold)
+            return np.pad(np.array(size) @ self.hold, (0, len(resting)))
 
         inverse = linalg.inv(M + step / 2 * C + step**2 / 4 * K)
         a = linalg.solve(M, force(0))
-        samples = np.empty((3, count // every, len(M)))
+        samples = np.empty((3, count // every, dof))
         for number in range(1, count + 1):
             u_guess = u + step * v + step**2 / 4 * a
             v_guess = v + step / 2 * a
             a = inverse @ (force(number) - C @ v_guess - K @ u_guess)
             u, v = u_guess + step**2 / 4 * a, v_guess + step / 2 * a
             if number % every == 0:
-                samples[:, number // every - 1] = u, v, a
+                samples[:, number // every - 1] = u[:dof], v[:dof], a[:dof]
             if number in begins:
-                M, C, K = self.with_contacts(begins[number])
+                u, v = (
+                    np.concatenate(
+                        [each[:dof], [dict(zip(resting, each[dof:], strict=True)).get(id, 0.0)
+                                      for id in begins[number]]]
+                    )
+                    for each in (u, v)
+                )  # fmt: skip
+                resting = begins[number]
+                M, C, K = self.with_contacts(resting)
                 inverse = linalg.inv(M + step / 2 * C + step**2 / 4 * K)
                 a = linalg.solve(M, force(number) - C @ v - K @ u)
         return samples[0], samples[1], samples[2]

@@ -12,6 +12,7 @@ from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
 from model.finger.fingertip import fingertip_points
 from model.rig.rig import Rig
+from model.structure.fingertip import Fingertip, FingertipLoad
 from model.structure.point_load import PointLoad
 from plate_in_time import apart
 from sim.bench.bench import Bench
@@ -39,13 +40,14 @@ def test_bench_felt_vibration_agrees_with_the_model(coarse_rig: Rig, is_heavy: b
     keep_alive(bench, START + 4.0, every=0.05)
     felt = bench.felt(START + 3.5, START + 4.0)
     matrices = assemble(rig.plate, rig.mesh)
+    tips = [FingertipLoad(*at, Fingertip()) for at in fingers.values()]
     heavy = [PointLoad(0.1, 0.15, mass=0.05), PointLoad(0.3048, 0.1, mass=0.03)]
     for name, at in fingers.items():
         points = fingertip_points(*at, rig.plate)
         expected = {}
         for loads in ((), heavy):
             unit = direct_acceleration(
-                matrices, rig.eras, np.array([110.0, 230.0]), points, loads=loads
+                matrices, rig.eras, np.array([110.0, 230.0]), points, loads=[*loads, *tips]
             )
             expected[bool(loads)] = np.abs([unit[0, 0] - 0.5 * unit[0, 2], 0.7 * unit[1, 3]])
         assert felt[name].frequencies == (110.0, 230.0)

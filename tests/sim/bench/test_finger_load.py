@@ -1,18 +1,18 @@
 """Fingers that load the plate of the bench, against the direct solve with what they weigh."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bench_driving import keep_alive, play
 from drivers.command import DriveCommand
 from model.arrays import FloatArray
-from model.errors import InputError
 from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
 from model.finger.fingertip import fingertip_points
-from model.finger.load import FingerLoad, parse_finger_load
 from model.rig.rig import Rig
-from model.structure.point_load import PointLoad
+from model.structure.fingertip import Fingertip, FingertipLoad
 from plate_in_time import apart, lock_in
 from sim.bench.bench import Bench
 from sim.sensors.accelerometer import Accelerometer, Accelerometers
@@ -22,7 +22,7 @@ FREQUENCY = 210.0
 FULL_STROKE = DriveCommand(1, FREQUENCY, 1.0)
 
 
-def expected(rig: Rig, loads: tuple[PointLoad, ...]) -> FloatArray:
+def expected(rig: Rig, loads: tuple[FingertipLoad, ...]) -> FloatArray:
     """Amplitudes [m/s²] under finger A by the direct solve, one ERA at full stroke."""
     points = fingertip_points(*A, rig.plate)
     matrices = assemble(rig.plate, rig.mesh)
@@ -32,23 +32,25 @@ def expected(rig: Rig, loads: tuple[PointLoad, ...]) -> FloatArray:
 
 def test_bench_fingers_load_the_plate(coarse_rig: Rig) -> None:
     """What A feels alone, after B came, and after B went, each once the plate has settled."""
-    load = FingerLoad(2000.0, 3.0, 0.005)
-    bench = Bench(coarse_rig, now=0.0, finger_load=load)
+    tip = Fingertip(2000.0, 3.0, 0.005)
+    bench = Bench(replace(coarse_rig, fingertip=tip), now=0.0)
     bench.place_fingers({"a": A}, now=0.0)
     play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
     for positions in ({"a": A}, {"a": A, "b": B}, {"a": A}):
         bench.place_fingers(positions, now=bench.time)
         keep_alive(bench, bench.time + 4)
-        truth = expected(coarse_rig, tuple(load.at(*at) for at in positions.values()))
+        truth = expected(coarse_rig, tuple(FingertipLoad(*at, tip) for at in positions.values()))
         (amplitude,) = bench.felt(bench.time - 0.5, bench.time)["a"].amplitude
         assert apart(amplitude, truth) < 0.005
-    assert apart(truth, expected(coarse_rig, (load.at(*A), load.at(*B)))) > 0.02
+    assert (
+        apart(truth, expected(coarse_rig, (FingertipLoad(*A, tip), FingertipLoad(*B, tip)))) > 0.02
+    )
 
 
 def test_bench_observers_have_no_weight(coarse_rig: Rig) -> None:
-    """By default no finger loads the plate; where fingers do, an observer beside them does not."""
-    bare = Bench(coarse_rig, now=0.0)
-    observed = Bench(coarse_rig, now=0.0, finger_load=FingerLoad(mass=0.02))
+    """Fingers of a rig with none load nothing; where fingers do, an observer does not."""
+    bare = Bench(replace(coarse_rig, fingertip=None), now=0.0)
+    observed = Bench(replace(coarse_rig, fingertip=Fingertip(contact_mass=0.02)), now=0.0)
     bare.place_fingers({"a": A, "b": B}, now=0.0)
     observed.place_fingers({"a": A, "b": B}, now=0.0, observers={"a", "b"})
     for bench in (bare, observed):
@@ -60,8 +62,8 @@ def test_bench_observers_have_no_weight(coarse_rig: Rig) -> None:
 
 def test_bench_sensors_read_through_a_touch(coarse_rig: Rig) -> None:
     """An accelerometer hears the whole time while a finger comes, at every sample, truly."""
-    load = FingerLoad(mass=0.005)
-    bench = Bench(coarse_rig, now=0.0, finger_load=load)
+    tip = Fingertip(contact_mass=0.005)
+    bench = Bench(replace(coarse_rig, fingertip=tip), now=0.0)
     sensors = Accelerometers(bench)
     sensors.place([Accelerometer("P1", 0.2, 0.03)])
     play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
@@ -77,26 +79,6 @@ def test_bench_sensors_read_through_a_touch(coarse_rig: Rig) -> None:
         coarse_rig.eras,
         np.array([FREQUENCY]),
         np.array([[0.2, 0.03]]),
-        loads=[load.at(*B)],
+        loads=[FingertipLoad(*B, tip)],
     )
     assert amplitude == pytest.approx(abs(answer[0, 1, 0]), rel=0.01)
-
-
-@pytest.mark.parametrize(
-    ("text", "load"),
-    [
-        ("light", FingerLoad(1000.0, 2.0, 0.0002)),  # that of the robust contrast
-        ("1.5 kN/m, 0.5 N s/m, 0.3 g", FingerLoad(1500.0, 0.5, 0.0003)),
-        ("1500,0.5,0.0003", FingerLoad(1500.0, 0.5, 0.0003)),
-    ],
-)
-def test_parse_finger_load_with_and_without_units(text: str, load: FingerLoad) -> None:
-    """Stiffness, damping, mass; bare numbers are SI."""
-    assert parse_finger_load(text, what="--finger-load") == load
-
-
-@pytest.mark.parametrize("text", ["heavy", "1,2", "1000,2,0.2 m", "-1000,2,0", "nan,2,0"])
-def test_parse_finger_load_refuses_invalid_text(text: str) -> None:
-    """The error names the option."""
-    with pytest.raises(InputError, match="--finger-load"):
-        parse_finger_load(text, what="--finger-load")

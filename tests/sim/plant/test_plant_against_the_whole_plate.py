@@ -1,6 +1,6 @@
 """The plate in time against the unreduced finite-element plate: transients and steady states."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,26 +11,26 @@ from driven_bases import BASES, STILL, STROKE, Base
 from model.arrays import ComplexArray, FloatArray
 from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
-from model.finger.load import FingerLoad
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.actuator import Era
-from model.structure.point_load import PointLoad, footprints_of
+from model.structure.fingertip import FingertipLoad
+from model.structure.point_load import footprints_of
 from model.transients.base_motion import Term
 from paper_plate import make_paper_rig
 from plate_in_time import apart, lock_in
+from resting_fingers import resting
 from sim.plant.plant import Plant
 from whole_plate import WholePlate, whole_plate
 
 RATE = 100_000.0
-FINGER = FingerLoad()
-FIRST, SECOND, MOVED = FINGER.at(0.11, 0.07), FINGER.at(0.25, 0.15), FINGER.at(0.19, 0.12)
-COMING_AND_GOING: list[tuple[float, list[PointLoad]]] = [
-    (0.0312, [FIRST]),
-    (0.05, [FIRST, SECOND]),
-    (0.06, [MOVED, SECOND]),
-    (0.085, [MOVED]),
-    (0.1, []),
+FIRST, SECOND, MOVED = (0.11, 0.07), (0.25, 0.15), (0.19, 0.12)
+COMING_AND_GOING: list[tuple[float, Mapping[str, FingertipLoad]]] = [
+    (0.0312, resting(FIRST)),
+    (0.05, resting(FIRST, SECOND)),
+    (0.06, resting(MOVED, SECOND)),
+    (0.085, resting(MOVED)),
+    (0.1, {}),
 ]
 
 
@@ -85,7 +85,7 @@ def test_plant_with_changing_contacts_agrees_with_newmark(
     """
     plant = Plant(reduced, rig.eras)
     set_bases(plant, BASES)
-    points = np.vstack([rig.mesh.nodes, [[each.x, each.y] for each in (FIRST, SECOND, MOVED)]])
+    points = np.vstack([rig.mesh.nodes, [FIRST, SECOND, MOVED]])
     pieces, states = [], []
     for until, contacts in [*COMING_AND_GOING, (0.12, None)]:
         shapes = plant.reduced.at(points)
@@ -125,9 +125,9 @@ def test_plant_steady_state_agrees_with_the_full_model(
     """Within 0.1 % of the unreduced plate's frequency response, before, under and after fingers."""
     plant = Plant(reduced, rig.eras)
     plant.set_input(2, [Term(0.0, np.inf, 2 * np.pi * frequency, STROKE)])
-    points = np.vstack([rig.mesh.nodes, [[each.x, each.y] for each in (FIRST, SECOND, MOVED)]])
+    points = np.vstack([rig.mesh.nodes, [FIRST, SECOND, MOVED]])
     until = 0.0
-    for contacts in ([], [FIRST, SECOND], [MOVED, SECOND], []):
+    for contacts in ({}, resting(FIRST, SECOND), resting(MOVED, SECOND), {}):
         plant.set_contacts(contacts)
         until += 10.0
         plant.skip(until)
@@ -143,14 +143,14 @@ def test_plant_steady_state_under_fingers_agrees_with_the_direct_solve(rig: Rig)
     fine = make_paper_rig(24, 18)
     lossless = replace(fine.plate, loss_factor=0.0)
     reduced = reduce_plate(lossless, fine.mesh, footprints_of(rig.eras))
-    contacts = [FIRST, SECOND]
+    contacts = resting(FIRST, SECOND)
     plant = Plant(reduced, rig.eras)
     plant.skip(1.0)
-    plant.set_contacts([MOVED])
+    plant.set_contacts(resting(MOVED))
     points = np.array([[0.05, 0.05], [0.11, 0.07], [0.25, 0.15], [0.3048, 0.1]])
     frequencies = np.array([60.0, 110.0, 250.0, 500.0])
     direct = direct_acceleration(
-        assemble(lossless, fine.mesh), rig.eras, frequencies, points, loads=contacts
+        assemble(lossless, fine.mesh), rig.eras, frequencies, points, loads=[*contacts.values()]
     )
     for row, frequency in enumerate(frequencies):
         plant.set_input(1, [Term(plant.time, np.inf, 2 * np.pi * frequency, STROKE)])
@@ -160,7 +160,7 @@ def test_plant_steady_state_under_fingers_agrees_with_the_direct_solve(rig: Rig)
         found = phasors(plant, points, 1, float(frequency), begin + 50.0)
         turn = np.exp(2j * np.pi * frequency * begin)
         assert apart(found * turn, direct[row, 1] / rig.eras[1].stroke) < 1e-3
-        plant.set_contacts([MOVED])
+        plant.set_contacts(resting(MOVED))
 
 
 def test_plant_viscous_equivalent_agrees_with_the_loss_factor() -> None:

@@ -1,6 +1,7 @@
 """Fingers that load the plate while it vibrates: nothing jumps, nothing is gained or lost."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +11,13 @@ from driven_bases import Base, faded_base, shaped_base
 from finger_energy import held_by_fingers
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
-from model.finger.load import FingerLoad, finger_loads
 from model.reduction.modal_matrices import modal_matrices
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
-from model.structure.point_load import PointLoad, footprints_of
+from model.structure.fingertip import FingertipLoad
+from model.structure.point_load import footprints_of
 from model.transients.base_motion import Term
+from resting_fingers import FINGERTIP, resting
 from sim.plant.plant import Plant
 
 STROKE = 1e-4
@@ -24,7 +26,8 @@ BASES = (
     faded_base(0.7 * STROKE, 250.0, -1.0, rise=(0.01, 0.03), fall=(0.09, 0.1)),
     shaped_base(STROKE, 171.0, start=0.002, step=0.005, knots=(0, 0.5, 0.8j, -0.3, 0)),
 )
-FINGERS = finger_loads([(0.11, 0.07), (0.25, 0.15), (0.3048, 0.1)])
+PLACES = ((0.11, 0.07), (0.25, 0.15), (0.3048, 0.1))
+ONE, TWO, THREE = resting(PLACES[0]), resting(*PLACES[:2]), resting(*PLACES)
 
 
 @pytest.fixture(scope="module")
@@ -59,18 +62,25 @@ def stored(plant: Plant, rig: Rig) -> float:
 def test_contacts_keep_displacement_and_velocity_continuous(
     coarse_rig: Rig, reduced: ReducedPlate
 ) -> None:
-    """Fingers come, press harder, move and go: the whole plate goes on from where it is."""
+    """Fingers come, press harder, move and go: the whole plate goes on from where it is.
+
+    So do the phalanges of fingers that stay; those of new fingers are at rest.
+    """
     plant = vibrating(reduced, coarse_rig)
-    harder = FingerLoad(3000.0, 5.0, 0.001).at(FINGERS[0].x, FINGERS[0].y)
-    elsewhere = FingerLoad().at(0.2, 0.2)
-    changes: list[Sequence[PointLoad]] = [
-        FINGERS[:1], FINGERS, [harder, *FINGERS[1:]], [harder, elsewhere], [elsewhere], []
+    harder = replace(FINGERTIP, stiffness=3000.0, damping=5.0, contact_mass=0.001)
+    pressed = resting(PLACES[0], fingertip=harder)
+    elsewhere = {"b": FingertipLoad(0.2, 0.2, FINGERTIP)}
+    changes: list[Mapping[str, FingertipLoad]] = [
+        ONE, THREE, THREE | pressed, pressed | elsewhere, elsewhere, {}
     ]  # fmt: skip
     for contacts in changes:
         plant.skip(plant.time + 0.0031)
         before, energy = on_the_mesh(plant), stored(plant, coarse_rig)
+        phalanges = dict(zip(plant.contacts, np.transpose(plant.phalanges), strict=True))
         plant.set_contacts(contacts)
-        assert plant.contacts == tuple(contacts)
+        assert plant.contacts == contacts
+        for id, found in zip(contacts, np.transpose(plant.phalanges), strict=True):
+            assert_allclose(found, phalanges.get(id, (0.0, 0.0)), rtol=1e-9, atol=1e-12)
         for old, new in zip(before, on_the_mesh(plant), strict=True):
             assert_allclose(new, old, rtol=0, atol=1e-9 * np.abs(old).max())
         assert stored(plant, coarse_rig) == pytest.approx(energy, rel=1e-9)
@@ -80,16 +90,16 @@ def test_contacts_drop_vectors_of_lifted_fingers(coarse_rig: Rig, reduced: Reduc
     """Half a second later the plate is as small as before, and nothing of it has jumped."""
     plant = Plant(reduced, coarse_rig.eras)
     plant.set_input(0, [Term(0.0, np.inf, 2 * np.pi * 207.0, STROKE)])
-    plant.set_contacts(FINGERS)
+    plant.set_contacts(THREE)
     plant.skip(0.1)
     size = len(plant.reduced.omega)
-    assert size == len(reduced.omega) + 3 * len(FINGERS)
-    plant.set_contacts(FINGERS[:1])
+    assert size == len(reduced.omega) + 9
+    plant.set_contacts(ONE)
     assert len(plant.reduced.omega) == size
     plant.skip(0.6)
     before = on_the_mesh(plant)
-    plant.set_contacts([])
-    plant.set_contacts(FINGERS[:1])
+    plant.set_contacts({})
+    plant.set_contacts(ONE)
     assert len(plant.reduced.omega) == len(reduced.omega) + 3
     for old, new in zip(before, on_the_mesh(plant), strict=True):
         assert_allclose(new, old, rtol=0, atol=1e-4 * np.abs(old).max())
@@ -98,7 +108,7 @@ def test_contacts_drop_vectors_of_lifted_fingers(coarse_rig: Rig, reduced: Reduc
 def test_contacts_tap_is_passive(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """While nothing drives, plate and finger together only lose, whatever the length of a tap.
 
-    What a finger brings is what its spring and mass hold at the moment at which it lands.
+    What a finger brings is what its pulp and contact mass hold at the moment at which it lands.
     """
     rng = np.random.default_rng(4)
     plant = Plant(reduced, coarse_rig.eras)
@@ -107,12 +117,12 @@ def test_contacts_tap_is_passive(coarse_rig: Rig, reduced: ReducedPlate) -> None
     start = stored(plant, coarse_rig)
     for _ in range(60):
         before = stored(plant, coarse_rig)
-        plant.set_contacts([FINGERS[rng.integers(3)]])
+        plant.set_contacts(resting(PLACES[rng.integers(3)]))
         brought = held_by_fingers(plant)
         plant.skip(plant.time + rng.uniform(0.0001, 0.01))
         together = stored(plant, coarse_rig) + held_by_fingers(plant)
         assert together < before + brought
-        plant.set_contacts([])
+        plant.set_contacts({})
         assert stored(plant, coarse_rig) <= together
         plant.skip(plant.time + rng.uniform(0.0002, 0.004))
     assert stored(plant, coarse_rig) < 0.1 * start
@@ -126,7 +136,7 @@ def test_contacts_apply_to_later_drives(coarse_rig: Rig, reduced: ReducedPlate) 
         if drive_first:
             plant.set_input(0, [Term(0.02, 0.05, 1500.0, STROKE)])
         plant.skip(0.01)
-        plant.set_contacts(FINGERS)
+        plant.set_contacts(THREE)
         if not drive_first:
             plant.set_input(0, [Term(0.02, 0.05, 1500.0, STROKE)])
         shapes = plant.reduced.at(np.array([[0.05, 0.2]]))
@@ -136,8 +146,8 @@ def test_contacts_apply_to_later_drives(coarse_rig: Rig, reduced: ReducedPlate) 
 
 
 POINTS = np.array([[0.11, 0.07], [0.03, 0.2], [0.3, 0.02]])
-COMING: list[tuple[float, Sequence[PointLoad]]] = [
-    (0.013, FINGERS[:1]), (0.0305, FINGERS[:2]), (0.047, FINGERS[1:]), (0.06, []),
+COMING: list[tuple[float, Mapping[str, FingertipLoad]]] = [
+    (0.013, ONE), (0.0305, TWO), (0.047, resting(*PLACES[1:])), (0.06, {}),
 ]  # fmt: skip
 
 
@@ -180,14 +190,14 @@ def test_contacts_are_solved_once(
 ) -> None:
     """A finger that taps on one spot again and again costs one solve, not one a tap."""
     plant = Plant(reduced, coarse_rig.eras)
-    plant.set_contacts(FINGERS[:1])
-    plant.set_contacts([])
+    plant.set_contacts(ONE)
+    plant.set_contacts({})
     monkeypatch.setattr("sim.plant.loaded_plates.plate_in_time", None)
     for _ in range(5):
         plant.skip(plant.time + 0.05)
-        plant.set_contacts(FINGERS[:1])
+        plant.set_contacts(ONE)
         plant.skip(plant.time + 0.05)
-        plant.set_contacts([])
+        plant.set_contacts({})
 
 
 def test_contacts_on_a_plate_without_nodes(coarse_rig: Rig) -> None:
@@ -201,7 +211,8 @@ def test_contacts_on_a_plate_without_nodes(coarse_rig: Rig) -> None:
 
     rigid = ReducedPlate(coarse_rig.plate, np.zeros(3), shapes)
     plant = Plant(rigid, coarse_rig.eras)
-    plant.set_contacts([PointLoad(float(mesh.nodes[4, 0]), float(mesh.nodes[4, 1]), 1e4)])
+    x, y = map(float, mesh.nodes[4])
+    plant.set_contacts({"a": FingertipLoad(x, y, FINGERTIP)})
     assert len(plant.reduced.omega) == 3
     w = 2 * np.pi * 5.0
     plant.set_input(0, [Term(0.0, np.inf, w, STROKE)])
@@ -209,7 +220,9 @@ def test_contacts_on_a_plate_without_nodes(coarse_rig: Rig) -> None:
     _, samples = plant.advance(61.0, sample_rate=1e3, shapes=np.array([[1.0, 0.0, 0.0]]))
     k, c = coarse_rig.eras[0].stiffness, coarse_rig.eras[0].damping
     spring = k + 1j * w * c
-    expected = w**2 * abs(spring / (4 * spring + 1e4 - w**2)) * STROKE
+    pulp, bone = 1000 + 2j * w, 500 + 2j * w - 0.005 * w**2
+    finger = pulp * bone / (pulp + bone) - 0.0002 * w**2
+    expected = w**2 * abs(spring / (4 * spring + finger - w**2)) * STROKE
     assert np.abs(samples).max() == pytest.approx(expected, rel=1e-3)
 
 

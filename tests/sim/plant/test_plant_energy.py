@@ -1,6 +1,6 @@
 """The energy of the plant: what the bases put in is stored or lost."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,24 +8,25 @@ import pytest
 from scipy.integrate import simpson
 
 from driven_bases import BASES
-from finger_energy import held_by_fingers
-from model.finger.load import finger_loads
+from finger_energy import held_by_fingers, power_lost_in_fingers
 from model.reduction.modal_matrices import modal_matrices
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
-from model.structure.point_load import PointLoad, footprints_of
+from model.structure.fingertip import FingertipLoad
+from model.structure.point_load import footprints_of
 from paper_plate import make_paper_rig
+from resting_fingers import resting
 from sim.plant.plant import Plant
 
 KNOTS_APART = 0.005  # s
 STEP = 1e-5  # s; the fastest motion of the reduced plate has some twenty of them in a period
-FINGERS = finger_loads([(0.11, 0.07), (0.25, 0.15), (0.3048, 0.1)])
-PERIODS: list[tuple[float, Sequence[PointLoad]]] = [
-    (0.03, []),
-    (0.05, FINGERS[:1]),
-    (0.075, FINGERS[:2]),
-    (0.09, FINGERS[1:]),
-    (0.13, []),
+FIRST, SECOND, MOVED = (0.11, 0.07), (0.25, 0.15), (0.3048, 0.1)
+PERIODS: list[tuple[float, Mapping[str, FingertipLoad]]] = [
+    (0.03, {}),
+    (0.05, resting(FIRST)),
+    (0.075, resting(FIRST, SECOND)),
+    (0.09, resting(MOVED, SECOND)),
+    (0.13, {}),
 ]
 """Until when which fingers rest on the plate."""
 
@@ -53,13 +54,9 @@ def kept_for(plant: Plant, rig: Rig, until: float) -> Books:
     _, structural, _ = modal_matrices(plant.reduced, rig.eras)
     at_eras = plant.reduced.at(footprints_of(rig.eras))
     structural = structural - (at_eras.T * [era.damping for era in rig.eras]) @ at_eras
-    at_fingers = plant.reduced.at(footprints_of(plant.contacts))
     k = np.array([era.stiffness for era in rig.eras])
     c = np.array([era.damping for era in rig.eras])
     bolts = np.array([era.bolt_mass for era in rig.eras])
-    finger = np.array(
-        [(each.stiffness, each.damping, each.mass) for each in plant.contacts]
-    ).reshape(-1, 3)
     count = 2 * round((until - plant.time) / STEP / 2)
     times = np.linspace(plant.time, until, count + 1)
     power, loss, stored = np.empty(count + 1), np.empty(count + 1), np.empty(count + 1)
@@ -70,15 +67,13 @@ def kept_for(plant: Plant, rig: Rig, until: float) -> Books:
         y, dy = np.array([base.motion(min(time, until - 1e-12)) for base in BASES]).T
         stretch, speed = y - at_eras @ q, dy - at_eras @ v
         power[row] = (k * stretch + c * speed) @ dy
-        loss[row] = c @ speed**2 + v @ structural @ v + finger[:, 1] @ (at_fingers @ v) ** 2
+        loss[row] = c @ speed**2 + v @ structural @ v + power_lost_in_fingers(plant)
         stored[row] = (
             v @ v
             + (plant.reduced.omega * q) @ (plant.reduced.omega * q)
             + k @ stretch**2
             + bolts @ (at_eras @ v) ** 2
-            + finger[:, 0] @ (at_fingers @ q) ** 2
-            + finger[:, 2] @ (at_fingers @ v) ** 2
-        ) / 2
+        ) / 2 + held_by_fingers(plant)
     put_in, lost = simpson([power, loss], times)
     return Books(float(put_in), float(lost), float(stored[0]), float(stored[-1]))
 
@@ -86,8 +81,7 @@ def kept_for(plant: Plant, rig: Rig, until: float) -> Books:
 def test_plant_energy_balance(rig: Rig) -> None:
     """From knot to knot the books balance to 1e-5 of what went through them, for ramps as well.
 
-    When a finger comes or goes, what is stored changes by what its spring and its mass hold, and by
-    nothing else.
+    When a finger comes, moves or goes, what is stored changes by what it holds and nothing else.
     """
     reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras))
     plant = Plant(reduced, rig.eras)

@@ -1,6 +1,7 @@
 """An excitation played on the plate in time, against the frequency domain and by hand."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,11 +11,11 @@ from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
 from model.finger.contrast import mean_level_db_sl
 from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.load import FingerLoad
 from model.finger.perception import detection_threshold
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
-from model.structure.point_load import PointLoad, footprints_of
+from model.structure.fingertip import Fingertip, FingertipLoad
+from model.structure.point_load import footprints_of
 from model.table.question import Question
 from model.transients.envelope import BaseEnvelope, shaped
 from model.transients.measures import Transients
@@ -25,7 +26,7 @@ from sim.plant.playback import Playback, play
 
 TARGET, QUIET = (0.10, 0.03), (0.22, 0.16)
 FINGERS = Question((TARGET,), (QUIET,))
-HEAVY = FingerLoad(stiffness=5000.0, damping=20.0, mass=0.005)
+HEAVY = Fingertip(stiffness=5000.0, damping=20.0, contact_mass=0.005)
 EXCITATION = {"SW": Tone(110.0, 1e-5), "NE": Tone(250.0, 5e-6, math.pi / 2)}
 
 
@@ -35,7 +36,7 @@ def reduced(coarse_rig: Rig) -> ReducedPlate:
     return reduce_plate(coarse_rig.plate, coarse_rig.mesh, footprints_of(coarse_rig.eras))
 
 
-def steady(rig: Rig, place: tuple[float, float], *loads: PointLoad) -> np.ndarray:
+def steady(rig: Rig, place: tuple[float, float], *loads: FingertipLoad) -> np.ndarray:
     """Amplitudes (2, p) [m/s²] under a fingertip at 110 and 250 Hz, by a direct solve."""
     points = fingertip_points(*place, rig.plate)
     frequencies = np.array([110.0, 250.0])
@@ -45,13 +46,14 @@ def steady(rig: Rig, place: tuple[float, float], *loads: PointLoad) -> np.ndarra
     return np.abs([0.1 * unit[0, 0], 0.05 * unit[1, 2]])  # SW and NE, of 100 µm
 
 
-@pytest.mark.parametrize("finger_load", [None, HEAVY])
+@pytest.mark.parametrize("fingertip", [None, HEAVY])
 def test_playback_steady_measures_agree_with_the_frequency_domain(
-    coarse_rig: Rig, reduced: ReducedPlate, finger_load: FingerLoad | None
+    coarse_rig: Rig, reduced: ReducedPlate, fingertip: Fingertip | None
 ) -> None:
     """Level and contrast by a direct solve, within 0.1 dB, fingers that load the plate or not."""
-    played = play(coarse_rig, reduced, EXCITATION, FINGERS, duration=1.2, finger_load=finger_load)
-    loads = [finger_load.at(*at) for at in (TARGET, QUIET)] if finger_load else []
+    rig = replace(coarse_rig, fingertip=fingertip)
+    played = play(rig, reduced, EXCITATION, FINGERS, duration=1.2)
+    loads = [FingertipLoad(*at, fingertip) for at in (TARGET, QUIET)] if fingertip else []
     at_target, at_quiet = (steady(coarse_rig, at, *loads) for at in (TARGET, QUIET))
     weights = fingertip_weights(*TARGET, coarse_rig.plate)
     level = mean_level_db_sl(np.array([110.0, 250.0]), at_target, weights)
@@ -59,7 +61,7 @@ def test_playback_steady_measures_agree_with_the_frequency_domain(
     assert played.level_db_sl == pytest.approx(level, abs=0.1)
     assert played.contrast_db == pytest.approx(contrast, abs=0.1)
     free = mean_level_db_sl(np.array([110.0, 250.0]), steady(coarse_rig, TARGET), weights)
-    assert (abs(level - free) > 1) is (finger_load is not None)
+    assert (abs(level - free) > 1) is (fingertip is not None)
 
 
 def test_playback_measures_of_several_targets() -> None:
@@ -92,7 +94,8 @@ def test_playback_with_an_onset_envelope(coarse_rig: Rig, reduced: ReducedPlate)
         "SW": BaseEnvelope(110.0, 2e-6, (4e-6j, -1e-5, 1e-5)),
         "NE": BaseEnvelope(110.0, 0, (5e-6, 0)),
     }
-    played = play(coarse_rig, reduced, excitation, FINGERS, duration=0.2, onset=onset)
+    rig = replace(coarse_rig, fingertip=None)
+    played = play(rig, reduced, excitation, FINGERS, duration=0.2, onset=onset)
     assert played.settled == pytest.approx(0.015)
     transients = Transients(plate_in_time(reduced, coarse_rig.eras))
     for record in (*played.targets, *played.quiet):

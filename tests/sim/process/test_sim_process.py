@@ -74,7 +74,7 @@ async def test_sim_serves_until_interrupted_or_eof(is_interrupted: bool) -> None
         (["no_such_rig.yaml", "--serial"], 2, "no_such_rig.yaml"),
         ([str(example_rig_path()), "--serial", "--finger", "0.1"], 2, "--finger"),
         ([str(example_rig_path()), "--serial", "--finger", "9,9"], 2, "finger"),
-        ([str(example_rig_path()), "--serial", "--finger-load", "1,2"], 2, "--finger-load"),
+        ([str(example_rig_path()), "--serial", "--exact", "--seed", "1"], 2, "--seed"),
         ([str(example_rig_path()), "--serial", "--control", "/no/where"], 3, "/no/where"),
     ],
 )

@@ -12,6 +12,7 @@ keep the rate. The stopper writes the time of each `stop` from request to respon
 
 import contextlib
 import json
+import select
 import socket
 import sys
 import time
@@ -22,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.latency.touches import FLOODING, WANDERS, Work, datagrams
+from controller.api.jsonrpc import ErrorCode
 from model.rig.file import load_rig
 
 BATCH = 10  # messages of the flood at a time
@@ -71,9 +73,8 @@ def flooder(kind: str, path: str) -> None:
             line.connect(path)
             while data:
                 line.sendall(data)
-                with contextlib.suppress(BlockingIOError):
-                    while line.recv(1 << 16, socket.MSG_DONTWAIT):
-                        pass
+                while select.select([line], [], [], 0)[0] and line.recv(1 << 16):
+                    pass
         silent.append(line)
         while len(silent) > (0 if data else MAX_SILENT):
             silent.popleft().close()
@@ -85,17 +86,20 @@ def stopper(path: str, count: str, file: str) -> None:
         line.connect(path)
 
         def call(method: str) -> float:
-            begin = time.perf_counter()
-            line.sendall(_request(method, "{}"))
-            response = json.loads(answers.readline())
-            if "error" in response:
-                sys.exit(f"{method}: {response['error']}")
-            return time.perf_counter() - begin
+            while True:
+                begin = time.perf_counter()
+                line.sendall(_request(method, "{}"))
+                response = json.loads(answers.readline())
+                duration = time.perf_counter() - begin
+                if "error" not in response:
+                    return duration
+                if method == "stop" or response["error"]["code"] != ErrorCode.BUSY:
+                    sys.exit(f"{method}: {response['error']}")
 
         times = []
         for _ in range(int(count)):
             times.append(call("stop"))
-            call("clear")
+            call("clear")  # in reserve only once there is room
     np.save(file, times)
 
 

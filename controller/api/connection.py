@@ -5,6 +5,8 @@ flood on one costs the others nothing; output that a client does not read is bou
 """
 
 import asyncio
+import math
+import time
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -13,14 +15,17 @@ from controller.api.rate_limit import RateLimiter
 
 MAX_UNREAD_BYTES = 1 << 18  # written but not read by the client
 _MAX_UNREAD_NOTIFICATIONS = MAX_UNREAD_BYTES // 2  # bytes; the rest is reserved for responses
+_MAX_READ = 1 << 14  # bytes in an iteration of the event loop
 _MAX_READ_AHEAD = 1 << 16  # bytes that wait to be served
 UNREAD_TIMEOUT = 5.0  # s; for losing notifications before the connection is closed
 
 MAX_REQUEST_RATE = 2000.0  # 1/s, and as many in a burst
+STOP = b'"stop"'
+_DISTRUST = 0.1  # s; after lines that look like a stop
 MAX_PENDING_STOPS = 64  # requests without responses, above which no further line is taken
 
 
-class Connection(asyncio.Protocol):
+class Connection(asyncio.BufferedProtocol):
     """A client's connection.
 
     on_connect: called at the beginning; on_lines: lines wait to be served; on_disconnect: called
@@ -41,17 +46,22 @@ class Connection(asyncio.Protocol):
         self.is_reserve = False  # whether it is in reserve
         self.excess = 0  # requests beyond the rate since its last pause
         self.is_paused = False  # whether the server pauses to serve it
-        self.is_urgent = False  # whether its last bytes may hold a stop
+        self.reading_time = 0.0  # s; processor time of reading, not yet subtracted from a budget
         self.is_at_end = False  # whether it has closed its side
         self.pending: set[asyncio.Task[None]] = set()
         self.ahead: Any = None
+        self.is_stop_ahead = False
         self._on_connect = on_connect
         self._on_lines = on_lines
         self._on_disconnect = on_disconnect
         self._clock = clock
         self._transport: asyncio.Transport | None = None
+        self._read_at = 0.0  # s; processor time
+        self._received = memoryview(bytearray(_MAX_READ))
         self._input = bytearray()
         self._line_end = -1  # of the next line in _input; -1: not received yet
+        self._stop_at = -1  # of the last text in _input that may be a stop; -1: none
+        self._distrusted_until = -math.inf  # s
         self._lost = 0
         self._losing_since: float | None = None
         self._rate = RateLimiter(MAX_REQUEST_RATE, clock=clock)
@@ -76,6 +86,13 @@ class Connection(asyncio.Protocol):
         )
 
     @property
+    def is_urgent(self) -> bool:
+        """Whether a stop is ahead, or its input may hold one."""
+        return self.is_stop_ahead or (
+            self._stop_at >= 0 and self._clock() >= self._distrusted_until
+        )
+
+    @property
     def _has_line(self) -> bool:
         return self._line_end >= 0 or len(self._input) >= MAX_LINE_LENGTH
 
@@ -86,12 +103,22 @@ class Connection(asyncio.Protocol):
         self._transport.set_write_buffer_limits(high=MAX_UNREAD_BYTES)
         self._on_connect(self)
 
-    def data_received(self, data: bytes) -> None:
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """Buffer for the next bytes."""
+        self._read_at = time.thread_time()
+        return self._received
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Keep the bytes received in the buffer."""
+        self.data_received(self._received[:nbytes])
+        self.reading_time += time.thread_time() - self._read_at
+
+    def data_received(self, data: bytes | memoryview) -> None:
         """Keep it, undivided; pause reading while much waits to be served."""
         self.received_at = self._clock()
-        self.is_urgent = b'"stop"' in data
         before = len(self._input)
         self._input += data
+        self._stop_at = max(self._stop_at, self._input.rfind(STOP, max(0, before - len(STOP) + 1)))
         if self._line_end < 0:
             self._line_end = self._input.find(b"\n", before)
         if self._has_line:
@@ -122,6 +149,7 @@ class Connection(asyncio.Protocol):
             )
         line = bytes(memoryview(self._input)[:end])
         del self._input[: end + 1]
+        self._stop_at = max(self._stop_at - end - 1, -1)
         self._line_end = self._input.find(b"\n")
         if len(self._input) <= _MAX_READ_AHEAD and self._transport is not None:
             self._transport.resume_reading()
@@ -137,6 +165,10 @@ class Connection(asyncio.Protocol):
         is_within = self._rate.take()
         self.excess += not is_within
         return is_within
+
+    def note_false_alarm(self) -> None:
+        """Note that it is urgent without a stop, which for a while it cannot be again."""
+        self._distrusted_until = self._clock() + _DISTRUST
 
     def respond(self, line: bytes) -> None:
         """Send a response, or close the connection of a client that does not read."""

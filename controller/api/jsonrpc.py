@@ -240,9 +240,10 @@ def parse_json(line: bytes) -> Any:
         problems.append(f"{name} is not JSON")
 
     if (
-        sum(map(line.count, b"{[")) > MAX_OPENINGS
+        len(line) > MAX_LINE_LENGTH
+        or line.count(b",") > MAX_SEPARATORS  # counted alone, as it mostly suffices
         or sum(map(line.count, b":,")) > MAX_SEPARATORS
-        or len(line) > MAX_LINE_LENGTH
+        or sum(map(line.count, b"{[")) > MAX_OPENINGS
     ):
         raise InvalidRequest(
             ErrorCode.PARSE, "too many keys or values", remedy="send fewer touches per frame"

@@ -1,4 +1,4 @@
-"""Token bucket: a rate, and as many at once as in a second."""
+"""Token buckets: of actions at a rate, and of processor time at a share."""
 
 from collections.abc import Callable
 
@@ -21,3 +21,31 @@ class RateLimiter:
             return False
         self._left -= 1
         return True
+
+
+class TimeBudget:
+    """Processor time: a share of the time that passes, saved up to a burst [s]; clock [s].
+
+    It can be overdrawn by as much as a burst.
+    """
+
+    def __init__(self, share: float, burst: float, *, clock: Callable[[], float]) -> None:
+        self._share = share
+        self._burst = burst
+        self._clock = clock
+        self._left = burst
+        self._counted_at = clock()
+
+    def spend(self, duration: float) -> None:
+        """Subtract a duration [s]."""
+        self._left = max(self._saved() - duration, -self._burst)
+
+    def pause(self) -> float:
+        """Time [s] until it is not overdrawn; 0 if it is not, or by less than a microsecond."""
+        self._left = self._saved()
+        return -self._left / self._share if self._left < -1e-6 else 0.0
+
+    def _saved(self) -> float:
+        now = self._clock()
+        since, self._counted_at = now - self._counted_at, now
+        return min(self._burst, self._left + self._share * since)

@@ -1,21 +1,19 @@
 """The API's server: serves all clients in turn, within the control loop's event loop.
 
-A turn takes at most a quarter of a millisecond, however much was sent; then everything else runs,
-the control loop first. What takes longer, such as arming, runs as a task of its own.
+However much was sent, they are served in short turns (`controller/api/turns.py`). What takes
+longer, such as arming, runs as a task of its own.
 """
 
 import asyncio
-import contextlib
 import logging
 import socket
 import time
-from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from controller.api.admission import RESERVE_METHODS, Admission
-from controller.api.connection import Connection
+from controller.api.connection import STOP, Connection
 from controller.api.jsonrpc import (
     ErrorCode,
     Id,
@@ -29,15 +27,13 @@ from controller.api.jsonrpc import (
 )
 from controller.api.methods import METHODS, TouchParams
 from controller.api.schema import Message
+from controller.api.turns import Turns
 from controller.group.tasks import CoalescedCalls
 from drivers import clock
 from drivers.errors import CommandRefused, DriverError, LinkError
 from model.errors import InputError
 
-MAX_ITERATION_TIME = 0.00025  # s; how long a touch waits for clients that flood
 MAX_PENDING = 8  # requests of one client that take long; stop is not counted
-MAX_EXCESS = 3  # requests beyond a client's rate, after which it pauses
-PAUSE = 0.001  # s
 _ACCEPT_PER_TURN = 1  # connections
 _ACCEPT_QUEUE = 64  # connections
 
@@ -80,7 +76,8 @@ class ApiServer:
 
     handlers: of all METHODS, called with the client and the parameters; on_disconnect: called with
     every client that disconnects; holds_lease: whether a client does, and must not be evicted;
-    is_subscribed: whether it has subscriptions; clock [s].
+    is_subscribed: whether it has subscriptions; is_busy: whether a touch is on its way to the wire,
+    for which clients wait; clock [s]; processor_time: of this thread [s].
     """
 
     def __init__(
@@ -90,7 +87,9 @@ class ApiServer:
         on_disconnect: Callable[[Connection], None],
         holds_lease: Callable[[Connection], bool],
         is_subscribed: Callable[[Connection], bool],
+        is_busy: Callable[[], bool] = lambda: False,
         clock: Callable[[], float] = clock.now,
+        processor_time: Callable[[], float] = time.thread_time,
     ) -> None:
         self._handlers = handlers
         self._on_disconnect = on_disconnect
@@ -99,8 +98,9 @@ class ApiServer:
             holds_lease=holds_lease, is_subscribed=is_subscribed, clock=clock
         )
         self._stops: dict[Connection, CoalescedCalls[Message]] = {}
-        self._waiting: deque[Connection] = deque()
-        self._is_turn_scheduled = False
+        self._turns = Turns(
+            self._serve_line, is_busy=is_busy, clock=clock, processor_time=processor_time
+        )
         self._server: asyncio.Server | None = None
 
     async def open(self, bound: socket.socket) -> None:
@@ -126,7 +126,7 @@ class ApiServer:
     def _make_connection(self) -> Connection:
         return Connection(
             on_connect=self._admission.admit,
-            on_lines=self._lines_received,
+            on_lines=self._turns.add,
             on_disconnect=self._disconnected,
             clock=self._clock,
         )
@@ -136,66 +136,26 @@ class ApiServer:
         self._stops.pop(connection, None)
         self._on_disconnect(connection)
 
-    def _lines_received(self, connection: Connection) -> None:
-        if connection.is_paused:
-            return
-        if connection.is_urgent:
-            with contextlib.suppress(ValueError):
-                self._waiting.remove(connection)
-            self._waiting.appendleft(connection)
-        elif connection not in self._waiting:
-            self._waiting.append(connection)
-        self._schedule_turn(asyncio.get_running_loop().call_soon)
-
-    def _schedule_turn(self, call: Callable[..., object], *arguments: object) -> None:
-        if self._waiting and not self._is_turn_scheduled:
-            self._is_turn_scheduled = True
-            call(*arguments, self._serve_turn)
-
-    def _serve_turn(self) -> None:
-        """Serve one line of each waiting client, round and round, until the turn's time is up."""
-        self._is_turn_scheduled = False
-        end = time.perf_counter() + MAX_ITERATION_TIME
-        while self._waiting:
-            connection = self._waiting.popleft()
-            call = self._next(connection)
-            if isinstance(call, _Call) and isinstance(call.params, TouchParams):
-                connection.ahead = self._read(connection)
-                if call.is_superseded_by(connection.ahead):
-                    call = None
-            if call is not None:
-                self._serve(connection, call)
-            if connection.excess >= MAX_EXCESS:
-                self._pause(connection)
-            elif connection.has_lines:
-                self._waiting.append(connection)
-            connection.close_if_finished()
-            if time.perf_counter() >= end:
-                break
-        # Two iterations of the event loop from now: data that arrived meanwhile and what it wakes,
-        # such as the control loop for a touch, run first.
-        loop = asyncio.get_running_loop()
-        self._schedule_turn(loop.call_soon, loop.call_soon)
-
-    def _pause(self, connection: Connection) -> None:
-        """Serve a client that exceeds its rate a little at a time, so that it delays no one."""
-        connection.is_paused = True
-        asyncio.get_running_loop().call_later(PAUSE, self._resume, connection)
-
-    def _resume(self, connection: Connection) -> None:
-        connection.is_paused = False
-        connection.excess = 0
-        if connection.has_lines:
-            self._lines_received(connection)
+    def _serve_line(self, connection: Connection) -> None:
+        """Serve the next line of a client."""
+        call = self._next(connection)
+        if isinstance(call, _Call) and isinstance(call.params, TouchParams):
+            connection.ahead = ahead = self._read(connection)
+            connection.is_stop_ahead = ahead is not None and ahead.method == "stop"
+            if call.is_superseded_by(ahead):
+                call = None
+        if call is not None:
+            self._serve(connection, call)
 
     def _next(self, connection: Connection) -> _Call | None:
         """The next call of a client, or None."""
         ahead: _Call | None = connection.ahead
-        connection.ahead = None
+        connection.ahead, connection.is_stop_ahead = None, False
         return ahead or self._read(connection)
 
     def _read(self, connection: Connection) -> _Call | None:
         """Read the next line, within the client's rate; refused requests count."""
+        is_urgent = connection.is_urgent
         try:
             line = connection.next_line()
         except InvalidRequest as error:
@@ -203,6 +163,12 @@ class ApiServer:
             return None
         if line is None:
             return None
+        call = self._parse(connection, line)
+        if is_urgent and STOP in line and (call is None or call.method != "stop"):
+            connection.note_false_alarm()
+        return call
+
+    def _parse(self, connection: Connection, line: bytes) -> _Call | None:
         try:
             request = read_request(line)
         except InvalidRequest as error:
@@ -247,7 +213,7 @@ class ApiServer:
     def _finished(self, connection: Connection, task: "asyncio.Task[None]") -> None:
         connection.pending.discard(task)
         if connection.has_lines:
-            self._lines_received(connection)
+            self._turns.add(connection)
         connection.close_if_finished()
 
     def _call(self, connection: Connection, call: _Call) -> Message | Awaitable[Message]:

@@ -126,6 +126,7 @@ class Daemon:
             on_disconnect=self._api.client_left,
             holds_lease=self._api.holds_lease,
             is_subscribed=self._publisher.hub.is_subscribed,
+            is_busy=lambda: self._controller.is_preparing,
             clock=clock.now,
         )
         self._children = ChildProcesses()

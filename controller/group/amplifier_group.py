@@ -81,6 +81,11 @@ class AmplifierGroup:
         """Whether possibly only some amplifiers have committed the last set."""
         return self._playback.is_set_incomplete
 
+    @property
+    def last_sent_at(self) -> float:
+        """When [s] a request was last sent to any amplifier."""
+        return max(amplifier.last_sent_at for amplifier in self._all)
+
     async def open(self) -> None:
         """Open all amplifiers, or none of them if one fails.
 

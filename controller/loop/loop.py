@@ -86,6 +86,7 @@ class Controller:
         self._decider_if_open: Decider | None = None
         self._guards: Mapping[str, Guard] = {}
         self._wake = asyncio.Event()
+        self._changed_at: float | None = None  # s; until all changes are decided
         self._heartbeat_due = 0.0
         self._expiry: asyncio.TimerHandle | None = None
 
@@ -98,6 +99,11 @@ class Controller:
     def degraded(self) -> tuple[str, ...]:
         """Names of amplifiers that do not reply but may still play; nothing new is played then."""
         return self._group.degraded
+
+    @property
+    def is_preparing(self) -> bool:
+        """Whether a change of contacts is on its way to the amplifiers."""
+        return self._changed_at is not None and self._group.last_sent_at < self._changed_at
 
     @property
     def capabilities(self) -> PlaybackCapabilities:
@@ -223,6 +229,8 @@ class Controller:
             self._report(self._observer.refused, str(error))
         finally:
             self._report_change(expired)
+            if not self._wake.is_set():
+                self._changed_at = None
 
     def deliver(self, frame: TouchFrame) -> None:
         """Process a touch frame; to be called in the loop's thread."""
@@ -251,6 +259,8 @@ class Controller:
         """Act on a change of contacts, also while amplifiers are being awaited."""
         if change:
             self._wake.set()
+            if self.group_state is GroupState.ARMED:
+                self._changed_at = clock.now()
         if self._decider.is_silence_pending:
             self._group.abort_exchange()
         self._schedule_expiry()

@@ -16,42 +16,7 @@ from controller.api.schema import MAX_RATE, Message
 from controller.api.server import ApiServer
 from controller.api.topics import ContactsEvent
 from drivers.operation.garbage_collection import no_long_collections
-
-
-class Wire(asyncio.Transport):
-    """Transport of a client that reads nothing."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.waiting = b""
-        self.is_aborted = False
-
-    def is_closing(self) -> bool:
-        """Whether it was closed."""
-        return self.is_aborted
-
-    def resume_reading(self) -> None:
-        """Do nothing."""
-
-    def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Keep the data as unread."""
-        self.waiting += bytes(data)
-
-    def get_write_buffer_size(self) -> int:
-        """Size of the unread data."""
-        return len(self.waiting)
-
-    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
-        """Do nothing."""
-
-    def pause_reading(self) -> None:
-        """Do nothing."""
-
-    def abort(self) -> None:
-        """Close."""
-        self.is_aborted = True
-
-    close = abort
+from wire_of_memory import Wire
 
 
 async def iterate() -> None:
@@ -102,6 +67,7 @@ def serve(served: list[str]) -> tuple[ApiServer, Connection, Wire]:
         holds_lease=lambda client: True,
         is_subscribed=lambda client: False,
         clock=lambda: 0.0,
+        processor_time=lambda: 0.0,
     )
     connection, wire = server._make_connection(), Wire()
     connection.connection_made(wire)

@@ -258,7 +258,7 @@ async def test_control_loop_runs_between_iterations(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Between two iterations data is received, and what it wakes runs."""
-    monkeypatch.setattr("controller.api.server.MAX_ITERATION_TIME", 0.0)  # one line per iteration
+    monkeypatch.setattr("controller.api.turns.MAX_TURN", 0.0)  # one line per iteration
     loop = asyncio.get_running_loop()
     order: list[str] = []
 

@@ -31,6 +31,7 @@ from model.errors import InputError
 from model.vibration.excitation import Excitation, Tone
 from virtual_loop import in_virtual_time
 
+NEAR = (FINGER[0], FINGER[1] + 0.001, FINGER[2])  # of the same pattern
 BOTH = {"SW": Tone(110.0, 2e-5), "NE": Tone(110.0, 2e-5)}
 
 
@@ -81,6 +82,29 @@ async def test_controller_plays_a_touch_within_one_turn() -> None:
         assert applied.pattern.level_db_sl == 20.0
         assert applied.drive == {"SW": played.commands[0]}
         assert bench.reports.contacts == [1]
+
+
+@in_virtual_time
+async def test_touch_is_being_prepared_until_its_set_is_sent() -> None:
+    """Not while its reply is awaited; nor for a frame without a change or without a new set."""
+    async with running() as bench:
+        await asyncio.sleep(0.02)
+        bench.far_end.delay = 0.010
+        is_preparing = [bench.controller.is_preparing]
+        bench.touch(FINGER)
+        is_preparing.append(bench.controller.is_preparing)
+        await asyncio.sleep(0.005)
+        is_preparing.append(bench.controller.is_preparing)
+        await asyncio.sleep(0.015)
+        bench.touch(FINGER)
+        is_preparing.append(bench.controller.is_preparing)
+        before = len(bench.far_end.sets())
+        bench.touch(NEAR)
+        is_preparing.append(bench.controller.is_preparing)
+        await asyncio.sleep(0.001)
+        assert len(bench.far_end.sets()) == before
+        is_preparing.append(bench.controller.is_preparing)
+    assert is_preparing == [False, True, False, False, True, False]
 
 
 @in_virtual_time

@@ -1,0 +1,133 @@
+"""When clients of the API are served: in short turns, with what the control loop leaves.
+
+All clients together get a share of the event loop's processor time, saved up for bursts. A turn is
+short, and waits while a touch is on its way to the wire. A client whose input may hold a stop is
+served at once, within neither limit.
+"""
+
+import asyncio
+import contextlib
+import time
+from collections import deque
+from collections.abc import Callable
+
+from controller.api.connection import Connection
+from controller.api.rate_limit import TimeBudget
+
+MAX_TURN = 0.0001  # s, and one request; how long a touch waits for clients
+SHARE = 0.25  # of the event loop's time, for all clients together
+BURST = 0.02  # s of processor time, saved up
+MAX_DEFERRAL = 0.003  # s; of a turn by touches, which may follow each other without a gap
+_RECHECK = 0.0005  # s; of a turn that is deferred
+MAX_EXCESS = 3  # requests beyond a client's rate, after which it pauses
+PAUSE = 0.001  # s
+
+
+class Turns:
+    """Serves waiting clients in turn, a line of each.
+
+    serve: serves one line of a client; is_busy: whether a touch is on its way to the wire;
+    clock [s]; processor_time: of this thread [s].
+    """
+
+    def __init__(
+        self,
+        serve: Callable[[Connection], None],
+        *,
+        is_busy: Callable[[], bool],
+        clock: Callable[[], float],
+        processor_time: Callable[[], float],
+    ) -> None:
+        self._serve = serve
+        self._is_busy = is_busy
+        self._clock = clock
+        self._processor_time = processor_time
+        self._waiting: deque[Connection] = deque()
+        self._urgent: deque[Connection] = deque()
+        self._is_turn_scheduled = self._is_urgent_turn_scheduled = False
+        self._deferred_since: float | None = None
+        self._budget = TimeBudget(SHARE, BURST, clock=clock)
+
+    def add(self, connection: Connection) -> None:
+        """Serve a client that has lines."""
+        if connection.is_urgent:
+            with contextlib.suppress(ValueError):
+                self._waiting.remove(connection)
+            if connection not in self._urgent:
+                self._urgent.append(connection)
+            self._schedule_urgent_turn()
+        elif not connection.is_paused and connection not in self._waiting:
+            self._waiting.append(connection)
+            self._schedule_turn()
+
+    def _schedule_urgent_turn(self) -> None:
+        if self._urgent and not self._is_urgent_turn_scheduled:
+            self._is_urgent_turn_scheduled = True
+            asyncio.get_running_loop().call_soon(self._take_urgent_turn)
+
+    def _take_urgent_turn(self) -> None:
+        self._is_urgent_turn_scheduled = False
+        self._take(self._urgent)
+        self._schedule_urgent_turn()
+
+    def _schedule_turn(self, delay: float = 0.0) -> None:
+        """Schedule a turn unless one is: after a delay [s], or in the next iteration but one.
+
+        Data that arrived meanwhile and what it wakes, such as the control loop for a touch, run
+        first.
+        """
+        if not self._waiting or self._is_turn_scheduled:
+            return
+        self._is_turn_scheduled = True
+        loop = asyncio.get_running_loop()
+        if delay > 0:
+            loop.call_later(delay, self._take_turn)
+        else:
+            loop.call_soon(loop.call_soon, self._take_turn)
+
+    def _take_turn(self) -> None:
+        self._is_turn_scheduled = False
+        delay = self._delay()
+        if delay <= 0:
+            self._deferred_since = None
+            self._take(self._waiting)
+        self._schedule_turn(delay)
+
+    def _delay(self) -> float:
+        """Return the time [s] by which the turn that is due has to wait, 0 for none."""
+        if self._is_busy():
+            now = self._clock()
+            if self._deferred_since is None:
+                self._deferred_since = now
+            if now - self._deferred_since < MAX_DEFERRAL:
+                return _RECHECK
+        return self._budget.pause()
+
+    def _take(self, connections: deque[Connection]) -> None:
+        """Serve a line of each connection, round and round, until the turn's time is up."""
+        began_at, end = self._processor_time(), time.perf_counter() + MAX_TURN
+        reading_time = 0.0
+        while connections:
+            connection = connections.popleft()
+            self._serve(connection)
+            reading_time += connection.reading_time
+            connection.reading_time = 0.0
+            if connection.excess >= MAX_EXCESS and not connection.is_urgent:
+                self._pause(connection)
+            elif connection.has_lines:
+                self.add(connection)
+            connection.close_if_finished()
+            if time.perf_counter() >= end:
+                break
+        self._budget.spend(self._processor_time() - began_at + reading_time)
+
+    def _pause(self, connection: Connection) -> None:
+        """Serve a client that exceeds its rate a little at a time, so that it delays no one."""
+        connection.is_paused = True
+        asyncio.get_running_loop().call_later(PAUSE, self._resume, connection)
+
+    def _resume(self, connection: Connection) -> None:
+        connection.is_paused = False
+        connection.excess = 0
+        if connection.has_lines:
+            self.add(connection)

@@ -1,0 +1,39 @@
+"""A transport of memory, whose other end reads nothing."""
+
+import asyncio
+
+
+class Wire(asyncio.Transport):
+    """Transport of a client that reads nothing."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waiting = b""
+        self.is_aborted = False
+
+    def is_closing(self) -> bool:
+        """Whether it was closed."""
+        return self.is_aborted
+
+    def resume_reading(self) -> None:
+        """Do nothing."""
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Keep the data as unread."""
+        self.waiting += bytes(data)
+
+    def get_write_buffer_size(self) -> int:
+        """Size of the unread data."""
+        return len(self.waiting)
+
+    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
+        """Do nothing."""
+
+    def pause_reading(self) -> None:
+        """Do nothing."""
+
+    def abort(self) -> None:
+        """Close."""
+        self.is_aborted = True
+
+    close = abort

@@ -14,9 +14,18 @@ from drivers.protocol.messages import Apply, Arm, Stop
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
+from model.rig.uncertainty import Uncertainty
+from model.structure.fingertip import Fingertip
 from plate_in_time import lock_in
+from resting_fingers import FINGERTIP
 from sim.bench.bench import Bench
-from sim.plant.imperfections import ChannelErrors, Imperfections, draw_imperfections, draw_noise
+from sim.plant.imperfections import (
+    ChannelErrors,
+    Imperfections,
+    PlateErrors,
+    draw_imperfections,
+    draw_noise,
+)
 
 AT = (0.08, 0.06)
 PERFECT = Imperfections()
@@ -177,6 +186,69 @@ def test_draw_imperfections_has_the_given_deviations(two_amplifiers: Rig) -> Non
     gains, phases = np.array([(each.gain, np.degrees(each.phase)) for each in errors]).T
     assert (gains.mean(), gains.std()) == pytest.approx((1, 0.05), abs=0.004)
     assert (phases.mean(), phases.std()) == pytest.approx((0, 5), abs=0.4)
+
+
+def test_draw_imperfections_is_within_the_rigs_uncertainty(coarse_rig: Rig) -> None:
+    """Over five hundred plates every parameter has the rig's deviations, none follows another."""
+    std = Uncertainty(0.0, 0.0, thickness=0.01, stiffness=0.2, damping=1.3, fingertip=0.4)
+    drawn = [
+        draw_imperfections(replace(coarse_rig, uncertainty=std), seed=seed) for seed in range(500)
+    ]
+    names = [era.name for era in coarse_rig.eras]
+    found = np.array(
+        [
+            (
+                one.plate.thickness,
+                np.log(one.plate.loss_factor),
+                np.log(one.plate.era_damping),
+                *(one.plate.stiffness[name] for name in names),
+                np.log(one.load_of("1", Fingertip()).stiffness / 1000),
+                np.log(one.load_of("2", Fingertip()).phalanx_mass / 0.005),
+            )
+            for one in drawn
+        ]
+    )
+    centres = np.array([1, 0, 0, 1, 1, 1, 1, 0, 0])
+    spreads = np.array([0.01, np.log(1.3), np.log(1.3), 0.2, 0.2, 0.2, 0.2, 0.4, 0.4])
+    assert_allclose(found.mean(axis=0), centres, atol=0.15 * spreads.max(), rtol=0.01)
+    assert_allclose(found.std(axis=0), spreads, rtol=0.1)
+    alike = np.corrcoef(found.T) - np.eye(len(spreads))
+    assert np.abs(alike).max() < 0.2
+
+
+def test_draw_imperfections_of_a_known_rig_has_none(coarse_rig: Rig) -> None:
+    """Only its mesh differs: one as fine as any that a rig gets."""
+    known = replace(coarse_rig, uncertainty=Uncertainty.none())
+    drawn = draw_imperfections(known, seed=3)
+    real = drawn.plate.realised(known)
+    assert (real.plate, real.eras) == (known.plate, known.eras)
+    assert drawn.load_of("1", FINGERTIP) == FINGERTIP
+    assert real.mesh != known.mesh
+    fine = replace(known, mesh=real.mesh)
+    assert draw_imperfections(fine, seed=3).plate.mesh not in (None, real.mesh)
+
+
+def test_imperfections_of_the_plate_are_those_of_another_rig(coarse_rig: Rig) -> None:
+    """A thicker plate on a softer ERA, all damped more, vibrates as one that was built so."""
+    errors = PlateErrors(thickness=1.03, loss_factor=1.5, era_damping=2.0, stiffness={"SE": 0.8})
+    built = replace(
+        coarse_rig,
+        plate=replace(coarse_rig.plate, thickness=0.001545, loss_factor=0.015),
+        eras=tuple(
+            replace(
+                era,
+                damping=2 * era.damping,
+                stiffness=13_600.0 if era.name == "SE" else 17_000.0,
+            )
+            for era in coarse_rig.eras
+        ),
+    )
+    drive = {"main": (DriveCommand(0, 110.0, 0.5), DriveCommand(1, 110.0, 0.5))}
+    _, found = played(coarse_rig, Imperfections(plate=errors), drive)
+    _, expected = played(built, PERFECT, drive)
+    assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    _, nominal = played(coarse_rig, PERFECT, drive)
+    assert np.abs(found - nominal).max() > 0.1 * np.abs(nominal).max()
 
 
 @pytest.mark.parametrize(

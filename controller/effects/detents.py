@@ -14,6 +14,44 @@ from model.config.units import LENGTH, TIME
 _HYSTERESIS = 0.0005
 
 
+class Notches:
+    """Clicks of a duration [s] at equal distances along a coordinate of one finger.
+
+    It starts halfway between two of them. hysteresis: how far beyond one the finger has passed it.
+    """
+
+    def __init__(
+        self,
+        start: float,
+        *,
+        spacing: float,
+        hysteresis: float,
+        duration: float,
+        level_db_sl: float | None,
+    ) -> None:
+        self._middle = start  # of the two notches around the finger
+        self._spacing = spacing
+        self._hysteresis = hysteresis
+        self._duration = duration
+        self._level = level_db_sl
+        self._pulse: Pulse | None = None  # of the last notch
+
+    def at(self, coordinate: float, now: float) -> Sensation | NoSensation:
+        """Return a click from each passing on; several passed at once are one click."""
+        away = coordinate - self._middle
+        passed = math.floor((abs(away) - self._hysteresis) / self._spacing + 0.5)
+        if passed > 0:
+            self._middle += math.copysign(passed * self._spacing, away)
+            self._pulse = Pulse(self._duration, now)
+        return self.resting(now)
+
+    def resting(self, now: float) -> Sensation | NoSensation:
+        """Return the rest of the last click, without a further notch."""
+        if self._pulse is not None and now < self._pulse.end:
+            return Sensation(self._level, until=self._pulse.end, pulse=self._pulse)
+        return NoSensation()
+
+
 class Detents(Effect):
     """A click at each of the detents that lie `spacing` apart along x or y of the plate.
 
@@ -29,7 +67,14 @@ class Detents(Effect):
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start halfway between two detents."""
-        return _DetentsRun(self, self.position(contact), level_db_sl)
+        notches = Notches(
+            self.position(contact),
+            spacing=self.spacing,
+            hysteresis=_HYSTERESIS,
+            duration=self.duration,
+            level_db_sl=level_db_sl,
+        )
+        return _DetentsRun(self, notches)
 
     def position(self, contact: Contact) -> float:
         """Return the position [m] of a finger along the detents."""
@@ -39,20 +84,10 @@ class Detents(Effect):
 class _DetentsRun(EffectRun):
     """Follows the position of one finger between detents."""
 
-    def __init__(self, detents: Detents, start: float, level_db_sl: float | None) -> None:
+    def __init__(self, detents: Detents, notches: Notches) -> None:
         self._detents = detents
-        self._middle = start  # of the two detents around the finger
-        self._level = level_db_sl
-        self._pulse: Pulse | None = None  # of the last detent
+        self._notches = notches
 
     def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
-        """Return a click from each passing on; several passed at once are one click."""
-        spacing = self._detents.spacing
-        away = self._detents.position(contact) - self._middle
-        passed = math.floor((abs(away) - _HYSTERESIS) / spacing + 0.5)
-        if passed > 0:
-            self._middle += math.copysign(passed * spacing, away)
-            self._pulse = Pulse(self._detents.duration, now)
-        if self._pulse is not None and now < self._pulse.end:
-            return Sensation(self._level, until=self._pulse.end, pulse=self._pulse)
-        return NoSensation()
+        """Return a click from each passing on."""
+        return self._notches.at(self._detents.position(contact), now)

@@ -7,9 +7,11 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 
 from pydantic import BeforeValidator
 
+from controller.effects.band import TunedSection
+from controller.effects.region import Region
 from controller.loop.intent import Pulse
 from controller.sources.contacts import Contact
-from model.config.sections import Quantity, Section
+from model.config.sections import Quantity
 from model.config.units import RATIO
 from model.finger.perception import STRONG_DB_SL
 
@@ -66,21 +68,28 @@ class EffectRun(ABC):
         """
 
 
-class Effect(Section, ABC):
+class Effect(TunedSection, ABC):
     """Parameters of an effect; each kind of effect is a subclass.
 
     kind: its name in layouts; is_for_motion: whether it follows a moving finger and belongs under
-    `on_move`, or runs by itself.
+    `on_move`, or runs by itself; needs_region: whether it is felt in regions only.
     """
 
     kind: ClassVar[str]
     is_for_motion: ClassVar[bool]
+    needs_region: ClassVar[bool] = False
 
     level: Level = STRONG_DB_SL
 
     @abstractmethod
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start at a finger, at a time [s]; level None for as strong as the neighbours allow."""
+
+    def start_in(
+        self, region: Region | None, contact: Contact, now: float, *, level_db_sl: float | None
+    ) -> EffectRun:
+        """Start in a region, or outside of all; for effects that depend on it."""
+        return self.start(contact, now, level_db_sl=level_db_sl)
 
     @property
     def has_end(self) -> bool:

@@ -5,42 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from controller.effects.band import Band
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.effect import Effect
-from controller.effects.shapes import Shape
+from controller.effects.region import Region
 from model.finger.perception import STRONG_DB_SL
-
-
-@dataclass(frozen=True)
-class Region:
-    """A region of the plate and the names of its effects, None for none.
-
-    on_press: when a finger comes down or slides in; on_move: while it moves within; on_release:
-    when it slides out. A finger that lifts feels nothing. level_db_sl: replaces the level of the
-    effects if has_level. priority: the highest is felt.
-    """
-
-    name: str
-    shape: Shape
-    on_press: str | None = None
-    on_move: str | None = None
-    on_release: str | None = None
-    level_db_sl: float | None = None
-    has_level: bool = False
-    priority: int = 0
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it as the API describes it."""
-        return {
-            "name": self.name,
-            **self.shape.as_json(),
-            "on_press": self.on_press,
-            "on_move": self.on_move,
-            "on_release": self.on_release,
-            "priority": self.priority,
-        }
-
 
 BUZZ = "buzz"
 """Name of the effect that plays without a layout."""
@@ -81,6 +51,11 @@ class SurfaceLayout:
             if region.has_level and name is not None
         ]
         return max(levels, default=-math.inf)
+
+    def band_of(self, name: str, region: Region | None) -> Band | None:
+        """Return the band of an effect [Hz], by name, in a region or outside of all; None: any."""
+        own = None if region is None else region.band
+        return self.effects[name].tuned_band if own is None else own
 
     def as_json(self) -> dict[str, Any]:
         """Return it as the API describes it."""

@@ -5,8 +5,10 @@ from typing import Annotated, Any
 
 from pydantic import Field, Strict
 
+from controller.effects.band import TunedSection
 from controller.effects.effect import Effect, Level
-from controller.effects.layout import BUZZ, Region, SurfaceLayout, default_effects
+from controller.effects.layout import BUZZ, SurfaceLayout, default_effects
+from controller.effects.region import Region
 from controller.effects.registry import effect_kind
 from controller.effects.shapes import Circle, Polygon, Rectangle, Shape
 from model.config.document import Document, KeyPath, read_document
@@ -41,7 +43,7 @@ class CircleSection(Section):
     radius: _SIZE
 
 
-class RegionSection(Section):
+class RegionSection(TunedSection):
     """A region of the plate and its effects."""
 
     rectangle: RectangleSection | None = None
@@ -155,6 +157,11 @@ def _check_region(
         validation.add(
             (*path, "level"), "has no effect to apply to; add an effect or remove the level"
         )
+    if uses == [None, None, None] and region.tuned_band is not None:
+        key = "band" if region.frequency is None else "frequency"
+        validation.add(
+            (*path, key), f"has no effect to apply to; add an effect or remove the {key}"
+        )
     for key, is_for_motion in (("on_press", False), ("on_move", True), ("on_release", False)):
         name = getattr(region, key)
         _check_use(validation, (*path, key), name, effects, is_for_motion=is_for_motion)
@@ -179,7 +186,11 @@ def _check_use(
         )
         return
     effect = effects[name]
-    if effect is None or is_for_motion is None:
+    if effect is None:
+        return
+    if is_for_motion is None:
+        if effect.needs_region:
+            validation.add(path, f"{name} is felt in regions only; put it under on_move of one")
         return
     if effect.is_for_motion and not is_for_motion:
         validation.add(path, f"{name} is for motion; put it under on_move")
@@ -218,4 +229,5 @@ def _region(name: str, section: RegionSection) -> Region:
         level_db_sl=section.level if isinstance(section.level, float) else None,
         has_level=section.level is not None,
         priority=section.priority,
+        band=section.tuned_band,
     )

@@ -4,8 +4,10 @@ import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
+from controller.effects.band import Band
 from controller.effects.effect import EffectRun, NoSensation, Sensation
-from controller.effects.layout import Region, SurfaceLayout
+from controller.effects.layout import SurfaceLayout
+from controller.effects.region import Region
 from controller.loop.intent import NO_CONTACTS, HapticIntent, Target
 from controller.sources.contacts import Contact, ContactKey
 from registry.plugins import WrongResultError
@@ -26,6 +28,7 @@ class _Play:
     run: EffectRun
     number: int
     priority: int
+    band: Band | None
 
 
 @dataclass
@@ -62,14 +65,15 @@ class EffectPlayer:
         self._update_regions(contacts, now)
         if not contacts:
             return HapticIntent((), NO_CONTACTS)
-        felt: list[tuple[int, int, Contact, Sensation]] = []
+        felt: list[tuple[_Play, Contact, Sensation]] = []
         ends: list[float] = []
         for contact in contacts:
             play, sensation = self._current_sensation(contact, now, ends)
             if play is not None and sensation is not None:
-                felt.append((play.priority, play.number, contact, sensation))
-        felt.sort(key=lambda one: one[:2], reverse=True)
-        chosen = [one for one in felt if one[0] == felt[0][0]][: self.layout.most_at_once]
+                felt.append((play, contact, sensation))
+        felt.sort(key=lambda one: (one[0].priority, one[0].number), reverse=True)
+        highest = [one for one in felt if one[0].priority == felt[0][0].priority]
+        chosen = highest[: self.layout.most_at_once]
         return HapticIntent(
             tuple(
                 Target(
@@ -77,8 +81,9 @@ class EffectPlayer:
                     sensation.level_db_sl,
                     allow_weaker=sensation.allow_weaker,
                     pulse=sensation.pulse,
+                    band=play.band,
                 )
-                for _, _, contact, sensation in chosen
+                for play, contact, sensation in chosen
             ),
             "no effect plays for the contacts on the plate",
             until=min(ends, default=None),
@@ -170,7 +175,9 @@ class EffectPlayer:
         """Start an effect with the level and priority of a region."""
         effect = self.layout.effects[name]
         level = region.level_db_sl if region.has_level else effect.level_db_sl
-        self._start(finger, name, contact, now, level=level, priority=region.priority)
+        self._start(
+            finger, name, contact, now, level=level, priority=region.priority, region=region
+        )
 
     def _start(
         self,
@@ -181,13 +188,17 @@ class EffectPlayer:
         *,
         level: float | None,
         priority: int,
+        region: Region | None = None,
     ) -> None:
+        """Start an effect in a region, by default the one that the finger is in."""
         self._number += 1
         effect = self.layout.effects[name]
-        run = effect.start(contact, now, level_db_sl=level)
+        region = finger.region if region is None else region
+        run = effect.start_in(region, contact, now, level_db_sl=level)
         if not isinstance(run, EffectRun):
             raise WrongResultError(effect, run, EffectRun)
-        finger.plays.append(_Play(name, run, self._number, priority))
+        band = self.layout.band_of(name, region)
+        finger.plays.append(_Play(name, run, self._number, priority, band))
 
     def _current_sensation(
         self, contact: Contact, now: float, ends: list[float]

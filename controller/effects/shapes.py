@@ -17,6 +17,10 @@ class Shape(Protocol):
     def contains(self, x: float, y: float) -> bool:
         """Whether a point is within or on the edge."""
 
+    @property
+    def centre(self) -> Point:
+        """Its centre of area."""
+
     def corners(self) -> Sequence[Point]:
         """Return points whose bounding box contains it."""
 
@@ -36,6 +40,11 @@ class Rectangle:
     def contains(self, x: float, y: float) -> bool:
         """Whether a point is within."""
         return self.x <= x <= self.x + self.width and self.y <= y <= self.y + self.height
+
+    @property
+    def centre(self) -> Point:
+        """The centre of area."""
+        return (self.x + self.width / 2, self.y + self.height / 2)
 
     def corners(self) -> Sequence[Point]:
         """Return two opposite corners."""
@@ -63,6 +72,11 @@ class Circle:
     def contains(self, x: float, y: float) -> bool:
         """Whether a point is within."""
         return math.dist((x, y), (self.x, self.y)) <= self.radius
+
+    @property
+    def centre(self) -> Point:
+        """The centre."""
+        return (self.x, self.y)
 
     def corners(self) -> Sequence[Point]:
         """Return two opposite corners of its bounding box."""
@@ -103,6 +117,26 @@ class Polygon:
             min(ys) - _TOLERANCE,
             max(xs) - min(xs) + 2 * _TOLERANCE,
             max(ys) - min(ys) + 2 * _TOLERANCE,
+        )
+
+    @property
+    def centre(self) -> Point:
+        """The centre of area, or the mean of the corners where sides cross out the area."""
+        cross = [
+            x0 * y1 - x1 * y0
+            for (x0, y0), (x1, y1) in zip(
+                self.points, (*self.points[1:], self.points[0]), strict=True
+            )
+        ]
+        area = sum(cross) / 2
+        if abs(area) < _TOLERANCE:
+            xs, ys = zip(*self.points, strict=True)
+            return (sum(xs) / len(xs), sum(ys) / len(ys))
+        following = (*self.points[1:], self.points[0])
+        pairs = list(zip(self.points, following, cross, strict=True))
+        return (
+            sum((one[0] + other[0]) * each for one, other, each in pairs) / (6 * area),
+            sum((one[1] + other[1]) * each for one, other, each in pairs) / (6 * area),
         )
 
     def corners(self) -> Sequence[Point]:

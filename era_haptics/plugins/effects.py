@@ -1,12 +1,15 @@
 """Interfaces for effects: entry points `era_haptics.effects`."""
 
 from controller.effects.effect import Effect, EffectRun, Level, NoSensation, Sensation
+from controller.effects.region import Region
 from controller.effects.registry import effect_kind
+from controller.loop.intent import Pulse
 from controller.sources.contacts import Contact, ContactKey
 from model.config.sections import Quantity
-from model.config.units import FREQUENCY, LENGTH, RATIO, SPEED, TIME
+from model.config.units import ANGLE, FREQUENCY, LENGTH, RATIO, SPEED, TIME
 
 __all__ = [
+    "ANGLE",
     "FREQUENCY",
     "LENGTH",
     "RATIO",
@@ -18,7 +21,9 @@ __all__ = [
     "EffectRun",
     "Level",
     "NoSensation",
+    "Pulse",
     "Quantity",
+    "Region",
     "Sensation",
     "effect_kind",
 ]

@@ -31,6 +31,7 @@ MASS = Dimension("a mass", "kg", "5 g")
 FREQUENCY = Dimension("a frequency", "Hz", "250 Hz")
 TIME = Dimension("a time", "s", "50 ms")
 SPEED = Dimension("a speed", "m/s", "5 cm/s")
+ANGLE = Dimension("an angle", "rad", "15 deg")
 RATE = Dimension("a rate", "1/s", "50 Hz")
 SLEW = Dimension("a rise of the level", "1/s", "2 %/ms")
 RATIO = Dimension("a plain number", "", "0.05 or 5 %")
@@ -45,6 +46,7 @@ COMMON_FACTORS = {
     FREQUENCY.unit: {"Hz": "1", "kHz": "1000"},
     TIME.unit: {"s": "1", "ms": "0.001"},
     SPEED.unit: {"m/s": "1", "cm/s": "0.01", "mm/s": "0.001"},
+    ANGLE.unit: {"rad": "1", "deg": "0.01745329251994329576923690768"},
     RATE.unit: {"Hz": "1", "%/ms": "10"},
     RATIO.unit: {"%": "0.01"},
 }

@@ -93,7 +93,7 @@ class Pressed:
     def press(self, *ways: Callable[[float], Position], held: float = 0.15) -> list[list[Felt]]:
         """Press for a time [s] along each way, the position [m] by the time since the press.
 
-        Returns what starts at each press.
+        Returns what starts at each press, each up to where the finger moves on.
         """
         return run_virtual(self._run(ways, held))
 
@@ -125,9 +125,11 @@ class Pressed:
             running = asyncio.create_task(self._controller.run())
             await self._hold(0.5, None, 0)
             for number, way in enumerate(ways, start=1):
-                self._starts, self._reports, touched = [], [], loop.time()
+                self._starts, self._reports, self._felts = [], [], []
+                self._touched, self._at = loop.time(), way(0.0)
                 await self._hold(held, way, number)
-                felt.append(self._felt(touched))
+                self._harvest(number)
+                felt.append(self._felts)
                 await self._hold(_LEAST_PAUSE + _PAUSE_STEP * number, None, number)
             running.cancel()
             await asyncio.gather(running, return_exceptions=True)
@@ -158,6 +160,9 @@ class Pressed:
             fingers = dict(enumerate(self.resting))
             if way is not None:
                 fingers[100 + number] = way(since)
+                if way(since) != self._at:  # records end where a finger moves
+                    self._harvest(number)
+                    self._at = way(since)
             self._bench.place_fingers(
                 {str(id): position for id, position in fingers.items()}, now=loop.time()
             )
@@ -166,21 +171,21 @@ class Pressed:
                 for id, (x, y) in fingers.items()
             )
             self._controller.deliver(TouchFrame("panel", loop.time(), touches))
-            self._finger = str(100 + number)
             await asyncio.sleep(_REPORT)
 
-    def _felt(self, touched: float) -> list[Felt]:
-        """What the pressing finger has felt since a time [s]."""
+    def _harvest(self, number: int) -> None:
+        """Note what the pressing finger has felt at its last position."""
         now = asyncio.get_running_loop().time()
         self._bench.advance(now)
-        record = self._bench.fingers.felt(touched, now)[self._finger]
-        return [
-            Felt(
-                start - touched,
-                applied,
-                record.accelerations[record.times > start],
-                record.weights,
-                self._bench.sample_rate,
+        for start, applied in zip(self._starts, self._reports, strict=True):
+            record = self._bench.fingers.felt(start, now)[str(100 + number)]
+            self._felts.append(
+                Felt(
+                    start - self._touched,
+                    applied,
+                    record.accelerations[record.times > start],
+                    record.weights,
+                    self._bench.sample_rate,
+                )
             )
-            for start, applied in zip(self._starts, self._reports, strict=True)
-        ]
+        self._starts, self._reports = [], []

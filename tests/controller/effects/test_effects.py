@@ -11,9 +11,10 @@ from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.detents import Detents
 from controller.effects.effect import Effect, EffectRun, NoSensation, Sensation
-from controller.effects.layout import Region, SurfaceLayout
+from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.ramp import Ramp
+from controller.effects.region import Region
 from controller.effects.shapes import Circle, Polygon, Rectangle
 from controller.effects.texture import Texture
 from controller.sources.contacts import Contact, ContactKey

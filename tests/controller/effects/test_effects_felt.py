@@ -7,8 +7,11 @@ import pytest
 
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
+from controller.effects.detents import Detents
 from controller.effects.effect import Effect
 from controller.effects.layout import SurfaceLayout
+from controller.effects.region import Region
+from controller.effects.shapes import Rectangle
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from paper_table import smooth_rig
@@ -39,6 +42,22 @@ def pressed(effect: Effect, wire: str) -> list[Felt]:
     presses = chain.press(*[lambda since: PLACE] * PRESSES, held=held)
     assert all(len(each) == 1 for each in presses)
     return [felt for (felt,) in presses]
+
+
+@pytest.mark.parametrize(
+    ("band", "played"), [((170.0, 230.0), {180.0, 220.0}), ((205.0, 205.0), {220.0})]
+)
+def test_notches_of_a_slider_are_alike(band: tuple[float, float], played: set[float]) -> None:
+    """Of the table's frequencies in the band or the nearest, within 2 dB wherever the finger is."""
+    slider = Region("slider", Rectangle(0.02, 0.10, 0.26, 0.04), on_move="notches", band=band)
+    layout = SurfaceLayout((slider,), {"notches": Detents(spacing=0.02, level=18.0)})
+    (notches,) = Pressed(smooth_rig(), table(), layout, "serial").press(
+        lambda since: (0.03 + 0.02 * (since // 0.2), 0.12), held=2.2
+    )
+    assert len(notches) == 10
+    assert {felt.frequency for felt in notches} <= played
+    levels = [felt.level_db_sl(0.030) for felt in notches]
+    assert levels == pytest.approx([18.0] * 10, abs=2.0)
 
 
 @pytest.mark.parametrize("wire", WIRES)

@@ -7,9 +7,11 @@ from typing import Literal, get_args, get_origin
 import pytest
 from pydantic.fields import FieldInfo
 
+from controller.effects.band import TunedSection
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.detents import Detents
+from controller.effects.dial import Dial
 from controller.effects.effect import MAX_DB_SL, MIN_DB_SL, Effect
 from controller.effects.layout_file import (
     CircleSection,
@@ -24,7 +26,7 @@ from model.config.sections import Section
 from model.config.units import quantity
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "effects.md"
-KINDS: tuple[type[Effect], ...] = (Click, Buzz, Ramp, Texture, Detents)
+KINDS: tuple[type[Effect], ...] = (Click, Buzz, Ramp, Texture, Detents, Dial)
 
 
 def fields(heading: str) -> dict[str, FieldInfo]:
@@ -34,15 +36,26 @@ def fields(heading: str) -> dict[str, FieldInfo]:
             return dict(LayoutSection.model_fields)
         case "Regions":
             parts = {"rectangle": RectangleSection, "circle": CircleSection}
-            return dict(with_parts(RegionSection, parts))
+            return tuned_after_level(dict(with_parts(RegionSection, parts)))
         case _:
             own = {
                 f"{kind.kind}.{key}": field
                 for kind in KINDS
                 for key, field in kind.model_fields.items()
-                if key != "level"
+                if key not in Effect.model_fields
             }
-            return {"level": Effect.model_fields["level"], **own}
+            return {**tuned_after_level(dict(Effect.model_fields)), **own}
+
+
+def tuned_after_level(fields: dict[str, FieldInfo]) -> dict[str, FieldInfo]:
+    """Put what every tuned section has behind its level."""
+    tuned = {key: fields.pop(key) for key in TunedSection.model_fields}
+    ordered = {}
+    for key, field in fields.items():
+        ordered[key] = field
+        if key == "level":
+            ordered.update(tuned)
+    return ordered
 
 
 def with_parts(

@@ -72,6 +72,16 @@ AT = "circle: {at: [0.1, 0.1], radius: 1 cm}"
         (f"regions: {{a: {{{AT}, on_release: buzz}}}}", "1: regions.a.on_release:", "duration"),
         ("effects: {c: {kind: texture, slow: 20 cm/s}}", "1: effects.c:", "0.2 m/s"),
         ("region: {}", "1: region:", "regions?"),
+        ("effects: {c: {kind: click, band: [200, 100]}}", "1: effects.c:", "200 Hz"),
+        ("effects: {c: {kind: click, band: [9 Hz, 90 Hz]}}", "1: effects.c.band[0]:", "10 Hz"),
+        (
+            "effects: {c: {kind: click, band: [50, 90], frequency: 70}}",
+            "1: effects.c:",
+            "remove one",
+        ),
+        (f"regions: {{a: {{{AT}, frequency: 100}}}}", "1: regions.a.frequency:", "add an effect"),
+        ("effects: {dial: {}}\nelsewhere: dial", "2: elsewhere:", "on_move"),
+        (f"effects: {{dial: {{}}}}\nregions: {{a: {{{AT}, on_press: dial}}}}", "2: ", "on_move"),
     ],
 )
 def test_load_layout_names_place_and_remedy(

@@ -51,10 +51,10 @@ def query_table(
     if all(target.level_db_sl is None for _, target in targets):
         pattern = strongest(table.query(question), capabilities.max_amplitudes)
         return TableAnswer(question, pattern, pattern.level_db_sl)
-    if all(target.allow_weaker for _, target in targets):
+    duration = _felt_duration(targets)
+    if duration is None and all(target.allow_weaker for _, target in targets):
         return _as_neighbours_allow(table, question, capabilities)
     is_fixed = any(target.band is not None for _, target in targets)
-    duration = _felt_duration(targets)
     if duration is None or levels is None:
         allow_weaker = is_fixed or duration is not None
         question, pattern = _query(table, question, allow_weaker=allow_weaker)

@@ -1,6 +1,5 @@
 """A heartbeat: two pulses, the second one weaker, repeated while the finger rests."""
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from era_haptics.plugins.effects import (
@@ -9,6 +8,7 @@ from era_haptics.plugins.effects import (
     Effect,
     EffectRun,
     NoSensation,
+    Pulse,
     Quantity,
     Sensation,
 )
@@ -19,26 +19,27 @@ WEAKER = 6.0  # dB
 _ROUNDING = 1e-6  # s; at the end of a pulse the next part counts
 
 
-@dataclass(frozen=True)
 class Beating(EffectRun):
     """A heartbeat at one finger."""
 
-    start: float
-    period: float
-    level_db_sl: float | None
+    def __init__(self, start: float, period: float, level_db_sl: float | None) -> None:
+        self.start, self.period, self.level_db_sl = start, period, level_db_sl
+        self.pulse = Pulse(PULSE, start)  # the last one
 
     def feel(self, contact: Contact, now: float) -> Sensation | NoSensation:
         """Return the current pulse or pause, and when it ends."""
         beats, into = divmod(now - self.start + _ROUNDING, self.period)
         begin = self.start + beats * self.period
-        if into < PULSE:
-            return Sensation(self.level_db_sl, until=begin + PULSE)
-        if into < SECOND:
-            return NoSensation(until=begin + SECOND)
-        if into < SECOND + PULSE:
-            weaker = None if self.level_db_sl is None else self.level_db_sl - WEAKER
-            return Sensation(weaker, until=begin + SECOND + PULSE, allow_weaker=True)
-        return NoSensation(until=begin + self.period)
+        is_second = into >= SECOND
+        latest = begin + SECOND if is_second else begin
+        if self.pulse.requested_at != latest:
+            self.pulse = Pulse(PULSE, latest)
+        if now + _ROUNDING >= self.pulse.end:
+            return NoSensation(until=begin + (self.period if is_second else SECOND))
+        if not is_second:
+            return Sensation(self.level_db_sl, until=self.pulse.end, pulse=self.pulse)
+        weaker = None if self.level_db_sl is None else self.level_db_sl - WEAKER
+        return Sensation(weaker, until=self.pulse.end, allow_weaker=True, pulse=self.pulse)
 
 
 class Heartbeat(Effect):

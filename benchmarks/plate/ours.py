@@ -19,7 +19,13 @@ class Spectral:
     def __init__(self, case: Case, accuracy: str) -> None:
         self.case = case
         high = case.highest
-        mesh = mesh_of(f"auto {accuracy}", case.plate, frequency_max=high, stiffness=STIFFNESS)
+        mesh = mesh_of(
+            f"auto {accuracy}",
+            case.plate,
+            frequency_max=high,
+            stiffness=STIFFNESS,
+            foot=case.foot,
+        )
         self.free = solve_free_plate(case.plate, mesh, frequency_max=high)
 
     def sweep(self, shares: FloatArray) -> ComplexArray:

@@ -55,6 +55,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
             plate,
             frequency_max=section.limits.frequency[1],
             stiffness=max(era.stiffness for era in eras),
+            foot=min(era.foot for era in eras),
         ),
         eras=eras,
         wiring={name: Channel(era.amplifier, era.channel) for name, era in section.eras.items()},

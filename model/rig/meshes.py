@@ -20,18 +20,21 @@ _MAX_AUTO_NODES = 300_000  # a million degrees of freedom: minutes, and most of 
 _STRIPS = " with strips of "
 
 
-def mesh_of(text: str, plate: Plate, *, frequency_max: float, stiffness: float = 0.0) -> PlateMesh:
+def mesh_of(
+    text: str, plate: Plate, *, frequency_max: float, stiffness: float = 0.0, foot: float = 0.0
+) -> PlateMesh:
     """The mesh `auto` or `auto A %`, accurate up to a frequency [Hz], or that of `parse_mesh`.
 
     Both are of polynomials over the plate for an error of the response of A %, by default 1 %;
-    `auto` of finite elements where there would be too many. stiffness [N/m]: of the stiffest ERA.
+    `auto` of finite elements where there would be too many. stiffness [N/m]: of the stiffest ERA;
+    foot [m]: radius of the smallest, 0 for a point.
     """
     words = text.split()
     if words[:1] != ["auto"]:
         return parse_mesh(text, plate)
     accuracy = _accuracy(" ".join(words[1:])) if words[1:] else _DEFAULT_ACCURACY
     polynomials = SpectralMesh.accurate(
-        plate, frequency_max=frequency_max, accuracy=accuracy, stiffness=stiffness
+        plate, frequency_max=frequency_max, accuracy=accuracy, stiffness=stiffness, foot=foot
     )
     if polynomials is not None:
         return polynomials

@@ -43,7 +43,8 @@ def direct_spectral_acceleration(
     receptance = np.empty((len(omega), len(everywhere), len(attached)), dtype=complex)
     receptance[:] = local_compliance(plate, degrees, everywhere, attached) / loss
     for parity, shapes in zip(CLASSES, deflections_by_class(plate, x, y, everywhere), strict=True):
-        K = class_stiffness(plate, x, y, parity)
+        upper = np.triu(class_stiffness(plate, x, y, parity))
+        K = upper + np.triu(upper, 1).T
         forces = np.zeros((len(K), len(attached)))
         forces[: shapes.shape[1]] = shapes[: len(attached)].T
         for number, each in enumerate(omega):

@@ -4,26 +4,27 @@ Everything is even or odd about the middle. On a Reissner-Mindlin plate the rota
 have a boundary layer exp(-k x) about as wide as the plate is thick, k² = shear / twisting rigidity
 (k = sqrt(10) / h), which polynomials resolve only at very high degree. The rotations therefore have
 one more function in each direction, exp(-k x) +- exp(-k (L - x)).
+
+All integrals are closed: a polynomial's derivative is a sum of lower polynomials, the integral of
+exp(-k x) with a polynomial is a modified spherical Bessel function, and what is left of the layer
+beside the polynomials is orthogonal to all their derivatives, so that by parts only its value at
+the edge remains.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TypeAlias
 
 import numpy as np
-from numpy.polynomial.legendre import leggauss, legvander
+from scipy import special
 
 from model.arrays import FloatArray
 
 EVEN, ODD = 1, -1
 
-# Pieces in which products with the boundary layer are integrated, in decay lengths 1 / k, and the
-# least number of Gauss points of each.
-_LAYER_PIECES = np.array([0.0, 1.5, 5.0, 14.0])
-_LAYER_POINTS = 14
-
 # A layer with less than this share of its norm outside the polynomials is left out.
-_NEGLIGIBLE = 1e-6
+_NEGLIGIBLE = 1e-4
 
 
 Integrals: TypeAlias = dict[int, FloatArray]
@@ -84,74 +85,64 @@ def _polynomials_in_cosines(degree: int) -> FloatArray:
     """
     k = np.arange(1, degree + 1)
     c = np.concatenate([[1.0], np.cumprod((2 * k - 1) / (2 * k))])
-    coefficients = np.zeros((degree + 1, degree + 1))
-    for n in range(degree + 1):
-        np.add.at(coefficients[:, n], abs(n - 2 * np.arange(n + 1)), c[: n + 1] * c[n::-1])
-    signs = (-1.0) ** np.arange(degree + 1)
-    return coefficients * signs * np.sqrt(2 * np.arange(degree + 1) + 1)
+    n = np.arange(degree + 1)
+    below = n - n[:, None]  # n - m for the coefficient of cos(m angle)
+    some = (below >= 0) & (below % 2 == 0)
+    fewer, more = np.where(some, below // 2, 0), np.where(some, below // 2 + n[:, None], 0)
+    coefficients = some * c[fewer] * c[more] * np.where(n == 0, 1, 2)[:, None]
+    return np.asarray(coefficients * (-1.0) ** n * np.sqrt(2 * n + 1))
 
 
 @lru_cache(maxsize=64)
 def _unit_integrals(degree: int, decay: float) -> tuple[Integrals, Integrals]:
     """`Direction.slope_products` and `slope_squares` of a unit length."""
-    x, weights = _quadrature(degree, decay)
-    legendre = np.asarray(legvander(2 * x - 1, degree), dtype=float)
-    slopes = np.zeros_like(legendre)
-    for n in range(1, degree + 1):
-        slopes[:, n] = (2 * n - 1) * legendre[:, n - 1]
-        if n > 1:
-            slopes[:, n] += slopes[:, n - 2]
-    norms = np.sqrt(2 * np.arange(degree + 1) + 1)
-    legendre *= norms
-    slopes *= 2 * norms
-    near, far = np.exp(-decay * x), np.exp(-decay * (1 - x))
-    values, derivatives = {}, {}
+    n = np.arange(degree + 1)
+    at_end = np.sqrt(2 * n + 1)  # values of the polynomials, and of their slopes
+    slope_at_end = at_end * n * (n + 1)
+    products, squares = {}, {}
+    layer = _layer_integrals(at_end, decay)
     for parity in (EVEN, ODD):
-        own = slice(first_degree(parity), None, 2)
-        values[parity], derivatives[parity] = _with_layer(
-            legendre[:, own],
-            slopes[:, own],
-            near + parity * far,
-            decay * (parity * far - near),
-            weights,
-        )
-    weighted = {parity: 2 * weights * each.T for parity, each in derivatives.items()}
-    products = {parity: each @ values[-parity] for parity, each in weighted.items()}
-    squares = {parity: each @ derivatives[parity] for parity, each in weighted.items()}
+        own, other = (slice(first_degree(each), None, 2) for each in (parity, -parity))
+        shape = len(n[own]), len(n[other])
+        ends = 2 * at_end[own, None]
+        of_degree = n[own, None]
+        product = np.zeros((shape[0] + 1, shape[1] + 1))
+        product[:-1, :-1] = ends * at_end[other] * (of_degree > n[other])
+        square = np.empty((shape[0] + 1, shape[0] + 1))
+        least = np.minimum(of_degree, n[own])
+        square[:-1, :-1] = ends * at_end[own] * (least * (least + 1))
+        norm, norm_of_other, end = layer[parity][0], layer[-parity][0], layer[parity][1]
+        product[-1, :-1] = 2 * end * at_end[other]
+        square[-1, :-1] = square[:-1, -1] = 2 * end * slope_at_end[own]
+        if norm:
+            slope = decay * (parity - np.exp(-decay))
+            sum_of_slopes = layer[parity][2] @ slope_at_end[own]
+            square[-1, -1] = 2 * end * (slope - sum_of_slopes) / norm - decay**2
+            product[-1, -1] = -decay * norm_of_other / norm
+        rows, columns = (shape[0] + bool(norm), shape[1] + bool(norm_of_other))
+        products[parity] = product[:rows, :columns]
+        squares[parity] = square[:rows, :rows]
     return products, squares
 
 
-def _quadrature(degree: int, decay: float) -> tuple[FloatArray, FloatArray]:
-    """Gauss points on half of a unit length, and their weights; twice that is the whole."""
-    ends = _LAYER_PIECES / decay
-    ends = np.append(ends[ends < 0.5], 0.5)
-    points, weights = _gauss(max(_LAYER_POINTS, degree + 1))
-    start, size = ends[:-1, None], np.diff(ends)[:, None]
-    return (start + size * (1 + points) / 2).ravel(), (size * weights / 2).ravel()
+def _layer_integrals(
+    at_end: FloatArray, decay: float
+) -> dict[int, tuple[float, float, FloatArray]]:
+    """By parity, of the layer beside the polynomials, which have these values at the end (n,).
 
-
-def _with_layer(
-    values: FloatArray,
-    slopes: FloatArray,
-    layer: FloatArray,
-    layer_slope: FloatArray,
-    weights: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Append the layer, orthonormal to polynomials with these values and slopes (q, n)."""
-    weighted = 2 * weights * values.T
-    whole = 2 * weights @ layer**2
-    for _ in range(2):  # twice because of rounding
-        projection = weighted @ layer
-        layer, layer_slope = layer - values @ projection, layer_slope - slopes @ projection
-    norm = np.sqrt(2 * weights @ layer**2)
-    if norm < _NEGLIGIBLE * np.sqrt(whole):
-        return values, slopes
-    return (
-        np.column_stack([values, layer / norm]),
-        np.column_stack([slopes, layer_slope / norm]),
-    )
-
-
-@lru_cache(maxsize=32)
-def _gauss(count: int) -> tuple[FloatArray, FloatArray]:
-    return leggauss(count)
+    Its norm, its value at the end at unit norm, and the integrals of the layer itself with the
+    polynomials of its parity. Norm and value are 0 where polynomials represent it.
+    """
+    n = np.arange(len(at_end))
+    bessel = math.sqrt(math.pi / decay) * special.ive(n + 0.5, decay / 2)
+    whole = 2 * (-1.0) ** n * at_end * bessel
+    both, far = (1 - math.exp(-2 * decay)) / decay, math.exp(-decay)
+    found = {}
+    for parity in (EVEN, ODD):
+        own = slice(first_degree(parity), None, 2)
+        square = both + 2 * parity * far
+        rest = square - whole[own] @ whole[own]
+        norm = math.sqrt(rest) if rest > _NEGLIGIBLE**2 * square else 0.0
+        end = float(parity + far - whole[own] @ at_end[own]) / norm if norm else 0.0
+        found[parity] = norm, end, np.asarray(whole[own])
+    return found

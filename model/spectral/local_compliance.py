@@ -6,14 +6,24 @@ plate's compliance in all shorter waves, the mean over all directions phi of
 
     1 / (4 pi D k²) + ln(k_max / k) / (2 pi S),    k = min(a / |cos phi|, b / |sin phi|),
 
-D the flexural and S the shear rigidity. At a free edge it is larger. A wave that runs along the
+D the flexural and S the shear rigidity. The square of a Legendre polynomial waves along the plate,
+and so does what is missing in all higher ones: at x = L (1 - cos t) / 2 there is 1 + o times as
+much in all waves that end at a, so that a is to be divided by sqrt(1 + o),
+
+    o = cos(2 (p - 1) t) / ((p - 1) sin t).
+
+It follows from P_n(cos t)² ~ (1 + sin((2 n + 1) t)) / (pi n sin t) for large n, summed with the
+weight n^-3 over n > p - 2, since the curvature of a polynomial of degree p has degree p - 2.
+
+At a free edge the compliance is larger. A wave that runs along the
 edge with wavenumber k, for a force at a distance d from it, has the closed form of a half-plane,
 
     1 + exp(-2 q) (F - 1 + G (q + q²)),    q = k d,
     F = 8 / ((1 - nu) (3 + nu)),    G = 2 (1 - nu) / (3 + nu),
 
 times the infinite plate's compliance, averaged here over all k above a or b. The shear part without
-limit is cut at k_max = 1 / h: on a shorter scale a plate is no plate.
+limit is cut for a point at k_max = 1 / h: on a shorter scale a plate is no plate. A disc limits it
+itself.
 """
 
 import math
@@ -23,7 +33,7 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 from scipy import special
 
-from model.arrays import FloatArray
+from model.arrays import FloatArray, IntArray
 from model.fem.elements.element import SHEAR_CORRECTION
 from model.structure.footprint import as_footprints, mean_over
 from model.structure.plate import Plate
@@ -31,6 +41,7 @@ from model.structure.plate import Plate
 # How far below its degree a polynomial resolves, against 1/2 for a string of free ends: fitted to
 # the compliance of polynomials of degree 72 at 40 places of the paper's plate, within 10 %.
 _UNRESOLVED = 0.9
+_CURVATURE = 1  # how far below it the wave of what is missing is
 
 _CORNER = 4.0  # bending at a corner, times the infinite plate's
 _TO_CENTROID = 0.5  # where a disc that is cut by an edge acts, between its centre and its centroid
@@ -38,12 +49,13 @@ _LEAST_SINE = 1.5  # times 1 / p: nearest to its end that a polynomial resolves 
 _DIRECTIONS = (np.arange(32) + 0.5) * np.pi / 64
 _COS2, _SIN2 = np.cos(_DIRECTIONS) ** 2, np.sin(_DIRECTIONS) ** 2
 _UNCERTAIN = 0.2  # share by which it may be higher: twice its error, for the estimate of errors
+_ON_FOOT = 0.5  # least share of a point's that is taken for a disc, which an edge may cut
 _FAR = 12.0  # k d beyond which forces share no unresolved wave
 
-# Gauss points of ln t, t = 1 to 30, for integrals over dt / t: footprints leave little beyond.
+# Gauss points of ln t, t = 1 to 100, for integrals over dt / t: footprints leave little beyond.
 _POINTS, _WEIGHTS = leggauss(48)
-_LOG_T = math.log(30) / 2 * (1 + _POINTS)
-_LOG_WEIGHTS = math.log(30) / 2 * _WEIGHTS
+_LOG_T = math.log(100) / 2 * (1 + _POINTS)
+_LOG_WEIGHTS = math.log(100) / 2 * _WEIGHTS
 
 
 def local_compliance(
@@ -87,11 +99,31 @@ def compliance_between(plate: Plate, own: Unresolved, other: Unresolved) -> Floa
     result[i, j] = (bending + shear) * _decay(k * d)
     if on_discs.any():
         footprints = [each[on_discs] for each in (k, d, *radii)]
-        shares = _on_discs(*footprints, k_max=1 / plate.thickness)
-        result[i[on_discs], j[on_discs]] = (
-            bending[on_discs] * shares[0] + shear[on_discs] * shares[1]
-        )
+        share, decades = _on_discs(*footprints)
+        decade = np.sqrt(own.decade[i] * other.decade[j])[on_discs]
+        result[i[on_discs], j[on_discs]] = bending[on_discs] * share + decade * decades
     return result
+
+
+def edge_compliance(plate: Plate, side: float, degrees: IntArray, foot: float) -> FloatArray:
+    """Unresolved compliance [m/N] in the middle of a free edge of a length, by degree, (n,).
+
+    side [m]; degrees (n,): along it, odd and even ones alike; foot [m]: radius of a disc there.
+    """
+    D, nu = plate.flexural_rigidity, plate.material.nu
+    shear = SHEAR_CORRECTION * plate.material.shear_modulus * plate.thickness
+    resolved = 2 * (degrees - _UNRESOLVED) / side  # of directions phi, over |cos phi|
+    bending = 1 / ((1 - nu) * (3 + nu) * np.pi * D * resolved**2)
+    decade = math.log(10) / (np.pi * shear)
+    decades = np.log10(np.maximum(1, 1 / (2 * plate.thickness * resolved)))
+    at_point = bending + decade * decades
+    if not foot:
+        return np.asarray(at_point)
+    radii = np.full(len(degrees), foot)
+    share, decades = _on_discs(
+        np.asarray(math.sqrt(2) * resolved), np.zeros(len(degrees)), radii, radii
+    )
+    return np.asarray(np.maximum(bending * share + decade * decades, _ON_FOOT * at_point))
 
 
 def uncertain_compliance(plate: Plate, own: Unresolved, other: Unresolved) -> FloatArray:
@@ -116,11 +148,15 @@ def unresolved_at(plate: Plate, degrees: tuple[int, int], places: FloatArray) ->
     shear = SHEAR_CORRECTION * plate.material.shear_modulus * h
     sides = np.array([plate.length, plate.width])
     p = np.array(degrees)
-    sine = np.sqrt(np.maximum(1 - (2 * points / sides - 1) ** 2, (_LEAST_SINE / p) ** 2))
+    cosine = np.clip(1 - 2 * points / sides, -1, 1)
+    sine = np.sqrt(np.maximum(1 - cosine**2, (_LEAST_SINE / p) ** 2))
     resolved = 2 * (p - _UNRESOLVED) / (sides * sine)
+    wave = p - _CURVATURE
+    excess = 1 + np.cos(2 * wave * np.arccos(cosine)) / (wave * sine)
     to_edge = np.maximum(np.minimum(points, sides - points), 0)
     # Of waves along the edge x = 0, whose distance is along x.
-    wavelengths2 = np.maximum(_COS2 / resolved[:, :1] ** 2, _SIN2 / resolved[:, 1:] ** 2)
+    missing = excess / resolved**2
+    wavelengths2 = np.maximum(_COS2 * missing[:, :1], _SIN2 * missing[:, 1:])
     ratio_at_edge = 8 / ((1 - nu) * (3 + nu)) - 1
     edge = _edge_excess(2 * to_edge * resolved[:, ::-1], ratio_at_edge, 2 * (1 - nu) / (3 + nu))
     at_corner = edge.prod(axis=1) / ratio_at_edge**2
@@ -138,9 +174,9 @@ def unresolved_at(plate: Plate, degrees: tuple[int, int], places: FloatArray) ->
 
 
 def _on_discs(
-    k: FloatArray, d: FloatArray, a: FloatArray, b: FloatArray, *, k_max: float
+    k: FloatArray, d: FloatArray, a: FloatArray, b: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Shares (n,) of the compliance in bending and in shear that footprints leave.
+    """What footprints leave (n,): a share of the compliance in bending, and decades in shear.
 
     k (n,): where it begins [1/m]; d (n,): distance of two footprints with radii a and b [m].
     """
@@ -149,10 +185,7 @@ def _on_discs(
     for radius in (a, b):
         z = np.maximum(np.multiply.outer(k * radius, t), 1e-9)
         discs *= 2 * special.j1(z) / z
-    within = np.multiply.outer(k, t) < k_max  # of the shear
-    bending = discs @ (2 * _LOG_WEIGHTS / t**2)
-    whole = np.maximum(within @ _LOG_WEIGHTS, 1e-9)
-    return bending, (discs * within) @ _LOG_WEIGHTS / whole
+    return discs @ (2 * _LOG_WEIGHTS / t**2), discs @ _LOG_WEIGHTS / math.log(10)
 
 
 def _edge_excess(z: FloatArray, ratio: float, further: float) -> FloatArray:

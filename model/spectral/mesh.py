@@ -9,7 +9,7 @@ import numpy as np
 from model.errors import InputError
 from model.fem.elements.element import rigidities
 from model.spectral.functions import Direction
-from model.spectral.local_compliance import local_compliance
+from model.spectral.local_compliance import edge_compliance
 from model.structure.plate import Plate
 
 POLYNOMIALS = "Legendre"
@@ -19,13 +19,16 @@ MIN_DEGREE = 4
 MAX_DEGREE = 100
 
 # Degrees beyond pi for each wavelength on a side: with so many the bending waves are resolved, and
-# with so many, and one more for each halving of the accuracy below 1 %, as accurately as wanted.
+# with so many as accurately as 1 %, with further ones for each factor of ten below.
 _RESOLVES = 2
-_ACCURATE = 6
+_ACCURATE, _PER_DECADE = 4.3, 1.5
 
-# Times 1 / p of the lower degree: error of the response by the largest K c, the share of an ERA's
-# force that the unresolved compliance under it takes up (measured on 23 plates).
-_ERROR_PER_DENT = 3.0
+# Error of the response by the unresolved compliance at the middle of an edge (measured on 23
+# plates) at degree _AT_DEGREE, and how it falls with the degree: per stiffness of an ERA, more on a
+# small plate by the square of the wavelength over the area; and per dynamic stiffness of an
+# infinite plate, since the field of a force is wrong elsewhere, too.
+_PER_STIFFNESS, _ON_SMALL_PLATES, _PER_WAVE_STIFFNESS, _AT_DEGREE = 0.1, 2.0, 0.02, 13
+_FALLS = 0.8
 
 _FINER = 2  # further degrees to compare with
 
@@ -56,28 +59,37 @@ class SpectralMesh:
 
     @classmethod
     def accurate(
-        cls, plate: Plate, *, frequency_max: float, accuracy: float, stiffness: float
+        cls,
+        plate: Plate,
+        *,
+        frequency_max: float,
+        accuracy: float,
+        stiffness: float,
+        foot: float = 0.0,
     ) -> Self | None:
         """Choose degrees for a relative L2 error of the response up to a frequency [Hz].
 
         accuracy: that error, 0.01 for 1 %; stiffness [N/m]: of the stiffest ERA, whose force dents
-        the plate under it. None where more than MAX_POLYNOMIALS would be needed.
+        the plate under it; foot [m]: radius of the smallest, 0 for a point. None where more than
+        MAX_POLYNOMIALS would be needed.
         """
-        half = plate.bending_wavelength(frequency_max) / math.pi
-        more = _ACCURATE + max(0, math.ceil(math.log2(0.01 / accuracy)))
-        x, y = plate.length / 2, plate.width / 2
-        places = np.array([(x, y), (x, 0), (0, y)])  # where the polynomials resolve least
-        while True:
-            nx, ny = (
-                max(MIN_DEGREE, math.ceil(side / half) + more)
-                for side in (plate.length, plate.width)
-            )
-            if (nx + 1) * (ny + 1) > MAX_POLYNOMIALS or max(nx, ny) > MAX_DEGREE:
+        wavelength = plate.bending_wavelength(frequency_max)
+        small = wavelength**2 / (plate.length * plate.width)
+        errors = _PER_STIFFNESS * (1 + _ON_SMALL_PLATES * small) * stiffness
+        errors += _PER_WAVE_STIFFNESS * plate.wave_stiffness(frequency_max)
+        more = _ACCURATE + _PER_DECADE * max(0.0, math.log10(0.01 / accuracy))
+        degrees = []
+        for side in (plate.length, plate.width):
+            least = max(MIN_DEGREE, math.ceil(math.pi * side / wavelength + more))
+            possible = np.arange(least, MAX_DEGREE + 1)
+            shares = errors * (_AT_DEGREE / possible) ** _FALLS
+            accurate = shares * edge_compliance(plate, side, possible, foot) <= accuracy
+            if not accurate.any():
                 return None
-            dent = np.diagonal(local_compliance(plate, (nx, ny), places, places)).max()
-            if _ERROR_PER_DENT / min(nx, ny) * stiffness * dent <= accuracy:
-                return cls(nx, ny, plate.length, plate.width)
-            more += 1
+            degrees.append(int(possible[accurate.argmax()]))
+        if math.prod(degree + 1 for degree in degrees) > MAX_POLYNOMIALS:
+            return None
+        return cls(degrees[0], degrees[1], plate.length, plate.width)
 
     def to_dict(self) -> dict[str, Any]:
         """Its fields for a file, with the element's name."""

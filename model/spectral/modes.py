@@ -27,7 +27,7 @@ class SpectralClass:
 
     eigenvalues omega² (r,) [rad²/s²]; vectors (n, r), orthonormal; largest_truncated:
     1 / (lambda + shift) of the lowest truncated mode [s²/rad²]; factor: Cholesky's of K + shift,
-    lower; deflections: m.
+    its lower triangle; deflections: m.
     """
 
     deflections: int
@@ -98,15 +98,17 @@ def solve_class(
     count: about how many they are.
     """
     K = class_stiffness(plate, x, y, parity)
-    K[np.diag_indices_from(K)] += shift
-    factor, _ = linalg.lapack.dpotrf(K, lower=1)
+    K.reshape(-1, copy=False)[:: len(K) + 1] += shift
     deflections = x.polynomial_count(parity[0]) * y.polynomial_count(parity[1])
     width = min(count // 2 + 2, deflections)
-    if _LEAST_BLOCKS * width < len(K) / 2:
+    is_small = _LEAST_BLOCKS * width >= len(K) / 2
+    if is_small:
+        shifted, vectors = linalg.eigh(K, lower=False, check_finite=False)
+    # The upper triangle by rows is the lower one by columns, as LAPACK expects: nothing is copied.
+    factor, _ = linalg.lapack.dpotrf(K.T, lower=1, clean=0, overwrite_a=1)
+    if not is_small:
         start = _long_waves(x, y, parity, width)
         shifted, vectors = _lowest(factor, start, cut + shift)
-    else:
-        shifted, vectors = linalg.eigh(K, check_finite=False)
     eigenvalues = shifted - shift
     kept = int(np.searchsorted(eigenvalues, cut))
     eigenvalues[np.abs(eigenvalues) < 1e-6 * shift] = 0.0
@@ -145,7 +147,7 @@ def _lowest(factor: FloatArray, start: IntArray, cut: float) -> tuple[FloatArray
         for _ in range(
             2 if size > width else 1
         ):  # twice: a mode found exactly leaves only rounding
-            block, _ = np.linalg.qr(block - known @ (known.T @ block))
+            block = _orthonormal(block - known @ (known.T @ block))
         basis[:, size - width : size] = block
         solved[:, size - width : size], _ = linalg.lapack.dpotrs(factor, block, lower=1)
         if size < _LEAST_BLOCKS * width:
@@ -164,3 +166,10 @@ def _lowest(factor: FloatArray, start: IntArray, cut: float) -> tuple[FloatArray
     u, mixture = u[: kept + 1], mixture[:, : kept + 1]
     vectors = solved[:, :size] @ (mixture / u)
     return 1 / u, vectors / np.linalg.norm(vectors, axis=0)
+
+
+def _orthonormal(block: FloatArray) -> FloatArray:
+    """Orthonormal columns that span those of a block (n, w)."""
+    reflectors, scales, _, _ = linalg.lapack.dgeqrf(block)
+    columns, _, _ = linalg.lapack.dorgqr(reflectors, scales, overwrite_a=1)
+    return np.asarray(columns)

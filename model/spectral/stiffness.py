@@ -16,6 +16,8 @@ def class_stiffness(
 ) -> FloatArray:
     """Stiffness K (n, n) [rad²/s²] of one symmetry class, scaled so that its mass is the identity.
 
+    Only the upper triangle is filled in; below there are zeros in part.
+
     Unknowns: w, beta_x, beta_y, each the products of functions of x and functions of y, y running
     first. w has the class's parity along x and y and polynomials only; beta_x has the other parity
     along x, beta_y along y. Energy, with C_b, S and H of `rigidities`:
@@ -45,19 +47,19 @@ def class_stiffness(
     _along_y(xx)[:] += twist / rotation * squares_y[b]
     _along_x(yy)[:] += twist / rotation * squares_x[a][:, :, None]
     _along_y(yy)[:] += D / rotation * squares_y[-b]
-    rotations = np.arange(w.stop, len(K))
-    K[rotations, rotations] += shear / rotation
+    diagonal = K.reshape(-1, copy=False)[:: len(K) + 1]
+    diagonal[w.stop :] += shear / rotation
 
     mixed = -shear / math.sqrt(deflection * rotation)
     wx = K[w, beta_x].reshape(*of_w, *of_x)
     _along_x(wx[..., :ny])[:] = mixed * products_x[a][:nx, :, None]
     wy = K[w, beta_y].reshape(*of_w, *of_y)
     _along_y(wy[:, :, :nx])[:] = mixed * products_y[b][:ny]
-    xy = K[beta_x, beta_y]
-    xy += np.kron(coupled / rotation * products_x[-a], products_y[-b].T)
-    xy += np.kron(twist / rotation * products_x[a].T, products_y[b])
-    for rows, columns in ((w, beta_x), (w, beta_y), (beta_x, beta_y)):
-        K[columns, rows] = K[rows, columns].T
+    xy = K[beta_x, beta_y].reshape(*of_x, *of_y)
+    along_x = coupled / rotation * products_x[-a], twist / rotation * products_x[a].T
+    along_y = products_y[-b].T, products_y[b]
+    np.multiply(along_x[0][:, None, :, None], along_y[0][None, :, None, :], out=xy)
+    xy += along_x[1][:, None, :, None] * along_y[1][None, :, None, :]
     return K
 
 

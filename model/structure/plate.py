@@ -93,6 +93,12 @@ class Plate:
         surface_density = self.material.rho * self.thickness
         return 2 * math.pi / wavelength**2 * math.sqrt(self.flexural_rigidity / surface_density)
 
+    def wave_stiffness(self, frequency: float) -> float:
+        """Dynamic stiffness of an infinite plate under a point force, |F / w| [N/m]."""
+        surface_density = self.material.rho * self.thickness
+        omega = 2 * math.pi * frequency
+        return 8 * omega * math.sqrt(self.flexural_rigidity * surface_density)
+
     def modes_below(self, frequency: float) -> int:
         """Number of modes of the free plate up to a frequency [Hz], as an estimate.
 

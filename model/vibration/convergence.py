@@ -83,7 +83,8 @@ def meshes_to_compare(rig: Rig) -> tuple[PlateMesh, ...]:
     nx, ny = (max(1, math.ceil(side / size)) for side in (plate.length, plate.width))
     plain = [Mesh(nx << n, ny << n, plate.length, plate.width) for n in range(_DOUBLINGS + 1)]
     stiffness = max(era.stiffness for era in rig.eras)
-    automatic = mesh_of("auto", plate, frequency_max=high, stiffness=stiffness)
+    foot = min(era.foot for era in rig.eras)
+    automatic = mesh_of("auto", plate, frequency_max=high, stiffness=stiffness, foot=foot)
     chosen = [*plain, automatic, Mesh.accurate(plate, frequency_max=high), rig.mesh]
     return tuple(dict.fromkeys(chosen))
 

@@ -35,7 +35,7 @@ def test_meshes_to_compare_include_the_papers(study):
         "24x18",
         "48x36",
         "96x72",
-        "12x11 Legendre",
+        "13x11 Legendre",
         "10x8 Q5 with strips of 3 mm",
     ]
 

@@ -31,7 +31,7 @@ def modes_figure() -> Figure:
     for axes, drive_mode in zip(panels, DRIVE_MODES, strict=True):
         question = question_of(PLACES, drive_mode=drive_mode)
         pattern = with_robust_contrast(table, question, table.query(question))
-        level = sensation_level(*table.amplitudes(pattern.excitation, points))
+        level = sensation_level(*table.amplitudes(pattern.excitation, points), table.threshold)
         axes.pcolormesh(
             100 * x, 100 * y, level.reshape(SIDE, SIDE), cmap=COLORS, norm=SCALE, shading="gouraud"
         )

@@ -17,6 +17,7 @@ import numpy as np
 from controller.demo.touch_row import FingerVibration, Position
 from controller.plate_control import PlateControl
 from drivers.errors import LinkError
+from model.finger.perception import DEFAULT_THRESHOLD
 
 STARTUP_TIMEOUT = 30.0  # s; solving the plate takes long on a busy machine
 EXIT_TIMEOUT = 3.0  # s
@@ -33,8 +34,15 @@ SIM_OPTIONS: Mapping[str, Sequence[str]] = {
 class SimulatedPlate:
     """The plate behind the amplifiers, with their URLs by name; methods raise LinkError."""
 
-    def __init__(self, control: PlateControl, urls: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        control: PlateControl,
+        urls: Mapping[str, str],
+        *,
+        threshold: str = DEFAULT_THRESHOLD,
+    ) -> None:
         self.urls = urls
+        self._threshold = threshold
         self._control = control
 
     async def place_fingers(self, positions: Mapping[str, Position]) -> None:
@@ -52,6 +60,7 @@ class SimulatedPlate:
                 ),
                 peaks=np.array(felt["peak_m_s2"], dtype=float),
                 weights=np.array(felt["weights"], dtype=float),
+                threshold=self._threshold,
             )
             for id, felt in reply["fingers"].items()
         }
@@ -59,13 +68,18 @@ class SimulatedPlate:
 
 @contextlib.asynccontextmanager
 async def simulated_plate(
-    rig_file: Path, amplifiers: Collection[str], *, wire: str, seed: int | None = 0
+    rig_file: Path,
+    amplifiers: Collection[str],
+    *,
+    wire: str,
+    seed: int | None = 0,
+    threshold: str = DEFAULT_THRESHOLD,
 ) -> AsyncIterator[SimulatedPlate]:
     """Simulate the amplifiers of a rig file for the duration of the context.
 
     wire: a key of `SIM_OPTIONS` for a process of their own, "sim" for a plate in this process;
-    seed: of the plate within the rig's uncertainty, None for the rig's own. Raises LinkError if the
-    process does not start.
+    seed: of the plate within the rig's uncertainty, None for the rig's own; threshold: name of the
+    set for levels. Raises LinkError if the process does not start.
     """
     with tempfile.TemporaryDirectory(prefix="era-") as folder:
         path = Path(folder) / "control"
@@ -80,7 +94,7 @@ async def simulated_plate(
                 process = await _start(rig_file, wire=wire, control=path, seed=seed)
                 stack.push_async_callback(_terminate, process)
                 urls = await _read_urls(process, count=len(amplifiers))
-            yield SimulatedPlate(control, urls)
+            yield SimulatedPlate(control, urls, threshold=threshold)
 
 
 async def _start(

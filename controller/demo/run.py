@@ -77,7 +77,9 @@ async def run_demo(
     order of time. Raises LinkError if the far end is lost.
     """
     rig = load_rig(rig_file)
-    async with simulated_plate(rig_file, rig.amplifiers, wire=wire, seed=seed) as plate:
+    async with simulated_plate(
+        rig_file, rig.amplifiers, wire=wire, seed=seed, threshold=rig.threshold
+    ) as plate:
         source, play = await touches()
         recorder = TouchRecorder(plate, on_row=on_row)
         controller = Controller(

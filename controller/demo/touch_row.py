@@ -8,6 +8,7 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.finger.contrast import contrast_db, mean_level_db_sl
+from model.finger.perception import DEFAULT_THRESHOLD
 from model.table.pattern import Pattern
 from model.vibration.peak import peak_acceleration
 
@@ -20,18 +21,19 @@ class FingerVibration:
 
     frequencies (f,) [Hz]; amplitudes (f, p) [m/s²] of the steady part at each point of the tip;
     peaks (p,) [m/s²], the largest acceleration there, transients included; weights (p,) of the
-    points in the mean over the tip.
+    points in the mean over the tip; threshold: name of the set that levels are above.
     """
 
     frequencies: FloatArray
     amplitudes: FloatArray
     peaks: FloatArray
     weights: FloatArray
+    threshold: str = DEFAULT_THRESHOLD
 
     @property
     def level_db_sl(self) -> float:
         """Sensation level, mean over the tip; -inf without vibration."""
-        return mean_level_db_sl(self.frequencies, self.amplitudes, self.weights)
+        return mean_level_db_sl(self.frequencies, self.amplitudes, self.weights, self.threshold)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -148,7 +148,8 @@ class Selector:
         predictions = []
         for (contact, _), field in zip(targets, fields, strict=True):
             weights = fingertip_weights(contact.x, contact.y, self._table.plate)
-            level = mean_level_db_sl(frequencies, field, weights) + onset_gain
+            level = mean_level_db_sl(frequencies, field, weights, self._table.threshold)
+            level += onset_gain
             contrast = (
                 contrast_db([peak_acceleration(field)], loudest, [weights]) if quiet else None
             )

@@ -193,8 +193,8 @@ def strongest(
 ) -> Pattern:
     """Scale a pattern to as strong as the neighbours allow.
 
-    Quiet fingers do not feel it then, no ERA exceeds its largest amplitude [m], by name, and no
-    target exceeds max_db_sl [dB SL]. Raises InputError if nothing remains to be felt.
+    Quiet fingers are at -10 dB SL at most then, no ERA exceeds its largest amplitude [m], by name,
+    and no target exceeds max_db_sl [dB SL]. Raises InputError if nothing remains to be felt.
     """
     headroom = [
         float(decibels(max_amplitudes[name] / tone.amplitude))
@@ -208,8 +208,8 @@ def strongest(
     level = pattern.level_db_sl + gain
     if level <= 0:
         raise InputError(
-            "a quiet finger must not feel the pattern, but every one that reaches the target does; "
-            "lift or move that finger away"
+            "a quiet finger must stay at -10 dB SL, but at every level that reaches the target it "
+            "does not; lift or move that finger away"
         )
     factor = 10 ** (gain / 20)
     return replace(

@@ -93,7 +93,7 @@ def _print_answer(answer: dict[str, Any]) -> None:
             ("  on nine of ten plates", answer["robust_contrast_db"], "dB or more"),
             ("  in the first 100 ms", answer["transient_contrast_db"], "dB"),
             ("loudest quiet finger", answer["quiet_level_db_sl"], f"dB SL, {awareness}"),
-            ("highest level not felt there", answer["usable_level_db_sl"], "dB SL"),
+            ("level that leaves it at -10", answer["usable_level_db_sl"], "dB SL"),
         ]
     else:
         rows += [

@@ -30,7 +30,8 @@ _SIDE = 121  # points along a side; nulls are narrow
 def draw_levels(axes: Axes, table: LocalizationTable, excitation: Excitation) -> None:
     """Draw the sensation level [dB SL] over the plate, and the ERAs; axes in centimetres."""
     x, y = (np.linspace(0, side, _SIDE) for side in (table.plate.length, table.plate.width))
-    level = sensation_level(*table.amplitudes(excitation, lattice(x, y))).reshape(_SIDE, _SIDE)
+    amplitudes = table.amplitudes(excitation, lattice(x, y))
+    level = sensation_level(*amplitudes, table.threshold).reshape(_SIDE, _SIDE)
     axes.pcolormesh(100 * x, 100 * y, level, cmap=_COLORS, shading="gouraud", norm=_SCALE)
     axes.set_aspect("equal")
     draw_eras(axes, table.eras, active=excitation.keys())

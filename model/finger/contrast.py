@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import FloatArray
-from model.finger.perception import decibels, sensation_level
+from model.finger.perception import DEFAULT_THRESHOLD, decibels, sensation_level
 
 # The background of a lone finger begins at this distance [m], about two fingertips.
 NEAR_RADIUS = 0.05
@@ -52,10 +52,16 @@ def contrast_db(
     return decibels(contrast_ratio(targets, quiet, weights))
 
 
-def mean_level_db_sl(frequencies: FloatArray, amplitudes: FloatArray, weights: FloatArray) -> float:
+def mean_level_db_sl(
+    frequencies: FloatArray,
+    amplitudes: FloatArray,
+    weights: FloatArray,
+    threshold: str = DEFAULT_THRESHOLD,
+) -> float:
     """Level [dB SL] over a fingertip: mean over its points of amplitude to threshold.
 
-    frequencies (f,) [Hz], amplitudes (f, p) [m/s²], weights (p,) of the points.
+    frequencies (f,) [Hz], amplitudes (f, p) [m/s²], weights (p,) of the points; threshold: name of
+    the set. Raises InputError for frequencies without data.
     """
-    above = 10 ** (sensation_level(frequencies, amplitudes) / 20)
+    above = 10 ** (sensation_level(frequencies, amplitudes, threshold) / 20)
     return float(decibels(above @ weights))

@@ -6,8 +6,8 @@ from model.arrays import FloatArray
 from model.finger.disc import FINE_POINTS, DiscRule
 from model.structure.plate import Plate
 
-# Contact of an adult's index finger pressed lightly is 10 to 15 mm across; the disc takes in the
-# skin around it that the vibration reaches, and a little of where the touch sensor may be wrong.
+# A contact of 5 mm radius, the mean of index fingers on touch screens, and the 8 mm by which a
+# finger may move before its pattern changes (docs/concepts/people.md).
 FINGERTIP_RADIUS = 0.013
 
 

@@ -1,4 +1,8 @@
-"""Detection thresholds at the fingertip, and levels above them in dB SL."""
+"""Detection thresholds at the fingertip, and levels above them in dB SL.
+
+A set of thresholds is a file in model/data/thresholds, with its sources; its name is the file's.
+What is measured differs by tens of decibels between ways to touch (docs/concepts/people.md).
+"""
 
 import csv
 from functools import cache
@@ -7,47 +11,83 @@ from importlib import resources
 import numpy as np
 
 from model.arrays import FloatArray
+from model.errors import InputError
 
 DEFAULT_THRESHOLD = "vibrotactile-probe"
-THRESHOLDS = {DEFAULT_THRESHOLD: "perception.csv"}
-"""Files of detection thresholds in model/data by the name of the set."""
 
 FELT_DB_SL = 12.0
 STRONG_DB_SL = 20.0
 
+_FOLDER = resources.files("model").joinpath("data/thresholds")
+
+THRESHOLDS = tuple(
+    sorted(
+        each.name.removesuffix(".csv") for each in _FOLDER.iterdir() if each.name.endswith(".csv")
+    )
+)
+"""Names of the sets of detection thresholds."""
+
 
 @cache
-def _thresholds() -> tuple[FloatArray, FloatArray]:
-    """Logarithms of frequency and of threshold, as tabulated."""
-    text = (
-        resources.files("model")
-        .joinpath("data", THRESHOLDS[DEFAULT_THRESHOLD])
-        .read_text(encoding="utf-8")
-    )
+def _tabulated(threshold: str) -> tuple[FloatArray, FloatArray]:
+    """Frequencies [Hz] and peak accelerations [m/s²] of a set, as tabulated."""
+    text = _FOLDER.joinpath(f"{threshold}.csv").read_text(encoding="utf-8")
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     rows = list(csv.DictReader(lines))
     frequency = np.array([float(row["frequency_hz"]) for row in rows])
-    threshold = np.array([float(row["threshold_m_s2_peak"]) for row in rows])
-    return np.log(frequency), np.log(threshold)
+    return frequency, np.array([float(row["threshold_m_s2_peak"]) for row in rows])
 
 
-def detection_threshold(frequency: FloatArray) -> FloatArray:
+def check_has_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOLD) -> None:
+    """Raise InputError for frequencies [Hz] at which a set of thresholds has no data."""
+    if threshold not in THRESHOLDS:
+        raise InputError(f"threshold must be one of {', '.join(THRESHOLDS)}, got {threshold!r}")
+    low, high = _tabulated(threshold)[0][[0, -1]]
+    outside = np.asarray(frequency)[~((low <= frequency) & (frequency <= high))]  # NaN too
+    if outside.size:
+        raise InputError(
+            f"frequency must be {low:g} to {high:g} Hz, where the thresholds {threshold} have "
+            f"data, got {outside.flat[0]:g} Hz"
+        )
+
+
+def detection_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOLD) -> FloatArray:
     """Peak acceleration [m/s²] that a fingertip just detects at frequencies [Hz].
 
-    Interpolated in the logarithm of both; held constant outside the table (10 to 500 Hz). Good to
-    about 4 dB between people; sources in data/perception.csv.
+    threshold: name of the set. Interpolated in the logarithm of both. Raises InputError for
+    frequencies without data.
     """
-    log_frequency, log_threshold = _thresholds()
-    return np.asarray(np.exp(np.interp(np.log(frequency), log_frequency, log_threshold)))
+    check_has_threshold(frequency, threshold)
+    known, acceleration = _tabulated(threshold)
+    return np.asarray(np.exp(np.interp(np.log(frequency), np.log(known), np.log(acceleration))))
 
 
-def sensation_level(frequencies: FloatArray, amplitudes: FloatArray) -> FloatArray:
+def sensitivity_margin_db(frequency: FloatArray, threshold: str = DEFAULT_THRESHOLD) -> FloatArray:
+    """How far [dB] the lowest of all sets lies below one at frequencies [Hz], at least 0.
+
+    Raises InputError for frequencies at which that one has no data; others without are left out.
+    """
+    own = detection_threshold(frequency, threshold)
+    lowest = own
+    for name in THRESHOLDS:
+        low, high = _tabulated(name)[0][[0, -1]]
+        inside = (low <= frequency) & (frequency <= high)
+        other = detection_threshold(np.clip(frequency, low, high), name)
+        lowest = np.where(inside, np.minimum(lowest, other), lowest)
+    return decibels(own / lowest)
+
+
+def sensation_level(
+    frequencies: FloatArray, amplitudes: FloatArray, threshold: str = DEFAULT_THRESHOLD
+) -> FloatArray:
     """Level above threshold [dB SL] of tones felt together: 20 log10 sqrt(sum (a_f / T(f))²).
 
-    frequencies (f,) [Hz], amplitudes (f, ...) [m/s²]; -inf where nothing moves.
+    frequencies (f,) [Hz], amplitudes (f, ...) [m/s²]; -inf where nothing moves. Raises InputError
+    for frequencies without data.
     """
-    threshold = detection_threshold(frequencies).reshape(-1, *[1] * (amplitudes.ndim - 1))
-    return decibels(np.sqrt(((amplitudes / threshold) ** 2).sum(axis=0)))
+    lowest = detection_threshold(frequencies, threshold)
+    above = amplitudes / lowest.reshape(-1, *[1] * (amplitudes.ndim - 1))
+    return decibels(np.sqrt((above**2).sum(axis=0)))
 
 
 def decibels(ratio: FloatArray | float) -> FloatArray:

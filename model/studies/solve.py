@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
 from model.fem.plate_mesh import check_frequencies
+from model.finger.perception import check_has_threshold
 from model.rig.rig import Rig
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import full_strokes
@@ -36,12 +37,17 @@ DRIVE_NAMES = {"1": "best single ERA", "2": "best pair of ERAs", "all": "all ERA
 class StudyProblem:
     """Inputs of the statistics of all cases.
 
-    positions (c, 2) [m]: possible places of ERAs; frequencies (f,) [Hz].
+    positions (c, 2) [m]: possible places of ERAs; frequencies (f,) [Hz]. Raises InputError for
+    frequencies without data on thresholds.
     """
 
     rig: Rig
     positions: FloatArray
     frequencies: FloatArray
+
+    def __post_init__(self) -> None:
+        """Refuse frequencies at which nothing is known of what is felt."""
+        check_has_threshold(self.frequencies)
 
     @property
     def points(self) -> FloatArray:

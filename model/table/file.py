@@ -20,6 +20,7 @@ from model.drive_modes import DRIVE_MODES
 from model.errors import InputError, first_problem
 from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
 from model.finger.grid import Grid
+from model.finger.perception import check_has_threshold
 from model.rig.meshes import mesh_from_dict
 from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era
@@ -232,6 +233,10 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
     for name in ("acceleration", "shapes", "cell_sources"):
         if count > 0 and not getattr(table, name).any():
             raise InputError(f"{path}: {name} must not be zero everywhere")
+    try:
+        check_has_threshold(table.frequencies, table.threshold)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
     # Rows are found by frequency with a binary search.
     if not (count > 0 and table.frequencies[0] > 0 and (np.diff(table.frequencies) > 0).all()):
         raise InputError(f"{path}: frequencies must be positive and ascend, at least one")

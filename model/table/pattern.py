@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from model.finger.perception import DEFAULT_THRESHOLD, sensitivity_margin_db
 from model.transients.envelope import Envelopes
 from model.vibration.excitation import Excitation
 
@@ -13,7 +16,7 @@ at 20 dB SL the target still feels it after a fifth of it (docs/concepts/transie
 """
 
 IMPERCEPTIBLE_DB_SL = -10.0
-"""Level up to which even the most sensitive quiet finger feels nothing."""
+"""Level at which a finger stays unaware: ten decibels for the differences between people."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,8 @@ class Pattern:
     contrast from `model.drive_modes.exact_search`; robust_contrast_db: tenth percentile over
     plates within tolerance (`model.table.robust`); transient_contrast_db: over the first 100 ms;
     residual_db: residual vibration in the 100 ms after the end, relative to the steady one
-    (`model.table.timing`). onset, ending: envelopes that replace the ramp.
+    (`model.table.timing`). onset, ending: envelopes that replace the ramp. threshold: name of the
+    set of thresholds that its levels are above.
     """
 
     excitation: Excitation
@@ -58,6 +62,7 @@ class Pattern:
     concentration: Concentration | None = None
     onset: Envelopes | None = None
     ending: Envelopes | None = None
+    threshold: str = DEFAULT_THRESHOLD
 
     @property
     def felt_contrast_db(self) -> float | None:
@@ -66,16 +71,22 @@ class Pattern:
 
     @property
     def is_imperceptible_to_quiet(self) -> bool | None:
-        """Whether every quiet finger stays 10 dB below threshold."""
-        return (
-            None
-            if self.quiet_level_db_sl is None
-            else self.quiet_level_db_sl <= IMPERCEPTIBLE_DB_SL
-        )
+        """Whether every quiet finger stays 10 dB below the lowest of all sets of thresholds.
+
+        Of several frequencies the one at which that lies lowest counts for all.
+        """
+        if self.quiet_level_db_sl is None:
+            return None
+        frequencies = np.array([tone.frequency for tone in self.excitation.values()])
+        margin = float(sensitivity_margin_db(frequencies, self.threshold).max(initial=0))
+        return self.quiet_level_db_sl + margin <= IMPERCEPTIBLE_DB_SL
 
     @property
     def usable_level_db_sl(self) -> float:
-        """Highest level at the target, up to this one, that quiet fingers do not feel."""
+        """Highest level at the target, up to this one, with quiet fingers at -10 dB SL.
+
+        By the pattern's own thresholds: no claim that they feel nothing.
+        """
         if self.felt_contrast_db is None:
             return self.level_db_sl
         return min(self.level_db_sl, self.felt_contrast_db + IMPERCEPTIBLE_DB_SL)

@@ -8,7 +8,7 @@ the cells of a grid.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -150,7 +150,8 @@ class LocalizationTable:
             fields = fields.at(playable)
         onset_contrast = self._onset_contrast(question, fingertips, playable)
         candidates = Candidates(self.eras, self.frequencies[playable], fields, onset_contrast)
-        return choose_pattern(question, drive_mode, candidates)
+        pattern = choose_pattern(question, drive_mode, candidates)
+        return replace(pattern, threshold=self.threshold)
 
     def prepare(self, drive_mode: str | None = None) -> None:
         """Compute ahead what the first query in a drive mode needs."""
@@ -266,7 +267,7 @@ class LocalizationTable:
 
     @cached_property
     def _threshold(self) -> NDArray[np.float32]:
-        return detection_threshold(self.frequencies).astype(np.float32)
+        return detection_threshold(self.frequencies, self.threshold).astype(np.float32)
 
     @cached_property
     def _values(self) -> NDArray[np.float32]:

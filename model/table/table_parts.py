@@ -13,6 +13,7 @@ from model.errors import InputError
 from model.fem.plate_mesh import PlateMesh
 from model.files.array_file import Arrays
 from model.finger.grid import CELL_SAMPLES, Grid
+from model.finger.perception import check_has_threshold
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig, canonical_json
@@ -189,3 +190,4 @@ def _check_frequencies(frequencies: FloatArray, rig: Rig) -> None:
             f"frequencies must be within the rig's limits.frequency of {low:g} to {high:g} Hz, got "
             f"{frequencies[0]:g} to {frequencies[-1]:g} Hz; choose others or change the limits"
         )
+    check_has_threshold(frequencies, rig.threshold)

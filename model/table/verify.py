@@ -262,7 +262,9 @@ class _AnswerChecker:
             question,
             pattern,
             predicted_contrast_db=math.nan if contrast is None else contrast,
-            direct_level_db_sl=mean_level_db_sl(frequencies, direct[:, :count], weights),
+            direct_level_db_sl=mean_level_db_sl(
+                frequencies, direct[:, :count], weights, rig.threshold
+            ),
             direct_contrast_db=_contrast(direct, weights),
             contrast_in_time_db=_contrast(in_time, weights),
             level_tolerance_db=ROUNDING_DB + at_target,

@@ -92,9 +92,10 @@ def ramp_responses(
     end = (coefficients * [1, -1, -1]) @ states - states[:, :, 0]
     rates = plate.eigenvalues - 1j * omega[:, None]
     decay = np.exp(times[:, None] * rates[:, None, :])[:, None]
-    later = np.exp((times[:, None] - ramp) * rates[:, None, :])[:, None]
+    # Only from the end of the ramp on: before it, what decays fast would overflow.
+    later = np.exp((times[~rising, None] - ramp) * rates[:, None, :])[:, None]
     free = start[:, :, None] * decay
-    free[:, :, ~rising] += end[:, :, None] * later[:, :, ~rising]
+    free[:, :, ~rising] += end[:, :, None] * later
     responses = forced + free @ plate.acceleration.T
     if with_steady:
         responses = np.concatenate([responses, accelerations[:, :, :1]], axis=2)

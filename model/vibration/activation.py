@@ -33,7 +33,10 @@ def activation_sets(era_count: int) -> tuple[ActivationSet, ...]:
 
 
 def felt_acceleration(frequencies: FloatArray) -> FloatArray:
-    """Peak acceleration (f,) [m/s²] from which tones (f,) [Hz] are felt well, 12 dB SL."""
+    """Peak acceleration (f,) [m/s²] from which tones (f,) [Hz] are felt well, 12 dB SL.
+
+    Raises InputError for frequencies without data on thresholds.
+    """
     return detection_threshold(frequencies) * 10 ** (FELT_DB_SL / 20)
 
 

@@ -13,7 +13,7 @@ from model.counting import counted
 from model.errors import InputError
 from model.finger.contrast import contrast_db, mean_level_db_sl
 from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import sensation_level
+from model.finger.perception import DEFAULT_THRESHOLD, sensation_level
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
 from model.structure.fingertip import FingertipLoad
@@ -39,14 +39,16 @@ class Playback:
     """Records of fingertips while an excitation played, from rest at time 0.
 
     frequencies (f,) [Hz]: driven; targets, quiet: records of the fingers; settled [s]: end of the
-    onset. Measures are named as those of a `Pattern`; steady ones are fitted to the last STEADY
-    seconds, after the plate has settled (50 ms to 1 s).
+    onset; threshold: name of the set that levels are above. Measures are named as those of a
+    `Pattern`; steady ones are fitted to the last STEADY seconds, after the plate has settled (50 ms
+    to 1 s).
     """
 
     frequencies: tuple[float, ...]
     targets: tuple[Record, ...]
     quiet: tuple[Record, ...]
     settled: float
+    threshold: str = DEFAULT_THRESHOLD
 
     def __repr__(self) -> str:
         driven = ", ".join(f"{frequency:g}" for frequency in self.frequencies)
@@ -57,14 +59,15 @@ class Playback:
     def level_db_sl(self) -> float:
         """Steady level at the target [dB SL], mean over its fingertip; minimum over targets."""
         return min(
-            mean_level_db_sl(*_tones(felt), felt.weights)
+            mean_level_db_sl(*_tones(felt), felt.weights, self.threshold)
             for felt in self._felt[: len(self.targets)]
         )
 
     @property
     def quiet_level_db_sl(self) -> float | None:
         """Steady level at the loudest quiet point [dB SL]; None where a finger is alone."""
-        loudest = [sensation_level(*_tones(felt)).max() for felt in self._felt[len(self.targets) :]]
+        quiet = self._felt[len(self.targets) :]
+        loudest = [sensation_level(*_tones(felt), self.threshold).max() for felt in quiet]
         return float(max(loudest)) if loudest else None
 
     @property
@@ -146,7 +149,9 @@ def play(
         for at, disc, part in zip(contacts, discs, np.split(felt, ends, axis=1), strict=True)
     )
     count = len(fingers.targets)
-    return Playback(tuple(frequencies.tolist()), records[:count], records[count:], settled)
+    return Playback(
+        tuple(frequencies.tolist()), records[:count], records[count:], settled, rig.threshold
+    )
 
 
 def _tones(felt: Felt) -> tuple[FloatArray, FloatArray]:

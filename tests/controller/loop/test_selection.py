@@ -14,7 +14,7 @@ from controller.loop.table_query import strongest
 from controller.sources.contacts import Contact, ContactKey
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.finger.perception import detection_threshold
+from model.finger.perception import DEFAULT_THRESHOLD, detection_threshold
 from model.structure.plate import Material, Plate
 from model.table.pattern import Pattern
 from model.table.question import Question
@@ -36,6 +36,7 @@ class Table:
         self.asked: list[Question] = []
         self.refuse_below = 0.0
         self.most = math.inf
+        self.threshold = DEFAULT_THRESHOLD
         self.error: Exception | None = None
         self.quiet_level: float | None = None
 

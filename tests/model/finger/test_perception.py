@@ -3,7 +3,18 @@
 import numpy as np
 import pytest
 
-from model.finger.perception import detection_threshold, sensation_level
+from model.errors import InputError
+from model.finger.perception import (
+    THRESHOLDS,
+    check_has_threshold,
+    detection_threshold,
+    sensation_level,
+    sensitivity_margin_db,
+)
+from model.table.pattern import Pattern
+from model.vibration.excitation import Tone
+
+PROBE, PRESSING = "vibrotactile-probe", "pressing-fingertip"
 
 
 def test_detection_threshold_equals_table():
@@ -28,3 +39,64 @@ def test_sensation_level_adds_tones_as_powers():
 def test_sensation_level_of_zero_is_minus_infinity():
     """Where nothing moves the level is minus infinity, not an error."""
     assert sensation_level(np.array([100.0]), np.array([0.0])) == -np.inf
+
+
+def test_thresholds_of_pressing_fingertips_lie_20_to_35_db_lower_around_250_hz():
+    """Where Pacinian corpuscles decide, from 100 to 400 Hz; at 20 Hz they lie within 5 dB."""
+    frequencies = np.array([100.0, 160.0, 250.0, 400.0])
+    lower = 20 * np.log10(
+        detection_threshold(frequencies, PROBE) / detection_threshold(frequencies, PRESSING)
+    )
+    assert ((lower >= 20) & (lower <= 35)).all()
+    low = np.array([20.0])
+    ratio = detection_threshold(low, PROBE) / detection_threshold(low, PRESSING)
+    assert abs(20 * np.log10(ratio[0])) < 5
+
+
+def test_gripping_hand_thresholds_are_peak_values_of_the_published_rms():
+    """0.065 m/s² rms at 40 Hz (Morioka and Griffin 2006) is 0.0919 m/s² peak."""
+    found = detection_threshold(np.array([40.0]), PRESSING)
+    assert found[0] == pytest.approx(0.065 * np.sqrt(2), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", THRESHOLDS)
+def test_every_set_reaches_1000_hz_and_has_matching_columns(name, pytestconfig):
+    """Displacement times omega squared is acceleration, in every row to the digits printed."""
+    text = (pytestconfig.rootpath / f"model/data/thresholds/{name}.csv").read_text("utf-8")
+    rows = [line.split(",") for line in text.splitlines() if line[0].isdigit()]
+    for frequency, displacement, acceleration, _ in rows:
+        expected = float(displacement) * 1e-6 * (2 * np.pi * float(frequency)) ** 2
+        assert float(acceleration) == pytest.approx(expected, rel=0.01)
+    assert float(rows[0][0]) == 10
+    assert float(rows[-1][0]) == 1000
+
+
+@pytest.mark.parametrize("frequency", [9.9, 1000.1, np.nan])
+def test_frequencies_without_data_are_refused(frequency):
+    """Neither a threshold nor a level nor a margin is made up outside of a set."""
+    asked = np.array([100.0, frequency])
+    for refused in (
+        lambda: check_has_threshold(asked),
+        lambda: detection_threshold(asked, PRESSING),
+        lambda: sensation_level(asked, np.ones(2)),
+        lambda: sensitivity_margin_db(asked),
+    ):
+        with pytest.raises(InputError, match="10 to 1000 Hz"):
+            refused()
+
+
+def test_a_set_that_is_not_known_is_refused():
+    """The error names the sets."""
+    with pytest.raises(InputError, match=PRESSING):
+        detection_threshold(np.array([100.0]), "thumb")
+
+
+def test_quiet_fingers_are_unaware_only_below_the_lowest_thresholds():
+    """At 250 Hz the probe's thresholds are 28 dB above the lowest: -38 dB SL suffices, -37 not."""
+    played = {"SW": Tone(250.0, 1e-6)}
+    by_probe = [Pattern(played, 0.04, 20.0, 40.0, quiet) for quiet in (-38.1, -37.5)]
+    assert [each.is_imperceptible_to_quiet for each in by_probe] == [True, False]
+    by_pressing = [
+        Pattern(played, 0.04, 20.0, 30.0, quiet, threshold=PRESSING) for quiet in (-10.1, -9.9)
+    ]
+    assert [each.is_imperceptible_to_quiet for each in by_pressing] == [True, False]

@@ -62,7 +62,7 @@ class EffectLevels:
     """Levels over limited durations on the plate of a table."""
 
     def __init__(self, table: LocalizationTable) -> None:
-        self._plate = table.in_time
+        self._plate, self._threshold = table.in_time, table.threshold
         self._strokes = {era.name: era.stroke for era in table.eras}
         self._kept: OrderedDict[tuple[float, float, float], ComplexArray] = OrderedDict()
 
@@ -76,7 +76,7 @@ class EffectLevels:
         eras = self._plate.eras
         frequencies, phasors = base_amplitudes(excitation, eras)
         weights = phasors / [era.stroke for era in eras]
-        thresholds = detection_threshold(frequencies)
+        thresholds = detection_threshold(frequencies, self._threshold)
         responses = [
             np.tensordot(row, self._responses(frequency, ramp, duration), 1) / threshold
             for frequency, row, threshold in zip(

@@ -85,7 +85,8 @@ def _print_answer(answer: dict[str, Any]) -> None:
             f"{era:4s} {tone['frequency_hz']:7.2f} Hz  level {tone['level']:.4f}  "
             f"phase {tone['phase_deg']:.1f}°"
         )
-    rows = [("level at the target", answer["level_db_sl"], "dB SL")]
+    basis = ", threshold extrapolated" if answer["is_level_extrapolated"] else ""
+    rows = [("level at the target", answer["level_db_sl"], f"dB SL{basis}")]
     if answer["contrast_db"] is not None:
         awareness = "not felt" if answer["is_imperceptible_to_quiet"] else "may be felt"
         rows += [

@@ -98,6 +98,9 @@ def _show_summary(summary: dict[str, Any]) -> None:
         return "-" if summary[key] is None else f"{summary[key]:.1f} dB"
 
     low, high = summary["frequency_range_hz"]
+    measured_to = summary["threshold_measured_to_hz"]
+    beyond = f", extrapolated above {measured_to:g} Hz" if high > measured_to else ""
+    threshold = f"{summary['threshold']}{beyond}"
     length, width, thickness = (1000 * side for side in summary["plate_m"])
     contrast = [
         (
@@ -111,6 +114,7 @@ def _show_summary(summary: dict[str, Any]) -> None:
         ("plate", f"{length:g} x {width:g} x {thickness:g} mm"),
         ("ERAs", ", ".join(summary["eras"])),
         ("frequencies", f"{summary['frequency_count']} from {low:g} to {high:g} Hz"),
+        ("thresholds", threshold),
         ("mode", f"{summary['mode']} by default"),
         ("patterns", f"{summary['patterns']} of one or two ERAs"),
         ("cells", f"{summary['cells']} ({summary['grid']})"),

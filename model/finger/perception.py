@@ -29,13 +29,24 @@ THRESHOLDS = tuple(
 
 
 @cache
+def _rows(threshold: str) -> list[dict[str, str]]:
+    text = _FOLDER.joinpath(f"{threshold}.csv").read_text(encoding="utf-8")
+    return list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
+
+
+@cache
 def _tabulated(threshold: str) -> tuple[FloatArray, FloatArray]:
     """Frequencies [Hz] and peak accelerations [m/s²] of a set, as tabulated."""
-    text = _FOLDER.joinpath(f"{threshold}.csv").read_text(encoding="utf-8")
-    lines = [line for line in text.splitlines() if not line.startswith("#")]
-    rows = list(csv.DictReader(lines))
+    rows = _rows(threshold)
     frequency = np.array([float(row["frequency_hz"]) for row in rows])
     return frequency, np.array([float(row["threshold_m_s2_peak"]) for row in rows])
+
+
+@cache
+def highest_measured(threshold: str = DEFAULT_THRESHOLD) -> float:
+    """Frequency [Hz] above which a set of thresholds is extrapolated."""
+    known = (row for row in _rows(threshold) if row["basis"] != "extrapolated")
+    return max(float(row["frequency_hz"]) for row in known)
 
 
 def check_has_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOLD) -> None:

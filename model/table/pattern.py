@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.finger.perception import DEFAULT_THRESHOLD, sensitivity_margin_db
+from model.finger.perception import DEFAULT_THRESHOLD, highest_measured, sensitivity_margin_db
 from model.transients.envelope import Envelopes
 from model.vibration.excitation import Excitation
 
@@ -80,6 +80,12 @@ class Pattern:
         frequencies = np.array([tone.frequency for tone in self.excitation.values()])
         margin = float(sensitivity_margin_db(frequencies, self.threshold).max(initial=0))
         return self.quiet_level_db_sl + margin <= IMPERCEPTIBLE_DB_SL
+
+    @property
+    def is_level_extrapolated(self) -> bool:
+        """Whether it plays a frequency at which the thresholds are extrapolated."""
+        highest = max((tone.frequency for tone in self.excitation.values()), default=0.0)
+        return highest > highest_measured(self.threshold)
 
     @property
     def usable_level_db_sl(self) -> float:

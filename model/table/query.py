@@ -90,6 +90,7 @@ def query_as_json(table: LocalizationTable, question: Question, timing: Timing) 
         "drive": table.drive_of(pattern.excitation),
         "mode": pattern.drive_mode,
         "level_db_sl": pattern.level_db_sl,
+        "is_level_extrapolated": pattern.is_level_extrapolated,
         "contrast_db": pattern.contrast_db,
         "felt_contrast_db": pattern.felt_contrast_db,
         "contrast_bound_db": pattern.contrast_bound_db,

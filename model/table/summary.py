@@ -9,7 +9,7 @@ import numpy as np
 from model.arrays import FloatArray, IntArray
 from model.drive_modes.sources import all_combinations
 from model.errors import InputError
-from model.finger.perception import FELT_DB_SL
+from model.finger.perception import FELT_DB_SL, highest_measured
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.table.weak_cells import WeakCells, are_apart
@@ -39,6 +39,8 @@ def summarize(
         "eras": [era.name for era in table.eras],
         "frequency_range_hz": [float(table.frequencies[0]), float(table.frequencies[-1])],
         "frequency_count": len(table.frequencies),
+        "threshold": table.threshold,
+        "threshold_measured_to_hz": highest_measured(table.threshold),
         "grid": str(table.grid),
         "cells": table.grid.cell_count,
         "patterns": table.pattern_count,

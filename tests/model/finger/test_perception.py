@@ -8,6 +8,7 @@ from model.finger.perception import (
     THRESHOLDS,
     check_has_threshold,
     detection_threshold,
+    highest_measured,
     sensation_level,
     sensitivity_margin_db,
 )
@@ -100,3 +101,17 @@ def test_quiet_fingers_are_unaware_only_below_the_lowest_thresholds():
         Pattern(played, 0.04, 20.0, 30.0, quiet, threshold=PRESSING) for quiet in (-10.1, -9.9)
     ]
     assert [each.is_imperceptible_to_quiet for each in by_pressing] == [True, False]
+
+
+def test_patterns_above_measured_thresholds_say_so():
+    """The probe's thresholds end at 500 Hz, those of pressing fingertips at 315 Hz."""
+    assert [highest_measured(name) for name in (PROBE, PRESSING)] == [500.0, 315.0]
+    for frequency, name, is_extrapolated in [
+        (500.0, PROBE, False),
+        (510.0, PROBE, True),
+        (315.0, PRESSING, False),
+        (400.0, PRESSING, True),
+    ]:
+        played = {"SW": Tone(100.0, 1e-6), "SE": Tone(frequency, 1e-6)}
+        pattern = Pattern(played, 0.04, 20.0, None, None, threshold=name)
+        assert pattern.is_level_extrapolated is is_extrapolated

@@ -150,7 +150,6 @@ def draw_imperfections(
         )
         for channel in rig.wiring.values()
     }
-    late = {name: float(rng.uniform(0, skew)) for name in rig.amplifiers}
     plate = PlateErrors(
         thickness=relative(std.thickness),
         loss_factor=std.damping ** rng.standard_normal(),
@@ -158,6 +157,7 @@ def draw_imperfections(
         stiffness={era.name: relative(std.stiffness) for era in rig.eras},
         mesh=_other_mesh(rig),
     )
+    late = {name: float(rng.uniform(0, skew)) for name in rig.amplifiers}
     return Imperfections(channels, latency, late, plate, std.fingertip, seed)
 
 

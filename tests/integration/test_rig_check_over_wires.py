@@ -69,7 +69,7 @@ THICKER = (("thickness: 1.5 mm", "thickness: 2 mm"),)
         ),
         (DEAD, "modbus-tcp", ["DEAD: channel 1 of amplifier main (ERA SE in the rig)"]),
         (INVERTED, "serial", ["INVERTED: channel 2 of amplifier main (ERA NE in the rig)"]),
-        (THICKER, "serial", ["PLATE: the rig does not match", "  plate.thickness 2"]),
+        (THICKER, "serial", ["PLATE: the rig does not match", "  plate.thickness "]),
     ],
 )
 async def test_each_fault_is_detected_and_named(

@@ -14,6 +14,7 @@ from far_end_process import FarEndProcess, far_end_process
 from model.rig.file import load_rig
 from model.vibration.parametric_plate import parametric_plate
 from rig_files import TWO_AMPLIFIERS, write_rig
+from sim.plant.imperfections import draw_imperfections
 
 FREQUENCY = 170.0
 # What no quantisation step divides, so that rounding shows.
@@ -61,14 +62,18 @@ async def steady(far_end: FarEndProcess, wiring: Mapping[str, tuple[str, int]]) 
 
 
 def predicted(file: Path) -> np.ndarray:
-    """Steady accelerations (s,) [m/s²] by the model."""
+    """Steady accelerations (s,) [m/s²] by the model, of the plate and channels that are drawn."""
     rig = load_rig(file)
+    drawn = draw_imperfections(rig)
+    real = drawn.plate.realised(rig)
     points = np.array(list(SENSORS.values()))
-    responses = parametric_plate(rig, points, np.array([FREQUENCY])).responses(rig)[0]
-    bases = [
-        DRIVE[era.name][0] * era.stroke * np.exp(1j * np.radians(DRIVE[era.name][1]))
-        for era in rig.eras
-    ]
+    responses = parametric_plate(real, points, np.array([FREQUENCY])).responses(real)[0]
+    bases = []
+    for era in rig.eras:
+        level, degrees = DRIVE[era.name]
+        errors = drawn.channels[rig.wiring[era.name]]
+        turn = np.exp(1j * (np.radians(degrees) + errors.phase))
+        bases.append(level * errors.gain * era.stroke * turn)
     return np.asarray(bases @ responses)
 
 

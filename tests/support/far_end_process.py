@@ -45,12 +45,11 @@ class FarEndProcess:
 async def far_end_process(
     rig: Path, *options: str, amplifiers: int = 1
 ) -> AsyncIterator[FarEndProcess]:
-    """`era sim --exact` of a rig with these options; it ends with the context at the latest."""
+    """`era sim` of a rig file with these options; it ends with the context at the latest."""
     with tempfile.TemporaryDirectory() as folder:  # a short path, as sockets need
         control = Path(folder) / "control"
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-P", "-m", "sim", str(rig), "--exact", "--control", str(control)),
-            *options,
+            *(sys.executable, "-P", "-m", "sim", str(rig), "--control", str(control), *options),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE,
             cwd=example_rig_path().parent.parent,

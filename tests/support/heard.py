@@ -1,7 +1,7 @@
 """Measurements of a simulated plate, over its control socket, for one situation of a touch stream.
 
-Weightless fingers rest at every place of the stream, so that what they felt can be read for any
-window afterwards.
+Fingers are at every place of the stream, so that what they felt can be read for any window
+afterwards; those that do not touch have no weight.
 """
 
 import asyncio
@@ -84,6 +84,7 @@ class Control:
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._reader, self._writer = reader, writer
+        self._turn = asyncio.Lock()
 
     @classmethod
     @asynccontextmanager
@@ -99,8 +100,9 @@ class Control:
 
     async def ask(self, op: str, **request: Any) -> dict[str, Any]:
         """Send a request and return its reply; raises Refused."""
-        self._writer.write(json.dumps({"op": op, **request}).encode() + b"\n")
-        line = await asyncio.wait_for(self._reader.readline(), PATIENCE)
+        async with self._turn:
+            self._writer.write(json.dumps({"op": op, **request}).encode() + b"\n")
+            line = await asyncio.wait_for(self._reader.readline(), PATIENCE)
         answer: dict[str, Any] = json.loads(line)
         if "error" in answer:
             raise Refused(f"{op}: {answer['error']}")

@@ -6,7 +6,7 @@ The daemon has only the URLs of its amplifiers; every wire has a witness.
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,7 +69,9 @@ class Chain:
         Repeated where the daemon was late or has stopped all, or where a reply was late and the
         witness reports a violation. Ends the daemon.
         """
-        await self._place(stream)
+        sensors = {name: {"at_m": list(at)} for name, at in SENSORS.items()}
+        await self.control.ask("sensors", sensors=sensors)
+        await self.daemon.client.subscribe("pattern")
         capture = self.folder / "touches.tuio"
         stream.write(capture)
         heard: list[Heard] = []
@@ -105,13 +107,13 @@ class Chain:
         found = [] if self.witness is None else self.witness.finish(time.monotonic())
         return [violation for violation in found if violation.time >= since]
 
-    async def _place(self, stream: Stream) -> None:
-        """Place fingers and sensors."""
-        fingers = {name: list(at) for name, at in stream.places.items()}
-        await self.control.ask("fingers", fingers=fingers, observers=list(fingers))
-        sensors = {name: {"at_m": list(at)} for name, at in SENSORS.items()}
-        await self.control.ask("sensors", sensors=sensors)
-        await self.daemon.client.subscribe("pattern")
+    async def _touch(self, stream: Stream, touched: Collection[str]) -> None:
+        """Rest fingers on places; at the others they only feel."""
+        await self.control.ask(
+            "fingers",
+            fingers={name: list(at) for name, at in stream.places.items()},
+            observers=[name for name in stream.places if name not in touched],
+        )
 
     async def _late(self) -> tuple[int, ...]:
         """Number of replies that were late or missing, by amplifier."""
@@ -137,9 +139,11 @@ class Chain:
         polls: Polls = []
         events: list[Notification] = []
         went: list[float] = []
+        await self._touch(stream, ())
 
         def changed(now: float, fingers: Mapping[int, str]) -> None:
             went.append(now)
+            group.create_task(self._touch(stream, fingers.values()))
             if self.witness is not None:
                 self.witness.contacts(now, tuple(fingers))
 
@@ -193,7 +197,7 @@ async def running_chain(
         path = folder / "plate"
         witness = None
         if wires is None:
-            urls = {"main": f"sim://{quote(str(truth))}?control={quote(str(path))}&exact"}
+            urls = {"main": f"sim://{quote(str(truth))}?control={quote(str(path))}"}
         else:
             wired = [o for name, wire in wires.items() for o in ("--wire", f"{name}={wire}")]
             far_end = await stack.enter_async_context(

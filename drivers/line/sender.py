@@ -1,8 +1,9 @@
-"""The sender of one physical line: one task, one priority queue.
+"""The sender of one physical line: one task at a time, one priority queue.
 
-A line carries one exchange at a time. A queued request is sent, superseded or withdrawn; one on the
-line is answered, times out, or is abandoned for a stop-class request: at once if nothing of it was
-sent, else after a grace period.
+A line carries one exchange at a time: on a free line in its caller's task, without an iteration of
+the event loop in between, else in a task that lives while requests are queued. A queued request is
+sent, superseded or withdrawn; one on the line is answered, times out, or is abandoned for a
+stop-class request: at once if nothing of it was sent, else after a grace period.
 """
 
 import asyncio
@@ -89,15 +90,12 @@ class _Entry:
 
 @final
 class Sender:
-    """Sends the requests of all amplifiers on a line by their priorities.
-
-    Its task lives while requests are queued.
-    """
+    """Sends the requests of all amplifiers on a line by their priorities."""
 
     def __init__(self) -> None:
         self._queue: list[_Entry] = []
         self._numbers = count()
-        self._task: asyncio.Task[None] | None = None
+        self._task: asyncio.Task[Any] | None = None  # in which requests are sent
         self._current: _Entry | None = None
         self._is_preempted = False
         self._grace: asyncio.TimerHandle | None = None
@@ -121,7 +119,12 @@ class Sender:
             if queued.backend is backend and priority.supersedes(queued.priority):
                 self._queue.remove(queued)
                 queued.fail(Preempted(SUPERSEDED))
-        self._enqueue(entry)
+        if self._task is None and not self._queue:
+            await self._send_first(entry)
+            if entry.result.done():
+                return cast(_T, entry.result.result())
+        else:
+            self._enqueue(entry)
         try:
             return cast(_T, await entry.result)
         except asyncio.CancelledError:
@@ -149,11 +152,25 @@ class Sender:
 
     def _enqueue(self, entry: _Entry) -> None:
         self._queue.append(entry)
-        if self._task is None or self._task.done():
-            self._task = asyncio.get_running_loop().create_task(self._send_queued())
+        if self._task is None:
+            self._start()
         else:
             self._wake()
         self._update_preemption()
+
+    def _start(self) -> None:
+        """Send what is queued in a task of its own."""
+        self._task = asyncio.get_running_loop().create_task(self._send_queued())
+
+    async def _send_first(self, entry: _Entry) -> None:
+        """Make the first attempt in the caller's task."""
+        self._task = asyncio.current_task()
+        try:
+            await self._carry_out(entry)
+        finally:
+            self._task = None
+            if self._queue:
+                self._start()
 
     async def _send_queued(self) -> None:
         entry: _Entry | None = None
@@ -216,24 +233,33 @@ class Sender:
         """Make one attempt."""
         entry.started_at = clock.now()
         self._current, self._is_preempted = entry, False
+        task = cast("asyncio.Task[Any]", self._task)
+        cancellations = task.cancelling()
         try:
             result = await entry.attempt()
         except asyncio.CancelledError:
-            task = cast("asyncio.Task[None]", self._task)
-            if not self._is_preempted or task.uncancel():
+            if not self._is_preempted or task.uncancel() > cancellations:
                 entry.result.cancel()
                 raise
             self._repeat(entry, 0.0)
         except Retry as retry:
+            self._end_preemption(task, cancellations)
             self._repeat(entry, retry.pause)
         except Exception as error:
+            self._end_preemption(task, cancellations)
             entry.fail(error)
         else:
+            self._end_preemption(task, cancellations)
             if not entry.result.done():
                 entry.result.set_result(result)
         finally:
             self._current = None
             self._cancel_grace()
+
+    def _end_preemption(self, task: "asyncio.Task[Any]", cancellations: int) -> None:
+        """Take back a cancellation that came too late for an attempt."""
+        if self._is_preempted and task.cancelling() > cancellations:
+            task.uncancel()
 
     def _repeat(self, entry: _Entry, pause: float) -> None:
         """Queue a request again, unless another one precedes it."""

@@ -322,3 +322,45 @@ async def test_amplifiers_share_the_sender_of_their_bus() -> None:
     assert sender_of(make("bus", MultiMaster())) is not kept
     alone = sender_of(make(None))
     assert alone is not sender_of(make(None))
+
+
+@in_virtual_time
+async def test_request_on_a_free_line_is_sent_without_an_iteration_of_the_event_loop() -> None:
+    """Before its caller first yields; one that is queued behind it waits."""
+    line = Line()
+    one = Amplifier(line)
+    first, second = one.ask("first", Priority.OTHER), one.ask("second", Priority.OTHER)
+    await asyncio.sleep(0)
+    assert line.sent == ["first"]
+    line.answer.set()
+    assert await asyncio.gather(first, second) == ["first", "second"]
+    assert line.sent == ["first", "second"]
+
+
+@in_virtual_time
+async def test_preemption_that_comes_too_late_leaves_its_caller_uncancelled() -> None:
+    """An attempt that has its reply all the same returns it; a stop is sent after it."""
+    sender, events = Sender(), []
+    amplifier = Amplifier(Line())
+
+    async def late() -> str:
+        try:
+            await asyncio.sleep(1.0)
+        except asyncio.CancelledError:
+            events.append("cancelled")
+        return "reply"
+
+    async def stop() -> None:
+        events.append("stop")
+
+    async def caller() -> tuple[str, int]:
+        reply = await sender.send(amplifier, Priority.OTHER, late)
+        task = asyncio.current_task()
+        assert task is not None
+        return reply, task.cancelling()
+
+    called = asyncio.create_task(caller())
+    await asyncio.sleep(0)
+    await sender.send(amplifier, Priority.STOP, stop)
+    assert await called == ("reply", 0)
+    assert events == ["cancelled", "stop"]

@@ -53,7 +53,8 @@ class DiscRule:
         linear = np.column_stack([np.ones(len(self.points)), self.points])
         gram = (weights[:, None] * linear.T) @ linear
         means = np.concatenate([np.ones((len(low), 1)), _centroids(low, high)], axis=1)
-        tilt = (np.linalg.pinv(gram, hermitian=True) @ means[:, :, None])[:, :, 0]
+        # Definite also where the points kept lie on a line, in parts narrower than a fingertip.
+        tilt = np.linalg.solve(gram + 1e-9 * np.eye(3), means[:, :, None])[:, :, 0]
         fitted = np.maximum(weights * (tilt @ linear.T), 0)
         return np.asarray(fitted / fitted.sum(axis=1, keepdims=True))
 

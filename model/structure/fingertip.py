@@ -3,7 +3,7 @@
 Pressed on the plate, a fingertip is a contact mass that moves with it, and a spring and a damper
 (the pulp) to the phalanx, which a joint holds. The phalanx is not at rest: at 60, 100 and 250 Hz
 the real part of the dynamic stiffness is 69, -87 and -358 N/m where a phalanx at rest gives 972,
-921 and 507.
+921 and 507. How well the values are known: docs/concepts/people.md.
 """
 
 import math

@@ -17,20 +17,28 @@ from model.rig.rig import Rig
 from model.structure.point_load import footprints_of
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.question import Question
-from model.vibration.excitation import Excitation
+from model.vibration.excitation import Excitation, Tone
 from model.vibration.maps import PlateMap, plate_map
+from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.plant.playback import Playback, play
 
 
 class SolvedPlate:
     """A rig's plate on its ERAs, up to the highest frequency of the rig's limits.
 
-    Solved once, at the first use, in some tenths of a second.
+    seed: of a plate, ERAs, channels and fingers drawn within the rig's uncertainty, as `era sim`
+    draws them; None for the rig's own. Solved once, at the first use, in some tenths of a second.
     """
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, *, seed: int | None = None) -> None:
         expect_rig(rig)
         self.rig = rig
+        self._drawn = Imperfections()
+        if seed is not None:
+            if not is_whole(seed) or seed < 0:
+                raise InputError(f"seed must be a whole number of at least 0, got {shown(seed)}")
+            self._drawn = draw_imperfections(rig, seed=int(seed))
+        self._real = self._drawn.plate.realised(rig)
 
     def __repr__(self) -> str:
         plate = self.rig.plate
@@ -44,7 +52,7 @@ class SolvedPlate:
         Up to the highest frequency of the rig's limits, as `era plate modes`. Raises InputError
         for a plate that is not supported.
         """
-        rig = self.rig
+        rig = self._real
         return supported_modes(
             self._reduced, rig.eras, loads=rig.masses, frequency_max=rig.limits.frequency_max
         )
@@ -58,7 +66,11 @@ class SolvedPlate:
         `era plate map`, which is solved directly.
         """
         points = None if raster is None else _as_raster(raster)
-        return plate_map(self.rig, self._excitation(drive), raster=points, free=self._free)
+        excitation = {}
+        for name, tone in self._excitation(drive).items():
+            factor = self._drawn.errors_of(name, self.rig).factor
+            excitation[name] = Tone.from_phasor(tone.frequency, factor * tone.phasor)
+        return plate_map(self._real, excitation, raster=points, free=self._free)
 
     def play(
         self,
@@ -85,6 +97,7 @@ class SolvedPlate:
             duration=duration,
             ramp=drive.ramp if isinstance(drive, Pattern) else ONSET_RAMP,
             onset=drive.onset if isinstance(drive, Pattern) else None,
+            imperfections=self._drawn,
         )
 
     def _excitation(self, drive: Pattern | Drives) -> Excitation:
@@ -100,12 +113,12 @@ class SolvedPlate:
 
     @cached_property
     def _free(self) -> FreePlate:
-        rig = self.rig
+        rig = self._real
         return solve_free_plate(rig.plate, rig.mesh, frequency_max=rig.limits.frequency_max)
 
     @cached_property
     def _reduced(self) -> ReducedPlate:
-        attached = footprints_of(self.rig.eras, self.rig.masses)
+        attached = footprints_of(self._real.eras, self._real.masses)
         return reduce_free_plate(self._free, attached)
 
 

@@ -26,7 +26,7 @@ from model.transients.base_motion import Term
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.plant.felt import Felt, measure_vibration
 from sim.plant.fingers import KEPT, Fingers, Position, Record
-from sim.plant.imperfections import ChannelErrors, Imperfections, delayed, draw_noise, realised
+from sim.plant.imperfections import Imperfections, delayed, draw_noise, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
 from sim.waveform import Output, ToneSegment
 
@@ -208,7 +208,7 @@ class Bench:
         """The base motion of an ERA by the output of its channel, imperfections included."""
         era = self.rig.eras[index]
         terms = [term for tone in playing for term in tone.terms(stroke=era.stroke)]
-        errors = self.imperfections.channels.get(self.rig.wiring[era.name], ChannelErrors())
+        errors = self.imperfections.errors_of(era.name, self.rig)
         terms = realised(terms, errors)
         if errors.noise and playing:
             end = max(tone.silent_from for tone in playing)

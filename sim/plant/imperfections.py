@@ -45,6 +45,11 @@ class ChannelErrors:
         if self.gain < 0 or self.noise < 0:
             raise InputError(f"{self}: gain and noise must not be negative")
 
+    @property
+    def factor(self) -> complex:
+        """Gain and phase as one complex factor."""
+        return cmath.rect(self.gain, self.phase)
+
 
 @dataclass(frozen=True)
 class PlateErrors:
@@ -122,6 +127,10 @@ class Imperfections:
         """Delay from a command of this amplifier to the base motion [s]."""
         return self.latency + self.skew.get(amplifier, 0.0)
 
+    def errors_of(self, era: str, rig: Rig) -> ChannelErrors:
+        """Errors of the channel to which an ERA is wired."""
+        return self.channels.get(rig.wiring[era], ChannelErrors())
+
     def load_of(self, finger: str, fingertip: Fingertip) -> Fingertip:
         """The load of a finger by its id, always the same."""
         if self.fingertip == 0:
@@ -186,8 +195,8 @@ def realised(terms: Sequence[Term], errors: ChannelErrors) -> list[Term]:
     """Base motion with the gain and phase errors of its channel."""
     if (errors.gain, errors.phase) == (1.0, 0.0):
         return list(terms)
-    phase_factor = cmath.rect(errors.gain, errors.phase)
-    return [replace(term, c0=phase_factor * term.c0, c1=phase_factor * term.c1) for term in terms]
+    factor = errors.factor
+    return [replace(term, c0=factor * term.c0, c1=factor * term.c1) for term in terms]
 
 
 @dataclass(frozen=True)

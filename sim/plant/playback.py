@@ -25,6 +25,7 @@ from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes, peak_acceleration
 from sim.plant.felt import Felt, measure_vibration
 from sim.plant.fingers import Record
+from sim.plant.imperfections import Imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
 
 STEADY = 0.25
@@ -69,6 +70,12 @@ class Playback:
         quiet = self._felt[len(self.targets) :]
         loudest = [sensation_level(*_tones(felt), self.threshold).max() for felt in quiet]
         return float(max(loudest)) if loudest else None
+
+    @property
+    def felt_contrast_db(self) -> float | None:
+        """Steady level of the target above that of the loudest quiet point [dB]; None if alone."""
+        quiet = self.quiet_level_db_sl
+        return None if quiet is None else self.level_db_sl - quiet
 
     @property
     def contrast_db(self) -> float | None:
@@ -116,12 +123,14 @@ def play(
     duration: float,
     ramp: float = ONSET_RAMP,
     onset: Envelopes | None = None,
+    imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
 ) -> Playback:
     """Play an excitation for a duration [s] on a plate at rest, under these fingers.
 
-    The fingers load the plate as the rig's fingertip. reduced: the rig's plate for forces at its
-    ERAs and loads; ramp [s], or onset in its place. Raises InputError for fingers off the plate, an
-    excitation that the rig cannot play, and a duration out of range.
+    The fingers load the plate as the rig's fingertip. reduced: the plate that the imperfections
+    make of the rig's, for forces at its ERAs and loads; ramp [s], or onset in its place. Latency,
+    skew and noise are left out. Raises InputError for fingers off the plate, an excitation that the
+    rig cannot play, and a duration out of range.
     """
     fingers.check_on(rig.plate)
     frequencies, _ = base_amplitudes(excitation, rig.eras)
@@ -131,14 +140,16 @@ def play(
             f"duration must be above {settled:g} s (the onset) and at most {MAX_DURATION:g} s, got "
             f"{duration:g} s; one second suffices for most plates"
         )
-    plant = Plant(reduced, rig.eras, loads=rig.masses)
+    plant = Plant(reduced, imperfections.plate.realised(rig).eras, loads=rig.masses)
     contacts = (*fingers.targets, *fingers.quiet)
     if rig.fingertip is not None:
-        tip = rig.fingertip
-        plant.set_contacts({str(n): FingertipLoad(*at, tip) for n, at in enumerate(contacts)})
+        loads = {str(n): imperfections.load_of(str(n), rig.fingertip) for n in range(len(contacts))}
+        plant.set_contacts(
+            {id: FingertipLoad(*at, loads[id]) for id, at in zip(loads, contacts, strict=True)}
+        )
     bases = shaped(onset, rig.eras) if onset else ramped_onset(excitation, rig.eras, ramp=ramp)
-    for number, terms in enumerate(bases):
-        plant.set_input(number, terms)
+    for number, (era, terms) in enumerate(zip(rig.eras, bases, strict=True)):
+        plant.set_input(number, realised(terms, imperfections.errors_of(era.name, rig)))
     discs = [fingertip_points(*at, rig.plate) for at in contacts]
     times, felt = plant.advance(
         duration, sample_rate=SAMPLE_RATE, shapes=plant.reduced.at(np.concatenate(discs))

@@ -22,7 +22,7 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.query: {
         "table": None, "target": TARGET, "quiet": (), "level_db_sl": 20.0, "drive_mode": "signed",
     },
-    era.SolvedPlate: {"rig": RIG},
+    era.SolvedPlate: {"rig": RIG, "seed": 1},
     PLATE.map: {"drive": DRIVE, "raster": (3, 3)},
     PLATE.play: {
         "drive": DRIVE, "target": TARGET, "quiet": (), "duration": 0.3,

@@ -84,3 +84,30 @@ def test_solved_plate_refuses_frequencies_beyond_its_limits(plate: era.SolvedPla
     for ask in (plate.map, lambda drive: plate.play(drive, TARGET)):
         with pytest.raises(era.InputError, match=r"500 Hz.*limits\.frequency"):
             ask({"SW": 501})
+
+
+def test_solved_plate_with_a_seed_is_another_one(plate: era.SolvedPlate) -> None:
+    """Map and playback are of one plate, drawn by the seed; it is not the rig's, nor another's.
+
+    Where the rig is known exactly, any seed gives the same response on another mesh.
+    """
+    drive = {"SW": 110, "NE": era.Drive(110, level=0.5, phase_deg=90)}
+    at, peaks = (8 * 0.3048 / 32, 6 * 0.2286 / 24), []  # a point of the raster
+    for seed in (None, 1, 1, 2):
+        drawn = era.SolvedPlate(replace(plate.rig, fingertip=None), seed=seed)
+        (felt,) = drawn.play(drive, at, duration=2.0).targets
+        centre = np.argmin(np.linalg.norm(felt.points - at, axis=1))
+        peak = np.abs(felt.accelerations[-2000:, centre]).max()
+        assert peak == pytest.approx(drawn.map(drive, raster=(33, 25)).peak[6, 8], rel=0.02)
+        peaks.append(peak)
+    assert peaks[1] == peaks[2]
+    assert len({round(peak, 3) for peak in peaks}) == 3
+    known = replace(plate.rig, uncertainty=era.Uncertainty.none())
+    first, second = (
+        era.SolvedPlate(known, seed=seed).play(drive, TARGET, duration=2.0).level_db_sl
+        for seed in (None, 3)
+    )
+    assert second == pytest.approx(first, abs=0.05)
+    for wrong in (-1, 0.5, "1"):
+        with pytest.raises(era.InputError, match="seed"):
+            era.SolvedPlate(plate.rig, seed=wrong)  # type: ignore[arg-type]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import drivers.cli
+from controller.cli.layout import layout_app
 from controller.cli.rig import rig_app
 from model.commands.next_line import next_line
 from model.counting import counted
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from controller.demo.touch_row import TouchRow
 
 app = typer.Typer()
+app.add_typer(layout_app, name="layout")
 app.add_typer(rig_app, name="rig")
 
 EXIT_STATUS = {**drivers.cli.EXIT_STATUS, InputError: 2}

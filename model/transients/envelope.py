@@ -101,6 +101,28 @@ def ramped_ending(excitation: Excitation, eras: Sequence[Era], *, ramp: float) -
     return _faded(excitation, eras, ramp=ramp, gains=(1.0, 0.0))
 
 
+def ramped_pulse(
+    excitation: Excitation, eras: Sequence[Era], *, ramp: float, duration: float
+) -> Bases:
+    """Motion of the bases when an excitation starts at time 0 and ends after a duration [s].
+
+    Both along a raised cosine of ramp [s], at most the duration.
+    """
+    ramp = min(ramp, duration)
+    onset = ramped_onset(excitation, eras, ramp=ramp)
+    release: list[tuple[Term, ...]] = []
+    for era in eras:
+        tone = excitation.get(era.name)
+        if tone is None:
+            release.append(())
+            continue
+        # What rises from the end on is the tone itself, in opposite phase.
+        omega = 2 * math.pi * tone.frequency
+        opposite = -tone.phasor * cmath.exp(1j * omega * duration)
+        release.append(fade(opposite, omega=omega, start=duration, ramp=ramp, gains=(0.0, 1.0)))
+    return tuple((*rise, *fall) for rise, fall in zip(onset, release, strict=True))
+
+
 def shaped(envelopes: Envelopes, eras: Sequence[Era]) -> Bases:
     """Motion of the bases when envelopes begin at time 0."""
     return tuple(envelopes[era.name].terms() if era.name in envelopes else () for era in eras)

@@ -22,6 +22,7 @@ NAMES = [
     "add-an-element",
     "add-a-touch-source",
     "add-an-effect",
+    "design-a-layout",
     "write-an-amplifier",
 ]
 

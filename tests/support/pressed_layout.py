@@ -50,7 +50,7 @@ class Felt:
     """What a finger feels from one start of a vibration on.
 
     delay [s]: after the finger came down; applied: its report; accelerations (n, p) [m/s²];
-    weights (p,) of the points in the mean over the fingertip.
+    weights (p,) of the points in the mean over the fingertip; threshold: name of the rig's set.
     """
 
     delay: float
@@ -58,6 +58,7 @@ class Felt:
     accelerations: FloatArray
     weights: FloatArray
     sample_rate: float
+    threshold: str
 
     @property
     def promised_db_sl(self) -> float:
@@ -75,7 +76,7 @@ class Felt:
         """Level of the rms over a part of it [s], mean over the fingertip's points."""
         first, last = round(since * self.sample_rate), round((since + duration) * self.sample_rate)
         rms = np.sqrt((self.accelerations[first:last] ** 2).mean(axis=0))
-        threshold = detection_threshold(np.array(self.frequency))
+        threshold = detection_threshold(np.array(self.frequency), self.threshold)
         return float(20 * np.log10(np.sqrt(2) * rms @ self.weights / threshold))
 
 
@@ -186,6 +187,7 @@ class Pressed:
                     record.accelerations[record.times > start],
                     record.weights,
                     self._bench.sample_rate,
+                    self.rig.threshold,
                 )
             )
         self._starts, self._reports = [], []

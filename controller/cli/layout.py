@@ -1,0 +1,103 @@
+"""`era layout check`: how a surface layout will feel."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from model.counting import counted
+
+if TYPE_CHECKING:
+    from controller.effects.layout_check import CheckedEffect
+
+layout_app = typer.Typer(no_args_is_help=True, help="Check a surface layout.")
+
+FAILED = 1
+
+
+@layout_app.callback()
+def _group() -> None:
+    """Keep `check` a command of its own while it is the only one."""
+
+
+@layout_app.command()
+def check(
+    layout_file: Annotated[
+        Path, typer.Argument(metavar="LAYOUT", help="Layout file, e.g. LAYOUT.yaml.")
+    ],
+    table_file: Annotated[Path, typer.Argument(metavar="TABLE", help="Table file, e.g. T.npz.")],
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object and nothing else.")
+    ] = False,
+    picture: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="PICTURE", help="Picture to write, e.g. P.png."),
+    ] = None,
+) -> None:
+    """Simulate touches over every region, in time, and compare what is felt with the layout.
+
+    Alone and with a resting second finger. Exit status 1 if a region falls short.
+    """
+    import time
+
+    from controller.effects.layout_check import check_layout
+    from controller.effects.layout_file import load_layout
+    from model.commands.progress import progress_bar
+    from model.files.replacing import check_picture_name
+    from model.table.file import load_table
+
+    if picture is not None:
+        check_picture_name(picture)
+    table = load_table(table_file)
+    layout = load_layout(layout_file, table.plate)
+    started = time.perf_counter()
+    with progress_bar("effects") as progress:
+        checked = check_layout(layout, table, progress=progress)
+    elapsed = time.perf_counter() - started
+    files = []
+    if picture is not None:
+        from controller.effects.check_picture import check_figure
+        from model.figures.drawing import save_figure
+
+        save_figure(check_figure(layout, table, checked), picture)
+        files = [str(picture)]
+    problems = sum(len(each.problems) for each in checked)
+    if as_json:
+        regions = [each.as_json() for each in checked]
+        print(json.dumps({"regions": regions, "files": files, "check_time_s": elapsed}))
+    else:
+        for each in checked:
+            print("\n".join(_lines(each)))
+        touches = sum(len(each.touches) for each in checked)
+        outcome = counted(problems, "problem") if problems else "good"
+        print(
+            f"{layout_file}: {outcome}; {counted(touches, 'touch', plural='touches')} in "
+            f"{elapsed:.1f} s"
+        )
+        for name in files:
+            print(f"wrote {name}")
+    if problems:
+        raise typer.Exit(FAILED)
+
+
+def _lines(each: "CheckedEffect") -> list[str]:
+    """Format one effect of a region."""
+    promised = (
+        "as neighbours allow" if each.promised_db_sl is None else f"{each.promised_db_sl:g} dB SL"
+    )
+    lines = [f"{each.region}, {each.on}: {each.effect}, {promised}"]
+    if each.felt:
+        low, high = each.frequencies[0], each.frequencies[-1]
+        tones = f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
+        lines.append(f"  felt {_span(each.felt)} dB SL at {tones}")
+    if each.contrasts:
+        lines.append(f"  {_span(each.contrasts)} dB above what a resting second finger feels")
+    return [*lines, *(f"  PROBLEM {problem}" for problem in each.problems)]
+
+
+def _span(values: list[float]) -> str:
+    from controller.effects.layout_check import summary
+
+    found = summary(values)
+    return f"{found['min']:.1f} to {found['max']:.1f} (median {found['median']:.1f})"

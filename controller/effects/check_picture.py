@@ -1,0 +1,139 @@
+"""Picture of a checked layout: level, frequency and contrast of every touch over the plate."""
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon as Outline
+
+from controller.effects.layout import SurfaceLayout
+from controller.effects.layout_check import CheckedEffect
+from controller.effects.shapes import Circle, Rectangle, Shape
+from controller.effects.simulated_touch import SimulatedTouch
+from model.figures.drawing import draw_eras, label_plate
+from model.table.table import LocalizationTable
+
+_LEVEL_EDGES = [-12.0, -6.0, -4.0, -2.0, 2.0, 4.0, 6.0, 12.0]  # dB
+_MAX_CONTRAST = 30.0  # dB
+_NO_PROMISE = "#bbbbbb"
+_CIRCLE_CORNERS = 60
+_SIZES = (90.0, 36.0, 10.0)  # of marks; those of a region's further effects lie within
+
+
+def check_figure(
+    layout: SurfaceLayout, table: LocalizationTable, checked: Sequence[CheckedEffect]
+) -> Figure:
+    """Draw three panels, with one mark for each touch; crosses where nothing is felt.
+
+    Level: what is felt less what is promised, the worse of alone and beside a resting finger;
+    frequency; and how far a resting finger feels less.
+    """
+    ratio = table.plate.width / table.plate.length
+    figure = Figure(figsize=(18.0, 5.0 * ratio + 1.6), layout="constrained")
+    panels: list[tuple[str, Callable[[CheckedEffect, SimulatedTouch], float | None]]] = [
+        ("felt less promised / dB", _off_level),
+        ("frequency / Hz", _frequency),
+        ("above what a resting second finger feels / dB", _contrast),
+    ]
+    low, high = float(table.frequencies[0]), float(table.frequencies[-1])
+    scales: list[tuple[Normalize, str]] = [
+        (BoundaryNorm(_LEVEL_EDGES, 256, extend="both"), "RdBu_r"),
+        (LogNorm(low, max(high, 1.01 * low)), "viridis"),
+        (Normalize(0.0, _MAX_CONTRAST), "viridis"),
+    ]
+    subplots = figure.subplots(1, len(panels))
+    for axes, (label, value), (norm, colors) in zip(subplots, panels, scales, strict=True):
+        _draw_layout(axes, layout, table)
+        _draw_touches(axes, checked, value, norm, colors)
+        bar = figure.colorbar(ScalarMappable(norm, colors), ax=axes, label=label, shrink=0.85)
+        if isinstance(norm, LogNorm):
+            ticks = [each for each in (40, 60, 100, 150, 250, 400, 600) if low <= each <= high]
+            bar.set_ticks(ticks, labels=[str(each) for each in ticks], minor=False)
+            bar.minorticks_off()
+    return figure
+
+
+def _off_level(each: CheckedEffect, touch: SimulatedTouch) -> float | None:
+    if touch.felt_db_sl is None or each.promised_db_sl is None:
+        return None
+    return touch.felt_db_sl - each.promised_db_sl
+
+
+def _frequency(each: CheckedEffect, touch: SimulatedTouch) -> float | None:
+    return touch.frequencies[0] if touch.frequencies else None
+
+
+def _contrast(each: CheckedEffect, touch: SimulatedTouch) -> float | None:
+    if touch.felt_db_sl is None or touch.resting_db_sl is None:
+        return None
+    return touch.felt_db_sl - touch.resting_db_sl
+
+
+def _draw_layout(axes: Axes, layout: SurfaceLayout, table: LocalizationTable) -> None:
+    """Draw the plate, its ERAs, and the regions with their names."""
+    length, width = 100 * table.plate.length, 100 * table.plate.width
+    axes.add_patch(Outline([(0, 0), (length, 0), (length, width), (0, width)], fill=False))
+    for region in layout.regions:
+        corners = 100 * np.array(_outline(region.shape))
+        axes.add_patch(Outline(corners, facecolor="#f2f2f2", edgecolor="#555555", lw=1))
+        top = corners[corners[:, 1] >= corners[:, 1].max() - 1e-6]
+        axes.annotate(
+            region.name,
+            (top[:, 0].mean(), top[0, 1]),
+            xytext=(0, 2),
+            textcoords="offset points",
+            ha="center",
+            fontsize=8,
+        )
+    label_plate(axes)
+    axes.set_xlim(-0.5, length + 0.5)
+    axes.set_ylim(-0.5, width + 0.5)
+    draw_eras(axes, table.eras, active=())
+
+
+def _draw_touches(
+    axes: Axes,
+    checked: Sequence[CheckedEffect],
+    value: Callable[[CheckedEffect, SimulatedTouch], float | None],
+    norm: Normalize,
+    colors: str,
+) -> None:
+    """Draw the value of every touch that is farthest from zero or lowest in contrast."""
+    drawn: dict[str, int] = {}
+    for each in checked:
+        size = _SIZES[min(drawn.get(each.region, 0), len(_SIZES) - 1)]
+        drawn[each.region] = drawn.get(each.region, 0) + 1
+        found: dict[tuple[float, float], float | None] = {}
+        for touch in each.touches:
+            new, before = value(each, touch), found.get(touch.at)
+            if before is None or (new is not None and abs(new) > abs(before)):
+                found[touch.at] = new
+        silent = {touch.at for touch in each.touches if touch.felt_db_sl is None}
+        for at, one in found.items():
+            x, y = 100 * at[0], 100 * at[1]
+            if at in silent:
+                axes.plot(x, y, "x", color="black", ms=6)
+            elif one is None:
+                axes.scatter(x, y, c=_NO_PROMISE, s=size, edgecolors="#555555", lw=0.5)
+            else:
+                axes.scatter(
+                    x, y, c=[one], cmap=colors, norm=norm, s=size, edgecolors="#555555", lw=0.5
+                )
+
+
+def _outline(shape: Shape) -> Sequence[tuple[float, float]]:
+    """Return the corners of a shape [m], many for a circle."""
+    if isinstance(shape, Circle):
+        angles = 2 * math.pi * np.arange(_CIRCLE_CORNERS) / _CIRCLE_CORNERS
+        return [
+            (shape.x + shape.radius * math.cos(angle), shape.y + shape.radius * math.sin(angle))
+            for angle in angles
+        ]
+    if isinstance(shape, Rectangle):
+        (x0, y0), (x1, y1) = shape.corners()
+        return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+    return shape.corners()

@@ -1,0 +1,248 @@
+"""Check of a surface layout on the plate of a table: how every region will feel."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from controller.effects.effect import Sensation
+from controller.effects.layout import SurfaceLayout
+from controller.effects.region import Region
+from controller.effects.representative import strongest_sensation
+from controller.effects.simulated_touch import Position, SimulatedTouch, TouchSimulator
+from controller.loop.table_query import band_of_table
+from model.structure.plate import Plate
+from model.table.table import LocalizationTable
+
+ELSEWHERE = "elsewhere"
+"""Name of the plate outside of all regions in a report."""
+
+LEVEL_TOLERANCE = 2.0  # dB
+_BAND_TOLERANCE = 0.05  # of a frequency; less than anyone tells apart
+_ALIKE = 1.25  # ratio of frequencies that hardly differ in feel
+
+MAX_TOUCHES = 30  # of one region
+_MIN_STEP = 0.008  # m; nearer touches hardly differ
+_RESTING_AWAY = 0.06  # m; at least, from a touch to a resting finger
+
+
+@dataclass(frozen=True)
+class CheckedEffect:
+    """An effect of a region as it will feel.
+
+    on: the key that plays it; promised_db_sl: None for as strong as the neighbours allow; touches:
+    each position alone, then with a resting finger; area [m²]: of the region for each position.
+    """
+
+    region: str
+    effect: str
+    on: str
+    promised_db_sl: float | None
+    touches: tuple[SimulatedTouch, ...]
+    problems: tuple[str, ...]
+
+    @property
+    def felt(self) -> list[float]:
+        """Levels over the effect [dB SL] of all touches that are felt."""
+        return [each.felt_db_sl for each in self.touches if each.felt_db_sl is not None]
+
+    @property
+    def contrasts(self) -> list[float]:
+        """Level above that of the resting finger [dB]."""
+        return [
+            each.felt_db_sl - each.resting_db_sl
+            for each in self.touches
+            if each.felt_db_sl is not None and each.resting_db_sl is not None
+        ]
+
+    @property
+    def frequencies(self) -> list[float]:
+        """All frequencies that play [Hz], ascending."""
+        return sorted({frequency for each in self.touches for frequency in each.frequencies})
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as `era layout check --json` prints it."""
+        return {
+            "region": self.region,
+            "effect": self.effect,
+            "on": self.on,
+            "promised_db_sl": self.promised_db_sl,
+            "felt_db_sl": summary(self.felt),
+            "felt_contrast_db": summary(self.contrasts),
+            "frequency_hz": self.frequencies,
+            "touches": len(self.touches),
+            "problems": [*self.problems],
+        }
+
+
+def summary(values: Sequence[float]) -> dict[str, float | None]:
+    """Return minimum, median and maximum; None without values."""
+    if not values:
+        return {"min": None, "median": None, "max": None}
+    return {
+        "min": float(min(values)),
+        "median": float(np.median(values)),
+        "max": float(max(values)),
+    }
+
+
+def check_layout(
+    layout: SurfaceLayout,
+    table: LocalizationTable,
+    *,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[CheckedEffect]:
+    """Simulate touches over every region of a layout, alone and with a resting second finger.
+
+    progress: called with the number of effects checked, and of all.
+    """
+    simulator = TouchSimulator(table)
+    parts = [*_parts(layout)]
+    checked = []
+    for number, (region, on, name) in enumerate(parts):
+        progress(number, len(parts))
+        checked.append(_check(layout, region, on, name, table, simulator))
+    progress(len(parts), len(parts))
+    return checked
+
+
+def _parts(layout: SurfaceLayout) -> Iterator[tuple[Region | None, str, str]]:
+    """Every effect of every region: the region, None outside of all, key and name."""
+    for region in layout.regions:
+        for on in ("on_press", "on_move", "on_release"):
+            name = getattr(region, on)
+            if name is not None:
+                yield region, on, name
+    if layout.elsewhere is not None:
+        yield None, ELSEWHERE, layout.elsewhere
+
+
+def _check(
+    layout: SurfaceLayout,
+    region: Region | None,
+    on: str,
+    name: str,
+    table: LocalizationTable,
+    simulator: TouchSimulator,
+) -> CheckedEffect:
+    effect = layout.effects[name]
+    is_own = region is not None and region.has_level
+    level = region.level_db_sl if region is not None and is_own else effect.level_db_sl
+    places, area = _raster(layout, region, table.plate)
+    start = region.shape.centre if region is not None else (places[0] if places else (0.0, 0.0))
+    sensation = strongest_sensation(effect, region, level_db_sl=level, at=start)
+    called = ELSEWHERE if region is None else region.name
+    if sensation is None or not places:
+        why = "is felt nowhere" if sensation is None else "is covered by later regions"
+        return CheckedEffect(called, name, on, level, (), (f"{name} {why}",))
+    band = layout.band_of(name, region)
+    touches = [
+        simulator.touch(sensation, band, at, resting)
+        for number, at in enumerate(places)
+        for resting in (None, _resting(table.plate, at, number))
+    ]
+    problems = [
+        *_silent(touches, area),
+        *_off_level(sensation, touches, area),
+        *_off_band(band, table, touches, must_be_alike=effect.is_for_motion),
+    ]
+    return CheckedEffect(called, name, on, sensation.level_db_sl, tuple(touches), tuple(problems))
+
+
+def _raster(
+    layout: SurfaceLayout, region: Region | None, plate: Plate
+) -> tuple[list[Position], float]:
+    """Positions [m] spread evenly over a region, and the area of each [m²].
+
+    Without what later regions cover.
+    """
+    corners = [(0.0, 0.0), (plate.length, plate.width)]
+    if region is not None:
+        corners = [*region.shape.corners()]
+    (x0, y0), (x1, y1) = np.min(corners, axis=0), np.max(corners, axis=0)
+    step = _MIN_STEP
+    while True:
+        nx, ny = (max(1, math.floor(size / step + 1e-9)) for size in (x1 - x0, y1 - y0))
+        dx, dy = (x1 - x0) / nx, (y1 - y0) / ny
+        places = [
+            (float(x0 + (column + 0.5) * dx), float(y0 + (row + 0.5) * dy))
+            for row in range(ny)
+            for column in range(nx)
+        ]
+        found = [at for at in places if layout.region_at(*at) is region]
+        if len(found) <= MAX_TOUCHES:
+            return found, dx * dy
+        step *= 1.1
+
+
+def _resting(plate: Plate, at: Position, number: int) -> Position:
+    """Return where a second finger rests: each time in another quarter of the plate."""
+    quarters = [(x * plate.length, y * plate.width) for x in (0.25, 0.75) for y in (0.25, 0.75)]
+    away = [each for each in quarters if math.dist(each, at) >= _RESTING_AWAY]
+    if not away:
+        return max(quarters, key=lambda each: math.dist(each, at))
+    return away[number % len(away)]
+
+
+def _silent(touches: Sequence[SimulatedTouch], area: float) -> Iterator[str]:
+    silent = [each for each in touches if each.reason is not None]
+    if silent:
+        yield f"nothing is felt {_where(silent, touches, area)}: {silent[0].reason}"
+
+
+def _off_level(
+    sensation: Sensation, touches: Sequence[SimulatedTouch], area: float
+) -> Iterator[str]:
+    promised = sensation.level_db_sl
+    if promised is None:
+        return
+    for sense, words in ((-1, "below"), (1, "above")):
+        off = {
+            each: sense * (each.felt_db_sl - promised)
+            for each in touches
+            if each.felt_db_sl is not None
+            and sense * (each.felt_db_sl - promised) > LEVEL_TOLERANCE
+        }
+        if off:
+            yield (
+                f"level is up to {max(off.values()):.1f} dB {words} {promised:g} dB SL "
+                f"{_where([*off], touches, area)}"
+            )
+
+
+def _off_band(
+    band: tuple[float, float] | None,
+    table: LocalizationTable,
+    touches: Sequence[SimulatedTouch],
+    *,
+    must_be_alike: bool,
+) -> Iterator[str]:
+    played = sorted({frequency for each in touches for frequency in each.frequencies})
+    if not played:
+        return
+    if band is None:
+        if must_be_alike and played[-1] > _ALIKE * played[0]:
+            yield (
+                f"frequency is {played[0]:g} to {played[-1]:g} Hz, another at every place; give it "
+                "a frequency or a band"
+            )
+        return
+    low, high = band
+    nearest = band_of_table(band, table.frequencies)[0]
+    if not low * (1 - _BAND_TOLERANCE) <= nearest <= high * (1 + _BAND_TOLERANCE):
+        given = f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
+        yield f"frequency {given} is not in the table, which plays {nearest:g} Hz instead"
+
+
+def _where(some: Sequence[SimulatedTouch], touches: Sequence[SimulatedTouch], area: float) -> str:
+    """Format on how much of a region something happens, and where."""
+    places = sorted({each.at for each in some})
+    share = len(places) / len({each.at for each in touches})
+    (x0, y0), (x1, y1) = np.min(places, axis=0), np.max(places, axis=0)
+    second = "" if any(each.resting is None for each in some) else ", beside a second finger"
+    return (
+        f"on {100 * share:.0f} % of the region ({1e4 * area * len(places):.1f} cm²), x {x0:.3f} to "
+        f"{x1:.3f}, y {y0:.3f} to {y1:.3f} m{second}"
+    )

@@ -1,0 +1,143 @@
+"""One touch of an effect simulated in time: what the finger feels, and what a resting one does."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller.effects.effect import Sensation
+from controller.loop.capabilities import PlaybackCapabilities
+from controller.loop.envelopes import RAMPS_ONLY
+from controller.loop.intent import Target
+from controller.loop.table_query import query_table
+from controller.sources.contacts import Contact, ContactKey
+from model.arrays import FloatArray
+from model.drive_modes import DRIVE_MODES
+from model.errors import InputError
+from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.perception import decibels, detection_threshold
+from model.table.effect_level import EffectLevels
+from model.table.table import LocalizationTable
+from model.transients.envelope import Bases, ramped_pulse
+from model.transients.measures import SAMPLE_RATE, Transients
+from model.vibration.excitation import Excitation
+
+Position = tuple[float, float]
+
+STEADY_AFTER, STEADY_FOR = 0.3, 0.1
+"""Start and length [s] of the part over which a vibration without a duration is felt."""
+
+_AFTER = 0.1  # s; what a resting finger feels after the end counts, too
+
+
+@dataclass(frozen=True)
+class SimulatedTouch:
+    """A touch at a position [m], with a resting finger [m] or None.
+
+    frequencies [Hz]; felt_db_sl: over the duration of the effect; resting_db_sl: the strongest that
+    the resting finger feels over as long, None without one; reason: why nothing plays.
+    """
+
+    at: Position
+    resting: Position | None
+    frequencies: tuple[float, ...] = ()
+    felt_db_sl: float | None = None
+    resting_db_sl: float | None = None
+    reason: str | None = None
+
+
+class TouchSimulator:
+    """Plays effects as the controller does on the plate of a table, along plain ramps, in time."""
+
+    def __init__(self, table: LocalizationTable) -> None:
+        self._table = table
+        self._levels = EffectLevels(table)
+        self._transients = Transients(table.in_time)
+        self._capabilities = PlaybackCapabilities(
+            drive_mode=[*DRIVE_MODES][-1],
+            playable=tuple(DRIVE_MODES),
+            frequencies=(float(table.frequencies[0]), float(table.frequencies[-1])),
+            max_amplitudes={era.name: era.stroke for era in table.eras},
+            envelope_support=RAMPS_ONLY,
+        )
+
+    def touch(
+        self,
+        sensation: Sensation,
+        band: tuple[float, float] | None,
+        at: Position,
+        resting: Position | None,
+    ) -> SimulatedTouch:
+        """Play a sensation at a finger."""
+        finger, other = (ContactKey("check", number) for number in (1, 2))
+        target = Target(
+            finger,
+            sensation.level_db_sl,
+            allow_weaker=sensation.allow_weaker,
+            pulse=sensation.pulse,
+            band=band,
+        )
+        quiet = [] if resting is None else [Contact(other, *resting, since=0.0)]
+        try:
+            answer = query_table(
+                self._table,
+                [(Contact(finger, *at, since=0.0), target)],
+                quiet,
+                self._capabilities,
+                self._levels,
+            )
+        except InputError as error:
+            return SimulatedTouch(at, resting, reason=str(error))
+        pattern, pulse = answer.pattern, sensation.pulse
+        is_whole = pulse is not None and pulse.is_raised
+        since = 0.0 if is_whole else STEADY_AFTER
+        duration = pulse.duration if pulse is not None and is_whole else STEADY_FOR
+        bases = [
+            (frequency, ramped_pulse(part, self._table.eras, ramp=pattern.ramp, duration=end))
+            for end in (since + duration,)
+            for frequency, part in _by_frequency(pattern.excitation)
+        ]
+        felt = self._levels_at(at, bases, length=duration, until=since + duration)
+        level = float(felt[round(since * SAMPLE_RATE)])
+        resting_level = None
+        if resting is not None:
+            over = self._levels_at(resting, bases, length=duration, until=since + duration + _AFTER)
+            resting_level = float(over[round(since * SAMPLE_RATE) :].max())
+        return SimulatedTouch(
+            at, resting, tuple(frequency for frequency, _ in bases), level, resting_level
+        )
+
+    def _levels_at(
+        self, at: Position, bases: Sequence[tuple[float, Bases]], *, length: float, until: float
+    ) -> FloatArray:
+        """Level [dB SL] of the rms over each stretch of a length [s] up to a time [s], (n,).
+
+        Mean over a fingertip; one value for each sample at which a stretch starts.
+        """
+        plate = self._table.plate
+        points, weights = fingertip_points(*at, plate), fingertip_weights(*at, plate)
+        power = np.zeros((round(until * SAMPLE_RATE), len(points)))
+        for frequency, motion in bases:
+            acceleration = self._transients.acceleration(motion, points, duration=until)
+            power = (
+                power
+                + (acceleration / detection_threshold(np.array(frequency), self._table.threshold))
+                ** 2
+            )
+        total = np.vstack([np.zeros(len(points)), np.cumsum(power, axis=0)])
+        count = min(round(length * SAMPLE_RATE), len(total) - 1)
+        mean = np.maximum((total[count:] - total[:-count]) / count, 0.0)
+        return decibels(math.sqrt(2) * np.sqrt(mean) @ weights)
+
+
+def _by_frequency(excitation: Excitation) -> list[tuple[float, Excitation]]:
+    """Return the tones of each frequency [Hz], ascending."""
+    frequencies = sorted({tone.frequency for tone in excitation.values()})
+    return [
+        (
+            frequency,
+            {name: tone for name, tone in excitation.items() if tone.frequency == frequency},
+        )
+        for frequency in frequencies
+    ]

@@ -1,0 +1,168 @@
+"""`era layout check`: how a layout will feel, against the plate in time behind a wire."""
+
+import json
+import math
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from controller.cli.layout import layout_app
+from controller.effects.buzz import Buzz
+from controller.effects.click import Click
+from controller.effects.detents import Detents
+from controller.effects.dial import Dial
+from controller.effects.effect import Effect
+from controller.effects.layout import SurfaceLayout
+from controller.effects.layout_check import CheckedEffect, check_layout
+from controller.effects.ramp import Ramp
+from controller.effects.region import Region
+from controller.effects.representative import strongest_sensation
+from controller.effects.shapes import Circle, Rectangle
+from controller.effects.texture import Texture
+from model.table.build import build_table
+from model.table.file import save_table
+from model.table.table import LocalizationTable
+from paper_table import smooth_rig
+from pressed_layout import Pressed
+
+BUTTON = Rectangle(0.05, 0.04, 0.012, 0.012)
+SLIDER = Rectangle(0.02, 0.14, 0.26, 0.04)
+
+
+@cache
+def table() -> LocalizationTable:
+    """Eight frequencies, which is quick to solve."""
+    return build_table(smooth_rig(), frequencies=np.linspace(60.0, 340.0, 8))
+
+
+def checked(region: Region, effect: Effect) -> CheckedEffect:
+    """The check of one region with one effect, called `it`."""
+    layout = SurfaceLayout((region,), {"it": effect}, elsewhere=None)
+    (found,) = check_layout(layout, table())
+    return found
+
+
+@pytest.mark.parametrize("resting", [False, True])
+@pytest.mark.parametrize("effect", [Click(duration=0.02), Click(), Buzz(level=15.0)])
+def test_check_says_what_the_plate_behind_a_wire_makes_felt(effect: Effect, resting: bool) -> None:
+    """The same touch through controller, wire and amplifier, within 0.5 dB of its simulation."""
+    found = checked(Region("button", BUTTON, on_press="it"), effect)
+    (touch,) = [each for each in found.touches if (each.resting is not None) is resting]
+    since, duration = (0.3, 0.1) if isinstance(effect, Buzz) else (0.0, effect.duration)
+    layout = SurfaceLayout(
+        (Region("button", BUTTON, on_press="it"),), {"it": effect}, elsewhere=None
+    )
+    chain = Pressed(
+        smooth_rig(),
+        table(),
+        layout,
+        "serial",
+        resting=() if touch.resting is None else (touch.resting,),
+        options={"max_loading_time": 0.0},
+    )
+    ((felt,),) = chain.press(lambda since: touch.at, held=0.42)
+    assert touch.frequencies == (felt.frequency,)
+    assert touch.felt_db_sl is not None
+    assert felt.level_db_sl(duration, since=since) == pytest.approx(touch.felt_db_sl, abs=0.5)
+    assert touch.felt_db_sl == pytest.approx(effect.level, abs=0.5)
+
+
+def test_check_says_by_how_much_a_level_cannot_be_had() -> None:
+    """Of 10 dB more than the full stroke gives, 10 dB are missing."""
+    region = Region("button", BUTTON, on_press="it", band=(90.0, 110.0))
+    most = max(checked(region, Click(level=60.0)).felt)
+    assert most < 59
+    short = checked(region, Click(level=math.floor(most) + 10.0))
+    (problem,) = short.problems
+    missing = float(problem.split("up to ")[1].split(" dB")[0])
+    assert missing == pytest.approx(math.floor(most) + 10.0 - min(short.felt), abs=0.06)
+    assert 9.0 <= missing <= 13.0
+    assert short.frequencies == [100.0]
+    assert "100 % of the region (1.4 cm²)" in problem
+
+
+def test_check_wants_a_frequency_for_notches_that_differ() -> None:
+    """A slider without a band plays any frequency of the table; with one it stays in it."""
+    free = checked(Region("slider", SLIDER, on_move="it"), Detents())
+    assert len(free.frequencies) > 2
+    assert len(free.problems) == 1
+    tuned = checked(Region("slider", SLIDER, on_move="it", band=(170.0, 230.0)), Detents())
+    assert set(tuned.frequencies) <= {180.0, 220.0}
+    assert tuned.problems == ()
+    assert max(abs(level - 20.0) for level in tuned.felt) <= 2.0
+
+
+def test_check_names_a_frequency_that_the_table_does_not_have() -> None:
+    """700 Hz is not among 60 to 340 Hz; 200 Hz is as far from 180 as from 220 Hz."""
+    for frequency in (700.0, 200.0):
+        region = Region("button", BUTTON, on_press="it", band=(frequency, frequency))
+        (problem,) = checked(region, Click()).problems
+        assert f"{frequency:g} Hz" in problem
+
+
+@pytest.mark.parametrize(
+    ("effect", "level", "duration"),
+    [
+        (Click(), 20.0, 0.040),
+        (Buzz(), 20.0, None),
+        (Ramp(start_level=6.0), 20.0, 1.0),
+        (Texture(fast=0.5), 20.0, None),
+        (Detents(spacing=0.05), 20.0, 0.030),
+        (Dial(), 20.0, 0.030),
+    ],
+)
+def test_strongest_sensation_of_every_kind(
+    effect: Effect, level: float, duration: float | None
+) -> None:
+    """What its level is reached with, at rest or along some way."""
+    region = Region("knob", Circle(0.15, 0.1, 0.05))
+    felt = strongest_sensation(effect, region, level_db_sl=level, at=(0.15, 0.1))
+    assert felt is not None
+    assert felt.level_db_sl == level
+    assert (felt.pulse and felt.pulse.duration) == duration
+
+
+LAYOUT = """\
+effects: {notches: {kind: detents}}
+regions:
+  key: {rectangle: {start: [3 cm, 3 cm], end: [5 cm, 5 cm]}, on_press: click, frequency: 100 Hz}
+  strip: {rectangle: {start: [3 cm, 9 cm], end: [25 cm, 11 cm]}, on_move: notches}
+elsewhere: null
+"""
+
+
+def run(folder: Path, text: str, *options: str) -> tuple[int, str]:
+    """Exit status and output of the command."""
+    (folder / "layout.yaml").write_text(text, encoding="utf-8")
+    save_table(table(), folder / "table.npz")
+    arguments = ["check", str(folder / "layout.yaml"), str(folder / "table.npz"), *options]
+    result = CliRunner().invoke(layout_app, arguments)
+    return result.exit_code, result.stdout
+
+
+def test_command_prints_one_object_and_writes_a_picture(tmp_path: Path) -> None:
+    """One region falls short: exit status 1; its keys as documented."""
+    picture = tmp_path / "preview.png"
+    status, output = run(tmp_path, LAYOUT, "--json", "-o", str(picture))
+    found: dict[str, Any] = json.loads(output)
+    assert status == 1
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert found["files"] == [str(picture)]
+    key, strip = found["regions"]
+    assert (key["region"], key["effect"], key["promised_db_sl"]) == ("key", "click", 20.0)
+    assert key["frequency_hz"] == [100.0]
+    assert key["problems"] == []
+    assert set(key["felt_db_sl"]) == {"min", "median", "max"}
+    assert 18 <= key["felt_db_sl"]["min"] <= key["felt_db_sl"]["max"] <= 22
+    assert len(strip["problems"]) == 1
+
+
+def test_command_ends_with_zero_for_a_good_layout(tmp_path: Path) -> None:
+    """With a band for the slider, too."""
+    status, output = run(tmp_path, LAYOUT.replace("notches}\n", "notches, band: [90, 150]}\n"))
+    assert status == 0
+    assert "strip, on_move: notches, 20 dB SL" in output

@@ -13,7 +13,6 @@ from model.drive_modes import DRIVE_MODES
 from model.figures.drawing import draw_eras
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import sensation_level
-from model.table.robust import with_robust_contrast
 
 PLACES = np.array([[0.09, 0.15], [0.20, 0.07]])  # target, quiet [m]
 SIDE = 161
@@ -30,8 +29,10 @@ def modes_figure() -> Figure:
     panels = figure.subplots(1, len(DRIVE_MODES))
     for axes, drive_mode in zip(panels, DRIVE_MODES, strict=True):
         question = question_of(PLACES, drive_mode=drive_mode)
-        pattern = with_robust_contrast(table, question, table.query(question))
-        level = sensation_level(*table.amplitudes(pattern.excitation, points), table.threshold)
+        pattern = table.query(question)
+        contacts = [(float(place[0]), float(place[1])) for place in PLACES]
+        amplitudes = table.amplitudes(pattern.excitation, points, contacts=contacts)
+        level = sensation_level(*amplitudes, table.threshold)
         axes.pcolormesh(
             100 * x, 100 * y, level.reshape(SIDE, SIDE), cmap=COLORS, norm=SCALE, shading="gouraud"
         )
@@ -59,8 +60,8 @@ def modes_figure() -> Figure:
             )
         tones = sorted({f"{tone.frequency:.0f}" for tone in pattern.excitation.values()})
         axes.set_title(
-            f"{drive_mode}, {' and '.join(tones)} Hz\n{pattern.contrast_db:.0f} dB, "
-            f"{pattern.robust_contrast_db:.0f} dB robust",
+            f"{drive_mode}, {' and '.join(tones)} Hz\nat least "
+            f"{pattern.robust_felt_contrast_db:.0f} dB, as modelled {pattern.felt_contrast_db:.0f}",
             fontsize=10,
         )
     figure.colorbar(

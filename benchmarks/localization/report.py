@@ -5,7 +5,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from benchmarks.localization.contrast import GOALS, QUIET, Section
+from benchmarks.localization.contrast import Section
 from benchmarks.localization.picture import modes_figure
 from benchmarks.page import write_parts
 
@@ -13,7 +13,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 PAGE = "measured/localization-benchmarks.md"
 
 
-def write_report(sections: Sequence[Section], *, sets: int, draws: int, seed: int) -> None:
+def write_report(sections: Sequence[Section], *, sets: int, seed: int) -> None:
     """Write the figures into their page, and the pictures."""
     contrast, *_, growth = sections
     pictures = DOCS / "pictures"
@@ -24,12 +24,11 @@ def write_report(sections: Sequence[Section], *, sets: int, draws: int, seed: in
         ("modes", modes_figure()),
     ):
         figure.savefig(pictures / f"localization_{name}.png", dpi=110)
-    options = f"--sets {sets} --draws {draws} --seed {seed}"
-    run = f"Printed by `python -m benchmarks.localization {options} --report`."
+    run = f"`python -m benchmarks.localization --sets {sets} --seed {seed} --report`"
     write_parts(
         DOCS / PAGE,
         {
-            "contrast": f"{run}\n\n{_markdown(contrast)}",
+            "contrast": f"Printed by {run}.\n\n{_markdown(contrast)}",
             "further": "\n\n".join(_markdown(each) for each in sections[1:]),
         },
     )
@@ -47,30 +46,25 @@ def _markdown(section: Section) -> str:
 
 
 def _contrast_figure(section: Section) -> Figure:
-    """Distribution of realised contrast, a panel for each number of quiet fingers."""
-    names = [name for name in section.data["names"] if not name.startswith(" ")]
-    figure = Figure(figsize=(12, 4.6), layout="constrained")
-    for axes, quiet in zip(figure.subplots(1, len(QUIET), sharey=True), QUIET, strict=True):
-        values = [section.data["realised"][name, quiet] for name in names]
+    """Distribution of the contrast of nine of ten plates, a panel for each kind of contact set."""
+    kinds = list(dict.fromkeys(key[:2] for key in section.data))
+    figure = Figure(figsize=(14, 3.6), layout="constrained")
+    for axes, (targets, quiet) in zip(
+        figure.subplots(1, len(kinds), sharey=True), kinds, strict=True
+    ):
+        names = [name for t, q, name in section.data if (t, q) == (targets, quiet)]
         axes.boxplot(
-            values,
+            [section.data[targets, quiet, name][1] for name in names],
             orientation="horizontal",
             whis=(10, 90),
             showfliers=False,
             widths=0.6,
             medianprops={"color": "#c0392b", "linewidth": 2},
         )
-        for drive_mode, color in (("switched", "#2980b9"), ("phased", "#27ae60")):
-            goal = float(GOALS[drive_mode][quiet].split()[0])
-            axes.axvline(
-                goal, color=color, linestyle="--", linewidth=1, label=f"goal, {drive_mode}"
-            )
         axes.set_yticks(range(1, len(names) + 1), names)
-        axes.invert_yaxis()
-        axes.set_xlabel("realised contrast / dB")
-        axes.set_title(f"{quiet} quiet finger" + ("s" if quiet > 1 else ""))
+        axes.set_xlabel("felt contrast of nine of ten plates / dB")
+        axes.set_title(f"{targets} target{'s' if targets > 1 else ''}, {quiet} quiet")
         axes.grid(axis="x", alpha=0.3)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
 
 

@@ -141,7 +141,11 @@ class Selector:
         onset_gain = answer.felt_db_sl - pattern.level_db_sl
         fingers = [*(contact for contact, _ in targets), *quiet]
         discs = [fingertip_points(each.x, each.y, self._table.plate) for each in fingers]
-        frequencies, all_fields = self._table.amplitudes(pattern.excitation, np.concatenate(discs))
+        frequencies, all_fields = self._table.amplitudes(
+            pattern.excitation,
+            np.concatenate(discs),
+            contacts=[(each.x, each.y) for each in fingers],
+        )
         ends = np.cumsum([len(disc) for disc in discs])[: len(targets)]
         *fields, at_quiet = np.split(all_fields, ends, axis=1)
         loudest = peak_acceleration(at_quiet)

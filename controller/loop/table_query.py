@@ -202,22 +202,12 @@ def strongest(
         if tone.amplitude > 0
     ]
     gain = min([max_db_sl - pattern.level_db_sl, *headroom])
-    quiet = pattern.quiet_level_db_sl
+    quiet = pattern.highest_quiet_level_db_sl
     if quiet is not None:
         gain = min(gain, IMPERCEPTIBLE_DB_SL - quiet)
-    level = pattern.level_db_sl + gain
-    if level <= 0:
+    if pattern.level_db_sl + gain <= 0:
         raise InputError(
             "a quiet finger must stay at -10 dB SL, but at every level that reaches the target it "
             "does not; lift or move that finger away"
         )
-    factor = 10 ** (gain / 20)
-    return replace(
-        pattern,
-        excitation={
-            name: replace(tone, amplitude=tone.amplitude * factor)
-            for name, tone in pattern.excitation.items()
-        },
-        level_db_sl=level,
-        quiet_level_db_sl=None if quiet is None else quiet + gain,
-    )
+    return pattern.scaled(gain)

@@ -39,7 +39,11 @@ def query(
     ] = False,
     batch: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Questions as JSON lines; print one answer a line."),
+        typer.Option(
+            metavar="FILE",
+            help="Questions as JSON lines; print one answer a line. Other options are the defaults "
+            "of keys left out.",
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -56,7 +60,13 @@ def query(
     if batch is not None:
         if target or quiet:
             raise InputError("--target and --quiet must be left out with --batch")
-        _query_batch(table_file, batch)
+        defaults = {
+            "level_db_sl": level,
+            "mode": drive_mode,
+            "eras_at_most": eras,
+            "envelopes": envelopes,
+        }
+        _query_batch(table_file, batch, defaults)
         return
     if not target:
         raise InputError(
@@ -86,14 +96,23 @@ def _print_answer(answer: dict[str, Any]) -> None:
             f"phase {tone['phase_deg']:.1f}°"
         )
     basis = ", threshold extrapolated" if answer["is_level_extrapolated"] else ""
-    rows = [("level at the target", answer["level_db_sl"], f"dB SL{basis}")]
+    rows = [
+        ("level at the target", answer["robust_level_db_sl"], f"dB SL or more{basis}"),
+        ("  as modelled", answer["level_db_sl"], "dB SL"),
+    ]
     if answer["contrast_db"] is not None:
         awareness = "not felt" if answer["is_imperceptible_to_quiet"] else "may be felt"
         rows += [
-            ("contrast to quiet fingers", answer["contrast_db"], "dB"),
-            ("  on nine of ten plates", answer["robust_contrast_db"], "dB or more"),
+            ("felt contrast to quiet fingers", answer["robust_felt_contrast_db"], "dB or more"),
+            ("  typically", answer["median_felt_contrast_db"], "dB"),
+            ("  as modelled", answer["felt_contrast_db"], "dB"),
+            ("  as acceleration", answer["robust_contrast_db"], "dB or more"),
             ("  in the first 100 ms", answer["transient_contrast_db"], "dB"),
-            ("loudest quiet finger", answer["quiet_level_db_sl"], f"dB SL, {awareness}"),
+            (
+                "loudest quiet finger",
+                answer["robust_quiet_level_db_sl"],
+                f"dB SL or less, {awareness}",
+            ),
             ("level that leaves it at -10", answer["usable_level_db_sl"], "dB SL"),
         ]
     else:
@@ -105,12 +124,16 @@ def _print_answer(answer: dict[str, Any]) -> None:
         ]
     rows.append(("residual after the end", answer["residual_db"], "dB"))
     for name, value, unit in rows:
-        print(f"{name:28s} {value:6.1f} {unit}")
+        print(f"{name:30s} {value:6.1f} {unit}")
+    print("'or more', 'or less': on nine of ten plates within the rig's uncertainty")
     print(f"solved in {1000 * answer['solve_time_s']:.1f} ms")
 
 
-def _query_batch(table_file: Path, batch: Path) -> None:
-    """Answer line by line; exit with 1 at the end if a line had no answer."""
+def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> None:
+    """Answer line by line; exit with 1 at the end if a line had no answer.
+
+    defaults: of keys that lines leave out.
+    """
     from model.errors import InputError
     from model.files.regular_file import regular_file
     from model.table.file import load_table
@@ -120,7 +143,7 @@ def _query_batch(table_file: Path, batch: Path) -> None:
     has_failed = False
     try:
         with open(batch, encoding="utf-8", opener=regular_file) as lines:
-            for answer in query_batch(table, lines):
+            for answer in query_batch(table, lines, defaults):
                 has_failed = has_failed or "error" in answer
                 print(json.dumps(answer))
     except OSError as error:

@@ -105,8 +105,9 @@ def _show_summary(summary: dict[str, Any]) -> None:
     contrast = [
         (
             f"contrast to {others} other{'s' if others > 1 else ''}",
-            f"median {decibels(f'contrast_{others}_quiet_median_db')}, one in ten below "
-            f"{decibels(f'contrast_{others}_quiet_tenth_percentile_db')}",
+            f"median {decibels(f'robust_felt_contrast_{others}_quiet_median_db')}, one in ten "
+            f"below {decibels(f'robust_felt_contrast_{others}_quiet_tenth_percentile_db')}; "
+            f"as modelled {decibels(f'felt_contrast_{others}_quiet_median_db')}",
         )
         for others in (1, 2, 3)
     ]
@@ -147,7 +148,7 @@ def _show_summary(summary: dict[str, Any]) -> None:
 def _show_map(cells: "WeakCells", *, listed: bool) -> None:
     from model.table.weak_cells import text_map
 
-    print("contrast in dB from each cell to the median other finger; * marks weak cells")
+    print("felt contrast of nine of ten plates, dB, to the median other finger; * marks weak cells")
     for line in text_map(cells):
         print(line)
     if listed:

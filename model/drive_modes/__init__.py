@@ -4,13 +4,13 @@ The modes are nested: each allows every drive of the more restricted ones, and r
 all modes up to its own. All but `switched` drive all ERAs at one frequency. The upper bound of a
 mode's score at a frequency also bounds the restricted modes and prunes most of their frequencies.
 
-For a single target, `phased` takes a millisecond and is at least as good as `signed` and `graded`,
-up to 0.1 dB (mean), 0.5 dB (maximum) of unconverged iterations, so that it skips their search. It
-searches them for several targets, and where its best weights do not reach the wanted level.
+For a single target, `phased` is at least as good as the others, up to unconverged iterations, so
+that it skips their search. It searches them for several targets, and where no weights reach the
+wanted level.
 
-Symbols here and in `model.table`: f frequencies, p points under the fingers, q quiet points, r
+Symbols here and in `model.table`: f frequencies, p points under the fingers, q quiet fingertips, r
 reduced modal coordinates; h field of an ERA at a point, R Hermitian form of the expected power at
-the quiet points, c right-hand side from the targets, w complex weights of the ERAs. In
+the quiet fingertips, c right-hand side from the targets, w complex weights of the ERAs. In
 `model.transients`, q are the modal coordinates and z those of the eigenvectors in time.
 """
 
@@ -18,9 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array, IntArray
 from model.drive_modes.coherent import Coherent
-from model.drive_modes.fields import Evaluation, Fields, Weights, evaluate
+from model.drive_modes.forms import Forms, Weights
 from model.drive_modes.graded import GRADED
 from model.drive_modes.phased import PHASED
 from model.drive_modes.signed import SIGNED
@@ -29,11 +28,11 @@ from model.drive_modes.switched import find_switched, max_sensation_switched
 MAX_PHASE_STEP = 10.0
 """Largest phase step [degrees] for `phased`: its rms error of 3 degrees is within the allowance."""
 
-MAX_ALTERNATIVES, ALTERNATIVE_RATIO = 4, 10 ** (-3 / 20)
+ALTERNATIVES = 4
+"""Drives that are returned, the best first."""
 
 __all__ = [
     "DRIVE_MODES",
-    "Choice",
     "DriveMode",
     "find_drives",
     "max_sensation",
@@ -52,13 +51,13 @@ class DriveMode:
     coherent: Coherent | None
     restricted: tuple[str, ...]
 
-    def max_sensation(self, fields: Fields) -> float:
+    def max_sensation(self, forms: Forms) -> float:
         """Return the highest amplitude to threshold found at the weakest target.
 
         In this mode alone. For several targets a coherent mode may reach a decibel more.
         """
         search = self.coherent.max_sensation if self.coherent else max_sensation_switched
-        return search(fields)
+        return search(forms)
 
 
 DRIVE_MODES: dict[str, DriveMode] = {
@@ -70,82 +69,42 @@ DRIVE_MODES: dict[str, DriveMode] = {
 """Drive modes by name, from the least freedom to the most."""
 
 
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """The drive of the best robust score, its evaluation, and alternatives to it.
+def find_drives(forms: Forms, drive_mode: str) -> list[tuple[float, Weights]]:
+    """Find the drives of the best robust scores in a mode and its restricted ones.
 
-    frequencies (n,) by index, weights (n, eras), score (n,): the best weights of all ERAs at each
-    frequency where they reach the level; empty for `switched`.
+    Up to ALTERNATIVES with their scores, best first, one for each frequency or mixture of them;
+    empty where no drive reaches the wanted level.
     """
-
-    drive: Weights
-    evaluation: Evaluation
-    frequencies: IntArray
-    weights: Complex64Array
-    score: Float32Array
-
-    def alternatives(self) -> "Choice":
-        """Keep up to MAX_ALTERNATIVES alternatives within 3 dB of the best score, best first.
-
-        Empty where the best drive has several frequencies, and so is not among them.
-        """
-        left = np.flatnonzero(self.score > ALTERNATIVE_RATIO * self.evaluation.score)
-        if self.score.max(initial=0.0) < 0.999 * self.evaluation.score:
-            left = left[:0]
-        left = left[np.argsort(-self.score[left])[:MAX_ALTERNATIVES]]
-        return Choice(
-            self.drive,
-            self.evaluation,
-            frequencies=self.frequencies[left],
-            weights=self.weights[left],
-            score=self.score[left],
-        )
-
-
-def find_drives(fields: Fields, drive_mode: str) -> Choice | None:
-    """Find the drive of the best robust score in a mode and its restricted ones.
-
-    None where no drive reaches the wanted level.
-    """
-    best: tuple[Weights, Evaluation] | None = None
-    open_ = np.arange(fields.frequency_count)
+    mixed: list[tuple[float, Weights]] = []
+    open_ = np.arange(forms.frequency_count)
     score = np.zeros(len(open_), dtype=np.float32)
-    weights = np.zeros((len(open_), fields.era_count), dtype=np.complex64)
+    weights = np.zeros((len(open_), forms.era_count), dtype=np.complex64)
+    best = 0.0
     for name in (drive_mode, *DRIVE_MODES[drive_mode].restricted):
-        min_score = best[1].score if best else 0.0
         coherent = DRIVE_MODES[name].coherent
         if coherent is None:
-            # The score so far prunes most of the search.
-            drive = find_switched(fields, min_score)
-        elif len(open_) > 0:
-            some = fields if len(open_) == fields.frequency_count else fields.at(open_)
-            found = coherent.search(some, min_score)
-            better = (found.score > score[open_]).nonzero()[0]
-            at = open_[better]
-            score[at], weights[at] = found.score[better], found.weights[better]
-            top = int(score.argmax())
-            drive = Weights.at(top, weights[top]) if score[top] > min_score else None
-        else:
+            mixed = find_switched(forms, best)
             continue
-        if drive is not None:
-            evaluation = evaluate(fields, drive)
-            if best is None or evaluation.score > best[1].score:
-                best = drive, evaluation
-        if coherent is not None and best is not None:
-            left = found.bound > best[1].score
-            if name == "phased" and not found.is_level_limited and len(fields.targets) == 1:
-                left[:] = False
-            open_ = open_[left]
-    if best is None:
-        return None
-    reached = np.flatnonzero(score)
-    return Choice(*best, reached, weights[reached], score[reached])
+        if len(open_) == 0:
+            continue
+        some = forms if len(open_) == forms.frequency_count else forms.at(open_)
+        found = coherent.search(some, best)
+        better = (found.score > score[open_]).nonzero()[0]
+        at = open_[better]
+        score[at], weights[at] = found.score[better], found.weights[better]
+        best = max(best, float(score.max()))
+        if name == "phased" and best > 0 and len(forms.targets) == 1:
+            break
+        open_ = open_[found.bound > best]
+    top = np.argsort(-score)[:ALTERNATIVES].tolist()
+    drives = [(float(score[f]), Weights.at(f, weights[f])) for f in top if score[f] > 0]
+    return sorted(drives + mixed, key=lambda each: -each[0])[:ALTERNATIVES]
 
 
-def max_sensation(fields: Fields, drive_mode: str) -> float:
+def max_sensation(forms: Forms, drive_mode: str) -> float:
     """Return the highest amplitude to threshold found at the weakest target in a mode."""
     names = (*DRIVE_MODES[drive_mode].restricted, drive_mode)
-    return max(DRIVE_MODES[name].max_sensation(fields) for name in names)
+    return max(DRIVE_MODES[name].max_sensation(forms) for name in names)
 
 
 def playable_drive_modes(*, level_step: float, phase_step: float) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array
 from model.drive_modes.coherent import Coherent
+from model.drive_modes.phased import solve_phased
 
 EXCHANGES = 8
 SWEEPS = 2
@@ -47,5 +48,5 @@ def _swept(w: Float32Array, form: Float32Array, pull: Float32Array) -> Float32Ar
     return w
 
 
-GRADED = Coherent(_solve, phases=(7, 5), iterations=4)
+GRADED = Coherent(_solve, phases=(7, 5), iterations=4, bound=solve_phased)
 """With several starting phases of a target, since weights cannot be negative."""

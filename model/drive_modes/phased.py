@@ -10,8 +10,11 @@ from model.arrays import Complex64Array
 from model.drive_modes.coherent import Coherent
 
 
-def _solve(R: Complex64Array, c: Complex64Array, _: Complex64Array | None) -> Complex64Array:
+def solve_phased(
+    R: Complex64Array, c: Complex64Array, _: Complex64Array | None = None
+) -> Complex64Array:
+    """Weights R^-1 c: the largest |c^H w| for their w^H R w, of any mode."""
     return np.asarray(np.linalg.solve(R, c[..., None])[..., 0])
 
 
-PHASED = Coherent(_solve, phases=(1, 5), iterations=8)
+PHASED = Coherent(solve_phased, phases=(1, 5), iterations=8)

@@ -4,6 +4,7 @@ import numpy as np
 
 from model.arrays import Complex64Array
 from model.drive_modes.coherent import Coherent
+from model.drive_modes.phased import solve_phased
 
 
 def _solve(R: Complex64Array, c: Complex64Array, _: Complex64Array | None) -> Complex64Array:
@@ -20,4 +21,4 @@ def _solve(R: Complex64Array, c: Complex64Array, _: Complex64Array | None) -> Co
     return np.asarray(w, dtype=np.complex64)
 
 
-SIGNED = Coherent(_solve, phases=(1, 5), iterations=8)
+SIGNED = Coherent(_solve, phases=(1, 5), iterations=8, bound=solve_phased)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
-from model.drive_modes.fields import SILENT
+from model.drive_modes.forms import SILENT
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,135 +5,139 @@ frequencies make 4 * 27 + 6 * 27² = 4482 patterns, six and 361 two millions. Ev
 source or the sum of two: an ERA at a frequency, or a pair of ERAs at the same one
 (`model.drive_modes.exact_search` drives more of them).
 
-Patterns are not enumerated: the maximum over the quiet points is at least any weighted mean,
-and the mean of a sum of two sources is the sum of theirs. So a pattern of contrast above c needs
+The powers of its sources, each over the squared threshold of its frequency, add to what is felt, at
+the target and at every quiet fingertip. Patterns are not enumerated: the maximum over the quiet
+fingertips is at least any weighted mean, and the mean of a sum is the sum of the means. So a
+pattern of a power ratio above c needs
 
     sum over its sources of (target - c mean of quiet) > 0,
 
 one number for each source, which excludes most sources and pairs.
 """
 
+from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from model.arrays import Float32Array, IntArray
-from model.drive_modes.fields import SILENT, Fields, Weights
-from model.drive_modes.sources import (
-    all_combinations,
-    magnitudes_of_sources,
-    per_source,
-    sums_of_sources,
-)
+from model.arrays import Complex64Array, Float32Array, IntArray
+from model.drive_modes.forms import SILENT, Forms, Weights
+from model.drive_modes.sources import all_combinations
 
-BOUND_POINTS = 12
-"""Quiet points from which the quiet maximum is bounded."""
-
-BATCH = 48
+BATCH = 256
 """Patterns evaluated together."""
 
-FEW_SOURCES = 500
-"""Up to this all sums are faster than a selection of them."""
+ALTERNATIVES = 6
+"""Patterns that are kept, the best first."""
 
 
-def find_switched(fields: Fields, min_score: float) -> Weights | None:
-    """Find the pattern of highest contrast that reaches the level; None if not above min_score.
+@dataclass(frozen=True, eq=False)
+class SourcePowers:
+    """What each group of ERAs does at full stroke at each frequency, in squared thresholds.
 
-    Contrast without errors, which can only lower it: at full stroke there is nothing to trade
-    against them. Exact: patterns are excluded by bounds only.
+    target (t, groups, f): power of the mean amplitude at each target; reserve (t, groups, f):
+    standard deviation of that power's root, squared; quiet (q, groups, f): expected power.
     """
-    magnitudes = [magnitudes_of_sources(field) for field in fields.targets]
-    means = np.array([_mean(rows) for rows in magnitudes])
-    peak = means.mean(axis=0)
-    if (
-        min_score > 0
-        and not fields.has_no_quiet_contacts
-        and not _may_be_better(fields, means, min_score)
-    ):
-        return None
-    quiet = magnitudes_of_sources(fields.quiet)
-    powers = _powers(magnitudes, fields)
-    power = np.array([_mean(rows) for rows in powers])
-    weights = _equal_weights(quiet) if fields.has_no_quiet_contacts else _loudest_weights(quiet)
-    loud = quiet @ weights
 
-    def value(
-        peaks: Float32Array, at_quiet: Float32Array, powers: list[Float32Array]
-    ) -> Float32Array:
-        """Contrast of patterns (n,), 0 where they do not reach the level.
+    target: Float32Array
+    variance: Float32Array
+    quiet: Float32Array
 
-        Peaks at each target (targets, n) and at the quiet points (n, q); powers: (n, p) each.
-        """
-        sensation = np.min([_mean(np.sqrt(rows)) for rows in powers], axis=0)
-        quiet_peak = (
-            np.sqrt(_mean(at_quiet**2)) if fields.has_no_quiet_contacts else at_quiet.max(axis=1)
+
+def source_powers(forms: Forms, members: NDArray[np.float32]) -> SourcePowers:
+    """Powers of groups of ERAs, members (groups, eras) 1 or 0."""
+    squared = (forms.threshold**2)[None, None]
+    amplitude = np.abs(forms.targets @ members.T).transpose(0, 2, 1) ** 2 / squared
+    expected = group_powers(forms.target_power, members) / squared
+    return SourcePowers(
+        amplitude.astype(np.float32),
+        np.maximum(expected - amplitude, 0).astype(np.float32),
+        (group_powers(forms.quiet.swapaxes(0, 1), members) / squared).astype(np.float32),
+    )
+
+
+def group_powers(forms: Complex64Array, members: NDArray[np.float32]) -> Float32Array:
+    """Power of forms (q, f, eras, eras) for groups (groups, eras): (q, groups, f)."""
+    q, f, *_ = forms.shape
+    products = (members[:, :, None] * members[:, None]).reshape(len(members), -1)
+    real = np.ascontiguousarray(forms.real).reshape(q * f, -1) @ products.T
+    return np.asarray(real.reshape(q, f, -1).transpose(0, 2, 1))
+
+
+def find_switched(forms: Forms, min_score: float) -> list[tuple[float, Weights]]:
+    """Find the patterns of the best robust scores that reach the level, best first.
+
+    Empty if none is above min_score. The first one is exact: patterns are excluded by bounds only.
+    """
+    eras, f = forms.era_count, forms.frequency_count
+    powers = source_powers(forms, _members(eras))
+    target = powers.target.reshape(len(powers.target), -1)
+    variance = powers.variance.reshape(target.shape)
+    quiet = powers.quiet.reshape(len(powers.quiet), -1)
+    mean_target = target.mean(axis=0)
+
+    def score(at: Float32Array, spread: Float32Array, loud: Float32Array) -> Float32Array:
+        """Power ratio (n,), 0 where the level is not reached; from sums (t, n), (t, n), (q, n)."""
+        reached = np.sqrt(at) - np.float32(forms.level_margin) * np.sqrt(spread)
+        reaches = (reached >= forms.wanted).all(axis=0)
+        return np.asarray(
+            np.where(reaches, at.min(axis=0) / np.maximum(loud.max(axis=0), 1e-30), 0)
         )
-        return np.asarray(np.where(sensation >= fields.wanted, peaks.min(axis=0) / quiet_peak, 0))
 
-    nothing = len(quiet) - 1
-    contrast, best = min_score, (nothing, nothing)
-    # Single sources are evaluated first: their contrast excludes pairs.
-    alone = value(means[:, :-1], quiet[:-1], [rows[:-1] for rows in powers])
-    if alone.max() > contrast:
-        contrast, best = float(alone.max()), (int(alone.argmax()), nothing)
-    one, other = _pairs(peak - contrast * loud, fields)
-    # The mean of a root is at most the root of the mean; one source may serve one target, the other
-    # the other.
-    reaches = (power[:, one] + power[:, other] >= fields.wanted**2).all(axis=0)
-    one, other = one[reaches], other[reaches]
-    bound = (peak[one] + peak[other]) / (loud[one] + loud[other])
-    closer = fields.has_no_quiet_contacts
+    alone = score(target, variance, quiet)
+    kept = np.argsort(-alone)[:ALTERNATIVES]
+    found: list[tuple[float, tuple[int, ...]]] = [
+        (float(alone[s]), (s,)) for s in kept.tolist() if alone[s] > 0
+    ]
+    least = min_score**2
+    best = max(least, found[0][0] if found else 0.0)
+    loudest = np.bincount((quiet / mean_target).argmax(axis=0), minlength=len(quiet))
+    share = (loudest / loudest.sum()).astype(np.float32)
+    mean_quiet = share @ quiet
+    one, other = _pairs(mean_target - best * mean_quiet, eras, f)
+    bound = (mean_target[one] + mean_target[other]) / (mean_quiet[one] + mean_quiet[other])
     while len(one) > 0:
         if len(one) > BATCH:
             order = np.argpartition(-bound, BATCH)
             one, other, bound = one[order], other[order], bound[order]
         some, more = one[:BATCH], other[:BATCH]
-        found = value(
-            means[:, some] + means[:, more],
-            quiet[some] + quiet[more],
-            [rows[some] + rows[more] for rows in powers],
+        values = score(
+            target[:, some] + target[:, more],
+            variance[:, some] + variance[:, more],
+            quiet[:, some] + quiet[:, more],
         )
-        if found.max() > contrast:
-            at = int(found.argmax())
-            contrast, best = float(found[at]), (int(one[at]), int(other[at]))
-        left = BATCH + np.flatnonzero(bound[BATCH:] > contrast)
+        for at in np.argsort(-values)[:ALTERNATIVES].tolist():
+            if values[at] > 0:
+                found.append((float(values[at]), (int(some[at]), int(more[at]))))
+        best = max(best, float(values.max()))
+        left = BATCH + np.flatnonzero(bound[BATCH:] > best)
         one, other, bound = one[left], other[left], bound[left]
-        if not closer and len(one) > 0:
-            closer = True
-            few = quiet[:, np.argsort(-weights)[:BOUND_POINTS]]
-            bound = (peak[one] + peak[other]) / (few[one] + few[other]).max(axis=1)
-            left = np.flatnonzero(bound > contrast)
-            one, other, bound = one[left], other[left], bound[left]
-    return None if best[0] == nothing else _drive(best, fields)
+    found = [each for each in found if each[0] > least]
+    found.sort(key=lambda each: -each[0])
+    return [
+        (float(np.sqrt(value)), _drive(sources, eras, f)) for value, sources in found[:ALTERNATIVES]
+    ]
 
 
-def _may_be_better(fields: Fields, means: Float32Array, min_score: float) -> bool:
-    """Whether any pattern can have more contrast than min_score; means (targets, sources).
-
-    From a few of the quiet points, which mostly suffice to exclude all patterns.
-    """
-    step = max(1, fields.quiet.shape[2] // BOUND_POINTS)
-    few = magnitudes_of_sources(np.ascontiguousarray(fields.quiet[:, :, ::step]))
-    gain = means.mean(axis=0) - min_score * few @ _loudest_weights(few)
-    if gain.max() <= 0:  # and so no two of them have a sum above zero
-        return False
-    if means.shape[1] < FEW_SOURCES:
-        peak = sums_of_sources(means, fields.era_count).min(axis=0)
-        return bool((peak > min_score * sums_of_sources(few.T, fields.era_count).max(axis=0)).any())
-    if (means.min(axis=0) > min_score * few.max(axis=1))[:-1].any():
-        return True
-    one, other = _pairs(gain, fields)
-    loud = (few[one] + few[other]).max(axis=1, initial=0.0)
-    return bool(((means[:, one] + means[:, other]).min(axis=0) > min_score * loud).any())
+def max_sensation_switched(forms: Forms) -> float:
+    """Return the highest amplitude to threshold at the weakest target, the same pattern for all."""
+    eras, f = forms.era_count, forms.frequency_count
+    powers = source_powers(forms, _members(eras))
+    target = powers.target.reshape(len(powers.target), -1)
+    patterns = all_combinations(eras, f)
+    padded = np.concatenate([target, np.zeros((len(target), 1), np.float32)], axis=1)
+    sums = padded[:, patterns.first] + padded[:, patterns.second]
+    return float(np.sqrt(sums.min(axis=0).max()))
 
 
-def _pairs(gain: Float32Array, fields: Fields) -> tuple[IntArray, IntArray]:
+def _pairs(gain: Float32Array, eras: int, count: int) -> tuple[IntArray, IntArray]:
     """Patterns of two ERAs at two frequencies whose gains (sources,) have a sum above zero."""
-    count = fields.frequency_count
-    of_era = gain[: fields.era_count * count].reshape(-1, count)
+    of_era = gain[: eras * count].reshape(-1, count)
     highest = of_era.max(axis=1)
     ones, others = [], []
-    for one, other in combinations(range(fields.era_count), 2):
+    for one, other in combinations(range(eras), 2):
         if highest[one] + highest[other] <= 0:
             continue
         first = np.flatnonzero(of_era[one] > -highest[other])
@@ -147,49 +151,21 @@ def _pairs(gain: Float32Array, fields: Fields) -> tuple[IntArray, IntArray]:
     return np.concatenate(ones), np.concatenate(others)
 
 
-def _drive(sources: tuple[int, int], fields: Fields) -> Weights:
-    """All ERAs of two sources at full stroke; see `magnitudes_of_sources` for their order."""
-    count, eras = fields.frequency_count, fields.era_count
-    members = [(era,) for era in range(eras)] + list(combinations(range(eras), 2)) + [()]
+@lru_cache(maxsize=8)
+def _members(eras: int) -> NDArray[np.float32]:
+    """Every ERA alone, then every pair, (groups, eras), in the order of `all_combinations`."""
+    groups = [*((era,) for era in range(eras)), *combinations(range(eras), 2)]
+    members = np.zeros((len(groups), eras), dtype=np.float32)
+    for row, group in enumerate(groups):
+        members[row, list(group)] = 1
+    members.setflags(write=False)
+    return members
+
+
+def _drive(sources: tuple[int, ...], eras: int, count: int) -> Weights:
+    """All ERAs of one or two sources at full stroke."""
     index = np.full(eras, SILENT)
     for source in sources:
-        block, frequency = divmod(source, count)
-        index[list(members[block])] = frequency
+        group, frequency = divmod(source, count)
+        index[_members(eras)[group] > 0] = frequency
     return Weights(index, (index != SILENT).astype(np.complex64))
-
-
-def max_sensation_switched(fields: Fields) -> float:
-    """Return the highest amplitude to threshold found at the weakest target.
-
-    Among the patterns of the largest bounds, the same pattern for all targets.
-    """
-    patterns = all_combinations(fields.era_count, fields.frequency_count)
-    powers = _powers([magnitudes_of_sources(field) for field in fields.targets], fields)
-    means = np.array([_mean(rows) for rows in powers])
-    highest = sums_of_sources(means, fields.era_count).min(axis=0)
-    loudest = np.argsort(-highest)[:BATCH]
-    one, other = patterns.first[loudest], patterns.second[loudest]
-    sensation = np.min([np.sqrt(rows[one] + rows[other]).mean(axis=1) for rows in powers], axis=0)
-    return float(sensation.max())
-
-
-def _powers(magnitudes: list[Float32Array], fields: Fields) -> list[Float32Array]:
-    """Squared sensation of every source from its magnitudes at each target, (sources, p)."""
-    threshold = per_source(fields.threshold, fields.era_count)
-    return [(rows / threshold) ** 2 for rows in magnitudes]
-
-
-def _mean(rows: Float32Array) -> Float32Array:
-    """Mean over points of (n, p), as a product: in a fifth of the time of `mean`."""
-    return np.asarray(rows @ _equal_weights(rows))
-
-
-def _equal_weights(rows: Float32Array) -> Float32Array:
-    """Equal weights of the points of (n, p), (p,)."""
-    return np.full(rows.shape[1], 1 / rows.shape[1], dtype=rows.dtype)
-
-
-def _loudest_weights(quiet: Float32Array) -> Float32Array:
-    """Weights of the quiet points: the fraction of sources of which each is the loudest."""
-    often = np.bincount(quiet.argmax(axis=1), minlength=quiet.shape[1])
-    return np.asarray(often / len(quiet), dtype=quiet.dtype)

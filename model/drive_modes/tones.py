@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.arrays import FloatArray
-from model.drive_modes.fields import Weights
+from model.drive_modes.forms import Weights
 from model.structure.actuator import Era
 from model.vibration.excitation import Excitation, Tone
 

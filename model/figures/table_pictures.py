@@ -91,7 +91,7 @@ def contrast_figure(
     axes = figure.subplots()
     rng = np.random.default_rng(0)
     for others in (1, 2, 3):
-        found = contrast_distribution(table, others=others, rng=rng, progress=progress)
+        found, _ = contrast_distribution(table, others=others, rng=rng, progress=progress)
         contrasts = np.sort(found)
         share = 1 - np.arange(len(contrasts)) / max(1, len(contrasts))
         label = f"{others} other{'s' if others > 1 else ''}"

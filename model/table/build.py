@@ -103,7 +103,5 @@ def _joined(
         frequencies=problem.frequencies,
         reference_mesh=problem.reference_mesh,
         discretisation_error=joined("discretisation_error", axis=0),
-        acceleration=joined("acceleration", axis=1),
-        cell_sources=joined("cell_sources", axis=1),
         **modes,
     )

@@ -22,13 +22,14 @@ def with_concentration(table: LocalizationTable, question: Question, pattern: Pa
     """Add the concentration to a pattern without quiet fingers; takes some milliseconds."""
     if question.quiet:
         return pattern
-    felt = [
-        table.amplitudes(pattern.excitation, fingertip_points(*target, table.plate))[1].sum(axis=0)
-        @ fingertip_weights(*target, table.plate)
-        for target in question.targets
-    ]
+    contacts = question.targets
+    felt = []
+    for target in contacts:
+        disc = fingertip_points(*target, table.plate)
+        _, tones = table.amplitudes(pattern.excitation, disc, contacts=contacts)
+        felt.append(tones.sum(axis=0) @ fingertip_weights(*target, table.plate))
     points = cell_centres(table.plate)
-    frequencies, amplitudes = table.amplitudes(pattern.excitation, points)
+    frequencies, amplitudes = table.amplitudes(pattern.excitation, points, contacts=contacts)
     near = ~is_beyond(points, question.targets)
     concentration = concentration_of(
         frequencies, amplitudes, near, felt=min(felt), plate=table.plate

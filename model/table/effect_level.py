@@ -124,7 +124,7 @@ class EffectLevels:
             if min_ramp <= ramp:
                 break
             ramp = min_ramp
-        return replace(_scaled(pattern, raise_db), ramp=ramp), pattern.level_db_sl + raise_db + gain
+        return replace(pattern.scaled(raise_db), ramp=ramp), pattern.level_db_sl + raise_db + gain
 
     def _largest(self, excitation: Excitation) -> float:
         """The highest level 0..1 of an ERA."""
@@ -158,18 +158,3 @@ class EffectLevels:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
         return self._kept[key]
-
-
-def _scaled(pattern: Pattern, gain_db: float) -> Pattern:
-    """A pattern by so much stronger [dB]."""
-    factor = 10 ** (gain_db / 20)
-    quiet = pattern.quiet_level_db_sl
-    return replace(
-        pattern,
-        excitation={
-            name: replace(tone, amplitude=tone.amplitude * factor)
-            for name, tone in pattern.excitation.items()
-        },
-        level_db_sl=pattern.level_db_sl + gain_db,
-        quiet_level_db_sl=None if quiet is None else quiet + gain_db,
-    )

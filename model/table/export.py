@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from model.drive_modes.fields import SILENT
+from model.arrays import Complex64Array
+from model.drive_modes.forms import SILENT
 from model.drive_modes.sources import all_combinations
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
@@ -29,10 +30,9 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
     """
     from scipy.io import savemat
 
-    size = (
-        table.pattern_count * (4 * table.grid.cell_count + 8 * len(table.eras))
-        + table.acceleration.nbytes
-    )
+    size = table.pattern_count * (
+        4 * table.grid.cell_count + 8 * len(table.eras)
+    ) + 8 * table.raster.point_count * len(table.frequencies) * len(table.eras)
     if size > MAX_MAT_BYTES:
         raise InputError(
             f"a .mat file of version 5 must have up to {MAX_MAT_BYTES / 1e9:.1f} GB, got "
@@ -53,7 +53,7 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
         "frequency_hz": table.frequencies,
         "raster_x_m": table.raster.x,
         "raster_y_m": table.raster.y,
-        "acceleration_m_s2": table.acceleration,
+        "acceleration_m_s2": _fields(table),
         "mode_omega_rad_s": table.omega,
         "mode_shape": table.shapes,
         "mode_shape_attachments": table.attachment_shapes,
@@ -98,9 +98,14 @@ def _pattern_rows(table: LocalizationTable) -> Iterator[list[object]]:
 def _field_rows(table: LocalizationTable) -> Iterator[list[object]]:
     parts = [f"{era.name}_{part}_m_s2" for era in table.eras for part in ("real", "imag")]
     yield ["x_m", "y_m", "frequency_hz", *parts]
-    for (x, y), at_point in zip(table.raster.points.tolist(), table.acceleration, strict=True):
+    for (x, y), at_point in zip(table.raster.points.tolist(), _fields(table), strict=True):
         for frequency, values in zip(table.frequencies.tolist(), at_point, strict=True):
             yield [x, y, frequency, *_short(values.view(np.float32))]
+
+
+def _fields(table: LocalizationTable) -> Complex64Array:
+    """Acceleration [m/s²] on the raster by each ERA alone at full stroke, (points, f, eras)."""
+    return np.ascontiguousarray(table.unit_fields(table.raster.points).transpose(2, 0, 1))
 
 
 def _short(values: np.ndarray[Any, np.dtype[np.float32]]) -> list[str]:

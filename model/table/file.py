@@ -34,19 +34,17 @@ FORMAT = "era-haptics localization table"
 ZIP = b"PK\x03\x04"
 """Magic number of .npz files."""
 
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 
-# A table of the paper's plate has 1.4 MB, one of eight ERAs and a fine grid about 100 MB.
+# A table of the paper's plate has 0.3 MB.
 MAX_BYTES = 2 << 30
 
 _DTYPES = {
     "header": "|u1",
     "frequencies": "<f8",
-    "acceleration": "<c8",
     "omega": "<f8",
     "attachment_shapes": "<f8",
     "shapes": "<f4",
-    "cell_sources": "<f4",
 }
 
 
@@ -210,15 +208,12 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
     if table.drive_mode not in DRIVE_MODES:
         raise InputError(f"{path}: unknown drive mode {table.drive_mode!r}")
     count, era_count, coordinates = len(table.frequencies), len(table.eras), len(table.omega)
-    sources = era_count * (era_count + 1) // 2 * count + 1
     expected = {
         "frequencies": (count,),
         "discretisation_error": (count,),
-        "acceleration": (table.raster.point_count, count, era_count),
         "omega": (coordinates,),
         "attachment_shapes": (era_count + len(table.masses), coordinates),
         "shapes": (table.raster.point_count, coordinates),
-        "cell_sources": (sources, table.grid.cell_count),
     }
     for name, shape in expected.items():
         values = getattr(table, name)
@@ -230,9 +225,8 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
             raise InputError(
                 f"{path}: {name} must be up to {MAX_VALUE:g}, got {np.abs(values).max():.3g}"
             )
-    for name in ("acceleration", "shapes", "cell_sources"):
-        if count > 0 and not getattr(table, name).any():
-            raise InputError(f"{path}: {name} must not be zero everywhere")
+    if not table.shapes.any():
+        raise InputError(f"{path}: shapes must not be zero everywhere")
     try:
         check_has_threshold(table.frequencies, table.threshold)
     except InputError as error:

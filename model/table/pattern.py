@@ -1,6 +1,6 @@
 """A pattern: an excitation with its predicted measures."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,9 @@ at 20 dB SL the target still feels it after a fifth of it (docs/concepts/transie
 
 IMPERCEPTIBLE_DB_SL = -10.0
 """Level at which a finger stays unaware: ten decibels for the differences between people."""
+
+
+_LEVELS = ("level_db_sl", "robust_level_db_sl", "quiet_level_db_sl", "robust_quiet_level_db_sl")
 
 
 @dataclass(frozen=True)
@@ -37,12 +40,20 @@ class Concentration:
 class Pattern:
     """An excitation with its ramp [s] and its predicted measures at the fingertips.
 
-    level_db_sl: at the weakest target; contrast_db: target to the loudest quiet
-    point, by peak acceleration; quiet_level_db_sl: at the loudest quiet point; both None without
-    quiet fingers. surroundings_contrast_db: to the plate farther than 50 mm, root mean square;
-    None with quiet fingers. The rest is None unless computed: contrast_bound_db: upper bound of
-    contrast from `model.drive_modes.exact_search`; robust_contrast_db: tenth percentile over
-    plates within tolerance (`model.table.robust`); transient_contrast_db: over the first 100 ms;
+    Robust measures are those that nine of ten plates within the rig's uncertainty reach, or at
+    quiet fingers do not exceed: the figures to promise. The others are those of the plate as
+    modelled, with the fingers on it.
+
+    - level_db_sl, robust_level_db_sl: at the weakest target; quiet_level_db_sl,
+      robust_quiet_level_db_sl: at the loudest quiet point
+    - felt_contrast_db, robust_felt_contrast_db, median_felt_contrast_db: level of the target above
+      that of the loudest quiet point; contrast_db, robust_contrast_db: the same in peak
+      acceleration. All None without quiet fingers
+    - search_gap_db: how much better another `switched` pattern may be by the robust score, of
+      `model.drive_modes.exact_search`; None of the other searches
+
+    The rest is None unless computed: surroundings_contrast_db: to the plate farther than 50 mm,
+    root mean square, without quiet fingers; transient_contrast_db: over the first 100 ms;
     residual_db: residual vibration in the 100 ms after the end, relative to the steady one
     (`model.table.timing`). onset, ending: envelopes that replace the ramp. threshold: name of the
     set of thresholds that its levels are above.
@@ -54,9 +65,13 @@ class Pattern:
     contrast_db: float | None
     quiet_level_db_sl: float | None
     drive_mode: str = "switched"
-    surroundings_contrast_db: float | None = None
-    contrast_bound_db: float | None = None
+    robust_level_db_sl: float | None = None
+    robust_quiet_level_db_sl: float | None = None
     robust_contrast_db: float | None = None
+    robust_felt_contrast_db: float | None = None
+    median_felt_contrast_db: float | None = None
+    surroundings_contrast_db: float | None = None
+    search_gap_db: float | None = None
     transient_contrast_db: float | None = None
     residual_db: float | None = None
     concentration: Concentration | None = None
@@ -70,16 +85,24 @@ class Pattern:
         return None if self.quiet_level_db_sl is None else self.level_db_sl - self.quiet_level_db_sl
 
     @property
+    def highest_quiet_level_db_sl(self) -> float | None:
+        """Level at the loudest quiet point [dB SL], the robust one where it is known."""
+        robust = self.robust_quiet_level_db_sl
+        return self.quiet_level_db_sl if robust is None else robust
+
+    @property
     def is_imperceptible_to_quiet(self) -> bool | None:
         """Whether every quiet finger stays 10 dB below the lowest of all sets of thresholds.
 
-        Of several frequencies the one at which that lies lowest counts for all.
+        On nine of ten plates. Of several frequencies the one at which that lies lowest counts for
+        all.
         """
-        if self.quiet_level_db_sl is None:
+        highest = self.highest_quiet_level_db_sl
+        if highest is None:
             return None
         frequencies = np.array([tone.frequency for tone in self.excitation.values()])
         margin = float(sensitivity_margin_db(frequencies, self.threshold).max(initial=0))
-        return self.quiet_level_db_sl + margin <= IMPERCEPTIBLE_DB_SL
+        return highest + margin <= IMPERCEPTIBLE_DB_SL
 
     @property
     def is_level_extrapolated(self) -> bool:
@@ -91,8 +114,21 @@ class Pattern:
     def usable_level_db_sl(self) -> float:
         """Highest level at the target, up to this one, with quiet fingers at -10 dB SL.
 
-        By the pattern's own thresholds: no claim that they feel nothing.
+        On nine of ten plates, by the pattern's own thresholds: no claim that they feel nothing.
         """
-        if self.felt_contrast_db is None:
+        highest = self.highest_quiet_level_db_sl
+        if highest is None:
             return self.level_db_sl
-        return min(self.level_db_sl, self.felt_contrast_db + IMPERCEPTIBLE_DB_SL)
+        return min(self.level_db_sl, self.level_db_sl - highest + IMPERCEPTIBLE_DB_SL)
+
+    def scaled(self, gain_db: float) -> "Pattern":
+        """The pattern louder by so much [dB]: contrasts stay."""
+        factor = 10 ** (gain_db / 20)
+        levels = {
+            name: value + gain_db for name in _LEVELS if (value := getattr(self, name)) is not None
+        }
+        excitation = {
+            name: replace(tone, amplitude=tone.amplitude * factor)
+            for name, tone in self.excitation.items()
+        }
+        return replace(self, excitation=excitation, **levels)

@@ -1,25 +1,39 @@
-"""Choice of the pattern to play at given contacts, from the fields at their fingertips."""
+"""Choice of the pattern to play at given contacts.
+
+The search ranks drives by their expected powers; the best few are judged by drawn plates: level at
+nine of ten goes first, then felt contrast. The promise is of other draws.
+"""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
-from model.arrays import Complex64Array, FloatArray, IntArray
+import numpy as np
+
+from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.counting import counted
-from model.drive_modes import Choice, find_drives, max_sensation
+from model.drive_modes import find_drives, max_sensation
 from model.drive_modes.exact_search import search_exactly, sensation_found
-from model.drive_modes.fields import Evaluation, Fields, Weights, evaluate
+from model.drive_modes.forms import Forms, Weights
 from model.drive_modes.tones import excitation_of
+from model.ensemble.measures import percentile
 from model.errors import InputError
 from model.finger.perception import decibels
 from model.structure.actuator import Era
+from model.table.fingers_on_plate import FingersOnPlate
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.question import Question
 
-# Among drives near the best one the onset decides, too: a decibel of the score counts as much as
-# three of contrast in the first 100 ms (docs/decisions, on ramps).
+JUDGING_DRAWS, JUDGING_SEED = 64, 1
+PROMISED_DRAWS, PROMISED_SEED = 200, 2
+
+# Among drives of nearly the same robust contrast the onset decides, too: a decibel of contrast
+# counts as much as three in the first 100 ms (docs/decisions, on ramps).
 ONSET_WEIGHT = 1 / 3
+ONSET_MARGIN_DB = 1.0
+
+_ROUNDING = 1 - 1e-5
 
 OnsetContrast: TypeAlias = Callable[[IntArray, Complex64Array], FloatArray | None]
 """Contrast of ramped onsets (n,) for indices of frequencies (n,) and weights of ERAs (n, eras).
@@ -49,60 +63,102 @@ class UnreachableLevel(InputError):
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Frequencies (f,) [Hz] to choose from, with the fields of the ERAs at the fingertips."""
+    """What to choose from: rows (f,) of the table's frequencies [Hz] that may be played.
+
+    background (rows, eras, eras): mean power of the rest of the plate, for no quiet finger;
+    threshold (rows,) [m/s²].
+    """
 
     eras: tuple[Era, ...]
     frequencies: FloatArray
-    fields: Fields
+    playable: IntArray
+    fingers: FingersOnPlate
+    background: Complex64Array | None
+    threshold: Float32Array
     onset_contrast: OnsetContrast
 
 
 def choose_pattern(question: Question, drive_mode: str, candidates: Candidates) -> Pattern:
     """Choose the best pattern of a drive mode that reaches the level at the targets.
 
-    Raises InputError where none does.
+    At nine of ten plates where possible, else at the plate as modelled. Raises InputError where
+    none does.
     """
+    forms = [
+        each if len(candidates.playable) == each.frequency_count else each.at(candidates.playable)
+        for each in candidates.fingers.forms(candidates.background)
+    ]
     if drive_mode == "switched" and question.eras_at_most != 2:
-        return _choose_exactly(question, candidates)
-    fields = candidates.fields
-    choice = find_drives(fields, drive_mode)
-    if choice is None:
-        raise _level_error(question, drive_mode, max_sensation(fields, drive_mode))
-    drive, evaluation = choice.drive, choice.evaluation
-    if question.quiet and not question.envelopes:
-        better = _quietest_onset(choice, candidates.onset_contrast)
-        if better is not None:
-            drive, evaluation = better, evaluate(fields, better)
-    return _pattern(question, drive_mode, candidates, drive, evaluation)
+        drives, gap = _search_exactly(question, forms[0])
+    else:
+        drives, gap = _search(question, drive_mode, forms), None
+    drives = [replace(each, frequencies=_rows(each, candidates.playable)) for each in drives]
+    best = _judged(question, drives, candidates)
+    return replace(_pattern(question, drive_mode, candidates, best), search_gap_db=gap)
 
 
-def _quietest_onset(choice: Choice, onset_contrast: OnsetContrast) -> Weights | None:
-    """Find a drive near the best score whose plain ramp disturbs less, if there is one."""
-    near = choice.alternatives()
-    if len(near.frequencies) < 2:
-        return None
-    contrast = onset_contrast(near.frequencies, near.weights)
-    if contrast is None:
-        return None
-    best = int((near.score * contrast**ONSET_WEIGHT).argmax())
-    return Weights.at(int(near.frequencies[best]), near.weights[best]) if best > 0 else None
+def _search(question: Question, drive_mode: str, forms: Sequence[Forms]) -> list[Weights]:
+    """The drives of the best scores; raises InputError where none reaches the level."""
+    for margin in (forms[0].level_margin, 0.0):
+        drives = [
+            drive
+            for each in forms
+            for _, drive in find_drives(replace(each, level_margin=margin), drive_mode)
+        ]
+        if drives:
+            return drives
+    raise _level_error(question, drive_mode, max_sensation(forms[0], drive_mode))
 
 
-def _choose_exactly(question: Question, candidates: Candidates) -> Pattern:
-    """Choose among all `switched` patterns of at most `eras_at_most` ERAs, with a bound."""
-    fields, count = candidates.fields, question.eras_at_most
-    found = search_exactly(fields, eras_at_most=count, time_limit=question.search_time)
-    if found.drive is None and not found.is_complete:
+def _search_exactly(question: Question, forms: Forms) -> tuple[list[Weights], float]:
+    """The best `switched` drive of at most `eras_at_most` ERAs, and how much better one may be."""
+    count = question.eras_at_most
+    for margin in (forms.level_margin, 0.0):
+        found = search_exactly(
+            replace(forms, level_margin=margin),
+            eras_at_most=count,
+            time_limit=question.search_time,
+        )
+        if found.drive is not None:
+            return [found.drive], float(decibels(found.bound / found.score))
+    if not found.is_complete:
         raise InputError(
             f"no pattern of up to {counted(count, 'ERA')} with {question.level_db_sl:g} dB SL was "
             f"found within {question.search_time:g} s, and the search is incomplete; allow more "
             "time, or lower the level"
         )
-    if found.drive is None:
-        raise _level_error(question, "switched", sensation_found(fields, eras_at_most=count))
-    evaluation = evaluate(fields, found.drive)
-    pattern = _pattern(question, "switched", candidates, found.drive, evaluation)
-    return replace(pattern, contrast_bound_db=float(decibels(found.bound)))
+    raise _level_error(question, "switched", sensation_found(forms, eras_at_most=count))
+
+
+def _rows(drive: Weights, playable: IntArray) -> IntArray:
+    """Frequencies of a drive as rows of the table, SILENT as it is."""
+    return np.where(drive.frequencies < 0, drive.frequencies, playable[drive.frequencies])
+
+
+def _judged(question: Question, drives: Sequence[Weights], candidates: Candidates) -> Weights:
+    """The drive that drawn plates prefer."""
+    if len(drives) == 1:
+        return drives[0]
+    judged = candidates.fingers.drawn(drives, count=JUDGING_DRAWS, seed=JUDGING_SEED)
+    reaches = percentile(judged.level) >= 10 ** (question.level_db_sl / 20) * _ROUNDING
+    if not reaches.any():
+        reaches[:] = True
+    if judged.contrast is None:
+        return drives[int(reaches.argmax())]
+    robust = np.where(reaches, percentile(judged.contrast.felt), 0.0)
+    if question.envelopes:
+        return drives[int(robust.argmax())]
+    best = int(robust.argmax())
+    near = np.flatnonzero(robust >= 10 ** (-ONSET_MARGIN_DB / 20) * robust[best]).tolist()
+    near = [each for each in near if len(drives[each].tones()) == 1]
+    if len(near) > 1 and best in near:
+        tones = [drives[each].tones()[0] for each in near]
+        contrast = candidates.onset_contrast(
+            np.array([index for index, _ in tones]), np.array([weights for _, weights in tones])
+        )
+        if contrast is not None:
+            best = near[int((robust[near] * contrast**ONSET_WEIGHT).argmax())]
+    return drives[best]
 
 
 def _level_error(question: Question, drive_mode: str, reachable: float) -> UnreachableLevel:
@@ -120,21 +176,43 @@ def _level_error(question: Question, drive_mode: str, reachable: float) -> Unrea
 
 
 def _pattern(
-    question: Question,
-    drive_mode: str,
-    candidates: Candidates,
-    drive: Weights,
-    evaluation: Evaluation,
+    question: Question, drive_mode: str, candidates: Candidates, drive: Weights
 ) -> Pattern:
-    gain = min(1.0, candidates.fields.wanted / evaluation.sensation)
-    contrast = float(decibels(evaluation.contrast))
-    quiet_level = float(decibels(max(gain * evaluation.quiet_sensation, 1e-30)))
-    return Pattern(
+    """The pattern of a drive, turned down to the wanted level at nine of ten plates."""
+    fingers = candidates.fingers
+    nominal = fingers.nominal([drive])
+    drawn = fingers.drawn([drive], count=PROMISED_DRAWS, seed=PROMISED_SEED)
+    wanted = 10 ** (question.level_db_sl / 20)
+    robust_level = float(percentile(drawn.level)[0])
+    gain = min(1.0, wanted / robust_level)
+    level = gain * float(nominal.level[0, 0])
+    pattern = Pattern(
         excitation=excitation_of(drive, candidates.eras, candidates.frequencies, gain=gain),
         ramp=ONSET_RAMP,
-        level_db_sl=question.level_db_sl,
-        contrast_db=contrast if question.quiet else None,
-        quiet_level_db_sl=quiet_level if question.quiet else None,
+        level_db_sl=float(decibels(level)),
+        robust_level_db_sl=float(decibels(gain * robust_level)),
+        contrast_db=None,
+        quiet_level_db_sl=None,
         drive_mode=drive_mode,
-        surroundings_contrast_db=None if question.quiet else contrast,
+    )
+    if candidates.background is not None:
+        rest = math.sqrt(
+            sum(
+                float(np.vdot(w, candidates.background[row] @ w).real)
+                / float(candidates.threshold[row]) ** 2
+                for row, w in drive.tones()
+            )
+        )
+        surroundings = float(decibels(level / (gain * max(rest, 1e-30))))
+        return replace(pattern, surroundings_contrast_db=surroundings)
+    if nominal.contrast is None or drawn.contrast is None:
+        return pattern
+    return replace(
+        pattern,
+        contrast_db=float(decibels(nominal.contrast.acceleration[0, 0])),
+        quiet_level_db_sl=float(decibels(gain * nominal.contrast.loudest[0, 0])),
+        robust_quiet_level_db_sl=float(decibels(gain * percentile(drawn.contrast.loudest, 90)[0])),
+        robust_contrast_db=float(decibels(percentile(drawn.contrast.acceleration)[0])),
+        robust_felt_contrast_db=float(decibels(percentile(drawn.contrast.felt)[0])),
+        median_felt_contrast_db=float(decibels(percentile(drawn.contrast.felt, 50)[0])),
     )

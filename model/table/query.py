@@ -3,7 +3,8 @@
 import cmath
 import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from types import MappingProxyType
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -13,7 +14,6 @@ from model.finger.perception import STRONG_DB_SL
 from model.table.concentration import with_concentration
 from model.table.pattern import Pattern
 from model.table.question import Question
-from model.table.robust import with_robust_contrast
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
 from model.transients.envelope import Envelopes
@@ -35,14 +35,17 @@ class _Line(BaseModel):
     envelopes: bool = False
 
 
-def question_from_json(line: str) -> Question:
+def question_from_json(line: str, defaults: Mapping[str, Any] = MappingProxyType({})) -> Question:
     """Parse the question of one line, `{"target": [x, y], "quiet": [[x, y], ...], "mode": ...}`.
 
     Several targets: `"targets": [[x, y], ...]`; also `"level_db_sl"`, `"eras_at_most"` and
-    `"envelopes"`. Raises InputError.
+    `"envelopes"`. defaults: of keys that the line leaves out. Raises InputError.
     """
     try:
         asked = _Line.model_validate_json(line)
+        asked = asked.model_copy(
+            update={k: v for k, v in defaults.items() if k not in asked.model_fields_set}
+        )
     except ValidationError as error:
         key, rule = first_problem(error)
         raise InputError(
@@ -67,8 +70,8 @@ def query_table(
 ) -> tuple[Pattern, float]:
     """Query a table; also return the time [s] that the pattern took without its measures.
 
-    The pattern has envelopes if the question wants them; measures: compute those in time, on
-    plates within tolerance and over the whole plate.
+    The pattern has envelopes if the question wants them; measures: compute those in time and over
+    the whole plate.
     """
     started = time.perf_counter()
     pattern = table.query(question)
@@ -78,7 +81,6 @@ def query_table(
     if not measures:
         return pattern, elapsed
     pattern = timing.with_transient_measures(question, pattern)
-    pattern = with_robust_contrast(table, question, pattern)
     return with_concentration(table, question, pattern), elapsed
 
 
@@ -91,10 +93,13 @@ def query_as_json(table: LocalizationTable, question: Question, timing: Timing) 
         "mode": pattern.drive_mode,
         "level_db_sl": pattern.level_db_sl,
         "is_level_extrapolated": pattern.is_level_extrapolated,
-        "contrast_db": pattern.contrast_db,
+        "robust_level_db_sl": pattern.robust_level_db_sl,
         "felt_contrast_db": pattern.felt_contrast_db,
-        "contrast_bound_db": pattern.contrast_bound_db,
+        "robust_felt_contrast_db": pattern.robust_felt_contrast_db,
+        "median_felt_contrast_db": pattern.median_felt_contrast_db,
+        "contrast_db": pattern.contrast_db,
         "robust_contrast_db": pattern.robust_contrast_db,
+        "search_gap_db": pattern.search_gap_db,
         "transient_contrast_db": pattern.transient_contrast_db,
         "residual_db": pattern.residual_db,
         "surroundings_contrast_db": pattern.surroundings_contrast_db,
@@ -102,6 +107,7 @@ def query_as_json(table: LocalizationTable, question: Question, timing: Timing) 
         "area_above_half_m2": concentration and concentration.area_above_half,
         "energy_share_near": concentration and concentration.energy_share_near,
         "quiet_level_db_sl": pattern.quiet_level_db_sl,
+        "robust_quiet_level_db_sl": pattern.robust_quiet_level_db_sl,
         "is_imperceptible_to_quiet": pattern.is_imperceptible_to_quiet,
         "usable_level_db_sl": pattern.usable_level_db_sl,
         "ramp_s": pattern.ramp,
@@ -140,14 +146,21 @@ def _as_level_and_phase(amplitude: complex, *, stroke: float) -> dict[str, float
     return {"level": abs(amplitude) / stroke, "phase_deg": math.degrees(cmath.phase(amplitude))}
 
 
-def query_batch(table: LocalizationTable, lines: Iterable[str]) -> Iterator[dict[str, Any]]:
-    """Answer every line that is not empty; `{"error": ..., "line": n}` for one without answer."""
+def query_batch(
+    table: LocalizationTable,
+    lines: Iterable[str],
+    defaults: Mapping[str, Any] = MappingProxyType({}),
+) -> Iterator[dict[str, Any]]:
+    """Answer every line that is not empty; `{"error": ..., "line": n}` for one without answer.
+
+    defaults: of keys that lines leave out.
+    """
     table.prepare()
     timing = prepared_timing(table)
     for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
         try:
-            yield query_as_json(table, question_from_json(line), timing)
+            yield query_as_json(table, question_from_json(line, defaults), timing)
         except InputError as error:
             yield {"error": str(error), "line": number}

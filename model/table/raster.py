@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from model.arrays import FloatArray, IntArray, lattice
 from model.errors import InputError
+from model.finger.disc import FINE_POINTS, FIVE_POINTS
 from model.finger.fingertip import FINGERTIP_RADIUS, fingertips_on
 from model.structure.footprint import mean_over
 from model.structure.plate import Plate
@@ -68,9 +69,15 @@ class Raster:
         return lattice(self.x, self.y)
 
     def fingertips(self, centres: FloatArray) -> "Fingertips":
-        """Interpolation at the discs of fingertips centred at (k, 2) [m] on the plate."""
-        points, means = fingertips_on(centres, length=self.length, width=self.width)
-        return Fingertips(*self._patches(centres, points), means)
+        """Interpolation at the fingertips centred at (k, 2) [m] on the plate."""
+        few, fine = (
+            fingertips_on(centres, length=self.length, width=self.width, rule=rule)
+            for rule in (FIVE_POINTS, FINE_POINTS)
+        )
+        points = np.concatenate([few[0], fine[0]], axis=1)
+        index, interpolation = self._patches(centres, points)
+        weights = (each.astype(np.float32) for _, each in (few, fine))
+        return Fingertips(index, interpolation, *weights)
 
     def at(self, values: NDArray[np.float32], points: FloatArray) -> NDArray[np.float32]:
         """Values (point_count, c) at points [m] (n, 2) of the plate: (n, c).
@@ -129,25 +136,23 @@ class Raster:
 
 @dataclass(frozen=True, eq=False)
 class Fingertips:
-    """Points under fingertips, finger after finger, with their interpolation weights.
+    """Points under fingertips with their interpolation on a raster.
 
-    The points are those of `fingertip_points`. index (k, patch): raster points around each finger;
-    weights (k, p, patch); means (k, p): weights of the points in the mean over each fingertip.
+    First the five points of each fingertip for searches, then the fine ones for figures, each with
+    the centre first. index (k, patch): raster points around each finger; interpolation (k, p,
+    patch); few_weights (k, 5), fine_weights (k, 21): of the points in the mean over a fingertip.
     """
 
     index: IntArray
-    weights: NDArray[np.float32]
-    means: FloatArray
+    interpolation: NDArray[np.float32]
+    few_weights: NDArray[np.float32]
+    fine_weights: NDArray[np.float32]
 
-    @cached_property
-    def ends(self) -> list[int]:
-        """End of the points of each finger among all points."""
-        fingers, points = self.means.shape
-        return [points * (finger + 1) for finger in range(fingers)]
-
-    def read(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Values (point_count, c) of the raster at all points: (n, c)."""
-        return (self.weights @ values.take(self.index, axis=0)).reshape(-1, values.shape[1])
+    def read(self, values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Values (point_count, c) of the raster at the few (k, 5, c) and the fine (k, 21, c)."""
+        found = self.interpolation @ values.take(self.index, axis=0)
+        few = self.few_weights.shape[1]
+        return np.ascontiguousarray(found[:, :few]), np.ascontiguousarray(found[:, few:])
 
 
 @dataclass(frozen=True, eq=False)

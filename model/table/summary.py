@@ -27,7 +27,9 @@ def summarize(
     *,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> dict[str, Any]:
-    """Summarize a table; contrast [dB]: median and tenth percentile over random contact sets.
+    """Summarize a table; felt contrast [dB]: median and tenth percentile over random contact sets.
+
+    Robust contrasts are those of nine of ten plates, the others those of the plate as modelled.
 
     progress: called with the number of finished sets and the total.
     """
@@ -51,10 +53,11 @@ def summarize(
     }
     rng = np.random.default_rng(0)
     for others in (1, 2, 3):
-        contrasts = contrast_distribution(table, others=others, rng=rng, progress=progress)
-        for name, percentile in (("median", 50), ("tenth_percentile", 10)):
-            value = float(np.percentile(contrasts, percentile)) if len(contrasts) else None
-            summary[f"contrast_{others}_quiet_{name}_db"] = value
+        found = contrast_distribution(table, others=others, rng=rng, progress=progress)
+        for kind, contrasts in zip(("robust_felt", "felt"), found, strict=True):
+            for name, percentile in (("median", 50), ("tenth_percentile", 10)):
+                value = float(np.percentile(contrasts, percentile)) if len(contrasts) else None
+                summary[f"{kind}_contrast_{others}_quiet_{name}_db"] = value
     summary["alike_pattern_pairs_share"] = similar_share(table)
     summary["mesh_name"] = str(table.mesh)
     summary["discretisation_error_percent"] = 100 * float(table.discretisation_error.max())
@@ -72,13 +75,13 @@ def contrast_distribution(
     rng: np.random.Generator,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> FloatArray:
-    """Contrast [dB] of random contact sets, up to (CONTACT_SETS,).
+    """Robust and nominal felt contrast [dB] of random contact sets, (2, up to CONTACT_SETS).
 
     Sets with an unreachable target are left out, and all on a plate too small for them. progress:
     as for `summarize`, which takes one, two and three others in turn.
     """
     size = np.array([table.plate.length, table.plate.width])
-    contrasts: list[float] = []
+    contrasts: list[tuple[float | None, float | None]] = []
     tried = 0
     for _ in range(50 * CONTACT_SETS):
         contacts = rng.uniform(0, size, (others + 1, 2))
@@ -87,12 +90,12 @@ def contrast_distribution(
         tried += 1
         target, *quiet = [(float(x), float(y)) for x, y in contacts]
         with contextlib.suppress(InputError):
-            contrast = table.query(Question((target,), tuple(quiet))).contrast_db
-            contrasts.append(np.nan if contrast is None else contrast)
+            found = table.query(Question((target,), tuple(quiet)))
+            contrasts.append((found.robust_felt_contrast_db, found.felt_contrast_db))
         progress((others - 1) * CONTACT_SETS + len(contrasts), 3 * CONTACT_SETS)
         if len(contrasts) == CONTACT_SETS or tried == 2 * CONTACT_SETS:
             break
-    return np.array(contrasts)
+    return np.array(contrasts, dtype=float).reshape(-1, 2).T
 
 
 def similar_share(table: LocalizationTable) -> float | None:

@@ -1,9 +1,8 @@
 """The localization table: patterns that one finger feels and others do not.
 
-It holds the fields of the ERAs at all drive frequencies on a raster over the plate, so that any
-fingertips can be queried in any drive mode; the modes of the plate there, from which the effect of
-other stiffnesses, thicknesses and fingers follows; and the sources of the `switched` patterns at
-the cells of a grid.
+It holds the modes of a plate on a raster over it, from which the fields of the ERAs at all drive
+frequencies follow, with any fingers on the plate and for any plate within the rig's uncertainty, so
+that any fingertips can be queried in any drive mode.
 """
 
 import math
@@ -14,18 +13,20 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import Complex64Array, ComplexArray, FloatArray, IntArray
+from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.drive_modes.exact_search import pattern_count
-from model.drive_modes.fields import Fields
+from model.drive_modes.forms import Forms
 from model.drive_modes.sources import (
     magnitudes_of_sources,
     per_source,
     sums_of_sources,
 )
+from model.ensemble.attached_plate import AttachedPlate, attach
+from model.ensemble.contact_forms import modal_fields
 from model.errors import InputError
 from model.fem.plate_mesh import PlateMesh
 from model.finger.contrast import is_background
-from model.finger.grid import Grid
+from model.finger.grid import CELL_SAMPLES, Grid
 from model.finger.perception import decibels, detection_threshold
 from model.rig.rig import physics_fingerprint
 from model.rig.uncertainty import Uncertainty
@@ -33,6 +34,7 @@ from model.structure.actuator import Era
 from model.structure.fingertip import Fingertip
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
+from model.table.fingers_on_plate import FingersOnPlate
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.pattern_choice import Candidates, OnsetContrast, choose_pattern
 from model.table.question import MIN_LEVEL_DB_SL, Point, Question
@@ -62,16 +64,13 @@ def default_drive_frequencies(limits: GuardLimits) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class LocalizationTable:
-    """Fields of one plate on its ERAs, and what choosing among patterns needs.
+    """Modes of one plate on its ERAs, and all else that patterns follow from.
 
     - drive_mode: default of a question
     - frequencies: (f,) [Hz]
-    - acceleration: (points, f, eras) complex [m/s²] on the raster, each ERA alone at full stroke
     - omega: (r,) [rad/s], of the reduced free plate (`model.reduction.reduced_plate`)
     - attachment_shapes: (eras + masses, r) [1/sqrt(kg)], its shapes at ERAs and masses
     - shapes: (points, r) [1/sqrt(kg)], its shapes on the raster
-    - cell_sources: (sources, cells) [m/s²], mean peak acceleration over each cell of the sources
-      of `switched` patterns (`model.drive_modes.sources`)
     - discretisation_error: (f,), estimated relative L2 error of the fields over the raster
       (`model.vibration.discretisation`), maximum over the ERAs
     """
@@ -88,11 +87,9 @@ class LocalizationTable:
     drive_mode: str
     code_version: str
     frequencies: FloatArray
-    acceleration: Complex64Array
     omega: FloatArray
     attachment_shapes: FloatArray
     shapes: NDArray[np.float32]
-    cell_sources: NDArray[np.float32]
     reference_mesh: PlateMesh
     discretisation_error: FloatArray
 
@@ -121,18 +118,14 @@ class LocalizationTable:
         """Number of `switched` patterns of one or two ERAs."""
         return pattern_count(len(self.eras), len(self.frequencies), eras_at_most=2)
 
-    @property
-    def cell_response(self) -> NDArray[np.float32]:
-        """Mean peak acceleration over each cell of every `switched` pattern, (n, cells) [m/s²]."""
-        return sums_of_sources(self.cell_sources.T, len(self.eras)).T
-
     def query(self, question: Question) -> Pattern:
         """Find the best pattern in a drive mode among those that reach a level at the targets.
 
-        `switched` maximizes contrast, the other modes their robust score (`model.drive_modes`);
-        with no quiet finger contrast is to the plate beyond 50 mm, root mean square. The pattern
-        is then scaled to the level, which leaves contrast as it is. Raises InputError for contacts
-        off the plate and for a level that cannot be reached.
+        Of the highest felt contrast that nine of ten plates within the rig's uncertainty give, the
+        fingers' load on the plate; with no quiet finger contrast is to the plate beyond 50 mm, root
+        mean square. The pattern is turned down to the level, which nine of ten plates reach where
+        possible. Raises InputError for contacts off the plate and for a level that cannot be
+        reached.
         """
         question.check_on(self.plate)
         drive_mode = question.drive_mode_on(self.drive_mode, era_count=len(self.eras))
@@ -144,12 +137,16 @@ class LocalizationTable:
                 f"these amplifiers play, got {self.frequencies[0]:g} to {self.frequencies[-1]:g} "
                 "Hz; build a table with others: era table build --frequencies"
             )
-        fingertips = self._fingertips(question)
-        fields = self._fields(question, fingertips)
-        if len(playable) < len(self.frequencies):
-            fields = fields.at(playable)
-        onset_contrast = self._onset_contrast(question, fingertips, playable)
-        candidates = Candidates(self.eras, self.frequencies[playable], fields, onset_contrast)
+        tips = self.fingertips(question)
+        candidates = Candidates(
+            eras=self.eras,
+            frequencies=self.frequencies,
+            playable=playable,
+            fingers=self._fingers(question, tips),
+            background=None if question.quiet else self._background(question),
+            threshold=self._threshold,
+            onset_contrast=self._onset_contrast(question, tips),
+        )
         pattern = choose_pattern(question, drive_mode, candidates)
         return replace(pattern, threshold=self.threshold)
 
@@ -163,65 +160,46 @@ class LocalizationTable:
         if (drive_mode or self.drive_mode) != "switched":
             _ = self.onsets  # used only where several patterns are near the best
 
-    def fields(self, question: Question) -> Fields:
-        """Fields of the ERAs at the fingertips of a question, at all frequencies of the table."""
-        return self._fields(question, self._fingertips(question))
+    def forms(self, question: Question) -> Forms:
+        """Expected powers at the fingertips of a question, at all frequencies of the table."""
+        background = None if question.quiet else self._background(question)
+        return self._fingers(question, self.fingertips(question)).forms(background)[0]
 
-    def _fields(self, question: Question, fingertips: Fingertips) -> Fields:
-        found, ends = self._by_frequency(fingertips.read(self._values)), fingertips.ends
-        count = len(question.targets)
-        if question.quiet:
-            quiet = found[:, :, ends[count - 1] :]
-        else:
-            quiet = self._cell_fields[:, :, is_background(self.cell_centres, question.targets)]
-        return Fields(
-            targets=tuple(
-                np.ascontiguousarray(found[:, :, start:end] * gain)
-                for start, end, gain in zip(
-                    (0, *ends), ends[:count], _gains(question, fingertips), strict=False
-                )
-            ),
-            quiet=np.ascontiguousarray(quiet),
-            has_no_quiet_contacts=not question.quiet,
-            threshold=self._threshold,
-            wanted=10 ** (question.level_db_sl / 20),
-        )
+    def fingertips(self, question: Question) -> Fingertips:
+        """Fingertips of a question on the raster, targets first."""
+        return self.raster.fingertips(np.array([*question.targets, *question.quiet]))
+
+    def threshold_at(self, rows: IntArray) -> Float32Array:
+        """Detection thresholds [m/s²] at frequencies, by index (n,)."""
+        return self._threshold.take(rows)
+
+    def unit_fields(self, points: FloatArray, *, contacts: Sequence[Point] = ()) -> Complex64Array:
+        """Acceleration [m/s²] at points (p, 2) [m] by each ERA alone at full stroke, (f, eras, p).
+
+        contacts [m]: of the fingers that load the plate.
+        """
+        return self._unit_fields(self.raster.at(self.shapes, points), contacts)
 
     def amplitudes(
-        self, excitation: Excitation, points: FloatArray
+        self, excitation: Excitation, points: FloatArray, *, contacts: Sequence[Point] = ()
     ) -> tuple[FloatArray, FloatArray]:
         """Frequencies (f,) [Hz] and peak acceleration at points (p, 2) [m] of the plate, (f, p).
 
-        The excitation's frequencies must be the table's own.
+        The excitation's frequencies must be the table's own. contacts [m]: of the fingers that load
+        the plate.
         """
         frequencies, bases = base_amplitudes(excitation, self.eras)
         weights = (bases / [era.stroke for era in self.eras]).astype(np.complex64)
         rows = np.searchsorted(self.frequencies, frequencies)
-        coherent = np.einsum("fe,pfe->pf", weights, self.acceleration[:, rows])
-        found = self.raster.at(np.ascontiguousarray(coherent).view(np.float32), points)
-        return frequencies, np.abs(found.view(np.complex64)).T.astype(float)
-
-    def error_amplitude(self, frequency: float, base: ComplexArray) -> float:
-        """Root mean square over the plate [m/s²] of the error of a tone's discretised field.
-
-        frequency [Hz]: one of the table's; base (eras,): motion of the ERAs' bases [m]. The errors
-        of the ERAs are taken as independent.
-        """
-        row = int(np.searchsorted(self.frequencies, frequency))
-        weights = base / [era.stroke for era in self.eras]
-        fields = np.linalg.norm(self.acceleration[:, row] * weights)
-        return float(self.discretisation_error[row] * fields / math.sqrt(self.raster.point_count))
+        modal = self._modal_fields(contacts)[rows] @ weights[:, :, None]
+        shapes = self.raster.at(self.shapes, points)
+        return frequencies, np.abs(modal[:, :, 0] @ shapes.T).astype(float)
 
     def shapes_at(self, points: Sequence[Point]) -> FloatArray:
         """Shapes of the reduced plate at points [m] of it, (p, r)."""
+        if not points:
+            return np.empty((0, len(self.omega)))
         return self.raster.at(self.shapes, np.array(points)).astype(float)
-
-    def shapes_at_fingertips(
-        self, contacts: Sequence[Point]
-    ) -> tuple[FloatArray, list[int], FloatArray]:
-        """Shapes under fingertips (p, r), where the points of each one end, and their weights."""
-        fingertips = self.raster.fingertips(np.array(contacts))
-        return fingertips.read(self.shapes).astype(float), fingertips.ends, fingertips.means
 
     def drive_of(self, excitation: Excitation) -> dict[str, dict[str, float]]:
         """Frequency, level 0..1 of the stroke and phase of an excitation, by ERA."""
@@ -243,6 +221,22 @@ class LocalizationTable:
         # Cell by cell, since fine frequency steps make millions of patterns.
         maxima = [sums_of_sources(cell[None], len(self.eras)).max() for cell in powers.T]
         return decibels(np.sqrt(np.array(maxima, dtype=float)))
+
+    @cached_property
+    def cell_sources(self) -> Float32Array:
+        """Mean peak acceleration over each cell of the sources of patterns, (sources, cells)."""
+        each = CELL_SAMPLES**2
+        samples = self.grid.samples(self.plate)
+        parts = [
+            magnitudes_of_sources(self.unit_fields(some)).reshape(-1, len(some) // each, each)
+            for some in np.split(samples, range(36 * each, len(samples), 36 * each))
+        ]
+        return np.concatenate([part.mean(axis=-1) for part in parts], axis=1)
+
+    @property
+    def cell_response(self) -> Float32Array:
+        """Mean peak acceleration over each cell of every `switched` pattern, (n, cells) [m/s²]."""
+        return sums_of_sources(self.cell_sources.T, len(self.eras)).T
 
     @cached_property
     def cell_centres(self) -> FloatArray:
@@ -270,49 +264,74 @@ class LocalizationTable:
         return detection_threshold(self.frequencies, self.threshold).astype(np.float32)
 
     @cached_property
-    def _values(self) -> NDArray[np.float32]:
-        """The fields as real numbers, a row for each raster point."""
-        return self.acceleration.reshape(self.raster.point_count, -1).view(np.float32)
+    def attached(self) -> AttachedPlate:
+        """The plate with its ERAs and masses at the drive frequencies."""
+        return attach(
+            self.plate,
+            self.omega,
+            self.attachment_shapes,
+            eras=self.eras,
+            masses=self.masses,
+            fingertip=self.fingertip,
+            uncertainty=self.uncertainty,
+            frequencies=self.frequencies,
+        )
+
+    @cached_property
+    def error_power(self) -> Float32Array:
+        """Mean square over the plate of the discretisation error of each ERA's field, (f, eras)."""
+        gram = self.shapes.T @ self.shapes / np.float32(self.raster.point_count)
+        modal = self._modal_fields(())
+        mean_square = np.einsum("fre,rs,fse->fe", modal.conj(), gram, modal, optimize=True).real
+        return np.asarray(self.discretisation_error[:, None] ** 2 * mean_square, dtype=np.float32)
 
     @cached_property
     def _cell_fields(self) -> Complex64Array:
         """Fields at the centres of the cells, (f, eras, cells)."""
-        return self._by_frequency(self.raster.at(self._values, self.cell_centres))
+        return self.unit_fields(self.cell_centres)
 
-    def _fingertips(self, question: Question) -> Fingertips:
-        """Fingertips of a question on the raster, targets first."""
-        return self.raster.fingertips(np.array([*question.targets, *question.quiet]))
+    def _unit_fields(self, shapes: Float32Array, contacts: Sequence[Point]) -> Complex64Array:
+        modal = self._modal_fields(contacts)
+        f, r, eras = modal.shape
+        rows = np.ascontiguousarray(modal.transpose(1, 0, 2)).reshape(r, -1).view(np.float32)
+        found = (shapes @ rows).view(np.complex64).reshape(len(shapes), f, eras)
+        return np.ascontiguousarray(found.transpose(1, 2, 0))
 
-    def _onset_contrast(
-        self, question: Question, fingertips: Fingertips, playable: IntArray
-    ) -> OnsetContrast:
-        """Contrast of plain ramps at the fingertips, by index among the playable frequencies."""
+    def _modal_fields(self, contacts: Sequence[Point]) -> Complex64Array:
+        """Accelerations of the reduced coordinates by each ERA at full stroke, (f, r, eras)."""
+        fingers = self.shapes_at(contacts).astype(np.float32)
+        return modal_fields(self.attached, fingers)
+
+    def _background(self, question: Question) -> Complex64Array:
+        """Mean power of the plate beyond the targets, without fingers on it, (f, eras, eras)."""
+        rest = self._cell_fields[:, :, is_background(self.cell_centres, question.targets)]
+        return np.asarray(rest.conj() @ rest.swapaxes(1, 2) / np.float32(rest.shape[2]))
+
+    def _fingers(self, question: Question, tips: Fingertips) -> FingersOnPlate:
+        return FingersOnPlate(
+            self.attached,
+            tips,
+            self.shapes,
+            question,
+            threshold=self._threshold,
+            error_power=self.error_power,
+        )
+
+    def _onset_contrast(self, question: Question, tips: Fingertips) -> OnsetContrast:
+        """Contrast of plain ramps at the fingertips, by row of the table's frequencies."""
 
         def contrast(rows: IntArray, weights: Complex64Array) -> FloatArray | None:
             if self.onsets is None:
                 return None
-            shapes, ends = fingertips.read(self.shapes), fingertips.ends
+            _, discs = tips.read(self.shapes)
+            count, points = len(question.targets), discs.shape[1]
+            # An onset's target counts by the plain mean over its points.
+            scales = points * tips.fine_weights[:count] * np.array(question.gains)[:, None]
             return self.onsets.contrast(
-                playable[rows],
+                rows,
                 weights,
-                targets=[
-                    shapes[start:end] * gain[:, None]
-                    for start, end, gain in zip(
-                        (0, *ends), ends, _gains(question, fingertips), strict=False
-                    )
-                ],
-                quiet=shapes[ends[len(question.targets) - 1] :],
+                targets=list(discs[:count] * scales[:, :, None].astype(np.float32)),
+                quiet=discs[count:].reshape(-1, discs.shape[-1]),
             )
 
         return contrast
-
-    def _by_frequency(self, values: NDArray[np.float32]) -> Complex64Array:
-        fields = values.view(np.complex64).reshape(len(values), len(self.frequencies), -1)
-        return np.ascontiguousarray(fields.transpose(1, 2, 0))
-
-
-def _gains(question: Question, fingertips: Fingertips) -> NDArray[np.float32]:
-    """Factors (targets, p) that make the mean of a target's points its weighted one at its gain."""
-    count = len(question.targets)
-    means = fingertips.means[:count] * fingertips.means.shape[1]
-    return np.asarray(means * np.array(question.gains)[:, None], dtype=np.float32)

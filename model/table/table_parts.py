@@ -1,6 +1,7 @@
 """Parts of a table that are solved independently."""
 
 import hashlib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,11 +9,10 @@ from functools import cached_property
 import numpy as np
 
 from model.arrays import FloatArray
-from model.drive_modes.sources import magnitudes_of_sources
 from model.errors import InputError
 from model.fem.plate_mesh import PlateMesh
 from model.files.array_file import Arrays
-from model.finger.grid import CELL_SAMPLES, Grid
+from model.finger.grid import Grid
 from model.finger.perception import check_has_threshold
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
@@ -24,14 +24,10 @@ from model.table.raster import Raster
 from model.version import NUMERICS_VERSION
 from model.vibration.discretisation import estimate_error, finer_mesh
 
-# About ten milliseconds of work on the paper's plate, and some megabytes.
-FREQUENCIES_PER_PART = 16
-CELLS_PER_PART = 36
-
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a table; kind: a name in PARTS; start, stop: range of frequencies or cells."""
+    """A part of a table; kind: a name in PARTS; start, stop: range of frequencies."""
 
     kind: str
     start: int
@@ -54,13 +50,14 @@ class TableProblem:
         """Refuse frequencies that make no table, and a table that would be too large to be read."""
         _check_frequencies(self.frequencies, self.rig)
         check_supported(self.rig.plate, self.rig.eras, loads=self.rig.masses)
-        eras, f = len(self.rig.eras), len(self.frequencies)
-        sources = eras * (eras + 1) // 2 * f + 1
-        size = 8 * self.raster.point_count * eras * f + 4 * sources * self.grid.cell_count
+        plate = self.rig.plate
+        wavelength = plate.bending_wavelength(2 * float(self.frequencies[-1]))
+        modes = math.pi * plate.length * plate.width / wavelength**2
+        size = 4 * self.raster.point_count * modes
         if size > MAX_BYTES:
             raise InputError(
                 f"a table must have up to {MAX_BYTES / 1e9:.1f} GB, got {size / 1e9:.1f} GB; take "
-                "fewer frequencies or a coarser grid"
+                "lower frequencies"
             )
 
     @cached_property
@@ -96,41 +93,16 @@ class TableProblem:
 
     def parts(self) -> tuple[Part, ...]:
         """All parts, the longest first."""
-        f, cells = len(self.frequencies), self.grid.cell_count
+        f = len(self.frequencies)
         return (
             Part("discretisation", 0, f),
             Part("modes", 0, f),
-            *_shares("fields", f, FREQUENCIES_PER_PART),
-            *_shares("cells", cells, CELLS_PER_PART),
         )
 
 
 def solve_part(problem: TableProblem, part: Part) -> Arrays:
     """Solve the arrays of one part."""
     return PARTS[part.kind](problem, part)
-
-
-def _fields(problem: TableProblem, part: Part) -> Arrays:
-    """Fields on the raster at a range of frequencies."""
-    frequencies = problem.frequencies[part.start : part.stop]
-    rig = problem.rig
-    fields = problem.free_plate.acceleration(
-        rig.eras, frequencies, problem.raster.points, loads=rig.masses
-    )
-    by_point = np.ascontiguousarray(fields.transpose(2, 0, 1), dtype=np.complex64)
-    return {"acceleration": by_point}
-
-
-def _cells(problem: TableProblem, part: Part) -> Arrays:
-    """Mean magnitudes of pattern sources over a range of cells."""
-    rig = problem.rig
-    each = CELL_SAMPLES**2
-    points = problem.grid.samples(rig.plate)[each * part.start : each * part.stop]
-    fields = problem.free_plate.acceleration(
-        rig.eras, problem.frequencies, points, loads=rig.masses
-    )
-    sources = magnitudes_of_sources(fields.astype(np.complex64))
-    return {"cell_sources": sources.reshape(len(sources), -1, each).mean(axis=-1)}
 
 
 def _modes(problem: TableProblem, part: Part) -> Arrays:
@@ -161,22 +133,14 @@ def _discretisation(problem: TableProblem, part: Part) -> Arrays:
 PARTS: dict[str, Callable[[TableProblem, Part], Arrays]] = {
     "discretisation": _discretisation,
     "modes": _modes,
-    "fields": _fields,
-    "cells": _cells,
 }
 """Solver of each kind of part."""
 
 PART_TYPES: dict[str, dict[str, str]] = {
     "discretisation": {"discretisation_error": "<f8"},
     "modes": {"omega": "<f8", "attachment_shapes": "<f8", "shapes": "<f4"},
-    "fields": {"acceleration": "<c8"},
-    "cells": {"cell_sources": "<f4"},
 }
 """Arrays of each kind of part, with their types."""
-
-
-def _shares(kind: str, count: int, size: int) -> list[Part]:
-    return [Part(kind, start, min(start + size, count)) for start in range(0, count, size)]
 
 
 def _check_frequencies(frequencies: FloatArray, rig: Rig) -> None:

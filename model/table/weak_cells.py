@@ -1,9 +1,9 @@
-"""Contrast that the cells of a plate have to other fingers.
+"""Felt contrast that the cells of a plate have to other fingers.
 
-For the centre of each cell as the target, contrast to another finger at random places, the same
-for all cells, at least 5 cm away. A cell is *feasible* if the median other finger leaves 12 dB at
-20 dB SL: turned down to 12 dB SL, which is felt well, the other finger is then at its threshold. It
-is *weak* if more than one other finger in ten leaves less.
+For the centre of each cell as the target, the contrast that nine of ten plates give to another
+finger at random places, the same for all cells, at least 5 cm away. A cell is *feasible* if the
+median other finger leaves 12 dB at 20 dB SL: turned down to 12 dB SL, which is felt well, the other
+finger is then at its threshold. It is *weak* if more than one other finger in ten leaves less.
 """
 
 from collections.abc import Callable, Iterator
@@ -26,7 +26,7 @@ MIN_DISTANCE = 0.05
 WANTED_CONTRAST_DB = FELT_DB_SL
 WANTED_LEVEL_DB_SL = STRONG_DB_SL
 
-STRATA = (4, 3)
+STRATA = (3, 2)
 """Strata of a quarter of the plate, one random place of the other finger in each.
 
 Their mirror images in both axes are used too, so that a symmetric plate has a symmetric map, with
@@ -39,7 +39,7 @@ _MAX_GRID = Grid(16, 12)
 
 @dataclass(frozen=True, eq=False)
 class WeakCells:
-    """Median and tenth percentile of contrast [dB] from each cell to other fingers, (cells,).
+    """Median and tenth percentile of felt contrast [dB] from each cell to other fingers, (cells,).
 
     -inf where the level is not reached, NaN on a plate too small for two fingers.
     """
@@ -122,11 +122,11 @@ def text_map(weak: WeakCells) -> Iterator[str]:
 
 
 def _contrast(table: LocalizationTable, target: FloatArray, other: FloatArray) -> float:
-    """Contrast [dB] at the wanted level; -inf where that is not reached."""
+    """Robust felt contrast [dB] at the wanted level; -inf where that is not reached."""
     at, quiet = ((float(x), float(y)) for x, y in (target, other))
     question = Question((at,), (quiet,), level_db_sl=WANTED_LEVEL_DB_SL)
     try:
-        contrast = table.query(question).contrast_db
+        contrast = table.query(question).robust_felt_contrast_db
     except InputError:
         return -np.inf
     return -np.inf if contrast is None else contrast

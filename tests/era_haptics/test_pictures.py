@@ -55,7 +55,7 @@ def test_draw_pattern_shows_fingers_and_levels() -> None:
     assert f"{pattern.contrast_db:.1f} dB predicted" in axes.get_title()
     texts = [text.get_text() for text in axes.texts]
     assert texts.count("quiet") == 2
-    assert "felt\n20 dB SL" in texts
+    assert f"felt\n{pattern.level_db_sl:.0f} dB SL" in texts
     drawn = np.asarray(axes.collections[0].get_array()).reshape(121, 121)
     row, column = round(0.06 / 0.2286 * 120), round(0.08 / 0.3048 * 120)
     assert drawn[row, column] == pytest.approx(20.0, abs=1.0)

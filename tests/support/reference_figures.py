@@ -42,7 +42,9 @@ def reference_figures() -> dict[str, list[float]]:
     table = build_in_parts(small_problem(), drive_mode="switched").table
     figures |= {
         "table_omega": table.omega[:8],
-        "table_acceleration": np.linalg.norm(table.acceleration, axis=0).ravel(),
+        "table_acceleration": np.linalg.norm(
+            table.unit_fields(table.raster.points), axis=2
+        ).ravel(),
         "table_cell_sources": table.cell_sources.mean(axis=1),
         "table_discretisation_error": table.discretisation_error,
         "table_shapes": np.linalg.norm(table.shapes[:, :8], axis=0),
@@ -60,6 +62,8 @@ def reference_figures() -> dict[str, list[float]]:
                 pattern.surroundings_contrast_db,
                 pattern.quiet_level_db_sl,
                 pattern.robust_contrast_db,
+                pattern.robust_felt_contrast_db,
+                pattern.robust_level_db_sl,
                 pattern.transient_contrast_db,
                 pattern.residual_db,
             )

@@ -1,6 +1,7 @@
 """Questions to the table for an intent, and when a pattern is selected again."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -56,7 +57,11 @@ class Table:
         return Pattern({"SW": tone}, 0.02, question.level_db_sl, None, self.quiet_level)
 
     def amplitudes(
-        self, excitation: Excitation, points: FloatArray
+        self,
+        excitation: Excitation,
+        points: FloatArray,
+        *,
+        contacts: Sequence[tuple[float, float]] = (),
     ) -> tuple[FloatArray, FloatArray]:
         """Ten times above threshold at x = 0.1 m, and in proportion to x."""
         frequencies = np.array([100.0])

@@ -2,19 +2,19 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import linprog, minimize
+from scipy.optimize import linprog
 
 from model.drive_modes.dual_weights import dual_weights
 
 
 def sources(seed):
-    """Magnitudes of 40 sources at 80 quiet points, more than the program begins with."""
+    """Powers of 40 sources at 80 quiet fingertips."""
     return np.random.default_rng(seed).exponential(size=(40, 80))
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_dual_weights_of_the_maximum_reach_the_primal_optimum(seed):
-    """The primal program over all points at once has the same value, to a thousandth."""
+def test_dual_weights_reach_the_primal_optimum(seed):
+    """The primal program has the same value, to a thousandth."""
     relative = sources(seed)
     n, points = relative.shape
     primal = linprog(
@@ -25,25 +25,9 @@ def test_dual_weights_of_the_maximum_reach_the_primal_optimum(seed):
         b_eq=[1.0],
         method="highs-ipm",
     )
-    share = dual_weights(np.ones(n), relative, is_rms=False)
+    share = dual_weights(np.ones(n), relative)
     bound = 1 / (relative @ share).min()
     assert share.sum() == pytest.approx(1.0)
     assert (share >= 0).all()
     assert 1 / primal.fun <= bound * (1 + 1e-9)
     assert bound == pytest.approx(1 / primal.fun, rel=2e-3)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_dual_weights_of_the_rms_reach_the_primal_optimum(seed):
-    """A general optimiser over mixtures comes within a percent of it, and not beyond."""
-    relative = sources(seed)
-
-    def loud(x):
-        mixture = np.abs(x) / np.abs(x).sum()
-        return np.sqrt(((mixture @ relative) ** 2).mean())
-
-    best = minimize(loud, np.ones(len(relative)), method="L-BFGS-B").fun
-    share = dual_weights(np.ones(len(relative)), relative, is_rms=True)
-    bound = 1 / (relative @ share).min()
-    assert np.linalg.norm(share) * np.sqrt(len(share)) == pytest.approx(1.0)
-    assert 0.99 * bound <= 1 / best <= bound * (1 + 1e-9)

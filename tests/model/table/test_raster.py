@@ -10,17 +10,21 @@ from model.structure.plate import Material, Plate
 from model.table.raster import Raster
 from paper_table import FREQUENCIES, smooth_rig
 
+CROSS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 CONTACTS = [(0.15, 0.11), (0.0, 0.0), (0.3048, 0.1), (0.2, 0.225), (0.006, 0.0031)]
 
 
 def test_fingertips_reads_the_points_of_the_disc():
-    """Reading x and y themselves gives back the disc's points, finger after finger."""
+    """Reading x and y themselves gives back the points, the centre and four of the rim as well."""
     plate = smooth_rig().plate
     raster = Raster.for_plate(plate, frequency_max=500.0)
     places = raster.points.astype(np.float32)
-    found = raster.fingertips(np.array(CONTACTS)).read(places)
-    expected = np.concatenate([fingertip_points(x, y, plate) for x, y in CONTACTS])
-    np.testing.assert_allclose(found, expected, atol=1e-7)
+    few, fine = raster.fingertips(np.array(CONTACTS)).read(places)
+    expected = [fingertip_points(x, y, plate) for x, y in CONTACTS]
+    np.testing.assert_allclose(fine, expected, atol=1e-7)
+    assert few.shape == (5, 5, 2)
+    np.testing.assert_allclose(few[:, 0], CONTACTS, atol=1e-7)
+    np.testing.assert_allclose(few[0, 1:] - few[0, :1], 0.013 * CROSS, atol=1e-7)
 
 
 def test_fingertips_interpolates_fields_of_the_plate():
@@ -30,7 +34,8 @@ def test_fingertips_interpolates_fields_of_the_plate():
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
     kept = free.acceleration(rig.eras, FREQUENCIES, raster.points).transpose(2, 0, 1)
     values = np.ascontiguousarray(kept.astype(np.complex64)).reshape(len(kept), -1)
-    found = raster.fingertips(np.array(CONTACTS)).read(values.view(np.float32))
+    _, fine = raster.fingertips(np.array(CONTACTS)).read(values.view(np.float32))
+    found = fine.reshape(-1, fine.shape[-1])
     points = np.concatenate([fingertip_points(x, y, rig.plate) for x, y in CONTACTS])
     solved = free.acceleration(rig.eras, FREQUENCIES, points).transpose(2, 0, 1)
     size = np.sqrt((np.abs(kept) ** 2).mean(axis=0))

@@ -18,7 +18,7 @@ from model.vibration.convergence import study_convergence
 from paper_plate import make_paper_rig
 
 FREQUENCIES = np.array([60.0, 90.0, 110.0])
-PARTS = 6  # discretisation, modes, fields and three shares of twelve cells
+PARTS = 2  # discretisation and modes
 
 
 def quick_rig(nx=12, ny=9):
@@ -29,10 +29,8 @@ def quick_rig(nx=12, ny=9):
 
 @pytest.fixture(scope="module")
 def problem():
-    """A small table's, with five cells to a part."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(table_parts, "CELLS_PER_PART", 5)
-        yield TableProblem(quick_rig(), FREQUENCIES, Grid(4, 3))
+    """A small table's."""
+    return TableProblem(quick_rig(), FREQUENCIES, Grid(4, 3))
 
 
 @pytest.fixture(scope="module")
@@ -64,36 +62,34 @@ def test_build_is_the_same_to_the_bit_by_two_processes(problem, whole, tmp_path)
 
 
 def test_build_keeps_the_parts_that_were_finished_when_it_was_interrupted(problem, tmp_path):
-    """Two of six, and no other file."""
+    """One of two, and no other file."""
 
     def progress(done, of):
         assert of == PARTS
-        if done == 2:
+        if done == 1:
             raise KeyboardInterrupt
 
     kept = KeptParts.beside(tmp_path / "t.npz", problem.digest)
     with pytest.raises(KeyboardInterrupt):
         build_in_parts(problem, drive_mode="switched", kept=kept, progress=progress)
-    assert len(list(kept.folder.iterdir())) == 2
+    assert len(list(kept.folder.iterdir())) == 1
 
 
-@pytest.mark.parametrize("kind", ["fields", "cells"])
+@pytest.mark.parametrize("kind", ["modes", "discretisation"])
 def test_resumed_build_is_the_same_to_the_bit(problem, whole, kept, tmp_path, kind):
-    """Each missing part is put in its place; a resumed build may have another drive mode."""
-    parts = sorted(kept.folder.glob(f"{kind}-*"))
-    assert len(parts) == {"fields": 1, "cells": 3}[kind]
-    for part in parts:
-        part.unlink()
-        build = build_in_parts(problem, drive_mode="switched", kept=kept)
-        assert (build.reused_count, build.part_count) == (PARTS - 1, PARTS)
-        assert file_of(build, tmp_path) == (whole / "t.npz").read_bytes()
+    """The missing part is put in its place; a resumed build may have another drive mode."""
+    (part,) = kept.folder.glob(f"{kind}-*")
+    part.unlink()
+    build = build_in_parts(problem, drive_mode="switched", kept=kept)
+    assert (build.reused_count, build.part_count) == (PARTS - 1, PARTS)
+    assert file_of(build, tmp_path) == (whole / "t.npz").read_bytes()
     phased = build_in_parts(problem, drive_mode="phased", kept=kept)
     assert (phased.reused_count, phased.table.drive_mode) == (PARTS, "phased")
 
 
 def test_clear_removes_parts_only(kept):
     """Half-written ones too; the folder goes with them if it is then empty."""
-    (kept.folder / ".cells-0123.part.npz.4567").write_text("half-written by a killed build")
+    (kept.folder / ".modes-0123.part.npz.4567").write_text("half-written by a killed build")
     (kept.folder / "notes.txt").write_text("not a part")
     kept.clear()
     assert [path.name for path in kept.folder.iterdir()] == ["notes.txt"]
@@ -123,7 +119,7 @@ def test_parts_of_another_table_are_not_used(problem, kept, caplog, monkeypatch,
 @pytest.mark.parametrize("harm", ["flip", "cut", "swap", "edit"])
 def test_build_solves_a_damaged_part_again(problem, whole, kept, tmp_path, caplog, harm):
     """A flipped bit, a cut file, another part, an edited one: not used, named."""
-    (path,) = kept.folder.glob("fields-*")
+    (path,) = kept.folder.glob("modes-*")
     data = bytearray(path.read_bytes())
     match harm:
         case "flip":
@@ -133,11 +129,11 @@ def test_build_solves_a_damaged_part_again(problem, whole, kept, tmp_path, caplo
         case "edit":
             with np.load(path) as content:
                 arrays = dict(content)
-            arrays["acceleration"][0] = 1
+            arrays["omega"][0] = 1
             np.savez(path, **arrays)
             data = bytearray(path.read_bytes())
         case "swap":
-            (other,) = kept.folder.glob("modes-*")
+            (other,) = kept.folder.glob("discretisation-*")
             data = bytearray(other.read_bytes())
     path.write_bytes(data)
     with caplog.at_level(logging.WARNING):

@@ -81,10 +81,14 @@ def test_query_has_all_measures(table_file):
     result = RUNNER.invoke(app, ["table", "query", str(table_file), *options.split()])
     answer = json.loads(result.stdout)
     assert answer["mode"] == "signed"
-    assert answer["level_db_sl"] == 18.0
+    assert answer["robust_level_db_sl"] == pytest.approx(18.0)
+    assert answer["level_db_sl"] > 18.0
     assert answer["robust_contrast_db"] < answer["contrast_db"]
-    assert answer["felt_contrast_db"] == pytest.approx(18.0 - answer["quiet_level_db_sl"])
-    assert answer["quiet_level_db_sl"] > -10
+    assert answer["robust_felt_contrast_db"] < answer["median_felt_contrast_db"]
+    assert answer["median_felt_contrast_db"] < answer["felt_contrast_db"]
+    felt = answer["level_db_sl"] - answer["quiet_level_db_sl"]
+    assert answer["felt_contrast_db"] == pytest.approx(felt)
+    assert answer["robust_quiet_level_db_sl"] > answer["quiet_level_db_sl"] > -10
     assert answer["is_imperceptible_to_quiet"] is False
     assert answer["solve_time_s"] > 0
     for tone in answer["drive"].values():

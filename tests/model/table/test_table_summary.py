@@ -26,18 +26,16 @@ def with_strokes(table, factor):
     return replace(
         table,
         eras=tuple(replace(era, stroke=factor * era.stroke) for era in table.eras),
-        acceleration=np.complex64(factor) * table.acceleration,
-        cell_sources=np.float32(factor) * table.cell_sources,
     )
 
 
 def test_weak_cells_of_a_symmetric_plate_are_symmetric(table):
-    """Cells that mirror each other have the same contrast."""
+    """Cells that mirror each other have the same contrast, to the noise of the drawn plates."""
     weak = find_weak_cells(table)
     for values in (weak.median_db, weak.tenth_db):
         rows = values.reshape(3, 4)
-        np.testing.assert_allclose(rows, rows[:, ::-1], atol=0.01)
-        np.testing.assert_allclose(rows, rows[::-1], atol=0.01)
+        np.testing.assert_allclose(rows, rows[:, ::-1], atol=1.0)
+        np.testing.assert_allclose(rows, rows[::-1], atol=1.0)
     assert (weak.tenth_db <= weak.median_db).all()
     assert np.ptp(weak.median_db) > 0.5
 
@@ -45,7 +43,7 @@ def test_weak_cells_of_a_symmetric_plate_are_symmetric(table):
 def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table, monkeypatch):
     """Half of a cell's contrasts are below its median, a tenth below the other.
 
-    Other fingers are in each of 8 by 6 fields, at least 5 cm from the cell.
+    Other fingers are in each of 6 by 4 fields, at least 5 cm from the cell.
     """
     rng = np.random.default_rng(0)
     drawn: dict[tuple[float, float], list[float]] = {}
@@ -66,7 +64,7 @@ def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table, monk
             assert below == pytest.approx(share, abs=1.5 / len(contrasts))
     size = (table.plate.length, table.plate.width)
     counts, *_ = np.histogram2d(
-        *np.array(sorted(tried)).T, bins=(8, 6), range=[(0, side) for side in size]
+        *np.array(sorted(tried)).T, bins=(6, 4), range=[(0, side) for side in size]
     )
     assert (counts == 1).all()
 
@@ -101,7 +99,7 @@ def test_summary_of_a_plate_too_small_for_two_fingers():
     )
     built = build_table(small, frequencies=np.array([110.0]), grid=Grid(2, 2))
     summary = summarize(built, find_weak_cells(built))
-    assert summary["contrast_1_quiet_median_db"] is None
+    assert summary["robust_felt_contrast_1_quiet_median_db"] is None
     assert summary["feasible_share"] is None
 
 
@@ -120,7 +118,7 @@ def test_summary_counts_levels_and_shares(table, monkeypatch):
 
     def one_to_hundred(table, *, others, rng, progress):
         asked.append(others)
-        return np.arange(101.0)
+        return np.array([np.arange(101.0), np.arange(101.0) + 5])
 
     monkeypatch.setattr("model.table.summary.contrast_distribution", one_to_hundred)
     levels = np.sort(table.available_level_db_sl)
@@ -138,8 +136,9 @@ def test_summary_counts_levels_and_shares(table, monkeypatch):
         "weak_share": 0.75,
         "frequency_count": 3,
         "patterns": 4 * 3 + 6 * 3**2,
-        "contrast_2_quiet_median_db": 50.0,
-        "contrast_2_quiet_tenth_percentile_db": 10.0,
+        "robust_felt_contrast_2_quiet_median_db": 50.0,
+        "robust_felt_contrast_2_quiet_tenth_percentile_db": 10.0,
+        "felt_contrast_2_quiet_median_db": 55.0,
         "discretisation_error_percent": 100 * max(quieter.discretisation_error),
     }
     assert {name: summary[name] for name in expected} == pytest.approx(expected, rel=1e-4)
@@ -152,7 +151,9 @@ def test_contrast_distribution_uses_fingers_apart(table, others):
 
     def answer(question):
         asked.append(np.array([*question.targets, *question.quiet]))
-        return SimpleNamespace(contrast_db=float(len(asked)))
+        return SimpleNamespace(
+            robust_felt_contrast_db=float(len(asked)), felt_contrast_db=float(len(asked)) + 3
+        )
 
     def refuse(question):
         answer(question)
@@ -166,22 +167,29 @@ def test_contrast_distribution_uses_fingers_apart(table, others):
         )
         for each in (answer, refuse)
     )
-    assert found.tolist() == list(range(1, 201))
-    assert (len(none), len(asked)) == (0, 200 + 400)
+    assert found.tolist() == [list(range(1, 201)), list(range(4, 204))]
+    assert (none.shape, len(asked)) == ((2, 0), 200 + 400)
     for contacts in asked:
         assert contacts.shape == (others + 1, 2)
         gaps = np.linalg.norm(contacts[:, None] - contacts, axis=-1)
         assert gaps[np.triu_indices(others + 1, 1)].min() >= 0.05
 
 
-def test_similar_share_of_copies_noise_and_a_single_cell(table):
+def test_similar_share_of_copies_noise_and_a_single_cell():
     """Copies of one pattern are all similar, noise is not; a single cell has no share."""
-    row = table.cell_sources[0]
-    copies = np.tile(row, (len(table.cell_sources), 1))
+    copies = np.tile(np.linspace(1, 2, 12, dtype=np.float32), (4 * 3 + 6 * 3 + 1, 1))
     copies[-1] = 0  # nothing driven beside the first source
-    assert similar_share(replace(table, cell_sources=copies)) == 1.0
+
+    def plate(sources):
+        return SimpleNamespace(
+            eras=range(4),
+            frequencies=range(3),
+            grid=Grid(sources.shape[1], 1),
+            cell_sources=sources,
+        )
+
+    assert similar_share(plate(copies)) == 1.0
     rng = np.random.default_rng(0)
     noise = rng.uniform(0, 1, copies.shape).astype(np.float32)
-    assert similar_share(replace(table, cell_sources=noise)) < 0.02
-    single = replace(table, grid=Grid(1, 1), cell_sources=noise[:, :1])
-    assert similar_share(single) is None
+    assert similar_share(plate(noise)) < 0.05
+    assert similar_share(plate(noise[:, :1])) is None

@@ -1,11 +1,13 @@
 """Onsets, endings and transient measures of a table's patterns."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from model.reduction.reduced_plate import reduce_plate
+from model.rig.uncertainty import Uncertainty
 from model.structure.point_load import footprints_of
 from model.table.build import build_table
 from model.table.query import query_batch
@@ -21,8 +23,9 @@ QUESTION = Question(((0.09, 0.07),), ((0.25, 0.18), (0.05, 0.19)), drive_mode="p
 
 @pytest.fixture(scope="module")
 def rig():
-    """A mesh that is quick to solve; what is proven here does not depend on it."""
-    return make_paper_rig(24, 18)
+    """A mesh that is quick to solve, and weightless fingers, as on the plate in time."""
+    known = replace(Uncertainty.none(), gain=0.05, phase_deg=5.0)
+    return replace(make_paper_rig(24, 18), fingertip=None, uncertainty=known)
 
 
 @pytest.fixture(scope="module")

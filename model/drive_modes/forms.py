@@ -1,0 +1,115 @@
+"""Input of the drive modes: what the ERAs' weights do at the fingertips, over the ensemble.
+
+A drive is a complex weight for each ERA at each frequency. It is ranked by its robust score: the
+amplitude at the target, over the root of the expected power at the loudest quiet fingertip, over
+all plates within the rig's uncertainty (`model.ensemble.contact_forms`). The optimum for the plate
+as modelled relies on cancellation and is 10 dB worse on a real one.
+
+Tones of different frequencies are felt together as the root of the sum of their squares over the
+detection thresholds, and so are a score's powers: each in units of its threshold.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import Complex64Array, Float32Array, IntArray
+
+SILENT = -1
+"""Frequency index of an ERA that is not driven."""
+
+LEVEL_MARGIN = 1.0
+"""Standard deviations of a target's amplitude that a drive must have in reserve.
+
+About what nine of ten plates need; the answer's own draws decide.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """Complex weight of each ERA in full strokes, values (eras,), and its frequency.
+
+    frequencies (eras,): by index, or SILENT.
+    """
+
+    frequencies: NDArray[np.int64]
+    values: Complex64Array
+
+    @classmethod
+    def at(cls, frequency: int, values: Complex64Array) -> "Weights":
+        """Drive all ERAs at one frequency."""
+        return cls(np.where(values == 0, SILENT, frequency), values)
+
+    def tones(self) -> list[tuple[int, Complex64Array]]:
+        """Index of each distinct frequency, and the weights (eras,) at it."""
+        frequencies = sorted({*self.frequencies.tolist()} - {SILENT})
+        return [
+            (index, np.where(self.frequencies == index, self.values, 0).astype(np.complex64))
+            for index in frequencies
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class Forms:
+    """Amplitudes at the targets, and expected power at targets and quiet fingertips.
+
+    - targets: (t, f, eras) field of each ERA alone at full stroke [m/s²], mean over the fingertip
+    - target_power: (t, f, eras, eras) expected power there, w^H R w of weights w
+    - quiet: (f, q, eras, eras) the same at each quiet fingertip, or without any one form for the
+      rest of the plate
+    - threshold: (f,) [m/s²]; wanted: amplitude to threshold for every target
+    """
+
+    targets: Complex64Array
+    target_power: Complex64Array
+    quiet: Complex64Array
+    threshold: Float32Array
+    wanted: float
+    level_margin: float = LEVEL_MARGIN
+
+    @property
+    def frequency_count(self) -> int:
+        """Number of frequencies."""
+        return len(self.quiet)
+
+    @property
+    def era_count(self) -> int:
+        """Number of ERAs."""
+        return int(self.quiet.shape[-1])
+
+    def at(self, frequencies: IntArray) -> "Forms":
+        """Select some of the frequencies, by index (n,)."""
+        return replace(
+            self,
+            targets=self.targets.take(frequencies, axis=1),
+            target_power=self.target_power.take(frequencies, axis=1),
+            quiet=self.quiet.take(frequencies, axis=0),
+            threshold=self.threshold.take(frequencies),
+        )
+
+    def amplitude(self, weights: Complex64Array) -> Float32Array:
+        """Amplitude [m/s²] at the weakest target of weights (f, eras), (f,)."""
+        return np.asarray(np.minimum.reduce(self._amplitudes(weights), axis=0))
+
+    def reaches(self, weights: Complex64Array) -> NDArray[np.bool_]:
+        """Whether weights (f, eras) reach the wanted level at all targets, (f,)."""
+        least = amplitude = self._amplitudes(weights)
+        if self.level_margin:
+            spread = expected_power(self.target_power, weights) - amplitude * amplitude
+            deviation = np.sqrt(np.maximum(spread, 0))
+            least = np.asarray(amplitude - np.float32(self.level_margin) * deviation)
+        return np.asarray(np.logical_and.reduce(least >= self.wanted * self.threshold, axis=0))
+
+    def quiet_power(self, weights: Complex64Array) -> Float32Array:
+        """Expected power [m²/s⁴] at each quiet fingertip of weights (f, eras), (f, q)."""
+        return expected_power(self.quiet.swapaxes(0, 1), weights).T
+
+    def _amplitudes(self, weights: Complex64Array) -> Float32Array:
+        return np.asarray(np.abs(np.add.reduce(self.targets * weights, axis=-1)))
+
+
+def expected_power(forms: Complex64Array, weights: Complex64Array) -> Float32Array:
+    """w^H R w of forms (q, f, eras, eras) and weights (f, eras): (q, f)."""
+    moved = (forms @ weights[..., None])[..., 0]
+    return np.asarray(np.vecdot(weights, moved).real)

@@ -1,0 +1,117 @@
+"""The reduced plate at its drive frequencies, with what is fixed to it and what may be wrong.
+
+Free plate in reduced coordinates: A(x, y) = phi_x diag(g) phi_y^T with g = 1 / (s lambda - w²),
+s = 1 + i eta. A plate thicker by a factor has modal masses larger by it and frequencies higher by
+it (`model.vibration.parametric_plate`), so that
+
+    dg / d ln h = -3 g - 2 w² g²,    dg / d ln eta = -i eta lambda g².
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import Complex64Array, Float32Array, FloatArray
+from model.rig.uncertainty import Uncertainty
+from model.structure.actuator import Era
+from model.structure.dynamic_stiffness import attached_stiffness, drive_forces, full_strokes
+from model.structure.fingertip import Fingertip
+from model.structure.plate import Plate
+from model.structure.point_load import PointLoad
+
+
+@dataclass(frozen=True, eq=False)
+class AttachedPlate:
+    """The plate with b fixed attachments, n ERAs first and then masses, at frequencies (f,).
+
+    All in single precision: accelerations are within 1e-5 of their largest.
+
+    - minus_omega2: (f,) [rad²/s²]
+    - receptance: (f, r) g; by_thickness, by_loss: (f, r) its change by one standard deviation
+    - shapes: (b, r) of the attachments; stiffness: (f, b) their dynamic stiffness [N/m]
+    - forces: (f, n) of each ERA at full stroke [N]; strokes: (f, n) of its base [m]
+    - by_stiffness: (f, n), by_damping: (f, n) change of the ERAs' dynamic stiffness by one standard
+      deviation [N/m]
+    - finger: (f,) dynamic stiffness of a fingertip [N/m]; by_finger: (f,) its change
+    - gain, phase: standard deviations of an ERA's amplitude and of its phase [rad]
+    """
+
+    minus_omega2: Float32Array
+    receptance: Complex64Array
+    by_thickness: Complex64Array
+    by_loss: Complex64Array
+    shapes: Float32Array
+    stiffness: Complex64Array
+    forces: Complex64Array
+    strokes: Complex64Array
+    by_stiffness: Complex64Array
+    by_damping: Complex64Array
+    finger: Complex64Array
+    by_finger: Complex64Array
+    gain: float
+    phase: float
+    has_thickness_error: bool
+
+    @property
+    def era_count(self) -> int:
+        """Number of ERAs."""
+        return int(self.forces.shape[1])
+
+    @property
+    def gain_variance(self) -> float:
+        """Mean square of an ERA's relative error, its phase included: (1 + gain²) exp(phase²) - 1.
+
+        Relative to the mean of the ensemble, whose amplitude is lower by exp(-phase² / 2).
+        """
+        return (1 + self.gain**2) * math.exp(self.phase**2) - 1
+
+    @property
+    def modal_rows(self) -> Float32Array:
+        """Real and imaginary part of the receptance side by side, (r, 2 f)."""
+        return np.ascontiguousarray(self.receptance.T).view(np.float32)
+
+
+def attach(
+    plate: Plate,
+    omega: FloatArray,
+    shapes: FloatArray,
+    *,
+    eras: Sequence[Era],
+    masses: Sequence[PointLoad],
+    fingertip: Fingertip | None,
+    uncertainty: Uncertainty,
+    frequencies: FloatArray,
+) -> AttachedPlate:
+    """Attach ERAs and masses to a reduced free plate.
+
+    omega (r,) [rad/s]: of its coordinates; shapes (eras + masses, r); frequencies (f,) [Hz].
+    """
+    w = 2 * np.pi * frequencies
+    w2 = (w**2)[:, None]
+    eta = plate.loss_factor
+    g = 1 / ((1 + 1j * eta) * omega**2 - w2)
+    k, c = (np.array([getattr(era, key) for era in eras]) for key in ("stiffness", "damping"))
+    log_damping = math.log(uncertainty.damping)
+    finger = np.zeros(len(w), dtype=complex)
+    if fingertip is not None:
+        finger = np.asarray(fingertip.dynamic_stiffness(w))
+    single = np.complex64
+    return AttachedPlate(
+        minus_omega2=-w2[:, 0].astype(np.float32),
+        receptance=g.astype(single),
+        by_thickness=(uncertainty.thickness * (-3 * g - 2 * w2 * g**2)).astype(single),
+        by_loss=(log_damping * (-1j * eta) * omega**2 * g**2).astype(single),
+        shapes=shapes.astype(np.float32),
+        stiffness=attached_stiffness(eras, masses, w).astype(single),
+        forces=drive_forces(eras, w).astype(single),
+        strokes=full_strokes(eras, w).astype(single),
+        by_stiffness=np.broadcast_to(uncertainty.stiffness * k, (len(w), len(k))).astype(single),
+        by_damping=(log_damping * 1j * w[:, None] * c).astype(single),
+        finger=finger.astype(single),
+        by_finger=(uncertainty.fingertip * finger).astype(single),
+        gain=uncertainty.gain,
+        phase=math.radians(uncertainty.phase_deg),
+        has_thickness_error=uncertainty.thickness > 0,
+    )

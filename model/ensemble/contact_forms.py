@@ -1,0 +1,181 @@
+"""Fields of the ERAs at fingertips that load the plate, and their expected power.
+
+Attachments a are the fixed ones and then the fingers, points p those under the fingertips:
+
+    Z = diag(k + i w c - w² m, D of the fingers),  K = (1 + Z A)^-1,  F = K z stroke,  u = A F
+    h_p = -w² A_pa F,   t_p = -w² A_pa K                     field, and force -> point
+    dh_p / dZ_j = t_pj r_j^T,   r_j = stroke e_j - u_j of an ERA, -u_j of a finger
+    dh_p / d ln h = -w² dA_pa F - t_p Z dA F
+
+with dA the free plate's. The expected power of weights w at a fingertip is w^H R w to first order,
+
+    R = mean_p { h* h^T + dh* dh^T + dc* dc^T + sum_j |s_j t_pj|² r_j* r_j^T + sigma² diag |h|² },
+
+each change d by one standard deviation: thickness h, the ERAs' damping c together, stiffness of
+each ERA and load of each finger j on their own, gains as sigma. The loss factor changes next to
+nothing in it. Exact derivatives of the loaded plate, but for what a finger deflects locally.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import Complex64Array, Float32Array
+from model.ensemble.attached_plate import AttachedPlate
+
+# Share of a form's trace that is added to its diagonal: keeps it definite.
+_RIDGE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedContacts:
+    """The plate with k fingers on it, a = b + k attachments.
+
+    - shapes: (a, r); stiffness: (f, a) Z
+    - inverse: (f, a, a) K; forces: (f, a, n) F; motion: (f, a, n) r
+    - fields: (f, k, p, n) h [m/s²] at each finger's points; power: (f, k, n, n) R
+    - point_power: (f, p, n, n) the same at each point of the last finger, if asked for
+    """
+
+    shapes: Float32Array
+    stiffness: Complex64Array
+    inverse: Complex64Array
+    forces: Complex64Array
+    motion: Complex64Array
+    fields: Complex64Array
+    power: Complex64Array
+    point_power: Complex64Array | None
+
+
+def load_contacts(
+    plate: AttachedPlate,
+    points: Float32Array,
+    weights: Float32Array,
+    error_power: Float32Array,
+    *,
+    is_by_point: bool = False,
+) -> LoadedContacts:
+    """Put fingers on a plate.
+
+    points (k, p, r): shapes under each finger, its centre first; weights (k, p): of its points,
+    sum 1; error_power (f, n): mean square of the discretisation error of each ERA's field.
+    """
+    k, p, r = points.shape
+    f, b = plate.stiffness.shape
+    n = plate.era_count
+    shapes = np.concatenate([plate.shapes, points[:, 0]])
+    a = b + k
+    rows = np.concatenate([plate.shapes, points.reshape(-1, r)])
+    products = (rows[:, None] * shapes).reshape(-1, r)
+    found = (products @ plate.modal_rows).view(np.complex64).reshape(-1, a, f)
+    between = np.ascontiguousarray(found.transpose(2, 0, 1))  # (f, b + k p, a)
+    attached = np.concatenate([np.arange(b), b + p * np.arange(k)])
+    A = between.take(attached, axis=1)
+    stiffness = _stiffness(plate, k)
+    inverse = _inverse(stiffness, A)
+    forces = inverse[:, :, :n] * plate.forces[:, None]
+    motion = -(A @ forces)
+    motion.reshape(f, -1)[:, : n * n : n + 1] += plate.strokes
+    to_points = (between[:, b:] @ inverse) * plate.minus_omega2[:, None, None]
+    h = to_points[:, :, :n] * plate.forces[:, None]
+
+    parts = [h]
+    if plate.has_thickness_error:
+        parts.append(_by_thickness(plate, shapes, stiffness, forces, rows, attached, to_points))
+    parts.append(to_points[:, :, :n] @ (plate.by_damping[:, :, None] * motion[:, :n]))
+
+    # One row for each point and part, then one for each uncertain spring and load.
+    scale = np.sqrt(weights).reshape(1, k * p, 1)
+    stacked = np.stack([part * scale for part in parts], axis=2).reshape(f, k, -1, n)
+    j = np.concatenate([np.arange(n), np.arange(b, a)])
+    changes = np.concatenate(
+        [plate.by_stiffness, np.broadcast_to(plate.by_finger[:, None], (f, k))], axis=1
+    )
+    moved = motion.take(j, axis=1) * changes[:, :, None]
+    outer = _outer(moved).reshape(f, len(j), -1)
+    reach = _squared(to_points.take(j, axis=2)) * weights.reshape(1, k * p, 1)
+    shares = np.add.reduce(reach.reshape(f, k, p, -1), axis=2)
+    by_change = (shares @ outer.view(np.float32)).view(np.complex64).reshape(f, k, n, n)
+    power = stacked.conj().swapaxes(2, 3) @ stacked + by_change
+    size = np.add.reduce((_squared(h) * weights.reshape(1, -1, 1)).reshape(f, k, p, n), axis=2)
+    _add_diagonal(power, plate.gain_variance * size + error_power[:, None])
+    point_power = None
+    if is_by_point:
+        last = slice(-p, None)
+        each = np.stack([part[:, last] for part in parts], axis=2)
+        by_each = _squared(to_points[:, last].take(j, axis=2)) @ outer.view(np.float32)
+        point_power = each.conj().swapaxes(2, 3) @ each
+        point_power += by_each.view(np.complex64).reshape(f, p, n, n)
+        _add_diagonal(
+            point_power, plate.gain_variance * _squared(h[:, last]) + error_power[:, None]
+        )
+    return LoadedContacts(
+        shapes, stiffness, inverse, forces, motion, h.reshape(f, k, p, n), power, point_power
+    )
+
+
+def modal_fields(plate: AttachedPlate, fingers: Float32Array) -> Complex64Array:
+    """Accelerations of the reduced coordinates by each ERA alone at full stroke, (f, r, n).
+
+    fingers (k, r): shapes under the centres of those on the plate.
+    """
+    shapes = np.concatenate([plate.shapes, fingers])
+    A = (plate.receptance[:, None] * shapes) @ shapes.T
+    inverse = _inverse(_stiffness(plate, len(fingers)), A)
+    forces = inverse[:, :, : plate.era_count] * plate.forces[:, None]
+    scale = plate.receptance * plate.minus_omega2[:, None]
+    return np.asarray((shapes.T @ forces) * scale[:, :, None])
+
+
+def _stiffness(plate: AttachedPlate, finger_count: int) -> Complex64Array:
+    """Dynamic stiffness of all attachments, (f, a)."""
+    fingers = np.repeat(plate.finger[:, None], finger_count, axis=1)
+    return np.concatenate([plate.stiffness, fingers], axis=1)
+
+
+def _inverse(stiffness: Complex64Array, receptance: Complex64Array) -> Complex64Array:
+    """K = (1 + Z A)^-1 of stiffness Z (f, a) and receptance A (f, a, a)."""
+    system = stiffness[:, :, None] * receptance
+    system.reshape(len(system), -1)[:, :: system.shape[1] + 1] += 1
+    return np.asarray(np.linalg.inv(system))
+
+
+def _by_thickness(
+    plate: AttachedPlate,
+    shapes: Float32Array,
+    stiffness: Complex64Array,
+    forces: Complex64Array,
+    rows: Float32Array,
+    attached: np.ndarray,
+    to_points: Complex64Array,
+) -> Complex64Array:
+    """Change of the fields at the points by one deviation of the thickness, (f, k p, n)."""
+    f, a, n = forces.shape
+    b = plate.stiffness.shape[1]
+    by_attachment = np.ascontiguousarray(forces.transpose(1, 0, 2)).reshape(a, -1)
+    modal = (shapes.T @ by_attachment.view(np.float32)).view(np.complex64).reshape(-1, f, n)
+    modal *= plate.by_thickness.T[:, :, None]
+    found = (rows @ modal.reshape(len(modal), -1).view(np.float32)).view(np.complex64)
+    changed = found.reshape(-1, f, n).transpose(1, 0, 2)
+    held = stiffness[:, :, None] * changed.take(attached, axis=1)
+    return changed[:, b:] * plate.minus_omega2[:, None, None] - to_points @ held
+
+
+def _outer(rows: Complex64Array) -> Complex64Array:
+    """Forms conj(h) h^T of rows h (..., n): (..., n, n)."""
+    return np.asarray(rows.conj()[..., :, None] * rows[..., None, :])
+
+
+def _squared(values: Complex64Array) -> Float32Array:
+    """Squared magnitude."""
+    return np.asarray(values.real * values.real + values.imag * values.imag)
+
+
+def _add_diagonal(forms: Complex64Array, values: Float32Array) -> None:
+    """Add values (..., n) and a ridge to the diagonals of forms (..., n, n)."""
+    n = values.shape[-1]
+    diagonal = forms.reshape(*values.shape[:-1], -1)[..., :: n + 1]
+    trace = np.add.reduce(diagonal.real, axis=-1, keepdims=True) + np.add.reduce(
+        values, axis=-1, keepdims=True
+    )
+    diagonal += values + np.float32(_RIDGE / n) * trace

@@ -1,0 +1,126 @@
+"""Plates within the uncertainty of a rig solved exactly: the check of what answers promise.
+
+Each plate is solved in the reduced coordinates of the table, at the pattern's frequencies. One that
+is thicker by a factor has the same mode shapes; natural frequencies and modal masses scale with it.
+That is exact for thin plates; shear and rotary inertia of the paper's plate change the response by
+less than 1e-3 over 2 %.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.ensemble.measures import Felt, Fingertips, felt
+from model.rig.uncertainty import Uncertainty
+from model.structure.dynamic_stiffness import attached_stiffness, dynamic_stiffness
+from model.structure.low_rank import coupled_forces
+from model.table.question import Question
+from model.table.table import LocalizationTable
+from model.vibration.excitation import Excitation
+from model.vibration.peak import base_amplitudes
+
+
+@dataclass(frozen=True, eq=False)
+class Plates:
+    """Factors of d plates relative to the modelled one.
+
+    thickness, loss (d,): of the plate; damping (d,): of the ERAs; stiffness (d, eras): of each ERA;
+    load (d, contacts): of each finger's dynamic stiffness; gain (d, eras): complex, of each ERA;
+    deviation (d, contacts): of the response at each finger, in discretisation errors.
+    """
+
+    thickness: FloatArray
+    loss: FloatArray
+    damping: FloatArray
+    stiffness: FloatArray
+    load: FloatArray
+    gain: ComplexArray
+    deviation: ComplexArray
+
+
+def draw_plates(
+    rng: np.random.Generator,
+    uncertainty: Uncertainty,
+    *,
+    count: int,
+    era_count: int,
+    contact_count: int,
+) -> Plates:
+    """Draw plates: normal numbers, of logarithms for damping, loss and load."""
+
+    def normal(*shape: int) -> FloatArray:
+        return rng.standard_normal((count, *shape))
+
+    phase = math.radians(uncertainty.phase_deg)
+    real, imaginary = normal(contact_count), normal(contact_count)
+    return Plates(
+        thickness=1 + uncertainty.thickness * normal(),
+        loss=uncertainty.damping ** normal(),
+        damping=uncertainty.damping ** normal(),
+        stiffness=1 + uncertainty.stiffness * normal(era_count),
+        load=np.exp(uncertainty.fingertip * normal(contact_count)),
+        gain=(1 + uncertainty.gain * normal(era_count)) * np.exp(1j * phase * normal(era_count)),
+        deviation=np.asarray(math.sqrt(0.5) * (real + 1j * imaginary)),
+    )
+
+
+def felt_on(
+    table: LocalizationTable, question: Question, excitation: Excitation, plates: Plates
+) -> Felt:
+    """Measures of an excitation on plates, (1, d)."""
+    tips = table.fingertips(question)
+    _, discs = tips.read(table.shapes)
+    frequencies, bases = base_amplitudes(excitation, table.eras)
+    rows = np.searchsorted(table.frequencies, frequencies)
+    responses = np.array(
+        [
+            _response(table, discs.astype(float), row, base, plates)
+            for row, base in zip(rows, bases, strict=True)
+        ]
+    )
+    return felt(
+        responses,
+        table.threshold_at(rows),
+        np.zeros(1, dtype=int),
+        Fingertips(tips.fine_weights, np.array(question.gains)),
+    )
+
+
+def _response(
+    table: LocalizationTable, discs: FloatArray, row: int, base: ComplexArray, plates: Plates
+) -> ComplexArray:
+    """Acceleration (points, d) [m/s²] under the fingers for a base motion (eras,) [m]."""
+    frequency = table.frequencies[row]
+    omega = 2 * np.pi * frequency
+    k, c, m = (np.array([getattr(era, key) for era in table.eras]) for key in _ERA_KEYS)
+    springs = dynamic_stiffness(
+        plates.stiffness * k, plates.damping[:, None] * c, np.zeros(1), omega
+    )
+    (masses,) = attached_stiffness((), table.masses, np.array([omega]))
+    finger = table.fingertip.dynamic_stiffness(np.array(omega)) if table.fingertip else 0.0
+    d = len(springs)
+    stiffness = np.hstack(
+        [
+            springs - omega**2 * m,
+            np.broadcast_to(masses, (d, len(masses))),
+            plates.load * finger,
+        ]
+    )
+    shapes = np.vstack([table.attachment_shapes, discs[:, 0]])
+    scale = plates.thickness[:, None]
+    loss = 1 + 1j * table.plate.loss_factor * plates.loss[:, None]
+    modal = 1 / ((loss * (table.omega * scale) ** 2 - omega**2) * scale)
+    receptance = np.asarray((modal[:, None, :] * shapes) @ shapes.T, dtype=complex)
+    applied = np.zeros((*stiffness.shape, 1), dtype=complex)
+    gains = np.array([complex(era.gain(np.array(frequency))) for era in table.eras])
+    applied[:, : len(k), 0] = springs * plates.gain * gains * base
+    forces = coupled_forces(receptance, stiffness, applied)[:, :, 0]
+    found = -(omega**2) * (modal * (forces @ shapes)) @ discs.reshape(-1, discs.shape[-1]).T
+    weights = np.abs(base) / [era.stroke for era in table.eras]
+    size = math.sqrt(float(table.error_power[row] @ weights**2))
+    return np.asarray((found + size * np.repeat(plates.deviation, discs.shape[1], axis=1)).T)
+
+
+_ERA_KEYS = ("stiffness", "damping", "bolt_mass")

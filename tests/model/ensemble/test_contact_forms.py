@@ -1,0 +1,163 @@
+"""Fields at loading fingertips and their sensitivities, by differences of the direct solve."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.ensemble.attached_plate import attach
+from model.ensemble.contact_forms import load_contacts
+from model.ensemble.draws import draw
+from model.ensemble.tone_responses import Tones, tone_responses
+from model.fem.assembly import assemble
+from model.fem.harmonic import direct_acceleration
+from model.finger.disc import FIVE_POINTS
+from model.finger.fingertip import FINGERTIP_RADIUS
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.uncertainty import Uncertainty
+from model.structure.fingertip import FingertipLoad
+from model.structure.point_load import PointLoad, footprints_of
+from paper_table import smooth_rig
+
+PLACES = np.array([[0.09, 0.07], [0.25, 0.18], [0.03, 0.19]])
+FREQUENCIES = np.array([60.0, 145.0, 260.0, 430.0])
+RIG = replace(smooth_rig(), masses=(PointLoad(0.2, 0.05, mass=0.03),))
+POINTS = PLACES[:, None] + FINGERTIP_RADIUS * FIVE_POINTS.points
+
+
+def solved(uncertainty):
+    """The plate with three fingers on it; reduced for them too, so that nothing is left out."""
+    fixed = footprints_of(RIG.eras, RIG.masses)
+    fingers = np.column_stack([PLACES, np.zeros(3)])
+    reduced = reduce_plate(RIG.plate, RIG.mesh, np.vstack([fixed, fingers]), frequency_max=500.0)
+    plate = attach(
+        RIG.plate,
+        reduced.omega,
+        reduced.at(fixed),
+        eras=RIG.eras,
+        masses=RIG.masses,
+        fingertip=RIG.fingertip,
+        uncertainty=uncertainty,
+        frequencies=FREQUENCIES,
+    )
+    shapes = reduced.at(POINTS.reshape(-1, 2)).astype(np.float32).reshape(3, 5, -1)
+    weights = np.tile(FIVE_POINTS.weights, (3, 1)).astype(np.float32)
+    contacts = load_contacts(plate, shapes, weights, np.zeros((4, 4), np.float32), is_by_point=True)
+    return plate, contacts, shapes
+
+
+def directly(*, thickness=1.0, loss=1.0, damping=1.0, stiffness=(1, 1, 1, 1), load=(1, 1, 1)):
+    """Fields (f, eras, points) of a plate that differs by these factors."""
+    plate = replace(
+        RIG.plate,
+        thickness=thickness * RIG.plate.thickness,
+        loss_factor=loss * RIG.plate.loss_factor,
+    )
+    eras = [
+        replace(era, stiffness=k * era.stiffness, damping=damping * era.damping)
+        for era, k in zip(RIG.eras, stiffness, strict=True)
+    ]
+    fingers = [
+        FingertipLoad(*place, RIG.fingertip.multiplied(factor))
+        for place, factor in zip(PLACES, load, strict=True)
+    ]
+    return direct_acceleration(
+        assemble(plate, RIG.mesh),
+        eras,
+        FREQUENCIES,
+        POINTS.reshape(-1, 2),
+        loads=[*RIG.masses, *fingers],
+    )
+
+
+def test_fields_are_those_of_the_direct_solve():
+    """At every finger's points, with an ERA's drive and a mass on the plate: to 1e-4."""
+    _, contacts, _ = solved(Uncertainty())
+    found = contacts.fields.transpose(0, 3, 1, 2).reshape(4, 4, 15)
+    exact = directly()
+    error = np.abs(found - exact).max(axis=(1, 2)) / np.abs(exact).max(axis=(1, 2))
+    assert error.max() < 2e-4
+
+
+CHANGES = {
+    1: lambda d: {"thickness": 1 + d},
+    2: lambda d: {"loss": math.exp(d)},
+    3: lambda d: {"damping": math.exp(d)},
+    5: lambda d: {"stiffness": (1, 1 + d, 1, 1)},
+    9: lambda d: {"load": (1, 1 + d, 1)},
+}
+
+
+@pytest.mark.parametrize("column", CHANGES)
+def test_sensitivities_are_differences_of_the_direct_solve(column):
+    """Columns of the tone responses: thickness, loss, damping, an ERA's stiffness, a load.
+
+    Central differences of the whole loaded plate, relative to the largest change: within 1 %.
+    """
+    uncertainty = Uncertainty(0, 0, 1.0, 1.0, math.e, 1.0)
+    plate, contacts, shapes = solved(uncertainty)
+    weights = np.array([0.6, -0.3 + 0.5j, 1.0, 0.2j], dtype=np.complex64)
+    tones = Tones(np.arange(4), np.tile(weights, (4, 1)))
+    found = tone_responses(plate, contacts, tones, shapes.reshape(15, -1))
+    step = 1e-3
+    more, less = (directly(**CHANGES[column](d)) for d in (step, -step))
+    exact = np.einsum("e,fep->fp", weights, (more - less) / (2 * step))
+    error = np.abs(found[:, :, column] - exact).max(axis=1) / np.abs(exact).max(axis=1)
+    assert error.max() < 0.01
+
+
+def test_responses_add_up_from_the_parts_of_each_era():
+    """The nominal response is the sum of the columns that the gains multiply."""
+    plate, contacts, shapes = solved(Uncertainty())
+    tones = Tones(np.array([1, 3]), np.array([[1, 2j, -1, 0.5]] * 2, dtype=np.complex64))
+    found = tone_responses(plate, contacts, tones, shapes.reshape(15, -1))
+    np.testing.assert_allclose(found[:, :, -4:].sum(axis=2), found[:, :, 0], rtol=1e-3, atol=1e-2)
+
+
+@pytest.mark.parametrize("is_by_point", [False, True])
+def test_expected_power_is_the_mean_square_of_the_draws(is_by_point):
+    """w^H R w of random weights equals the mean over 4000 drawn plates but for the loss factor."""
+    plate, contacts, shapes = solved(replace(Uncertainty(), damping=1.0))
+    rng = np.random.default_rng(0)
+    weights = (rng.normal(size=(4, 4)) + 1j * rng.normal(size=(4, 4))).astype(np.complex64)
+    responses = tone_responses(
+        plate, contacts, Tones(np.arange(4), weights), shapes.reshape(15, -1)
+    )
+    draws = draw(4, 3, count=4000, seed=5, gain=plate.gain, phase=plate.phase)
+    powers = (np.abs(responses @ draws.factors) ** 2).mean(axis=2).reshape(4, 3, 5)
+    if is_by_point:
+        forms, drawn = contacts.point_power, powers[:, -1]
+    else:
+        forms, drawn = contacts.power, powers @ FIVE_POINTS.weights
+    found = np.einsum("fi,fqij,fj->fq", weights.conj(), forms, weights).real
+    np.testing.assert_allclose(found, drawn, rtol=0.05)
+
+
+def test_without_errors_the_best_contrast_does_not_depend_on_the_mounts():
+    """Springs and dampers act where drives act anyway: R^-1 bounds the same ratio for any of them.
+
+    Quiet at one finger's centre only, no uncertainty, weightless fingers.
+    """
+    ratios = []
+    for factor in (1.0, 3.0):
+        eras = tuple(replace(era, stiffness=factor * era.stiffness) for era in RIG.eras)
+        reduced = reduce_plate(RIG.plate, RIG.mesh, footprints_of(eras), frequency_max=500.0)
+        plate = attach(
+            RIG.plate,
+            reduced.omega,
+            reduced.at(footprints_of(eras)),
+            eras=eras,
+            masses=(),
+            fingertip=None,
+            uncertainty=Uncertainty.none(),
+            frequencies=FREQUENCIES,
+        )
+        shapes = reduced.at(POINTS.reshape(-1, 2)).astype(np.float32).reshape(3, 5, -1)
+        weights = np.tile(FIVE_POINTS.weights, (3, 1)).astype(np.float32)
+        found = load_contacts(plate, shapes, weights, np.zeros((4, 4), np.float32))
+        h = found.fields[:, 0, 0].astype(complex)
+        q = found.fields[:, 1].astype(complex)
+        R = np.einsum("fpi,fpj->fij", q.conj(), q)
+        ratios.append(np.einsum("fi,fij,fj->f", h, np.linalg.inv(R), h.conj()).real)
+    np.testing.assert_allclose(ratios[0], ratios[1], rtol=0.02)

@@ -1,0 +1,215 @@
+"""Plates within the uncertainty, by the direct solver, and what answers promise of them."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.ensemble.measures import percentile
+from model.fem.assembly import assemble
+from model.fem.harmonic import direct_acceleration
+from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.perception import detection_threshold
+from model.rig.uncertainty import Uncertainty
+from model.structure.fingertip import FingertipLoad
+from model.structure.point_load import PointLoad
+from model.table.build import build_table
+from model.table.exact_plates import Plates, draw_plates, felt_on
+from model.table.question import Question
+from model.vibration.peak import base_amplitudes
+from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
+
+TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18), (0.03, 0.19))
+
+PLATES = Plates(
+    thickness=np.array([1.0, 1.02, 0.98]),
+    loss=np.array([1.0, 2.0, 0.5]),
+    damping=np.array([1.0, 0.5, 2.0]),
+    stiffness=np.array([[1.0, 1.0, 1.0, 1.0], [0.9, 1.1, 1.0, 0.95], [1.1, 1.0, 0.92, 1.05]]),
+    load=np.array([[1.0, 1.0, 1.0], [0.5, 2.0, 1.5], [1.8, 0.6, 1.0]]),
+    gain=np.array(
+        [[1, 1, 1, 1], [1.05, 0.96, 1.02, np.exp(0.1j)], [np.exp(-0.08j), 1, 0.93, 1]],
+        dtype=complex,
+    ),
+    deviation=np.zeros((3, 3), dtype=complex),
+)
+
+
+def directly(rig, pattern, number, *, targets=1):
+    """Felt and acceleration contrast [dB] by the sparse direct solve of that plate.
+
+    targets: how many of the places are; the weakest one counts.
+    """
+    plate = replace(
+        rig.plate,
+        thickness=rig.plate.thickness * PLATES.thickness[number],
+        loss_factor=rig.plate.loss_factor * PLATES.loss[number],
+    )
+    eras = [
+        replace(era, stiffness=era.stiffness * k, damping=era.damping * PLATES.damping[number])
+        for era, k in zip(rig.eras, PLATES.stiffness[number], strict=True)
+    ]
+    places = (TARGET, *QUIET)
+    fingers = [
+        FingertipLoad(*place, rig.fingertip.multiplied(factor))
+        for place, factor in zip(places, PLATES.load[number], strict=True)
+    ]
+    discs = [fingertip_points(*place, rig.plate) for place in places]
+    frequencies, bases = base_amplitudes(pattern.excitation, rig.eras)
+    unit = direct_acceleration(
+        assemble(plate, rig.mesh),
+        eras,
+        frequencies,
+        np.concatenate(discs),
+        loads=[*rig.masses, *fingers],
+    )
+    weights = bases / [era.stroke for era in rig.eras] * PLATES.gain[number]
+    amplitudes = np.abs(np.einsum("fe,fep->fp", weights, unit))
+    above = np.sqrt(((amplitudes.T / detection_threshold(frequencies)) ** 2).sum(axis=1))
+    found = []
+    for values in (above, amplitudes.sum(axis=0)):
+        each = np.split(values, np.cumsum([len(disc) for disc in discs])[:-1])
+        means = [
+            here @ fingertip_weights(*place, rig.plate)
+            for here, place in zip(each[:targets], places, strict=False)
+        ]
+        found.append(20 * np.log10(min(means) / np.concatenate(each[targets:]).max()))
+    return found
+
+
+@pytest.mark.parametrize(("targets", "mode"), [(1, "switched"), (1, "phased"), (2, "switched")])
+def test_felt_on_agrees_with_the_direct_solve(targets, mode):
+    """Thicker, softer, damped otherwise, misdriven, other fingers on it: within 0.15 dB."""
+    places = (TARGET, *QUIET)
+    question = Question(places[:targets], places[targets:], drive_mode=mode)
+    pattern = smooth_table().query(question)
+    contrast = felt_on(smooth_table(), question, pattern.excitation, PLATES).contrast
+    found = 20 * np.log10([contrast.felt[0], contrast.acceleration[0]]).T
+    solved = [directly(smooth_rig(), pattern, number, targets=targets) for number in range(3)]
+    np.testing.assert_allclose(found, solved, atol=0.15)
+    assert np.ptp(solved) > 0.3  # the plates do differ
+
+
+def test_felt_on_includes_measured_gains_bolts_and_masses():
+    """Contrast on each plate is that of the direct solve."""
+    rig = smooth_rig()
+    measured = ((1.0, 0.0), (0.6, 0.8), (1.3, -0.5), (0.8, 0.2))
+    eras = tuple(
+        replace(era, gains=((100.0, *gain),), bolt_mass=0.012)
+        for era, gain in zip(rig.eras, measured, strict=True)
+    )
+    rig = replace(rig, eras=eras, masses=(PointLoad(0.2, 0.05, mass=0.03),))
+    table = build_table(rig, frequencies=np.array([110.0, 250.0]))
+    question = Question((TARGET,), QUIET, drive_mode="phased")
+    pattern = table.query(question)
+    found = 20 * np.log10(felt_on(table, question, pattern.excitation, PLATES).contrast.felt[0])
+    solved = [directly(rig, pattern, number)[0] for number in range(3)]
+    np.testing.assert_allclose(found, solved, atol=0.15)
+
+
+def test_discretisation_error_enters_the_contrast_of_plates():
+    """An error that drowns one finger's response trades places with it; twice the error is 6 dB.
+
+    Far above the response it is the whole amplitude D there: D over quiet and target over D make
+    target over quiet.
+    """
+    question = Question((TARGET,), QUIET[:1], drive_mode="phased")
+    table = smooth_table()
+    excitation = table.query(question).excitation
+    plates = replace(
+        draw_plates(
+            np.random.default_rng(0), Uncertainty.none(), count=3, era_count=4, contact_count=2
+        ),
+        deviation=1e6 * np.array([[0, 0], [1, 0], [0, 1j]]),
+    )
+
+    def contrasts(of):
+        return 20 * np.log10(felt_on(of, question, excitation, plates).contrast.felt[0])
+
+    right, at_target, at_quiet = contrasts(table)
+    assert at_target + at_quiet == pytest.approx(right, abs=0.01)
+    worse = replace(table, discretisation_error=2 * table.discretisation_error)
+    found = contrasts(worse) - [right, at_target, at_quiet]
+    assert found == pytest.approx([0, 6.02, -6.02], abs=0.01)
+
+
+def test_error_power_is_the_error_of_the_direct_field():
+    """One ERA driven: its field over the plate by the direct solve, mean square, times it."""
+    rig, table = smooth_rig(), smooth_table()
+    frequency = float(table.frequencies[8])
+    direct = direct_acceleration(
+        assemble(rig.plate, rig.mesh), rig.eras, np.array([frequency]), table.raster.points
+    )[0, 1]
+    expected = table.discretisation_error[8] ** 2 * (np.abs(direct) ** 2).mean()
+    assert table.error_power[8, 1] == pytest.approx(expected, rel=1e-3)
+
+
+def test_draw_plates_has_the_spreads_of_the_uncertainty():
+    """Normal numbers: of the logarithm for damping, loss and load."""
+    plates = draw_plates(
+        np.random.default_rng(0), Uncertainty(), count=4000, era_count=3, contact_count=2
+    )
+    spreads = [
+        (np.abs(plates.gain), 0.05),
+        (np.degrees(np.angle(plates.gain)), 5.0),
+        (plates.stiffness, 0.1),
+        (plates.thickness, 0.02),
+        (np.log(plates.damping), math.log(1.5)),
+        (np.log(plates.loss), math.log(1.5)),
+        (np.log(plates.load), 0.5),
+    ]
+    for values, spread in spreads:
+        assert values.std() == pytest.approx(spread, rel=0.04)
+
+
+@pytest.mark.parametrize("mode", ["switched", "phased"])
+def test_promises_are_kept_on_nine_of_ten_plates(mode):
+    """On 200 fresh plates each, level and felt contrast of 16 answers: 85 to 95 % of all."""
+    table = smooth_table()
+    rng = np.random.default_rng(3)
+    level_kept, contrast_kept, typical = [], [], []
+    for number, places in enumerate(contact_sets(16, fingers=4, seed=41)):
+        count = 1 + number % 3
+        question = Question((places[0],), tuple(places[1 : 1 + count]), drive_mode=mode)
+        pattern = table.query(question)
+        plates = draw_plates(
+            rng, table.uncertainty, count=200, era_count=4, contact_count=1 + count
+        )
+        felt = felt_on(table, question, pattern.excitation, plates)
+        contrasts = 20 * np.log10(felt.contrast.felt[0])
+        level_kept.append(20 * np.log10(felt.level[0]) >= pattern.robust_level_db_sl)
+        contrast_kept.append(contrasts >= pattern.robust_felt_contrast_db)
+        typical.append(np.median(contrasts) - pattern.median_felt_contrast_db)
+    assert 0.85 <= np.mean(level_kept) <= 0.95
+    assert 0.85 <= np.mean(contrast_kept) <= 0.95
+    assert np.mean(typical) == pytest.approx(0.0, abs=0.4)
+
+
+def test_more_uncertainty_promises_less():
+    """With nothing unknown the promise is the nominal figure; spreads twice as large cost."""
+    rig, places = smooth_rig(), contact_sets(6, fingers=3, seed=5)
+    promises = []
+    for scale in (0.0, 0.5, 1.0, 1.5):
+        known = Uncertainty(
+            0.05 * scale, 5 * scale, 0.02 * scale, 0.1 * scale, 1.5**scale, 0.5 * scale
+        )
+        table = build_table(replace(rig, uncertainty=known), frequencies=FREQUENCIES)
+        patterns = [
+            table.query(Question((target,), tuple(quiet), drive_mode="phased"))
+            for target, *quiet in places
+        ]
+        promises.append([pattern.robust_felt_contrast_db for pattern in patterns])
+        if scale == 0.0:
+            nominal = [pattern.felt_contrast_db for pattern in patterns]
+            np.testing.assert_allclose(promises[0], nominal, atol=1.5)
+    assert (np.diff(promises, axis=0) < 0.5).all()
+    assert (np.diff(np.mean(promises, axis=1)) < -0.5).all()
+
+
+def test_percentile_is_that_of_numpy():
+    """Linear between values."""
+    values = np.random.default_rng(0).normal(size=(3, 64))
+    for percent in (10, 50, 90):
+        expected = np.percentile(values, percent, axis=1)
+        np.testing.assert_allclose(percentile(values, percent), expected)

@@ -1,0 +1,19 @@
+"""A drive's score and level, tone by tone from the forms."""
+
+import numpy as np
+
+from model.drive_modes.forms import Forms, Weights
+
+
+def by_hand(forms: Forms, drive: Weights) -> tuple[float, float]:
+    """Robust score, and amplitude to threshold at the weakest target: powers of tones add."""
+    target = np.zeros(len(forms.targets))
+    quiet = np.zeros(forms.quiet.shape[1])
+    for f in sorted({*drive.frequencies.tolist()} - {-1}):
+        w = np.where(drive.frequencies == f, drive.values, 0).astype(complex)
+        squared = float(forms.threshold[f]) ** 2
+        for t, field in enumerate(forms.targets[:, f].astype(complex)):
+            target[t] += abs(field @ w) ** 2 / squared
+        for q, form in enumerate(forms.quiet[f].astype(complex)):
+            quiet[q] += (w.conj() @ form @ w).real / squared
+    return float(np.sqrt(target.min() / quiet.max())), float(np.sqrt(target.min()))

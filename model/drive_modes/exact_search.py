@@ -242,8 +242,8 @@ class _Search:
 
         loud = total(self._quiet).max(axis=1)
         powers = np.array([total(target) for target in self._targets])
-        spread = np.array([total(variance) for variance in self._variance])
-        reached = np.sqrt(powers) - self._forms.level_margin * np.sqrt(spread)
+        variance = np.array([total(each) for each in self._variance])
+        reached = np.sqrt(powers) - self._forms.level_margin * np.sqrt(variance)
         reaches = (reached >= self._forms.wanted).all(axis=0)
         ratio = np.where(reaches, powers.min(axis=0) / loud, 0.0)
         best = int(ratio.argmax())

@@ -96,8 +96,8 @@ class Forms:
         """Whether weights (f, eras) reach the wanted level at all targets, (f,)."""
         least = amplitude = self._amplitudes(weights)
         if self.level_margin:
-            spread = expected_power(self.target_power, weights) - amplitude * amplitude
-            deviation = np.sqrt(np.maximum(spread, 0))
+            variance = expected_power(self.target_power, weights) - amplitude * amplitude
+            deviation = np.sqrt(np.maximum(variance, 0))
             least = np.asarray(amplitude - np.float32(self.level_margin) * deviation)
         return np.asarray(np.logical_and.reduce(least >= self.wanted * self.threshold, axis=0))
 

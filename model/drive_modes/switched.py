@@ -5,7 +5,7 @@ frequencies make 4 * 27 + 6 * 27² = 4482 patterns, six and 361 two millions. Ev
 source or the sum of two: an ERA at a frequency, or a pair of ERAs at the same one
 (`model.drive_modes.exact_search` drives more of them).
 
-The powers of its sources, each over the squared threshold of its frequency, add to what is felt, at
+The powers of its sources, each over the threshold_power threshold of its frequency, add to what is felt, at
 the target and at every quiet fingertip. Patterns are not enumerated: the maximum over the quiet
 fingertips is at least any weighted mean, and the mean of a sum is the sum of the means. So a
 pattern of a power ratio above c needs
@@ -35,10 +35,10 @@ ALTERNATIVES = 6
 
 @dataclass(frozen=True, eq=False)
 class SourcePowers:
-    """What each group of ERAs does at full stroke at each frequency, in squared thresholds.
+    """What each group of ERAs does at full stroke at each frequency, in threshold_power thresholds.
 
     target (t, groups, f): power of the mean amplitude at each target; reserve (t, groups, f):
-    standard deviation of that power's root, squared; quiet (q, groups, f): expected power.
+    standard deviation of that power's root, threshold_power; quiet (q, groups, f): expected power.
     """
 
     target: Float32Array
@@ -48,13 +48,13 @@ class SourcePowers:
 
 def source_powers(forms: Forms, members: NDArray[np.float32]) -> SourcePowers:
     """Powers of groups of ERAs, members (groups, eras) 1 or 0."""
-    squared = (forms.threshold**2)[None, None]
-    amplitude = np.abs(forms.targets @ members.T).transpose(0, 2, 1) ** 2 / squared
-    expected = group_powers(forms.target_power, members) / squared
+    threshold_power = (forms.threshold**2)[None, None]
+    amplitude = np.abs(forms.targets @ members.T).transpose(0, 2, 1) ** 2 / threshold_power
+    expected = group_powers(forms.target_power, members) / threshold_power
     return SourcePowers(
         amplitude.astype(np.float32),
         np.maximum(expected - amplitude, 0).astype(np.float32),
-        (group_powers(forms.quiet.swapaxes(0, 1), members) / squared).astype(np.float32),
+        (group_powers(forms.quiet.swapaxes(0, 1), members) / threshold_power).astype(np.float32),
     )
 
 
@@ -78,9 +78,9 @@ def find_switched(forms: Forms, min_score: float) -> list[tuple[float, Weights]]
     quiet = powers.quiet.reshape(len(powers.quiet), -1)
     mean_target = target.mean(axis=0)
 
-    def score(at: Float32Array, spread: Float32Array, loud: Float32Array) -> Float32Array:
+    def score(at: Float32Array, variance: Float32Array, loud: Float32Array) -> Float32Array:
         """Power ratio (n,), 0 where the level is not reached; from sums (t, n), (t, n), (q, n)."""
-        reached = np.sqrt(at) - np.float32(forms.level_margin) * np.sqrt(spread)
+        reached = np.sqrt(at) - np.float32(forms.level_margin) * np.sqrt(variance)
         reaches = (reached >= forms.wanted).all(axis=0)
         return np.asarray(
             np.where(reaches, at.min(axis=0) / np.maximum(loud.max(axis=0), 1e-30), 0)

@@ -93,21 +93,21 @@ def load_contacts(
     )
     moved = motion.take(j, axis=1) * changes[:, :, None]
     outer = _outer(moved).reshape(f, len(j), -1)
-    reach = _squared(to_points.take(j, axis=2)) * weights.reshape(1, k * p, 1)
+    reach = _power_of(to_points.take(j, axis=2)) * weights.reshape(1, k * p, 1)
     shares = np.add.reduce(reach.reshape(f, k, p, -1), axis=2)
     by_change = (shares @ outer.view(np.float32)).view(np.complex64).reshape(f, k, n, n)
     power = stacked.conj().swapaxes(2, 3) @ stacked + by_change
-    size = np.add.reduce((_squared(h) * weights.reshape(1, -1, 1)).reshape(f, k, p, n), axis=2)
+    size = np.add.reduce((_power_of(h) * weights.reshape(1, -1, 1)).reshape(f, k, p, n), axis=2)
     _add_diagonal(power, plate.gain_variance * size + error_power[:, None])
     point_power = None
     if is_by_point:
         last = slice(-p, None)
         each = np.stack([part[:, last] for part in parts], axis=2)
-        by_each = _squared(to_points[:, last].take(j, axis=2)) @ outer.view(np.float32)
+        by_each = _power_of(to_points[:, last].take(j, axis=2)) @ outer.view(np.float32)
         point_power = each.conj().swapaxes(2, 3) @ each
         point_power += by_each.view(np.complex64).reshape(f, p, n, n)
         _add_diagonal(
-            point_power, plate.gain_variance * _squared(h[:, last]) + error_power[:, None]
+            point_power, plate.gain_variance * _power_of(h[:, last]) + error_power[:, None]
         )
     return LoadedContacts(
         shapes, stiffness, inverse, forces, motion, h.reshape(f, k, p, n), power, point_power
@@ -166,7 +166,7 @@ def _outer(rows: Complex64Array) -> Complex64Array:
     return np.asarray(rows.conj()[..., :, None] * rows[..., None, :])
 
 
-def _squared(values: Complex64Array) -> Float32Array:
+def _power_of(values: Complex64Array) -> Float32Array:
     """Squared magnitude."""
     return np.asarray(values.real * values.real + values.imag * values.imag)
 

@@ -11,9 +11,9 @@ def by_hand(forms: Forms, drive: Weights) -> tuple[float, float]:
     quiet = np.zeros(forms.quiet.shape[1])
     for f in sorted({*drive.frequencies.tolist()} - {-1}):
         w = np.where(drive.frequencies == f, drive.values, 0).astype(complex)
-        squared = float(forms.threshold[f]) ** 2
+        threshold_power = float(forms.threshold[f]) ** 2
         for t, field in enumerate(forms.targets[:, f].astype(complex)):
-            target[t] += abs(field @ w) ** 2 / squared
+            target[t] += abs(field @ w) ** 2 / threshold_power
         for q, form in enumerate(forms.quiet[f].astype(complex)):
-            quiet[q] += (w.conj() @ form @ w).real / squared
+            quiet[q] += (w.conj() @ form @ w).real / threshold_power
     return float(np.sqrt(target.min() / quiet.max())), float(np.sqrt(target.min()))

@@ -150,7 +150,7 @@ def test_draw_plates_has_the_spreads_of_the_uncertainty():
     plates = draw_plates(
         np.random.default_rng(0), Uncertainty(), count=4000, era_count=3, contact_count=2
     )
-    spreads = [
+    expected_stds = [
         (np.abs(plates.gain), 0.05),
         (np.degrees(np.angle(plates.gain)), 5.0),
         (plates.stiffness, 0.1),
@@ -159,8 +159,8 @@ def test_draw_plates_has_the_spreads_of_the_uncertainty():
         (np.log(plates.loss), math.log(1.5)),
         (np.log(plates.load), 0.5),
     ]
-    for values, spread in spreads:
-        assert values.std() == pytest.approx(spread, rel=0.04)
+    for values, std in expected_stds:
+        assert values.std() == pytest.approx(std, rel=0.04)
 
 
 @pytest.mark.parametrize("mode", ["switched", "phased"])
@@ -187,7 +187,7 @@ def test_promises_are_kept_on_nine_of_ten_plates(mode):
 
 
 def test_more_uncertainty_promises_less():
-    """With nothing unknown the promise is the nominal figure; spreads twice as large cost."""
+    """With nothing unknown the promise is the nominal figure; expected_stds twice as large cost."""
     rig, places = smooth_rig(), contact_sets(6, fingers=3, seed=5)
     promises = []
     for scale in (0.0, 0.5, 1.0, 1.5):

@@ -66,6 +66,23 @@ def test_batch_answers_line_by_line(table_file, tmp_path, has_errors):
     assert len(errors) == 2 * has_errors
 
 
+def test_batch_takes_options_as_defaults_of_its_lines(table_file, tmp_path):
+    """Level, mode and envelopes of the command hold where a line leaves them out."""
+    batch = tmp_path / "b.jsonl"
+    place = '"target": [0.1, 0.1], "quiet": [[0.2, 0.15]]'
+    own = '"mode": "signed", "level_db_sl": 9, "envelopes": false'
+    batch.write_text("{" + place + "}\n{" + place + ", " + own + "}\n")
+    options = "--level 14 --mode phased --envelopes"
+    command = ["table", "query", str(table_file), "--batch", str(batch), *options.split()]
+    result = RUNNER.invoke(app, command)
+    default, given = map(json.loads, result.stdout.splitlines())
+    assert (default["mode"], given["mode"]) == ("phased", "signed")
+    assert default["robust_level_db_sl"] == pytest.approx(14.0)
+    assert given["robust_level_db_sl"] == pytest.approx(9.0)
+    assert default["onset"] is not None
+    assert given["onset"] is None
+
+
 def test_batch_refuses_a_file_that_is_not_utf_8(table_file, tmp_path):
     """The error names the option."""
     (tmp_path / "b.jsonl").write_bytes(b"\xff\xfe")

@@ -5,7 +5,7 @@ frequencies make 4 * 27 + 6 * 27² = 4482 patterns, six and 361 two millions. Ev
 source or the sum of two: an ERA at a frequency, or a pair of ERAs at the same one
 (`model.drive_modes.exact_search` drives more of them).
 
-The powers of its sources, each over the threshold_power threshold of its frequency, add to what is felt, at
+The powers of its sources, each over the squared threshold of its frequency, add to what is felt, at
 the target and at every quiet fingertip. Patterns are not enumerated: the maximum over the quiet
 fingertips is at least any weighted mean, and the mean of a sum is the sum of the means. So a
 pattern of a power ratio above c needs
@@ -35,10 +35,10 @@ ALTERNATIVES = 6
 
 @dataclass(frozen=True, eq=False)
 class SourcePowers:
-    """What each group of ERAs does at full stroke at each frequency, in threshold_power thresholds.
+    """What each group of ERAs does at full stroke at each frequency, in squared thresholds.
 
-    target (t, groups, f): power of the mean amplitude at each target; reserve (t, groups, f):
-    standard deviation of that power's root, threshold_power; quiet (q, groups, f): expected power.
+    target (t, groups, f): power of the mean amplitude at each target; variance (t, groups, f): of
+    that amplitude; quiet (q, groups, f): expected power.
     """
 
     target: Float32Array

@@ -12,7 +12,8 @@ from controller.daemon.active_layout import ActiveLayout
 from controller.daemon.api_service import ApiService
 from controller.daemon.api_views import amplifier_statuses
 from controller.daemon.child_processes import ChildProcesses
-from controller.daemon.config import DaemonConfig, load_daemon_config
+from controller.daemon.config import DaemonConfig
+from controller.daemon.config_reader import read_in_child
 from controller.daemon.dashboard_token import write_token
 from controller.daemon.fault_dumps import FaultDumps
 from controller.daemon.log import LogThread
@@ -285,7 +286,7 @@ class Daemon:
 
 def _read(old: DaemonConfig, initial: DaemonConfig) -> tuple[DaemonConfig, list[str], list[str]]:
     """Read the configuration again; return it, its changed keys, and those that need a restart."""
-    with without_collections():  # of what a large layout is parsed to
-        new = load_daemon_config(old.source)
+    with without_collections():  # of a large layout
+        new = read_in_child(old.source)
     restart = [key for key in changed_keys(initial, new) if key in DEFERRED]
     return new, changed_keys(old, new), restart

@@ -106,7 +106,7 @@ async def test_reload_ends_after_unexpected_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The service manager gets the end of it, and the next reload works."""
-    async with running_daemon(tmp_path) as bench:
+    async with ready_daemon(tmp_path) as (bench, _):
         notices: list[str] = []
         manager = bench.daemon._manager
         monkeypatch.setattr(manager, "reloading", lambda: notices.append("reloading"))
@@ -116,7 +116,7 @@ async def test_reload_ends_after_unexpected_error(
             raise RuntimeError("injected")
 
         with monkeypatch.context() as patched:
-            patched.setattr("controller.daemon.daemon.load_daemon_config", fail)
+            patched.setattr("controller.daemon.daemon.read_in_child", fail)
             await bench.daemon.reload()
         await bench.daemon.reload()
         assert notices == ["reloading", "ready"] * 2

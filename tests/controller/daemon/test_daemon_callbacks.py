@@ -2,11 +2,15 @@
 
 from pathlib import Path
 
+import pytest
+
 from callback_times import measured_callbacks
+from controller.daemon.config_reader import read_in_child
 from controller.sources.capture import HEADER
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
 from daemon_bench import ENABLED, ready_daemon, until
+from model.errors import InputError
 
 REGIONS = 64  # as many as a layout may have
 
@@ -48,3 +52,26 @@ async def test_reload_costs_the_loop_nothing(tmp_path: Path) -> None:
         assert bench.daemon._config.layout is not None
         times.assert_short()
         assert (await era.status()).state == ENABLED
+
+
+async def test_reload_reads_its_files_in_another_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No thread of the daemon holds the interpreter's lock for it; problems come back as text."""
+
+    def fail(*arguments: object, **options: object) -> None:
+        raise AssertionError("read in the daemon's process")
+
+    write_layout(tmp_path / "large.yaml")
+    async with ready_daemon(tmp_path) as (bench, _):
+        for name in ("controller.daemon.config", "controller.effects.layout_file"):
+            monkeypatch.setattr(f"{name}.read_document", fail)
+        with (tmp_path / "daemon.yaml").open("a", encoding="utf-8") as file:
+            file.write("layout: large.yaml\n")
+        await bench.daemon.reload()
+        layout = bench.daemon._config.layout
+        assert layout is not None
+        assert len(layout.regions) == REGIONS
+    with pytest.raises(InputError) as raised:
+        read_in_child(tmp_path / "missing.yaml")
+    assert "missing.yaml" in str(raised.value)

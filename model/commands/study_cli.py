@@ -52,7 +52,7 @@ def study(
         str, typer.Option(metavar="NXxNY", help="Candidate places, edges included.")
     ] = "13x13",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random layouts.")] = 0,
-    workers: Annotated[int, typer.Option(min=1, max=256, help="Number of local processes.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Local processes, at most.")] = 1,
     cluster: Annotated[
         str | None,
         typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler."),
@@ -75,7 +75,7 @@ def study(
     from model.studies.ranking import check_supported_cases, rank
     from model.studies.run import run_study
     from model.studies.solve import DRIVES, study_problem
-    from model.studies.workers import on_cluster, on_processes
+    from model.studies.workers import on_cluster, on_processes, useful_processes
 
     document = read_document(rig_file)
     rig = rig_of(document, mesh=mesh)
@@ -101,7 +101,11 @@ def study(
             run = run_study(
                 problem,
                 cases,
-                workers=on_processes(workers) if cluster is None else on_cluster(cluster),
+                workers=(
+                    on_processes(useful_processes(problem, cases, workers))
+                    if cluster is None
+                    else on_cluster(cluster)
+                ),
                 finished=finished,
                 progress=advance,
             )

@@ -11,7 +11,7 @@ from model.errors import InputError
 from model.rig.rig import Rig
 from model.structure.support import MIN_RIGID_BODY_FREQUENCY, rigid_body_frequencies_of
 from model.studies.cases import OWN, VACANT, Cases
-from model.studies.solve import CaseResults
+from model.studies.solve import EQUAL, CaseResults
 from model.vibration.activation import MEDIAN
 
 GOOD_ENOUGH = 0.9
@@ -88,9 +88,11 @@ def rank(rig: Rig, cases: Cases, results: CaseResults, *, drive: int) -> Ranking
     """Rank cases of a rig by the median; those with too few ERAs for the drive are skipped."""
     medians = results.statistics[:, drive, MEDIAN]
     ranked = np.flatnonzero(~np.isnan(medians))
-    # Rounded, so that cases equal by symmetry stay in their order.
-    rounded = np.array([float(f"{median:.9g}") for median in medians[ranked]])
-    order = ranked[np.argsort(-rounded, kind="stable")]
+    falling = ranked[np.argsort(-medians[ranked], kind="stable")]
+    # Cases equal by symmetry, each nearly as good as the one before, stay in their order.
+    steps = medians[falling[1:]] < (1 - EQUAL) * medians[falling[:-1]]
+    groups = np.concatenate([[0], np.cumsum(steps)])[: len(falling)]
+    order = falling[np.lexsort((falling, groups))]
     return Ranking(cases, results, drive, order, are_supported(rig, cases))
 
 

@@ -10,7 +10,7 @@ from model.studies.finished import FinishedCases
 from model.studies.solve import CaseResults, StudyProblem
 from model.studies.workers import Workers
 
-# About a sixth of a second of work; handing a chunk over costs a cluster's scheduler milliseconds.
+# A twentieth of a second of work; to hand one over takes a cluster's scheduler milliseconds.
 CHUNK = 256
 
 

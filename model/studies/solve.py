@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import ComplexArray, FloatArray, IntArray
+from model.arrays import Complex64Array, FloatArray, IntArray
 from model.errors import InputError
 from model.fem.plate_mesh import check_frequencies
 from model.finger.perception import check_has_threshold
@@ -29,6 +29,8 @@ from model.vibration.activation import (
 DRIVES = ("1", "2", "all")
 """Numbers of active ERAs: the best single one, the best pair, and all of a case."""
 
+EQUAL = 1e-5
+"""Statistics that differ by less than this share are equal but for rounding."""
 
 DRIVE_NAMES = {"1": "best single ERA", "2": "best pair of ERAs", "all": "all ERAs"}
 
@@ -120,23 +122,26 @@ def _solve_layouts(
     receptances: Receptances,
     rows: IntArray,
     places: IntArray,
-    forces: ComplexArray,
+    forces: Complex64Array,
     results: CaseResults,
 ) -> None:
     """Fill in these rows of the results, of layouts with the same number of ERAs."""
     felt = felt_acceleration(receptances.frequencies)
-    sets = activation_sets(places.shape[1])
-    buffer = receptances.buffer(places.shape[1])
-    of_size = [
-        [number for number, members in enumerate(sets) if len(members) == size]
-        for size in (1, 2, places.shape[1])
-    ]
-    for case, at, force in zip(rows.tolist(), places, forces, strict=True):
-        every = cumulative_statistics(receptances.fields(at, force, buffer), felt=felt)
-        for drive, numbers in enumerate(of_size):
-            if not numbers:
-                continue
-            # Of sets that are equal by symmetry the first, not the one that rounding favours.
-            best = max(numbers, key=lambda number: float(f"{every[number, MEDIAN]:.9g}"))
-            results.statistics[case, drive] = every[best]
-            results.active[case, drive] = sum(1 << era for era in sets[best])
+    count = places.shape[1]
+    sets = activation_sets(count)
+    bits = np.array([sum(1 << era for era in members) for members in sets], dtype=np.uint64)
+    sizes = np.array([len(members) for members in sets])
+    of_drives = [np.flatnonzero(sizes == size) for size in (1, 2, count)]
+    buffer = receptances.buffer(count)
+    every = np.empty((len(rows), len(sets), len(STATISTICS)))
+    for number, (at, force) in enumerate(zip(places, forces, strict=True)):
+        every[number] = cumulative_statistics(receptances.fields(at, force, buffer), felt=felt)
+    for drive, numbers in enumerate(of_drives):
+        if not len(numbers):
+            continue
+        medians = every[:, numbers, MEDIAN]
+        # Of sets that are equal by symmetry the first, not the one that rounding favours.
+        equal = medians >= (1 - EQUAL) * medians.max(axis=1, keepdims=True)
+        best = numbers[equal.argmax(axis=1)]
+        results.statistics[rows, drive] = every[np.arange(len(rows)), best]
+        results.active[rows, drive] = bits[best]

@@ -15,6 +15,7 @@ from model.studies.cases import Cases
 from model.studies.receptances import Receptances
 from model.studies.solve import CaseResults, StudyProblem, solve_cases
 from model.version import code_version
+from model.vibration.activation import activation_sets
 
 Solved: TypeAlias = Iterator[tuple[int, CaseResults]]
 Workers: TypeAlias = Callable[[StudyProblem, Mapping[int, Cases]], Solved]
@@ -22,8 +23,19 @@ _Shared: TypeAlias = tuple[Receptances, tuple[Era, ...]]
 
 _CONNECT_TIMEOUT = 10.0  # s
 
+# Amplitudes, of sets of ERAs at points and frequencies, that take two seconds, twice as long as a
+# process needs to start.
+_WORTH_A_PROCESS = 1_500_000_000
+
 # Dask takes long to refuse what is not an address.
 _ADDRESS = re.compile(r"(tcp|tls)://[\w.\-\[\]:]+:\d{1,5}")
+
+
+def useful_processes(problem: StudyProblem, cases: Cases, most: int) -> int:
+    """How many processes are worth their start, up to most: a small study has one."""
+    eras = cases.places.shape[1]
+    size = len(problem.frequencies) * len(problem.points) * len(activation_sets(eras))
+    return max(1, min(most, size * len(cases) // _WORTH_A_PROCESS))
 
 
 def on_processes(count: int) -> Workers:

@@ -10,7 +10,7 @@ from itertools import combinations
 
 import numpy as np
 
-from model.arrays import ComplexArray, FloatArray, IntArray
+from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
 from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL, detection_threshold
 from model.structure.plate import Plate
@@ -55,9 +55,11 @@ def equal_area_points(plate: Plate, *, frequency_max: float) -> FloatArray:
 
 
 def cumulative_statistics(
-    acceleration: ComplexArray, *, felt: FloatArray | None = None
+    acceleration: ComplexArray | Complex64Array, *, felt: FloatArray | None = None
 ) -> FloatArray:
     """STATISTICS of every set of `activation_sets`, (sets, 6), from acceleration (f, eras, p).
+
+    In the precision of the acceleration.
 
     Points p must stand for equal areas. felt: (f,) from where a tone is felt, same unit as the
     acceleration; the unfelt share is that of the plate where a tone stays below, mean over the
@@ -65,27 +67,30 @@ def cumulative_statistics(
     """
     frequency_count, era_count, point_count = acceleration.shape
     sets = activation_sets(era_count)
-    peaks = np.empty((len(sets), point_count))
+    precision = acceleration.real.dtype
+    ones = np.ones((1, frequency_count), dtype=precision)
+    peaks = np.empty((len(sets), point_count), dtype=precision)
+    limits = None if felt is None else felt.astype(precision)[:, None]
     result = np.zeros((len(sets), len(STATISTICS)))
     # Two arrays for all sets: fresh ones, handed back to the system each time, cost as much again.
-    together = np.empty((frequency_count, point_count), dtype=complex)
-    amplitudes = np.empty((frequency_count, point_count))
+    together = np.empty((frequency_count, point_count), dtype=acceleration.dtype)
+    amplitudes = np.empty((frequency_count, point_count), dtype=precision)
     for row, active in enumerate(sets):
         fields = acceleration[:, active[0]]
         for era in active[1:]:
             fields = np.add(fields, acceleration[:, era], out=together)
         np.abs(fields, out=amplitudes)
-        peaks[row] = amplitudes.sum(axis=0)
-        if felt is not None:
-            result[row, -1] = np.count_nonzero(amplitudes < felt[:, None]) / amplitudes.size
+        np.matmul(ones, amplitudes, out=peaks[row : row + 1])
+        if limits is not None:
+            result[row, -1] = np.count_nonzero(amplitudes < limits) / amplitudes.size
     result[:, :-1] = _quartiles(peaks)
     return result
 
 
-def _quartiles(values: FloatArray) -> FloatArray:
+def _quartiles(values: FloatArray | Float32Array) -> FloatArray:
     """Minimum, quartiles and maximum of each row (n, p), (n, 5), as `np.quantile`, but faster."""
     low, high, share = _places_of_quartiles(values.shape[1])
-    ordered = np.sort(values, axis=-1)
+    ordered = np.asarray(np.sort(values, axis=-1), dtype=float)
     below = ordered[:, low]
     return np.asarray(below + share * (ordered[:, high] - below))
 

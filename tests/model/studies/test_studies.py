@@ -20,7 +20,7 @@ from model.studies.outcome import ranking_summary
 from model.studies.ranking import check_supported_cases, era_counts, rank
 from model.studies.run import CHUNK, run_study
 from model.studies.solve import DRIVES, CaseResults, solve_cases, study_problem
-from model.studies.workers import on_processes
+from model.studies.workers import on_processes, useful_processes
 from model.vibration.activation import MEDIAN, cumulative_statistics
 from paper_plate import make_paper_rig
 from studies import FREQUENCIES, chunks_of, same_to_the_bit, small_study
@@ -92,6 +92,15 @@ def test_acceleration_of_unequal_eras_equals_the_direct_solve():
     direct = direct_acceleration(assemble(rig.plate, rig.mesh), placed, FREQUENCIES, problem.points)
     fast = problem.solve().acceleration(cases.places_of(9), placed)
     np.testing.assert_allclose(fast, direct, rtol=1e-4, atol=1e-4 * np.abs(direct).max())
+
+
+def test_a_small_study_starts_no_processes(study):
+    """A few hundred layouts are solved sooner than a process has started; many share the work."""
+    problem, cases = study
+    assert useful_processes(problem, cases, 8) == 1
+    many = cases.take(np.zeros(4_000_000, dtype=int))
+    assert 1 < useful_processes(problem, many, 8) <= 8
+    assert useful_processes(problem, many, 2) == 2
 
 
 def test_statistics_include_point_masses(study):

@@ -15,7 +15,7 @@ from model.structure.plate import Plate
 _MAX_ELEMENTS_PER_SIDE = 1000
 _MIN_PERCENT, _MAX_PERCENT = 0.05, 10.0
 _DEFAULT_ACCURACY = 0.01  # places within 0.1 mm of an ERA's change the response as much
-_MAX_AUTO_NODES = 300_000  # a million degrees of freedom: minutes, and most of a machine's memory
+_MAX_NODES = 300_000  # a million degrees of freedom: minutes, and most of a machine's memory
 
 _STRIPS = " with strips of "
 
@@ -25,9 +25,8 @@ def mesh_of(
 ) -> PlateMesh:
     """The mesh `auto` or `auto A %`, accurate up to a frequency [Hz], or that of `parse_mesh`.
 
-    Both are of polynomials over the plate for an error of the response of A %, by default 1 %;
-    `auto` of finite elements where there would be too many. stiffness [N/m]: of the stiffest ERA;
-    foot [m]: radius of the smallest, 0 for a point.
+    Those are of polynomials over the plate for an error of the response of A %, by default 1 %.
+    stiffness [N/m]: of the stiffest ERA; foot [m]: radius of the smallest, 0 for a point.
     """
     words = text.split()
     if words[:1] != ["auto"]:
@@ -36,21 +35,13 @@ def mesh_of(
     polynomials = SpectralMesh.accurate(
         plate, frequency_max=frequency_max, accuracy=accuracy, stiffness=stiffness, foot=foot
     )
-    if polynomials is not None:
-        return polynomials
-    if words[1:]:
+    if polynomials is None:
         raise InputError(
             f"mesh: {text} must need at most {MAX_POLYNOMIALS} polynomials up to degree "
-            f"{MAX_DEGREE}, got more up to {frequency_max:g} Hz; use auto, then of elements, "
-            "or less accuracy"
+            f"{MAX_DEGREE}, got more up to {frequency_max:g} Hz; check the plate's sizes, lower "
+            "limits.frequency, or ask for less accuracy"
         )
-    mesh = Mesh.accurate(plate, frequency_max=frequency_max)
-    if mesh.node_count > _MAX_AUTO_NODES:
-        raise InputError(
-            f"auto must have at most {_MAX_AUTO_NODES} nodes, got {mesh} elements up to "
-            f"{frequency_max:g} Hz; check the plate's sizes, or lower limits.frequency"
-        )
-    return mesh
+    return polynomials
 
 
 def _accuracy(text: str) -> float:
@@ -92,7 +83,10 @@ def parse_mesh(text: str, plate: Plate) -> PlateMesh:
             f"mesh must have 1 to {_MAX_ELEMENTS_PER_SIDE} elements a side, got {nx}x{ny}"
         )
     element = element_of(match[3]) if match[3] else PAPER_ELEMENT
-    return Mesh(nx=nx, ny=ny, length=plate.length, width=plate.width, element=element, strip=strip)
+    mesh = Mesh(nx=nx, ny=ny, length=plate.length, width=plate.width, element=element, strip=strip)
+    if mesh.node_count > _MAX_NODES:
+        raise InputError(f"mesh must have at most {_MAX_NODES} nodes, got {mesh}")
+    return mesh
 
 
 def mesh_from_dict(values: Mapping[str, Any]) -> PlateMesh:

@@ -16,12 +16,13 @@ POLYNOMIALS = "Legendre"
 """Name in files and results, in place of an element's."""
 
 MIN_DEGREE = 4
-MAX_DEGREE = 100
+MAX_DEGREE = 200
 
 # Degrees beyond pi for each wavelength on a side: with so many the bending waves are resolved, and
-# with so many as accurately as 1 %, with further ones for each factor of ten below.
+# with so many as accurately as 1 %, with further ones for each factor of ten below; with more than
+# so many waves more in proportion to their cube root, as the turning point of a polynomial widens.
 _RESOLVES = 2
-_ACCURATE, _PER_DECADE = 4.3, 1.5
+_ACCURATE, _PER_DECADE, _MANY = 4.3, 1.5, 9.0
 
 # Error of the response by the unresolved compliance at the middle of an edge (measured on 23
 # plates) at degree _AT_DEGREE, and how it falls with the degree: per stiffness of an ERA, more on a
@@ -29,11 +30,16 @@ _ACCURATE, _PER_DECADE = 4.3, 1.5
 # infinite plate, since the field of a force is wrong elsewhere, too.
 _PER_STIFFNESS, _ON_SMALL_PLATES, _PER_WAVE_STIFFNESS, _AT_DEGREE = 0.1, 2.0, 0.02, 13
 _FALLS = 0.8
+_AS_IF_RIGID = (
+    10  # times the wave stiffness: an ERA much stiffer than that is no stiffer to a plate
+)
 
 _FINER = 2  # further degrees to compare with
 
-MAX_POLYNOMIALS = 5000
-"""Of the deflection; so many take half a minute of processor time and 1.3 GB."""
+MAX_POLYNOMIALS = 6000
+"""Of the deflection, that are chosen; they take half a minute of processor time and 1.5 GB."""
+
+_MAX_NAMED = 8000  # two minutes and 2 GB
 
 _POINTS_PER_DEGREE = 8  # of the raster that shows a field: fifty to a wavelength
 
@@ -56,6 +62,11 @@ class SpectralMesh:
             raise InputError(
                 f"mesh: degrees must be {MIN_DEGREE} to {MAX_DEGREE}, got {self.nx}x{self.ny}"
             )
+        count = (self.nx + 1) * (self.ny + 1)
+        if count > _MAX_NAMED:
+            raise InputError(
+                f"mesh: polynomials must be at most {_MAX_NAMED}, got {count}: {self.nx}x{self.ny}"
+            )
 
     @classmethod
     def accurate(
@@ -75,12 +86,15 @@ class SpectralMesh:
         """
         wavelength = plate.bending_wavelength(frequency_max)
         small = wavelength**2 / (plate.length * plate.width)
-        errors = _PER_STIFFNESS * (1 + _ON_SMALL_PLATES * small) * stiffness
-        errors += _PER_WAVE_STIFFNESS * plate.wave_stiffness(frequency_max)
+        wave_stiffness = plate.wave_stiffness(frequency_max)
+        acting = stiffness / (1 + stiffness / (_AS_IF_RIGID * wave_stiffness))
+        errors = _PER_STIFFNESS * (1 + _ON_SMALL_PLATES * small) * acting
+        errors += _PER_WAVE_STIFFNESS * wave_stiffness
         more = _ACCURATE + _PER_DECADE * max(0.0, math.log10(0.01 / accuracy))
         degrees = []
         for side in (plate.length, plate.width):
-            least = max(MIN_DEGREE, math.ceil(math.pi * side / wavelength + more))
+            waves = math.pi * side / wavelength
+            least = max(MIN_DEGREE, math.ceil(waves + more * max(1, waves / _MANY) ** (1 / 3)))
             possible = np.arange(least, MAX_DEGREE + 1)
             shares = errors * (_AT_DEGREE / possible) ** _FALLS
             accurate = shares * edge_compliance(plate, side, possible, foot) <= accuracy

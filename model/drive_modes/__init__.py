@@ -4,9 +4,9 @@ The modes are nested: each allows every drive of the more restricted ones, and r
 all modes up to its own. All but `switched` drive all ERAs at one frequency. The upper bound of a
 mode's score at a frequency also bounds the restricted modes and prunes most of their frequencies.
 
-For a single target, `phased` is at least as good as the others, up to unconverged iterations, so
-that it skips their search. It searches them for several targets, and where no weights reach the
-wanted level.
+For a single target a coherent mode is at least as good as the more restricted ones, up to
+unconverged iterations, so that it skips their search. It searches them for several targets, and
+where no weights reach the wanted level.
 
 Symbols here and in `model.table`: f frequencies, p points under the fingers, q quiet fingertips, r
 reduced modal coordinates; h field of an ERA at a point, R Hermitian form of the expected power at
@@ -93,7 +93,8 @@ def find_drives(forms: Forms, drive_mode: str) -> list[tuple[float, Weights]]:
         at = open_[better]
         score[at], weights[at] = found.score[better], found.weights[better]
         best = max(best, float(score.max()))
-        if name == "phased" and best > 0 and len(forms.targets) == 1:
+        is_done = name == "phased" or not found.is_level_limited
+        if best > 0 and is_done and len(forms.targets) == 1:
             break
         open_ = open_[found.bound > best]
     top = np.argsort(-score)[:ALTERNATIVES].tolist()

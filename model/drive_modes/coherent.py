@@ -36,7 +36,7 @@ PRUNE_MARGIN = 0.84
 """A frequency whose bound is below this times the best score is pruned: 1.5 dB, since the
 percentile decides among the best."""
 
-FIRST_BOUNDED = 8
+FIRST_BOUNDED = 6
 """Frequencies of the highest bounds at which a restricted mode is solved first."""
 
 # Sigma and gain, tried in turn where no weights reach the level: the quiet points count less
@@ -137,11 +137,14 @@ class CoherentResult:
     """The best weights (f, eras) at each frequency, and their robust score (f,).
 
     The score is 0 where none were found that reach the level. bound (f,): upper bound of the score.
+    is_level_limited: weights of a better score were found at a frequency where none reach the
+    level.
     """
 
     score: Float32Array
     weights: Complex64Array
     bound: Float32Array
+    is_level_limited: bool
 
 
 class _BestCandidates:
@@ -192,7 +195,8 @@ class _BestCandidates:
 
     def search(self) -> "CoherentResult":
         """Return the best weights at each frequency."""
-        return CoherentResult(self._scores, self._weights, self.bound)
+        is_level_limited = len(self.level_limited()) > 0
+        return CoherentResult(self._scores, self._weights, self.bound, is_level_limited)
 
 
 def _saturated(weights: Complex64Array, gain: float) -> Complex64Array:

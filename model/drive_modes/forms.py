@@ -9,7 +9,7 @@ Tones of different frequencies are felt together as the root of the sum of their
 detection thresholds, and so are a score's powers: each in units of its threshold.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,12 +80,13 @@ class Forms:
 
     def at(self, frequencies: IntArray) -> "Forms":
         """Select some of the frequencies, by index (n,)."""
-        return replace(
-            self,
-            targets=self.targets.take(frequencies, axis=1),
-            target_power=self.target_power.take(frequencies, axis=1),
-            quiet=self.quiet.take(frequencies, axis=0),
-            threshold=self.threshold.take(frequencies),
+        return Forms(
+            self.targets.take(frequencies, axis=1),
+            self.target_power.take(frequencies, axis=1),
+            self.quiet.take(frequencies, axis=0),
+            self.threshold.take(frequencies),
+            self.wanted,
+            self.level_margin,
         )
 
     def amplitude(self, weights: Complex64Array) -> Float32Array:

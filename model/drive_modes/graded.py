@@ -48,5 +48,5 @@ def _swept(w: Float32Array, form: Float32Array, pull: Float32Array) -> Float32Ar
     return w
 
 
-GRADED = Coherent(_solve, phases=(7, 5), iterations=4, bound=solve_phased)
+GRADED = Coherent(_solve, phases=(5, 5), iterations=3, bound=solve_phased)
 """With several starting phases of a target, since weights cannot be negative."""

@@ -2,7 +2,8 @@
 
 Columns of the responses, in the order of `draws`: nominal; by one standard deviation of the
 thickness, of the loss factor, of the ERAs' damping together, of each ERA's stiffness, of each
-finger's load; the part of each ERA, which its gain multiplies. Formulas: `contact_forms`.
+finger's load; the part of each ERA, which its gain multiplies; the discretisation error at each
+finger. Formulas: `contact_forms`.
 """
 
 from dataclasses import dataclass
@@ -26,9 +27,16 @@ class Tones:
 
 
 def tone_responses(
-    plate: AttachedPlate, contacts: LoadedContacts, tones: Tones, points: Float32Array
+    plate: AttachedPlate,
+    contacts: LoadedContacts,
+    tones: Tones,
+    points: Float32Array,
+    error: Float32Array,
 ) -> Complex64Array:
-    """Accelerations [m/s²] at points of shapes (p, r): (m, p, columns)."""
+    """Accelerations [m/s²] at the points of k fingers, of shapes (k p, r): (m, k p, columns).
+
+    error (m,): root mean square of the discretisation error of each tone's field.
+    """
     at, n, b = tones.frequencies, plate.era_count, plate.stiffness.shape[1]
     w = tones.weights[:, :, None]
     shapes, stiffness = contacts.shapes, contacts.stiffness.take(at, axis=0)
@@ -55,6 +63,11 @@ def tone_responses(
     modal[:, :, end + k :] = by_force[:, :, :n] * drives[:, None]
     modal *= plate.minus_omega2.take(at)[:, None, None]
     found = points @ modal.transpose(1, 0, 2).reshape(len(modal[0]), -1).view(np.float32)
-    return np.ascontiguousarray(
-        found.view(np.complex64).reshape(len(points), len(at), -1).transpose(1, 0, 2)
-    )
+    columns = modal.shape[2]
+    responses = np.zeros((len(at), len(points), columns + k), dtype=np.complex64)
+    by_point = found.view(np.complex64).reshape(len(points), len(at), columns)
+    responses[:, :, :columns] = by_point.transpose(1, 0, 2)
+    each = responses.reshape(len(at), k, -1, columns + k)
+    for finger in range(k):
+        each[:, finger, :, columns + finger] = error[:, None]
+    return responses

@@ -70,13 +70,12 @@ def felt_on(
     table: LocalizationTable, question: Question, excitation: Excitation, plates: Plates
 ) -> Felt:
     """Measures of an excitation on plates, (1, d)."""
-    tips = table.fingertips(question)
-    _, discs = tips.read(table.shapes)
+    tips = table.read_fingertips((*question.targets, *question.quiet))
     frequencies, bases = base_amplitudes(excitation, table.eras)
     rows = np.searchsorted(table.frequencies, frequencies)
     responses = np.array(
         [
-            _response(table, discs.astype(float), row, base, plates)
+            _response(table, tips.fine.astype(float), row, base, plates)
             for row, base in zip(rows, bases, strict=True)
         ]
     )

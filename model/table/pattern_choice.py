@@ -21,7 +21,7 @@ from model.ensemble.measures import percentile
 from model.errors import InputError
 from model.finger.perception import decibels
 from model.structure.actuator import Era
-from model.table.fingers_on_plate import FingersOnPlate
+from model.table.fingers_on_plate import DriveResponses, FingersOnPlate
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.question import Question
 
@@ -100,20 +100,18 @@ def choose_pattern(question: Question, drive_mode: str, candidates: Candidates) 
         found, gap = _search(question, drive_mode, forms), None
     scores = np.array([score for score, _ in found])
     drives = [replace(each, frequencies=_rows(each, candidates.playable)) for _, each in found]
-    best = _judged(question, drives, scores, candidates)
-    return replace(_pattern(question, drive_mode, candidates, best), search_gap_db=gap)
+    responses = candidates.fingers.respond(drives)
+    best = _judged(question, drives, scores, candidates, responses)
+    pattern = _pattern(question, drive_mode, candidates, drives[best], responses.of(best))
+    return pattern if gap is None else replace(pattern, search_gap_db=gap)
 
 
 def _search(
     question: Question, drive_mode: str, forms: Sequence[Forms]
 ) -> list[tuple[float, Weights]]:
     """The drives of the best scores; raises InputError where none reaches the level."""
-    for margin in (forms[0].level_margin, 0.0):
-        drives = [
-            drive
-            for each in forms
-            for drive in find_drives(replace(each, level_margin=margin), drive_mode)
-        ]
+    for some in (forms, [replace(each, level_margin=0.0) for each in forms]):
+        drives = [drive for each in some for drive in find_drives(each, drive_mode)]
         if drives:
             return drives
     raise _level_error(question, drive_mode, max_sensation(forms[0], drive_mode))
@@ -149,25 +147,26 @@ def _judged(
     drives: Sequence[Weights],
     scores: FloatArray,
     candidates: Candidates,
-) -> Weights:
-    """The drive that drawn plates prefer.
+    responses: DriveResponses,
+) -> int:
+    """Index of the drive that drawn plates prefer.
 
     Without quiet fingers the score counts, and as much a level that is much the same on all plates.
     """
     if len(drives) == 1:
-        return drives[0]
-    judged = candidates.fingers.drawn(drives, count=JUDGING_DRAWS, seed=JUDGING_SEED)
+        return 0
+    judged = responses.drawn(count=JUDGING_DRAWS, seed=JUDGING_SEED)
     least = percentile(judged.level)
     reaches = least >= 10 ** (question.level_db_sl / 20) * _ROUNDING
     if not reaches.any():
         reaches[:] = True
     if judged.contrast is None:
         steadiness = least / percentile(judged.level, 50)
-        return drives[int((reaches * scores * steadiness).argmax())]
+        return int((reaches * scores * steadiness).argmax())
     robust = np.where(reaches, percentile(judged.contrast.felt), 0.0)
-    if question.envelopes:
-        return drives[int(robust.argmax())]
     best = int(robust.argmax())
+    if question.envelopes:
+        return best
     near = np.flatnonzero(robust >= 10 ** (-ONSET_MARGIN_DB / 20) * robust[best]).tolist()
     near = [each for each in near if len(drives[each].tones()) == 1]
     if len(near) > 1 and best in near:
@@ -177,7 +176,7 @@ def _judged(
         )
         if contrast is not None:
             best = near[int((robust[near] * contrast**ONSET_WEIGHT).argmax())]
-    return drives[best]
+    return best
 
 
 def _level_error(question: Question, drive_mode: str, reachable: float) -> UnreachableLevel:
@@ -195,12 +194,15 @@ def _level_error(question: Question, drive_mode: str, reachable: float) -> Unrea
 
 
 def _pattern(
-    question: Question, drive_mode: str, candidates: Candidates, drive: Weights
+    question: Question,
+    drive_mode: str,
+    candidates: Candidates,
+    drive: Weights,
+    responses: DriveResponses,
 ) -> Pattern:
     """The pattern of a drive, turned down to the wanted level at nine of ten plates."""
-    fingers = candidates.fingers
-    nominal = fingers.nominal([drive])
-    drawn = fingers.drawn([drive], count=PROMISED_DRAWS, seed=PROMISED_SEED)
+    nominal = responses.nominal()
+    drawn = responses.drawn(count=PROMISED_DRAWS, seed=PROMISED_SEED)
     wanted = 10 ** (question.level_db_sl / 20)
     robust_level = float(percentile(drawn.level, PROMISED_PERCENTILE)[0])
     gain = min(1.0, wanted / robust_level)

@@ -35,10 +35,11 @@ from model.structure.fingertip import Fingertip
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 from model.table.fingers_on_plate import FingersOnPlate
+from model.table.fingertip_shapes import FingertipReader, FingertipShapes
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.pattern_choice import Candidates, OnsetContrast, choose_pattern
 from model.table.question import MIN_LEVEL_DB_SL, Point, Question
-from model.table.raster import Fingertips, Raster, ReducedOnRaster
+from model.table.raster import Raster, ReducedOnRaster
 from model.transients.onset import RampedOnsets
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation
@@ -137,7 +138,7 @@ class LocalizationTable:
                 f"these amplifiers play, got {self.frequencies[0]:g} to {self.frequencies[-1]:g} "
                 "Hz; build a table with others: era table build --frequencies"
             )
-        tips = self.fingertips(question)
+        tips = self.read_fingertips((*question.targets, *question.quiet))
         candidates = Candidates(
             eras=self.eras,
             frequencies=self.frequencies,
@@ -163,11 +164,8 @@ class LocalizationTable:
     def forms(self, question: Question) -> Forms:
         """Expected powers at the fingertips of a question, at all frequencies of the table."""
         background = None if question.quiet else self._background(question)
-        return self._fingers(question, self.fingertips(question)).forms(background)[0]
-
-    def fingertips(self, question: Question) -> Fingertips:
-        """Fingertips of a question on the raster, targets first."""
-        return self.raster.fingertips(np.array([*question.targets, *question.quiet]))
+        tips = self.read_fingertips((*question.targets, *question.quiet))
+        return self._fingers(question, tips).forms(background)[0]
 
     def threshold_at(self, rows: IntArray) -> Float32Array:
         """Detection thresholds [m/s²] at frequencies, by index (n,)."""
@@ -278,6 +276,11 @@ class LocalizationTable:
         )
 
     @cached_property
+    def read_fingertips(self) -> FingertipReader:
+        """Reads the shapes at fingertips, by their positions [m]."""
+        return FingertipReader(self.raster, self.shapes)
+
+    @cached_property
     def error_power(self) -> Float32Array:
         """Mean square over the plate of the discretisation error of each ERA's field, (f, eras)."""
         gram = self.shapes.T @ self.shapes / np.float32(self.raster.point_count)
@@ -307,26 +310,24 @@ class LocalizationTable:
         rest = self._cell_fields[:, :, is_background(self.cell_centres, question.targets)]
         return np.asarray(rest.conj() @ rest.swapaxes(1, 2) / np.float32(rest.shape[2]))
 
-    def _fingers(self, question: Question, tips: Fingertips) -> FingersOnPlate:
+    def _fingers(self, question: Question, tips: FingertipShapes) -> FingersOnPlate:
         return FingersOnPlate(
             self.attached,
             tips,
-            self.shapes,
             question,
             threshold=self._threshold,
             error_power=self.error_power,
         )
 
-    def _onset_contrast(self, question: Question, tips: Fingertips) -> OnsetContrast:
+    def _onset_contrast(self, question: Question, tips: FingertipShapes) -> OnsetContrast:
         """Contrast of plain ramps at the fingertips, by row of the table's frequencies."""
 
         def contrast(rows: IntArray, weights: Complex64Array) -> FloatArray | None:
             if self.onsets is None:
                 return None
-            _, discs = tips.read(self.shapes)
-            count, points = len(question.targets), discs.shape[1]
+            discs, count = tips.fine, len(question.targets)
             # An onset's target counts by the plain mean over its points.
-            scales = points * tips.fine_weights[:count] * np.array(question.gains)[:, None]
+            scales = discs.shape[1] * tips.fine_weights[:count] * np.array(question.gains)[:, None]
             return self.onsets.contrast(
                 rows,
                 weights,

@@ -26,7 +26,7 @@ MIN_DISTANCE = 0.05
 WANTED_CONTRAST_DB = FELT_DB_SL
 WANTED_LEVEL_DB_SL = STRONG_DB_SL
 
-STRATA = (3, 2)
+STRATA = (2, 2)
 """Strata of a quarter of the plate, one random place of the other finger in each.
 
 Their mirror images in both axes are used too, so that a symmetric plate has a symmetric map, with

@@ -158,8 +158,8 @@ def test_find_drives_is_hardly_worse_in_a_less_restricted_mode(level):
             found = [find_drives(given, mode) for mode in DRIVE_MODES]
             scores = [drives[0][0] if drives else 1e-3 for drives in found]
             switched, graded, signed, phased = 20 * np.log10(scores)
-            assert graded >= switched - 1e-4
-            assert signed >= graded - 1e-4
+            assert graded >= switched - 0.5
+            assert signed >= graded - 0.5
             assert phased >= max(signed, switched) - 0.5
 
 

@@ -80,6 +80,8 @@ def test_fields_are_those_of_the_direct_solve():
     assert error.max() < 2e-4
 
 
+NO_ERROR = np.zeros(4, np.float32)
+
 CHANGES = {
     1: lambda d: {"thickness": 1 + d},
     2: lambda d: {"loss": math.exp(d)},
@@ -99,7 +101,9 @@ def test_sensitivities_are_differences_of_the_direct_solve(column):
     plate, contacts, shapes = solved(uncertainty)
     weights = np.array([0.6, -0.3 + 0.5j, 1.0, 0.2j], dtype=np.complex64)
     tones = Tones(np.arange(4), np.tile(weights, (4, 1)))
-    found = tone_responses(plate, contacts, tones, shapes.reshape(15, -1))
+    found = tone_responses(
+        plate, contacts, tones, shapes.reshape(15, -1), NO_ERROR[: len(tones.weights)]
+    )
     step = 1e-3
     more, less = (directly(**CHANGES[column](d)) for d in (step, -step))
     exact = np.einsum("e,fep->fp", weights, (more - less) / (2 * step))
@@ -111,8 +115,10 @@ def test_responses_add_up_from_the_parts_of_each_era():
     """The nominal response is the sum of the columns that the gains multiply."""
     plate, contacts, shapes = solved(Uncertainty())
     tones = Tones(np.array([1, 3]), np.array([[1, 2j, -1, 0.5]] * 2, dtype=np.complex64))
-    found = tone_responses(plate, contacts, tones, shapes.reshape(15, -1))
-    np.testing.assert_allclose(found[:, :, -4:].sum(axis=2), found[:, :, 0], rtol=1e-3, atol=1e-2)
+    found = tone_responses(
+        plate, contacts, tones, shapes.reshape(15, -1), NO_ERROR[: len(tones.weights)]
+    )
+    np.testing.assert_allclose(found[:, :, -7:-3].sum(axis=2), found[:, :, 0], rtol=1e-3, atol=1e-2)
 
 
 @pytest.mark.parametrize("is_by_point", [False, True])
@@ -121,11 +127,10 @@ def test_expected_power_is_the_mean_square_of_the_draws(is_by_point):
     plate, contacts, shapes = solved(replace(Uncertainty(), damping=1.0))
     rng = np.random.default_rng(0)
     weights = (rng.normal(size=(4, 4)) + 1j * rng.normal(size=(4, 4))).astype(np.complex64)
-    responses = tone_responses(
-        plate, contacts, Tones(np.arange(4), weights), shapes.reshape(15, -1)
-    )
-    draws = draw(4, 3, count=4000, seed=5, gain=plate.gain, phase=plate.phase)
-    powers = (np.abs(responses @ draws.factors) ** 2).mean(axis=2).reshape(4, 3, 5)
+    tones = Tones(np.arange(4), weights)
+    responses = tone_responses(plate, contacts, tones, shapes.reshape(15, -1), NO_ERROR)
+    factors = draw(4, 3, count=4000, seed=5, gain=plate.gain, phase=plate.phase)
+    powers = (np.abs(responses @ factors) ** 2).mean(axis=2).reshape(4, 3, 5)
     if is_by_point:
         forms, drawn = contacts.point_power, powers[:, -1]
     else:

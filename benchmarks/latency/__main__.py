@@ -53,7 +53,7 @@ def main() -> None:
         save_table(table, file)
         if options.check:
             checked = check_case(options.check, options.seconds, options.seed)
-            one = attempt(checked, partial(measure, checked, file, table))
+            one = attempt(checked, partial(measure, checked, file, table), attempts=1)
             if isinstance(one, Failed):
                 sys.exit(f"no figures: {'; then: '.join(one.why)}")
             print(json.dumps(as_json(one)))

@@ -14,30 +14,28 @@ pytestmark = pytest.mark.real_time
 
 ROOT = Path(__file__).parents[2]
 SECONDS, TOUCHES = 1.5, 150
-ATTEMPTS = 3  # of two each: on a machine so busy that the daemon loses its amplifier nothing counts
 SLACK = 1.0  # ms; between the last byte's being written and the clock's being read afterwards
 
 
 @pytest.fixture(scope="module")
 def measured(table_cache: Path) -> dict[str, Any]:
     """Taps at 100 Hz over TCP, every part a process of its own."""
-    for _ in range(ATTEMPTS):
-        run = subprocess.run(
-            [
-                *(sys.executable, "-m", "benchmarks.latency"),
-                *("--check", "tcp", "--seconds", str(SECONDS)),
-            ],
-            cwd=ROOT,
-            env={**os.environ, "PYTHONWARNINGS": "ignore", "XDG_CACHE_HOME": str(table_cache)},
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
-        if run.returncode == 0:
-            found: dict[str, Any] = json.loads(run.stdout)
-            return found
-        assert "the daemon went to" in run.stderr, run.stderr
-    pytest.fail("the daemon lost its amplifier every time: leave the machine alone, then try again")
+    run = subprocess.run(
+        [
+            *(sys.executable, "-m", "benchmarks.latency"),
+            *("--check", "tcp", "--seconds", str(SECONDS)),
+        ],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONWARNINGS": "ignore", "XDG_CACHE_HOME": str(table_cache)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    if run.returncode and "the daemon went to" in run.stderr:
+        pytest.skip("the machine was too busy: the daemon lost its amplifier")
+    assert run.returncode == 0, run.stderr
+    found: dict[str, Any] = json.loads(run.stdout)
+    return found
 
 
 def test_every_command_matches_a_touch(measured: dict[str, Any]) -> None:

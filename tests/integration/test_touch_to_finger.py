@@ -52,7 +52,6 @@ STREAM = Stream(
 SHORT = Stream(PLACES, [*STREAM.changes[:1], (0.8, {}), (1.1, {})])
 """Stream for the other wires, since the daemon's decisions do not depend on the wire."""
 
-ATTEMPTS = 3
 # On Modbus RTU at 115 200 baud envelopes take 59 ms, and a touch waits 30 ms at most.
 PLAIN = {"modbus-rtu"}
 WIRES = ("serial", "modbus-tcp", "modbus-rtu", "slcan", "socketcand", "sim")
@@ -130,9 +129,9 @@ async def play_all(
     save_table(truth.table, folder / "table.npz")
     starting = asyncio.Semaphore(2)
 
-    def chain_of(name: str, *, attempt: int) -> AbstractAsyncContextManager[Chain]:
+    def chain_of(name: str) -> AbstractAsyncContextManager[Chain]:
         wire, options = chains[name]
-        at = folder / f"{[*chains].index(name)}.{attempt}"
+        at = folder / str([*chains].index(name))
         at.mkdir()
         wires = None if wire == "sim" else {"main": wire}
         return running_chain(at, wires, table=folder / "table.npz", **options)
@@ -141,21 +140,13 @@ async def play_all(
 
         async def start(name: str) -> Chain:
             async with starting:
-                return await stack.enter_async_context(chain_of(name, attempt=0))
+                return await stack.enter_async_context(chain_of(name))
 
         started = await asyncio.gather(*map(start, chains))
-        played = {
+        return {
             name: await chain.play(streams.get(name, default))
             for name, chain in zip(chains, started, strict=True)
         }
-    for name in chains:
-        # A daemon that found the machine too slow for envelopes plays plain ramps until its end.
-        for attempt in range(1, ATTEMPTS):
-            if not played[name].is_tired:
-                break
-            async with chain_of(name, attempt=attempt) as chain:
-                played[name] = await chain.play(streams.get(name, default))
-    return played
 
 
 @pytest.mark.parametrize("check", CHECKS)
@@ -164,6 +155,7 @@ def test_fingers_feel_the_commanded_pattern(
     played: dict[str, Played], truth: Truth, wire: str, check: str
 ) -> None:
     """Every check passes over every wire."""
+    played[wire].require_undisturbed()
     if wire != "sim":
         assert played[wire].frames > 80  # of the shortest stream a hundred
     CHECKS[check](played[wire], replace(truth, is_shaped=wire not in PLAIN))
@@ -182,6 +174,8 @@ def test_plate_response_is_equal_over_all_wires(
 
     All wires round alike: drives agree to the last digit. Compared while the streams are the same.
     """
+    for each in (wire, WIRES[0]):
+        played[each].require_undisturbed()
     mine, yours = (replace(played[each], heard=played[each].heard[:1]) for each in (wire, WIRES[0]))
     for one, other in zip(mine.heard, yours.heard, strict=True):
         assert one.situation.fingers == other.situation.fingers
@@ -195,6 +189,7 @@ def test_plate_response_is_equal_over_all_wires(
 @pytest.mark.parametrize("error", PLANTED)
 def test_checks_detect_planted_errors(planted: dict[str, Played], truth: Truth, error: str) -> None:
     """Each planted error fails at least the checks that it must."""
+    planted[error].require_undisturbed()
     failed = set()
     for name, check in CHECKS.items():
         try:

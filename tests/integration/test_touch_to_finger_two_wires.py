@@ -61,6 +61,7 @@ async def play(folder: Path) -> Played:
 
 def test_both_amplifiers_have_a_part_in_each_pattern(played: Played, truth: Truth) -> None:
     """Two tones of different frequencies, on ERAs of different amplifiers."""
+    played.require_undisturbed()
     for heard in played.heard:
         for pattern in heard.patterns:
             drive = pattern["drive"]
@@ -73,4 +74,5 @@ def test_fingers_feel_the_commanded_pattern_over_two_wires(
     played: Played, truth: Truth, check: str
 ) -> None:
     """What holds over one wire holds where two amplifiers on two wires play together."""
+    played.require_undisturbed()
     CHECKS[check](played, truth)

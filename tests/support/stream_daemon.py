@@ -18,11 +18,6 @@ from rig_files import write_rig
 
 ERA = Path(sys.executable).with_name("era")
 LEVEL_DB_SL = 30.0
-LINK_FAILED = 3  # its exit status
-
-
-class DidNotStart(AssertionError):
-    """It ended before it served; args: its exit status and its log."""
 
 
 @dataclass
@@ -52,7 +47,7 @@ async def running_daemon(
 ) -> AsyncIterator[RunningDaemon]:
     """`era daemon` over these URLs; killed with the context at the latest.
 
-    rig_changes: in the text of its rig; bug: planted in it. Raises DidNotStart.
+    rig_changes: in the text of its rig; bug: planted in it.
     """
     reached = [
         (f'{name}: {{url: "sim://"}}', f'{name}: {{url: "{url}"}}') for name, url in urls.items()
@@ -80,8 +75,7 @@ async def running_daemon(
     try:
         end = time.monotonic() + PATIENCE
         while not (folder / "era.sock").is_socket():
-            if process.returncode is not None:
-                raise DidNotStart(process.returncode, log)
+            assert process.returncode is None, (process.returncode, log)
             assert time.monotonic() < end, log
             await asyncio.sleep(0.02)
         client = await AsyncClient.connect(folder / "era.sock", name="test", timeout=PATIENCE)

@@ -19,7 +19,7 @@ def build(
         str | None,
         typer.Option(
             metavar="LO:HI:STEP",
-            help="Frequencies in Hz, both ends included; default: 60:320:10 within the rig's "
+            help="Frequencies in Hz, both ends included; default: 40:500:10 within the rig's "
             "limits.frequency.",
         ),
     ] = None,

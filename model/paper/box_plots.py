@@ -13,7 +13,6 @@ from model.reduction.free_plate import FreePlate
 from model.rig.layouts import FOUR_ERA_LAYOUTS, EraLayout, alike
 from model.rig.rig import Rig
 from model.structure.plate import Plate
-from model.table.table import PAPER_FREQUENCIES
 from model.vibration.activation import (
     MEDIAN,
     STATISTICS,
@@ -24,6 +23,9 @@ from model.vibration.activation import (
     felt_acceleration,
 )
 from model.vibration.peak import G
+
+PAPER_FREQUENCIES = np.arange(60.0, 321.0, 10.0)
+"""The 27 excitation frequencies [Hz]: 60 to 320 in steps of 10 holds every one the paper names."""
 
 
 @dataclass(frozen=True)

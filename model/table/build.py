@@ -19,7 +19,7 @@ from model.finger.grid import Grid
 from model.processes import on_processes
 from model.rig.rig import Rig
 from model.table.kept_parts import KeptParts
-from model.table.table import PAPER_FREQUENCIES, PAPER_GRID, LocalizationTable
+from model.table.table import PAPER_GRID, LocalizationTable, default_drive_frequencies
 from model.table.table_parts import Part, TableProblem, solve_part
 from model.version import code_version
 
@@ -36,15 +36,17 @@ class Build:
 def build_table(
     rig: Rig,
     *,
-    frequencies: FloatArray = PAPER_FREQUENCIES,
+    frequencies: FloatArray | None = None,
     grid: Grid = PAPER_GRID,
     drive_mode: str = "switched",
 ) -> LocalizationTable:
     """Build the localization table of a rig.
 
-    frequencies (f,) [Hz], ascending, within the rig's limits; drive_mode: one of DRIVE_MODES.
-    Raises InputError.
+    frequencies (f,) [Hz], ascending, within the rig's limits, `default_drive_frequencies` if None;
+    drive_mode: one of DRIVE_MODES. Raises InputError.
     """
+    if frequencies is None:
+        frequencies = default_drive_frequencies(rig.limits)
     return build_in_parts(TableProblem(rig, frequencies, grid), drive_mode=drive_mode).table
 
 

@@ -46,20 +46,23 @@ from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes
 from registry.limits import GuardLimits
 
-PAPER_FREQUENCIES = np.arange(60.0, 321.0, 10.0)
-"""The 27 excitation frequencies [Hz]: 60 to 320 in steps of 10 holds every one the paper names."""
+DEFAULT_FREQUENCIES = np.arange(40.0, 501.0, 10.0)
+"""Drive frequencies [Hz] of a table by default, the paper's among them.
+
+Steps of 2 Hz would promise 0.2 to 0.4 dB more and take half as long again (docs/decisions).
+"""
 
 PAPER_GRID = Grid(12, 9)
 
 
 def default_drive_frequencies(limits: GuardLimits) -> FloatArray:
-    """Drive frequencies of a table by default: the paper's within the rig's limits, (f,) [Hz].
+    """Drive frequencies of a table by default: 40 to 500 Hz within the rig's limits, (f,) [Hz].
 
     Steps of 10 Hz from the lowest limit where that leaves none.
     """
     low, high = limits.frequency_min, limits.frequency_max
-    first, past = np.searchsorted(PAPER_FREQUENCIES, [low, np.nextafter(high, np.inf)])
-    within = PAPER_FREQUENCIES[first:past]
+    first, past = np.searchsorted(DEFAULT_FREQUENCIES, [low, np.nextafter(high, np.inf)])
+    within = DEFAULT_FREQUENCIES[first:past]
     return within if len(within) else np.arange(low, high + 1e-9, 10.0)
 
 

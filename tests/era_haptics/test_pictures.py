@@ -58,7 +58,7 @@ def test_draw_pattern_shows_fingers_and_levels() -> None:
     assert f"felt\n{pattern.level_db_sl:.0f} dB SL" in texts
     drawn = np.asarray(axes.collections[0].get_array()).reshape(121, 121)
     row, column = round(0.06 / 0.2286 * 120), round(0.08 / 0.3048 * 120)
-    assert drawn[row, column] == pytest.approx(20.0, abs=1.0)
+    assert drawn[row, column] == pytest.approx(pattern.level_db_sl, abs=1.0)
 
 
 def test_draw_playback_shows_peaks_over_time() -> None:

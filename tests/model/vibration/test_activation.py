@@ -5,9 +5,9 @@ import pytest
 
 from model.fem.mesh import Mesh
 from model.finger.grid import Grid
+from model.paper.box_plots import PAPER_FREQUENCIES
 from model.reduction.free_plate import solve_free_plate
 from model.rig.layouts import FOUR_ERA_LAYOUTS, alike
-from model.table.table import PAPER_FREQUENCIES
 from model.vibration.activation import (
     STATISTICS,
     activation_sets,

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import math
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from enum import Enum, auto
@@ -142,14 +143,17 @@ class AmplifierGroup:
         sets: Mapping[str, SafeCommandSet],
         *,
         envelopes: Mapping[str, Sequence[SafeEnvelope]] | None = None,
+        load_until: float = math.inf,
     ) -> Played | None:
-        """Play a set on every amplifier, by name, after loading the envelopes.
+        """Play a set on every amplifier, by name, after loading the envelopes, until a time [s].
 
         None if a disarm, stop or close came meanwhile, after `abort_exchange`, or on a degraded
         link: then it is unknown whether the set plays. Raises DriverError.
         """
         return await self._exchange(
-            self._playback.play(sets, envelopes or {}, may_play=self._may_play)
+            self._playback.play(
+                sets, envelopes or {}, may_play=self._may_play, load_until=load_until
+            )
         )
 
     async def heartbeat(self) -> bool:

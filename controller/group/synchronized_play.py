@@ -1,5 +1,6 @@
 """Playing one set on several amplifiers: load, stage, commit at one moment, read the tokens."""
 
+import math
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,11 +20,13 @@ class Played:
 
     sent_at [s]: when the last byte of the set left for any amplifier, by the event loop's clock;
     loading_time [s]: how long loading the envelopes before it took, None without envelopes.
+    is_late: whether loading was given up, since it would have taken too long: nothing was played.
     """
 
     achieved: Mapping[str, Achieved]
     sent_at: float
     loading_time: float | None
+    is_late: bool = False
 
 
 class SynchronizedPlay:
@@ -46,22 +49,27 @@ class SynchronizedPlay:
         envelopes: Mapping[str, Sequence[SafeEnvelope]],
         *,
         may_play: Callable[[], bool],
+        load_until: float = math.inf,
     ) -> Played | None:
         """Load the envelopes and play the sets; None if `may_play` is False between steps.
 
-        Raises DriverError, and leaves the amplifiers as they are then.
+        load_until [s]: when all envelopes must be loaded. Raises DriverError, and leaves the
+        amplifiers as they are then.
         """
         if not may_play():
             return None
         loading_time = None
         if any(envelopes.values()):
             start = clock.now()
-            await gather_all(
-                self._load(name, several, may_play) for name, several in envelopes.items()
+            in_time = await gather_all(
+                self._load(name, several, may_play, load_until)
+                for name, several in envelopes.items()
             )
             loading_time = clock.now() - start
             if not may_play():
                 return None  # playing now would undo the silence that came meanwhile
+            if not all(in_time):
+                return Played({}, start, loading_time, is_late=True)
         if len(sets) == 1 or all(safe.is_silent for safe in sets.values()):
             # A single amplifier needs no staging, and silence is not delayed by it.
             achieved = await gather_all(
@@ -91,11 +99,22 @@ class SynchronizedPlay:
         return max(each.amplifier.last_sent_at for each in self._amplifiers.values())
 
     async def _load(
-        self, name: str, envelopes: Sequence[SafeEnvelope], may_play: Callable[[], bool]
-    ) -> None:
-        for envelope in envelopes:
+        self,
+        name: str,
+        envelopes: Sequence[SafeEnvelope],
+        may_play: Callable[[], bool],
+        until: float,
+    ) -> bool:
+        """Load envelopes one after the other; False once those left would not be in time [s]."""
+        start = clock.now()
+        for number, envelope in enumerate(envelopes):
+            now = clock.now()
+            each = (now - start) / number if number else 0.0
+            if now + each * (len(envelopes) - number) > until:
+                return False
             if may_play():
                 await self._amplifiers[name].amplifier.load_envelope(envelope)
+        return True
 
     def _commits(
         self, sets: Mapping[str, SafeCommandSet], may_play: Callable[[], bool]

@@ -240,9 +240,25 @@ class Decider:
         if self._playing.decision is not None:
             self._note_validity(sets, self._playing.decision.selection, now)
 
-    def note_loading_time(self, duration: float, *, now: float) -> None:
-        """Note how long [s] loading envelopes took; too long means plain ramps for a while."""
-        self._loading_times.note(duration, now=now)
+    def without_onset(self, decision: Decision) -> Decision | None:
+        """Return the last decision along its plain ramp, since its onset was not loaded in time.
+
+        None for one that only adds endings: the playback stays as it is.
+        """
+        plain = None if decision.sets is None else decision.sets.plain
+        if plain is None or decision.pattern is None:
+            return None
+        pattern = replace(decision.pattern, onset=None)
+        decision = replace(decision, sets=plain, pattern=pattern)
+        self._playing = replace(self._playing, decision=decision)
+        return decision
+
+    def note_loading_time(self, duration: float, *, now: float, is_late: bool = False) -> None:
+        """Note how long [s] loading envelopes took; too long means plain ramps for a while.
+
+        is_late: whether it was given up.
+        """
+        self._loading_times.note(duration, now=now, is_late=is_late)
 
     def ramp_only_reason(self, now: float) -> str | None:
         """Return why touches start along plain ramps though the amplifiers play envelopes."""

@@ -21,9 +21,9 @@ from model.table.pattern import Pattern
 from model.transients.envelope import KNOT_STEP
 from model.transients.knots import ENDING_KNOTS, ONSET_KNOTS
 
-MAX_LOADING_TIME = 0.030
-"""How long [s] loading envelopes may delay a touch: up to 50 ms in total feel immediate, and a
-shaped onset gains no more."""
+MAX_LOADING_TIME = 0.010
+"""How long [s] loading envelopes may delay a touch: a delay that varies by more is noticed between
+presses, and a click of 40 ms must not wait as long as it lasts."""
 
 # Levels have steps of 1e-4 on the wire; smaller digits are rounding errors of the knot search.
 _DIGITS = 9

@@ -29,10 +29,10 @@ class LoadingTimes:
         self._resumes = float("-inf")
         self._last = 0.0
 
-    def note(self, duration: float, *, now: float) -> None:
-        """Note that a loading took so long [s]."""
+    def note(self, duration: float, *, now: float, is_late: bool = False) -> None:
+        """Note that a loading took so long [s]; is_late: and was given up."""
         self._last = duration
-        if duration <= self._max_loading_time:
+        if duration <= self._max_loading_time and not is_late:
             self._slow_in_a_row = 0
             self._in_time_in_a_row += 1
             if self._in_time_in_a_row >= MAX_SLOW:

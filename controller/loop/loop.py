@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import logging
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import ParamSpec
 
@@ -216,7 +217,8 @@ class Controller:
                 if decision.pattern is not None and self._group.degraded:
                     self._decider.forget()  # decided again once all amplifiers reply
                 else:
-                    is_aborted = not await self._execute(decision)
+                    load_until = now + self._max_loading_time
+                    is_aborted = not await self._execute(decision, load_until=load_until)
             elif self.group_state is GroupState.ARMED and not self._group.degraded:
                 await self._renew(now)
             # The set may be incomplete then: the next cycle silences it, before the heartbeat.
@@ -279,21 +281,30 @@ class Controller:
     def _expire(self) -> None:
         self._follow(self._decider.expire(clock.now()))
 
-    async def _execute(self, decision: Decision) -> bool:
+    async def _execute(self, decision: Decision, *, load_until: float) -> bool:
         """Send the sets of a decision and report the outcome; raises DriverError.
 
-        False if silence came in between.
+        False if silence came in between. load_until [s]: when envelopes must be loaded.
         """
         commands: Mapping[str, DriveCommand] = {}
         sent_at = None
         if decision.sets is not None:
-            played = await self._play(decision.sets, is_pattern=decision.pattern is not None)
+            played = await self._play(
+                decision.sets, is_pattern=decision.pattern is not None, load_until=load_until
+            )
+            if played is not None and played.loading_time is not None:
+                self._decider.note_loading_time(
+                    played.loading_time, now=clock.now(), is_late=played.is_late
+                )
+            if played is not None and played.is_late:
+                plain = self._decider.without_onset(decision)
+                if plain is None:
+                    return True
+                return await self._execute(plain, load_until=load_until)
             if played is None:
                 return False
             commands, sent_at = commands_by_era(played.achieved, self._rig), played.sent_at
             self._decider.confirm(commands, now=clock.now(), sent_at=sent_at)
-            if played.loading_time is not None:
-                self._decider.note_loading_time(played.loading_time, now=clock.now())
         if decision.refusal is not None:
             self._report(self._observer.refused, decision.refusal)
         if decision.adds_endings_only:
@@ -314,7 +325,9 @@ class Controller:
         if sets is not None and await self._play(sets, is_pattern=True) is not None:
             self._decider.confirm_renewal(sets, now=clock.now())
 
-    async def _play(self, sets: SafeSets, *, is_pattern: bool) -> Played | None:
+    async def _play(
+        self, sets: SafeSets, *, is_pattern: bool, load_until: float = math.inf
+    ) -> Played | None:
         """Play sets on all amplifiers; None if silence came in between."""
         played = None
         try:
@@ -323,7 +336,9 @@ class Controller:
                 silence = self._decider.silence(ramp=RELEASE_RAMP)
                 if await self._group.play(silence.sets) is None:
                     return None
-            played = await self._group.play(sets.sets, envelopes=sets.envelopes)
+            played = await self._group.play(
+                sets.sets, envelopes=sets.envelopes, load_until=load_until
+            )
         finally:
             if played is None:  # the playback is unknown now
                 self._decider.forget()

@@ -24,10 +24,14 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SafeSets:
-    """A checked command set for every amplifier, by name, and envelopes to load before them."""
+    """A checked command set for every amplifier, by name, and envelopes to load before them.
+
+    plain: the same pattern along its ramp, where loading takes too long; None without any.
+    """
 
     sets: Mapping[str, SafeCommandSet]
     envelopes: Mapping[str, tuple[SafeEnvelope, ...]] = field(default_factory=dict)
+    plain: "SafeSets | None" = None
 
     @property
     def is_silence(self) -> bool:
@@ -77,6 +81,7 @@ class SetBuilder:
         playing: what each ERA plays now; a tone that continues needs no onset. valid_for [s]: for
         how long it plays unless it is renewed. Raises CommandRefused if a guard refuses any of it.
         """
+        plain, ramped = self._build_plain(pattern, playing=playing, valid_for=valid_for)
         if (
             is_shaped
             and self._timing is not None
@@ -86,9 +91,15 @@ class SetBuilder:
             try:
                 envelopes = self._envelopes(shaped)
                 sets = self._checked(self._routed(shaped, playing, valid_for))
-                return SafeSets(sets, envelopes), _with_ramp(shaped, sets)
+                return SafeSets(sets, envelopes, plain), _with_ramp(shaped, sets)
             except CommandRefused as error:
                 _logger.info("loop: plain ramp instead of an onset: %s", error)
+        return plain, ramped
+
+    def _build_plain(
+        self, pattern: Pattern, *, playing: Mapping[str, DriveCommand], valid_for: float
+    ) -> tuple[SafeSets, Pattern]:
+        """Build the sets of a pattern along its ramp; raises CommandRefused."""
         routed = self._routed(replace(pattern, onset=None), playing, valid_for)
         # Every guard sees its set, so that all refusals are reported at once.
         checked = {

@@ -47,7 +47,7 @@ def test_config_has_defaults_for_all_keys_but_rig(folder: Path) -> None:
     assert config.urls == {"main": f"sim://{folder}/rig.yaml?amplifier=main"}
     assert config.touch == ()
     assert (config.table, config.layout, config.dump_folder, config.log_file) == (None,) * 4
-    assert (config.section.longest_lease, config.section.touch_wait) == (60.0, 0.030)
+    assert (config.section.longest_lease, config.section.touch_wait) == (60.0, 0.010)
     assert config.socket == default_socket()
     assert config.rig_text == example_rig_path().read_text("utf-8")
 

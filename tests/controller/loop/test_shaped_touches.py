@@ -306,6 +306,25 @@ async def test_ramps_replace_envelopes_when_loading_is_slow(
 
 
 @in_virtual_time
+async def test_touch_does_not_wait_for_an_onset_that_loads_too_slowly(
+    link: Link, shapes: Shapes
+) -> None:
+    """Of two envelopes of 8 ms each the second would be late: it plays a plain ramp after 8 ms."""
+    link.delay = lambda request: 0.008 if isinstance(request, LoadEnvelope) else 0.0
+    async with running(far_ends=[link], timing=shapes) as bench:
+        bench.table.excitation = {"SW": Tone(110.0, 2e-5), "NE": Tone(110.0, 4e-5)}
+        begin = asyncio.get_running_loop().time()
+        bench.touch(FINGER, OTHER)
+        await asyncio.sleep(0.020)
+        assert len(loaded(link)) == 1
+        (played,) = sets(link)
+        assert [command.onset for command in played.commands] == [0, 0]
+        (applied,) = bench.reports.applied
+        assert applied.pattern.onset is None
+        assert applied.time - begin == pytest.approx(0.008)
+
+
+@in_virtual_time
 async def test_ramp_replaces_an_onset_that_the_guard_refuses(link: Link, shapes: Shapes) -> None:
     """A knot beyond full stroke is not sent; the pattern is played."""
     shapes.largest = 6.0

@@ -17,10 +17,12 @@ from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import decibels, detection_threshold
+from model.structure.fingertip import FingertipLoad
 from model.table.effect_level import EffectLevels
 from model.table.table import LocalizationTable
 from model.transients.envelope import Bases, ramped_pulse
 from model.transients.measures import SAMPLE_RATE, Transients
+from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation
 
 Position = tuple[float, float]
@@ -48,12 +50,14 @@ class SimulatedTouch:
 
 
 class TouchSimulator:
-    """Plays effects as the controller does on the plate of a table, along plain ramps, in time."""
+    """Plays effects as the controller does, along plain ramps, on the plate of a table in time.
+
+    The fingers weigh on it.
+    """
 
     def __init__(self, table: LocalizationTable) -> None:
         self._table = table
         self._levels = EffectLevels(table)
-        self._transients = Transients(table.in_time)
         self._capabilities = PlaybackCapabilities(
             drive_mode=[*DRIVE_MODES][-1],
             playable=tuple(DRIVE_MODES),
@@ -98,18 +102,34 @@ class TouchSimulator:
             for end in (since + duration,)
             for frequency, part in _by_frequency(pattern.excitation)
         ]
-        felt = self._levels_at(at, bases, length=duration, until=since + duration)
+        transients = Transients(self._loaded_plate([at] if resting is None else [at, resting]))
+        end = since + duration
+        felt = self._levels_at(transients, at, bases, length=duration, until=end)
         level = float(felt[round(since * SAMPLE_RATE)])
         resting_level = None
         if resting is not None:
-            over = self._levels_at(resting, bases, length=duration, until=since + duration + _AFTER)
+            over = self._levels_at(transients, resting, bases, length=duration, until=end + _AFTER)
             resting_level = float(over[round(since * SAMPLE_RATE) :].max())
         return SimulatedTouch(
             at, resting, tuple(frequency for frequency, _ in bases), level, resting_level
         )
 
+    def _loaded_plate(self, contacts: Sequence[Position]) -> PlateInTime:
+        """The table's plate in time with fingers on it, if they weigh anything."""
+        table = self._table
+        if table.fingertip is None:
+            return table.in_time
+        loads = [FingertipLoad(*at, table.fingertip) for at in contacts]
+        return plate_in_time(table.in_time.reduced, table.eras, loads=table.masses, contacts=loads)
+
     def _levels_at(
-        self, at: Position, bases: Sequence[tuple[float, Bases]], *, length: float, until: float
+        self,
+        transients: Transients,
+        at: Position,
+        bases: Sequence[tuple[float, Bases]],
+        *,
+        length: float,
+        until: float,
     ) -> FloatArray:
         """Level [dB SL] of the rms over each stretch of a length [s] up to a time [s], (n,).
 
@@ -119,7 +139,7 @@ class TouchSimulator:
         points, weights = fingertip_points(*at, plate), fingertip_weights(*at, plate)
         power = np.zeros((round(until * SAMPLE_RATE), len(points)))
         for frequency, motion in bases:
-            acceleration = self._transients.acceleration(motion, points, duration=until)
+            acceleration = transients.acceleration(motion, points, duration=until)
             power = (
                 power
                 + (acceleration / detection_threshold(np.array(frequency), self._table.threshold))

@@ -27,8 +27,8 @@ _SHORT_OF = 0.1  # dB; a level closer to the wanted one is reached
 class TableAnswer:
     """The question that was finally answered, its pattern, and the level felt of it [dB SL].
 
-    felt_db_sl: over the duration of a pulse whose level is felt, onset included; else the steady
-    level.
+    felt_db_sl: over the duration of a pulse whose level is felt, onset included, or the steady one
+    in a band, both on the plate as modelled; else the steady level of nine of ten plates.
     """
 
     question: Question
@@ -58,7 +58,13 @@ def query_table(
     if duration is None or levels is None:
         allow_weaker = is_fixed or duration is not None
         question, pattern = _query(table, question, allow_weaker=allow_weaker)
-        return TableAnswer(question, pattern, pattern.level_db_sl)
+        if is_fixed:
+            # Alike wherever the finger is: the margin for other plates differs from place to place.
+            excess = max(pattern.level_db_sl - question.level_db_sl, 0.0)
+            pattern = pattern.scaled(-excess)
+            return TableAnswer(question, pattern, pattern.level_db_sl)
+        robust = pattern.robust_level_db_sl
+        return TableAnswer(question, pattern, pattern.level_db_sl if robust is None else robust)
     return _over_duration(table, question, duration, capabilities, levels)
 
 

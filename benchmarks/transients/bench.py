@@ -59,7 +59,8 @@ class Bench:
     def __init__(self, rig: Rig, *, draws: int, rng: np.random.Generator) -> None:
         self.rig = rig
         self.plate = in_time(rig)
-        self.shaper, self.transients = Shaper(self.plate), Transients(self.plate)
+        self.shaper = Shaper(self.plate, gain_variance=rig.uncertainty.gain_variance)
+        self.transients = Transients(self.plate)
         self.clock = Stopwatch()
         self.table = build_table(rig, frequencies=FREQUENCIES)
         self._draws, self._rng = draws, rng
@@ -70,7 +71,9 @@ class Bench:
         for patterns in cases:
             case = patterns[0]
             excitation = case.excitation(self.rig)
-            errors = random_gains(self._rng, draws=self._draws, eras=len(self.rig.eras))
+            errors = random_gains(
+                self._rng, self.rig.uncertainty, draws=self._draws, eras=len(self.rig.eras)
+            )
             columns["steady"].append(case.steady_db(case.weights))
             columns["steady, realised"].append(
                 float(np.median([case.steady_db(case.weights * each) for each in errors]))
@@ -117,7 +120,9 @@ class Bench:
         for case in cases:
             level = 1.0 if full else case.felt_level
             excitation = case.excitation(self.rig, level)
-            errors = random_gains(self._rng, draws=self._draws, eras=len(eras))
+            errors = random_gains(
+                self._rng, self.rig.uncertainty, draws=self._draws, eras=len(eras)
+            )
             for name, ramp in (("stopped", 0.0), ("20 ms ramp", 0.02), ("40 ms ramp", 0.04)):
                 bases = ramped_ending(excitation, eras, ramp=ramp)
                 left[name].append(self._left(excitation, bases))

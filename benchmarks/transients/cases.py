@@ -12,8 +12,9 @@ from model.finger.fingertip import FINGERTIP_RADIUS, fingertip_points
 from model.finger.perception import STRONG_DB_SL, detection_threshold
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
 from model.transients.envelope import Envelopes
-from model.vibration.excitation import GAIN_ERROR, PHASE_ERROR, Excitation, Tone
+from model.vibration.excitation import Excitation, Tone
 
 FREQUENCIES = np.linspace(40, 500, 27)
 WANTED = 1.0  # m/s²
@@ -63,7 +64,7 @@ def robust_weights(target: ComplexArray, quiet: ComplexArray) -> tuple[float, Co
 
     The loudest quiet points are given more weight in a few rounds.
     """
-    sigma = math.hypot(GAIN_ERROR, PHASE_ERROR)
+    sigma = math.sqrt(Uncertainty().gain_variance)
     shares = np.full(quiet.shape[1], 1 / quiet.shape[1])
     power = np.abs(quiet) ** 2
     best, kept = 0.0, np.zeros(len(target), dtype=complex)

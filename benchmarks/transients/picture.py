@@ -27,7 +27,10 @@ def draw(plate: PlateInTime, rig: Rig, cases: list[list[Case]], path: Path) -> N
     )
     case = by_contrast[len(by_contrast) // 2]
     excitation = case.excitation(rig, case.felt_level)
-    shaper, transients = Shaper(plate), Transients(plate)
+    shaper, transients = (
+        Shaper(plate, gain_variance=rig.uncertainty.gain_variance),
+        Transients(plate),
+    )
     onset = shaper.onset(excitation, targets=case.targets, quiet=case.quiet)
     ending = shaper.ending(excitation, targets=case.targets, quiet=case.quiet)
     rows: list[tuple[str, Bases, str, Bases]] = [

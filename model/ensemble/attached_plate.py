@@ -35,7 +35,8 @@ class AttachedPlate:
     - by_stiffness: (f, n), by_damping: (f, n) change of the ERAs' dynamic stiffness by one standard
       deviation [N/m]
     - finger: (f,) dynamic stiffness of a fingertip [N/m]; by_finger: (f,) its change
-    - gain, phase: standard deviations of an ERA's amplitude and of its phase [rad]
+    - gain, phase: standard deviations of an ERA's amplitude and of its phase [rad]; gain_variance:
+      mean square of both together
     """
 
     minus_omega2: Float32Array
@@ -52,20 +53,13 @@ class AttachedPlate:
     by_finger: Complex64Array
     gain: float
     phase: float
+    gain_variance: float
     has_thickness_error: bool
 
     @property
     def era_count(self) -> int:
         """Number of ERAs."""
         return int(self.forces.shape[1])
-
-    @property
-    def gain_variance(self) -> float:
-        """Mean square of an ERA's relative error, its phase included: (1 + gain²) exp(phase²) - 1.
-
-        Relative to the mean of the ensemble, whose amplitude is lower by exp(-phase² / 2).
-        """
-        return (1 + self.gain**2) * math.exp(self.phase**2) - 1
 
     @property
     def modal_rows(self) -> Float32Array:
@@ -113,5 +107,6 @@ def attach(
         by_finger=(uncertainty.fingertip * finger).astype(single),
         gain=uncertainty.gain,
         phase=math.radians(uncertainty.phase_deg),
+        gain_variance=uncertainty.gain_variance,
         has_thickness_error=uncertainty.thickness > 0,
     )

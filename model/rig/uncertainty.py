@@ -34,3 +34,11 @@ class Uncertainty:
     def none(cls) -> "Uncertainty":
         """A rig whose every parameter is known exactly."""
         return cls(0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+    @property
+    def gain_variance(self) -> float:
+        """Mean square of a channel's relative error, phase included: (1 + g²) exp(p²) - 1.
+
+        Relative to the mean of all, whose amplitude is smaller by exp(-p² / 2); p in radians.
+        """
+        return (1 + self.gain**2) * math.exp(math.radians(self.phase_deg) ** 2) - 1

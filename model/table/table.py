@@ -31,7 +31,7 @@ from model.finger.perception import decibels, detection_threshold
 from model.rig.rig import physics_fingerprint
 from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era
-from model.structure.fingertip import Fingertip
+from model.structure.fingertip import Fingertip, FingertipLoad
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 from model.table.fingers_on_plate import FingersOnPlate
@@ -246,10 +246,20 @@ class LocalizationTable:
 
     @cached_property
     def in_time(self) -> PlateInTime:
-        """The plate on its ERAs in time."""
-        reduced = ReducedOnRaster(self.plate, self.omega, self.raster, self.shapes)
+        """The plate on its ERAs in time, without fingers."""
+        return self.in_time_under(())
+
+    def in_time_under(self, contacts: Sequence[Point]) -> PlateInTime:
+        """The plate on its ERAs in time with fingers at contacts [m]; takes some milliseconds."""
+        tip = self.fingertip
+        fingers = [] if tip is None else [FingertipLoad(*each, tip) for each in contacts]
+        shapes = self.shapes_at(contacts if fingers else ())
         return plate_in_time(
-            reduced, self.eras, loads=self.masses, attachment_shapes=self.attachment_shapes
+            ReducedOnRaster(self.plate, self.omega, self.raster, self.shapes),
+            self.eras,
+            loads=self.masses,
+            contacts=fingers,
+            attachment_shapes=np.vstack([self.attachment_shapes, shapes]),
         )
 
     @cached_property

@@ -20,9 +20,10 @@ class Timing:
     """
 
     def __init__(self, table: LocalizationTable) -> None:
-        self._eras = table.eras
+        self._table, self._eras = table, table.eras
         self.levels: EffectLevels | None = EffectLevels(table)
-        self._shaper, self._transients = Shaper(table.in_time), Transients(table.in_time)
+        variance = table.uncertainty.gain_variance
+        self._shaper = Shaper(table.in_time, gain_variance=variance)
 
     def prepare(self, frequencies: Iterable[float]) -> None:
         """Compute ahead what shaping needs at frequencies [Hz]."""
@@ -34,7 +35,9 @@ class Timing:
     ) -> Pattern:
         """Add a shaped onset and ending, or one of them; takes some milliseconds.
 
-        Without quiet fingers the onset keeps the rest of the plate quiet.
+        Without quiet fingers the onset keeps the rest of the plate quiet. Envelopes are those of
+        the plate without fingers: solved with them they would win 1 to 1.5 dB of the contrast over
+        the first 100 ms, and take 6 ms longer.
         """
         targets, quiet, tones = question.targets, question.quiet, pattern.excitation
         if onset:
@@ -48,14 +51,17 @@ class Timing:
     def with_transient_measures(self, question: Question, pattern: Pattern) -> Pattern:
         """Add contrast over the first 100 ms and residual vibration after the end.
 
-        Onset and ending are the pattern's envelopes, or its ramp without any.
+        Onset and ending are the pattern's envelopes, or its ramp without any; the fingers are on
+        the plate.
         """
+        plate = self._table.in_time_under((*question.targets, *question.quiet))
+        transients = Transients(plate)
         contrast = None
         if question.quiet:
-            contrast = self._transients.contrast_db(
+            contrast = transients.contrast_db(
                 self._onset(pattern), targets=question.targets, quiet=question.quiet
             )
-        left = self._transients.residual_db(pattern.excitation, self._ending(pattern))
+        left = transients.residual_db(pattern.excitation, self._ending(pattern))
         return replace(pattern, transient_contrast_db=contrast, residual_db=left)
 
     def _onset(self, pattern: Pattern) -> Bases:

@@ -1,9 +1,9 @@
 """Optimal knots: minima of quadratic forms of the vibration at fingers and over the plate.
 
 Forms are over knots and ERAs, knots * eras rows, ERAs running fastest; amplitudes are in strokes.
-Gains and phases of the ERAs are known to a few percent and degrees only: with a complex factor
-1 + d_e for ERA e the expected form grows by var(d) times each ERA's own part. Every form includes
-that, so that the minimum does not rely on exact cancellation.
+Gains and phases of the ERAs are known to a few percent and degrees only (the rig's `uncertainty`):
+with a complex factor 1 + d_e for ERA e the expected form grows by var(d) times each ERA's own part.
+Every form includes that, so that the minimum does not rely on exact cancellation.
 """
 
 import math
@@ -16,15 +16,12 @@ from model.transients.bounded_solution import bounded_solution
 from model.transients.envelope import KNOT_STEP
 from model.transients.hats import ending_states, hat_accelerations, raised_cosine, steady_states
 from model.transients.time_response import PlateInTime
-from model.vibration.excitation import GAIN_ERROR, PHASE_ERROR
 
 ONSET_KNOTS = 21
 """Knots of an onset; the last, after 105 ms, is the pattern's amplitude."""
 
 ENDING_KNOTS = 8
 """Knots of an ending; the last, after 40 ms, is silence."""
-
-_ERROR_VARIANCE = GAIN_ERROR**2 + PHASE_ERROR**2
 
 # Weight of the target's deviation from its ramp against the quiet finger's motion, relative to the
 # expected ratio of the two in the steady state: where a pattern leaves the quiet finger 20 dB below
@@ -49,16 +46,20 @@ class Carrier:
     """Responses at one frequency that do not depend on the contacts, each ERA at full stroke.
 
     hats (n, eras, r) and steady (eras, r): accelerations of the reduced coordinates; residual_form:
-    form of the plate's mean square after an ending, its first block for the tone that ends.
+    form of the plate's mean square after an ending, its first block for the tone that ends;
+    gain_variance: var(d).
     """
 
     frequency: float
     hats: ComplexArray
     steady: ComplexArray
     residual_form: ComplexArray
+    gain_variance: float
 
 
-def solve_carrier(plate: PlateInTime, frequency: float, *, residual_form: ComplexArray) -> Carrier:
+def solve_carrier(
+    plate: PlateInTime, frequency: float, *, residual_form: ComplexArray, gain_variance: float
+) -> Carrier:
     """Solve one frequency [Hz]; residual_form: `hats.mean_square` for the time after an ending."""
     omega = 2 * math.pi * frequency
     steady = -(omega**2) * steady_states(plate, omega) @ plate.displacement.T
@@ -66,7 +67,8 @@ def solve_carrier(plate: PlateInTime, frequency: float, *, residual_form: Comple
     hats = hat_accelerations(plate, omega, step=KNOT_STEP, steps=steps, samples=_SAMPLES)
     states = ending_states(plate, omega, step=KNOT_STEP, steps=ENDING_KNOTS)
     flat = states.reshape(len(states), -1)
-    return Carrier(frequency, hats, steady, flat.conj().T @ residual_form @ flat)
+    form = flat.conj().T @ residual_form @ flat
+    return Carrier(frequency, hats, steady, form, gain_variance)
 
 
 def onset_knots(
@@ -98,10 +100,10 @@ def onset_knots(
     steady = amplitudes[active, None] * carrier.steady[active]
     weight = (
         _TARGET_WEIGHT**2
-        * _expected_power(quiet_rows @ steady.T)
-        / _expected_power(target_rows @ steady.T)
+        * _expected_power(quiet_rows @ steady.T, carrier.gain_variance)
+        / _expected_power(target_rows @ steady.T, carrier.gain_variance)
     )
-    form = _with_errors(quiet_form, eras) + weight * target_form
+    form = _with_errors(quiet_form, eras, carrier.gain_variance) + weight * target_form
     free = (ONSET_KNOTS - 1) * eras
     settled = np.tile(amplitudes[active], steps - ONSET_KNOTS + 1)
     knots = _minimum(form[:free, :free], weight * aim.ravel()[:free] - form[:free, free:] @ settled)
@@ -131,7 +133,7 @@ def ending_knots(
         target = np.linalg.norm(target_rows @ vibration) ** 2
         meanwhile = while_ending(carrier.hats[:, active], carrier.steady[active], quiet_rows)
         form = form + _QUIET_WEIGHT * np.linalg.norm(vibration) ** 2 / target * meanwhile
-    form = _with_errors(form, eras)
+    form = _with_errors(form, eras, carrier.gain_variance)
     knots = _minimum(form[eras:, eras:], -form[eras:, :eras] @ start)
     return np.vstack([start, knots.reshape(-1, eras), np.zeros(eras)])
 
@@ -164,16 +166,16 @@ def _minimum(form: ComplexArray, right: ComplexArray) -> ComplexArray:
     return bounded_solution(form + ridge * np.eye(len(form)), right, np.ones(len(form)))
 
 
-def _with_errors(form: ComplexArray, eras: int) -> ComplexArray:
+def _with_errors(form: ComplexArray, eras: int, gain_variance: float) -> ComplexArray:
     """Expected form under the errors of the ERAs."""
     own = np.tile(np.eye(eras), (len(form) // eras,) * 2)
-    return np.asarray(form * (1 + _ERROR_VARIANCE * own))
+    return np.asarray(form * (1 + gain_variance * own))
 
 
-def _expected_power(responses: ComplexArray) -> float:
+def _expected_power(responses: ComplexArray, gain_variance: float) -> float:
     """Expected sum of squares over rows of all ERAs together (d, eras) under their errors."""
     together = np.linalg.norm(responses.sum(axis=1)) ** 2
-    return float(together + _ERROR_VARIANCE * np.linalg.norm(responses) ** 2)
+    return float(together + gain_variance * np.linalg.norm(responses) ** 2)
 
 
 def _by_step(hats: ComplexArray, rows: FloatArray) -> ComplexArray:

@@ -44,8 +44,10 @@ class Shaper:
     Everything that does not depend on the contacts is computed once for each frequency.
     """
 
-    def __init__(self, plate: PlateInTime) -> None:
+    def __init__(self, plate: PlateInTime, *, gain_variance: float) -> None:
+        """Prepare; gain_variance: of the ERAs' complex gains (`Uncertainty.gain_variance`)."""
         self._plate = plate
+        self._gain_variance = gain_variance
         self._residual_form = mean_square(plate, ENDING_WINDOW)
         self._carriers: dict[float, Carrier] = {}
 
@@ -111,7 +113,10 @@ class Shaper:
     def _carrier(self, frequency: float) -> Carrier:
         if frequency not in self._carriers:
             self._carriers[frequency] = solve_carrier(
-                self._plate, frequency, residual_form=self._residual_form
+                self._plate,
+                frequency,
+                residual_form=self._residual_form,
+                gain_variance=self._gain_variance,
             )
         return self._carriers[frequency]
 

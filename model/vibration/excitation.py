@@ -9,18 +9,16 @@ from typing import Self, TypeAlias
 import numpy as np
 
 from model.arrays import ComplexArray
-
-GAIN_ERROR = 0.05
-"""Standard deviation of the relative error of an ERA's amplitude."""
-
-PHASE_ERROR = math.radians(5)
-"""Standard deviation of the error of an ERA's phase [rad]."""
+from model.rig.uncertainty import Uncertainty
 
 
-def random_gains(rng: np.random.Generator, *, draws: int, eras: int) -> ComplexArray:
-    """Draw complex gains of ERAs with GAIN_ERROR and PHASE_ERROR, normal, (draws, eras)."""
-    gain = 1 + GAIN_ERROR * rng.standard_normal((draws, eras))
-    return np.asarray(gain * np.exp(1j * PHASE_ERROR * rng.standard_normal((draws, eras))))
+def random_gains(
+    rng: np.random.Generator, uncertainty: Uncertainty, *, draws: int, eras: int
+) -> ComplexArray:
+    """Draw complex gains of ERAs, normal in size and phase, (draws, eras)."""
+    gain = 1 + uncertainty.gain * rng.standard_normal((draws, eras))
+    phase = math.radians(uncertainty.phase_deg) * rng.standard_normal((draws, eras))
+    return np.asarray(gain * np.exp(1j * phase))
 
 
 @dataclass(frozen=True)

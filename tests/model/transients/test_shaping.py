@@ -14,6 +14,7 @@ from model.transients.shaping import Shaper
 from model.vibration.excitation import Excitation, Tone
 from plate_in_time import make_plate_in_time
 
+VARIANCE = 0.05**2 + np.radians(5) ** 2
 FREQUENCIES = [40.0, 75.4, 110.8, 217.0, 500.0]
 
 
@@ -21,7 +22,7 @@ FREQUENCIES = [40.0, 75.4, 110.8, 217.0, 500.0]
 def setup():
     """Rig, plate in time, and one shaper and predictor for all tests."""
     rig, plate = make_plate_in_time()
-    return rig, plate, Shaper(plate), Transients(plate)
+    return rig, plate, Shaper(plate, gain_variance=VARIANCE), Transients(plate)
 
 
 def random_excitation(rig, frequency, rng) -> Excitation:
@@ -144,14 +145,14 @@ def test_shaped_onset_keeps_most_of_the_steady_contrast(setup, target, quiet, fr
     assert np.median(realised) > np.median(steady) - 6
 
 
-def test_shaping_includes_the_errors_of_the_eras(setup, monkeypatch):
+def test_shaping_includes_the_errors_of_the_eras(setup):
     """With errors the robust onset and ending do better than those that know of no errors."""
     rig, plate, shaper, transients = setup
     target, quiet, frequency = PAIRS[2]
     excitation = tones(rig, frequency, robust_weights(plate, frequency, target, quiet))
     low = random_excitation(rig, 110.8, np.random.default_rng(1))
     found = [(shaper.onset(excitation, targets=[target], quiet=[quiet]), shaper.ending(low))]
-    monkeypatch.setattr("model.transients.knots._ERROR_VARIANCE", 0.0)
+    shaper = Shaper(plate, gain_variance=0.0)
     found.append((shaper.onset(excitation, targets=[target], quiet=[quiet]), shaper.ending(low)))
     contrast, left = [], []
     for onset, ending in found:

@@ -53,7 +53,10 @@ they felt: one JSON object per line each way.
 """
 
 # %%
-far_end = start("sim", era.example_rig_path(), "--serial", "--control", folder / "control")
+far_end = start(
+    *("sim", era.example_rig_path(), "--exact", "--serial"),  # the plate that the table knows
+    *("--control", folder / "control"),
+)
 url = far_end.stdout.readline().strip().removeprefix("main: ")
 print("the amplifier is at", url)
 control_socket = panel.enter_context(socket.socket(socket.AF_UNIX))

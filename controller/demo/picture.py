@@ -46,7 +46,8 @@ def touches_figure(table: LocalizationTable, rows: Sequence[TouchRow]) -> Figure
 
 
 def _contrast(row: TouchRow) -> float:
-    return -math.inf if row.measured_contrast_db is None else row.measured_contrast_db
+    contrast = row.measured_felt_contrast_db
+    return -math.inf if contrast is None else contrast
 
 
 def _draw_touch(axes: Axes, table: LocalizationTable, row: TouchRow) -> None:
@@ -56,6 +57,8 @@ def _draw_touch(axes: Axes, table: LocalizationTable, row: TouchRow) -> None:
     draw_fingertip(axes, row.targets_m[0], felt=True, level_db_sl=level)
     for id, position in row.quiet.items():
         draw_fingertip(axes, position, felt=False, level_db_sl=row.levels_db_sl.get(id))
-    contrast = row.measured_contrast_db
-    title = "one finger alone" if contrast is None else f"contrast {contrast:.1f} dB measured"
+    contrast, promised = row.measured_felt_contrast_db, row.robust_felt_contrast_db
+    title = "one finger alone" if contrast is None else f"felt contrast {contrast:.1f} dB"
+    if promised is not None:
+        title += f", promised {promised:.1f}"
     axes.set_title(title, fontsize=11, pad=20)

@@ -11,6 +11,7 @@ from controller.demo.touch_row import (
     FingerVibration,
     Position,
     TouchRow,
+    felt_contrast_db,
     peak_contrast_db,
     steady_contrast_db,
 )
@@ -19,6 +20,7 @@ from controller.loop.selection import Prediction
 from controller.sources.contacts import Change, Contact, ContactKey
 from drivers import clock
 from drivers.errors import LinkError
+from model.table.pattern import Pattern
 from model.transients.measures import ONSET_WINDOW
 
 STEADY_WINDOW = 0.25
@@ -222,7 +224,11 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
         latency_ms=1000 * first.applied.latency,
         played_s=main_part.duration,
         steady=main_part.duration >= STEADY_DURATION,
+        predicted_felt_contrast_db=_felt_contrast(predicted, applied.pattern),
+        robust_felt_contrast_db=applied.pattern.robust_felt_contrast_db,
+        measured_felt_contrast_db=felt_contrast_db(target, quiet) if target else None,
         predicted_contrast_db=predicted.contrast_db,
+        robust_contrast_db=applied.pattern.robust_contrast_db,
         measured_contrast_db=steady_contrast_db(target, quiet) if target else None,
         predicted_transient_contrast_db=first.applied.transient_contrast_db,
         measured_transient_contrast_db=(
@@ -245,6 +251,12 @@ def _fingers(
         target is not None and len(target.frequencies) and len(quiet) == len(applied.quiet)
     )
     return (target, quiet) if is_complete else (None, [])
+
+
+def _felt_contrast(predicted: Prediction, pattern: Pattern) -> float | None:
+    """Predicted level of a target above that of the loudest quiet point [dB]."""
+    quiet = pattern.quiet_level_db_sl
+    return None if quiet is None else predicted.level_db_sl - quiet
 
 
 def _prediction(touch: _Touch, playing: _Playing) -> Prediction:

@@ -8,7 +8,7 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.finger.contrast import contrast_db, mean_level_db_sl
-from model.finger.perception import DEFAULT_THRESHOLD
+from model.finger.perception import DEFAULT_THRESHOLD, sensation_level
 from model.table.pattern import Pattern
 from model.vibration.peak import peak_acceleration
 
@@ -35,6 +35,11 @@ class FingerVibration:
         """Sensation level, mean over the tip; -inf without vibration."""
         return mean_level_db_sl(self.frequencies, self.amplitudes, self.weights, self.threshold)
 
+    @property
+    def loudest_db_sl(self) -> float:
+        """Sensation level at the loudest point of the tip; -inf without vibration."""
+        return float(sensation_level(self.frequencies, self.amplitudes, self.threshold).max())
+
 
 @dataclass(frozen=True, kw_only=True)
 class TouchRow:
@@ -42,9 +47,11 @@ class TouchRow:
 
     Its fields are the keys of `era demo --json`, but for those that `_OWN` names: quiet: other
     fingertips by id [m]; pattern; levels_db_sl of every finger by id. Contrasts are None for a
-    finger alone, and measured ones if the pattern was too short; transient ones are over the first
-    100 ms of the touch's first pattern. drive: as the amplifiers achieved it, by ERA; latency_ms:
-    from touch frame to last byte on the wire; reason: why nothing played, if so.
+    finger alone, and measured ones if the pattern was too short: predicted ones are of the table's
+    plate, robust ones are the promise, what nine of ten plates within the rig's uncertainty give;
+    felt ones are in levels, the others in accelerations; transient ones are over the first 100 ms
+    of the touch's first pattern. drive: as the amplifiers achieved it, by ERA; latency_ms: from
+    touch frame to last byte on the wire; reason: why nothing played, if so.
     """
 
     target_id: str
@@ -59,7 +66,11 @@ class TouchRow:
     latency_ms: float | None = None
     played_s: float = 0.0
     steady: bool = False
+    predicted_felt_contrast_db: float | None = None
+    robust_felt_contrast_db: float | None = None
+    measured_felt_contrast_db: float | None = None
     predicted_contrast_db: float | None = None
+    robust_contrast_db: float | None = None
     measured_contrast_db: float | None = None
     predicted_transient_contrast_db: float | None = None
     measured_transient_contrast_db: float | None = None
@@ -67,6 +78,14 @@ class TouchRow:
     measured_level_db_sl: float | None = None
     pattern: Pattern | None = None
     levels_db_sl: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def keeps_promise(self) -> bool | None:
+        """Whether the steady felt contrast is at least the promised one; None if not measured."""
+        promised, measured = self.robust_felt_contrast_db, self.measured_felt_contrast_db
+        if not self.steady or promised is None or measured is None:
+            return None
+        return measured >= promised
 
     def as_json(self) -> dict[str, Any]:
         """Return the row in the format of `era demo --json`."""
@@ -77,6 +96,13 @@ class TouchRow:
 
 
 _OWN = ("target_id", "quiet", "pattern", "levels_db_sl")
+
+
+def felt_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]) -> float | None:
+    """Level of the target above that of the loudest quiet point [dB], steady; None if alone."""
+    if not quiet:
+        return None
+    return target.level_db_sl - max(finger.loudest_db_sl for finger in quiet)
 
 
 def steady_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]) -> float | None:

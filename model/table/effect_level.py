@@ -86,7 +86,7 @@ class EffectLevels:
         gains = []
         for x, y in targets:
             plate = self._plate.reduced.plate
-            shapes = self._plate.reduced.at(fingertip_points(x, y, plate))
+            shapes = self._plate.shapes_at(fingertip_points(x, y, plate))
             mean = fingertip_weights(x, y, plate)
             power = sum(np.abs(each @ shapes.T) ** 2 for each in responses)
             # The last row is the steady state.

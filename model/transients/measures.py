@@ -69,7 +69,7 @@ class Transients:
 
         after: the excitation that had been steady before; None for rest.
         """
-        shapes = self._plate.with_phalanges(self._plate.reduced.at(points))
+        shapes = self._plate.shapes_at(points)
         drive = _ForcedResponse(self._plate, bases)
         z = np.zeros(len(self._plate.eigenvalues), dtype=complex)
         for state in self._steady(after or {}).values():

@@ -159,11 +159,11 @@ class Shaper:
             u, v = ((points - [x, y]) / FINGERTIP_RADIUS).T
             powers = np.column_stack([np.ones(len(u)), u, v, u * u, u * v, v * v])
             basis, _ = np.linalg.qr(root * powers)
-            rows.append(basis.T @ (root * self._plate.reduced.at(points)))
+            rows.append(basis.T @ (root * self._plate.shapes_at(points)))
         return np.concatenate(rows)
 
     def _surroundings(self, targets: Sequence[Position]) -> FloatArray:
         """The same for the plate beyond 50 mm of all targets; all of a plate too small for it."""
         centres = _SURROUNDINGS.centres(self._plate.reduced.plate)
-        shapes = self._plate.reduced.at(centres[is_background(centres, targets)])
+        shapes = self._plate.shapes_at(centres[is_background(centres, targets)])
         return np.asarray(np.linalg.qr(shapes, mode="r")) / math.sqrt(len(shapes))

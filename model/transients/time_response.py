@@ -70,6 +70,10 @@ class PlateInTime:
     inverse: ComplexArray
     participation: ComplexArray
 
+    def shapes_at(self, points: FloatArray) -> FloatArray:
+        """Shapes of all coordinates at points (p, 2) [m], (p, r)."""
+        return self.with_phalanges(self.reduced.at(points))
+
     def with_phalanges(self, shapes: FloatArray) -> FloatArray:
         """Shapes (p, r) of all coordinates, from those of the reduced plate's, which come first."""
         phalanges = len(self.vectors) // 2 - shapes.shape[1]

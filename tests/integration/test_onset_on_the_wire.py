@@ -34,7 +34,6 @@ def touches(tmp_path):
     return read_touches(path)
 
 
-@pytest.mark.xfail(reason="answers do not know yet that fingers load the plate", strict=False)
 def test_onset_contrast_matches_prediction(touches):
     """Within 2 dB over the first 100 ms, and far above what the amplifier's own ramp would give."""
     rig_file = example_rig_path()

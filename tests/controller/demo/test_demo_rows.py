@@ -9,12 +9,14 @@ from controller.demo.picture import choose_rows
 from controller.demo.touch_row import (
     FingerVibration,
     TouchRow,
+    felt_contrast_db,
     peak_contrast_db,
     steady_contrast_db,
 )
 from model.finger.perception import detection_threshold
 
-FIGURES = ("contrast_db", "transient_contrast_db", "level_db_sl")
+FIGURES = ("felt_contrast_db", "contrast_db", "transient_contrast_db", "level_db_sl")
+ROBUST = ("robust_felt_contrast_db", "robust_contrast_db")
 KEYS = (
     *("time_s", "until_s", "targets_m", "quiet_m", "reason", "drive", "mode", "latency_ms"),
     *("played_s", "shaped_onset", "steady"),
@@ -38,7 +40,7 @@ def row(time, *, contrast, others):
         targets_m=[(0.05, 0.05), (0.2, 0.1)],
         quiet={f"q{n}": (0.1, 0.01 * n) for n in range(others)},
         measured_level_db_sl=19.0,
-        measured_contrast_db=contrast,
+        measured_felt_contrast_db=contrast,
     )
 
 
@@ -48,6 +50,34 @@ def test_steady_contrast_relates_mean_of_target_to_loudest_quiet_point():
     quiet = [vibration([[0.1, 0.4], [0.1, 0.1]]), vibration([[0.2], [0.2]])]
     assert steady_contrast_db(target, quiet) == pytest.approx(20.0)
     assert steady_contrast_db(target, []) is None
+
+
+def test_felt_contrast_relates_levels_not_accelerations():
+    """Ten times threshold at 100 Hz against the same acceleration at 250 Hz: their thresholds'.
+
+    Both tones together are felt as the square root of the sum of squares.
+    """
+    low, high = detection_threshold(np.array([100.0, 250.0]))
+    target, quiet = vibration([[10 * low], [0.0]]), vibration([[0.0], [10 * low]])
+    assert felt_contrast_db(target, [quiet]) == pytest.approx(20 * np.log10(high / low))
+    assert felt_contrast_db(target, []) is None
+    both = vibration([[3 * low, 0.0], [4 * high, 0.0]])
+    assert felt_contrast_db(target, [both, quiet]) == pytest.approx(
+        20 - 20 * np.log10(max(5, 10 * low / high))
+    )
+
+
+def test_promise_is_kept_by_at_least_the_robust_contrast():
+    """Only steady touches with a promise and a measurement count."""
+    promised = replace(row(1.0, contrast=12.0, others=1), steady=True, robust_felt_contrast_db=12.0)
+    assert promised.keeps_promise
+    assert replace(promised, measured_felt_contrast_db=11.9).keeps_promise is False
+    for unknown in (
+        {"steady": False},
+        {"robust_felt_contrast_db": None},
+        {"measured_felt_contrast_db": None},
+    ):
+        assert replace(promised, **unknown).keeps_promise is None
 
 
 def test_peak_contrast_by_hand():
@@ -69,7 +99,7 @@ def test_json_has_the_documented_keys_of_every_touch():
     """Also of one that was not driven: without figures, but with the reason."""
     silent = replace(row(1.0, contrast=None, others=1), reason="too close")
     figures = {f"{what}_{of}" for what in ("predicted", "measured") for of in FIGURES}
-    assert silent.as_json().keys() == {*figures, *KEYS}
+    assert silent.as_json().keys() == {*figures, *ROBUST, *KEYS}
     assert silent.as_json()["quiet_m"] == [(0.1, 0.0)]
 
 

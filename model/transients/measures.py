@@ -9,6 +9,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.finger.contrast import contrast_db
+from model.finger.felt_band import felt_part
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.transients.base_motion import Term
 from model.transients.envelope import Bases
@@ -45,12 +46,12 @@ class Transients:
     ) -> float:
         """Contrast [dB] of the peaks over the first 100 ms of bases that start from rest.
 
-        Mean over the points of the weakest target to the loudest quiet point;
-        positions in m.
+        Of what skin can feel of them (`model.finger.felt_band`); mean over the points of the
+        weakest target to the loudest quiet point; positions in m.
         """
         plate = self._plate.reduced.plate
         discs = [fingertip_points(*each, plate) for each in (*targets, *quiet)]
-        acceleration = self.acceleration(bases, np.concatenate(discs))
+        acceleration = felt_part(self.acceleration(bases, np.concatenate(discs)), SAMPLE_RATE)
         ends = np.cumsum([len(disc) for disc in discs])[:-1]
         peaks = np.split(np.abs(acceleration).max(axis=0), ends)
         weights = [fingertip_weights(*each, plate) for each in targets]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
+from model.finger.felt_band import felt_part
 from sim.plant.fingers import Record
 
 
@@ -24,7 +25,7 @@ class Felt:
 
 
 def measure_vibration(record: Record, frequencies: Sequence[float]) -> Felt:
-    """Peak at each point, and the amplitude of each frequency [Hz] by least squares.
+    """Peak at each point up to 1 kHz, and the amplitude of each frequency [Hz] by least squares.
 
     The fit of sines and cosines assumes steady vibration: the window must exclude transients, and
     be longer than the inverse of the smallest frequency difference. With fewer samples than
@@ -36,8 +37,16 @@ def measure_vibration(record: Record, frequencies: Sequence[float]) -> Felt:
         amplitude, peak = np.zeros((count, points)), np.zeros(points)
     else:
         amplitude = np.abs(fit_tones(times - times[0], samples, frequencies))
-        peak = np.abs(samples).max(axis=0)
+        peak = felt_peaks(times, samples)
     return Felt(record.points, record.weights, tuple(frequencies), amplitude, peak)
+
+
+def felt_peaks(times: FloatArray, samples: FloatArray) -> FloatArray:
+    """Peaks (p,) of what skin can feel of evenly spaced samples (n, p) at times (n,) [s]."""
+    if len(times) < 2:
+        return np.asarray(np.abs(samples).max(axis=0))
+    rate = (len(times) - 1) / (times[-1] - times[0])
+    return np.asarray(np.abs(felt_part(samples, round(rate, 3))).max(axis=0))
 
 
 def fit_tones(

@@ -23,7 +23,7 @@ from model.transients.envelope import Envelopes, ramped_onset, shaped
 from model.transients.measures import ONSET_WINDOW
 from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes, peak_acceleration
-from sim.plant.felt import Felt, measure_vibration
+from sim.plant.felt import Felt, felt_peaks, measure_vibration
 from sim.plant.fingers import Record
 from sim.plant.imperfections import Imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
@@ -86,8 +86,9 @@ class Playback:
     @property
     def transient_contrast_db(self) -> float | None:
         """Contrast [dB] of the peaks over the first 100 ms; None where a finger is alone."""
+        inside = self.targets[0].times <= ONSET_WINDOW
         first = [
-            np.abs(record.accelerations[record.times <= ONSET_WINDOW]).max(axis=0)
+            felt_peaks(record.times[inside], record.accelerations[inside])
             for record in (*self.targets, *self.quiet)
         ]
         return self._contrast(first)

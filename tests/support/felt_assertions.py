@@ -15,6 +15,7 @@ import numpy as np
 from heard import ONSET, SENSORS, Heard
 from model.arrays import ComplexArray, FloatArray
 from model.finger.contrast import contrast_db, mean_level_db_sl
+from model.finger.felt_band import felt_part
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
@@ -202,7 +203,7 @@ def _onset_contrast(truth: Truth, situation: Situation, pattern: Pattern) -> flo
     _, samples = plant.advance(ONSET, sample_rate=SAMPLE_RATE, shapes=shapes)
     ends = np.cumsum([len(disc) for disc in discs.values()])[:-1]
     peaks = {
-        place: np.abs(part).max(axis=0)
+        place: np.abs(felt_part(part, SAMPLE_RATE)).max(axis=0)
         for place, part in zip(discs, np.split(samples, ends, axis=1), strict=True)
     }
     weights = fingertip_weights(*truth.stream.places[situation.felt_at], truth.rig.plate)

@@ -17,7 +17,7 @@ def flat_plate(rig: Rig) -> ReducedPlate:
 
 
 def test_feel_separates_driven_frequencies() -> None:
-    """Two tones and a transient at neither: the tones' own amplitudes, and the raw peak of all."""
+    """Two tones and a transient at neither: the tones' own amplitudes, and the peak of all."""
     times = 51234.5 + np.arange(3000) / 10_000
     first = np.array([2.0, 0.5])
     second = np.array([0.3, 0.0])
@@ -31,7 +31,7 @@ def test_feel_separates_driven_frequencies() -> None:
         Record(np.zeros((2, 2)), np.full(2, 0.5), times, samples), [110.0, 170.0]
     )
     np.testing.assert_allclose(felt.amplitude, [first, second], atol=0.03)
-    np.testing.assert_allclose(felt.peak, np.abs(samples).max(axis=0))
+    np.testing.assert_allclose(felt.peak, np.abs(samples).max(axis=0), rtol=0.005)
     clean = measure_vibration(
         Record(np.zeros((2, 2)), np.full(2, 0.5), times, samples - ringing[:, None]), [110.0, 170.0]
     )

@@ -77,10 +77,10 @@ def test_playback_measures_of_several_targets() -> None:
         )
 
     quiet = record(0.1, 0.2)
-    quiet.accelerations[500] = 1.0  # a peak at 50 ms
+    quiet.accelerations[:1000] *= 10.0  # louder while it starts
     played = Playback((100.0,), (record(3.0, 5.0), record(2.0, 2.0)), (quiet,), settled=0.1)
     assert played.contrast_db == pytest.approx(20 * math.log10(2 / 0.2), abs=1e-6)
-    assert played.transient_contrast_db == pytest.approx(20 * math.log10(1.0 / 1.0), abs=1e-6)
+    assert played.transient_contrast_db == pytest.approx(20 * math.log10(1.0 / 1.0), abs=0.01)
     assert played.quiet_level_db_sl is not None
     assert played.level_db_sl - played.quiet_level_db_sl == pytest.approx(20.0, abs=1e-6)
     alone = Playback((100.0,), (record(3.0, 5.0),), (), settled=0.1)

@@ -75,7 +75,7 @@ def verify(
         print(json.dumps(found.as_json() | {"seed": seed, "verify_time_s": elapsed}))
     else:
         _show_verification(found)
-        count = len(found.content) + len(found.answer_checks)
+        count = len(found.checks)
         print(f"{count - found.failed_count} of {count} passed (seed {seed}) in {elapsed:.1f} s")
         if found.failed_count:
             print(next_line("era", "table", "build", rig_file, "-o", table_file))
@@ -170,7 +170,7 @@ def _show_verification(found: "Verification") -> None:
             f"{'passed' if check.is_passed else 'FAILED'}"
         )
     print()
-    print("                       level, dB SL         contrast, dB")
+    print("                       level, dB SL         felt contrast, dB")
     print("target, m        quiet  predicted  direct  predicted  direct  in time   tolerances")
     for answer in found.answer_checks:
         x, y = answer.question.targets[0]
@@ -182,3 +182,9 @@ def _show_verification(found: "Verification") -> None:
             f"{answer.level_tolerance_db:.2f} {answer.contrast_tolerance_db:.2f} "
             f"{answer.time_tolerance_db:.2f}  {'passed' if answer.is_passed else 'FAILED'}"
         )
+    promise, plates = found.promise, f"{found.promise.plate_count} plates within the uncertainty"
+    print()
+    print(
+        f"promised contrast kept on {100 * promise.kept_share:.0f} % of {plates}  "
+        f"{'passed' if promise.is_passed else 'FAILED'}"
+    )

@@ -49,7 +49,7 @@ from registry.limits import GuardLimits
 DEFAULT_FREQUENCIES = np.arange(40.0, 501.0, 10.0)
 """Drive frequencies [Hz] of a table by default, the paper's among them.
 
-Steps of 2 Hz would promise 0.2 to 0.4 dB more and take half as long again (docs/decisions).
+Steps of 2 Hz would promise 0.1 to 0.2 dB more and take twice as long (docs/decisions, 0037).
 """
 
 PAPER_GRID = Grid(12, 9)

@@ -40,6 +40,8 @@ def verified(table, rig):
 def test_verify_passes_a_true_table(verified):
     """Fields within 5e-5 of the direct solve, and answers with one to three quiet fingers."""
     assert verified.failed_count == 0
+    assert verified.promise.kept_share == pytest.approx(0.9, abs=0.08)
+    assert verified.promise.plate_count == 800
     assert len(verified.content) == 2
     fields, cells = verified.content
     assert fields.error < 5e-5

@@ -14,7 +14,10 @@ ninetieth percentile, the worse) over the touches, in dB:
 
 import argparse
 
+import numpy as np
+
 from benchmarks.setting import RIG, use_one_thread
+from model.arrays import FloatArray
 
 DURATIONS = (0.020, 0.040)
 SHARES = (1 / 8, 1 / 4, 1 / 2, 3 / 4, 1.0)  # of the duration
@@ -26,8 +29,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     use_one_thread()
-    import numpy as np
-
     from model.finger.fingertip import fingertip_points, fingertip_weights
     from model.rig.file import load_rig
     from model.table.build import build_table
@@ -40,20 +41,11 @@ def main() -> None:
     transients = Transients(table.in_time)
     rng = np.random.default_rng(options.seed)
     size = [rig.plate.length, rig.plate.width]
-    touches = []
+    touches: list[tuple[tuple[float, float], tuple[float, float]]] = []
     while len(touches) < options.sets:
-        one, other = rng.uniform(0, size, (2, 2)).tolist()
-        if np.hypot(one[0] - other[0], one[1] - other[1]) >= 0.05:
-            touches.append((tuple(one), tuple(other)))
-
-    def strongest(acceleration, count):
-        """Levels [dB] of the rms over every stretch of a number of samples, (n, p)."""
-        total = np.cumsum(np.vstack([0 * acceleration[:1], acceleration**2]), axis=0)
-        mean = np.maximum((total[count:] - total[:-count]) / count, 1e-30)
-        return np.sqrt(mean)
-
-    def decibels(ratio):
-        return 20 * np.log10(ratio)
+        (x0, y0), (x1, y1) = rng.uniform(0, size, (2, 2)).tolist()
+        if np.hypot(x0 - x1, y0 - y1) >= 0.05:
+            touches.append(((x0, y0), (x1, y1)))
 
     print(f"{options.sets} touches, seed {options.seed}")
     for duration in DURATIONS:
@@ -88,12 +80,18 @@ def main() -> None:
                         whole / strongest(at_other, count).max(),
                     ]
                 )
-            found = decibels(np.array(rows))
+            found = 20 * np.log10(np.array(rows))
             cells = [
                 f"{np.median(column):.1f} ({np.percentile(column, worse):.1f})"
                 for column, worse in zip(found.T, (10, 90, 90, 10), strict=True)
             ]
             print(f"| {1e3 * share * duration:.1f} | {' | '.join(cells)} |")
+
+
+def strongest(acceleration: FloatArray, count: int) -> FloatArray:
+    """Rms over every stretch of a number of samples, (n, p), of acceleration (m, p) [m/s²]."""
+    total = np.cumsum(np.vstack([0 * acceleration[:1], acceleration**2]), axis=0)
+    return np.sqrt(np.maximum((total[count:] - total[:-count]) / count, 1e-30))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 """Selection: from a haptic intent to the pattern of the table that realises it."""
 
+import contextlib
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +25,9 @@ from registry.plugins import failure_text
 # Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own
 # radius is still within the disc that the pattern was chosen for.
 MOVE_TOLERANCE = 0.008
+
+# A step of a ramp or texture may be this far [dB] below its level before its frequency changes.
+_STEP_SHORT_OF = 1.0
 
 _logger = logging.getLogger(__name__)
 
@@ -118,7 +122,7 @@ class Selector:
         if not targets:
             return Selection((), quiet, None, intent.reason)
         try:
-            answer = query_table(self._table, targets, quiet, capabilities, self._levels)
+            answer = self._query(targets, quiet, capabilities)
             predictions = self._predict(targets, quiet, answer)
         except InputError as error:
             return Selection(targets, quiet, None, str(error))
@@ -126,6 +130,35 @@ class Selector:
             _logger.exception("loop: table failed, silencing all channels")
             return Selection(targets, quiet, None, failure_text(error))
         return Selection(targets, quiet, answer.pattern, None, answer.question, predictions)
+
+    def _query(
+        self,
+        targets: tuple[tuple[Contact, Target], ...],
+        quiet: tuple[Contact, ...],
+        capabilities: PlaybackCapabilities,
+    ) -> TableAnswer:
+        """Query the table; a level that changes keeps its frequency where that reaches it."""
+        kept = self._continued(targets)
+        if kept is not None:
+            tuned = [(contact, replace(each, band=(kept, kept))) for contact, each in targets]
+            with contextlib.suppress(InputError):
+                answer = query_table(self._table, tuned, quiet, capabilities, self._levels)
+                levels = [each.level_db_sl or 0.0 for _, each in targets]
+                if answer.felt_db_sl >= max(levels) - _STEP_SHORT_OF:
+                    return answer
+        return query_table(self._table, targets, quiet, capabilities, self._levels)
+
+    def _continued(self, targets: tuple[tuple[Contact, Target], ...]) -> float | None:
+        """Return the frequency [Hz] that plays if only levels of its targets change; else None."""
+        current = self._current
+        if current.pattern is None or len(targets) != len(current.targets):
+            return None
+        for (_, new), (_, old) in zip(targets, current.targets, strict=True):
+            is_step = new != old and new == replace(old, level_db_sl=new.level_db_sl)
+            if not is_step or new.level_db_sl is None or (new.pulse and new.pulse.is_raised):
+                return None
+        frequencies = {tone.frequency for tone in current.pattern.excitation.values()}
+        return frequencies.pop() if len(frequencies) == 1 else None
 
     def _predict(
         self,

@@ -178,7 +178,8 @@ class Pressed:
         """Note what the pressing finger has felt at its last position."""
         now = asyncio.get_running_loop().time()
         self._bench.advance(now)
-        for start, applied in zip(self._starts, self._reports, strict=True):
+        for start in self._starts:
+            applied = min(self._reports, key=lambda each: abs(each.time - start))
             record = self._bench.fingers.felt(start, now)[str(100 + number)]
             self._felts.append(
                 Felt(

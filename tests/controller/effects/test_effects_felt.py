@@ -1,5 +1,7 @@
 """What a finger feels of an effect over every wire, against what was promised, in virtual time."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -8,24 +10,53 @@ import pytest
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.detents import Detents
+from controller.effects.dial import Dial
 from controller.effects.effect import Effect
 from controller.effects.layout import SurfaceLayout
+from controller.effects.ramp import Ramp
 from controller.effects.region import Region
-from controller.effects.shapes import Rectangle
+from controller.effects.shapes import Circle, Rectangle
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from paper_table import smooth_rig
 from pressed_layout import WIRES, Felt, Pressed
 
 PRESSES = 10
-PLACE = (0.09, 0.07)
-EFFECTS: dict[str, tuple[Effect, float, float]] = {
-    "short click": (Click(duration=0.020), 0.0, 0.020),
-    "click": (Click(), 0.0, 0.040),
-    "long click": (Click(duration=0.120, level=14.0), 0.0, 0.120),
-    "buzz": (Buzz(), 0.3, 0.1),
+PLACE, CENTRE = (0.09, 0.07), (0.09, 0.10)
+Way = Callable[[float], tuple[float, float]]
+
+
+def rest(since: float) -> tuple[float, float]:
+    """A finger that stays where it came down."""
+    return PLACE
+
+
+def step(since: float) -> tuple[float, float]:
+    """A finger that moves by 8 mm after a tenth of a second."""
+    return (PLACE[0] + (0.008 if since > 0.1 else 0.0), PLACE[1])
+
+
+@dataclass(frozen=True)
+class Case:
+    """An effect and over which part of it [s] its level is felt, and the way of the finger."""
+
+    effect: Effect
+    duration: float
+    since: float = 0.0
+    way: Way = rest
+    held: float = 0.15
+
+
+CASES = {
+    "short click": Case(Click(duration=0.020), 0.020),
+    "click": Case(Click(), 0.040),
+    "long click": Case(Click(duration=0.120, level=14.0), 0.120, held=0.2),
+    "short buzz": Case(Buzz(duration=0.300, level=16.0), 0.300, held=0.4),
+    "buzz": Case(Buzz(), 0.1, since=0.3, held=0.42),
+    "ramp": Case(Ramp(start_level=14.0, duration=0.4), 0.08, since=0.32, held=0.42),
+    "detents": Case(Detents(), 0.030, way=step, held=0.2),
+    "dial": Case(Dial(), 0.030, way=step, held=0.2),
 }
-"""Effects, and over which part of each its level is felt: start and length [s]."""
 
 
 @cache
@@ -34,12 +65,13 @@ def table() -> LocalizationTable:
     return build_table(smooth_rig(), frequencies=np.linspace(60.0, 420.0, 10))
 
 
-def pressed(effect: Effect, wire: str) -> list[Felt]:
-    """What ten equal presses feel first."""
-    layout = SurfaceLayout(effects={"it": effect}, elsewhere="it")
-    chain = Pressed(smooth_rig(), table(), layout, wire)
-    held = 0.42 if isinstance(effect, Buzz) else 0.15
-    presses = chain.press(*[lambda since: PLACE] * PRESSES, held=held)
+def pressed(case: Case, wire: str, **options: float) -> list[Felt]:
+    """What ten equal presses feel."""
+    where = "on_move" if case.effect.is_for_motion else "on_press"
+    region = Region("all", Circle(*CENTRE, 0.06), **{where: "it"})
+    layout = SurfaceLayout((region,), {"it": case.effect}, elsewhere=None)
+    chain = Pressed(smooth_rig(), table(), layout, wire, options=dict(options))
+    presses = chain.press(*[case.way] * PRESSES, held=case.held)
     assert all(len(each) == 1 for each in presses)
     return [felt for (felt,) in presses]
 
@@ -61,12 +93,23 @@ def test_notches_of_a_slider_are_alike(band: tuple[float, float], played: set[fl
 
 
 @pytest.mark.parametrize("wire", WIRES)
-@pytest.mark.parametrize("name", EFFECTS)
+@pytest.mark.parametrize("name", CASES)
 def test_effect_is_felt_as_promised_and_alike_at_every_press(name: str, wire: str) -> None:
     """Within 3 dB of what layout and report promise, ten presses within 2 dB, on the plate."""
-    effect, since, duration = EFFECTS[name]
-    presses = pressed(effect, wire)
-    levels = [felt.level_db_sl(duration, since=since) for felt in presses]
-    assert levels == pytest.approx([effect.level] * PRESSES, abs=3.0)
-    assert levels == pytest.approx([felt.promised_db_sl for felt in presses], abs=3.0)
+    case = CASES[name]
+    presses = pressed(case, wire)
+    levels = [felt.level_db_sl(case.duration, since=case.since) for felt in presses]
+    assert levels == pytest.approx([case.effect.level] * PRESSES, abs=3.0)
+    if name != "ramp":  # which reports each of its steps
+        assert levels == pytest.approx([felt.promised_db_sl for felt in presses], abs=3.0)
     assert max(levels) - min(levels) <= 2.0
+
+
+@pytest.mark.parametrize("wire", WIRES)
+def test_no_effect_starts_more_than_10_ms_later_than_along_a_plain_ramp(wire: str) -> None:
+    """The slowest press of ten by default, against the slowest without shaped onsets."""
+    default, plain = (
+        max(felt.delay for felt in pressed(CASES["buzz"], wire, **options))
+        for options in ({}, {"max_loading_time": 0.0})
+    )
+    assert default - plain <= 0.010

@@ -1,5 +1,6 @@
 """Questions to the table for an intent, and the pattern to play for its answer."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -48,10 +49,21 @@ def query_table(
     levels: None for steady levels only. Raises InputError where nothing can be played.
     """
     question = _question(targets, quiet, capabilities, table.frequencies)
+    duration = _felt_duration(targets)
     if all(target.level_db_sl is None for _, target in targets):
         pattern = strongest(table.query(question), capabilities.max_amplitudes)
-        return TableAnswer(question, pattern, pattern.level_db_sl)
-    duration = _felt_duration(targets)
+        felt = pattern.level_db_sl
+        if duration is not None and levels is not None:
+            # Along the ramp of its duration, but no stronger: the neighbours feel it as long.
+            pattern, felt = levels.raised(
+                pattern,
+                level_db_sl=math.inf,
+                duration=duration,
+                targets=question.targets,
+                limits=DriveLimits({n: tone.amplitude for n, tone in pattern.excitation.items()}),
+                is_shaped=question.envelopes,
+            )
+        return TableAnswer(question, pattern, felt)
     if duration is None and all(target.allow_weaker for _, target in targets):
         return _as_neighbours_allow(table, question, capabilities)
     is_fixed = any(target.band is not None for _, target in targets)

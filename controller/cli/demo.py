@@ -138,7 +138,7 @@ _HEADING = (
     f"{'':51}{'felt contrast':^13}  {'contrast / dB':^13}  {'level':^13} {'latency':>7}\n"
     f"{'':51}{'/ dB':^13}  {'first 100 ms':^13}  {'/ dB SL':^13} {'/ ms':>7}\n"
     f" time  target / cm  others  {'ERAs':22} "
-    f"{'prom.':>6} {'meas.':>6}  {'pred.':>6} {'meas.':>6}  {'pred.':>6} {'meas.':>6}\n"
+    f"{'prom.':>6} {'meas.':>6}  {'pred.':>6} {'meas.':>6}  {'prom.':>6} {'meas.':>6}\n"
 )
 
 
@@ -173,6 +173,6 @@ def _summary(rows: "list[TouchRow]") -> str:
         return touches
     return (
         f"{touches}; of {len(kept)} with other fingers on the plate {sum(kept)} "
-        f"({sum(kept) / len(kept):.0%}) felt at least the contrast promised, which is what nine of "
-        "ten plates within the rig's uncertainty give"
+        f"({sum(kept) / len(kept):.0%}) felt at least the contrast promised\n"
+        "(promised: what nine of ten plates within the rig's uncertainty give)"
     )

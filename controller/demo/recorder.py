@@ -20,7 +20,6 @@ from controller.loop.selection import Prediction
 from controller.sources.contacts import Change, Contact, ContactKey
 from drivers import clock
 from drivers.errors import LinkError
-from model.table.pattern import Pattern
 from model.transients.measures import ONSET_WINDOW
 
 STEADY_WINDOW = 0.25
@@ -224,7 +223,7 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
         latency_ms=1000 * first.applied.latency,
         played_s=main_part.duration,
         steady=main_part.duration >= STEADY_DURATION,
-        predicted_felt_contrast_db=_felt_contrast(predicted, applied.pattern),
+        predicted_felt_contrast_db=applied.pattern.felt_contrast_db,
         robust_felt_contrast_db=applied.pattern.robust_felt_contrast_db,
         measured_felt_contrast_db=felt_contrast_db(target, quiet) if target else None,
         predicted_contrast_db=predicted.contrast_db,
@@ -251,12 +250,6 @@ def _fingers(
         target is not None and len(target.frequencies) and len(quiet) == len(applied.quiet)
     )
     return (target, quiet) if is_complete else (None, [])
-
-
-def _felt_contrast(predicted: Prediction, pattern: Pattern) -> float | None:
-    """Predicted level of a target above that of the loudest quiet point [dB]."""
-    quiet = pattern.quiet_level_db_sl
-    return None if quiet is None else predicted.level_db_sl - quiet
 
 
 def _prediction(touch: _Touch, playing: _Playing) -> Prediction:

@@ -57,9 +57,7 @@ def demo(environment, tmp_path, monkeypatch, capsys):
 
     def run_demo(*arguments):
         commands = entry_points(group="era_haptics.commands")
-        status = run(
-            ["demo", "--exact", *map(str, arguments), "--out", str(tmp_path), "--json"], commands
-        )
+        status = run(["demo", *map(str, arguments), "--out", str(tmp_path), "--json"], commands)
         printed = capsys.readouterr()
         assert status == 0, printed.err
         return json.loads(printed.out)
@@ -70,7 +68,10 @@ def demo(environment, tmp_path, monkeypatch, capsys):
 @pytest.mark.real_time
 @pytest.mark.parametrize("wire", ["serial", "can"])
 def test_demo_contacts_feel_the_prediction(wire, capture, demo):
-    """Each touch has its row; measured contrast and level are the predicted ones within 3 dB."""
+    """Each touch has its row; level within 3 dB of the promise, contrast at least the promised.
+
+    Of the first plate that is drawn, on which these touches keep it.
+    """
     result = demo("--wire", wire, "--touches", capture)
     assert result["wire"] == wire
     rows = result["touches"]
@@ -92,8 +93,10 @@ def test_demo_contacts_feel_the_prediction(wire, capture, demo):
     assert alone["predicted_transient_contrast_db"] is None
     assert beside["measured_transient_contrast_db"] is None
     assert beside["quiet_m"] == alone["targets_m"]
-    assert beside["predicted_contrast_db"] > 5
-    assert beside["measured_contrast_db"] == pytest.approx(beside["predicted_contrast_db"], abs=3)
+    for what in ("contrast_db", "felt_contrast_db"):
+        promised, measured = beside[f"robust_{what}"], beside[f"measured_{what}"]
+        assert 3 < promised < beside[f"predicted_{what}"]
+        assert promised <= measured < promised + 20
     (picture,) = map(Path, result["files"])
     assert picture.read_bytes().startswith(b"\x89PNG")
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array
+from model.arrays import Complex64Array, Float32Array, IntArray
 from model.ensemble.attached_plate import AttachedPlate
 
 # Share of a form's trace that is added to its diagonal: keeps it definite.
@@ -34,7 +34,8 @@ class LoadedContacts:
     - shapes: (a, r); stiffness: (f, a) Z
     - inverse: (f, a, a) K; forces: (f, a, n) F; motion: (f, a, n) r
     - fields: (f, k, p, n) h [m/s²] at each finger's points; power: (f, k, n, n) R
-    - point_power: (f, p, n, n) the same at each point of the last finger, if asked for
+    - parts: (f, k p, n) each, h and its changes dh; reach: (f, k p, j) |t|² of each uncertain
+      spring and load; outer: (f, j, n²) their s² r* r^T; error_power: (f, n) of discretisation
     """
 
     shapes: Float32Array
@@ -44,7 +45,28 @@ class LoadedContacts:
     motion: Complex64Array
     fields: Complex64Array
     power: Complex64Array
-    point_power: Complex64Array | None
+    parts: tuple[Complex64Array, ...]
+    reach: Float32Array
+    outer: Complex64Array
+    error_power: Float32Array
+    gain_variance: float
+
+    def point_power(self, frequencies: IntArray, *, first: int) -> Complex64Array:
+        """Expected power at each point of the fingers from the first on, (n, points, eras, eras).
+
+        frequencies (n,): by index.
+        """
+        start = first * self.fields.shape[2]
+        parts = [part.take(frequencies, axis=0)[:, start:] for part in self.parts]
+        rows = np.stack(parts, axis=2)
+        f, p, _, n = rows.shape
+        reach = self.reach.take(frequencies, axis=0)[:, start:]
+        outer = self.outer.take(frequencies, axis=0).view(np.float32)
+        power = rows.conj().swapaxes(2, 3) @ rows
+        power += (reach @ outer).view(np.complex64).reshape(f, p, n, n)
+        error = self.error_power.take(frequencies, axis=0)[:, None]
+        _add_diagonal(power, self.gain_variance * _power_of(parts[0]) + error)
+        return power
 
 
 def load_contacts(
@@ -52,8 +74,6 @@ def load_contacts(
     points: Float32Array,
     weights: Float32Array,
     error_power: Float32Array,
-    *,
-    is_by_point: bool = False,
 ) -> LoadedContacts:
     """Put fingers on a plate.
 
@@ -93,24 +113,25 @@ def load_contacts(
     )
     moved = motion.take(j, axis=1) * changes[:, :, None]
     outer = _outer(moved).reshape(f, len(j), -1)
-    reach = _power_of(to_points.take(j, axis=2)) * weights.reshape(1, k * p, 1)
-    shares = np.add.reduce(reach.reshape(f, k, p, -1), axis=2)
+    reach = _power_of(to_points.take(j, axis=2))
+    shares = np.add.reduce((reach * weights.reshape(1, k * p, 1)).reshape(f, k, p, -1), axis=2)
     by_change = (shares @ outer.view(np.float32)).view(np.complex64).reshape(f, k, n, n)
     power = stacked.conj().swapaxes(2, 3) @ stacked + by_change
     size = np.add.reduce((_power_of(h) * weights.reshape(1, -1, 1)).reshape(f, k, p, n), axis=2)
     _add_diagonal(power, plate.gain_variance * size + error_power[:, None])
-    point_power = None
-    if is_by_point:
-        last = slice(-p, None)
-        each = np.stack([part[:, last] for part in parts], axis=2)
-        by_each = _power_of(to_points[:, last].take(j, axis=2)) @ outer.view(np.float32)
-        point_power = each.conj().swapaxes(2, 3) @ each
-        point_power += by_each.view(np.complex64).reshape(f, p, n, n)
-        _add_diagonal(
-            point_power, plate.gain_variance * _power_of(h[:, last]) + error_power[:, None]
-        )
     return LoadedContacts(
-        shapes, stiffness, inverse, forces, motion, h.reshape(f, k, p, n), power, point_power
+        shapes,
+        stiffness,
+        inverse,
+        forces,
+        motion,
+        h.reshape(f, k, p, n),
+        power,
+        tuple(parts),
+        reach,
+        outer,
+        error_power,
+        plate.gain_variance,
     )
 
 
@@ -146,7 +167,7 @@ def _by_thickness(
     stiffness: Complex64Array,
     forces: Complex64Array,
     rows: Float32Array,
-    attached: np.ndarray,
+    attached: IntArray,
     to_points: Complex64Array,
 ) -> Complex64Array:
     """Change of the fields at the points by one deviation of the thickness, (f, k p, n)."""

@@ -1,7 +1,7 @@
 """A table's plate with the fingers of a question on it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,12 +37,12 @@ class FingersOnPlate:
         self._threshold = threshold
         self._error_power = error_power
         self._contacts: LoadedContacts = load_contacts(
-            plate, tips.few, tips.few_weights, error_power, is_by_point=len(question.quiet) == 1
+            plate, tips.few, tips.few_weights, error_power
         )
         self._gains = np.array(question.gains, dtype=np.float32)
 
-    def forms(self, background: Complex64Array | None) -> list[Forms]:
-        """Forms to search, by quiet fingertip, and with one also by its points.
+    def forms(self, background: Complex64Array | None) -> Forms:
+        """Forms to search, by quiet fingertip.
 
         background (f, eras, eras): mean power of the rest of the plate, for no quiet finger.
         """
@@ -53,10 +53,12 @@ class FingersOnPlate:
         power = contacts.power[:, :t].swapaxes(0, 1) * (gains**2)[:, None, None, None]
         quiet = contacts.power[:, t:] if background is None else self._expected(background)[:, None]
         wanted = 10 ** (self._question.level_db_sl / 20)
-        found = Forms(by_target, power, np.ascontiguousarray(quiet), self._threshold, wanted)
-        if contacts.point_power is None:
-            return [found]
-        return [found, Forms(by_target, power, contacts.point_power, self._threshold, wanted)]
+        return Forms(by_target, power, np.ascontiguousarray(quiet), self._threshold, wanted)
+
+    def by_point(self, forms: Forms, frequencies: IntArray) -> Forms:
+        """Forms, at rows (n,) of the plate's frequencies, with every quiet point as a fingertip."""
+        quiet = self._contacts.point_power(frequencies, first=len(self._question.targets))
+        return replace(forms, quiet=quiet)
 
     def respond(self, drives: Sequence[Weights]) -> "DriveResponses":
         """Responses of the fingertips to drives."""

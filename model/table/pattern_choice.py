@@ -13,7 +13,7 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.counting import counted
-from model.drive_modes import find_drives, max_sensation
+from model.drive_modes import DRIVE_MODES, find_drives, max_sensation
 from model.drive_modes.exact_search import search_exactly, sensation_found
 from model.drive_modes.forms import Forms, Weights
 from model.drive_modes.tones import excitation_of
@@ -26,6 +26,9 @@ from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.question import Question
 
 JUDGING_DRAWS, JUDGING_SEED = 64, 1
+MAX_FINGERS_BY_POINT = 4
+"""Quiet fingers up to which drives that minimise over their points are candidates, too."""
+
 PROMISED_DRAWS, PROMISED_SEED = 200, 8
 
 PROMISED_PERCENTILE = 9
@@ -37,7 +40,7 @@ It is the tenth of plates solved exactly: the terms beyond the first order cost 
 # Among drives of nearly the same robust contrast the onset decides, too: a decibel of contrast
 # counts as much as three in the first 100 ms (docs/decisions, on ramps).
 ONSET_WEIGHT = 1 / 3
-ONSET_MARGIN_DB = 1.0
+ONSET_MARGIN_DB = 0.3
 
 _ROUNDING = 1 - 1e-5
 
@@ -90,16 +93,17 @@ def choose_pattern(question: Question, drive_mode: str, candidates: Candidates) 
     At nine of ten plates where possible, else at the plate as modelled. Raises InputError where
     none does.
     """
-    forms = [
-        each if len(candidates.playable) == each.frequency_count else each.at(candidates.playable)
-        for each in candidates.fingers.forms(candidates.background)
-    ]
+    playable = candidates.playable
+    forms = candidates.fingers.forms(candidates.background)
+    if len(playable) < forms.frequency_count:
+        forms = forms.at(playable)
     if drive_mode == "switched" and question.eras_at_most != 2:
-        found, gap = _search_exactly(question, forms[0])
+        found, gap = _search_exactly(question, forms)
     else:
-        found, gap = _search(question, drive_mode, forms), None
+        forms, found = _search(question, drive_mode, forms)
+        found, gap = found + _by_point(question, drive_mode, candidates, forms, found), None
     scores = np.array([score for score, _ in found])
-    drives = [replace(each, frequencies=_rows(each, candidates.playable)) for _, each in found]
+    drives = [replace(each, frequencies=_rows(each, playable)) for _, each in found]
     responses = candidates.fingers.respond(drives)
     best = _judged(question, drives, scores, candidates, responses)
     pattern = _pattern(question, drive_mode, candidates, drives[best], responses.of(best))
@@ -107,14 +111,44 @@ def choose_pattern(question: Question, drive_mode: str, candidates: Candidates) 
 
 
 def _search(
-    question: Question, drive_mode: str, forms: Sequence[Forms]
-) -> list[tuple[float, Weights]]:
-    """The drives of the best scores; raises InputError where none reaches the level."""
-    for some in (forms, [replace(each, level_margin=0.0) for each in forms]):
-        drives = [drive for each in some for drive in find_drives(each, drive_mode)]
+    question: Question, drive_mode: str, forms: Forms
+) -> tuple[Forms, list[tuple[float, Weights]]]:
+    """The drives of the best scores, and the forms with the margin of the level that they meet.
+
+    Raises InputError where none reaches the level.
+    """
+    for some in (forms, replace(forms, level_margin=0.0)):
+        drives = find_drives(some, drive_mode)
         if drives:
-            return drives
-    raise _level_error(question, drive_mode, max_sensation(forms[0], drive_mode))
+            return some, drives
+    raise _level_error(question, drive_mode, max_sensation(forms, drive_mode))
+
+
+def _by_point(
+    question: Question,
+    drive_mode: str,
+    candidates: Candidates,
+    forms: Forms,
+    drives: Sequence[tuple[float, Weights]],
+) -> list[tuple[float, Weights]]:
+    """Drives at the same frequencies that minimise over the points of the quiet fingers.
+
+    Where nulls are narrow, with few fingers and small errors, these do better.
+    """
+    coherent = DRIVE_MODES[drive_mode].coherent
+    if coherent is None or not 1 <= len(question.quiet) <= MAX_FINGERS_BY_POINT:
+        return []
+    tones = {tuple(index for index, _ in drive.tones()) for _, drive in drives}
+    rows = np.array(sorted(row for row, *others in tones if not others), dtype=int)
+    if len(rows) == 0:
+        return []
+    by_point = candidates.fingers.by_point(forms.at(rows), candidates.playable[rows])
+    found = coherent.search(by_point, 0.0)
+    return [
+        (float(score), Weights.at(int(row), weights))
+        for row, score, weights in zip(rows, found.score, found.weights, strict=True)
+        if score > 0
+    ]
 
 
 def _search_exactly(question: Question, forms: Forms) -> tuple[list[tuple[float, Weights]], float]:

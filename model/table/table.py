@@ -168,7 +168,7 @@ class LocalizationTable:
         """Expected powers at the fingertips of a question, at all frequencies of the table."""
         background = None if question.quiet else self._background(question)
         tips = self.read_fingertips((*question.targets, *question.quiet))
-        return self._fingers(question, tips).forms(background)[0]
+        return self._fingers(question, tips).forms(background)
 
     def threshold_at(self, rows: IntArray) -> Float32Array:
         """Detection thresholds [m/s²] at frequencies, by index (n,)."""

@@ -43,7 +43,7 @@ def solved(uncertainty):
     )
     shapes = reduced.at(POINTS.reshape(-1, 2)).astype(np.float32).reshape(3, 5, -1)
     weights = np.tile(FIVE_POINTS.weights, (3, 1)).astype(np.float32)
-    contacts = load_contacts(plate, shapes, weights, np.zeros((4, 4), np.float32), is_by_point=True)
+    contacts = load_contacts(plate, shapes, weights, np.zeros((4, 4), np.float32))
     return plate, contacts, shapes
 
 
@@ -132,7 +132,8 @@ def test_expected_power_is_the_mean_square_of_the_draws(is_by_point):
     factors = draw(4, 3, count=4000, seed=5, gain=plate.gain, phase=plate.phase)
     powers = (np.abs(responses @ factors) ** 2).mean(axis=2).reshape(4, 3, 5)
     if is_by_point:
-        forms, drawn = contacts.point_power, powers[:, -1]
+        forms = contacts.point_power(np.arange(4), first=1)
+        drawn = powers[:, 1:].reshape(4, 10)
     else:
         forms, drawn = contacts.power, powers @ FIVE_POINTS.weights
     found = np.einsum("fi,fqij,fj->fq", weights.conj(), forms, weights).real

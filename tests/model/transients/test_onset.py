@@ -55,7 +55,7 @@ def test_ramped_onset_contrast_equals_sampled_contrast(ramp, within):
 
 
 def test_plain_ramps_choose_among_nearly_equal_drives_by_their_onset():
-    """At most a decibel of the judged contrast is given, for more in the first 100 ms on average.
+    """Tenths of a decibel of the judged contrast are given, for more in the first 100 ms.
 
     Beside the same questions with envelopes, which need no such choice; sampled in time.
     """
@@ -76,7 +76,7 @@ def test_plain_ramps_choose_among_nearly_equal_drives_by_their_onset():
         ]
         given.append(steady.robust_felt_contrast_db - ramped.robust_felt_contrast_db)
         gained.append(first[1] - first[0])
-    assert max(given) < 1.0 + 1.0  # judged by other draws than those of the promise
+    assert np.mean(given) < 0.3  # judged by other draws than those of the promise
     assert np.count_nonzero(gained) >= 3
     assert np.mean(gained) > 0
 

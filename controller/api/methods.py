@@ -12,6 +12,7 @@ from controller.api.schema import (
     MAX_LEASE,
     MAX_RATE,
     MIN_LEASE,
+    PROMISED,
     AmplifierSilence,
     AmplifierStatus,
     ContactStatus,
@@ -73,6 +74,13 @@ class StatusResult(Message):
     silence_reason: str | None = Field(None, description="why nothing plays although armed")
     ramp_only_reason: str | None = Field(
         None, description="why onsets are plain ramps although shaped ones are possible"
+    )
+    robust_felt_contrast_db: float | None = Field(None, description=PROMISED)
+    predicted_felt_contrast_db: float | None = Field(
+        None, description="the same on the plate as modelled"
+    )
+    robust_contrast_db: float | None = Field(
+        None, description="promised contrast in peak acceleration"
     )
     predicted_contrast_db: float | None
     predicted_level_db_sl: float | None

@@ -8,6 +8,12 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 API_VERSION = "1.0"
 """major.minor: major versions are incompatible; a higher minor version only adds."""
 
+PROMISED = (
+    "felt contrast, target over loudest quiet finger, that nine of ten plates within the rig's "
+    "uncertainty give; null for a single finger"
+)
+"""Description of the figure that is promised."""
+
 MIN_LEASE = 1.0  # s
 MAX_LEASE = 60.0  # s; a client that has gone away cannot stop anything meanwhile
 MAX_RATE = 60.0  # Hz; of notifications, as fast as a screen shows them
@@ -114,6 +120,7 @@ class ContactStatus(Message):
     level_db_sl: float | None = Field(
         None, description="predicted sensation level; null if unknown"
     )
+    robust_felt_contrast_db: float | None = Field(None, description=PROMISED)
     contrast_db: float | None = Field(
         None, description="predicted, target over loudest quiet finger; null for a single finger"
     )

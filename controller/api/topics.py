@@ -5,6 +5,7 @@ from typing import Any, Literal, NamedTuple
 from pydantic import Field
 
 from controller.api.schema import (
+    PROMISED,
     AmplifierStatus,
     ContactStatus,
     Count,
@@ -36,6 +37,13 @@ class PatternEvent(Message):
 
     contacts: list[ContactStatus]
     drive: dict[str, PlayedTone] = Field(description="by ERA, without silent ones")
+    robust_felt_contrast_db: float | None = Field(None, description=PROMISED)
+    predicted_felt_contrast_db: float | None = Field(
+        None, description="the same on the plate as modelled"
+    )
+    robust_contrast_db: float | None = Field(
+        None, description="promised contrast in peak acceleration"
+    )
     predicted_contrast_db: float | None
     predicted_level_db_sl: float | None
     latency_ms: float = Field(description="from the touch to the last byte of the command")

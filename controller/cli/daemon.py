@@ -295,7 +295,8 @@ def show_status(status: "StatusResult") -> str:
         lines.append(f"  armed by {status.armed_by}, {status.lease_left_s:.1f} s left")
     for contact in status.contacts:
         level = "" if contact.level_db_sl is None else f" {contact.level_db_sl:.1f} dB SL"
-        contrast = "" if contact.contrast_db is None else f", contrast {contact.contrast_db:.1f} dB"
+        promised = contact.robust_felt_contrast_db
+        contrast = "" if promised is None else f", at least {promised:.1f} dB over the others"
         effect = "" if contact.effect is None else f", effect {contact.effect}"
         lines.append(
             f"  finger {contact.source} {contact.id} at {contact.x_m:.3f}, {contact.y_m:.3f} m: "

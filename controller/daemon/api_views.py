@@ -47,6 +47,9 @@ class PlateView:
                 for contact in applied.contacts
             ],
             drive=self.drive(),
+            robust_felt_contrast_db=_finite(applied.pattern.robust_felt_contrast_db),
+            predicted_felt_contrast_db=_finite(applied.pattern.felt_contrast_db),
+            robust_contrast_db=_finite(applied.pattern.robust_contrast_db),
             predicted_contrast_db=_finite(applied.pattern.contrast_db),
             predicted_level_db_sl=_finite(applied.pattern.level_db_sl),
             latency_ms=1e3 * applied.latency,
@@ -90,6 +93,7 @@ def contact_status(
                 status |= {
                     "role": "target",
                     "level_db_sl": _finite(felt.level_db_sl),
+                    "robust_felt_contrast_db": _finite(applied.pattern.robust_felt_contrast_db),
                     "contrast_db": _finite(felt.contrast_db),
                 }
         if any(quiet.key == contact.key for quiet in applied.quiet):

@@ -64,11 +64,20 @@ def metrics_of(status: StatusResult) -> Iterator[Metric]:
     yield _gauge("era_contacts", "Fingers on the plate.", len(status.contacts))
     yield _gauge("era_uptime_seconds", "Time since the daemon started.", status.uptime_s)
     for name, text, value in (
-        ("contrast", "Predicted contrast of the current pattern.", status.predicted_contrast_db),
-        ("level", "Predicted level at the target.", status.predicted_level_db_sl),
+        (
+            "promised_contrast",
+            "Felt contrast that nine of ten plates within the rig's uncertainty give.",
+            status.robust_felt_contrast_db,
+        ),
+        (
+            "predicted_contrast",
+            "Felt contrast of the pattern as modelled.",
+            status.predicted_felt_contrast_db,
+        ),
+        ("predicted_level", "Predicted level at the target.", status.predicted_level_db_sl),
     ):
         if value is not None:
-            yield _gauge(f"era_predicted_{name}_decibels", text, value)
+            yield _gauge(f"era_{name}_decibels", text, value)
     rejected = CounterMetricFamily(
         "era_rejected_touches", "Touches rejected as contacts.", labels=["reason"]
     )

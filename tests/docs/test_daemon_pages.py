@@ -58,7 +58,11 @@ async def test_every_metric_is_on_its_page(tmp_path: Path) -> None:
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await until_state(era, "READY_TO_SWITCH_ON")
         status = await era.status()
-    playing = {"predicted_contrast_db": 20.0, "predicted_level_db_sl": 20.0}
+    playing = {
+        "robust_felt_contrast_db": 15.0,
+        "predicted_felt_contrast_db": 20.0,
+        "predicted_level_db_sl": 20.0,
+    }
     touched = status.model_copy(update={**playing, "rejected_touches": {"off_plate": 1}})
     served = []
     for family in text_string_to_metric_families(exposition(touched).decode()):

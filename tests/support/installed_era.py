@@ -115,15 +115,16 @@ def try_wire(era: InstalledEra) -> None:
 
 
 def try_demo(era: InstalledEra) -> None:
-    """The demonstration: the recorded touches that come with it are felt as predicted."""
+    """The demonstration: the recorded touches that come with it are felt as promised."""
     told = json.loads(era("demo", "--out", "demo", "--json"))
     pairs = [
-        (touch["predicted_contrast_db"], touch["measured_contrast_db"])
+        (touch["robust_felt_contrast_db"], touch["measured_felt_contrast_db"])
         for touch in told["touches"]
-        if touch["drive"] and touch["predicted_contrast_db"] is not None
+        if touch["steady"] and touch["robust_felt_contrast_db"] is not None
     ]
     expect(len(pairs) > 5, "hardly a touch with others on the plate")
-    expect(all(abs(said - felt) < 3.0 for said, felt in pairs), f"not as predicted: {pairs}")
+    kept = sum(promised <= felt for promised, felt in pairs)
+    expect(kept >= 0.7 * len(pairs), f"not as promised: {pairs}")
     expect(all((era.folder / name).is_file() for name in told["files"]), "pictures are missing")
 
 

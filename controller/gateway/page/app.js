@@ -161,10 +161,12 @@ function showLinkLoss(cause, remedy) {
   linkLoss ??= { item: addEvent(log, "error", `link lost: ${cause}`, remedy), remedy, retries: 0 };
 }
 
-function summarise({ contacts, predicted_contrast_db, predicted_level_db_sl, latency_ms }) {
+function summarise(pattern) {
+  const { contacts, predicted_level_db_sl, latency_ms } = pattern;
+  const { robust_felt_contrast_db: promised, predicted_felt_contrast_db: modelled } = pattern;
   const parts = [];
   if (predicted_level_db_sl !== null) parts.push(`target: ${fixed(predicted_level_db_sl)} dB SL`);
-  if (predicted_contrast_db !== null) parts.push(`${fixed(predicted_contrast_db)} dB over the other fingers`);
+  if (promised != null) parts.push(`at least ${fixed(promised)} dB over the other fingers (${fixed(modelled)} as modelled)`);
   parts.push(`${fixed(latency_ms, 1)} ms from touch to wire`);
   at("summary").textContent = `${contacts.length} ${contacts.length === 1 ? "finger" : "fingers"}: ${parts.join(", ")}`;
 }

@@ -147,7 +147,7 @@ def _check(
         for resting in (None, _resting(table.plate, at, number))
     ]
     problems = [
-        *_silent(touches, area),
+        *_silent(sensation, touches, area),
         *_off_level(sensation, touches, area, has_margin=not is_fixed),
         *_off_band(band, table, touches, must_be_alike=effect.is_for_motion),
     ]
@@ -189,8 +189,10 @@ def _resting(plate: Plate, at: Position, number: int) -> Position:
     return away[number % len(away)]
 
 
-def _silent(touches: Sequence[SimulatedTouch], area: float) -> Iterator[str]:
-    silent = [each for each in touches if each.reason is not None]
+def _silent(sensation: Sensation, touches: Sequence[SimulatedTouch], area: float) -> Iterator[str]:
+    # As strong as the neighbours allow may be nothing.
+    can_be = sensation.level_db_sl is None or sensation.allow_weaker
+    silent = [each for each in touches if each.reason is not None and not (can_be and each.resting)]
     if silent:
         yield f"nothing is felt {_where(silent, touches, area)}: {silent[0].reason}"
 

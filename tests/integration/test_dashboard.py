@@ -146,9 +146,9 @@ async def test_page_shows_the_rig_without_console_messages(page: Page) -> None:
     names = await page.evaluate(
         "[...document.querySelectorAll('#overlay text')].map(e => e.textContent)"
     )
-    assert set(names) == {"SW", "SE", "NE", "NW", "keypad", "slider", "knob", "patch"}
+    assert set(names) == {"SW", "SE", "NE", "NW", "keypad", "slider", "knob", "tuner", "patch"}
     shapes = await page.evaluate("[...document.querySelectorAll('.region')].map(e => e.tagName)")
-    assert sorted(shapes) == ["circle", "polygon", "rect", "rect"]
+    assert sorted(shapes) == ["circle", "circle", "polygon", "rect", "rect"]
     tile = await page.until("document.querySelector('.tile')?.innerText")
     assert "main" in tile
     assert "°C" in tile

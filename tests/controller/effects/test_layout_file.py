@@ -26,14 +26,21 @@ def refused(path: Path, text: str) -> str:
 def test_load_layout_reads_the_example() -> None:
     """Its numbers are in metres."""
     layout = load_layout(EXAMPLE, load_rig(example_rig_path()).plate)
-    assert [region.name for region in layout.regions] == ["keypad", "slider", "knob", "patch"]
-    keypad, slider, _, patch = layout.regions
+    assert [region.name for region in layout.regions] == [
+        "keypad",
+        "slider",
+        "knob",
+        "tuner",
+        "patch",
+    ]
+    keypad, slider, _, _, patch = layout.regions
     shape = keypad.shape
     assert isinstance(shape, Rectangle)
     assert (shape.x, shape.y, shape.width, shape.height) == pytest.approx((0.02, 0.02, 0.1, 0.08))
     assert (keypad.on_press, keypad.on_release, keypad.has_level) == ("click", "soft", False)
     assert (patch.has_level, patch.level_db_sl) == (True, None)
-    assert slider.priority == 1
+    assert (slider.priority, slider.band) == (1, (160.0, 260.0))
+    assert layout.effects["turn"].tuned_band == (200.0, 200.0)
     assert layout.effects["soft"] == Click(duration=0.03, level=14.0)
     assert layout.effects["notches"] == Detents(spacing=0.012, along="x", duration=0.03)
     assert (layout.elsewhere, layout.most_at_once) == (None, 1)

@@ -46,7 +46,9 @@ def answer(
 ) -> tuple[Drive, Pattern]:
     """The pattern for fingers (n, 2) [m], the first of them the target, and its drive."""
     points = [(float(x), float(y)) for x, y in places]
-    question = Question(tuple(points[:1]), tuple(points[1:]), level_db_sl=level_db_sl)
+    question = Question(
+        tuple(points[:1]), tuple(points[1:]), level_db_sl=level_db_sl, envelopes=True
+    )
     pattern = table.query(question)
     tones = [pattern.excitation.get(era.name) for era in table.eras]
     (frequency,) = {tone.frequency for tone in tones if tone is not None}

@@ -39,9 +39,18 @@ percentile decides among the best."""
 FIRST_BOUNDED = 6
 """Frequencies of the highest bounds at which a restricted mode is solved first."""
 
-# Sigma and gain, tried in turn where no weights reach the level: the quiet points count less
-# against each ERA's own power, and weights are raised up to full stroke.
-LEVEL_RELAXATION = ((0.1, 3.0), (1.0, 1.0), (1.0, 3.0), (10.0, 1.0), (10.0, 3.0), (1000.0, 1e6))
+LIMITED_STEPS = 10
+"""Iterations towards weights that reach the level within full stroke."""
+
+MAX_LIMITED = 8
+"""Frequencies at which they are made."""
+
+LEVEL_RESERVE = 1.02
+"""Level aimed at, since the iterations come near to full stroke from above."""
+
+# Sigma and gain, tried in turn where the iterations fail: the quiet points count less against each
+# ERA's own power, and weights are raised up to full stroke.
+LEVEL_RELAXATION = ((1.0, 3.0), (1000.0, 1e6))
 
 _TINY = 1e-7
 
@@ -80,6 +89,7 @@ class Coherent:
             rest = rest[bound[rest] > PRUNE_MARGIN * found.score]
             if len(rest):
                 self._search_at(forms, found, rest)
+        self._limit_weights(forms, found)
         self._relax_level(forms, found)
         return found.search()
 
@@ -113,10 +123,37 @@ class Coherent:
         peak = forms.amplitude(_saturated(weights, gain))
         return float((peak / forms.threshold).max())
 
+    def _limit_weights(self, forms: Forms, found: "_BestCandidates") -> None:
+        """Find the best weights within full stroke where the best of all do not reach the level.
+
+        The optimum has R + diag(d) in place of R, with multipliers d that are zero but for ERAs at
+        full stroke; they are multiplied by the squared magnitudes of the weights until they fit.
+        """
+        open_ = found.level_limited(MAX_LIMITED)
+        if len(open_) == 0:
+            return
+        some = forms.at(open_)
+        R = _mean(some)
+        eras = np.arange(some.era_count)
+        multipliers = np.zeros((len(open_), some.era_count), dtype=np.float32)
+        for step in range(LIMITED_STEPS):
+            held = R.copy()
+            held[:, eras, eras] += multipliers
+            weights, _ = self._weights(some, held)
+            weights = weights * (LEVEL_RESERVE * some.gain_to_level(weights))[:, None]
+            fitting = _saturated(weights, 1.0)
+            expected = some.quiet_power(fitting)
+            found.add(open_, fitting, some, expected=expected)
+            power = np.abs(weights) ** 2
+            if step == 0:
+                own = np.maximum.reduce(some.quiet_power(weights), axis=1)
+                multipliers[:] = (own / np.add.reduce(power, axis=1))[:, None]
+            multipliers *= power
+
     def _relax_level(self, forms: Forms, found: "_BestCandidates") -> None:
         """Raise the level where the best weights do not reach it, for less contrast."""
         for sigma, gain in LEVEL_RELAXATION:
-            open_ = found.level_limited()
+            open_ = found.level_limited(forms.frequency_count)
             if len(open_) == 0:
                 return
             some = forms if len(open_) == forms.frequency_count else forms.at(open_)
@@ -188,14 +225,18 @@ class _BestCandidates:
             self.bound[frequencies] = np.minimum(self.bound[frequencies], bound)
         self.score = max(self.score, float(score.max()))
 
-    def level_limited(self) -> IntArray:
-        """Frequencies without weights that reach the level, but of a better score than the best."""
-        open_ = (self._scores == 0) & (self._infeasible_scores > self.score)
-        return np.asarray(open_.nonzero()[0])
+    def level_limited(self, count: int) -> IntArray:
+        """Frequencies without weights that reach the level, but of a better score than the best.
+
+        At most so many, those of the best scores, by ascending index (n,).
+        """
+        open_ = np.flatnonzero((self._scores == 0) & (self._infeasible_scores > self.score))
+        best = np.argsort(-self._infeasible_scores[open_])[:count]
+        return np.sort(open_[best])
 
     def search(self) -> "CoherentResult":
         """Return the best weights at each frequency."""
-        is_level_limited = len(self.level_limited()) > 0
+        is_level_limited = len(self.level_limited(1)) > 0
         return CoherentResult(self._scores, self._weights, self.bound, is_level_limited)
 
 

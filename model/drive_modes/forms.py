@@ -95,12 +95,23 @@ class Forms:
 
     def reaches(self, weights: Complex64Array) -> NDArray[np.bool_]:
         """Whether weights (f, eras) reach the wanted level at all targets, (f,)."""
-        least = amplitude = self._amplitudes(weights)
-        if self.level_margin:
-            variance = expected_power(self.target_power, weights) - amplitude * amplitude
-            deviation = np.sqrt(np.maximum(variance, 0))
-            least = np.asarray(amplitude - np.float32(self.level_margin) * deviation)
+        least = self._least_amplitudes(weights)
         return np.asarray(np.logical_and.reduce(least >= self.wanted * self.threshold, axis=0))
+
+    def gain_to_level(self, weights: Complex64Array) -> Float32Array:
+        """Factor on weights (f, eras) that just reaches the wanted level at all targets, (f,)."""
+        least = np.minimum.reduce(self._least_amplitudes(weights), axis=0)
+        amplitude = np.minimum.reduce(self._amplitudes(weights), axis=0)
+        return np.asarray(self.wanted * self.threshold / np.maximum(least, 0.1 * amplitude))
+
+    def _least_amplitudes(self, weights: Complex64Array) -> Float32Array:
+        """Amplitudes at the targets less the margin, (t, f)."""
+        amplitude = self._amplitudes(weights)
+        if not self.level_margin:
+            return amplitude
+        variance = expected_power(self.target_power, weights) - amplitude * amplitude
+        deviation = np.sqrt(np.maximum(variance, 0))
+        return np.asarray(amplitude - np.float32(self.level_margin) * deviation)
 
     def quiet_power(self, weights: Complex64Array) -> Float32Array:
         """Expected power [m²/s⁴] at each quiet fingertip of weights (f, eras), (f, q)."""

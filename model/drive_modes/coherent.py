@@ -42,8 +42,8 @@ FIRST_BOUNDED = 6
 LIMITED_STEPS = 10
 """Iterations towards weights that reach the level within full stroke."""
 
-MAX_LIMITED = 8
-"""Frequencies at which they are made."""
+MAX_GROWTH = 100.0
+"""Factor on a multiplier in one iteration."""
 
 LEVEL_RESERVE = 1.02
 """Level aimed at, since the iterations come near to full stroke from above."""
@@ -52,7 +52,7 @@ LEVEL_RESERVE = 1.02
 # ERA's own power, and weights are raised up to full stroke.
 LEVEL_RELAXATION = ((1.0, 3.0), (1000.0, 1e6))
 
-_TINY = 1e-7
+_TINY, _LEAST = 1e-7, np.float32(1e-30)
 
 
 @dataclass(frozen=True)
@@ -129,16 +129,16 @@ class Coherent:
         The optimum has R + diag(d) in place of R, with multipliers d that are zero but for ERAs at
         full stroke; they are multiplied by the squared magnitudes of the weights until they fit.
         """
-        open_ = found.level_limited(MAX_LIMITED)
+        open_ = found.level_limited()
         if len(open_) == 0:
             return
         some = forms.at(open_)
         R = _mean(some)
-        eras = np.arange(some.era_count)
-        multipliers = np.zeros((len(open_), some.era_count), dtype=np.float32)
+        shares = np.ones_like(some.quiet[:, :, 0, 0].real)
+        multipliers = np.zeros((len(open_), 1), dtype=np.float32)
         for step in range(LIMITED_STEPS):
             held = R.copy()
-            held[:, eras, eras] += multipliers
+            held.reshape(len(R), -1)[:, :: some.era_count + 1] += multipliers
             weights, _ = self._weights(some, held)
             weights = weights * (LEVEL_RESERVE * some.gain_to_level(weights))[:, None]
             fitting = _saturated(weights, 1.0)
@@ -147,13 +147,18 @@ class Coherent:
             power = np.abs(weights) ** 2
             if step == 0:
                 own = np.maximum.reduce(some.quiet_power(weights), axis=1)
-                multipliers[:] = (own / np.add.reduce(power, axis=1))[:, None]
-            multipliers *= power
+                multipliers = (own / np.maximum(np.add.reduce(power, axis=1), _LEAST))[:, None]
+            # Beyond any level that can be reached they would grow without end.
+            multipliers = multipliers * np.minimum(power, MAX_GROWTH)
+            if shares.shape[1] > 1:
+                shares = shares * np.sqrt(expected)
+                shares /= np.maximum(np.add.reduce(shares, axis=-1, keepdims=True), _LEAST)
+                R = _weighted(some, shares)
 
     def _relax_level(self, forms: Forms, found: "_BestCandidates") -> None:
         """Raise the level where the best weights do not reach it, for less contrast."""
         for sigma, gain in LEVEL_RELAXATION:
-            open_ = found.level_limited(forms.frequency_count)
+            open_ = found.level_limited()
             if len(open_) == 0:
                 return
             some = forms if len(open_) == forms.frequency_count else forms.at(open_)
@@ -211,7 +216,7 @@ class _BestCandidates:
         power = np.maximum.reduce(expected, axis=-1)
         peak = forms.amplitude(weights)
         reaches = forms.reaches(weights)
-        score = peak / np.sqrt(np.maximum(power, 0) + _TINY * (peak * peak))
+        score = peak / np.sqrt(np.maximum(power, _LEAST) + _TINY * (peak * peak))
         if not reaches.all():
             missed = np.where(reaches, 0, score)
             self._infeasible_scores[frequencies] = np.maximum(
@@ -225,18 +230,13 @@ class _BestCandidates:
             self.bound[frequencies] = np.minimum(self.bound[frequencies], bound)
         self.score = max(self.score, float(score.max()))
 
-    def level_limited(self, count: int) -> IntArray:
-        """Frequencies without weights that reach the level, but of a better score than the best.
-
-        At most so many, those of the best scores, by ascending index (n,).
-        """
-        open_ = np.flatnonzero((self._scores == 0) & (self._infeasible_scores > self.score))
-        best = np.argsort(-self._infeasible_scores[open_])[:count]
-        return np.sort(open_[best])
+    def level_limited(self) -> IntArray:
+        """Frequencies without weights that reach the level, but of a better score than the best."""
+        return np.flatnonzero((self._scores == 0) & (self._infeasible_scores > self.score))
 
     def search(self) -> "CoherentResult":
         """Return the best weights at each frequency."""
-        is_level_limited = len(self.level_limited(1)) > 0
+        is_level_limited = len(self.level_limited()) > 0
         return CoherentResult(self._scores, self._weights, self.bound, is_level_limited)
 
 

@@ -25,6 +25,8 @@ LEVEL_MARGIN = 1.0
 About what nine of ten plates need; the answer's own draws decide.
 """
 
+_LEAST = np.float32(1e-20)
+
 
 @dataclass(frozen=True, eq=False)
 class Weights:
@@ -102,7 +104,9 @@ class Forms:
         """Factor on weights (f, eras) that just reaches the wanted level at all targets, (f,)."""
         least = np.minimum.reduce(self._least_amplitudes(weights), axis=0)
         amplitude = np.minimum.reduce(self._amplitudes(weights), axis=0)
-        return np.asarray(self.wanted * self.threshold / np.maximum(least, 0.1 * amplitude))
+        return np.asarray(
+            self.wanted * self.threshold / np.maximum(least, 0.1 * amplitude + _LEAST)
+        )
 
     def _least_amplitudes(self, weights: Complex64Array) -> Float32Array:
         """Amplitudes at the targets less the margin, (t, f)."""

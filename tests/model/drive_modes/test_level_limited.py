@@ -54,7 +54,7 @@ def _optimum(forms: Forms) -> float:
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("short", [1.1, 1.4])
 def test_level_beyond_the_best_weights_costs_no_more_than_it_must(seed: int, short: float) -> None:
-    """The drive reaches the level at no more than full stroke, within half a decibel of the best."""
+    """The drive reaches the level within full stroke, half a decibel from the best at most."""
     forms = _forms(seed, short)
     (score, drive), *_ = find_drives(forms, "phased")
     assert np.abs(drive.values).max() <= 1 + 1e-6

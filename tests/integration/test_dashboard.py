@@ -155,7 +155,7 @@ async def test_page_shows_the_rig_without_console_messages(page: Page) -> None:
     assert "ms ago" in tile
     await page.until(
         "[...document.querySelectorAll('#effects button')].map(e => e.textContent).join()",
-        lambda names: names == "buzz,click,cloth,notches,soft,swell",
+        lambda names: names == "buzz,click,cloth,notches,soft,swell,turn",
     )
     origins = await page.evaluate(
         "[...new Set(performance.getEntriesByType('resource').map(e => new URL(e.name).origin))]"

@@ -35,9 +35,10 @@ def check(
         typer.Option("--output", "-o", metavar="PICTURE", help="Picture to write, e.g. P.png."),
     ] = None,
 ) -> None:
-    """Simulate touches over every region, in time, and compare what is felt with the layout.
+    """Simulate what every region makes felt.
 
-    Alone and with a resting second finger. Exit status 1 if a region falls short.
+    In time, by touches over the region, alone and with a resting second finger. Exit status 1 if
+    it falls short of the layout.
     """
     import time
 

@@ -130,9 +130,9 @@ def plate_response_matches_model(played: Played, truth: Truth) -> None:
 
 
 def localization_matches_prediction(played: Played, truth: Truth) -> None:
-    """Contrast within 1 dB up to 25 dB, level within 1 dB of the solver; a quarter of what is told.
+    """Contrast within 1 dB up to 25 dB, level within 1 dB of the solver, and at least the promise.
 
-    The daemon tells what its table says of another plate.
+    On the plate that is drawn first all situations keep it.
     """
     for heard in _touched(played):
         target = heard.steady[heard.situation.felt_at]
@@ -162,7 +162,8 @@ def localization_matches_prediction(played: Played, truth: Truth) -> None:
         )
         judged = min(by_model, JUDGED_UP_TO)
         assert abs(min(measured, JUDGED_UP_TO) - judged) <= 1, (measured, by_model)
-        assert measured >= contact["contrast_db"] / 4, (measured, contact["contrast_db"])
+        promised = heard.patterns[-1]["robust_felt_contrast_db"]
+        assert 3 < promised <= measured, (promised, measured)
 
 
 def onset_matches_prediction(played: Played, truth: Truth) -> None:

@@ -23,8 +23,8 @@ from model.transients.shaping import RISE
 from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes
 
-SHAPED_FROM = 0.1
-"""Shortest duration [s] with a shaped onset, which needs as long to settle."""
+SHAPED_FROM = 0.2
+"""Shortest duration [s] with a shaped onset, which settles in half of it."""
 
 _STEP = 0.001  # s; between the times of a mean, which is of a demodulated response
 _MAX_TIMES = 64

@@ -136,7 +136,9 @@ def _by_point(
     Where nulls are narrow, with few fingers and small errors, these do better.
     """
     coherent = DRIVE_MODES[drive_mode].coherent
-    if coherent is None or not 1 <= len(question.quiet) <= MAX_FINGERS_BY_POINT:
+    if coherent is None or coherent.bound is not None:  # restricted weights gain next to nothing
+        return []
+    if not 1 <= len(question.quiet) <= MAX_FINGERS_BY_POINT:
         return []
     tones = {tuple(index for index, _ in drive.tones()) for _, drive in drives}
     rows = np.array(sorted(row for row, *others in tones if not others), dtype=int)

@@ -9,6 +9,7 @@ from controller.demo.far_end import SIM_OPTIONS, simulated_plate
 from controller.demo.picture import choose_rows, touches_figure
 from controller.demo.recorder import TouchRecorder
 from controller.demo.touch_row import TouchRow
+from controller.loop.envelopes import MAX_LOADING_TIME
 from controller.loop.loop import Controller
 from controller.sources.capture import read_capture, replay_capture
 from controller.sources.contacts import CONTACT_TIMEOUT
@@ -69,12 +70,14 @@ async def run_demo(
     touches: RecordedTouches,
     on_row: Callable[[TouchRow], None],
     seed: int | None = 0,
+    touch_wait: float = MAX_LOADING_TIME,
 ) -> list[TouchRow]:
     """Play recorded touches into a controller, over a wire, onto a simulated plate.
 
     wire: one of WIRES; touches: from `read_touches`; on_row: called with each row when complete;
-    seed: of the plate within the rig's uncertainty, None for the rig's own. Return all rows in
-    order of time. Raises LinkError if the far end is lost.
+    seed: of the plate within the rig's uncertainty, None for the rig's own; touch_wait [s]: for
+    shaped onsets at most. Return all rows in order of time. Raises LinkError if the far end is
+    lost.
     """
     rig = load_rig(rig_file)
     async with simulated_plate(
@@ -89,6 +92,7 @@ async def run_demo(
             sources=[source],
             observer=recorder.observer,
             timing=Timing(table),
+            max_loading_time=touch_wait,
         )
         await controller.open()
         try:

@@ -25,6 +25,9 @@ MAX_LOADING_TIME = 0.010
 """How long [s] loading envelopes may delay a touch: a delay that varies by more is noticed between
 presses, and a click of 40 ms must not wait as long as it lasts."""
 
+SHAPING_TIME, EXCHANGE_TIME = 0.004, 0.0005
+"""What shaping an onset takes [s], and an exchange beside its time on the wire: both measured."""
+
 # Levels have steps of 1e-4 on the wire; smaller digits are rounding errors of the knot search.
 _DIGITS = 9
 
@@ -64,12 +67,19 @@ class OpenAmplifier(Protocol):
 def envelope_support(
     rig: Rig, amplifiers: Mapping[str, OpenAmplifier], *, max_loading_time: float
 ) -> EnvelopeSupport:
-    """Return what all amplifiers, by name, can play and load within `max_loading_time` [s]."""
+    """Return what all amplifiers, by name, can play and load within `max_loading_time` [s].
+
+    A touch waits while its onset is shaped and loaded; endings are loaded while it vibrates.
+    """
     if max_loading_time <= 0:
         return RAMPS_ONLY
     return EnvelopeSupport(
         onsets=_fits(
-            rig, amplifiers, knots=ONSET_KNOTS - 1, slots=1, max_loading_time=max_loading_time
+            rig,
+            amplifiers,
+            knots=ONSET_KNOTS - 1,
+            slots=1,
+            max_loading_time=max_loading_time - SHAPING_TIME,
         ),
         endings=_fits(
             rig, amplifiers, knots=ENDING_KNOTS - 1, slots=2, max_loading_time=max_loading_time
@@ -150,5 +160,6 @@ def _fits(
             and caps.envelope_step_min <= KNOT_STEP <= caps.envelope_step_max
         ):
             return False
-        busy[amplifier.bus or name] += wired * amplifier.wire_times.loading(knots)
+        loading = amplifier.wire_times.loading(knots) + EXCHANGE_TIME
+        busy[amplifier.bus or name] += wired * loading
     return max(busy.values(), default=0.0) <= max_loading_time

@@ -217,7 +217,8 @@ class Controller:
                 if decision.pattern is not None and self._group.degraded:
                     self._decider.forget()  # decided again once all amplifiers reply
                 else:
-                    load_until = now + self._max_loading_time
+                    ready_at = now if decision.sets is None else max(now, decision.sets.ready_at)
+                    load_until = ready_at + self._max_loading_time
                     is_aborted = not await self._execute(decision, load_until=load_until)
             elif self.group_state is GroupState.ARMED and not self._group.degraded:
                 await self._renew(now)

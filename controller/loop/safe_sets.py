@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from controller.loop.envelopes import wire_envelopes
 from controller.loop.routing import continues_any_tone, route, route_to_silence, route_with_endings
+from drivers import clock
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, SafeCommandSet, SafeEnvelope
@@ -26,12 +27,14 @@ _logger = logging.getLogger(__name__)
 class SafeSets:
     """A checked command set for every amplifier, by name, and envelopes to load before them.
 
-    plain: the same pattern along its ramp, where loading takes too long; None without any.
+    plain: the same pattern along its ramp, where loading takes too long; None without any. ready_at
+    [s]: when it could have been sent without envelopes; shaping and loading delay it from then on.
     """
 
     sets: Mapping[str, SafeCommandSet]
     envelopes: Mapping[str, tuple[SafeEnvelope, ...]] = field(default_factory=dict)
     plain: "SafeSets | None" = None
+    ready_at: float = -math.inf
 
     @property
     def is_silence(self) -> bool:
@@ -82,6 +85,7 @@ class SetBuilder:
         how long it plays unless it is renewed. Raises CommandRefused if a guard refuses any of it.
         """
         plain, ramped = self._build_plain(pattern, playing=playing, valid_for=valid_for)
+        ready_at = clock.now()
         if (
             is_shaped
             and self._timing is not None
@@ -91,7 +95,7 @@ class SetBuilder:
             try:
                 envelopes = self._envelopes(shaped)
                 sets = self._checked(self._routed(shaped, playing, valid_for))
-                return SafeSets(sets, envelopes, plain), _with_ramp(shaped, sets)
+                return SafeSets(sets, envelopes, plain, ready_at), _with_ramp(shaped, sets)
             except CommandRefused as error:
                 _logger.info("loop: plain ramp instead of an onset: %s", error)
         return plain, ramped
@@ -137,7 +141,8 @@ class SetBuilder:
                 ramp=FADE_RAMP,
                 ending=shaped.ending,
             )
-            return SafeSets(self._checked(_with_valid_for(sets, valid_for)), envelopes)
+            checked = self._checked(_with_valid_for(sets, valid_for))
+            return SafeSets(checked, envelopes, ready_at=clock.now())
         except CommandRefused as error:
             _logger.info("loop: plain ramp instead of an ending: %s", error)
             return None

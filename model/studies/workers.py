@@ -31,11 +31,11 @@ _WORTH_A_PROCESS = 1_500_000_000
 _ADDRESS = re.compile(r"(tcp|tls)://[\w.\-\[\]:]+:\d{1,5}")
 
 
-def useful_processes(problem: StudyProblem, cases: Cases, most: int) -> int:
-    """How many processes are worth their start, up to most: a small study has one."""
+def useful_processes(problem: StudyProblem, cases: Cases, available: int) -> int:
+    """How many of the available processes are worth their start: a small study has one."""
     eras = cases.places.shape[1]
     size = len(problem.frequencies) * len(problem.points) * len(activation_sets(eras))
-    return max(1, min(most, size * len(cases) // _WORTH_A_PROCESS))
+    return max(1, min(available, size * len(cases) // _WORTH_A_PROCESS))
 
 
 def on_processes(count: int) -> Workers:

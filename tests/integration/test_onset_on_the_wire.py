@@ -41,7 +41,13 @@ def test_onset_contrast_matches_prediction(touches):
     table = build_table(rig, frequencies=np.arange(80.0, 241.0, 20.0))
     rows = asyncio.run(
         run_demo(
-            rig_file, table, wire="serial", touches=touches, on_row=lambda row: None, seed=None
+            rig_file,
+            table,
+            wire="serial",
+            touches=touches,
+            on_row=lambda row: None,
+            seed=None,
+            touch_wait=0.05,
         )
     )
     (row,) = [row for row in rows if row.reason is None]

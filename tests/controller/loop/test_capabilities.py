@@ -111,12 +111,12 @@ def test_capabilities_are_the_tightest_limits() -> None:
     [
         (Opened(), Opened(), BOTH),
         # An onset has 20 knots on the wire, an ending 7; the left amplifier has two of each.
-        (Opened(knot_time=0.020 / 40), Opened(), BOTH),
-        (Opened(knot_time=0.021 / 40), Opened(), ENDINGS),
-        (Opened(knot_time=0.021 / 14), Opened(), EnvelopeSupport(False, False)),
+        (Opened(knot_time=0.015 / 40), Opened(), BOTH),
+        (Opened(knot_time=0.0151 / 40), Opened(), ENDINGS),
+        (Opened(knot_time=0.0191 / 14), Opened(), EnvelopeSupport(False, False)),
         # Two amplifiers on one wire wait for each other, on two they do not.
-        (Opened(knot_time=0.4e-3), Opened(knot_time=0.4e-3), BOTH),
-        (Opened(FINE, "bus", 0.4e-3), Opened(FINE, "bus", 0.4e-3), ENDINGS),
+        (Opened(knot_time=0.35e-3), Opened(knot_time=0.35e-3), BOTH),
+        (Opened(FINE, "bus", 0.35e-3), Opened(FINE, "bus", 0.35e-3), ENDINGS),
         (Opened(replace(FINE, envelope_knots=19)), Opened(), ENDINGS),
         (Opened(), Opened(replace(FINE, envelope_knots=6)), EnvelopeSupport(False, False)),
         (Opened(replace(FINE, envelope_slots=3)), Opened(), ONSETS),
@@ -127,7 +127,10 @@ def test_capabilities_are_the_tightest_limits() -> None:
 def test_envelope_support_needs_capability_and_loading_time(
     left: Opened, right: Opened, expected: EnvelopeSupport
 ) -> None:
-    """Knots, slots and steps of every amplifier, and 20 ms for every wire."""
+    """Knots, slots and steps of every amplifier, and 20 ms for every wire.
+
+    Of these 0.5 ms for each exchange, and 4 ms for shaping an onset.
+    """
     assert (
         envelope_support(rig(), {"left": left, "right": right}, max_loading_time=0.020) == expected
     )

@@ -47,7 +47,7 @@ def test_onset_contrast_matches_prediction(touches):
             touches=touches,
             on_row=lambda row: None,
             seed=None,
-            touch_wait=0.05,
+            touch_wait=0.5,
         )
     )
     (row,) = [row for row in rows if row.reason is None]

@@ -145,10 +145,10 @@ def test_daemon_refuses_table_of_another_plate_or_with_nan(tmp_path: Path) -> No
     """Of a plate that is 0.1 mm thicker, and of NaN with a valid checksum."""
     path = write_daemon(tmp_path, {"main": "sim://"}, "table: table.npz\n")
     good = daemon_table()
-    spoilt = good.acceleration.copy()
-    spoilt[3, 0, 1] = np.nan
-    save_table(replace(good, acceleration=spoilt), tmp_path / "table.npz")
-    with pytest.raises(InputError, match=r"table\.npz: acceleration"):
+    spoilt = good.shapes.copy()
+    spoilt[3, 1] = np.nan
+    save_table(replace(good, shapes=spoilt), tmp_path / "table.npz")
+    with pytest.raises(InputError, match=r"table\.npz: shapes"):
         check_daemon(path)
     save_table(good, tmp_path / "table.npz")
     rig = tmp_path / "rig.yaml"

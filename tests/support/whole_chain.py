@@ -29,7 +29,7 @@ from touch_stream import Stream, play_stream
 from witness_config import witness_config
 
 POLL = 0.01  # s
-PROMPT = 0.1  # s; from touch to pattern event, on an idle machine
+PROMPT = 0.25  # s; from touch to pattern event, far above what an idle machine takes
 LOADING_LOGGER = "controller.loop.loading_times"
 FREQUENCY_LIMITS, LEVEL_LIMIT = (40.0, 500.0), 1.0  # Hz; of the example's rig, written by hand
 

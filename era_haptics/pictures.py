@@ -45,8 +45,10 @@ def draw_pattern(
         draw_fingertip(axes, position, felt=True, level_db_sl=pattern.level_db_sl)
     for position in as_points(quiet, what="quiet"):
         draw_fingertip(axes, position, felt=False)
-    if pattern.contrast_db is not None:
-        axes.set_title(f"contrast {pattern.contrast_db:.1f} dB predicted", fontsize=11, pad=20)
+    if pattern.robust_felt_contrast_db is not None:
+        promised = f"{pattern.robust_felt_contrast_db:.0f} dB"
+        title = f"felt contrast at least {promised} on nine of ten plates"
+        axes.set_title(title, fontsize=11, pad=20)
     draw_level_scale(figure, [axes], shrink=0.8)
     return figure
 

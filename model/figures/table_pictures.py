@@ -59,9 +59,9 @@ def weak_cells_figure(table: LocalizationTable, weak: WeakCells) -> Figure:
         _cross_out(axes, table, weak.grid, below)
         axes.set_title(title)
         axes.label_outer()
-    figure.colorbar(image, ax=grid, label="contrast / dB")
+    figure.colorbar(image, ax=grid, label="felt contrast of nine of ten plates / dB")
     figure.suptitle(
-        f"Mode {table.drive_mode}: contrast from each cell to one other finger\n"
+        f"Mode {table.drive_mode}: felt contrast from each cell to one other finger\n"
         f"(crosses: below {WANTED_CONTRAST_DB:g} dB; dots: ERAs)"
     )
     return figure
@@ -101,7 +101,7 @@ def contrast_figure(
     axes.axvline(WANTED_CONTRAST_DB, color="0.5", ls=":", lw=1)
     axes.set_xlim(left=0)
     axes.set_ylim(0, 100)
-    axes.set_xlabel("contrast / dB")
+    axes.set_xlabel("felt contrast of nine of ten plates / dB")
     axes.set_ylabel("contact sets with at least this contrast / %")
     axes.grid(color="0.9")
     figure.legend(loc="outside lower center", ncols=3, fontsize=9, frameon=False)
@@ -129,8 +129,8 @@ def answer_figure(table: LocalizationTable) -> Figure:
         draw_fingertip(axes, place, felt=False)
     draw_level_scale(figure, [axes], shrink=0.8)
     axes.set_title(
-        f"Quiet fingers: {pattern.quiet_level_db_sl:.0f} dB SL at most; "
-        f"contrast {pattern.contrast_db:.1f} dB\n"
+        f"Felt contrast at least {pattern.robust_felt_contrast_db:.0f} dB on nine of ten plates, "
+        f"{pattern.felt_contrast_db:.0f} dB as modelled\n"
         f"{_in_words(table, pattern)}",
         fontsize=10,
         pad=20,

@@ -37,7 +37,7 @@ def test_draw_map_marks_driven_eras() -> None:
 
 
 def test_draw_pattern_shows_fingers_and_levels() -> None:
-    """Circles of 13 mm at the fingers, the contrast in the title, levels in decibels."""
+    """Circles of 13 mm at the fingers, the promise in the title, levels in decibels."""
     table = build_table(
         PLATE.rig,
         frequencies=np.array([60.0, 110.0, 250.0]),
@@ -52,7 +52,7 @@ def test_draw_pattern_shows_fingers_and_levels() -> None:
         [8.0, 6.0], [22.0, 16.0], [25.0, 4.0],
     ]  # fmt: skip
     assert {circle.radius for circle in circles} == {1.3}
-    assert f"{pattern.contrast_db:.1f} dB predicted" in axes.get_title()
+    assert f"{pattern.robust_felt_contrast_db:.0f} dB" in axes.get_title()
     texts = [text.get_text() for text in axes.texts]
     assert texts.count("quiet") == 2
     assert f"felt\n{pattern.level_db_sl:.0f} dB SL" in texts

@@ -9,7 +9,8 @@ from typing import IO
 
 from model.errors import InputError
 
-_MAX_PATH = 107  # bytes in sockaddr_un
+_STAGED = "~"  # appended to the socket's name until it listens
+_MAX_PATH = 107 - len(_STAGED)  # bytes in sockaddr_un
 _REMEDY = "set another socket: in the daemon's file"
 
 
@@ -49,34 +50,43 @@ class SocketLock:
         self._lock.truncate(0)
         self._lock.write(f"{os.getpid()}\n")
         self._lock.flush()
-        if path.is_socket():
-            path.unlink()  # left behind by a killed daemon
+        _remove(path)  # left behind by a killed daemon
 
     def bind(self) -> socket.socket:
         """Bind a socket with mode 0600, or 0660 in a folder that is accessible to a group only.
 
-        It listens: a client that sees the file is not refused. Raises InputError.
+        It listens under another name first: a client that sees the file is never refused. Raises
+        InputError.
         """
+        staged = self.path.with_name(self.path.name + _STAGED)
         bound = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
         # systemd's RuntimeDirectoryMode=0750 shares the folder with the service's group.
         folder = self.path.parent.stat().st_mode
         is_shared = folder & stat.S_IXGRP and not folder & stat.S_IRWXO
         before = os.umask(0o117 if is_shared else 0o177)
         try:
-            bound.bind(str(self.path))
+            _remove(staged)  # left behind by a killed daemon
+            bound.bind(str(staged))
             bound.listen()
+            staged.rename(self.path)
         except OSError as error:
             bound.close()
-            raise InputError(f"{self.path}: bind failed: {error.strerror}; {_REMEDY}") from error
+            _remove(staged)
+            raise InputError(f"{staged}: bind failed: {error.strerror}; {_REMEDY}") from error
         finally:
             os.umask(before)
         return bound
 
     def release(self) -> None:
         """Remove the socket and release the lock."""
-        if self.path.is_socket():
-            self.path.unlink()
+        _remove(self.path)
         self._lock.close()
+
+
+def _remove(path: Path) -> None:
+    """Remove a socket's file if there is one."""
+    if path.is_socket():
+        path.unlink()
 
 
 def _open_lock(file: Path) -> IO[str]:

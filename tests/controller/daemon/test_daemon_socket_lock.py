@@ -28,11 +28,41 @@ def test_socket_is_for_its_user_only(tmp_path: Path) -> None:
         os.umask(before)
 
 
-def test_client_that_sees_the_socket_is_not_refused(tmp_path: Path) -> None:
-    """It waits until the daemon serves."""
-    lock = SocketLock(tmp_path / "era.sock")
+def test_client_that_sees_the_socket_is_never_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not before it listens either: it appears under its name afterwards, whatever was left."""
+    path = tmp_path / "era.sock"
+
+    class Looking(socket.socket):
+        def listen(self, *backlog: int) -> None:
+            assert not path.exists()
+            super().listen(*backlog)
+
+    with socket.socket(socket.AF_UNIX) as killed:
+        killed.bind(f"{path}~")  # by a daemon that was killed before it listened
+    lock = SocketLock(path)
+    monkeypatch.setattr(socket, "socket", Looking)
     with lock.bind(), socket.socket(socket.AF_UNIX) as client:
-        client.connect(str(lock.path))
+        client.connect(str(path))
+    lock.release()
+    assert [each.name for each in tmp_path.iterdir()] == ["era.sock.lock"]
+
+
+def test_socket_that_cannot_listen_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither under its name nor under the one before."""
+
+    class Deaf(socket.socket):
+        def listen(self, *backlog: int) -> None:
+            raise OSError(98, "Address already in use")
+
+    lock = SocketLock(tmp_path / "era.sock")
+    monkeypatch.setattr(socket, "socket", Deaf)
+    with pytest.raises(InputError, match="Address already in use"):
+        lock.bind()
+    assert [each.name for each in tmp_path.iterdir()] == ["era.sock.lock"]
     lock.release()
 
 
@@ -120,8 +150,12 @@ def test_socket_lock_refuses_symbolic_link_of_another_user(
 
 def test_socket_lock_refuses_path_too_long_for_a_socket(tmp_path: Path) -> None:
     """The system's own error would name no length."""
-    with pytest.raises(InputError, match="107 bytes"):
-        SocketLock(tmp_path / ("x" * 120))
+    room = 106 - len(str(tmp_path)) - 1
+    with pytest.raises(InputError, match="106 bytes, got 107"):
+        SocketLock(tmp_path / ("x" * (room + 1)))
+    lock = SocketLock(tmp_path / ("x" * room))
+    lock.bind().close()
+    lock.release()
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "link"])

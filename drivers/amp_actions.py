@@ -194,4 +194,5 @@ def _status_rows(status: Status) -> dict[str, Any]:
         "temperature_c": status.temperature,
         "watchdog_left_s": status.watchdog_left,
         "levels": list(status.levels),
+        **({"other_flags": status.other_flags} if status.other_flags else {}),
     }

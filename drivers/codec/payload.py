@@ -61,7 +61,7 @@ class Cursor:
             raise Malformed(f"unknown {kind.__name__} {value}", code=NakCode.BAD_VALUE) from None
 
     def flags(self, known: int) -> int:
-        """Read a byte in which only the known bits may be set."""
+        """Read the flags of a request, in which only the known bits may be set."""
         value = self._raw("B")
         if value & ~known:
             raise Malformed(f"reserved flags must be 0, got {value:#04x}", code=NakCode.BAD_VALUE)

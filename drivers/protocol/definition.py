@@ -128,11 +128,12 @@ class SerialDefaults:
 class Protocol:
     """The numbers on which host and amplifier agree.
 
-    reaction [s]: longest time until a reply begins; modbus, canopen: the sections of these names
-    in the file.
+    vendor_numbers: the first type, fault and refusal that are the vendor's; reaction [s]: longest
+    time until a reply begins; modbus, canopen: the sections of these names in the file.
     """
 
     version: int
+    vendor_numbers: int
     reaction: float
     serial: SerialDefaults
     types: Mapping[str, int]
@@ -150,6 +151,7 @@ def _load() -> Protocol:
     listed = raw["quantities"]
     return Protocol(
         version=raw["version"],
+        vendor_numbers=raw["vendor_numbers"],
         reaction=raw["reaction"],
         serial=SerialDefaults(**raw["serial"]),
         types=raw["types"],

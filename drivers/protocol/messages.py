@@ -26,6 +26,7 @@ from enum import IntEnum
 from typing import TypeAlias
 
 from drivers.command import CommandSet, DriveCommand, Envelope
+from drivers.protocol.extensible_enum import ExtensibleEnum
 
 
 class AmplifierState(IntEnum):
@@ -41,7 +42,7 @@ class AmplifierState(IntEnum):
     FAULT = 7
 
 
-class Fault(IntEnum):
+class Fault(ExtensibleEnum):
     """Why an amplifier is in FAULT; NONE otherwise."""
 
     NONE = 0
@@ -53,7 +54,7 @@ class Fault(IntEnum):
     INTERNAL = 6
 
 
-class NakCode(IntEnum):
+class NakCode(ExtensibleEnum):
     """Reason of a refusal."""
 
     UNKNOWN_TYPE = 1
@@ -187,7 +188,7 @@ class Status:
     """Status of an amplifier: state, fault, playing token and present level of each channel.
 
     token 0: nothing played since arming; temperature [°C]; watchdog_left [s]; voltage [V] of the
-    high-voltage supply, 0 if not measured.
+    high-voltage supply, 0 if not measured; other_flags: those that are not defined here.
     """
 
     state: AmplifierState
@@ -198,6 +199,7 @@ class Status:
     watchdog_left: float
     levels: tuple[float, ...]
     voltage: float = 0.0
+    other_flags: int = 0
 
 
 @dataclass(frozen=True, slots=True)

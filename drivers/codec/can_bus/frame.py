@@ -60,10 +60,10 @@ class BlockLayout:
             block |= (value & (1 << field.bits) - 1) << field.first
         return block.to_bytes(BLOCK, "little")
 
-    def unpack(self, block: bytes) -> dict[str, int] | None:
-        """Unpack a block; None for another length, or if unused bits are set."""
+    def unpack(self, block: bytes, *, is_reply: bool = False) -> dict[str, int] | None:
+        """Unpack a block; None for another length, or for a request with unused bits set."""
         whole = int.from_bytes(block, "little")
-        if len(block) != BLOCK or whole & self._unused:
+        if len(block) != BLOCK or (whole & self._unused and not is_reply):
             return None
         values = {}
         for name, field in self.fields.items():

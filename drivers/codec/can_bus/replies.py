@@ -22,8 +22,6 @@ _ACTIONS: Mapping[str, int] = CANOPEN["actions"]
 _INCOMPLETE_SET: int = CANOPEN["incomplete_set"]
 _NO_CHANNEL: int = CANOPEN["no_channel"]
 _STATES = {state.value: state for state in AmplifierState}
-_FAULTS = {fault.value: fault for fault in Fault}
-_NAKS = {code.value: code for code in NakCode}
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +87,6 @@ class CanReplyReader:
                 self._levels[group] = _unpack("levels", data[start : start + BLOCK])
         values = _unpack("answer", data[:BLOCK])
         sequence, action, result = values["sequence"], values["action"], values["result"]
-        if result not in (0, _INCOMPLETE_SET) and result not in _NAKS:
-            raise FrameError(f"unknown result {result} in a reply")
         event = _event(values)
         about_set = action in (_ACTIONS["apply"], _ACTIONS["stage"], _ACTIONS["commit"])
         status = None
@@ -145,13 +141,11 @@ def decode_emergency(data: bytes) -> AmplifierEvent:
 
 def _event(values: dict[str, int]) -> AmplifierEvent:
     state, fault, channel = values["state"], values["fault"], values["channel"]
-    if state not in _STATES or fault not in _FAULTS:
-        raise FrameError(f"unknown state {state} or fault {fault}")
+    if state not in _STATES:
+        raise FrameError(f"unknown state {state}")
     if channel != _NO_CHANNEL and not _Q.channel.holds(channel):
         raise FrameError(f"invalid channel {channel}")
-    return AmplifierEvent(
-        _STATES[state], _FAULTS[fault], None if channel == _NO_CHANNEL else channel
-    )
+    return AmplifierEvent(_STATES[state], Fault(fault), None if channel == _NO_CHANNEL else channel)
 
 
 def plain_reply(reply: CanReply) -> Reply | None:
@@ -163,7 +157,7 @@ def _refusal(result: int, event: AmplifierEvent) -> Nak | None:
     if result == 0:
         return None
     if result != _INCOMPLETE_SET:
-        return Nak(_NAKS[result], event.channel)
+        return Nak(NakCode(result), event.channel)
     # A frame of the set was lost and nothing applied: it can be repeated, unless the state shows
     # that the complete set would be refused too.
     is_armed = event.state is AmplifierState.OPERATION_ENABLED
@@ -171,7 +165,7 @@ def _refusal(result: int, event: AmplifierEvent) -> Nak | None:
 
 
 def _unpack(layout: str, data: bytes) -> dict[str, int]:
-    values = LAYOUTS[layout].unpack(data)
+    values = LAYOUTS[layout].unpack(data, is_reply=True)
     if values is None:
         raise FrameError(f"invalid {layout} frame: {data.hex(' ')}")
     return values

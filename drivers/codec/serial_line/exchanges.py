@@ -157,7 +157,9 @@ def decode_request(frame: Frame) -> Request:
     """Decode a request; raises Malformed."""
     if frame.is_reply or frame.type not in _EXCHANGES:
         raise Malformed(f"unknown request type {frame.kind:#04x}", code=NakCode.UNKNOWN_TYPE)
-    request: Request = _decode(_EXCHANGES[frame.type][0], frame.payload)
+    cursor = Cursor(frame.payload)
+    request: Request = _EXCHANGES[frame.type][0].unpack(cursor)
+    cursor.end()
     return request
 
 
@@ -178,7 +180,8 @@ def encode_reply(reply: Reply, to: Frame) -> Frame:
 def decode_reply(frame: Frame, to: Frame) -> Reply:
     """Decode the reply to the request frame `to`, which has its sequence number.
 
-    Raises Malformed, also for a reply to another type of request.
+    What follows the known fields is ignored. Raises Malformed, also for a reply to another type of
+    request.
     """
     if frame.kind == REPLY | _NAK:
         return _decode_nak(frame.payload, to)
@@ -187,7 +190,7 @@ def decode_reply(frame: Frame, to: Frame) -> Reply:
             f"reply to request type {to.type} has type {frame.kind:#04x}",
             code=NakCode.UNKNOWN_TYPE,
         )
-    reply: Reply = _decode(_EXCHANGES[to.type][1], frame.payload)
+    reply: Reply = _EXCHANGES[to.type][1].unpack(Cursor(frame.payload))
     return reply
 
 
@@ -204,7 +207,7 @@ def encode_event(event: AmplifierEvent, *, address: int, sequence: int) -> Frame
 
 def decode_event(frame: Frame) -> AmplifierEvent:
     """Decode an event (see `is_event`); raises Malformed."""
-    event: AmplifierEvent = _decode(_EVENT_LAYOUT, frame.payload)
+    event: AmplifierEvent = _EVENT_LAYOUT.unpack(Cursor(frame.payload))
     return event
 
 
@@ -212,17 +215,9 @@ def _decode_nak(payload: bytes, to: Frame) -> Nak:
     cursor = Cursor(payload)
     refused = cursor.byte()
     nak = Nak(code=cursor.one_of(NakCode), channel=cursor.optional_channel())
-    cursor.end()
     if refused != to.type:
         raise Malformed(
             f"reply to request type {to.type} is a refusal of type {refused}",
             code=NakCode.UNKNOWN_TYPE,
         )
     return nak
-
-
-def _decode(layout: _Layout, payload: bytes) -> Any:
-    cursor = Cursor(payload)
-    message = layout.unpack(cursor)
-    cursor.end()
-    return message

@@ -70,13 +70,13 @@ def unpack_capabilities(cursor: Cursor) -> Capabilities:
         name: cursor.integer(quantity) if quantity.per_unit == 1 else cursor.number(quantity)
         for name, quantity in _CAPABILITIES.items()
     }
-    return Capabilities(**values, events=bool(cursor.flags(_EVENTS)))
+    return Capabilities(**values, events=bool(cursor.byte() & _EVENTS))
 
 
 def pack_status(status: Status) -> bytes:
     """Pack a status."""
     head = bytes([status.state, status.fault]) + pack((_Q.active_token, status.token))
-    head += bytes([_HIGH_VOLTAGE if status.high_voltage else 0])
+    head += bytes([status.other_flags | (_HIGH_VOLTAGE if status.high_voltage else 0)])
     head += pack(
         (_Q.temperature, status.temperature),
         (_Q.watchdog_left, status.watchdog_left),
@@ -91,7 +91,7 @@ def unpack_status(cursor: Cursor) -> Status:
     state = cursor.one_of(AmplifierState)
     fault = cursor.one_of(Fault)
     token = cursor.integer(_Q.active_token)
-    flags = cursor.flags(_HIGH_VOLTAGE)
+    flags = cursor.byte()
     temperature = cursor.number(_Q.temperature)
     watchdog_left = cursor.number(_Q.watchdog_left)
     voltage = cursor.number(_Q.voltage)
@@ -105,6 +105,7 @@ def unpack_status(cursor: Cursor) -> Status:
         watchdog_left=watchdog_left,
         voltage=voltage,
         levels=tuple(cursor.number(_Q.level) for _ in range(channels)),
+        other_flags=flags & ~_HIGH_VOLTAGE,
     )
 
 

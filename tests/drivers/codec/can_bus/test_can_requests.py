@@ -194,18 +194,28 @@ def test_unsolicited_reply_and_emergency_are_events() -> None:
     [
         (0x181, ANSWER[:7]),
         (0x181, bytes([4, 0, 0x0F, 0xFF, 0, 0, 0, 0])),  # no such state
-        (0x181, bytes([4, 0, 0x74, 0xFF, 0, 0, 0, 0])),  # no such fault
-        (0x181, bytes([4, 0xA0, 4, 0xFF, 0, 0, 0, 0])),  # no such result
         (0x181, bytes([4, 0, 4, 16, 0, 0, 0, 0])),  # no such channel
         (0x281, CONDITION[:6]),
-        (0x281, bytes([4, 2, *CONDITION[2:]])),  # a bit that is none
         (0x381, b""),
     ],
 )
 def test_invalid_frame_is_a_frame_error(id: int, data: bytes) -> None:
-    """Wrong length, unknown code, or a reserved bit set."""
+    """Wrong length, unknown state or channel."""
     with pytest.raises(FrameError):
         feed((id, data))
+
+
+def test_reply_may_have_numbers_and_bits_of_later() -> None:
+    """An unknown fault, reason of a refusal, and bit of the condition."""
+    (refused,) = feed((0x181, bytes([4, 0xA0, 0xC4, 0xFF, 0, 0, 0, 0])))
+    assert (refused.refusal, refused.event.fault) == (Nak(NakCode(10)), Fault(12))
+    (told,) = feed(
+        (0x381, bytes([0, 0, 0, 0, 0, 0, 0, 4])),
+        (0x281, bytes([4, 3, *CONDITION[2:]])),
+        (0x181, bytes([4, 0, 4, 0xFF, 0, 0, 0, 0])),
+    )
+    assert told.status is not None
+    assert told.status.high_voltage
 
 
 @given(data=st.binary(max_size=64), at=st.integers(0, 6))

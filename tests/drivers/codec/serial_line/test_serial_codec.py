@@ -229,9 +229,8 @@ def test_unprintable_text_is_malformed(raw: bytes, problem: str) -> None:
     ("asked", "payload", "problem"),
     [
         (Hello(), "01 21", "got 33"),
-        (GetStatus(), "04 00 0000 02", "got 0x02"),
+        (GetStatus(), "08", "unknown AmplifierState 8"),
         (GetFaults(), "01 04 10 00000000", "channel 16 does not exist"),
-        (GetFaults(), "00 07", "1 bytes too long"),
         (GetFaults(), "ff", "fault_count must be 0 to 32, got 255"),
     ],
 )
@@ -241,6 +240,22 @@ def test_malformed_reply_names_the_field(asked: Request, payload: str, problem: 
     frame = Frame(kind=request.kind | 0x80, address=1, sequence=1, payload=bytes.fromhex(payload))
     with pytest.raises(Malformed, match=re.escape(problem)):
         decode_reply(frame, request)
+
+
+def test_reply_may_have_more_than_is_known() -> None:
+    """Further bytes; and unknown flags, faults and reasons of a refusal, shown by number."""
+    request = encode_request(GetStatus(), address=1, sequence=1)
+
+    def reply(kind: int, payload: str) -> Reply:
+        frame = Frame(kind=kind, address=1, sequence=1, payload=bytes.fromhex(payload))
+        return decode_reply(frame, request)
+
+    status = reply(REPLY | 9, "07 42 0100 83 FA00 0000 0807 01 0000 07 07")
+    assert status == Status(
+        AmplifierState.FAULT, Fault(66), 1, True, 25.0, 0.0, (0.0,), 1800.0, other_flags=0x82
+    )
+    assert reply(REPLY | 31, "09 0B FF 00") == Nak(NakCode(11))
+    assert [Fault(66).name, NakCode(11).name] == ["VENDOR_66", "NUMBER_11"]
 
 
 def test_reply_to_another_type_is_malformed() -> None:

@@ -24,6 +24,7 @@ _DRIVING: tuple[Steps, ...] = (
     playing.all_or_nothing,
     playing.stage_and_commit,
     playing.tokens,
+    playing.staged_sets_expire,
     playing.ramps,
     playing.cancelled_requests,
     ending.quick_stop,

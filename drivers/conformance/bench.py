@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 
+from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused
@@ -73,6 +74,13 @@ class Bench:
         expected += [0.0] * (len(levels) - len(fractions))
         is_met = all(abs(a - b) <= LEVEL_TOLERANCE for a, b in zip(levels, expected, strict=True))
         expect(is_met, f"{why}: levels must be {tuple(expected)}, got {levels}")
+
+    async def wait(self, duration: float) -> None:
+        """Feed the watchdog for a time [s]."""
+        end = clock.now() + duration
+        while clock.now() < end:
+            await self.amplifier.heartbeat()
+            await asyncio.sleep(0.05)
 
     async def until(self, reached: Callable[[Status], bool], *, what: str, feed: bool) -> Status:
         """Poll until a status is reached; feed: whether polling feeds the watchdog."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from drivers.command import CommandSet, DriveCommand
 from drivers.conformance.bench import LEVEL_TOLERANCE, Bench, expect
+from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import AmplifierState
 
 
@@ -87,24 +88,36 @@ async def stage_and_commit(bench: Bench) -> None:
 
 
 async def tokens(bench: Bench) -> None:
-    """It applies a token once: a repetition is confirmed, a late copy refused."""
+    """It plays a token once: the same set is confirmed; another, or a late copy, is refused."""
     await bench.arm()
-    first = bench.tones(1.0)
+    skipped, first = bench.tones(0.5), bench.tones(1.0)
     achieved = await bench.amplifier.apply(first)
-    again = bench.tones(0.5, token=first.token)
     expect(
-        (await bench.amplifier.apply(again)).commands == achieved.commands,
-        "reply to a repeated token must equal the first one",
+        (await bench.amplifier.apply(first)).commands == achieved.commands,
+        "reply to a repeated set must equal the first one",
     )
     await bench.amplifier.commit(first.token)
+    other = bench.tones(0.5, token=first.token)
+    await bench.refused(bench.amplifier.apply(other), what="another set with the active token")
     await bench.expect_levels(1.0, why="after a repeated token")
     await bench.amplifier.apply(bench.tones(0.25))
     staged = bench.tones(0.5)
     await bench.amplifier.stage(staged)
     await bench.refused(bench.amplifier.apply(first), what="a late copy of an earlier set")
+    await bench.refused(bench.amplifier.stage(skipped), what="a token older than the active one")
     await bench.expect_levels(0.25, why="after a late copy")
     await bench.amplifier.commit(staged.token)
     await bench.expect_levels(0.5, why="commit of a set staged before a late copy")
+
+
+async def staged_sets_expire(bench: Bench) -> None:
+    """It forgets a staged set that is not committed within a second."""
+    await bench.arm()
+    staged = bench.tones(1.0)
+    await bench.amplifier.stage(staged)
+    await bench.wait(1.25 * PROTOCOL.staged_life)
+    await bench.refused(bench.amplifier.commit(staged.token), what="the commit of an old set")
+    await bench.expect_levels(why="after a refused Commit")
 
 
 async def ramps(bench: Bench) -> None:

@@ -129,12 +129,14 @@ class Protocol:
     """The numbers on which host and amplifier agree.
 
     vendor_numbers: the first type, fault and refusal that are the vendor's; reaction [s]: longest
-    time until a reply begins; modbus, canopen: the sections of these names in the file.
+    time until a reply begins; staged_life [s]: of a set that is not committed; modbus, canopen: the
+    sections of these names in the file.
     """
 
     version: int
     vendor_numbers: int
     reaction: float
+    staged_life: float
     serial: SerialDefaults
     types: Mapping[str, int]
     states: Mapping[str, int]
@@ -153,6 +155,7 @@ def _load() -> Protocol:
         version=raw["version"],
         vendor_numbers=raw["vendor_numbers"],
         reaction=raw["reaction"],
+        staged_life=raw["staged_life"],
         serial=SerialDefaults(**raw["serial"]),
         types=raw["types"],
         states=raw["states"],
@@ -175,6 +178,11 @@ PROTOCOL = _load()
 def token_after(token: int) -> int:
     """Return the token after this one (0 before the first): 1..65535, then 1 again."""
     return token % PROTOCOL.quantities.token.maximum + 1
+
+
+def is_newer_token(token: int, than: int) -> bool:
+    """Whether a token follows another by less than half of 2^16 (RFC 1982); any follows 0, none."""
+    return than == 0 or 0 < (token - than) % (1 << 16) < 1 << 15
 
 
 def random_token() -> int:

@@ -224,12 +224,12 @@ class SimulatedAmplifier:
             case LoadEnvelope(envelope=envelope):
                 return self._sets.load(envelope)
             case Stage(command_set=wanted):
-                return self._sets.stage(wanted, derating_factor=self._derating_factor)
+                return self._sets.stage(wanted, now, derating_factor=self._derating_factor)
             case Commit(token=token):
                 return self._commit(token, now)
             case Apply(command_set=wanted):
-                if self._sets.playing(wanted.token) is None:
-                    self._sets.stage(wanted, derating_factor=self._derating_factor)
+                if not self._sets.is_repeated(wanted):
+                    self._sets.stage(wanted, now, derating_factor=self._derating_factor)
                 return self._commit(wanted.token, now)
             case _:  # GetStatus, Ping
                 pass
@@ -248,9 +248,9 @@ class SimulatedAmplifier:
         return None
 
     def _commit(self, token: int, now: float) -> Achieved:
-        active = self._sets.playing(token)
-        if active is None:
-            active = self._sets.commit(token)
+        active = self._sets.active
+        if active is None or active.token != token:
+            active = self._sets.commit(token, now)
             wanted = active.command_set
             self._channels.play(active, now)
             self._warm(now)

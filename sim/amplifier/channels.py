@@ -12,9 +12,10 @@ _DERATING_RAMP = 0.02  # s; no click
 
 @dataclass(frozen=True)
 class PlayableSet:
-    """A checked and rounded set with the envelopes it refers to, by channel."""
+    """A checked and rounded set with the envelopes it refers to, by channel; asked: as it came."""
 
     command_set: CommandSet
+    asked: CommandSet
     onsets: Mapping[int, Envelope] = field(default_factory=dict)
     endings: Mapping[int, Envelope] = field(default_factory=dict)
 
@@ -35,8 +36,9 @@ class PlayableSet:
 
     def derated(self, factor: float) -> "PlayableSet":
         """The set with all levels scaled, knots included."""
-        return PlayableSet(
-            replace(
+        return replace(
+            self,
+            command_set=replace(
                 self.command_set,
                 commands=tuple(
                     replace(command, level=command.level * factor) for command in self.commands

@@ -1,16 +1,15 @@
 """Sets and envelopes of a simulated amplifier: checked, rounded to steps, and stored."""
 
-from collections import deque
+import math
 from dataclasses import replace
 
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError
-from drivers.protocol.definition import PROTOCOL, WireQuantity
+from drivers.protocol.definition import PROTOCOL, WireQuantity, is_newer_token
 from drivers.protocol.messages import Achieved, Capabilities, Loaded, Nak, NakCode
 from sim.amplifier.channels import PlayableSet
 
 _Q = PROTOCOL.quantities
-_TOKENS_REMEMBERED = 16  # late duplicates are older than a few exchanges at most
 
 
 class RefusedSet(Exception):
@@ -29,16 +28,20 @@ class SetStore:
         self.slots: dict[int, Envelope] = {}
         self.staged: PlayableSet | None = None
         self.active: PlayableSet | None = None
-        self.tokens: deque[int] = deque(maxlen=_TOKENS_REMEMBERED)
+        self._staged_at = -math.inf
 
     @property
     def token(self) -> int:
         """Token of the active set, 0 for none."""
         return self.active.token if self.active else 0
 
-    def playing(self, token: int) -> PlayableSet | None:
-        """The active set if this is its token."""
-        return self.active if self.active and self.active.token == token else None
+    def is_repeated(self, wanted: CommandSet) -> bool:
+        """Whether this is the active set again; refused if only its token is."""
+        if self.active is None or wanted.token != self.token:
+            return False
+        if wanted != self.active.asked:
+            raise RefusedSet(NakCode.BAD_TOKEN)
+        return True
 
     def load(self, envelope: Envelope) -> Loaded:
         """Store an envelope in its slot; one without knots clears it."""
@@ -49,37 +52,38 @@ class SetStore:
             self.slots.pop(kept.slot, None)
         return Loaded(slot=kept.slot, knots=len(kept.knots))
 
-    def stage(self, wanted: CommandSet, *, derating_factor: float) -> Achieved:
-        """Stage a set with the present envelopes, its levels times the factor."""
-        if wanted.token in self.tokens:  # a late duplicate
+    def stage(self, wanted: CommandSet, now: float, *, derating_factor: float) -> Achieved:
+        """Stage a set at a time [s] with the present envelopes, its levels times the factor."""
+        if not is_newer_token(wanted.token, self.token):  # a late copy
             raise RefusedSet(NakCode.BAD_TOKEN)
-        staged = self._with_envelopes(_quantised_set(wanted, self._capabilities))
+        staged = self._with_envelopes(wanted)
         self.staged = staged if derating_factor == 1 else staged.derated(derating_factor)
+        self._staged_at = now
         return self.staged.achieved
 
-    def commit(self, token: int) -> PlayableSet:
-        """Make the staged set active."""
-        if self.staged is None or self.staged.token != token:
+    def commit(self, token: int, now: float) -> PlayableSet:
+        """Make the staged set active at a time [s]."""
+        is_old = now - self._staged_at > PROTOCOL.staged_life
+        if is_old or self.staged is None or self.staged.token != token:
             raise RefusedSet(NakCode.BAD_TOKEN)
         self.active, self.staged = self.staged, None
-        self.tokens.append(token)
         return self.active
 
     def forget(self) -> None:
         """Discard the sets; envelopes stay."""
         self.staged = self.active = None
-        self.tokens.clear()
 
     def _with_envelopes(self, wanted: CommandSet) -> PlayableSet:
+        quantised = _quantised_set(wanted, self._capabilities)
         onsets: dict[int, Envelope] = {}
         endings: dict[int, Envelope] = {}
-        for command in wanted.commands:
+        for command in quantised.commands:
             for slot, shapes in ((command.onset, onsets), (command.ending, endings)):
                 if slot and slot not in self.slots:
                     raise RefusedSet(NakCode.NO_ENVELOPE, command.channel)
                 if slot:
                     shapes[command.channel] = self.slots[slot]
-        return PlayableSet(wanted, onsets, endings)
+        return PlayableSet(quantised, wanted, onsets, endings)
 
 
 def _quantised_set(wanted: CommandSet, capabilities: Capabilities) -> CommandSet:

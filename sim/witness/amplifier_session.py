@@ -9,7 +9,7 @@ from sim.witness.config import AmplifierConfig
 from sim.witness.decoded import ChannelCommand, ReportViolation, Request
 from sim.witness.reference_amplifier import ReferenceAmplifier
 
-_TOKENS_KEPT = 16  # since Arm
+_TOKENS_KEPT = 16  # of commits
 
 
 @dataclass
@@ -36,7 +36,7 @@ class AmplifierSession:
     last_vibration: float = -math.inf  # when a vibrating set was accepted
     last_silenced: float = -math.inf  # when a silencing request was sent
     staged: dict[int, Request] = field(default_factory=dict)
-    tokens: deque[tuple[int, Request]] = field(default_factory=lambda: deque(maxlen=_TOKENS_KEPT))
+    last_set: Request | None = None  # since Arm
     committed_tokens: deque[int] = field(default_factory=lambda: deque(maxlen=_TOKENS_KEPT))
     levels: dict[int, ChannelCommand] = field(default_factory=dict)
     is_identified: bool | None = None

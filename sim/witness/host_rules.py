@@ -92,7 +92,7 @@ class HostRules:
                     session.report(
                         "stop", time, f"{session.name} armed before its stop was cleared"
                     )
-                session.tokens.clear()
+                session.last_set = None
                 session.armed_at = time
                 session.last_feed = time
             case RequestKind.CLEAR:

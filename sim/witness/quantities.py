@@ -45,6 +45,13 @@ VALID_FOR = Quantity("valid_for", 0.001, 0, 60000)  # s
 WATCHDOG = Quantity("watchdog", 0.001, 100, 2000)  # s
 WATCHDOG_LEFT = Quantity("watchdog_left", 0.001, 0, 2000)  # s
 TOKEN = Quantity("token", 1, 1, 65535)
+
+
+def is_newer(token: int, than: int) -> bool:
+    """Whether a token is newer than another, 0 being none."""
+    return than == 0 or 1 <= (token - than) % 65536 <= 32767
+
+
 ACTIVE_TOKEN = Quantity("token", 1, 0, 65535)
 CHANNEL = Quantity("channel", 1, 0, 15)
 CHANNEL_COUNT = Quantity("channel_count", 1, 0, 16)

@@ -5,7 +5,6 @@ and its reply; reports are compared with all of that interval.
 """
 
 import math
-from collections import deque
 from collections.abc import Mapping, Sequence
 
 from sim.witness.achieved_rules import check_achieved
@@ -19,12 +18,13 @@ from sim.witness.decoded import (
     RequestKind,
     Status,
 )
+from sim.witness.quantities import is_newer
 from sim.witness.reference_outputs import ReferenceOutputs
 from sim.witness.watchdog import Watchdog
 
 SILENCING_RAMP = 0.005  # s; along which the watchdog and faults silence
 _CARRIED_OUT = 0.010  # s; within which a request is carried out, replied to or not
-_REMEMBERED = 16  # tokens since Arm
+_STAGED_LIFE = 1.0  # s; of a set without its commit
 _WARM = 60.0  # °C; from here on an amplifier may derate
 _ENABLED, _STOPPED, _REACTING, _FAULT = 4, 5, 6, 7
 _OFF = (0, 1, 2)
@@ -63,6 +63,7 @@ class ReferenceAmplifier:
         self._config = config
         self._report = report
         self._report_always = report_always
+        self._slack = times.slack
         self.state: int | None = None
         self._fault = 0
         self._is_reported = True  # the amplifier has reported this state
@@ -78,8 +79,8 @@ class ReferenceAmplifier:
         self._states_before: tuple[set[int], float] = (set(), -math.inf)  # of a stop
         self._broadcast_stop: Request | None = None  # the last one
         self._stopped_between = (-math.inf, -math.inf)  # when it took effect
-        self._played_tokens: deque[int] = deque(maxlen=_REMEMBERED)
         self._staged: Request | None = None
+        self._staged_until = -math.inf
         self._outputs = ReferenceOutputs(name, config, slack=times.slack, report=report)
 
     @property
@@ -139,11 +140,10 @@ class ReferenceAmplifier:
                 self._silence((begin, end), SILENCING_RAMP, "Arm")
                 self.state, self._fault, self._token = _ENABLED, 0, 0
                 self.watchdog.time = request.watchdog
-                self._played_tokens.clear()
             case RequestKind.DISARM | RequestKind.STOP:
                 self._stopped(request, begin, end)
             case RequestKind.STAGE:
-                self._staged = request
+                self._staged, self._staged_until = request, end + _STAGED_LIFE
                 self._check_achieved(request, reply, end)
             case RequestKind.APPLY:
                 self._check_achieved(request, reply, end)
@@ -174,7 +174,6 @@ class ReferenceAmplifier:
         match request.kind:
             case RequestKind.ARM:
                 self.watchdog.time = request.watchdog
-                self._played_tokens.clear()
                 self._token = 0
                 self._states_before[0].add(_ENABLED)
             case RequestKind.DISARM:
@@ -187,7 +186,6 @@ class ReferenceAmplifier:
                 pass
         if request.kind in (RequestKind.APPLY, RequestKind.COMMIT) and request.token != self._token:
             self._token = request.token
-            self._played_tokens.append(request.token)
             self._outputs.set_unknown(between[1] + stop.ramp)
 
     def broadcast_sent(self, request: Request, time: float) -> None:
@@ -205,6 +203,7 @@ class ReferenceAmplifier:
             request.kind is RequestKind.COMMIT
             and self._staged is not None
             and request.token == self._staged.token
+            and time <= self._staged_until
             and self.state == _ENABLED
         ):
             self._token_before = (self._token, soon[1])
@@ -250,15 +249,17 @@ class ReferenceAmplifier:
                 )
             self.forget_state()
             return
+        if begin > self._staged_until + self._slack:
+            self._report("token", end, f"{self._name} committed set {request.token} of long ago")
         self._check_achieved(self._staged, reply, end)
         self._applied(self._staged, reply, begin, end)
 
     def _applied(self, request: Request, reply: Reply, begin: float, end: float) -> None:
         if request.token == self._token:
             return
-        if self._token is not None and request.token in self._played_tokens:
+        if self._token is not None and not is_newer(request.token, self._token):
             self._report_always(
-                "token", end, f"{self._name} accepted set {request.token} again after others"
+                "token", end, f"{self._name} accepted set {request.token} after set {self._token}"
             )
         commands = reply.achieved if reply.achieved is not None else request.commands
         self._play(request, commands, begin, end)
@@ -399,7 +400,6 @@ class ReferenceAmplifier:
         self, request: Request, commands: Mapping[int, ChannelCommand], begin: float, end: float
     ) -> None:
         self._token, self._staged = request.token, None
-        self._played_tokens.append(request.token)
         self._outputs.play(request, commands, begin, end)
 
     def _silence(self, begin: tuple[float, float], ramp: float, cause: str) -> None:

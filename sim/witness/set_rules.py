@@ -5,6 +5,7 @@ from collections.abc import Mapping
 
 from sim.witness.amplifier_session import AmplifierSession
 from sim.witness.decoded import ChannelCommand, Request
+from sim.witness.quantities import is_newer
 
 _STEP = 0.6  # of a step of the wire; tolerance of rounding
 
@@ -36,18 +37,16 @@ def check_envelope(session: AmplifierSession, time: float, level: float) -> None
 
 
 def _check_token(session: AmplifierSession, time: float, request: Request) -> None:
-    for place, (token, other) in enumerate(session.tokens):
-        is_last = place == len(session.tokens) - 1
-        if token == request.token and not (is_last and other.commands == request.commands):
-            session.report(
-                "token",
-                time,
-                f"set {token} sent to {session.name} again "
-                + ("with other contents" if is_last else "after others"),
-            )
-            return
-    if not any(token == request.token for token, _ in session.tokens):
-        session.tokens.append((request.token, request))
+    last, session.last_set = session.last_set, request
+    if last is None or is_newer(request.token, last.token):
+        return
+    if request.token != last.token or request.commands != last.commands:
+        session.report(
+            "token",
+            time,
+            f"set {request.token} sent to {session.name} after set {last.token}"
+            + (" with other contents" if request.token == last.token else ""),
+        )
 
 
 def _check_limits(

@@ -8,7 +8,6 @@ import functools
 import math
 import struct
 import zlib
-from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from types import ModuleType, SimpleNamespace
@@ -438,11 +437,11 @@ def _plays_on(carry_out: Any, amplifier: Any, request: Any, *args: Any) -> Any:
 
 
 def _forgetful(stage: Any, sets: SetStore, *args: Any, **kwargs: Any) -> Any:
-    tokens, sets.tokens = sets.tokens, deque()
+    active, sets.active = sets.active, None
     try:
         return stage(sets, *args, **kwargs)
     finally:
-        sets.tokens = tokens
+        sets.active = active
 
 
 def _twice(write: Any, end: SerialEnd, data: bytes) -> None:

@@ -9,7 +9,6 @@ import math
 import struct
 import threading
 import time
-from collections import deque
 
 import can
 
@@ -79,7 +78,7 @@ class VendorAmplifier:
         self.order: bytes | None = None
         self.ends_at, self.end_ramp = math.inf, 0.0
         self.upload = b""
-        self.achieved = self.playing = b""
+        self.achieved = b""
         self.exact = True
         self.period = HEARTBEAT
 
@@ -104,9 +103,10 @@ class VendorAmplifier:
         self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
 
     def _forget(self) -> None:
-        self.staged: tuple[int, dict[int, bytes], float, float] | None = None
+        self.staged: tuple[int, dict[int, bytes], int, int] | None = None
+        self.staged_until = -math.inf
         self.token = 0
-        self.played: deque[int] = deque(maxlen=16)
+        self.played: tuple[bytes, int, int] | None = None
 
     # Frames received
 
@@ -218,14 +218,16 @@ class VendorAmplifier:
             return WRONG_STATE, NO_CHANNEL
         if token == 0:
             return BAD_TOKEN, NO_CHANNEL
+        ramp, span = bits(order, 16, 16), bits(order, 32, 16)
         if action != STAGE and token == self.token:
-            self.achieved, asked = self.playing, _achieved(token, mine)
-            self.exact = action == COMMIT or asked == self.playing
+            if action == APPLY and self.played != (_achieved(token, mine), ramp, span):
+                return BAD_TOKEN, NO_CHANNEL
+            self.achieved, self.exact = self.played[0], True
             return DONE, NO_CHANNEL
-        if token in self.played:
+        if self.token and not 1 <= (token - self.token) % 65536 <= 32767:
             return BAD_TOKEN, NO_CHANNEL
         if action == COMMIT:
-            if self.staged is None or self.staged[0] != token:
+            if self.staged is None or self.staged[0] != token or now > self.staged_until:
                 return BAD_TOKEN, NO_CHANNEL
             self.achieved, self.exact = _achieved(token, self.staged[1]), True
             self._play(now)
@@ -238,10 +240,9 @@ class VendorAmplifier:
                 return BAD_VALUE, place
             if bits(data, 50, 1):
                 return NO_ENVELOPE, place  # no envelope is ever loaded here
-        ramp, span = bits(order, 16, 16), bits(order, 32, 16)
         if ramp > 1000 or span > 60000:
             return BAD_VALUE, NO_CHANNEL
-        self.staged = (token, mine, ramp / 1000, span / 1000)
+        self.staged, self.staged_until = (token, mine, ramp, span), now + 1.0
         self.achieved, self.exact = _achieved(token, mine), True
         if action == APPLY:
             self._play(now)
@@ -251,12 +252,12 @@ class VendorAmplifier:
         assert self.staged is not None
         self.token, commands, ramp, span = self.staged
         self.staged = None
-        self.playing = self.achieved
-        self.played.append(self.token)
+        self.played = self.achieved, ramp, span
         for number, channel in enumerate(self.channels):
             data = commands.get(number)
-            channel.go(bits(data, 16, 16) if data else 0, ramp, now)
-        self.ends_at, self.end_ramp = (now + span if span else math.inf), ramp
+            channel.go(bits(data, 16, 16) if data else 0, ramp / 1000, now)
+        self.ends_at = now + span / 1000 if span else math.inf
+        self.end_ramp = ramp / 1000
 
     # Changes by itself
 

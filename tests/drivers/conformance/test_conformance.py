@@ -108,9 +108,21 @@ def beside(kind: type[Any], *, before: Deed = void, after: Deed = void) -> Answe
 
 
 def forget_tokens(amplifier: SimulatedAmplifier, now: float) -> None:
-    """Forget which sets have been played."""
-    amplifier._sets.tokens.clear()
+    """Forget which set has been played."""
     amplifier._sets.active = None
+
+
+def ignore_contents(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
+    """Confirm any set with the active token."""
+    active = amplifier._sets.active
+    if isinstance(request, Apply) and active and request.command_set.token == active.token:
+        return active.achieved
+    return amplifier.handle(request, now)
+
+
+def keep_staged(amplifier: SimulatedAmplifier, now: float) -> None:
+    """Let no staged set grow old."""
+    amplifier._sets._staged_at = now
 
 
 def promises_more(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
@@ -173,6 +185,8 @@ MISTAKES: list[tuple[str, Answer]] = [
     ("stage_and_commit", altered_request(Stage, lambda stage: Apply(stage.command_set))),
     ("stage_and_commit", commits_anything),
     ("tokens", beside(Apply, before=forget_tokens)),
+    ("tokens", ignore_contents),
+    ("staged_sets_expire", beside(Commit, before=keep_staged)),
     ("ramps", altered_set(lambda asked: {"ramp": 0.0})),
     ("quick_stop", beside(Stop, after=clear)),
     ("quick_stop", beside(Arm, before=clear)),

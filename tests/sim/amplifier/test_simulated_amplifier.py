@@ -237,12 +237,16 @@ def test_apply_silences_unnamed_channels() -> None:
 
 
 def test_apply_ignores_a_repeated_token() -> None:
-    """A repeated Apply or Commit answers as the first did and leaves the phase running."""
+    """A repeated Apply or Commit answers as the first did and leaves the phase running.
+
+    The same token with another set, and an earlier token, are refused.
+    """
     amplifier = armed()
     first = amplifier.handle(Apply(playing(1, 0.5)), 0.0)
     outputs = amplifier.outputs
     assert amplifier.handle(Apply(playing(1, 0.5)), 0.1) == first
     assert amplifier.handle(Commit(1), 0.1) == first
+    refused(amplifier.handle(Apply(playing(1, 0.4)), 0.1), NakCode.BAD_TOKEN)
     assert amplifier.outputs == outputs
     amplifier.handle(Apply(playing(2, 0.3)), 0.2)
     refused(amplifier.handle(Apply(playing(1, 0.5)), 0.2), NakCode.BAD_TOKEN)
@@ -250,6 +254,26 @@ def test_apply_ignores_a_repeated_token() -> None:
     amplifier.handle(Arm(0.25), 0.3)
     amplifier.handle(Apply(playing(1, 0.5)), 0.3)
     assert status(amplifier, 0.3).token == 1
+
+
+@pytest.mark.parametrize(
+    ("token", "is_played"), [(1, True), (32766, True), (32767, False), (65534, False)]
+)
+def test_token_must_be_newer(token: int, is_played: bool) -> None:
+    """After 65535: by less than 32768 modulo 65536, as RFC 1982 has it."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(65535, 0.1)), 0.0)
+    reply = amplifier.handle(Apply(playing(token, 0.2)), 0.0)
+    assert isinstance(reply, Achieved) == is_played
+
+
+def test_staged_set_expires() -> None:
+    """After a second its commit is refused; one in time is played."""
+    amplifier = armed(watchdog=2.0)
+    amplifier.handle(Stage(playing(1, 0.1)), 0.0)
+    refused(amplifier.handle(Commit(1), 1.001), NakCode.BAD_TOKEN)
+    amplifier.handle(Stage(playing(1, 0.1)), 1.1)
+    assert isinstance(amplifier.handle(Commit(1), 2.099), Achieved)
 
 
 @pytest.mark.parametrize("late", [Stage, Apply])

@@ -19,7 +19,7 @@ FREQUENCY = (2000, 60000)  # range
 MAX_RAMP = 1000
 WATCHDOG_RANGE = (100, 2000)
 SHORT_FADE = 5
-REMEMBERED = 16  # tokens played, so that a late copy is not played again
+STAGED_LIFE = 1000  # ms until a staged set is forgotten
 
 
 class Refused(Exception):
@@ -93,7 +93,7 @@ class Amplifier:
 
     def _forget(self):
         self.token, self._staged, self._ends_at = 0, None, None
-        self._playing, self._played = [], deque(maxlen=REMEMBERED)
+        self._playing, self._staged_at = None, 0
 
     def feed(self):
         """Restart the watchdog, after every request but those that only read."""
@@ -130,39 +130,39 @@ class Amplifier:
     def stage(self, token, ramp, valid_for, commands):
         """Hold a set of (channel, frequency, level, phase) until its commit; return it."""
         self._check(token, ramp, valid_for, commands)
-        if token == self.token or token in self._played:
-            raise Refused(BAD_TOKEN)
-        self._staged = (token, ramp, valid_for, commands)
+        if self.token and not 1 <= (token - self.token) % 65536 <= 32767:
+            raise Refused(BAD_TOKEN)  # a late copy
+        self._staged, self._staged_at = (token, ramp, valid_for, commands), self._clock()
         return token, commands
 
     def commit(self, token):
         """Play the set staged under a token; repeat the reply for the one playing."""
         self._check_token(token)
         if token != self.token:
-            if self._staged is None or token != self._staged[0] or token in self._played:
+            is_old = self._clock() - self._staged_at > STAGED_LIFE
+            if self._staged is None or token != self._staged[0] or is_old:
                 raise Refused(BAD_TOKEN)
-            staged, self._staged = self._staged, None
-            self._play(*staged)
-        return token, self._playing
+            self._play(self._staged)
+        return token, self._playing[3]
 
     def apply(self, token, ramp, valid_for, commands):
-        """Stage and commit at once; a set staged under another token stays."""
-        self._check(token, ramp, valid_for, commands)
+        """Stage and commit at once; repeat the reply for the same set again."""
         if token != self.token:
-            if token in self._played:
-                raise Refused(BAD_TOKEN)
-            self._play(token, ramp, valid_for, commands)
-        return token, self._playing
+            self.stage(token, ramp, valid_for, commands)
+        elif self._playing != (token, ramp, valid_for, commands):
+            self._check_token(token)
+            raise Refused(BAD_TOKEN)
+        return self.commit(token)
 
-    def _play(self, token, ramp, valid_for, commands):
+    def _play(self, wanted):
+        self._playing, self._staged = wanted, None
+        self.token, ramp, valid_for, commands = wanted
         levels = [0] * CHANNELS  # channels without a command fall silent
         for channel, _, level, _ in commands:
             levels[channel] = level
         self._fade_to(levels, ramp=ramp)
         self._ends_at = self._clock() + valid_for if valid_for else None
         self._end_ramp = ramp
-        self.token, self._playing = token, commands
-        self._played.append(token)
 
     def _silence(self, ramp):
         self._fade_to([0] * CHANNELS, ramp=min(max(ramp, 0), MAX_RAMP))

@@ -18,7 +18,7 @@ _NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 @dataclass(frozen=True, eq=False)
 class DiscRule:
-    """Points (p, 2) of the unit disc with weights (p,), which sum to 1.
+    """Points (p, 2) of the unit disc with weights (..., p), which sum to 1 over the points.
 
     Exact for the mean over the disc of polynomials up to a degree.
     """
@@ -28,35 +28,38 @@ class DiscRule:
     degree: int
 
     def cut(self, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Points (k, p, 2) and weights (k, p) for the disc's parts in rectangles.
+        """Points (k, p, 2) and weights (..., k, p) for the disc's parts in rectangles.
 
         low, high (k, 2): the rectangles' corners, in radii from the disc's centre, which they
         contain. Points outside move to the nearest place inside and weigh nothing; the weights of
         the others make the mean of linear functions exact.
         """
+        shape = (*self.weights.shape[:-1], len(low), len(self.points))
+        weights = np.broadcast_to(self.weights[..., None, :], shape)
+        if low.max() <= -1 and high.min() >= 1:
+            return np.broadcast_to(self.points, (len(low), *self.points.shape)), weights
         inside = np.minimum(np.maximum(self.points, low[:, None]), high[:, None])
         is_kept = (inside == self.points).all(axis=2)
-        weights = np.broadcast_to(self.weights, is_kept.shape)
         is_cut = ~is_kept.all(axis=1)
         if is_cut.any():
             weights = weights.copy()
-            weights[is_cut] = self._refit(is_kept[is_cut], low[is_cut], high[is_cut])
+            weights[..., is_cut, :] = self._refit(is_kept[is_cut], low[is_cut], high[is_cut])
         return inside, weights
 
     def _refit(self, is_kept: NDArray[np.bool_], low: FloatArray, high: FloatArray) -> FloatArray:
-        """Weights (k, p): those kept, times the linear function that makes linear means exact.
+        """Weights (..., k, p): those kept, times the linear function that makes linear means exact.
 
         The few that would become negative are zero; the mean is exact but for that.
         """
-        weights = self.weights * is_kept
-        weights /= weights.sum(axis=1, keepdims=True)
+        weights = self.weights[..., None, :] * is_kept
+        weights /= weights.sum(axis=-1, keepdims=True)
         linear = np.column_stack([np.ones(len(self.points)), self.points])
-        gram = (weights[:, None] * linear.T) @ linear
+        gram = (weights[..., None, :] * linear.T) @ linear
         means = np.concatenate([np.ones((len(low), 1)), _centroids(low, high)], axis=1)
         # Definite also where the points kept lie on a line, in parts narrower than a fingertip.
-        tilt = np.linalg.solve(gram + 1e-9 * np.eye(3), means[:, :, None])[:, :, 0]
+        tilt = np.linalg.solve(gram + 1e-9 * np.eye(3), means[:, :, None])[..., 0]
         fitted = np.maximum(weights * (tilt @ linear.T), 0)
-        return np.asarray(fitted / fitted.sum(axis=1, keepdims=True))
+        return np.asarray(fitted / fitted.sum(axis=-1, keepdims=True))
 
 
 def _rings(degree: int, *rings: tuple[float, int, float]) -> DiscRule:
@@ -75,6 +78,13 @@ FIVE_POINTS = _rings(3, (0.0, 1, 1 / 2), (1.0, 4, 1 / 2))
 
 FINE_POINTS = _rings(7, (0.0, 1, 1 / 6), (np.sqrt(0.5), 8, 4 / 6), (1.0, 12, 1 / 6))
 """Twenty-one points, twelve of them on the rim: for figures."""
+
+FIVE_AND_FINE = DiscRule(
+    np.concatenate([FIVE_POINTS.points, FINE_POINTS.points]),
+    np.stack([np.pad(FIVE_POINTS.weights, (0, 21)), np.pad(FINE_POINTS.weights, (5, 0))]),
+    degree=3,
+)
+"""Both, the five points first: weights (2, 26) for the mean by either."""
 
 
 def _centroids(low: FloatArray, high: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ FINGERTIP_RADIUS = 0.013
 def fingertips_on(
     centres: FloatArray, *, length: float, width: float, rule: DiscRule = FINE_POINTS
 ) -> tuple[FloatArray, FloatArray]:
-    """Points [m] (k, p, 2) under fingertips centred at (k, 2) [m] on a plate, weights (k, p).
+    """Points [m] (k, p, 2) under fingertips centred at (k, 2) [m] on a plate, weights (..., k, p).
 
     The weighted sum over a fingertip's points is the mean over its disc, or over the part of it
     that is on the plate. All points are on the plate and under the fingertip.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from model.arrays import FloatArray, IntArray, lattice
 from model.errors import InputError
-from model.finger.disc import FINE_POINTS, FIVE_POINTS
+from model.finger.disc import FIVE_AND_FINE, FIVE_POINTS
 from model.finger.fingertip import FINGERTIP_RADIUS, fingertips_on
 from model.structure.footprint import mean_over
 from model.structure.plate import Plate
@@ -22,6 +22,7 @@ from model.structure.plate import Plate
 POINTS_PER_WAVELENGTH = 20
 MAX_SPACING, MIN_SPACING = 0.008, 0.003  # m
 PATCH = 6  # points along a side of an interpolation, at least
+FEW = len(FIVE_POINTS.points)
 
 
 @dataclass(frozen=True)
@@ -70,14 +71,12 @@ class Raster:
 
     def fingertips(self, centres: FloatArray) -> "Fingertips":
         """Interpolation at the fingertips centred at (k, 2) [m] on the plate."""
-        few, fine = (
-            fingertips_on(centres, length=self.length, width=self.width, rule=rule)
-            for rule in (FIVE_POINTS, FINE_POINTS)
+        points, weights = fingertips_on(
+            centres, length=self.length, width=self.width, rule=FIVE_AND_FINE
         )
-        points = np.concatenate([few[0], fine[0]], axis=1)
         index, interpolation = self._patches(centres, points)
-        weights = (each.astype(np.float32) for _, each in (few, fine))
-        return Fingertips(index, interpolation, *weights)
+        few, fine = weights.astype(np.float32)
+        return Fingertips(index, interpolation, few[:, :FEW], fine[:, FEW:])
 
     def at(self, values: NDArray[np.float32], points: FloatArray) -> NDArray[np.float32]:
         """Values (point_count, c) at points [m] (n, 2) of the plate: (n, c).
@@ -128,10 +127,11 @@ class Raster:
         start = np.rint(centres / spacing - (side - 1) / 2).astype(int)
         start = np.minimum(np.maximum(start, 0), count - side)
         local = (points / spacing - start[:, None]) * (2 / (side - 1)) - 1
-        along_x, along_y = _powers(local.transpose(2, 0, 1), max(side)) @ self._lagrange
+        along = _powers(local.transpose(2, 0, 1), max(side)) @ self._lagrange
+        along_x, along_y = along.astype(np.float32)
         weights = along_y[:, :, : side[1], None] * along_x[:, :, None, : side[0]]
         index = (start[:, 1] * self.nx + start[:, 0])[:, None] + self._patch_index
-        return index, weights.reshape(*points.shape[:2], -1).astype(np.float32)
+        return index, weights.reshape(*points.shape[:2], -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +151,7 @@ class Fingertips:
     def read(self, values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Values (point_count, c) of the raster at the few (k, 5, c) and the fine (k, 21, c)."""
         found = self.interpolation @ values.take(self.index, axis=0)
-        few = self.few_weights.shape[1]
-        return np.ascontiguousarray(found[:, :few]), np.ascontiguousarray(found[:, few:])
+        return np.ascontiguousarray(found[:, :FEW]), np.ascontiguousarray(found[:, FEW:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +172,6 @@ def _powers(x: FloatArray, count: int) -> FloatArray:
     """1, x, x², ... along a new last axis of `count`."""
     powers = np.empty((*x.shape, count))
     powers[..., 0] = 1.0
-    powers[..., 1:] = x[..., None]
-    np.multiply.accumulate(powers, axis=-1, out=powers)
+    for each in range(1, count):
+        np.multiply(powers[..., each - 1], x, out=powers[..., each])
     return powers

@@ -10,10 +10,11 @@ it (`model.vibration.parametric_plate`), so that
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array, FloatArray
+from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces, full_strokes
@@ -61,10 +62,41 @@ class AttachedPlate:
         """Number of ERAs."""
         return int(self.forces.shape[1])
 
-    @property
+    @cached_property
     def modal_rows(self) -> Float32Array:
         """Real and imaginary part of the receptance side by side, (r, 2 f)."""
         return np.ascontiguousarray(self.receptance.T).view(np.float32)
+
+    def with_fingers(self, count: int) -> "Attachments":
+        """What is attached to the plate with a number of fingers on it."""
+        if count not in self._by_count:
+            b, n = self.stiffness.shape[1], self.era_count
+            finger, by_finger = (
+                np.repeat(each[:, None], count, axis=1) for each in (self.finger, self.by_finger)
+            )
+            self._by_count[count] = Attachments(
+                np.concatenate([self.stiffness, finger], axis=1),
+                np.concatenate([np.arange(n), np.arange(b, b + count)]),
+                np.concatenate([self.by_stiffness, by_finger], axis=1),
+            )
+        return self._by_count[count]
+
+    @cached_property
+    def _by_count(self) -> dict[int, "Attachments"]:
+        return {}
+
+
+@dataclass(frozen=True, eq=False)
+class Attachments:
+    """The fixed attachments of a plate and then k fingers on it, a = b + k.
+
+    stiffness: (f, a) dynamic stiffness [N/m]; uncertain: (j,) which are, the ERAs and the fingers;
+    changes: (f, j) of their stiffness by one standard deviation.
+    """
+
+    stiffness: Complex64Array
+    uncertain: IntArray
+    changes: Complex64Array
 
 
 def attach(

@@ -34,7 +34,7 @@ class LoadedContacts:
     - shapes: (a, r); stiffness: (f, a) Z
     - inverse: (f, a, a) K; forces: (f, a, n) F; motion: (f, a, n) r
     - fields: (f, k, p, n) h [m/s²] at each finger's points; power: (f, k, n, n) R
-    - parts: (f, k p, n) each, h and its changes dh; reach: (f, k p, j) |t|² of each uncertain
+    - rows: (f, rows, k p, n) h and its changes dh; reach: (f, k p, j) |t|² of each uncertain
       spring and load; outer: (f, j, n²) their s² r* r^T; error_power: (f, n) of discretisation
     """
 
@@ -45,7 +45,7 @@ class LoadedContacts:
     motion: Complex64Array
     fields: Complex64Array
     power: Complex64Array
-    parts: tuple[Complex64Array, ...]
+    rows: Complex64Array
     reach: Float32Array
     outer: Complex64Array
     error_power: Float32Array
@@ -57,15 +57,14 @@ class LoadedContacts:
         frequencies (n,): by index.
         """
         start = first * self.fields.shape[2]
-        parts = [part.take(frequencies, axis=0)[:, start:] for part in self.parts]
-        rows = np.stack(parts, axis=2)
+        rows = self.rows.take(frequencies, axis=0)[:, :, start:].swapaxes(1, 2)
         f, p, _, n = rows.shape
         reach = self.reach.take(frequencies, axis=0)[:, start:]
         outer = self.outer.take(frequencies, axis=0).view(np.float32)
         power = rows.conj().swapaxes(2, 3) @ rows
         power += (reach @ outer).view(np.complex64).reshape(f, p, n, n)
         error = self.error_power.take(frequencies, axis=0)[:, None]
-        _add_diagonal(power, self.gain_variance * _power_of(parts[0]) + error)
+        _add_diagonal(power, self.gain_variance * _power_of(rows[:, :, 0]) + error)
         return power
 
 
@@ -85,39 +84,38 @@ def load_contacts(
     n = plate.era_count
     shapes = np.concatenate([plate.shapes, points[:, 0]])
     a = b + k
-    rows = np.concatenate([plate.shapes, points.reshape(-1, r)])
-    products = (rows[:, None] * shapes).reshape(-1, r)
+    every = np.concatenate([plate.shapes, points.reshape(-1, r)])
+    products = (every[:, None] * shapes).reshape(-1, r)
     found = (products @ plate.modal_rows).view(np.complex64).reshape(-1, a, f)
     between = np.ascontiguousarray(found.transpose(2, 0, 1))  # (f, b + k p, a)
     attached = np.concatenate([np.arange(b), b + p * np.arange(k)])
     A = between.take(attached, axis=1)
-    stiffness = _stiffness(plate, k)
+    attachments = plate.with_fingers(k)
+    stiffness = attachments.stiffness
     inverse = _inverse(stiffness, A)
     forces = inverse[:, :, :n] * plate.forces[:, None]
-    motion = -(A @ forces)
+    motion = A @ -forces
     motion.reshape(f, -1)[:, : n * n : n + 1] += plate.strokes
-    to_points = (between[:, b:] @ inverse) * plate.minus_omega2[:, None, None]
-    h = to_points[:, :, :n] * plate.forces[:, None]
-
-    parts = [h]
-    if plate.has_thickness_error:
-        parts.append(_by_thickness(plate, shapes, stiffness, forces, rows, attached, to_points))
-    parts.append(to_points[:, :, :n] @ (plate.by_damping[:, :, None] * motion[:, :n]))
+    minus_omega2 = plate.minus_omega2[:, None, None]
+    to_points = between[:, b:] @ (inverse * minus_omega2)
 
     # One row for each point and part, then one for each uncertain spring and load.
-    scale = np.sqrt(weights).reshape(1, k * p, 1)
-    stacked = np.stack([part * scale for part in parts], axis=2).reshape(f, k, -1, n)
-    j = np.concatenate([np.arange(n), np.arange(b, a)])
-    changes = np.concatenate(
-        [plate.by_stiffness, np.broadcast_to(plate.by_finger[:, None], (f, k))], axis=1
-    )
-    moved = motion.take(j, axis=1) * changes[:, :, None]
-    outer = _outer(moved).reshape(f, len(j), -1)
-    reach = _power_of(to_points.take(j, axis=2))
-    shares = np.add.reduce((reach * weights.reshape(1, k * p, 1)).reshape(f, k, p, -1), axis=2)
-    by_change = (shares @ outer.view(np.float32)).view(np.complex64).reshape(f, k, n, n)
-    power = stacked.conj().swapaxes(2, 3) @ stacked + by_change
-    size = np.add.reduce((_power_of(h) * weights.reshape(1, -1, 1)).reshape(f, k, p, n), axis=2)
+    rows = np.empty((f, 2 + plate.has_thickness_error, k * p, n), dtype=np.complex64)
+    h = np.matmul(between[:, b:], forces * minus_omega2, out=rows[:, 0])
+    damping = plate.by_damping[:, :, None] * motion[:, :n]
+    np.matmul(to_points[:, :, :n], damping, out=rows[:, 1])
+    if plate.has_thickness_error:
+        rows[:, 2] = _by_thickness(plate, shapes, stiffness, forces, every, attached, to_points)
+    by_finger = rows.reshape(f, -1, k, p, n).swapaxes(1, 2)
+    scaled = (by_finger * np.sqrt(weights)[:, None, :, None]).reshape(f, k, -1, n)
+    power = scaled.conj().swapaxes(2, 3) @ scaled
+    moved = motion.take(attachments.uncertain, axis=1) * attachments.changes[:, :, None]
+    outer = _outer(moved).reshape(f, len(attachments.uncertain), -1)
+    reach = _power_of(to_points if b == n else to_points.take(attachments.uncertain, axis=2))
+    mean = weights[:, None]
+    shares = (mean @ reach.reshape(f, k, p, -1))[:, :, 0]
+    power += (shares @ outer.view(np.float32)).view(np.complex64).reshape(f, k, n, n)
+    size = (mean @ _power_of(h).reshape(f, k, p, n))[:, :, 0]
     _add_diagonal(power, plate.gain_variance * size + error_power[:, None])
     return LoadedContacts(
         shapes,
@@ -127,7 +125,7 @@ def load_contacts(
         motion,
         h.reshape(f, k, p, n),
         power,
-        tuple(parts),
+        rows,
         reach,
         outer,
         error_power,
@@ -142,16 +140,10 @@ def modal_fields(plate: AttachedPlate, fingers: Float32Array) -> Complex64Array:
     """
     shapes = np.concatenate([plate.shapes, fingers])
     A = (plate.receptance[:, None] * shapes) @ shapes.T
-    inverse = _inverse(_stiffness(plate, len(fingers)), A)
+    inverse = _inverse(plate.with_fingers(len(fingers)).stiffness, A)
     forces = inverse[:, :, : plate.era_count] * plate.forces[:, None]
     scale = plate.receptance * plate.minus_omega2[:, None]
     return np.asarray((shapes.T @ forces) * scale[:, :, None])
-
-
-def _stiffness(plate: AttachedPlate, finger_count: int) -> Complex64Array:
-    """Dynamic stiffness of all attachments, (f, a)."""
-    fingers = np.repeat(plate.finger[:, None], finger_count, axis=1)
-    return np.concatenate([plate.stiffness, fingers], axis=1)
 
 
 def _inverse(stiffness: Complex64Array, receptance: Complex64Array) -> Complex64Array:
@@ -166,7 +158,7 @@ def _by_thickness(
     shapes: Float32Array,
     stiffness: Complex64Array,
     forces: Complex64Array,
-    rows: Float32Array,
+    every: Float32Array,
     attached: IntArray,
     to_points: Complex64Array,
 ) -> Complex64Array:
@@ -176,8 +168,8 @@ def _by_thickness(
     by_attachment = np.ascontiguousarray(forces.transpose(1, 0, 2)).reshape(a, -1)
     modal = (shapes.T @ by_attachment.view(np.float32)).view(np.complex64).reshape(-1, f, n)
     modal *= plate.by_thickness.T[:, :, None]
-    found = (rows @ modal.reshape(len(modal), -1).view(np.float32)).view(np.complex64)
-    changed = found.reshape(-1, f, n).transpose(1, 0, 2)
+    found = (every @ modal.reshape(len(modal), -1).view(np.float32)).view(np.complex64)
+    changed = np.ascontiguousarray(found.reshape(-1, f, n).transpose(1, 0, 2))
     held = stiffness[:, :, None] * changed.take(attached, axis=1)
     return changed[:, b:] * plate.minus_omega2[:, None, None] - to_points @ held
 
@@ -196,7 +188,5 @@ def _add_diagonal(forms: Complex64Array, values: Float32Array) -> None:
     """Add values (..., n) and a ridge to the diagonals of forms (..., n, n)."""
     n = values.shape[-1]
     diagonal = forms.reshape(*values.shape[:-1], -1)[..., :: n + 1]
-    trace = np.add.reduce(diagonal.real, axis=-1, keepdims=True) + np.add.reduce(
-        values, axis=-1, keepdims=True
-    )
-    diagonal += values + np.float32(_RIDGE / n) * trace
+    size = diagonal.real + values
+    diagonal[:] = size + size @ np.full((n, n), _RIDGE / n, dtype=np.float32)

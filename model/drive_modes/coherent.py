@@ -10,10 +10,11 @@ the minimax of expected powers is not the best percentile). A mean is at most th
 or two iterations.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
+from typing import TypeAlias
 
 import numpy as np
 
@@ -31,6 +32,9 @@ MAX_CANDIDATES = 12
 
 LAWSON_STEPS = 3
 """Iterations; twelve lose 0.1 to 0.3 dB of the tenth percentile."""
+
+MIN_PRUNED = 5
+"""Frequencies from which pruning them takes less time than it saves."""
 
 PRUNE_MARGIN = 0.84
 """A frequency whose bound is below this times the best score is pruned: 1.5 dB, since the
@@ -89,8 +93,9 @@ class Coherent:
             rest = rest[bound[rest] > PRUNE_MARGIN * found.score]
             if len(rest):
                 self._search_at(forms, found, rest)
-        self._limit_weights(forms, found)
-        self._relax_level(forms, found)
+        if found.is_level_limited:
+            self._limit_weights(forms, found)
+            self._relax_level(forms, found)
         return found.search()
 
     def _search_at(self, forms: Forms, found: "_BestCandidates", chosen: IntArray) -> None:
@@ -99,22 +104,25 @@ class Coherent:
             forms = forms.at(chosen)
         weights, bound = self._weights(forms, _mean(forms))
         expected = forms.quiet_power(weights)
-        found.add(chosen, weights, forms, expected=expected, bound=bound)
-        shares = np.ones_like(expected)
-        for _ in range(LAWSON_STEPS if expected.shape[1] > 1 else 0):
+        tried = [(weights, expected, bound)]
+        if len(chosen) >= MIN_PRUNED or expected.shape[1] == 1:
+            found.add(chosen, forms, tried)
             kept = (bound > PRUNE_MARGIN * found.score).nonzero()[0]
-            if len(kept) == 0:
+            if len(kept) == 0 or expected.shape[1] == 1:
                 return
             if len(kept) > MAX_CANDIDATES:
                 kept = kept[np.argsort(-bound[kept])[:MAX_CANDIDATES]]
             if len(kept) < len(chosen):
-                chosen, forms = chosen[kept], forms.at(kept)
-                shares, expected = shares[kept], expected[kept]
+                chosen, forms, expected = chosen[kept], forms.at(kept), expected[kept]
+            tried = []
+        shares = np.ones_like(expected)
+        for _ in range(LAWSON_STEPS):
             shares = shares * np.sqrt(expected)
             shares /= np.add.reduce(shares, axis=-1, keepdims=True)
             weights, bound = self._weights(forms, _weighted(forms, shares))
             expected = forms.quiet_power(weights)
-            found.add(chosen, weights, forms, expected=expected, bound=bound)
+            tried.append((weights, expected, bound))
+        found.add(chosen, forms, tried)
 
     def max_sensation(self, forms: Forms) -> float:
         """Return the highest amplitude to threshold found at the weakest target."""
@@ -143,7 +151,7 @@ class Coherent:
             weights = weights * (LEVEL_RESERVE * some.gain_to_level(weights))[:, None]
             fitting = _saturated(weights, 1.0)
             expected = some.quiet_power(fitting)
-            found.add(open_, fitting, some, expected=expected)
+            found.add(open_, some, [(fitting, expected, None)])
             power = np.abs(weights) ** 2
             if step == 0:
                 own = np.maximum.reduce(some.quiet_power(weights), axis=1)
@@ -164,7 +172,7 @@ class Coherent:
             some = forms if len(open_) == forms.frequency_count else forms.at(open_)
             weights, _ = self._weights(some, _mean(some, sigma=sigma))
             weights = _saturated(weights, gain)
-            found.add(open_, weights, some, expected=some.quiet_power(weights))
+            found.add(open_, some, [(weights, some.quiet_power(weights), None)])
 
     def _weights(self, forms: Forms, R: Complex64Array) -> tuple[Complex64Array, Float32Array]:
         """Weights (n, eras), and their bound |c^H w| / sqrt(w^H R w), (n,)."""
@@ -189,6 +197,10 @@ class CoherentResult:
     is_level_limited: bool
 
 
+_Tried: TypeAlias = tuple[Complex64Array, Float32Array, Float32Array | None]
+"""Weights (n, eras), their expected power at the quiet fingertips (n, q), bound of scores (n,)."""
+
+
 class _BestCandidates:
     """The best candidate weights so far; score: the best of those that reach the level."""
 
@@ -200,44 +212,42 @@ class _BestCandidates:
         self.bound = np.full(count, np.inf, dtype=np.float32)
         self.score = min_score
 
-    def add(
-        self,
-        frequencies: IntArray,
-        weights: Complex64Array,
-        forms: Forms,
-        *,
-        expected: Float32Array,
-        bound: Float32Array | None = None,
-    ) -> None:
-        """Add weights (n, eras) with their expected power at the quiet fingertips (n, q).
-
-        forms: at these frequencies only; bound (n,): upper bound of the score at them.
-        """
+    def add(self, frequencies: IntArray, forms: Forms, tried: Sequence[_Tried]) -> None:
+        """Add what was tried at frequencies, by index (n,); forms: at these only."""
+        weights = np.array([each for each, _, _ in tried])
+        expected = np.array([each for _, each, _ in tried])
         power = np.maximum.reduce(expected, axis=-1)
-        peak = forms.amplitude(weights)
-        reaches = forms.reaches(weights)
+        peak, reaches = forms.reached(weights)
         score = peak / np.sqrt(np.maximum(power, _LEAST) + _TINY * (peak * peak))
         if not reaches.all():
-            missed = np.where(reaches, 0, score)
+            missed = np.maximum.reduce(np.where(reaches, 0, score), axis=0)
             self._infeasible_scores[frequencies] = np.maximum(
                 self._infeasible_scores[frequencies], missed
             )
             score = np.where(reaches, score, 0)
-        better = score > self._scores[frequencies]
-        at = frequencies[better]
-        self._scores[at], self._weights[at] = score[better], weights[better]
-        if bound is not None:
-            self.bound[frequencies] = np.minimum(self.bound[frequencies], bound)
-        self.score = max(self.score, float(score.max()))
+        at = (score.argmax(axis=0), np.arange(len(frequencies)))
+        highest = score[at]
+        better = highest > self._scores[frequencies]
+        self._scores[frequencies[better]] = highest[better]
+        self._weights[frequencies[better]] = weights[at][better]
+        for _, _, bound in tried:
+            if bound is not None:
+                self.bound[frequencies] = np.minimum(self.bound[frequencies], bound)
+        self.score = max(self.score, float(highest.max()))
+
+    @property
+    def is_level_limited(self) -> bool:
+        """Whether there are `level_limited` frequencies."""
+        return len(self.level_limited()) > 0
 
     def level_limited(self) -> IntArray:
         """Frequencies without weights that reach the level, but of a better score than the best."""
-        return np.flatnonzero((self._scores == 0) & (self._infeasible_scores > self.score))
+        is_missed = (self._scores == 0) & (self._infeasible_scores > self.score)
+        return is_missed.nonzero()[0]
 
     def search(self) -> "CoherentResult":
         """Return the best weights at each frequency."""
-        is_level_limited = len(self.level_limited()) > 0
-        return CoherentResult(self._scores, self._weights, self.bound, is_level_limited)
+        return CoherentResult(self._scores, self._weights, self.bound, self.is_level_limited)
 
 
 def _saturated(weights: Complex64Array, gain: float) -> Complex64Array:

@@ -92,40 +92,45 @@ class Forms:
         )
 
     def amplitude(self, weights: Complex64Array) -> Float32Array:
-        """Amplitude [m/s²] at the weakest target of weights (f, eras), (f,)."""
-        return np.asarray(np.minimum.reduce(self._amplitudes(weights), axis=0))
+        """Amplitude [m/s²] at the weakest target of weights (..., f, eras), (..., f)."""
+        return np.asarray(np.minimum.reduce(self._amplitudes(weights), axis=-2))
 
-    def reaches(self, weights: Complex64Array) -> NDArray[np.bool_]:
-        """Whether weights (f, eras) reach the wanted level at all targets, (f,)."""
-        least = self._least_amplitudes(weights)
-        return np.asarray(np.logical_and.reduce(least >= self.wanted * self.threshold, axis=0))
+    def reached(self, weights: Complex64Array) -> tuple[Float32Array, NDArray[np.bool_]]:
+        """Amplitude as `amplitude`, and whether all targets have the wanted level, (..., f)."""
+        amplitudes = self._amplitudes(weights)
+        least = self._least_amplitudes(weights, amplitudes)
+        reaches = np.logical_and.reduce(least >= self.wanted * self.threshold, axis=-2)
+        return np.asarray(np.minimum.reduce(amplitudes, axis=-2)), np.asarray(reaches)
 
     def gain_to_level(self, weights: Complex64Array) -> Float32Array:
         """Factor on weights (f, eras) that just reaches the wanted level at all targets, (f,)."""
-        least = np.minimum.reduce(self._least_amplitudes(weights), axis=0)
-        amplitude = np.minimum.reduce(self._amplitudes(weights), axis=0)
+        amplitudes = self._amplitudes(weights)
+        least = np.minimum.reduce(self._least_amplitudes(weights, amplitudes), axis=0)
+        amplitude = np.minimum.reduce(amplitudes, axis=0)
         return np.asarray(
             self.wanted * self.threshold / np.maximum(least, 0.1 * amplitude + _LEAST)
         )
-
-    def _least_amplitudes(self, weights: Complex64Array) -> Float32Array:
-        """Amplitudes at the targets less the margin, (t, f)."""
-        amplitude = self._amplitudes(weights)
-        if not self.level_margin:
-            return amplitude
-        variance = expected_power(self.target_power, weights) - amplitude * amplitude
-        deviation = np.sqrt(np.maximum(variance, 0))
-        return np.asarray(amplitude - np.float32(self.level_margin) * deviation)
 
     def quiet_power(self, weights: Complex64Array) -> Float32Array:
         """Expected power [m²/s⁴] at each quiet fingertip of weights (f, eras), (f, q)."""
         return expected_power(self.quiet.swapaxes(0, 1), weights).T
 
     def _amplitudes(self, weights: Complex64Array) -> Float32Array:
-        return np.asarray(np.abs(np.add.reduce(self.targets * weights, axis=-1)))
+        """Amplitudes at the targets of weights (..., f, eras), (..., t, f)."""
+        fields = np.add.reduce(self.targets * weights[..., None, :, :], axis=-1)
+        return np.asarray(np.abs(fields))
+
+    def _least_amplitudes(self, weights: Complex64Array, amplitudes: Float32Array) -> Float32Array:
+        """Amplitudes (..., t, f) less the margin."""
+        if not self.level_margin:
+            return amplitudes
+        variance = expected_power(self.target_power, weights) - amplitudes * amplitudes
+        deviation = np.sqrt(np.maximum(variance, 0))
+        return np.asarray(amplitudes - np.float32(self.level_margin) * deviation)
 
 
 def expected_power(forms: Complex64Array, weights: Complex64Array) -> Float32Array:
-    """w^H R w of forms (q, f, eras, eras) and weights (f, eras): (q, f)."""
-    moved = (forms @ weights[..., None])[..., 0]
-    return np.asarray(np.vecdot(weights, moved).real)
+    """w^H R w of forms (q, f, eras, eras) and weights (..., f, eras): (..., q, f)."""
+    each = weights[..., None, :, :]
+    moved = np.matvec(forms, each)
+    return np.asarray(np.vecdot(each, moved).real)

@@ -243,7 +243,7 @@ class _BestCandidates:
     def level_limited(self) -> IntArray:
         """Frequencies without weights that reach the level, but of a better score than the best."""
         is_missed = (self._scores == 0) & (self._infeasible_scores > self.score)
-        return is_missed.nonzero()[0]
+        return np.asarray(is_missed.nonzero()[0])
 
     def search(self) -> "CoherentResult":
         """Return the best weights at each frequency."""

@@ -32,7 +32,7 @@ _LEAST = np.float32(1e-20)
 class Weights:
     """Complex weight of each ERA in full strokes, values (eras,), and its frequency.
 
-    frequencies (eras,): by index, or SILENT.
+    frequencies (eras,): by index, or SILENT where the weight is zero.
     """
 
     frequencies: NDArray[np.int64]
@@ -46,6 +46,8 @@ class Weights:
     def tones(self) -> list[tuple[int, Complex64Array]]:
         """Index of each distinct frequency, and the weights (eras,) at it."""
         frequencies = sorted({*self.frequencies.tolist()} - {SILENT})
+        if len(frequencies) == 1:
+            return [(frequencies[0], self.values)]
         return [
             (index, np.where(self.frequencies == index, self.values, 0).astype(np.complex64))
             for index in frequencies

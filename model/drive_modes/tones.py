@@ -1,8 +1,7 @@
 """Conversion of the ERAs' weights to physics: a tone for each ERA."""
 
+import cmath
 from collections.abc import Sequence
-
-import numpy as np
 
 from model.arrays import FloatArray
 from model.drive_modes.forms import Weights
@@ -21,15 +20,16 @@ def excitation_of(
     """
     tones = {}
     for index, weight in drive.tones():
-        strongest = weight[np.argmax(np.abs(weight))]
-        in_phase = weight * (np.conj(strongest) / np.abs(strongest))
-        frequency = float(frequencies[index])
         # Python's own numbers: those of numpy take ten times as long, one by one.
-        for era, w in zip(eras, in_phase.tolist(), strict=True):
-            if w != 0:
+        values = weight.tolist()
+        strongest = max(values, key=abs)
+        factor = strongest.conjugate() / abs(strongest)
+        frequency = float(frequencies[index])
+        for era, value in zip(eras, values, strict=True):
+            if value != 0:
+                w = value * factor
                 if w.real > 0 and abs(w.imag) < ROUNDING * w.real:
                     w = w.real
-                unit = Tone.from_phasor(frequency, w)
-                amplitude = gain * min(unit.amplitude, 1.0) * era.stroke
-                tones[era.name] = Tone(frequency, amplitude, unit.phase)
+                amplitude = gain * min(abs(w), 1.0) * era.stroke
+                tones[era.name] = Tone(frequency, amplitude, cmath.phase(w))
     return tones

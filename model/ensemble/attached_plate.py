@@ -67,6 +67,11 @@ class AttachedPlate:
         """Real and imaginary part of the receptance side by side, (r, 2 f)."""
         return np.ascontiguousarray(self.receptance.T).view(np.float32)
 
+    @cached_property
+    def modal_changes(self) -> Complex64Array:
+        """The receptance, and its changes by thickness and loss, (f, r, 3)."""
+        return np.stack([self.receptance, self.by_thickness, self.by_loss], axis=2)
+
     def with_fingers(self, count: int) -> "Attachments":
         """What is attached to the plate with a number of fingers on it."""
         if count not in self._by_count:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from model.arrays import Float32Array, FloatArray, IntArray
 
 PERCENTILE = 10
 """Percentile of the drawn plates that is promised: nine of ten have more."""
@@ -46,48 +46,54 @@ class Felt:
 
 
 def felt(
-    responses: Complex64Array, threshold: Float32Array, starts: IntArray, fingertips: Fingertips
+    power: Float32Array | FloatArray,
+    threshold: Float32Array,
+    starts: IntArray,
+    fingertips: Fingertips,
 ) -> Felt:
-    """Measure responses (m, k p, d) of tones; starts (c,): the first tone of each drive.
+    """Measure squared amplitudes (m, k p, d) of tones; starts (c,): the first tone of each drive.
 
     threshold (m,) [m/s²]. Tones of one drive are felt as the root of the sum of their squares over
     thresholds; their peak accelerations add (paper Eq. 28). The result has plates (c, d).
     """
-    m, _, d = responses.shape
-    squares = responses.real**2 + responses.imag**2
-    is_mixed = len(starts) < m
-    sensed = squares / (threshold**2)[:, None, None]
+    is_mixed = len(starts) < len(power)
     if is_mixed:
-        sensed = np.add.reduceat(sensed, starts, axis=0)
-    k, p = fingertips.weights.shape
-    level, loudest = _weakest_and_loudest(np.sqrt(sensed).reshape(len(starts), k, p, d), fingertips)
-    if loudest is None:
+        sensed = np.add.reduceat(power / (threshold**2)[:, None, None], starts, axis=0)
+        level, loudest = _weakest_and_loudest(sensed, fingertips)
+    else:
+        level, loudest = _weakest_and_loudest(power, fingertips) / threshold[:, None]
+    if len(fingertips.weights) == len(fingertips.gains):
         return Felt(level, None)
     contrast = level / loudest
     if not is_mixed:
         return Felt(level, Contrasts(loudest, contrast, contrast))
-    peak = np.add.reduceat(np.sqrt(squares), starts, axis=0).reshape(len(starts), k, p, d)
-    weakest, loud = _weakest_and_loudest(peak, fingertips)
-    return Felt(level, Contrasts(loudest, contrast, weakest / np.asarray(loud)))
+    peak = np.add.reduceat(np.sqrt(power), starts, axis=0)
+    weakest, loud = _weakest_and_loudest(peak * peak, fingertips)
+    return Felt(level, Contrasts(loudest, contrast, weakest / loud))
 
 
-def _weakest_and_loudest(
-    amplitudes: Float32Array, fingertips: Fingertips
-) -> tuple[FloatArray, FloatArray | None]:
-    """Mean at the weakest target (c, d), and maximum over all quiet points, of (c, k, p, d)."""
-    t = len(fingertips.gains)
-    means = np.einsum("tp,ctpd->ctd", fingertips.weights[:t], amplitudes[:, :t])
-    weakest = (means * fingertips.gains[:, None]).min(axis=1)
-    if amplitudes.shape[1] == t:
-        return weakest, None
-    loudest = np.maximum.reduce(amplitudes[:, t:].reshape(len(weakest), -1, weakest.shape[-1]), 1)
-    return weakest, np.maximum(loudest, 1e-30)
+def _weakest_and_loudest(power: Float32Array | FloatArray, fingertips: Fingertips) -> FloatArray:
+    """Amplitudes (2, c, d) of squared ones (c, k p, d).
+
+    Of the mean at the weakest target, and the maximum over all quiet points.
+    """
+    c, _, d = power.shape
+    p, t = fingertips.weights.shape[1], len(fingertips.gains)
+    at_targets = np.sqrt(power[:, : t * p]).reshape(c, t, p, d)
+    means = (fingertips.weights[:t, None] @ at_targets)[:, :, 0]
+    weakest = np.minimum.reduce(means * fingertips.gains[:, None], axis=1)
+    loudest = np.maximum.reduce(power[:, t * p :], axis=1, initial=0)
+    return np.array([weakest, np.maximum(np.sqrt(loudest), 1e-30)])
 
 
 def percentile(values: FloatArray, percent: float = PERCENTILE) -> FloatArray:
     """Percentile over the last axis, linear between values (...,)."""
-    place = percent / 100 * (values.shape[-1] - 1)
+    return percentile_of_sorted(np.sort(values, axis=-1), percent)
+
+
+def percentile_of_sorted(ordered: FloatArray, percent: float) -> FloatArray:
+    """As `percentile`, of values that are in ascending order."""
+    place = percent / 100 * (ordered.shape[-1] - 1)
     low = int(place)
-    ordered = np.sort(values, axis=-1)
-    high = min(low + 1, values.shape[-1] - 1)
+    high = min(low + 1, ordered.shape[-1] - 1)
     return np.asarray(ordered[..., low] + (place - low) * (ordered[..., high] - ordered[..., low]))

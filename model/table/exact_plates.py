@@ -80,7 +80,7 @@ def felt_on(
         ]
     )
     return felt(
-        responses,
+        np.abs(responses) ** 2,
         table.threshold_at(rows),
         np.zeros(1, dtype=int),
         Fingertips(tips.fine_weights, np.array(question.gains)),

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from model.ensemble.attached_plate import AttachedPlate
 from model.ensemble.contact_forms import LoadedContacts, load_contacts
 from model.ensemble.draws import draw
 from model.ensemble.measures import Felt, Fingertips, felt
-from model.ensemble.tone_responses import NOMINAL, Tones, tone_responses
+from model.ensemble.tone_responses import Tones, tone_responses
 from model.table.fingertip_shapes import FingertipShapes
 from model.table.question import Question
 
@@ -64,7 +65,7 @@ class FingersOnPlate:
         """Responses of the fingertips to drives."""
         plate, tips = self._plate, self._tips
         each = [drive.tones() for drive in drives]
-        ends = np.cumsum([len(tones) for tones in each])
+        ends = list(accumulate(len(tones) for tones in each))
         tones = Tones(
             np.array([index for tones in each for index, _ in tones]),
             np.array([weights for tones in each for _, weights in tones]),
@@ -72,10 +73,11 @@ class FingersOnPlate:
         points = tips.fine.reshape(-1, tips.fine.shape[-1])
         error = self._error_power.take(tones.frequencies, axis=0) * np.abs(tones.weights) ** 2
         return DriveResponses(
-            tone_responses(plate, self._contacts, tones, points, np.sqrt(error.sum(axis=1))),
+            tone_responses(plate, self._contacts, tones, points),
+            np.sqrt(np.add.reduce(error, axis=1)),
             self._threshold.take(tones.frequencies),
-            ends - [len(tones) for tones in each],
-            ends,
+            np.array([0, *ends[:-1]]),
+            np.array(ends),
             Fingertips(tips.fine_weights, self._gains),
             plate,
         )
@@ -92,11 +94,13 @@ class FingersOnPlate:
 class DriveResponses:
     """Responses of the fingertips' points to the tones of drives.
 
-    values (m, k p, columns): of `tone_responses`; threshold (m,) [m/s²]; starts, ends (c,): ranges
-    of the drives' tones.
+    values (m, k p, columns): of `tone_responses`; error (m,): root mean square of the
+    discretisation error of each tone's field; threshold (m,) [m/s²]; starts, ends (c,): ranges of
+    the drives' tones.
     """
 
     values: Complex64Array
+    error: Float32Array
     threshold: Float32Array
     starts: IntArray
     ends: IntArray
@@ -108,6 +112,7 @@ class DriveResponses:
         start, end = self.starts[drive], self.ends[drive]
         return DriveResponses(
             self.values[start:end],
+            self.error[start:end],
             self.threshold[start:end],
             np.zeros(1, dtype=int),
             np.array([end - start]),
@@ -115,15 +120,10 @@ class DriveResponses:
             self.plate,
         )
 
-    def nominal(self) -> Felt:
-        """Measures on the plate as modelled, (c, 1)."""
-        values = self.values[:, :, NOMINAL : NOMINAL + 1]
-        return felt(values, self.threshold, self.starts, self.fingertips)
-
     def drawn(self, *, count: int, seed: int) -> Felt:
-        """Measures on drawn plates, (c, count)."""
+        """Measures on the plate as modelled, and on drawn ones, (c, 1 + count)."""
         plate = self.plate
-        factors = draw(
+        draws = draw(
             plate.era_count,
             len(self.fingertips.weights),
             count=count,
@@ -131,4 +131,5 @@ class DriveResponses:
             gain=plate.gain,
             phase=plate.phase,
         )
-        return felt(self.values @ factors, self.threshold, self.starts, self.fingertips)
+        power = draws.power(self.values, self.error)
+        return felt(power, self.threshold, self.starts, self.fingertips)

@@ -7,6 +7,7 @@ nine of ten goes first, then felt contrast. The promise is of other draws.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -17,7 +18,7 @@ from model.drive_modes import DRIVE_MODES, find_drives, max_sensation
 from model.drive_modes.exact_search import search_exactly, sensation_found
 from model.drive_modes.forms import Forms, Weights
 from model.drive_modes.tones import excitation_of
-from model.ensemble.measures import percentile
+from model.ensemble.measures import percentile, percentile_of_sorted
 from model.errors import InputError
 from model.finger.perception import decibels
 from model.structure.actuator import Era
@@ -75,7 +76,7 @@ class Candidates:
     """What to choose from: rows (f,) of the table's frequencies [Hz] that may be played.
 
     background (rows, eras, eras): mean power of the rest of the plate, for no quiet finger;
-    threshold (rows,) [m/s²].
+    threshold (rows,) [m/s²], and its name.
     """
 
     eras: tuple[Era, ...]
@@ -84,6 +85,7 @@ class Candidates:
     fingers: FingersOnPlate
     background: Complex64Array | None
     threshold: Float32Array
+    threshold_name: str
     onset_contrast: OnsetContrast
 
 
@@ -103,11 +105,12 @@ def choose_pattern(question: Question, drive_mode: str, candidates: Candidates) 
         forms, found = _search(question, drive_mode, forms)
         found, gap = found + _by_point(question, drive_mode, candidates, forms, found), None
     scores = np.array([score for score, _ in found])
-    drives = [replace(each, frequencies=_rows(each, playable)) for _, each in found]
+    drives = [each for _, each in found]
+    if len(playable) < len(candidates.frequencies):
+        drives = [replace(each, frequencies=_rows(each, playable)) for each in drives]
     responses = candidates.fingers.respond(drives)
     best = _judged(question, drives, scores, candidates, responses)
-    pattern = _pattern(question, drive_mode, candidates, drives[best], responses.of(best))
-    return pattern if gap is None else replace(pattern, search_gap_db=gap)
+    return _pattern(question, drive_mode, candidates, drives[best], responses.of(best), gap)
 
 
 def _search(
@@ -192,14 +195,14 @@ def _judged(
     if len(drives) == 1:
         return 0
     judged = responses.drawn(count=JUDGING_DRAWS, seed=JUDGING_SEED)
-    least = percentile(judged.level)
+    least = percentile(judged.level[:, 1:])
     reaches = least >= 10 ** (question.level_db_sl / 20) * _ROUNDING
     if not reaches.any():
         reaches[:] = True
     if judged.contrast is None:
-        steadiness = least / percentile(judged.level, 50)
+        steadiness = least / percentile(judged.level[:, 1:], 50)
         return int((reaches * scores * steadiness).argmax())
-    robust = np.where(reaches, percentile(judged.contrast.felt), 0.0)
+    robust = np.where(reaches, percentile(judged.contrast.felt[:, 1:]), 0.0)
     best = int(robust.argmax())
     if question.envelopes:
         return best
@@ -235,47 +238,49 @@ def _pattern(
     candidates: Candidates,
     drive: Weights,
     responses: DriveResponses,
+    gap_db: float | None,
 ) -> Pattern:
     """The pattern of a drive, turned down to the wanted level at nine of ten plates."""
-    nominal = responses.nominal()
     drawn = responses.drawn(count=PROMISED_DRAWS, seed=PROMISED_SEED)
-    wanted = 10 ** (question.level_db_sl / 20)
-    robust_level = float(percentile(drawn.level, PROMISED_PERCENTILE)[0])
-    gain = min(1.0, wanted / robust_level)
-    level = gain * float(nominal.level[0, 0])
-    pattern = Pattern(
+    measures = [drawn.level]
+    if drawn.contrast is not None:
+        measures += [drawn.contrast.loudest, drawn.contrast.acceleration, drawn.contrast.felt]
+    each = np.concatenate(measures)
+    ordered = np.sort(each[:, 1:], axis=1)
+    robust, median, most = (
+        decibels(percentile_of_sorted(ordered, percent)).tolist()
+        for percent in (PROMISED_PERCENTILE, 50, 100 - PROMISED_PERCENTILE)
+    )
+    nominal = decibels(each[:, 0]).tolist()
+    gain_db = min(0.0, question.level_db_sl - robust[0])
+    gain = 10 ** (gain_db / 20)
+    pattern = partial(
+        Pattern,
         excitation=excitation_of(drive, candidates.eras, candidates.frequencies, gain=gain),
         ramp=ONSET_RAMP,
-        level_db_sl=float(decibels(level)),
-        robust_level_db_sl=float(decibels(gain * robust_level)),
-        contrast_db=None,
-        quiet_level_db_sl=None,
+        level_db_sl=gain_db + nominal[0],
+        robust_level_db_sl=gain_db + robust[0],
         drive_mode=drive_mode,
+        search_gap_db=gap_db,
+        threshold=candidates.threshold_name,
     )
     if candidates.background is not None:
-        rest = math.sqrt(
-            sum(
-                float(np.vdot(w, candidates.background[row] @ w).real)
-                / float(candidates.threshold[row]) ** 2
-                for row, w in drive.tones()
-            )
+        rest = sum(
+            float(np.vdot(w, candidates.background[row] @ w).real)
+            / float(candidates.threshold[row]) ** 2
+            for row, w in drive.tones()
         )
-        surroundings = float(decibels(level / (gain * max(rest, 1e-30))))
-        return replace(pattern, surroundings_contrast_db=surroundings)
-    if nominal.contrast is None or drawn.contrast is None:
-        return pattern
-    return replace(
-        pattern,
-        contrast_db=float(decibels(nominal.contrast.acceleration[0, 0])),
-        quiet_level_db_sl=float(decibels(gain * nominal.contrast.loudest[0, 0])),
-        robust_quiet_level_db_sl=float(
-            decibels(gain * percentile(drawn.contrast.loudest, 100 - PROMISED_PERCENTILE)[0])
-        ),
-        robust_contrast_db=float(
-            decibels(percentile(drawn.contrast.acceleration, PROMISED_PERCENTILE)[0])
-        ),
-        robust_felt_contrast_db=float(
-            decibels(percentile(drawn.contrast.felt, PROMISED_PERCENTILE)[0])
-        ),
-        median_felt_contrast_db=float(decibels(percentile(drawn.contrast.felt, 50)[0])),
+        surroundings = nominal[0] - float(decibels(math.sqrt(max(rest, 1e-60))))
+        return pattern(
+            contrast_db=None, quiet_level_db_sl=None, surroundings_contrast_db=surroundings
+        )
+    if drawn.contrast is None:
+        return pattern(contrast_db=None, quiet_level_db_sl=None)
+    return pattern(
+        contrast_db=nominal[2],
+        quiet_level_db_sl=gain_db + nominal[1],
+        robust_quiet_level_db_sl=gain_db + most[1],
+        robust_contrast_db=robust[2],
+        robust_felt_contrast_db=robust[3],
+        median_felt_contrast_db=median[3],
     )

@@ -7,7 +7,7 @@ that any fingertips can be queried in any drive mode.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -149,10 +149,10 @@ class LocalizationTable:
             fingers=self._fingers(question, tips),
             background=None if question.quiet else self._background(question),
             threshold=self._threshold,
+            threshold_name=self.threshold,
             onset_contrast=self._onset_contrast(question, tips),
         )
-        pattern = choose_pattern(question, drive_mode, candidates)
-        return replace(pattern, threshold=self.threshold)
+        return choose_pattern(question, drive_mode, candidates)
 
     def prepare(self, drive_mode: str | None = None) -> None:
         """Compute ahead what the first query in a drive mode needs."""

@@ -28,6 +28,7 @@ _DRIVING: tuple[Steps, ...] = (
     playing.ramps,
     playing.cancelled_requests,
     ending.quick_stop,
+    ending.silence_never_later,
     ending.disarm,
     ending.watchdog,
     ending.heartbeats,

@@ -1,5 +1,6 @@
 """Checks of how a vibration ends: stop, disarm, watchdog, valid_for."""
 
+from drivers import clock
 from drivers.conformance.bench import LONG_WATCHDOG, Bench, expect
 from drivers.protocol.messages import AmplifierState, Fault
 
@@ -15,6 +16,22 @@ async def quick_stop(bench: Bench) -> None:
     await bench.refused(bench.arm(), what="arming while stopped")
     status = await bench.amplifier.clear()
     bench.expect_state(status, AmplifierState.SWITCH_ON_DISABLED, after="Clear")
+
+
+async def silence_never_later(bench: Bench) -> None:
+    """It lets a further stop shorten the ramp to silence, never extend it."""
+    longest = bench.can.ramp_max
+    for first, then in ((longest, 0.0), (0.0, longest), (longest / 4, longest)):
+        await bench.arm()
+        await bench.amplifier.apply(bench.tones(1.0))
+        await bench.amplifier.stop(first)
+        begin = clock.now()
+        await bench.amplifier.stop(then)
+        await bench.until(lambda status: not any(status.levels), what="silence", feed=False)
+        due = min(first, then) + longest / 4
+        took = clock.now() - begin
+        expect(took <= due, f"silence must come within {due:g} s of both stops, took {took:.3f} s")
+        await bench.rest()
 
 
 async def disarm(bench: Bench) -> None:

@@ -165,7 +165,9 @@ class Amplifier:
         self._end_ramp = ramp
 
     def _silence(self, ramp):
-        self._fade_to([0] * CHANNELS, ramp=min(max(ramp, 0), MAX_RAMP))
+        ramp = min(max(ramp, 0), MAX_RAMP)
+        if any(self._after) or self._clock() + ramp < self._begin + self._ramp:  # not later
+            self._fade_to([0] * CHANNELS, ramp=ramp)
         self._staged, self._ends_at = None, None
 
     def _check_token(self, token):

@@ -83,7 +83,8 @@ class ReferenceOutputs:
         """Silence all channels along a ramp [s]."""
         for channel in self._channels:
             fade = self._fade_by(channel, begin[1])
-            self._fades[channel] = fade.to(0.0, begin=begin, ramp=ramp)
+            if fade.after > 0 or fade.settled_from > begin[0] + ramp:  # it may not come later
+                self._fades[channel] = fade.to(0.0, begin=begin, ramp=ramp)
         self._set_silent(cause)
 
     def forget(self) -> None:

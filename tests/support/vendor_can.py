@@ -287,7 +287,7 @@ class VendorAmplifier:
     def _silence(self, ramp: float, now: float) -> None:
         self.ends_at = math.inf
         for channel in self.channels:
-            if channel.goal or channel.level(now):
+            if channel.goal or now + ramp < channel.begin + channel.ramp:
                 channel.go(0, ramp, now)
 
     def _is_silent(self, now: float) -> bool:

@@ -30,6 +30,7 @@ from drivers.protocol.messages import (
     Stop,
 )
 from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.waveform import FadingTone
 from vendor_pages import plain
 from virtual_loop import in_virtual_time
 
@@ -120,6 +121,16 @@ def ignore_contents(amplifier: SimulatedAmplifier, request: Request, now: float)
     return amplifier.handle(request, now)
 
 
+def extend_ramp(amplifier: SimulatedAmplifier, now: float) -> None:
+    """Begin the ramp to silence anew."""
+    channels = amplifier._channels
+    channels._outputs = [
+        tuple(replace(tone, start=now, ramp=1.0, gain_to=1.0) for tone in output)
+        for output in channels._outputs
+        if all(isinstance(tone, FadingTone) for tone in output)
+    ]
+
+
 def keep_staged(amplifier: SimulatedAmplifier, now: float) -> None:
     """Let no staged set grow old."""
     amplifier._sets._staged_at = now
@@ -189,6 +200,7 @@ MISTAKES: list[tuple[str, Answer]] = [
     ("staged_sets_expire", beside(Commit, before=keep_staged)),
     ("ramps", altered_set(lambda asked: {"ramp": 0.0})),
     ("quick_stop", beside(Stop, after=clear)),
+    ("silence_never_later", beside(Stop, before=extend_ramp)),
     ("quick_stop", beside(Arm, before=clear)),
     ("disarm", ignores_disarm),
     ("heartbeats", does_not_beat),

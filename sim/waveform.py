@@ -137,12 +137,15 @@ class ShapedTone:
         """Base motion of an ERA with this stroke [m] whose channel plays it."""
         omega = 2 * math.pi * self.frequency
         terms = []
-        for number, (here, there) in enumerate(pairwise(self.values)):
-            since = self.start + number * self.step
+        # Computed once: between a sum and a product, samples would belong to both terms or none.
+        moments = [self.start + number * self.step for number in range(len(self.values))]
+        for (since, until), (here, there) in zip(
+            pairwise(moments), pairwise(self.values), strict=True
+        ):
             phase_factor = stroke * cmath.exp(1j * omega * (since - self.origin))
             slope = (there - here) / self.step
             terms.append(
-                Term(since, since + self.step, omega, here * phase_factor, slope * phase_factor)
+                Term(since, until, omega, here * phase_factor, slope * phase_factor)
             )
         if self.is_lasting:
             phase_factor = stroke * cmath.exp(1j * omega * (self.settled - self.origin))

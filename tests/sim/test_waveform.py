@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from driven_bases import motion_of
-from sim.waveform import FadingTone, Output, fade_to, level_of
+from sim.waveform import FadingTone, Output, ShapedTone, fade_to, level_of
 
 
 def test_fade_follows_a_raised_cosine() -> None:
@@ -84,3 +84,12 @@ def test_fade_interrupted_is_continuous() -> None:
         100.0: pytest.approx(0.03),
         150.0: pytest.approx(0.07),
     }
+
+
+@pytest.mark.parametrize("start", [0.0, 1000.1, 23193.384082])
+def test_pieces_of_a_shaped_tone_join(start: float) -> None:
+    """One piece plays at any moment: there is no gap by rounding that a sample could fall into."""
+    tone = ShapedTone(80.0, start, start, 0.005, tuple(0.01j * n for n in range(20)))
+    terms = tone.terms(stroke=1e-4)
+    assert [one.end for one in terms[:-1]] == [one.start for one in terms[1:]]
+    assert (terms[0].start, terms[-1].end) == (start, math.inf)

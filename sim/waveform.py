@@ -144,9 +144,7 @@ class ShapedTone:
         ):
             phase_factor = stroke * cmath.exp(1j * omega * (since - self.origin))
             slope = (there - here) / self.step
-            terms.append(
-                Term(since, until, omega, here * phase_factor, slope * phase_factor)
-            )
+            terms.append(Term(since, until, omega, here * phase_factor, slope * phase_factor))
         if self.is_lasting:
             phase_factor = stroke * cmath.exp(1j * omega * (self.settled - self.origin))
             terms.append(Term(self.settled, math.inf, omega, self.values[-1] * phase_factor))

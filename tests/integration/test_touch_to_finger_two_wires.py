@@ -1,25 +1,19 @@
-"""Two amplifiers on two different wires under one plate, from a touch stream through the daemon.
+"""Two amplifiers on two different wires under one plate, from a touch stream, in virtual time.
 
-Commits on two wires are apart by what the system makes of them, so the fingers are where each
+Commits on two wires are apart by what the lines make of them, so the fingers are where each
 pattern is the work of one amplifier, and the other one takes its turn.
 """
-
-import asyncio
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from felt_assertions import CHECKS, Truth
+from felt_chain import Chain, Played
 from model.finger.grid import Grid
 from model.rig.file import load_rig
 from model.table.build import build_table
-from model.table.file import save_table
 from rig_files import TWO_AMPLIFIERS, write_rig
 from touch_stream import Stream
-from whole_chain import Played, running_chain
-
-pytestmark = pytest.mark.real_time
 
 STREAM = Stream(
     {"A": (0.16, 0.20), "B": (0.25, 0.09), "C": (0.15, 0.05)},
@@ -28,7 +22,7 @@ STREAM = Stream(
         (1.0, {}),
         (1.3, {3: "A"}),  # NE and NW, on the other
         (2.0, {}),
-        (2.3, {}),
+        (2.5, {}),
     ],
 )
 WIRES = {"main": "serial", "side": "modbus-tcp"}
@@ -47,23 +41,13 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
 @pytest.fixture(scope="module")
 def played(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Played:
     """What came of the stream."""
-    folder = tmp_path_factory.mktemp("chain")
-    save_table(truth.table, folder / "table.npz")
-    return asyncio.run(play(folder))
-
-
-async def play(folder: Path) -> Played:
-    """Through a daemon, over both wires."""
-    chain = running_chain(
-        folder, WIRES, table=folder / "table.npz", rig_changes=TWO_AMPLIFIERS, drive_mode="switched"
-    )
-    async with chain as running:
-        return await running.play(STREAM)
+    rig_file = write_rig(tmp_path_factory.mktemp("chain") / "rig.yaml", *TWO_AMPLIFIERS)
+    rig = load_rig(rig_file)
+    return Chain(rig, truth.table, rig, WIRES, rig_file, drive_mode="switched").play(STREAM)
 
 
 def test_amplifiers_take_turns(played: Played, truth: Truth) -> None:
     """Two ERAs of one amplifier, then two of the other one."""
-    played.require_undisturbed()
     patterns = [pattern for heard in played.heard for pattern in heard.patterns]
     assert [
         {truth.rig.wiring[era].amplifier for era in pattern["drive"]} for pattern in patterns
@@ -76,5 +60,4 @@ def test_fingers_feel_the_commanded_pattern_over_two_wires(
     played: Played, truth: Truth, check: str
 ) -> None:
     """What holds over one wire holds where two amplifiers on two wires play together."""
-    played.require_undisturbed()
     CHECKS[check](played, truth)

@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from felt_chain import LEVEL_DB_SL, LEVEL_LIMIT, Played
 from heard import ONSET, SENSORS, Heard
 from model.arrays import ComplexArray, FloatArray
 from model.finger.contrast import contrast_db, mean_level_db_sl
@@ -29,15 +30,13 @@ from model.transients.envelope import ramped_onset, shaped
 from model.vibration.direct import direct_responder
 from sim.plant.imperfections import Imperfections, draw_imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
-from stream_daemon import LEVEL_DB_SL
 from touch_stream import Situation, Stream
-from whole_chain import LEVEL_LIMIT, Played
 
 STROKE = 100e-6  # m; of every ERA in the example
 JUDGED_UP_TO = 25.0  # dB; no model predicts what a quiet finger feels beyond that
 LEVEL_STEP, PHASE_STEP = 1e-4, 0.01  # the wires' own: full strokes, degrees
+PATTERN = 0.100  # s; from a touch to its pattern on the wire
 COMMANDED, RELEASE = 0.020, 0.010  # s; from the last finger's lift to a command of zero, its ramp
-BUSY = 0.150  # s; delay that a busy machine may add to one lift of several
 
 
 @dataclass(frozen=True)
@@ -211,19 +210,21 @@ def _onset_contrast(truth: Truth, situation: Situation, pattern: Pattern) -> flo
     return _contrast(peaks, situation, weights)
 
 
-def silence_is_on_time(played: Played, truth: Truth) -> None:
-    """After the last lift, levels are zero within 20 ms and the ramp, by the amplifier's clock.
+def onset_is_on_time(played: Played, truth: Truth) -> None:
+    """Each change of the fingers leads to its pattern within 100 ms."""
+    late = [heard.delay for heard in _touched(played)]
+    assert max(late) <= PATTERN, late
 
-    At the best of the lifts, and at none later than what a busy machine may add.
-    """
+
+def silence_is_on_time(played: Played, truth: Truth) -> None:
+    """After the last lift, levels are zero within 20 ms and the ramp, by the amplifier's clock."""
     late = []
     for heard in played.heard:
         if heard.situation.fingers:
             continue
         loud = [t for t, levels in played.polls if heard.begin <= t < heard.end and any(levels)]
         late.append(max(loud, default=heard.begin) - heard.begin)
-    assert min(late) <= COMMANDED + RELEASE, late
-    assert max(late) <= COMMANDED + RELEASE + BUSY, late
+    assert max(late) <= COMMANDED + RELEASE, late
 
 
 def plate_decays(played: Played, truth: Truth) -> None:
@@ -238,22 +239,25 @@ def plate_decays(played: Played, truth: Truth) -> None:
             continue
         end = after.fading.samples[after.fading.times >= after.end - 0.02]
         left.append((end**2).sum(axis=1).mean() / ((np.abs(before.phasors) ** 2).sum() / 2))
-    assert min(left) < 0.05, left
+    assert max(left) < 0.05, left
 
 
 def levels_stay_within_limits(played: Played, truth: Truth) -> None:
-    """Levels within limits and only while a finger is down; the end is off, without a fault."""
-    spans = [(heard.begin, heard.end + RELEASE + BUSY) for heard in _touched(played)]
+    """Levels within limits and only while a finger is down."""
+    spans = [(heard.begin, heard.end + COMMANDED + RELEASE) for heard in _touched(played)]
     for moment, levels in played.polls:
         assert max(levels) <= LEVEL_LIMIT, levels
         is_touched = any(begin <= moment <= end for begin, end in spans)
         assert is_touched or not any(levels), (moment, levels, spans)
     assert len(played.polls) > 50, len(played.polls)
+
+
+def all_is_off_in_the_end(played: Played, truth: Truth) -> None:
+    """Every amplifier is silent, without high voltage and without a fault."""
     for amplifier in played.state["amplifiers"].values():
         assert (amplifier["state"], amplifier["fault"]) == ("SWITCH_ON_DISABLED", "NONE"), amplifier
         assert not amplifier["high_voltage"], amplifier
         assert not any(amplifier["levels"]), amplifier
-    assert played.exit_status == 0, played.exit_status
 
 
 def witness_reports_nothing(played: Played, truth: Truth) -> None:
@@ -269,9 +273,11 @@ CHECKS: Mapping[str, Callable[[Played, Truth], None]] = {
         plate_response_matches_model,
         localization_matches_prediction,
         onset_matches_prediction,
+        onset_is_on_time,
         silence_is_on_time,
         plate_decays,
         levels_stay_within_limits,
+        all_is_off_in_the_end,
         witness_reports_nothing,
     )
 }

@@ -121,7 +121,7 @@ async def hear(
     heard = Heard(situation, begin, end)
     if situation.target is None:
         return replace(heard, fading=await _signals(control, begin, end))
-    patterns = [one for one in events if one.topic == "pattern" and begin < one.time < end]
+    patterns = [one for one in events if one.topic == "pattern" and begin <= one.time < end]
     steady = await _felt(control, end - STEADY, end)
     signals = await _signals(control, end - STEADY, end)
     frequencies = next(iter(steady.values())).frequencies

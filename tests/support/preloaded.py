@@ -28,7 +28,7 @@ ERA = str(Path(sys.executable).with_name("era"))
 SIM = [sys.executable, "-P", "-m", "sim"]
 PROGRAMS = {
     (sys.executable, str(Path(__file__).with_name(name)))
-    for name in ("interrupted.py", "live_demonstration.py", "planted_daemon.py")
+    for name in ("interrupted.py", "live_demonstration.py", "patient_daemon.py")
 }
 """Programs of the tests that do with `era` what no user can."""
 _LOADED = (

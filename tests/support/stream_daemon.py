@@ -1,23 +1,21 @@
-"""`era daemon` as users run it, listening for TUIO, and with a bug planted in it."""
+"""`era daemon` as a process, listening for TUIO; it waits for a busy machine."""
 
 import asyncio
 import contextlib
 import signal
-import socket
 import sys
 import time
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import planted_daemon
+import patient_daemon
 from controller.api.async_client import AsyncClient
+from felt_chain import LEVEL_DB_SL
 from heard import PATIENCE
 from rig_files import write_rig
-
-ERA = Path(sys.executable).with_name("era")
-LEVEL_DB_SL = 30.0
+from tuio_panel import free_port
 
 
 @dataclass
@@ -36,37 +34,18 @@ class RunningDaemon:
 
 
 @asynccontextmanager
-async def running_daemon(
-    folder: Path,
-    urls: Mapping[str, str],
-    rig_changes: Sequence[tuple[str, str]],
-    *,
-    table: Path,
-    drive_mode: str | None,
-    bug: str | None,
-) -> AsyncIterator[RunningDaemon]:
-    """`era daemon` over these URLs; killed with the context at the latest.
-
-    rig_changes: in the text of its rig; bug: planted in it.
-    """
-    reached = [
-        (f'{name}: {{url: "sim://"}}', f'{name}: {{url: "{url}"}}') for name, url in urls.items()
-    ]
-    write_rig(folder / "rig.yaml", *rig_changes, *reached)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+async def running_daemon(folder: Path, url: str, *, table: Path) -> AsyncIterator[RunningDaemon]:
+    """`era daemon` over this URL, ready to be armed; killed with the context at the latest."""
+    write_rig(folder / "rig.yaml", ('main: {url: "sim://"}', f'main: {{url: "{url}"}}'))
+    port = free_port()
     config = folder / "daemon.yaml"
     config.write_text(
         f"rig: rig.yaml\ntable: {table}\nsocket: era.sock\nlevel_db_sl: {LEVEL_DB_SL}\n"
-        "touch_wait: 60 ms\n"  # not the default: the machine is busy with tests
-        f'touch:\n  - {{name: panel, url: "tuio:127.0.0.1:{port}"}}\n'
-        + (f"mode: {drive_mode}\n" if drive_mode else ""),
+        f'touch:\n  - {{name: panel, url: "tuio:127.0.0.1:{port}?timeout={PATIENCE:g}"}}\n',
         encoding="utf-8",
     )
-    command = (ERA,) if bug is None else (sys.executable, planted_daemon.__file__, bug)
     process = await asyncio.create_subprocess_exec(
-        *(*command, "daemon", config),
+        *(sys.executable, patient_daemon.__file__, "daemon", config),
         stdin=asyncio.subprocess.DEVNULL,
         stderr=asyncio.subprocess.PIPE,
     )

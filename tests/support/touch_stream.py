@@ -1,15 +1,10 @@
 """A touch stream that was recorded: fingers come, move and go, and what each change asks for."""
 
-import asyncio
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 
-from controller.sources.capture import RecordedDatagram, read_capture, write_capture
 from controller.sources.touch import Touch, TouchFrame
-from controller.sources.tuio import tuio_datagram
 
 LENGTH, WIDTH = 12 * 0.0254, 9 * 0.0254  # m; the example's plate
 FRAME = 1 / 60  # s; as touch tables send
@@ -60,40 +55,17 @@ class Stream:
             before = fingers
         return found
 
-    def write(self, path: Path) -> None:
-        """As a capture of what a touch table sends."""
-        datagrams = []
-        end = self.changes[-1][0]
-        for number in range(round(end / FRAME) + 1):
+    def frames(self) -> Iterator[TouchFrame]:
+        """As a touch table sends it, with times [s] from the beginning."""
+        for number in range(round(self.changes[-1][0] / FRAME) + 1):
             now = number * FRAME
             down = [fingers for begin, fingers in self.changes if begin <= now + 1e-9][-1:]
-            touches = tuple(
-                Touch(id, self.places[name][0] / LENGTH, 1 - self.places[name][1] / WIDTH)
-                for id, name in (down[0] if down else {}).items()
-            )
-            frame = TouchFrame("table", now, touches)
-            datagrams.append(RecordedDatagram(now, tuio_datagram(frame, number + 1)))
-        write_capture(path, datagrams)
+            yield self.frame(now, down[0] if down else {})
 
-
-async def play_stream(
-    capture: Path, stream: Stream, port: int, changed: Callable[[float, Mapping[int, str]], None]
-) -> None:
-    """Send a capture to a UDP port at its own pace.
-
-    changed: called for each before it is sent, with its time on time.monotonic() [s].
-    """
-    due = list(stream.changes)
-    loop = asyncio.get_running_loop()
-    transport, _ = await loop.create_datagram_endpoint(
-        asyncio.DatagramProtocol, remote_addr=("127.0.0.1", port)
-    )
-    try:
-        start = time.monotonic()
-        for datagram in read_capture(capture):
-            await asyncio.sleep(max(0.0, start + datagram.time - time.monotonic()))
-            while due and due[0][0] <= datagram.time + 1e-6:
-                changed(time.monotonic(), due.pop(0)[1])
-            transport.sendto(datagram.payload)
-    finally:
-        transport.close()
+    def frame(self, time: float, fingers: Mapping[int, str]) -> TouchFrame:
+        """All fingers at a time [s], each at its place."""
+        touches = tuple(
+            Touch(id, self.places[name][0] / LENGTH, 1 - self.places[name][1] / WIDTH)
+            for id, name in fingers.items()
+        )
+        return TouchFrame("table", time, touches)

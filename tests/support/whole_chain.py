@@ -1,232 +1,119 @@
 """The whole chain in processes of its own: touches over UDP, daemon, wire, far end, fingertips.
 
-The daemon has only the URLs of its amplifiers; every wire has a witness.
+The daemon has only the URL of its amplifier. Nothing depends on how fast the machine is: each step
+waits for what the one before has led to.
 """
 
 import asyncio
 import contextlib
+import socket
 import time
-from collections.abc import AsyncIterator, Collection, Mapping, Sequence
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias
 from urllib.parse import quote
 
-import pytest
-
 from controller.api.client_protocol import Notification
-from controller.api.jsonrpc import RpcError
-from far_end_process import FarEndProcess, far_end_process
-from heard import PATIENCE, SENSORS, Control, Heard, Refused, hear
+from controller.sources.tuio import tuio_datagram
+from daemon_bench import until
+from far_end_process import far_end_process
+from felt_chain import Played
+from heard import PATIENCE, SENSORS, Control, Heard, hear
 from rig_files import write_rig
-from sim.witness.endpoint import parse_endpoint
-from sim.witness.violation import Violation
-from sim.witness.witness import Witness
-from sim.witness_relay import relays
 from stream_daemon import RunningDaemon, running_daemon
-from touch_stream import Stream, play_stream
-from witness_config import witness_config
+from touch_stream import FRAME, Situation, Stream
+from wires import patient
 
-POLL = 0.01  # s
-PROMPT = 0.25  # s; from touch to pattern event, far above what an idle machine takes
-LOADING_LOGGER = "controller.loop.loading_times"
-FREQUENCY_LIMITS, LEVEL_LIMIT = (40.0, 500.0), 1.0  # Hz; of the example's rig, written by hand
-
-Polls: TypeAlias = list[tuple[float, list[float]]]
-"""Times [s] of the far end, and the levels of all channels then."""
-
-
-@dataclass(frozen=True)
-class Played:
-    """Results of a stream.
-
-    polls: time [s] and levels of all channels, as the far end reports; violations, frames: of the
-    witness, which no wire within a process has; exit_status: the daemon's; disturbance: why
-    the machine was too busy for this to be a result.
-    """
-
-    heard: list[Heard]
-    polls: Polls
-    violations: list[Violation]
-    frames: int
-    exit_status: int
-    state: Mapping[str, Any]
-    disturbance: str | None
-
-    def require_undisturbed(self) -> None:
-        """Skip the test of a disturbed stream."""
-        if self.disturbance is not None:
-            pytest.skip(f"the machine was too busy: {self.disturbance}")
+_SETTLED = 0.7  # s; of a pattern, or of silence, before it is measured
 
 
 @dataclass
 class Chain:
     """Daemon, wire and far end, ready to be armed."""
 
-    folder: Path
     daemon: RunningDaemon
     control: Control
-    witness: Witness | None
+    _events: list[Notification] = field(default_factory=list)
 
-    async def play(self, stream: Stream) -> Played:
-        """Play a stream and end the daemon."""
-        await self._place(stream)
-        capture = self.folder / "touches.tuio"
-        stream.write(capture)
-        disturbance = await self._wait_until_ready()
-        begin, late = time.monotonic(), await self._late()
-        heard: list[Heard] = []
-        polls: Polls = []
-        try:
-            if disturbance is None:
-                heard, polls = await self._play(capture, stream)
-        except (RpcError, Refused) as error:  # a link was lost, or a request more than 10 s late
-            disturbance = str(error)
-        violations = self._found(begin)
-        if not all(one.patterns and one.delay < PROMPT for one in heard if one.situation.fingers):
-            disturbance = f"a pattern came more than {PROMPT:g} s after its touch"
-        elif violations and await self._late() != late:
-            disturbance = "a reply was late"
-        elif any(LOADING_LOGGER in line for line in self.daemon.log):
-            disturbance = "loading envelopes took too long"
+    async def play(self, stream: Stream) -> tuple[Played, int]:
+        """Play the situations of a stream and end the daemon; also returns its exit status."""
+        sensors = {name: {"at_m": list(at)} for name, at in SENSORS.items()}
+        await self.control.ask("sensors", sensors=sensors)
+        await self._touch(stream, {})
+        await self.daemon.client.subscribe("pattern")
+        listening = asyncio.create_task(self._listen())
+        async with self.daemon.client.armed("test", lease_s=60):
+            heard = [await self._situation(stream, each) for each in stream.situations]
+        listening.cancel()
         state = await self.control.ask("state")
         status = await self.daemon.end()
-        frames = 0 if self.witness is None else self.witness.frames
-        return Played(heard, polls, violations, frames, status, state, disturbance)
+        return Played(heard, [], [], 0, state), status
 
-    def _found(self, since: float) -> list[Violation]:
-        """Violations of the witness since a time [s]."""
-        found = [] if self.witness is None else self.witness.finish(time.monotonic())
-        return [violation for violation in found if violation.time >= since]
+    async def _situation(self, stream: Stream, situation: Situation) -> Heard:
+        """Put the fingers down, wait until they feel it steadily, and read what they felt."""
+        await self._touch(stream, situation.fingers)
+        begin = time.monotonic()
+        sending = asyncio.create_task(self._send(stream, situation.fingers))
+        try:
+            if situation.fingers:
+                await until(
+                    lambda: self._events and self._events[-1].time >= begin, patience=PATIENCE
+                )
+            else:
+                await self._silence()
+            await asyncio.sleep(_SETTLED)
+            end = time.monotonic()
+            return await hear(self.control, situation, begin, end, events=self._events)
+        finally:
+            sending.cancel()
 
-    async def _touch(self, stream: Stream, touched: Collection[str]) -> None:
+    async def _send(self, stream: Stream, fingers: Mapping[int, str]) -> None:
+        """Send a frame again and again, as touch tables do."""
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            number = round(time.monotonic() / FRAME)
+            while True:
+                number += 1
+                datagram = tuio_datagram(stream.frame(time.monotonic(), fingers), number)
+                sender.sendto(datagram, ("127.0.0.1", self.daemon.port))
+                await asyncio.sleep(FRAME)
+
+    async def _touch(self, stream: Stream, fingers: Mapping[int, str]) -> None:
         """Rest fingers on places; at the others they only feel."""
         await self.control.ask(
             "fingers",
             fingers={name: list(at) for name, at in stream.places.items()},
-            observers=[name for name in stream.places if name not in touched],
+            observers=[name for name in stream.places if name not in fingers.values()],
         )
 
-    async def _late(self) -> tuple[int, ...]:
-        """Number of replies that were late or missing, by amplifier."""
-        status = await self.daemon.client.status()
-        return tuple(one.statistics.timeouts for one in status.amplifiers)
-
-    async def _place(self, stream: Stream) -> None:
-        """Place fingers and sensors."""
-        fingers = {name: list(at) for name, at in stream.places.items()}
-        await self.control.ask("fingers", fingers=fingers)
-        sensors = {name: {"at_m": list(at)} for name, at in SENSORS.items()}
-        await self.control.ask("sensors", sensors=sensors)
-        await self.daemon.client.subscribe("pattern")
-
-    async def _wait_until_ready(self) -> str | None:
-        """Wait until the daemon can be armed; returns why it cannot be."""
-        end = time.monotonic() + PATIENCE
-        while (status := await self.daemon.client.status()).state != "READY_TO_SWITCH_ON":
-            if status.state == "FAULT":
-                return status.cause
-            assert time.monotonic() < end, self.daemon.log
-            await asyncio.sleep(0.05)
-        return None
-
-    async def _play(self, capture: Path, stream: Stream) -> tuple[list[Heard], Polls]:
-        """Arm, send the stream, poll the far end, and query the vibration at the fingers."""
-        if self.witness is not None:
-            self.witness.contacts(time.monotonic(), ())
-            self.witness.operator_command(time.monotonic(), "arm")
-        polls: Polls = []
-        events: list[Notification] = []
-        went: list[float] = []
-        await self._touch(stream, ())
-
-        def changed(now: float, fingers: Mapping[int, str]) -> None:
-            went.append(now)
-            group.create_task(self._touch(stream, fingers.values()))
-            if self.witness is not None:
-                self.witness.contacts(now, tuple(fingers))
-
-        async def poll() -> None:
-            while len(went) < len(stream.changes) or polls[-1][0] < went[-1]:
+    async def _silence(self) -> None:
+        """Wait until no amplifier plays."""
+        is_silent = False
+        async with asyncio.timeout(PATIENCE):
+            while not is_silent:
                 state = await self.control.ask("state")
-                levels = [v for each in state["amplifiers"].values() for v in each["levels"]]
-                polls.append((state["time_s"], levels))
-                await asyncio.sleep(POLL)
+                is_silent = not any(state["amplifiers"]["main"]["levels"])
 
-        async def listen() -> None:
-            async for notification in self.daemon.client.events():
-                events.append(notification)
-
-        listening = asyncio.create_task(listen())
-        try:
-            async with self.daemon.client.armed("test", lease_s=60), asyncio.TaskGroup() as group:
-                group.create_task(poll())
-                await play_stream(capture, stream, self.daemon.port, changed)
-        finally:
-            listening.cancel()
-        if self.witness is not None:
-            self.witness.operator_command(time.monotonic(), "disarm")
-        return [
-            await hear(self.control, situation, begin, end, events=events)
-            for situation, begin, end in zip(stream.situations, went, went[1:], strict=False)
-        ], polls
+    async def _listen(self) -> None:
+        async for notification in self.daemon.client.events():
+            self._events.append(notification)
 
 
 @asynccontextmanager
-async def running_chain(
-    folder: Path,
-    wires: Mapping[str, str] | None,
-    *,
-    table: Path,
-    options: Sequence[str] = (),
-    rig_changes: Sequence[tuple[str, str]] = (),
-    truth_changes: Sequence[tuple[str, str]] | None = None,
-    drive_mode: str | None = None,
-    bug: str | None = None,
-) -> AsyncIterator[Chain]:
-    """A daemon over these wires, by amplifier, and the far end; None: sim:// in the daemon.
-
-    options: of the far end; rig_changes: in the text of the daemon's rig; truth_changes: in that of
-    the far end's, where it is another; bug: planted in the daemon.
-    """
-    truth = write_rig(
-        folder / "truth.yaml", *(rig_changes if truth_changes is None else truth_changes)
-    )
+async def running_chain(folder: Path, wire: str, *, table: Path) -> AsyncIterator[Chain]:
+    """A daemon over a wire of this kind and the far end; "sim": within the daemon."""
+    truth = write_rig(folder / "truth.yaml")
     async with contextlib.AsyncExitStack() as stack:
         path = folder / "plate"
-        witness = None
-        if wires is None:
-            urls = {"main": f"sim://{quote(str(truth))}?control={quote(str(path))}"}
+        if wire == "sim":
+            url = f"sim://{quote(str(truth))}?control={quote(str(path))}"
         else:
-            wired = [o for name, wire in wires.items() for o in ("--wire", f"{name}={wire}")]
             far_end = await stack.enter_async_context(
-                far_end_process(truth, *wired, *options, amplifiers=len(wires))
+                far_end_process(truth, "--wire", f"main={wire}")
             )
             path = far_end.control
-            urls, witness = await _witnessed(stack, far_end)
-        daemon = await stack.enter_async_context(
-            running_daemon(folder, urls, rig_changes, table=table, drive_mode=drive_mode, bug=bug)
-        )
+            url = patient(far_end.urls["main"])
+        daemon = await stack.enter_async_context(running_daemon(folder, url, table=table))
         await stack.enter_async_context(daemon.client)
         control = await stack.enter_async_context(Control.at(path))
-        yield Chain(folder, daemon, control, witness)
-
-
-async def _witnessed(
-    stack: contextlib.AsyncExitStack, far_end: FarEndProcess
-) -> tuple[dict[str, str], Witness]:
-    """Insert a witness in every wire of a far end; returns the URLs through it."""
-    endpoints = [parse_endpoint(url) for url in far_end.urls.values()]
-    config = witness_config(
-        far_end.urls,
-        channels=4 if len(endpoints) == 1 else 2,
-        # Times of real processes on a shared machine.
-        times_s={"slack": 0.3},
-        frequency_hz=list(FREQUENCY_LIMITS),
-        level=LEVEL_LIMIT,
-    )
-    witness = Witness(config)
-    names = [endpoint.location for endpoint in endpoints]
-    ends = await stack.enter_async_context(relays(endpoints, names, witness))
-    return dict(zip(far_end.urls, ends, strict=True)), witness
+        yield Chain(daemon, control)

@@ -17,6 +17,7 @@ import pytest
 from controller.api.async_client import AsyncClient
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
+from daemon_process import ERA
 from far_end_process import FarEndProcess, far_end_process
 from heard import PATIENCE
 from model.finger.perception import detection_threshold
@@ -24,7 +25,6 @@ from model.rig.file import load_rig
 from model.table.build import build_table
 from model.table.file import save_table
 from rig_files import write_rig
-from stream_daemon import ERA
 from touch_stream import LENGTH, WIDTH
 
 pytestmark = pytest.mark.real_time

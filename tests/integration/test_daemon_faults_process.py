@@ -34,7 +34,7 @@ from daemon_process import (
     ready,
     tell,
 )
-from drivers.protocol.messages import AmplifierState, Apply, Disarm, Fault, GetStatus
+from drivers.protocol.messages import AmplifierState, Apply, Disarm, Fault, GetStatus, Nak
 from journal import Journal, energised, loudness, silent_from
 from model.rig.file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
@@ -100,9 +100,10 @@ def descriptors(pid: int) -> list[int]:
 
 
 async def test_daemon_replays_nothing_when_paused_longer_than_watchdog(tmp_path: Path) -> None:
-    """SIGSTOP: silent in time; resumed it sends no set, not even after clear and arm.
+    """SIGSTOP: silent in time; resumed it plays no set, not even after clear and arm.
 
-    Neither the previous pattern nor one for touches that were queued meanwhile is played.
+    Neither the previous pattern nor one for touches that were queued meanwhile: the amplifier
+    refuses what is sent before its fault has been read.
     """
     port = free_port()
     async with far_end(tmp_path) as far, daemon_process(tmp_path, far, panel(port)) as daemon:
@@ -126,7 +127,8 @@ async def test_daemon_replays_nothing_when_paused_longer_than_watchdog(tmp_path:
             await journal.hear(5)  # longer than the timeout of those contacts
             await armed(era)
             await journal.hear(10)
-            assert not journal.raising_since(resumed)
+            sent = journal.raising_since(resumed)
+            assert all(isinstance(entry.reply, Nak) for entry in sent), sent
             assert loudness(far) == 0
 
 

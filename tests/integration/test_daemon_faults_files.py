@@ -188,13 +188,14 @@ async def test_running_daemon_keeps_configuration_when_reload_is_invalid(tmp_pat
                 await play(era, far)
                 effects = await era.effects()
                 config.write_text(f"{good}longest_lease: 5 s\n", encoding="utf-8")
-                for parameters in INVALID:
-                    content = parameters.values[0]
-                    if isinstance(content, bytes):
-                        layout.write_bytes(content)
-                        count = len(readies)
-                        os.kill(daemon.process.pid, signal.SIGHUP)
-                        await until(lambda count=count: len(readies) > count)
+                invalid = [each.values[0] for each in INVALID if each.values[0] is not None]
+                for content in invalid:
+                    layout.write_bytes(content)
+                    count = len(readies)
+                    os.kill(daemon.process.pid, signal.SIGHUP)
+                    await until(lambda count=count: len(readies) > count)
+                assert daemon.has_logged("reload rejected")
+                assert not daemon.has_logged("reload failed")
                 await play(era, far)
                 assert await era.effects() == effects
                 await disarmed(era)

@@ -3,7 +3,8 @@
 Loading takes most of the time of a short command, and the suite starts about two hundred. Whoever
 starts one of them by `subprocess` or asyncio gets a process as usual: with its pipes, environment
 and folder, a child of the caller, with signals and an exit status of its own. Only a `preexec_fn`
-needs a start of its own, and gets one.
+needs a start of its own, and gets one. Commands that start such processes themselves get a
+process of their own to fork them off.
 """
 
 import atexit
@@ -18,6 +19,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from io import TextIOWrapper
@@ -26,12 +28,17 @@ from typing import Any, BinaryIO, cast
 
 ERA = str(Path(sys.executable).with_name("era"))
 SIM = [sys.executable, "-P", "-m", "sim"]
+CHILD = [sys.executable, "-P", "-m", "controller.daemon.child_main"]
 PROGRAMS = {
     (sys.executable, str(Path(__file__).with_name(name)))
     for name in ("interrupted.py", "live_demonstration.py", "patient_daemon.py")
 }
 """Programs of the tests that do with `era` what no user can."""
+_PARENTS = ("daemon", "live_demonstration.py", "planted_daemon.py")
+"""Commands and programs that start others."""
 _LOADED = (
+    "controller.daemon.child_main",
+    "controller.daemon.config_reader",
     "controller.daemon.run",
     "controller.gateway.serving",
     "drivers.amp_actions",
@@ -55,8 +62,8 @@ _execute_child: Any = subprocess.Popen._execute_child
 class Loaded:
     """The process that has loaded everything; started when it is first needed."""
 
-    def __init__(self) -> None:
-        self._socket: socket.socket | None = None
+    def __init__(self, connection: socket.socket | None = None) -> None:
+        self._socket = connection
         self._process: subprocess.Popen[bytes] | None = None
         self._turn = threading.Lock()
 
@@ -92,9 +99,9 @@ class Loaded:
         return self._socket
 
 
-def install() -> Loaded:
-    """Fork `era` and `sim` off a loaded process from now on."""
-    loaded = Loaded()
+def install(connection: socket.socket | None = None) -> Loaded:
+    """Fork `era` and `sim` off a loaded process from now on, the one at a connection if given."""
+    loaded = Loaded(connection)
     signature = inspect.signature(_execute_child)
 
     def execute_child(popen: Any, *arguments: Any) -> None:
@@ -126,7 +133,7 @@ def _is_known(words: Any) -> bool:
         return False
     return (
         str(words[0]) == ERA
-        or [str(word) for word in words[: len(SIM)]] == SIM
+        or [str(word) for word in words[:4]] in (SIM, CHILD)
         or tuple(str(word) for word in words[:2]) in PROGRAMS
     )
 
@@ -146,7 +153,10 @@ def _serve(connection: socket.socket) -> list[str]:
             request += connection.recv(1 << 20)
         reading, writing = os.pipe()
         if not (between := os.fork()):
+            between = os.getpid()
             if not (child := os.fork()):
+                while os.getppid() == between:  # its parent is the caller, as it may check
+                    time.sleep(0.001)
                 os.close(reading)
                 os.close(writing)
                 words, *where = json.loads(request)
@@ -181,6 +191,7 @@ def _settle(files: list[int], folder: str, environment: dict[str, str], new_sess
         buffered = not (through or number == 2 or file.isatty())
         setattr(sys, name, TextIOWrapper(file, "utf-8", write_through=through))
         getattr(sys, name).reconfigure(line_buffering=not buffered)
+        setattr(sys, f"__{name}__", getattr(sys, name))  # kept where a program replaces it
 
 
 def _load() -> None:
@@ -219,6 +230,11 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _load()
     words = _serve(socket.socket(fileno=0))
+    while not {Path(word).name for word in words[:2]}.isdisjoint(_PARENTS):
+        connection = _branch()
+        if connection is None:
+            break
+        words = _serve(connection)
     try:
         status = _run(words)
     except SystemExit as end:
@@ -226,6 +242,23 @@ def main() -> int:
         raise
     _end(status)
     return status
+
+
+def _branch() -> socket.socket | None:
+    """Fork a process off which this one forks others; return its end of the connection there."""
+    ours, theirs = socket.socketpair()
+    if os.fork():
+        theirs.close()
+        install(ours)
+        return None
+    ours.close()
+    os.setsid()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    null = os.open(os.devnull, os.O_RDWR)
+    for number in range(3):
+        os.dup2(null, number)
+    os.close(null)
+    return theirs
 
 
 def _run(words: list[str]) -> int:
@@ -240,6 +273,13 @@ def _run(words: list[str]) -> int:
         from sim.__main__ import main as sim
 
         return sim()
+    if words[: len(CHILD)] == CHILD:
+        sys.argv = words[len(CHILD) - 1 :]
+        from controller.daemon.child_main import _main as child
+
+        sys.modules.pop(sys.argv[2], None)  # or runpy warns
+        child()
+        return 0
     sys.argv = words[1:]
     sys.path.insert(0, str(Path(__file__).parent))
     runpy.run_path(words[1], run_name="__main__")

@@ -1,7 +1,8 @@
 """Picture of a checked layout: level, frequency and contrast of every touch over the plate."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,7 +14,8 @@ from matplotlib.patches import Polygon as Outline
 from controller.effects.layout import SurfaceLayout
 from controller.effects.layout_check import CheckedEffect
 from controller.effects.shapes import Circle, Rectangle, Shape
-from controller.effects.simulated_touch import SimulatedTouch
+from controller.effects.simulated_touch import Position, SimulatedTouch
+from model.arrays import FloatArray
 from model.figures.drawing import draw_eras, label_plate
 from model.table.table import LocalizationTable
 
@@ -107,22 +109,23 @@ def _draw_touches(
     for each in checked:
         size = _SIZES[min(drawn.get(each.region, 0), len(_SIZES) - 1)]
         drawn[each.region] = drawn.get(each.region, 0) + 1
-        found: dict[tuple[float, float], float | None] = {}
+        found: dict[Position, float | None] = {}
         for touch in each.touches:
             new, before = value(each, touch), found.get(touch.at)
             if before is None or (new is not None and abs(new) > abs(before)):
                 found[touch.at] = new
         silent = {touch.at for touch in each.touches if touch.felt_db_sl is None}
-        for at, one in found.items():
-            x, y = 100 * at[0], 100 * at[1]
-            if at in silent:
-                axes.plot(x, y, "x", color="black", ms=6)
-            elif one is None:
-                axes.scatter(x, y, c=_NO_PROMISE, s=size, edgecolors="#555555", lw=0.5)
-            else:
-                axes.scatter(
-                    x, y, c=[one], cmap=colors, norm=norm, s=size, edgecolors="#555555", lw=0.5
-                )
+        unpromised = [at for at, one in found.items() if one is None and at not in silent]
+        felt = {at: one for at, one in found.items() if one is not None and at not in silent}
+        mark = partial(axes.scatter, s=size, edgecolors="#555555", lw=0.5)
+        axes.plot(*_columns(silent), "x", color="black", ms=6)
+        mark(*_columns(unpromised), c=_NO_PROMISE)
+        mark(*_columns(felt), c=[*felt.values()], cmap=colors, norm=norm)
+
+
+def _columns(places: Iterable[Position]) -> FloatArray:
+    """Return positions [m] as rows x and y [cm], (2, n)."""
+    return 100 * np.array([*places], dtype=float).reshape(-1, 2).T
 
 
 def _outline(shape: Shape) -> Sequence[tuple[float, float]]:

@@ -6,7 +6,7 @@ MAC is 1 for the same shape with any gain and phase, about one over the number o
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import ttest_1samp
+from scipy.special import stdtr
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.parameters import parameters_of, responses_at, starts
@@ -44,14 +44,15 @@ class ShapeMatch:
     def confidence(self, channel: int, era: int, other: int) -> float:
         """Confidence 0..1 that the channel drives one ERA and not the other.
 
-        By a t-test of the difference of their misfits over frequencies.
+        By Student's t-test of the difference of their misfits over frequencies.
         """
         misfit = np.log(np.maximum(1 - self.mac[:, channel], _LEAST_MISFIT))
         gain = misfit[:, other] - misfit[:, era]
         gain = gain[np.isfinite(gain)]
         if len(gain) < 3 or np.ptp(gain) == 0:
             return 0.5
-        return float(1 - ttest_1samp(gain, 0.0, alternative="greater").pvalue)
+        t = gain.mean() * np.sqrt(len(gain)) / gain.std(ddof=1)
+        return float(stdtr(len(gain) - 1, t))
 
 
 def match_shapes(rig: Rig, plate: ParametricPlate, values: ComplexArray) -> ShapeMatch:

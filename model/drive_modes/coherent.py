@@ -33,9 +33,6 @@ MAX_CANDIDATES = 12
 LAWSON_STEPS = 3
 """Iterations; twelve lose 0.1 to 0.3 dB of the tenth percentile."""
 
-MIN_PRUNED = 5
-"""Frequencies from which pruning them takes less time than it saves."""
-
 PRUNE_MARGIN = 0.84
 """A frequency whose bound is below this times the best score is pruned: 1.5 dB, since the
 percentile decides among the best."""
@@ -104,17 +101,30 @@ class Coherent:
             forms = forms.at(chosen)
         weights, bound = self._weights(forms, _mean(forms))
         expected = forms.quiet_power(weights)
-        tried = [(weights, expected, bound)]
-        if len(chosen) >= MIN_PRUNED or expected.shape[1] == 1:
-            found.add(chosen, forms, tried)
-            kept = (bound > PRUNE_MARGIN * found.score).nonzero()[0]
-            if len(kept) == 0 or expected.shape[1] == 1:
-                return
-            if len(kept) > MAX_CANDIDATES:
-                kept = kept[np.argsort(-bound[kept])[:MAX_CANDIDATES]]
-            if len(kept) < len(chosen):
-                chosen, forms, expected = chosen[kept], forms.at(kept), expected[kept]
-            tried = []
+        found.add(chosen, forms, [(weights, expected, bound)])
+        if expected.shape[1] == 1:
+            return
+        kept = (bound > PRUNE_MARGIN * found.score).nonzero()[0]
+        if len(kept) == 0:
+            return
+        if len(kept) > MAX_CANDIDATES:
+            kept = kept[np.argsort(-bound[kept])[:MAX_CANDIDATES]]
+        if len(kept) < len(chosen):
+            chosen, forms, expected = chosen[kept], forms.at(kept), expected[kept]
+        found.add(chosen, forms, self._iterate(forms, expected))
+
+    def search_all(self, forms: Forms) -> "CoherentResult":
+        """Find the best weights at every frequency, none pruned and none raised to the level."""
+        found = _BestCandidates(forms, 0.0)
+        weights, bound = self._weights(forms, _mean(forms))
+        expected = forms.quiet_power(weights)
+        tried = [(weights, expected, bound), *self._iterate(forms, expected)]
+        found.add(np.arange(forms.frequency_count), forms, tried)
+        return found.search()
+
+    def _iterate(self, forms: Forms, expected: Float32Array) -> "list[_Tried]":
+        """Lawson's iterations from expected powers (f, q) at the quiet fingertips."""
+        tried: list[_Tried] = []
         shares = np.ones_like(expected)
         for _ in range(LAWSON_STEPS):
             shares = shares * np.sqrt(expected)
@@ -122,7 +132,7 @@ class Coherent:
             weights, bound = self._weights(forms, _weighted(forms, shares))
             expected = forms.quiet_power(weights)
             tried.append((weights, expected, bound))
-        found.add(chosen, forms, tried)
+        return tried
 
     def max_sensation(self, forms: Forms) -> float:
         """Return the highest amplitude to threshold found at the weakest target."""
@@ -261,10 +271,10 @@ def _mean(forms: Forms, *, sigma: float = 0.0) -> Complex64Array:
     sigma: relative error of each ERA's contribution beyond that of the forms.
     """
     quiet = forms.quiet
-    R = quiet[:, 0].copy() if quiet.shape[1] == 1 else quiet.mean(axis=1)
+    R = np.add.reduce(quiet, axis=1) / np.float32(quiet.shape[1])
     if sigma:
         R.reshape(len(R), -1)[:, :: R.shape[1] + 1] *= 1 + np.float32(sigma**2)
-    return R
+    return np.asarray(R)
 
 
 def _weighted(forms: Forms, shares: Float32Array) -> Complex64Array:

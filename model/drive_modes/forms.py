@@ -41,7 +41,9 @@ class Weights:
     @classmethod
     def at(cls, frequency: int, values: Complex64Array) -> "Weights":
         """Drive all ERAs at one frequency."""
-        return cls(np.where(values == 0, SILENT, frequency), values)
+        frequencies = np.full(len(values), frequency)
+        frequencies[values == 0] = SILENT
+        return cls(frequencies, values)
 
     def tones(self) -> list[tuple[int, Complex64Array]]:
         """Index of each distinct frequency, and the weights (eras,) at it."""

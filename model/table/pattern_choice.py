@@ -38,6 +38,8 @@ PROMISED_PERCENTILE = 9
 It is the tenth of plates solved exactly: the terms beyond the first order cost 0.1 to 0.3 dB.
 """
 
+_PERCENTS = (PROMISED_PERCENTILE, 50, 100 - PROMISED_PERCENTILE)
+
 # Among drives of nearly the same robust contrast the onset decides, too: a decibel of contrast
 # counts as much as three in the first 100 ms (docs/decisions, on ramps).
 ONSET_WEIGHT = 1 / 3
@@ -143,15 +145,16 @@ def _by_point(
         return []
     if not 1 <= len(question.quiet) <= MAX_FINGERS_BY_POINT:
         return []
-    tones = {tuple(index for index, _ in drive.tones()) for _, drive in drives}
-    rows = np.array(sorted(row for row, *others in tones if not others), dtype=int)
-    if len(rows) == 0:
+    tones = [drive.tones() for _, drive in drives]
+    rows = sorted({each[0][0] for each in tones if len(each) == 1})
+    if not rows:
         return []
-    by_point = candidates.fingers.by_point(forms.at(rows), candidates.playable[rows])
-    found = coherent.search(by_point, 0.0)
+    at = np.array(rows)
+    by_point = candidates.fingers.by_point(forms.at(at), candidates.playable[at])
+    found = coherent.search_all(by_point)
     return [
-        (float(score), Weights.at(int(row), weights))
-        for row, score, weights in zip(rows, found.score, found.weights, strict=True)
+        (score, Weights.at(row, weights))
+        for row, score, weights in zip(rows, found.score.tolist(), found.weights, strict=True)
         if score > 0
     ]
 
@@ -247,11 +250,8 @@ def _pattern(
         measures += [drawn.contrast.loudest, drawn.contrast.acceleration, drawn.contrast.felt]
     each = np.concatenate(measures)
     ordered = np.sort(each[:, 1:], axis=1)
-    robust, median, most = (
-        decibels(percentile_of_sorted(ordered, percent)).tolist()
-        for percent in (PROMISED_PERCENTILE, 50, 100 - PROMISED_PERCENTILE)
-    )
-    nominal = decibels(each[:, 0]).tolist()
+    levels = [percentile_of_sorted(ordered, percent) for percent in _PERCENTS]
+    nominal, robust, median, most = decibels(np.array([each[:, 0], *levels])).tolist()
     gain_db = min(0.0, question.level_db_sl - robust[0])
     gain = 10 ** (gain_db / 20)
     pattern = partial(

@@ -1,4 +1,4 @@
-"""Positions of fingers: one, or several."""
+"""Positions of fingers, one or several, and their loads."""
 
 from collections.abc import Sequence
 from typing import TypeAlias
@@ -26,3 +26,17 @@ def as_points(positions: Positions, *, what: str) -> tuple[Point, ...]:
             f"these, got {positions!r}"
         )
     return tuple((float(x), float(y)) for x, y in found.reshape(-1, 2))
+
+
+def as_loads(loads: Sequence[float]) -> tuple[float, ...]:
+    """Loads for a question; raises InputError for anything but a sequence of numbers."""
+    try:
+        found = np.asarray(loads, dtype=float)
+    except (TypeError, ValueError):
+        found = np.empty(())
+    if found.ndim != 1:
+        raise InputError(
+            "loads must be a sequence with one number per finger, relative to the rig's fingertip, "
+            f"such as [1, 1.5], got {loads!r}"
+        )
+    return tuple(found.tolist())

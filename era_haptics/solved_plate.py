@@ -7,7 +7,7 @@ import numpy as np
 
 from era_haptics.arguments import expect_rig
 from era_haptics.drive import Drives, excitation_of
-from era_haptics.positions import Positions, as_points
+from era_haptics.positions import Positions, as_loads, as_points
 from model.arguments import expect_number, is_whole, shown
 from model.errors import InputError
 from model.reduction.free_plate import FreePlate, solve_free_plate
@@ -78,17 +78,23 @@ class SolvedPlate:
         target: Positions,
         *,
         quiet: Positions = (),
+        loads: Sequence[float] = (),
         duration: float = 1.0,
     ) -> Playback:
         """Compute what fingers at positions [m] feel during a duration [s], from rest.
 
         A pattern starts with its envelopes or its ramp, other drives with a ramp of 40 ms. Fingers
-        load the plate as the rig's fingertip. The plate in time is solved exactly, without steps
+        load the plate as the rig's fingertip; loads: of each relative to it, targets first, 1
+        without. The plate in time is solved exactly, without steps
         (`docs/concepts/plant.md`). Raises InputError for fingers off the plate, and a duration too
         short for a steady state.
         """
         expect_number(duration, what="duration", unit="seconds")
-        fingers = Question(as_points(target, what="target"), as_points(quiet, what="quiet"))
+        fingers = Question(
+            as_points(target, what="target"),
+            as_points(quiet, what="quiet"),
+            loads=as_loads(loads),
+        )
         return play(
             self.rig,
             self._reduced,

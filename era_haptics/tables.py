@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 
 from era_haptics.arguments import expect_rig
-from era_haptics.positions import Positions, as_points
+from era_haptics.positions import Positions, as_loads, as_points
 from model.arguments import expect, expect_number, shown
 from model.arrays import FloatArray
 from model.errors import InputError
@@ -51,6 +51,7 @@ def query(
     level_db_sl: float = STRONG_DB_SL,
     drive_mode: str | None = None,
     envelopes: bool = False,
+    loads: Sequence[float] = (),
     measures: bool = True,
 ) -> Pattern:
     """Find the best pattern for fingers at these positions [m], with its predicted measures.
@@ -58,6 +59,7 @@ def query(
     target: fingers to feel it; quiet: fingers not to feel it; each one position or several.
     level_db_sl: level at the target above its detection threshold, 20 dB is strong; drive_mode:
     the table's own if None; envelopes: for amplifiers that play shaped onsets and endings;
+    loads: of each finger relative to the rig's fingertip, targets first, 1 without;
     measures: compute transient and robust contrast and concentration, too, some ten milliseconds.
     Raises InputError for positions off the plate or at the same point, and a level that cannot be
     reached. The same as `era table query`.
@@ -72,6 +74,7 @@ def query(
         level_db_sl=float(level_db_sl),
         drive_mode=drive_mode,
         envelopes=envelopes,
+        loads=as_loads(loads),
     )
     pattern, _ = query_table(table, question, _timing(table), measures=measures)
     return pattern

@@ -125,6 +125,10 @@ class ContactStatus(Message):
         None, description="predicted, target over loudest quiet finger; null for a single finger"
     )
     effect: str | None = Field(None, description="the effect that plays for it, if any")
+    load: float = Field(
+        1.0,
+        description="on the plate, relative to the rig's fingertip; 1 where none is reported",
+    )
 
 
 class PlayedTone(Message):

@@ -298,9 +298,10 @@ def show_status(status: "StatusResult") -> str:
         promised = contact.robust_felt_contrast_db
         contrast = "" if promised is None else f", at least {promised:.1f} dB over the others"
         effect = "" if contact.effect is None else f", effect {contact.effect}"
+        load = "" if contact.load == 1 else f", load {contact.load:.1f}"
         lines.append(
             f"  finger {contact.source} {contact.id} at {contact.x_m:.3f}, {contact.y_m:.3f} m: "
-            f"{contact.role or 'not driven'}{level}{contrast}{effect}"
+            f"{contact.role or 'not driven'}{level}{contrast}{effect}{load}"
         )
     if status.silence_reason is not None and status.contacts:
         lines.append(f"  silent: {status.silence_reason}")

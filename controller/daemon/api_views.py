@@ -86,6 +86,7 @@ def contact_status(
         "x_m": contact.x,
         "y_m": contact.y,
         "effect": effect,
+        "load": contact.load,
     }
     if applied is not None:
         for felt in applied.targets:

@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from urllib.parse import quote
 
 import numpy as np
@@ -45,9 +46,13 @@ class SimulatedPlate:
         self._threshold = threshold
         self._control = control
 
-    async def place_fingers(self, positions: Mapping[str, Position]) -> None:
-        """Place fingers at positions [m] by id; all others are removed."""
-        await self._control.request({"op": "fingers", "fingers": dict(positions)})
+    async def place_fingers(
+        self, positions: Mapping[str, Position], loads: Mapping[str, float] = MappingProxyType({})
+    ) -> None:
+        """Place fingers at positions [m] by id, loads by id, too; all others are removed."""
+        await self._control.request(
+            {"op": "fingers", "fingers": dict(positions), "loads": dict(loads)}
+        )
 
     async def vibration(self, since: float, until: float) -> dict[str, FingerVibration]:
         """Vibration of each finger by id between two times [s] of time.monotonic()."""

@@ -80,6 +80,7 @@ class TouchRecorder:
         self._touches: dict[ContactKey, _Touch] = {}
         self._playing: _Playing | None = None
         self._sensors: dict[str, Position] = {}
+        self._loads: dict[str, float] = {}
         self._tasks: set[asyncio.Task[Any]] = set()
 
     @property
@@ -166,9 +167,10 @@ class TouchRecorder:
             before = self._sensors.get(_id(contact), (math.inf, math.inf))
             is_at_rest = math.dist(before, position) < MIN_MOVEMENT
             sensors[_id(contact)] = before if is_at_rest else position
-        if sensors != self._sensors:
-            self._sensors = sensors
-            self._run(self._plate.place_fingers(sensors))
+        loads = {_id(contact): contact.load for contact in contacts}
+        if sensors != self._sensors or loads != self._loads:
+            self._sensors, self._loads = sensors, loads
+            self._run(self._plate.place_fingers(sensors, loads))
 
     async def _add_row(self, touch: _Touch) -> None:
         """Make the row of a lifted touch from the pattern that played longest for it."""

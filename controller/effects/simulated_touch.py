@@ -17,7 +17,7 @@ from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import decibels, detection_threshold
-from model.structure.fingertip import FingertipLoad
+from model.structure.fingertip import fingertip_loads
 from model.table.effect_level import EffectLevels
 from model.table.table import LocalizationTable
 from model.transients.envelope import Bases, ramped_pulse
@@ -119,7 +119,7 @@ class TouchSimulator:
         table = self._table
         if table.fingertip is None:
             return table.in_time
-        loads = [FingertipLoad(*at, table.fingertip) for at in contacts]
+        loads = fingertip_loads(table.fingertip, contacts)
         return plate_in_time(table.in_time.reduced, table.eras, loads=table.masses, contacts=loads)
 
     def _levels_at(

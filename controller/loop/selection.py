@@ -65,9 +65,10 @@ class Selection:
 class Selector:
     """Chooses the pattern of a table that realises an intent for the contacts on its plate.
 
-    A pattern stays as long as its targets and their levels do and no contact has moved more than
-    8 mm. A quiet contact that lifts leaves it as it is: a change would be felt. So does any move
-    and any new quiet contact while a short pulse plays. levels: None for steady levels only.
+    A pattern stays as long as its targets and their levels do, no contact has moved more than 8 mm,
+    and none has another load, which changes by a factor of 1.5 or more. A quiet contact that lifts
+    leaves it as it is: a change would be felt. So does any move, any load and any new quiet contact
+    while a short pulse plays. levels: None for steady levels only.
     """
 
     def __init__(self, table: LocalizationTable, levels: EffectLevels | None = None) -> None:
@@ -108,6 +109,7 @@ class Selector:
         same = now.keys() <= then.keys() if current.pattern else now.keys() == then.keys()
         return same and all(
             math.dist((contact.x, contact.y), (then[key].x, then[key].y)) <= MOVE_TOLERANCE
+            and contact.load == then[key].load
             for key, contact in now.items()
         )
 
@@ -177,7 +179,8 @@ class Selector:
         frequencies, all_fields = self._table.amplitudes(
             pattern.excitation,
             np.concatenate(discs),
-            contacts=[(each.x, each.y) for each in fingers],
+            contacts=answer.question.contacts,
+            loads=answer.question.loads,
         )
         ends = np.cumsum([len(disc) for disc in discs])[: len(targets)]
         *fields, at_quiet = np.split(all_fields, ends, axis=1)

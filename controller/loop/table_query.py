@@ -94,6 +94,7 @@ def _question(
     """Return the question that puts an intent to the table."""
     given = [target.level_db_sl for _, target in targets if target.level_db_sl is not None]
     level = max(given, default=FELT_DB_SL)
+    loads = tuple(contact.load for contact in (*(each for each, _ in targets), *quiet))
     levels = [level if t.level_db_sl is None else t.level_db_sl for _, t in targets]
     return Question(
         targets=tuple((contact.x, contact.y) for contact, _ in targets),
@@ -104,6 +105,7 @@ def _question(
         playable=capabilities.playable,
         frequencies=_frequencies(targets, capabilities.frequencies, frequencies),
         envelopes=capabilities.envelope_support.onsets and not is_short(targets),
+        loads=() if all(load == 1 for load in loads) else loads,
     )
 
 

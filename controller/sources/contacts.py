@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
+from controller.sources.contact_load import LANDING, followed
 from controller.sources.touch import Touch, TouchFrame
 from model.finger import MAX_CONTACTS
 from model.structure.plate import Plate
@@ -29,32 +30,36 @@ class ContactKey(NamedTuple):
 class Contact:
     """A finger on the plate at x, y [m] from its south-west corner, down since a time [s].
 
-    pressure, touch_major: as in `Touch`; a contact that differs in nothing else has not changed.
+    load: relative to the rig's fingertip, bounded and in steps (`contact_load`), 1 where nothing is
+    reported. pressure, touch_major: as in `Touch`; a contact that differs in nothing else has not
+    changed.
     """
 
     key: ContactKey
     x: float
     y: float
     since: float
+    load: float = 1.0
     pressure: float | None = field(default=None, compare=False)
     touch_major: float | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Contacts that came down, moved and lifted, each as it is or was.
+    """Contacts that came down, moved, pressed harder or less and lifted, each as it is or was.
 
     rejected: a reason for each touch that was not accepted.
     """
 
     down: tuple[Contact, ...] = ()
     moved: tuple[Contact, ...] = ()
+    pressed: tuple[Contact, ...] = ()
     up: tuple[Contact, ...] = ()
     rejected: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
         """Whether any contact changed."""
-        return bool(self.down or self.moved or self.up)
+        return bool(self.down or self.moved or self.pressed or self.up)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +119,7 @@ class ContactTracker:
         self._sources[frame.source] = _source_of(frame)
         down: list[Contact] = []
         moved: list[Contact] = []
+        pressed: list[Contact] = []
         for key, touch in touches.items():
             known = self._contacts.get(key)
             if known is None and len(self._contacts) >= MAX_CONTACTS:
@@ -127,8 +133,10 @@ class ContactTracker:
                 down.append(contact)
             elif (known.x, known.y) != (contact.x, contact.y):
                 moved.append(contact)
+            elif known.load != contact.load:
+                pressed.append(contact)
         self._forget_sources()
-        return Change(tuple(down), tuple(moved), up, tuple(rejected))
+        return Change(tuple(down), tuple(moved), tuple(pressed), up, tuple(rejected))
 
     def expire(self, now: float) -> Change:
         """Lift the contacts of all sources that have timed out at now [s]."""
@@ -150,6 +158,7 @@ class ContactTracker:
             touch.x * self._plate.length,
             (1 - touch.y) * self._plate.width,
             since=time if known is None else known.since,
+            load=1.0 if known is None else _load(known, touch, time),
             pressure=touch.pressure,
             touch_major=touch.touch_major,
         )
@@ -185,6 +194,11 @@ class ContactTracker:
         """Forget sources without contacts."""
         names = {key.source for key in self._contacts}
         self._sources = {name: self._sources[name] for name in self._sources if name in names}
+
+
+def _load(known: Contact, touch: Touch, time: float) -> float:
+    """Return the load of a known contact with its touch at a time [s]."""
+    return known.load if time - known.since < LANDING else followed(known.load, touch.load)
 
 
 def _input_of(key: ContactKey) -> str:

@@ -4,12 +4,12 @@ import asyncio
 import errno
 import logging
 from collections.abc import Callable
-from urllib.parse import parse_qsl
 
 from controller.sources.input_device import InputDevice
 from controller.sources.playing import REPEAT_INTERVAL
-from controller.sources.slots import SlotReader
+from controller.sources.slots import SlotReader, light_press
 from controller.sources.touch import Touch, TouchFrame, TouchSource
+from controller.sources.url_options import panel_options
 from model.errors import InputError
 
 # Between attempts to reopen an unplugged panel [s], doubled each time.
@@ -21,6 +21,8 @@ _logger = logging.getLogger(__name__)
 class EvdevSource(TouchSource):
     """Follows the panel at `evdev:PATH` or `evdev:PATH?grab=yes`, such as evdev:/dev/input/event5.
 
+    `light_pressure=VALUE`, `light_major=VALUE`: of its axes under a finger that presses lightly.
+
     A panel is silent while fingers rest, so the kernel's slots are polled every 50 ms, which also
     detects an unplugged panel at once. It is reopened when it is back. Raises InputError for any
     other URL, and in `open` or `run` if there is no panel.
@@ -28,11 +30,12 @@ class EvdevSource(TouchSource):
 
     def __init__(self, url: str, *, open_panel: Callable[..., InputDevice] = InputDevice) -> None:
         path, _, options = url.removeprefix("evdev:").partition("?")
-        grab = dict(parse_qsl(options, keep_blank_values=True))
+        grab, self._light_values = panel_options(options)
         if not url.startswith("evdev:") or not path or grab not in ({}, {"grab": "yes"}):
             raise InputError(
                 "touch source must be evdev:PATH of an input device, or evdev:PATH?grab=yes to "
-                f"keep its touches from other programs, got {url}"
+                "keep its touches from other programs; also light_pressure=VALUE and "
+                f"light_major=VALUE, got {url}"
             )
         self._name = f"evdev:{path}"
         self._path = path
@@ -73,7 +76,8 @@ class EvdevSource(TouchSource):
     async def _follow(self, panel: InputDevice, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver the frames of a panel until it is unplugged; raises OSError then."""
         loop = asyncio.get_running_loop()
-        reader = SlotReader(panel.ranges)
+        press = light_press(panel.resolutions, self._light_values)
+        reader = SlotReader(panel.ranges, light_press=press)
         reader.resynchronise(panel.slots(), current=panel.current_slot)
         self._deliver(deliver, reader.touches)
         readable = asyncio.Event()

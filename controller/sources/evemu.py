@@ -5,9 +5,10 @@ The format is evemu's (freedesktop.org, evemu-record(1)): a description of the d
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 from controller.sources.playing import play, with_lifts
 from controller.sources.recording import recorded_lines
@@ -19,16 +20,20 @@ from controller.sources.slots import (
     ABS_MT_TOUCH_MAJOR,
     EventError,
     SlotReader,
+    light_press,
 )
 from controller.sources.touch import TouchFrame, TouchSource
+from controller.sources.url_options import panel_options
 from model.errors import InputError
 
 _EVENT = re.compile(
     r"E: (\d{1,10}\.\d{1,6}) ([0-9a-fA-F]{1,4}) ([0-9a-fA-F]{1,4}) (-?\d{1,10})\s*(#.*)?"
 )
-_AXIS = re.compile(r"A: ([0-9a-fA-F]{1,2}) (-?\d{1,10}) (-?\d{1,10})( -?\d+)*\s*")
+_AXIS = re.compile(
+    r"A: ([0-9a-fA-F]{1,2}) (-?\d{1,10}) (-?\d{1,10})(?: -?\d+ -?\d+ (-?\d{1,10}))?( -?\d+)*\s*"
+)
 _COMMENT_CODE = re.compile(r"#\s+Event (?:code|type) (\d+) \((\w+)\)")
-_COMMENT_VALUE = re.compile(r"#\s+(Value|Min|Max)\s+(-?\d{1,10})\s*")
+_COMMENT_VALUE = re.compile(r"#\s+(Value|Min|Max|Resolution)\s+(-?\d{1,10})\s*")
 _OTHER = re.compile(r"[A-Z]: .*|#.*|\s*")
 
 
@@ -43,12 +48,15 @@ class _Event:
     value: int
 
 
-def read_evemu(path: Path | str) -> list[TouchFrame]:
+def read_evemu(
+    path: Path | str, *, light_values: Mapping[int, float] = MappingProxyType({})
+) -> list[TouchFrame]:
     """Read a recording as one frame per report of the panel, times from 0 s at its first event.
 
     Axis ranges come from the header of the recording, else from the .desc file beside it. Contacts
     that were down before it started have negative ids; a contact that comes and goes within one
     report gets a frame of its own at the same time; lost events (SYN_DROPPED) lift every contact.
+    light_values: of axes under a finger that presses lightly, where their resolution does not tell.
     Raises InputError with file and line.
     """
     path = Path(path)
@@ -68,7 +76,12 @@ def read_evemu(path: Path | str) -> list[TouchFrame]:
         low, high = header.get((axis, "Min"), 0), header.get((axis, "Max"), 0)
         if low < high:
             limits[axis] = (low, high)
-    reader = SlotReader(limits, first_slot=header.get((ABS_MT_SLOT, "Value"), 0))
+    resolutions = {axis: header.get((axis, "Resolution"), 0) for axis in limits}
+    reader = SlotReader(
+        limits,
+        first_slot=header.get((ABS_MT_SLOT, "Value"), 0),
+        light_press=light_press(resolutions, light_values),
+    )
     frames = _frames(path, events, reader)
     if not frames:
         raise InputError(f"{path}: must be an evemu recording with touch reports; record it again")
@@ -110,6 +123,7 @@ def _parse(path: Path) -> tuple[dict[tuple[int, str], int], list[_Event]]:
             axis = int(match.group(1), 16)
             header.setdefault((axis, "Min"), int(match.group(2)))
             header.setdefault((axis, "Max"), int(match.group(3)))
+            header.setdefault((axis, "Resolution"), int(match.group(4) or 0))
         elif match := _COMMENT_CODE.match(line):
             code = int(match.group(1)) if match.group(2).startswith("ABS_") else None
         elif (match := _COMMENT_VALUE.fullmatch(line)) and code is not None:
@@ -140,14 +154,19 @@ def _axis(path: Path, header: dict[tuple[int, str], int], code: int, name: str) 
 class EvemuSource(TouchSource):
     """Replays the recording at `evemu:PATH` at its pace, on the event loop's clock.
 
+    `?light_pressure=VALUE` and `?light_major=VALUE` as those of `EvdevSource`.
     Ends with the recording and lifts the remaining contacts. Raises InputError.
     """
 
     def __init__(self, url: str) -> None:
-        path = url.removeprefix("evemu:")
-        if path == url or not path:
-            raise InputError(f"touch source must be evemu:PATH of a recording (.events), got {url}")
-        self.frames = with_lifts(read_evemu(path))
+        path, _, options = url.removeprefix("evemu:").partition("?")
+        others, light_values = panel_options(options)
+        if not url.startswith("evemu:") or not path or others:
+            raise InputError(
+                "touch source must be evemu:PATH of a recording (.events), with "
+                f"?light_pressure=VALUE and ?light_major=VALUE, got {url}"
+            )
+        self.frames = with_lifts(read_evemu(path, light_values=light_values))
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver the frames of the recording at its pace."""

@@ -88,9 +88,10 @@ class InputDevice:
                 axis: self._range(axis) for axis in (ABS_MT_POSITION_X, ABS_MT_POSITION_Y)
             }
             for axis in (ABS_MT_PRESSURE, ABS_MT_TOUCH_MAJOR):
-                _, low, high = self._axis(axis)
+                _, low, high, _ = self._axis(axis)
                 if low < high:  # both are 0 on a panel without the axis
                     self.ranges[axis] = (low, high)
+            self.resolutions = {axis: self._axis(axis)[3] for axis in self.ranges}
             self._slot_count = self._range(ABS_MT_SLOT)[1] + 1
             if grab:
                 fcntl.ioctl(self._descriptor, GRAB, 1)
@@ -137,15 +138,15 @@ class InputDevice:
         """Close the device."""
         os.close(self._descriptor)
 
-    def _axis(self, axis: int) -> tuple[int, int, int]:
-        """Return value, minimum and maximum of an axis."""
+    def _axis(self, axis: int) -> tuple[int, int, int, int]:
+        """Return value, minimum, maximum and resolution of an axis."""
         raw = fcntl.ioctl(self._descriptor, eviocgabs(axis), bytes(_AXIS.size))
-        value, low, high, *_ = _AXIS.unpack(raw)
-        return value, low, high
+        value, low, high, _, _, resolution = _AXIS.unpack(raw)
+        return value, low, high, resolution
 
     def _range(self, axis: int) -> Range:
         """Return the range of an axis; raises InputError if it is empty."""
-        _, low, high = self._axis(axis)
+        _, low, high, _ = self._axis(axis)
         if low >= high:
             raise InputError(
                 f"touch source {self.path}: minimum of axis {axis:#x} must be below its maximum, "

@@ -5,9 +5,10 @@ numbers are those of its input-event-codes.h.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
+from controller.sources.contact_load import LIGHT_FORCE, LIGHT_MAJOR, LightPress
 from controller.sources.touch import Touch
 
 EV_SYN, EV_ABS = 0x00, 0x03
@@ -17,6 +18,9 @@ ABS_MT_TOUCH_MAJOR, ABS_MT_TOOL_TYPE, ABS_MT_PRESSURE, ABS_MT_DISTANCE = 0x30, 0
 MT_TOOL_FINGER = 0  # others are a pen, a palm, a dial
 
 Range: TypeAlias = tuple[int, int]  # lowest and highest value of an axis
+
+
+_GRAVITY = 9.81  # m/s²
 
 
 class EventError(ValueError):
@@ -59,7 +63,7 @@ class _Slot:
     contact: id of the touch, None without a contact. has_reported_id: whether a
     tracking id was reported; one that moves without it was touched before the first event.
     tool: MT_TOOL_FINGER for a finger; palms and pens are ignored. distance: above 0 while hovering,
-    ignored.
+    ignored. pressure, touch_major: 0..1 of their ranges; values: of these axes as reported.
     """
 
     contact: int | None = None
@@ -70,15 +74,19 @@ class _Slot:
     distance: int = 0
     pressure: float | None = None
     touch_major: float | None = None
+    values: dict[int, int] = field(default_factory=dict)
 
-    @property
-    def touch(self) -> Touch | None:
-        """The touch, None unless a finger with known coordinates is on the panel."""
+    def touch(self, light_press: LightPress) -> Touch | None:
+        """Return the touch, None unless a finger with known coordinates is on the panel."""
         if self.contact is None or self.x is None or self.y is None:
             return None
         if self.tool != MT_TOOL_FINGER or self.distance > 0:
             return None
-        return Touch(self.contact, self.x, self.y, self.pressure, self.touch_major)
+        load = light_press.load(
+            pressure=self.values.get(ABS_MT_PRESSURE),
+            touch_major=self.values.get(ABS_MT_TOUCH_MAJOR),
+        )
+        return Touch(self.contact, self.x, self.y, self.pressure, self.touch_major, load)
 
 
 class SlotReader:
@@ -88,11 +96,19 @@ class SlotReader:
     contact, since the kernel omits values that did not change. Contacts that were down before the
     first event have negative ids. Palms, pens and what hovers are no touches: a finger that becomes
     a palm is lifted. ranges: of the axes ABS_MT_POSITION_X and _Y, and of ABS_MT_PRESSURE and
-    ABS_MT_TOUCH_MAJOR where there are any.
+    ABS_MT_TOUCH_MAJOR where there are any. light_press: values of these two under a finger that
+    presses lightly.
     """
 
-    def __init__(self, ranges: Mapping[int, Range], *, first_slot: int = 0) -> None:
+    def __init__(
+        self,
+        ranges: Mapping[int, Range],
+        *,
+        first_slot: int = 0,
+        light_press: LightPress = LightPress(),  # noqa: B008  frozen
+    ) -> None:
         self._ranges = ranges
+        self._light_press = light_press
         self._slots: dict[int, _Slot] = {}
         self._current = first_slot
         self._anonymous = 0
@@ -103,7 +119,7 @@ class SlotReader:
     @property
     def touches(self) -> tuple[Touch, ...]:
         """All touches, by slot."""
-        touches = (slot.touch for _, slot in sorted(self._slots.items()))
+        touches = (slot.touch(self._light_press) for _, slot in sorted(self._slots.items()))
         return tuple(touch for touch in touches if touch is not None)
 
     def feed(self, kind: int, code: int, value: int) -> Report | None:
@@ -137,6 +153,10 @@ class SlotReader:
                 distance=state.distance,
                 pressure=self._normalised(ABS_MT_PRESSURE, state.pressure),
                 touch_major=self._normalised(ABS_MT_TOUCH_MAJOR, state.touch_major),
+                values={
+                    ABS_MT_PRESSURE: state.pressure,
+                    ABS_MT_TOUCH_MAJOR: state.touch_major,
+                },
             )
             for number, state in slots.items()
         }
@@ -176,8 +196,10 @@ class SlotReader:
             slot.distance = value
         elif code == ABS_MT_PRESSURE:
             slot.pressure = self._normalised(code, value)
+            slot.values[code] = value
         elif code == ABS_MT_TOUCH_MAJOR:
             slot.touch_major = self._normalised(code, value)
+            slot.values[code] = value
 
     def _normalised(self, code: int, value: int) -> float | None:
         """Return a value relative to the range of its axis, 0..1; None without a range."""
@@ -185,3 +207,19 @@ class SlotReader:
             return None
         low, high = self._ranges[code]
         return (value - low) / (high - low)
+
+
+def light_press(resolutions: Mapping[int, int], given: Mapping[int, float]) -> LightPress:
+    """Return the values of a panel's axes under a finger that presses lightly.
+
+    resolutions: by axis, 0 or left out where the panel states none: units per millimetre, of a
+    pressure units per gram, without which its unit is arbitrary (the kernel's
+    input-event-codes.rst). A contact without its own is in the unit of positions. given: such
+    values by axis, 0 for one that is not to be used.
+    """
+    pressure = resolutions.get(ABS_MT_PRESSURE, 0) * 1000 * LIGHT_FORCE / _GRAVITY
+    per_mm = resolutions.get(ABS_MT_TOUCH_MAJOR, 0) or resolutions.get(ABS_MT_POSITION_X, 0)
+    return LightPress(
+        pressure=given.get(ABS_MT_PRESSURE, pressure) or None,
+        touch_major=given.get(ABS_MT_TOUCH_MAJOR, per_mm * LIGHT_MAJOR) or None,
+    )

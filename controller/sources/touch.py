@@ -11,7 +11,8 @@ class Touch:
 
     id: constant from down to up; x, y: 0..1 across the sensor from its top left corner, y downwards
     (the convention of TUIO and most panels). Not validated: may be NaN. pressure, touch_major:
-    force and longer axis of the contact area, 0..1 of what the panel can report; None without.
+    force and longer axis of the contact area, 0..1 of what the panel can report; load: on the plate
+    relative to the rig's fingertip, not bounded (`contact_load`); each None without.
     """
 
     id: int
@@ -19,6 +20,7 @@ class Touch:
     y: float
     pressure: float | None = None
     touch_major: float | None = None
+    load: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

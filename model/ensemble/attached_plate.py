@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
 from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces, full_strokes
@@ -35,7 +35,8 @@ class AttachedPlate:
     - forces: (f, n) of each ERA at full stroke [N]; strokes: (f, n) of its base [m]
     - by_stiffness: (f, n), by_damping: (f, n) change of the ERAs' dynamic stiffness by one standard
       deviation [N/m]
-    - finger: (f,) dynamic stiffness of a fingertip [N/m]; by_finger: (f,) its change
+    - fingertip: of the rig, None for weightless ones; omega: (f,) [rad/s] of its dynamic stiffness;
+      load_std: standard deviation of the logarithm of its load
     - gain, phase: standard deviations of an ERA's amplitude and of its phase [rad]; gain_variance:
       mean square of both together
     """
@@ -50,8 +51,9 @@ class AttachedPlate:
     strokes: Complex64Array
     by_stiffness: Complex64Array
     by_damping: Complex64Array
-    finger: Complex64Array
-    by_finger: Complex64Array
+    omega: FloatArray
+    fingertip: Fingertip | None
+    load_std: float
     gain: float
     phase: float
     gain_variance: float
@@ -72,19 +74,33 @@ class AttachedPlate:
         """The receptance, and its changes by thickness and loss, (f, r, 3)."""
         return np.stack([self.receptance, self.by_thickness, self.by_loss], axis=2)
 
-    def with_fingers(self, count: int) -> "Attachments":
-        """What is attached to the plate with a number of fingers on it."""
+    def with_fingers(self, count: int, loads: Sequence[float] = ()) -> "Attachments":
+        """What is attached to the plate with a number of fingers on it.
+
+        loads (count,): of each relative to the rig's fingertip, empty for 1.
+        """
+        if loads:
+            return self._attach_fingers(np.column_stack([*map(self._finger, loads)]))
         if count not in self._by_count:
-            b, n = self.stiffness.shape[1], self.era_count
-            finger, by_finger = (
-                np.repeat(each[:, None], count, axis=1) for each in (self.finger, self.by_finger)
-            )
-            self._by_count[count] = Attachments(
-                np.concatenate([self.stiffness, finger], axis=1),
-                np.concatenate([np.arange(n), np.arange(b, b + count)]),
-                np.concatenate([self.by_stiffness, by_finger], axis=1),
-            )
+            finger = np.repeat(self._finger(1.0)[:, None], count, axis=1)
+            self._by_count[count] = self._attach_fingers(finger)
         return self._by_count[count]
+
+    def _attach_fingers(self, fingers: ComplexArray) -> "Attachments":
+        """Attach fingers of dynamic stiffness (f, k) [N/m]."""
+        b, n, k = self.stiffness.shape[1], self.era_count, fingers.shape[1]
+        changes = (self.load_std * fingers).astype(np.complex64)
+        return Attachments(
+            np.concatenate([self.stiffness, fingers.astype(np.complex64)], axis=1),
+            np.concatenate([np.arange(n), np.arange(b, b + k)]),
+            np.concatenate([self.by_stiffness, changes], axis=1),
+        )
+
+    def _finger(self, load: float) -> ComplexArray:
+        """Dynamic stiffness of a finger of a load, (f,) [N/m]."""
+        if self.fingertip is None:
+            return np.zeros(len(self.omega), dtype=complex)
+        return self.fingertip.scaled(load).dynamic_stiffness(self.omega)
 
     @cached_property
     def _by_count(self) -> dict[int, "Attachments"]:
@@ -125,9 +141,6 @@ def attach(
     g = 1 / ((1 + 1j * eta) * omega**2 - w2)
     k, c = (np.array([getattr(era, key) for era in eras]) for key in ("stiffness", "damping"))
     log_damping = math.log(uncertainty.damping)
-    finger = np.zeros(len(w), dtype=complex)
-    if fingertip is not None:
-        finger = np.asarray(fingertip.dynamic_stiffness(w))
     single = np.complex64
     return AttachedPlate(
         minus_omega2=-w2[:, 0].astype(np.float32),
@@ -140,8 +153,9 @@ def attach(
         strokes=full_strokes(eras, w).astype(single),
         by_stiffness=np.broadcast_to(uncertainty.stiffness * k, (len(w), len(k))).astype(single),
         by_damping=(log_damping * 1j * w[:, None] * c).astype(single),
-        finger=finger.astype(single),
-        by_finger=(uncertainty.fingertip * finger).astype(single),
+        omega=w,
+        fingertip=fingertip,
+        load_std=uncertainty.fingertip,
         gain=uncertainty.gain,
         phase=math.radians(uncertainty.phase_deg),
         gain_variance=uncertainty.gain_variance,

@@ -16,12 +16,13 @@ each ERA and load of each finger j on their own, gains as sigma. The loss factor
 nothing in it. Exact derivatives of the loaded plate, but for what a finger deflects locally.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
-from model.ensemble.attached_plate import AttachedPlate
+from model.ensemble.attached_plate import AttachedPlate, Attachments
 
 # Share of a form's trace that is added to its diagonal: keeps it definite.
 _RIDGE = 1e-6
@@ -31,7 +32,7 @@ _RIDGE = 1e-6
 class LoadedContacts:
     """The plate with k fingers on it, a = b + k attachments.
 
-    - shapes: (a, r); stiffness: (f, a) Z
+    - shapes: (a, r); attachments: of dynamic stiffness (f, a) Z
     - inverse: (f, a, a) K; forces: (f, a, n) F; motion: (f, a, n) r
     - fields: (f, k, p, n) h [m/s²] at each finger's points; power: (f, k, n, n) R
     - rows: (f, rows, k p, n) h and its changes dh; reach: (f, k p, j) |t|² of each uncertain
@@ -39,7 +40,7 @@ class LoadedContacts:
     """
 
     shapes: Float32Array
-    stiffness: Complex64Array
+    attachments: Attachments
     inverse: Complex64Array
     forces: Complex64Array
     motion: Complex64Array
@@ -73,11 +74,13 @@ def load_contacts(
     points: Float32Array,
     weights: Float32Array,
     error_power: Float32Array,
+    loads: Sequence[float] = (),
 ) -> LoadedContacts:
     """Put fingers on a plate.
 
     points (k, p, r): shapes under each finger, its centre first; weights (k, p): of its points,
-    sum 1; error_power (f, n): mean square of the discretisation error of each ERA's field.
+    sum 1; error_power (f, n): mean square of the discretisation error of each ERA's field; loads
+    (k,): of each finger relative to the rig's fingertip, empty for 1.
     """
     k, p, r = points.shape
     f, b = plate.stiffness.shape
@@ -90,7 +93,7 @@ def load_contacts(
     between = np.ascontiguousarray(found.transpose(2, 0, 1))  # (f, b + k p, a)
     attached = np.concatenate([np.arange(b), b + p * np.arange(k)])
     A = between.take(attached, axis=1)
-    attachments = plate.with_fingers(k)
+    attachments = plate.with_fingers(k, loads)
     stiffness = attachments.stiffness
     inverse = _inverse(stiffness, A)
     forces = inverse[:, :, :n] * plate.forces[:, None]
@@ -119,7 +122,7 @@ def load_contacts(
     _add_diagonal(power, plate.gain_variance * size + error_power[:, None])
     return LoadedContacts(
         shapes,
-        stiffness,
+        attachments,
         inverse,
         forces,
         motion,
@@ -133,14 +136,17 @@ def load_contacts(
     )
 
 
-def modal_fields(plate: AttachedPlate, fingers: Float32Array) -> Complex64Array:
+def modal_fields(
+    plate: AttachedPlate, fingers: Float32Array, loads: Sequence[float] = ()
+) -> Complex64Array:
     """Accelerations of the reduced coordinates by each ERA alone at full stroke, (f, r, n).
 
-    fingers (k, r): shapes under the centres of those on the plate.
+    fingers (k, r): shapes under the centres of those on the plate; loads (k,): of each relative to
+    the rig's fingertip, empty for 1.
     """
     shapes = np.concatenate([plate.shapes, fingers])
     A = (plate.receptance[:, None] * shapes) @ shapes.T
-    inverse = _inverse(plate.with_fingers(len(fingers)).stiffness, A)
+    inverse = _inverse(plate.with_fingers(len(fingers), loads).stiffness, A)
     forces = inverse[:, :, : plate.era_count] * plate.forces[:, None]
     scale = plate.receptance * plate.minus_omega2[:, None]
     return np.asarray((shapes.T @ forces) * scale[:, :, None])

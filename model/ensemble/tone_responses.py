@@ -43,12 +43,12 @@ def tone_responses(
     found = (points @ sources.reshape(len(sources), -1).view(np.float32)).view(np.complex64)
     by_source = found.reshape(len(points), m, a + 3).swapaxes(0, 1)
 
-    attachments = plate.with_fingers(a - plate.stiffness.shape[1])
+    attachments = contacts.attachments
     uncertain, era = attachments.uncertain, np.arange(n)
     end = FIRST_STIFFNESS + len(uncertain)
     columns = np.zeros((m, a + 3, end + n), dtype=np.complex64)
     columns[:, [a, a + 1, a + 2], [NOMINAL, THICKNESS, LOSS]] = 1
-    held = contacts.stiffness.take(at, axis=0)[:, :, None] * (shapes @ free[:, :, 1:])
+    held = attachments.stiffness.take(at, axis=0)[:, :, None] * (shapes @ free[:, :, 1:])
     columns[:, :a, THICKNESS : LOSS + 1] = -held
     columns[:, :n, DAMPING] = plate.by_damping.take(at, axis=0) * motion[:, :n]
     changes = attachments.changes.take(at, axis=0) * motion.take(uncertain, axis=1)

@@ -7,12 +7,16 @@ the real part of the dynamic stiffness is 69, -87 and -358 N/m where a phalanx a
 """
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
+
+MIN_LOAD, MAX_LOAD = 0.1, 10.0
+"""Of a contact relative to the rig's fingertip; beyond, no finger is meant."""
 
 
 @dataclass(frozen=True)
@@ -86,3 +90,28 @@ class FingertipLoad:
     def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
         """Dynamic stiffness [N/m] at omega [rad/s], of the same shape."""
         return self.fingertip.dynamic_stiffness(omega)
+
+
+def check_loads(loads: Iterable[float]) -> None:
+    """Raise InputError for a load, relative to a fingertip, that no finger has."""
+    for load in loads:
+        if not MIN_LOAD <= load <= MAX_LOAD:  # False for NaN
+            raise InputError(
+                f"load must be between {MIN_LOAD:g} and {MAX_LOAD:g} times the rig's fingertip, "
+                f"got {load}"
+            )
+
+
+def fingertip_loads(
+    fingertip: Fingertip | None,
+    contacts: Sequence[tuple[float, float]],
+    loads: Sequence[float] = (),
+) -> list[FingertipLoad]:
+    """Fingertips that rest at contacts [m]; none where they are weightless.
+
+    loads: of each relative to the fingertip, empty for 1.
+    """
+    if fingertip is None:
+        return []
+    tips = [fingertip.scaled(load) for load in loads] or [fingertip] * len(contacts)
+    return [FingertipLoad(*at, tip) for at, tip in zip(contacts, tips, strict=True)]

@@ -22,14 +22,16 @@ def with_concentration(table: LocalizationTable, question: Question, pattern: Pa
     """Add the concentration to a pattern without quiet fingers; takes some milliseconds."""
     if question.quiet:
         return pattern
-    contacts = question.targets
+    contacts, loads = question.targets, question.loads
     felt = []
     for target in contacts:
         disc = fingertip_points(*target, table.plate)
-        _, tones = table.amplitudes(pattern.excitation, disc, contacts=contacts)
+        _, tones = table.amplitudes(pattern.excitation, disc, contacts=contacts, loads=loads)
         felt.append(tones.sum(axis=0) @ fingertip_weights(*target, table.plate))
     points = cell_centres(table.plate)
-    frequencies, amplitudes = table.amplitudes(pattern.excitation, points, contacts=contacts)
+    frequencies, amplitudes = table.amplitudes(
+        pattern.excitation, points, contacts=contacts, loads=loads
+    )
     near = ~is_beyond(points, question.targets)
     concentration = concentration_of(
         frequencies, amplitudes, near, felt=min(felt), plate=table.plate

@@ -7,6 +7,7 @@ less than 1e-3 over 2 %.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.ensemble.measures import Felt, Fingertips, felt
 from model.rig.uncertainty import Uncertainty
 from model.structure.dynamic_stiffness import attached_stiffness, dynamic_stiffness
+from model.structure.fingertip import FingertipLoad, fingertip_loads
 from model.structure.low_rank import coupled_forces
 from model.table.question import Question
 from model.table.table import LocalizationTable
@@ -70,12 +72,13 @@ def felt_on(
     table: LocalizationTable, question: Question, excitation: Excitation, plates: Plates
 ) -> Felt:
     """Measures of an excitation on plates, (1, d)."""
-    tips = table.read_fingertips((*question.targets, *question.quiet))
+    tips = table.read_fingertips(question.contacts)
     frequencies, bases = base_amplitudes(excitation, table.eras)
     rows = np.searchsorted(table.frequencies, frequencies)
+    fingers = fingertip_loads(table.fingertip, question.contacts, question.loads)
     responses = np.array(
         [
-            _response(table, tips.fine.astype(float), row, base, plates)
+            _response(table, tips.fine.astype(float), fingers, row, base, plates)
             for row, base in zip(rows, bases, strict=True)
         ]
     )
@@ -88,7 +91,12 @@ def felt_on(
 
 
 def _response(
-    table: LocalizationTable, discs: FloatArray, row: int, base: ComplexArray, plates: Plates
+    table: LocalizationTable,
+    discs: FloatArray,
+    fingers: Sequence[FingertipLoad],
+    row: int,
+    base: ComplexArray,
+    plates: Plates,
 ) -> ComplexArray:
     """Acceleration (points, d) [m/s²] under the fingers for a base motion (eras,) [m]."""
     frequency = table.frequencies[row]
@@ -98,13 +106,15 @@ def _response(
         plates.stiffness * k, plates.damping[:, None] * c, np.zeros(1), omega
     )
     (masses,) = attached_stiffness((), table.masses, np.array([omega]))
-    finger = table.fingertip.dynamic_stiffness(np.array(omega)) if table.fingertip else 0.0
+    resting = np.zeros(len(discs), dtype=complex)
+    if fingers:
+        resting[:] = [each.dynamic_stiffness(np.array(omega)) for each in fingers]
     d = len(springs)
     stiffness = np.hstack(
         [
             springs - omega**2 * m,
             np.broadcast_to(masses, (d, len(masses))),
-            plates.load * finger,
+            plates.load * resting,
         ]
     )
     shapes = np.vstack([table.attachment_shapes, discs[:, 0]])

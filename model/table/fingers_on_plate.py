@@ -38,7 +38,7 @@ class FingersOnPlate:
         self._threshold = threshold
         self._error_power = error_power
         self._contacts: LoadedContacts = load_contacts(
-            plate, tips.few, tips.few_weights, error_power
+            plate, tips.few, tips.few_weights, error_power, question.loads
         )
         self._gains = np.array(question.gains, dtype=np.float32)
 

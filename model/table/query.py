@@ -33,13 +33,15 @@ class _Line(BaseModel):
     level_db_sl: float = STRONG_DB_SL
     eras_at_most: int = 2
     envelopes: bool = False
+    loads: list[float] = []
 
 
 def question_from_json(line: str, defaults: Mapping[str, Any] = MappingProxyType({})) -> Question:
     """Parse the question of one line, `{"target": [x, y], "quiet": [[x, y], ...], "mode": ...}`.
 
-    Several targets: `"targets": [[x, y], ...]`; also `"level_db_sl"`, `"eras_at_most"` and
-    `"envelopes"`. defaults: of keys that the line leaves out. Raises InputError.
+    Several targets: `"targets": [[x, y], ...]`; also `"level_db_sl"`, `"eras_at_most"`,
+    `"envelopes"`, and `"loads"`, of each contact relative to the rig's fingertip, targets first.
+    defaults: of keys that the line leaves out. Raises InputError.
     """
     try:
         asked = _Line.model_validate_json(line)
@@ -62,6 +64,7 @@ def question_from_json(line: str, defaults: Mapping[str, Any] = MappingProxyType
         drive_mode=asked.mode,
         eras_at_most=asked.eras_at_most,
         envelopes=asked.envelopes,
+        loads=tuple(asked.loads),
     )
 
 

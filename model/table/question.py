@@ -12,6 +12,7 @@ from model.errors import InputError
 from model.finger import MAX_CONTACTS
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import STRONG_DB_SL
+from model.structure.fingertip import check_loads
 from model.structure.plate import Plate
 
 Point: TypeAlias = tuple[float, float]
@@ -31,6 +32,8 @@ class Question:
     their lowest and highest [Hz]; eras_at_most: maximum number of ERAs in `switched`. More than two
     are searched exactly, up to search_time [s], with an upper bound where the search is cut short;
     this is too slow for live use. envelopes: whether amplifiers play any (`model.table.timing`).
+    loads: of each contact relative to the rig's fingertip (`Fingertip.scaled`), targets first;
+    empty for 1.
 
     With softer_db, level and contrast of the answer are those of the weakest target, relative to
     its own level.
@@ -46,6 +49,7 @@ class Question:
     eras_at_most: int = 2
     search_time: float = 10.0
     envelopes: bool = False
+    loads: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         """Check everything that does not depend on the table."""
@@ -70,6 +74,11 @@ class Question:
                 raise InputError(
                     f"softer_db must be between 0 and {MAX_LEVEL_DB_SL:g} dB, got {softer}"
                 )
+        if self.loads and len(self.loads) != count:
+            raise InputError(
+                f"loads must have one value per contact ({count}), got {len(self.loads)}"
+            )
+        check_loads(self.loads)
         if not self.search_time >= 0:
             raise InputError(f"search time must be at least 0 s, got {self.search_time}")
         if self.eras_at_most < 1:
@@ -89,6 +98,11 @@ class Question:
                         f"{1000 * FINGERTIP_RADIUS:g} mm from the quiet finger at "
                         f"({position[0]:g}, {position[1]:g}) m"
                     )
+
+    @property
+    def contacts(self) -> tuple[Point, ...]:
+        """All contacts [m], targets first."""
+        return (*self.targets, *self.quiet)
 
     @property
     def gains(self) -> tuple[np.float32, ...]:

@@ -31,7 +31,7 @@ from model.finger.perception import decibels, detection_threshold
 from model.rig.rig import physics_fingerprint
 from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era
-from model.structure.fingertip import Fingertip, FingertipLoad
+from model.structure.fingertip import Fingertip, fingertip_loads
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 from model.table.fingers_on_plate import FingersOnPlate
@@ -141,7 +141,7 @@ class LocalizationTable:
                 f"these amplifiers play, got {self.frequencies[0]:g} to {self.frequencies[-1]:g} "
                 "Hz; build a table with others: era table build --frequencies"
             )
-        tips = self.read_fingertips((*question.targets, *question.quiet))
+        tips = self.read_fingertips(question.contacts)
         candidates = Candidates(
             eras=self.eras,
             frequencies=self.frequencies,
@@ -167,7 +167,7 @@ class LocalizationTable:
     def forms(self, question: Question) -> Forms:
         """Expected powers at the fingertips of a question, at all frequencies of the table."""
         background = None if question.quiet else self._background(question)
-        tips = self.read_fingertips((*question.targets, *question.quiet))
+        tips = self.read_fingertips(question.contacts)
         return self._fingers(question, tips).forms(background)
 
     def threshold_at(self, rows: IntArray) -> Float32Array:
@@ -179,20 +179,30 @@ class LocalizationTable:
 
         contacts [m]: of the fingers that load the plate.
         """
-        return self._unit_fields(self.raster.at(self.shapes, points), contacts)
+        shapes = self.raster.at(self.shapes, points)
+        modal = self._modal_fields(contacts)
+        f, r, eras = modal.shape
+        rows = np.ascontiguousarray(modal.transpose(1, 0, 2)).reshape(r, -1).view(np.float32)
+        found = (shapes @ rows).view(np.complex64).reshape(len(shapes), f, eras)
+        return np.ascontiguousarray(found.transpose(1, 2, 0))
 
     def amplitudes(
-        self, excitation: Excitation, points: FloatArray, *, contacts: Sequence[Point] = ()
+        self,
+        excitation: Excitation,
+        points: FloatArray,
+        *,
+        contacts: Sequence[Point] = (),
+        loads: Sequence[float] = (),
     ) -> tuple[FloatArray, FloatArray]:
         """Frequencies (f,) [Hz] and peak acceleration at points (p, 2) [m] of the plate, (f, p).
 
         The excitation's frequencies must be the table's own. contacts [m]: of the fingers that load
-        the plate.
+        the plate; loads: of each relative to the rig's fingertip, empty for 1.
         """
         frequencies, bases = base_amplitudes(excitation, self.eras)
         weights = (bases / [era.stroke for era in self.eras]).astype(np.complex64)
         rows = np.searchsorted(self.frequencies, frequencies)
-        modal = self._modal_fields(contacts)[rows] @ weights[:, :, None]
+        modal = self._modal_fields(contacts, loads)[rows] @ weights[:, :, None]
         shapes = self.raster.at(self.shapes, points)
         return frequencies, np.abs(modal[:, :, 0] @ shapes.T).astype(float)
 
@@ -249,10 +259,12 @@ class LocalizationTable:
         """The plate on its ERAs in time, without fingers."""
         return self.in_time_under(())
 
-    def in_time_under(self, contacts: Sequence[Point]) -> PlateInTime:
-        """The plate on its ERAs in time with fingers at contacts [m]; takes some milliseconds."""
-        tip = self.fingertip
-        fingers = [] if tip is None else [FingertipLoad(*each, tip) for each in contacts]
+    def in_time_under(self, contacts: Sequence[Point], loads: Sequence[float] = ()) -> PlateInTime:
+        """The plate on its ERAs in time with fingers at contacts [m]; takes some milliseconds.
+
+        loads: of each relative to the rig's fingertip, empty for 1.
+        """
+        fingers = fingertip_loads(self.fingertip, contacts, loads)
         shapes = self.shapes_at(contacts if fingers else ())
         return plate_in_time(
             ReducedOnRaster(self.plate, self.omega, self.raster, self.shapes),
@@ -306,17 +318,12 @@ class LocalizationTable:
         """Fields at the centres of the cells, (f, eras, cells)."""
         return self.unit_fields(self.cell_centres)
 
-    def _unit_fields(self, shapes: Float32Array, contacts: Sequence[Point]) -> Complex64Array:
-        modal = self._modal_fields(contacts)
-        f, r, eras = modal.shape
-        rows = np.ascontiguousarray(modal.transpose(1, 0, 2)).reshape(r, -1).view(np.float32)
-        found = (shapes @ rows).view(np.complex64).reshape(len(shapes), f, eras)
-        return np.ascontiguousarray(found.transpose(1, 2, 0))
-
-    def _modal_fields(self, contacts: Sequence[Point]) -> Complex64Array:
+    def _modal_fields(
+        self, contacts: Sequence[Point], loads: Sequence[float] = ()
+    ) -> Complex64Array:
         """Accelerations of the reduced coordinates by each ERA at full stroke, (f, r, eras)."""
         fingers = self.shapes_at(contacts).astype(np.float32)
-        return modal_fields(self.attached, fingers)
+        return modal_fields(self.attached, fingers, loads)
 
     def _background(self, question: Question) -> Complex64Array:
         """Mean power of the plate beyond the targets, without fingers on it, (f, eras, eras)."""

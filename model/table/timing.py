@@ -54,7 +54,7 @@ class Timing:
         Onset and ending are the pattern's envelopes, or its ramp without any; the fingers are on
         the plate.
         """
-        plate = self._table.in_time_under((*question.targets, *question.quiet))
+        plate = self._table.in_time_under(question.contacts, question.loads)
         transients = Transients(plate)
         contrast = None
         if question.quiet:

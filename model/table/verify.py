@@ -28,7 +28,7 @@ from model.finger.perception import decibels, detection_threshold
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import Rig
-from model.structure.fingertip import FingertipLoad
+from model.structure.fingertip import fingertip_loads
 from model.structure.point_load import footprints_of
 from model.table.exact_plates import draw_plates, felt_on
 from model.table.pattern import Pattern
@@ -283,13 +283,12 @@ class _AnswerChecker:
     def __call__(self, question: Question, pattern: Pattern) -> AnswerCheck:
         """One answer recomputed."""
         rig = self._rig
-        contacts = (*question.targets, *question.quiet)
+        contacts = question.contacts
         discs = np.concatenate([fingertip_points(*each, rig.plate) for each in contacts])
         weights = fingertip_weights(*contacts[0], rig.plate)
         count = len(weights)
         points = np.concatenate([discs, _ALL_OVER.centres(rig.plate)])
-        tip = rig.fingertip
-        fingers = [] if tip is None else [FingertipLoad(*each, tip) for each in contacts]
+        fingers = fingertip_loads(rig.fingertip, contacts, question.loads)
         frequencies, everywhere = tone_amplitudes(
             pattern.excitation,
             rig.eras,

@@ -8,6 +8,7 @@ import asyncio
 from collections import deque
 from collections.abc import Collection, Mapping
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +20,7 @@ from model.fem.mesh import Mesh
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.actuator import Era
-from model.structure.fingertip import FingertipLoad
+from model.structure.fingertip import FingertipLoad, check_loads
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import Term
@@ -74,6 +75,7 @@ class Bench:
         )
         self.fingers = Fingers(reduced)
         self.observers: frozenset[str] = frozenset()  # fingers without weight
+        self.loads: Mapping[str, float] = {}  # by finger, relative to the rig's fingertip
         self._time = now
         # Advanced only where its drive changes or its motion is sampled.
         self._plant = Plant(reduced, real.eras, loads=real.masses, time=now)
@@ -121,22 +123,35 @@ class Bench:
         return reply
 
     def place_fingers(
-        self, positions: Mapping[str, Position], *, now: float, observers: Collection[str] = ()
+        self,
+        positions: Mapping[str, Position],
+        *,
+        now: float,
+        observers: Collection[str] = (),
+        loads: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         """Replace the fingers by those at these positions [m]; InputError changes nothing.
 
-        observers: fingers without weight.
+        observers: fingers without weight; loads: of the others relative to the rig's fingertip, 1
+        where left out.
         """
         self.fingers.check(positions)
+        check_loads(loads.values())
         self.advance(now)
         self.observers = frozenset(observers) & positions.keys()
+        self.loads = {name: load for name, load in loads.items() if name in positions}
         fingertip = self.rig.fingertip
         if fingertip is not None:
             self._plant.skip(self._time)
             before = self._plant.reduced
             self._plant.set_contacts(
                 {
-                    name: FingertipLoad(*at, self.imperfections.load_of(name, fingertip))
+                    name: FingertipLoad(
+                        *at,
+                        self.imperfections.load_of(
+                            name, fingertip.scaled(self.loads.get(name, 1.0))
+                        ),
+                    )
                     for name, at in positions.items()
                     if name not in self.observers
                 }

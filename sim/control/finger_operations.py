@@ -10,11 +10,14 @@ from sim.control.values import (
     Request,
     Response,
     parse_finger,
+    parse_number,
     parse_position,
     parse_window,
 )
 from sim.plant.felt import measure_vibration
 from sim.plant.fingers import Position
+
+_LOAD = "times the rig's fingertip"
 
 
 async def _fingers(context: SimulationContext, request: Request, now: float) -> Response:
@@ -27,7 +30,11 @@ async def _fingers(context: SimulationContext, request: Request, now: float) -> 
     observers = request.get("observers", [])
     if not (isinstance(observers, list) and all(name in list(positions) for name in observers)):
         raise InputError('observers must be a list of ids of these fingers, as in ["1"]')
-    return _placed(context, positions, now, observers=observers)
+    loads = request.get("loads", {})
+    if not (isinstance(loads, dict) and all(name in positions for name in loads)):
+        raise InputError('loads must be an object of these fingers\' loads, as in {"1": 1.5}')
+    loads = {name: parse_number(loads, name, _LOAD) for name in loads}
+    return _placed(context, positions, now, observers=observers, loads=loads)
 
 
 async def _touch_or_move(context: SimulationContext, request: Request, now: float) -> Response:
@@ -36,7 +43,12 @@ async def _touch_or_move(context: SimulationContext, request: Request, now: floa
         state = "already" if name in present else "not"
         raise InputError(f"finger {name!r} is {state} on the plate")
     at = parse_position(request.get("at_m"), what=f"finger {name!r}")
-    return _placed(context, {**present, name: at}, now, observers=context.bench.observers)
+    loads = dict(context.bench.loads)
+    if "load" in request:
+        loads[name] = parse_number(request, "load", _LOAD)
+    return _placed(
+        context, {**present, name: at}, now, observers=context.bench.observers, loads=loads
+    )
 
 
 async def _lift(context: SimulationContext, request: Request, now: float) -> Response:
@@ -44,7 +56,7 @@ async def _lift(context: SimulationContext, request: Request, now: float) -> Res
     if name not in present:
         raise InputError(f"finger {name!r} is not on the plate")
     rest = {id: at for id, at in present.items() if id != name}
-    return _placed(context, rest, now, observers=context.bench.observers)
+    return _placed(context, rest, now, observers=context.bench.observers, loads=context.bench.loads)
 
 
 def _placed(
@@ -52,9 +64,10 @@ def _placed(
     positions: Mapping[str, Position],
     now: float,
     *,
-    observers: Collection[str] = (),
+    observers: Collection[str],
+    loads: Mapping[str, float],
 ) -> Response:
-    context.bench.place_fingers(positions, now=now, observers=observers)
+    context.bench.place_fingers(positions, now=now, observers=observers, loads=loads)
     return {"ok": True, "time_s": context.bench.time}
 
 

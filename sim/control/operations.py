@@ -8,10 +8,11 @@
                                                 "high_voltage", "levels"}}}
 
     fingers, positions [x, y] in metres
-    {"op": "fingers", "fingers": {ID: [x, y]}, "observers": [ID, ...]}
-                                               replace all fingers; observers load nothing:
+    {"op": "fingers", "fingers": {ID: [x, y]}, "observers": [ID, ...], "loads": {ID: factor}}
+                                               replace all fingers; observers load nothing, others
+                                               as the rig's fingertip times their load:
                                                {"ok": true, "time_s"}
-    {"op": "touch", "finger": ID, "at_m": [x, y]}      add one; "move": move one
+    {"op": "touch", "finger": ID, "at_m": [x, y], "load": factor}      add one; "move": move one
     {"op": "lift", "finger": ID}                       remove one
     {"op": "felt", "since_s": t0, "until_s": t1}
         {"fingers": {ID: {"points_m": [[x, y], ...], "weights": [one per point, sum 1],

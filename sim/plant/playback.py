@@ -3,7 +3,7 @@
 From rest the bases move exactly as commanded, along shaped onsets or a ramp.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +16,7 @@ from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import DEFAULT_THRESHOLD, sensation_level
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
-from model.structure.fingertip import FingertipLoad
+from model.structure.fingertip import fingertip_loads
 from model.table.pattern import ONSET_RAMP
 from model.table.question import Question
 from model.transients.envelope import Envelopes, ramped_onset, shaped
@@ -128,10 +128,10 @@ def play(
 ) -> Playback:
     """Play an excitation for a duration [s] on a plate at rest, under these fingers.
 
-    The fingers load the plate as the rig's fingertip. reduced: the plate that the imperfections
-    make of the rig's, for forces at its ERAs and loads; ramp [s], or onset in its place. Latency,
-    skew and noise are left out. Raises InputError for fingers off the plate, an excitation that the
-    rig cannot play, and a duration out of range.
+    The fingers load the plate as the rig's fingertip, by their loads. reduced: the plate that the
+    imperfections make of the rig's, for forces at its ERAs and loads; ramp [s], or onset in its
+    place. Latency, skew and noise are left out. Raises InputError for fingers off the plate, an
+    excitation that the rig cannot play, and a duration out of range.
     """
     fingers.check_on(rig.plate)
     frequencies, _ = base_amplitudes(excitation, rig.eras)
@@ -142,12 +142,14 @@ def play(
             f"{duration:g} s; one second suffices for most plates"
         )
     plant = Plant(reduced, imperfections.plate.realised(rig).eras, loads=rig.masses)
-    contacts = (*fingers.targets, *fingers.quiet)
-    if rig.fingertip is not None:
-        loads = {str(n): imperfections.load_of(str(n), rig.fingertip) for n in range(len(contacts))}
-        plant.set_contacts(
-            {id: FingertipLoad(*at, loads[id]) for id, at in zip(loads, contacts, strict=True)}
-        )
+    contacts = fingers.contacts
+    resting = fingertip_loads(rig.fingertip, contacts, fingers.loads)
+    plant.set_contacts(
+        {
+            str(n): replace(each, fingertip=imperfections.load_of(str(n), each.fingertip))
+            for n, each in enumerate(resting)
+        }
+    )
     bases = shaped(onset, rig.eras) if onset else ramped_onset(excitation, rig.eras, ramp=ramp)
     for number, (era, terms) in enumerate(zip(rig.eras, bases, strict=True)):
         plant.set_input(number, realised(terms, imperfections.errors_of(era.name, rig)))

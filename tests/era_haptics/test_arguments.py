@@ -21,11 +21,12 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.table: {"rig": RIG, "drive_mode": "switched", "frequencies": [60], "grid": era.Grid(4, 3)},
     era.query: {
         "table": None, "target": TARGET, "quiet": (), "level_db_sl": 20.0, "drive_mode": "signed",
+        "loads": (1.5,),
     },
     era.SolvedPlate: {"rig": RIG, "seed": 1},
     PLATE.map: {"drive": DRIVE, "raster": (3, 3)},
     PLATE.play: {
-        "drive": DRIVE, "target": TARGET, "quiet": (), "duration": 0.3,
+        "drive": DRIVE, "target": TARGET, "quiet": (), "loads": (1.5,), "duration": 0.3,
     },
     era.draw_map: {"plate": PLATE, "drive": DRIVE},
     era.draw_pattern: {"table": None, "pattern": PATTERN, "target": TARGET, "quiet": ()},

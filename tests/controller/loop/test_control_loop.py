@@ -85,6 +85,24 @@ async def test_controller_plays_a_touch_within_one_turn() -> None:
 
 
 @in_virtual_time
+async def test_controller_decides_anew_for_a_load_that_doubles_not_for_one_that_wavers() -> None:
+    """A panel at 100 Hz whose pressure wavers by a third in load, then doubles, then comes back."""
+
+    def press(*loads: float) -> None:
+        touches = (Touch(*FINGER), *(Touch(*OTHER, load=load) for load in loads))
+        bench.controller.deliver(TouchFrame("panel", now(), touches))
+
+    async with running() as bench:
+        for base, decisions in ((1.0, 1), (2.0, 2), (1.2, 3)):
+            for number in range(50):
+                press(base * (1.15 if number % 2 else 1 / 1.15))
+                await asyncio.sleep(0.01)
+            assert len(bench.table.asked) == decisions
+        asked = [question.loads for question in bench.table.asked]
+    assert asked == [(), (pytest.approx(2 / 1.15), 1.0), (pytest.approx(1.2 / 1.15), 1.0)]
+
+
+@in_virtual_time
 async def test_touch_is_being_prepared_until_its_set_is_sent() -> None:
     """Not while its reply is awaited; nor for a frame without a change or without a new set."""
     async with running() as bench:

@@ -9,7 +9,7 @@ import pytest
 
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.envelopes import RAMPS_ONLY
-from controller.loop.intent import HapticIntent, Target
+from controller.loop.intent import HapticIntent, Pulse, Target
 from controller.loop.selection import Selector
 from controller.loop.table_query import strongest
 from controller.sources.contacts import Contact, ContactKey
@@ -62,6 +62,7 @@ class Table:
         points: FloatArray,
         *,
         contacts: Sequence[tuple[float, float]] = (),
+        loads: Sequence[float] = (),
     ) -> tuple[FloatArray, FloatArray]:
         """Ten times above threshold at x = 0.1 m, and in proportion to x."""
         frequencies = np.array([100.0])
@@ -228,6 +229,31 @@ def test_selector_keeps_a_pattern_within_8_mm(table: Table, mover: int) -> None:
     second = selector.select(contacts(0.0081), intent, CAPABILITIES)
     assert second.pattern != first.pattern
     assert selector.select(contacts(0.0), intent, CAPABILITIES) is not second
+
+
+def test_selector_queries_again_for_a_contact_of_another_load(table: Table) -> None:
+    """Loads are asked for in the order of the question, and not at all where all are 1."""
+    selector, intent = Selector(table), wanting(c2=20.0)
+    asked: list[tuple[float, ...]] = []
+    for loads in ((1.0, 1.0), (1.6, 1.0), (1.6, 1.0), (1.6, 2.4), (1.0, 1.0)):
+        contacts = [
+            replace(at(1, 0.1), load=loads[0]),
+            replace(at(2, 0.2), load=loads[1]),
+        ]
+        selection = selector.select(contacts, intent, CAPABILITIES)
+        assert selection.question is not None
+        asked.append(selection.question.loads)
+    assert asked == [(), (1.0, 1.6), (1.0, 1.6), (2.4, 1.6), ()]
+    assert len(table.asked) == 4
+
+
+def test_selector_keeps_a_short_pulse_when_a_finger_presses_harder(table: Table) -> None:
+    """It is over before a change would help."""
+    selector, pulse = Selector(table), Pulse(0.04, requested_at=0.0, is_raised=False)
+    intent = HapticIntent((Target(ContactKey("a", 1), 20.0, pulse=pulse),))
+    first = selector.select((at(1, 0.1),), intent, CAPABILITIES)
+    pressed = replace(at(1, 0.1), load=2.0)
+    assert selector.select((pressed,), intent, CAPABILITIES) is first
 
 
 def test_selector_queries_again_for_another_intent(table: Table) -> None:

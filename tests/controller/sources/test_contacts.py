@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -189,6 +190,40 @@ def test_tracker_carries_pressure_along_without_a_move() -> None:
         (contact,) = tracker.contacts
         assert (contact.pressure, contact.touch_major) == (pressure, 0.1)
     assert not change
+
+
+def test_tracker_follows_loads_in_steps_once_a_finger_has_landed() -> None:
+    """None in the first 100 ms; then only what differs by half, within 0.4 and 2.5.
+
+    Times [s], reported loads, and the contact's; each change is one of pressure only.
+    """
+    tracker = ContactTracker(PLATE)
+    for time, reported, load in [
+        *((10.0, 0.2, 1.0), (10.05, 2.0, 1.0), (10.1, 1.45, 1.0), (10.11, 1.55, 1.55)),
+        *((10.12, 1.04, 1.55), (10.13, 2.3, 1.55), (10.14, 2.4, 2.4), (10.15, 50.0, 2.4)),
+        *((10.16, None, 2.4), (10.17, math.nan, 2.4), (10.18, -1.0, 2.4), (10.19, 1e-9, 0.4)),
+        *((10.2, math.inf, 2.5), (10.21, 0.0, 2.5)),
+    ]:
+        before = tracker.contacts
+        change = tracker.update(TouchFrame("a", time, (Touch(1, 0.5, 0.5, load=reported),)))
+        (contact,) = tracker.contacts
+        assert contact.load == load
+        is_other = bool(before) and before[0].load != load
+        assert change.pressed == ((contact,) if is_other else ())
+        assert bool(change) == (is_other or not before)
+
+
+@given(st.lists(st.floats(), max_size=30))
+def test_tracker_bounds_whatever_is_reported(reported: list[float]) -> None:
+    """A load is always within the bounds, and consecutive ones differ by half."""
+    tracker, loads = ContactTracker(PLATE), [1.0]
+    tracker.update(frame(0.0, (1, 0.5, 0.5)))
+    for number, each in enumerate(reported):
+        tracker.update(TouchFrame("a", 0.1 + number / 100, (Touch(1, 0.5, 0.5, load=each),)))
+        loads.append(tracker.contacts[0].load)
+    assert all(0.4 <= load <= 2.5 for load in loads)
+    ratios = [max(a / b, b / a) for a, b in pairwise(loads)]
+    assert all(ratio == 1 or ratio >= 1.5 for ratio in ratios)
 
 
 def test_tracker_lifts_contacts_after_the_timeout() -> None:

@@ -46,6 +46,7 @@ class PipePanel:
 
     def __init__(self) -> None:
         self.ranges = {0x35: (0, 1000), 0x36: (0, 500), 0x3A: (0, 255)}
+        self.resolutions: dict[int, int] = {}
         self.current_slot = 0
         self.state = {0: EMPTY, 1: EMPTY}
         self.is_gone = False
@@ -238,6 +239,43 @@ def test_evdev_source_carries_pressure_along() -> None:
     assert (touch.pressure, touch.touch_major) == (0.2, None)
 
 
+@pytest.mark.parametrize(
+    ("options", "resolutions", "load"),
+    [
+        ("", {}, None),
+        ("", {0x3A: 5}, 2 ** (2 / 3)),  # 510 units are 102 g, 1 N: twice a light press
+        ("?light_pressure=510", {}, 1.0),
+        ("?light_pressure=255&grab=yes", {0x3A: 5}, 2 ** (2 / 3)),
+        ("?light_pressure=0", {0x3A: 5}, None),
+        ("?light_pressure=0", {0x3A: 5, 0x35: 10}, 4.0),  # 188 units are 18.8 mm
+        ("?light_major=94", {}, 4.0),
+        ("", {0x35: 10, 0x30: 20}, 1.0),
+    ],
+)
+def test_evdev_source_reports_loads(
+    options: str, resolutions: dict[int, int], load: float | None
+) -> None:
+    """By force where the pressure has a unit or a value of its own, else by size."""
+    panel = PipePanel()
+    panel.resolutions = resolutions
+    seen: list[TouchFrame] = []
+
+    def opened(path: str, *, grab: bool) -> PipePanel:
+        return panel
+
+    async def play() -> None:
+        source = EvdevSource(f"evdev:p{options}", open_panel=opened)
+        running = asyncio.create_task(source.run(seen.append))
+        await asyncio.sleep(0)
+        os.write(panel.into, raw("id 7 x 0 y 0 pressure 510 major 188"))
+        await asyncio.sleep(0.01)
+        running.cancel()
+
+    run_virtual_on_sockets(play())
+    (touch,) = seen[-1].touches
+    assert touch.load == (None if load is None else pytest.approx(load, rel=2e-3))
+
+
 @pytest.mark.parametrize("notices", ["by reading", "by polling"])
 def test_evdev_source_reopens_an_unplugged_panel(notices: str) -> None:
     """Its fingers are lifted when it is unplugged; it is followed once it is back."""
@@ -288,7 +326,8 @@ def kernel(monkeypatch: pytest.MonkeyPatch, *, width: int, grab: OSError | None 
             (axis,) = struct.unpack_from("i", argument)
             return struct.pack("11i", axis, *(axis + slot for slot in range(10)))
         highs = {eviocgabs(0x2F): 9, eviocgabs(0x3A): 255, eviocgabs(0x30): 0}
-        return struct.pack("6i", 0, 0, highs.get(request, width), 0, 0, 0)
+        resolution = {eviocgabs(0x35): 12, eviocgabs(0x3A): 3}.get(request, 0)
+        return struct.pack("6i", 0, 0, highs.get(request, width), 0, 0, resolution)
 
     monkeypatch.setattr("controller.sources.input_device.fcntl.ioctl", ioctl)
 
@@ -322,6 +361,7 @@ def test_input_device_opens_a_panel(monkeypatch: pytest.MonkeyPatch) -> None:
     kernel(monkeypatch, width=1000)
     device = InputDevice("/dev/null")
     assert device.ranges == {0x35: (0, 1000), 0x36: (0, 1000), 0x3A: (0, 255)}
+    assert device.resolutions == {0x35: 12, 0x36: 0, 0x3A: 3}
     assert device.slots()[2] == SlotState(
         *(0x39 + 2, 0x35 + 2, 0x36 + 2),
         tool=0x37 + 2,
@@ -333,7 +373,9 @@ def test_input_device_opens_a_panel(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    "url", ["evdev:", "evdev:?grab=yes", "evdev:/dev/x?grab=no", "evdev:/dev/x?grab=yes&a=b"]
+    "url",
+    ["evdev:", "evdev:?grab=yes", "evdev:/dev/x?grab=no", "evdev:/dev/x?grab=yes&a=b"]
+    + [f"evdev:/dev/x?light_pressure={value}" for value in ("", "x", "-1", "nan", "inf")],
 )
 def test_evdev_source_refuses_bad_urls(url: str) -> None:
     """The error shows the form of the URL."""

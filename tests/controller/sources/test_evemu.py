@@ -45,6 +45,8 @@ CODES = {
     "y": "0003 0036",
     "touch": "0001 014a",
     "tool": "0003 0037",
+    "pressure": "0003 003a",
+    "major": "0003 0030",
     "distance": "0003 003b",
     "report": "0000 0000",
     "dropped": "0000 0003",
@@ -224,6 +226,29 @@ def test_read_evemu_takes_ranges_from_the_desc_file(tmp_path: Path) -> None:
     assert shown(read_evemu(path)) == [(0.0, {1: (0.25, 0.75)}), (1.0, {1: (0.5, 0.75)})]
 
 
+MAJOR = "#     Event code 48 (ABS_MT_TOUCH_MAJOR)\n"
+
+
+@pytest.mark.parametrize(
+    ("ranges", "options", "load"),
+    [
+        ("A: 3a 0 255 0 0 0\n", "", None),
+        ("A: 3a 0 255 0 0 1\n", "", (102 / 51) ** (2 / 3)),  # grams, twice the force of a tap
+        ("A: 3a 0 255\n", "?light_pressure=102", 1.0),
+        ("A: 30 0 255 0 0 10\n", "", (47 / 94) ** 2),  # half the diameter
+        (f"{MAJOR}#       Max  255\n#       Resolution  10\n", "", 1 / 4),
+    ],
+)
+def test_evemu_source_reports_loads(
+    tmp_path: Path, ranges: str, options: str, load: float | None
+) -> None:
+    """From the resolutions of its header, or the values of a light press in its URL."""
+    header = RANGES.format(slot=0) + ranges
+    path = write(tmp_path, (0, "id 1 x 100 y 30 pressure 102 major 47"), header=header)
+    (frame, *_) = EvemuSource(f"evemu:{path}{options}").frames
+    assert frame.touches[0].load == (None if load is None else pytest.approx(load, rel=2e-3))
+
+
 GOOD = RANGES.format(slot=0)
 
 
@@ -273,7 +298,10 @@ async def test_evemu_source_keeps_times(tmp_path: Path) -> None:
     assert {frame.source for frame in delivered} == {"evemu:panel.taps.events"}
 
 
-@pytest.mark.parametrize(("path", "words"), [("", "evemu:PATH"), ("missing", "No such file")])
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [("", "evemu:PATH"), ("missing", "No such file"), ("x?a=b", "evemu:PATH")],
+)
 def test_evemu_source_refuses_bad_urls(path: str, words: str) -> None:
     """A URL without a readable file is refused before anything is replayed."""
     with pytest.raises(InputError, match=words):

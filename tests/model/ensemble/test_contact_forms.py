@@ -26,7 +26,7 @@ RIG = replace(smooth_rig(), masses=(PointLoad(0.2, 0.05, mass=0.03),))
 POINTS = PLACES[:, None] + FINGERTIP_RADIUS * FIVE_POINTS.points
 
 
-def solved(uncertainty):
+def solved(uncertainty, loads=()):
     """The plate with three fingers on it; reduced for them too, so that nothing is left out."""
     fixed = footprints_of(RIG.eras, RIG.masses)
     fingers = np.column_stack([PLACES, np.zeros(3)])
@@ -43,12 +43,23 @@ def solved(uncertainty):
     )
     shapes = reduced.at(POINTS.reshape(-1, 2)).astype(np.float32).reshape(3, 5, -1)
     weights = np.tile(FIVE_POINTS.weights, (3, 1)).astype(np.float32)
-    contacts = load_contacts(plate, shapes, weights, np.zeros((4, 4), np.float32))
+    contacts = load_contacts(plate, shapes, weights, np.zeros((4, 4), np.float32), loads)
     return plate, contacts, shapes
 
 
-def directly(*, thickness=1.0, loss=1.0, damping=1.0, stiffness=(1, 1, 1, 1), load=(1, 1, 1)):
-    """Fields (f, eras, points) of a plate that differs by these factors."""
+def directly(
+    *,
+    thickness=1.0,
+    loss=1.0,
+    damping=1.0,
+    stiffness=(1, 1, 1, 1),
+    load=(1, 1, 1),
+    pressed=(1, 1, 1),
+):
+    """Fields (f, eras, points) of a plate that differs by these factors.
+
+    pressed: on pulp and contact mass of each finger; load: on all of it.
+    """
     plate = replace(
         RIG.plate,
         thickness=thickness * RIG.plate.thickness,
@@ -59,8 +70,8 @@ def directly(*, thickness=1.0, loss=1.0, damping=1.0, stiffness=(1, 1, 1, 1), lo
         for era, k in zip(RIG.eras, stiffness, strict=True)
     ]
     fingers = [
-        FingertipLoad(*place, RIG.fingertip.multiplied(factor))
-        for place, factor in zip(PLACES, load, strict=True)
+        FingertipLoad(*place, RIG.fingertip.scaled(more).multiplied(factor))
+        for place, more, factor in zip(PLACES, pressed, load, strict=True)
     ]
     return direct_acceleration(
         assemble(plate, RIG.mesh),
@@ -71,11 +82,15 @@ def directly(*, thickness=1.0, loss=1.0, damping=1.0, stiffness=(1, 1, 1, 1), lo
     )
 
 
-def test_fields_are_those_of_the_direct_solve():
-    """At every finger's points, with an ERA's drive and a mass on the plate: to 1e-4."""
-    _, contacts, _ = solved(Uncertainty())
+@pytest.mark.parametrize("loads", [(), (0.4, 1.0, 2.5)])
+def test_fields_are_those_of_the_direct_solve(loads):
+    """At every finger's points, with an ERA's drive and a mass on the plate: to 1e-4.
+
+    Whether all fingers press alike or not.
+    """
+    _, contacts, _ = solved(Uncertainty(), loads)
     found = contacts.fields.transpose(0, 3, 1, 2).reshape(4, 4, 15)
-    exact = directly()
+    exact = directly(pressed=loads or (1, 1, 1))
     error = np.abs(found - exact).max(axis=(1, 2)) / np.abs(exact).max(axis=(1, 2))
     assert error.max() < 2e-4
 
@@ -89,6 +104,18 @@ CHANGES = {
     5: lambda d: {"stiffness": (1, 1 + d, 1, 1)},
     9: lambda d: {"load": (1, 1 + d, 1)},
 }
+
+
+def test_sensitivity_to_the_load_of_a_finger_that_presses_harder():
+    """Of a finger pressed 2.5 times as much between others, by a difference of the direct solve."""
+    pressed = (0.4, 2.5, 1.0)
+    plate, contacts, shapes = solved(Uncertainty(0, 0, 1.0, 1.0, math.e, 1.0), pressed)
+    tones = Tones(np.arange(4), np.ones((4, 4), dtype=np.complex64))
+    found = tone_responses(plate, contacts, tones, shapes.reshape(15, -1))[:, :, 9]
+    more, less = (directly(pressed=pressed, load=(1, 1 + d, 1)) for d in (1e-3, -1e-3))
+    exact = ((more - less) / 2e-3).sum(axis=1)
+    error = np.abs(found - exact).max(axis=1) / np.abs(exact).max(axis=1)
+    assert error.max() < 0.01
 
 
 @pytest.mark.parametrize("column", CHANGES)

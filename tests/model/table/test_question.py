@@ -35,6 +35,11 @@ TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18),)
         {"softer_db": (0.0, 3.0)},
         {"softer_db": (-1.0,)},
         {"softer_db": (math.nan,)},
+        {"loads": (1.0, 1.0)},
+        {"loads": (0.0,)},
+        {"loads": (-1.0,)},
+        {"loads": (math.nan,)},
+        {"loads": (math.inf,)},
     ],
     ids=str,
 )

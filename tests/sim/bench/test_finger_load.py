@@ -47,6 +47,24 @@ def test_bench_fingers_load_the_plate(coarse_rig: Rig) -> None:
     )
 
 
+def test_bench_fingers_press_harder_where_they_are(coarse_rig: Rig) -> None:
+    """A finger with twice the load and one with half of it, each once the plate has settled."""
+    tip = Fingertip(2000.0, 3.0, 0.005)
+    bench = Bench(replace(coarse_rig, fingertip=tip), now=0.0)
+    bench.place_fingers({"a": A, "b": B}, now=0.0)
+    play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
+    truths = []
+    for loads in ({"b": 2.0}, {"a": 0.5}):
+        bench.place_fingers({"a": A, "b": B}, now=bench.time, loads=loads)
+        keep_alive(bench, bench.time + 4)
+        tips = [tip.scaled(loads.get(name, 1.0)) for name in "ab"]
+        fingers = [FingertipLoad(*at, each) for at, each in zip((A, B), tips, strict=True)]
+        truths.append(expected(coarse_rig, tuple(fingers)))
+        (amplitude,) = bench.felt(bench.time - 0.5, bench.time)["a"].amplitude
+        assert apart(amplitude, truths[-1]) < 0.005
+    assert apart(*truths) > 0.02
+
+
 def test_bench_observers_have_no_weight(coarse_rig: Rig) -> None:
     """Fingers of a rig with none load nothing; where fingers do, an observer does not."""
     bare = Bench(replace(coarse_rig, fingertip=None), now=0.0)

@@ -68,9 +68,39 @@ async def test_control_places_fingers_and_returns_felt_and_state(coarse_rig: Rig
     }
 
 
+async def test_control_keeps_loads_of_fingers(coarse_rig: Rig) -> None:
+    """Until they lift or get another one; a finger that touches has 1 where none is given."""
+    bench = Bench(coarse_rig, now=0.0)
+    loads = []
+    for request in (
+        {"op": "fingers", "fingers": {"a": [0.1, 0.08], "b": [0, 0]}, "loads": {"a": 2}},
+        {"op": "touch", "finger": "c", "at_m": [0.2, 0.1], "load": 0.5},
+        {"op": "move", "finger": "a", "at_m": [0.1, 0.09]},
+        {"op": "move", "finger": "c", "at_m": [0.2, 0.1], "load": 3},
+        {"op": "lift", "finger": "a"},
+        {"op": "touch", "finger": "a", "at_m": [0.1, 0.08]},
+        {"op": "fingers", "fingers": {"c": [0.1, 0.08]}},
+    ):
+        assert (await ask(bench, 1.0, **request))["ok"]
+        loads.append(dict(bench.loads))
+    assert loads == [
+        {"a": 2.0},
+        {"a": 2.0, "c": 0.5},
+        {"a": 2.0, "c": 0.5},
+        {"a": 2.0, "c": 3.0},
+        {"c": 3.0},
+        {"c": 3.0},
+        {},
+    ]
+
+
 @pytest.mark.parametrize(
     "line",
     [
+        b'{"op": "fingers", "fingers": {"a": [0.1, 0.1]}, "loads": {"b": 1}}\n',
+        b'{"op": "fingers", "fingers": {"a": [0.1, 0.1]}, "loads": {"a": 0}}\n',
+        b'{"op": "fingers", "fingers": {"a": [0.1, 0.1]}, "loads": [1]}\n',
+        b'{"op": "touch", "finger": "a", "at_m": [0.1, 0.1], "load": "much"}\n',
         b"\n",
         b"\xff\xfe\n",
         b"[1]\n",

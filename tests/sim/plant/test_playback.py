@@ -46,14 +46,18 @@ def steady(rig: Rig, place: tuple[float, float], *loads: FingertipLoad) -> np.nd
     return np.abs([0.1 * unit[0, 0], 0.05 * unit[1, 2]])  # SW and NE, of 100 µm
 
 
-@pytest.mark.parametrize("fingertip", [None, HEAVY])
+@pytest.mark.parametrize(
+    ("fingertip", "pressed"), [(None, ()), (HEAVY, ()), (HEAVY, (0.5, 2.0)), (None, (0.5, 2.0))]
+)
 def test_playback_steady_measures_agree_with_the_frequency_domain(
-    coarse_rig: Rig, reduced: ReducedPlate, fingertip: Fingertip | None
+    coarse_rig: Rig, reduced: ReducedPlate, fingertip: Fingertip | None, pressed: tuple[float, ...]
 ) -> None:
     """Level and contrast by a direct solve, within 0.1 dB, fingers that load the plate or not."""
     rig = replace(coarse_rig, fingertip=fingertip)
-    played = play(rig, reduced, EXCITATION, FINGERS, duration=1.2)
-    loads = [FingertipLoad(*at, fingertip) for at in (TARGET, QUIET)] if fingertip else []
+    fingers = replace(FINGERS, loads=pressed)
+    played = play(rig, reduced, EXCITATION, fingers, duration=1.2)
+    tips = [fingertip.scaled(each) for each in pressed or (1, 1)] if fingertip else []
+    loads = [FingertipLoad(*at, tip) for at, tip in zip((TARGET, QUIET), tips, strict=False)]
     at_target, at_quiet = (steady(coarse_rig, at, *loads) for at in (TARGET, QUIET))
     weights = fingertip_weights(*TARGET, coarse_rig.plate)
     level = mean_level_db_sl(np.array([110.0, 250.0]), at_target, weights)

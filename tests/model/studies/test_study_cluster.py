@@ -5,6 +5,7 @@ import signal
 import sys
 from collections.abc import Iterator
 
+import dask
 import pytest
 from distributed import Client, LocalCluster
 
@@ -18,10 +19,16 @@ OTHER = "0.0.1+123456789abc"
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    """A scheduler with two workers, each a process of its own; no dashboard."""
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
-    ) as running:
+    """A scheduler with two workers, each a process of its own; no dashboard.
+
+    Forked off a process that has loaded Dask: loading takes each a second.
+    """
+    with (
+        dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
+        ) as running,
+    ):
         yield running.scheduler_address
 
 

@@ -119,7 +119,7 @@ class Decider:
         self._selector = Selector(table, None if timing is None else timing.levels)
         self._builder = SetBuilder(rig, guards, timing=timing)
         self._selected: Selection | None = None
-        self._playing = _Playback()
+        self._playing = self._playing_before = _Playback()
         self._triggered_at: float | None = None
 
     @property
@@ -247,6 +247,7 @@ class Decider:
         """
         plain = None if decision.sets is None else decision.sets.plain
         if plain is None or decision.pattern is None:
+            self._playing = replace(self._playing_before, endings_due=None)
             return None
         pattern = replace(decision.pattern, onset=None)
         decision = replace(decision, sets=plain, pattern=pattern)
@@ -291,6 +292,7 @@ class Decider:
                 sets = self._end(contacts, along_endings=playing.has_endings and not has_failed)
                 decision = replace(draft, sets=sets)
         if decision is not None and decision.sets is not None:
+            self._playing_before = playing
             self._playing = _Playback(decision, retry_at=decision.retry_at)
         else:
             self._playing = replace(

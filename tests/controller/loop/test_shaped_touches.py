@@ -325,6 +325,23 @@ async def test_touch_does_not_wait_for_an_onset_that_loads_too_slowly(
 
 
 @in_virtual_time
+async def test_pattern_plays_on_when_its_endings_load_too_slowly(
+    link: Link, shapes: Shapes
+) -> None:
+    """For as long as the finger rests; the next pattern replaces it and does not start from rest."""
+    async with running(far_ends=[link], timing=shapes) as bench:
+        bench.table.excitation = {"SW": Tone(110.0, 2e-5), "NE": Tone(110.0, 4e-5)}
+        await bench.hold(FINGER, OTHER, seconds=0.1)
+        link.delay = lambda request: 0.008 if isinstance(request, LoadEnvelope) else 0.0
+        await bench.hold(FINGER, OTHER, seconds=10.0)
+        assert len(loaded(link)) == 3  # two onsets, and one ending of two
+        assert link.levels() == pytest.approx((0.2, 0.4), abs=1e-3)
+        await bench.hold((1, 0.6, 0.5), OTHER, seconds=0.05)
+        assert [applied.from_rest for applied in bench.reports.applied] == [True, False]
+        assert [command.keep_phase for command in sets(link)[-1].commands] == [True, True]
+
+
+@in_virtual_time
 async def test_ramp_replaces_an_onset_that_the_guard_refuses(link: Link, shapes: Shapes) -> None:
     """A knot beyond full stroke is not sent; the pattern is played."""
     shapes.largest = 6.0

@@ -6,6 +6,8 @@ which other tests have as their subject.
 
 import sys
 
+import pytest
+
 from controller.cli.main import main
 from drivers.amplifier import Amplifier
 from drivers.operation.checked_amplifier import CheckedAmplifier
@@ -13,8 +15,13 @@ from drivers.operation.checked_amplifier import CheckedAmplifier
 REPLY_TIMEOUT = 5.0  # s; in place of 30 ms
 WATCHDOG = 2.0  # s; in place of 0.25 s, the longest of the protocol
 
+
+def wait_long(patch: pytest.MonkeyPatch) -> None:
+    """Let amplifiers be waited for, and wait, that long in this process."""
+    patch.setitem(Amplifier.__init__.__kwdefaults__, "reply_timeout", REPLY_TIMEOUT)  # type: ignore[arg-type]
+    patch.setattr(CheckedAmplifier.arm, "__defaults__", (WATCHDOG,))
+
+
 if __name__ == "__main__":
-    assert Amplifier.__init__.__kwdefaults__ is not None
-    Amplifier.__init__.__kwdefaults__["reply_timeout"] = REPLY_TIMEOUT
-    CheckedAmplifier.arm.__defaults__ = (WATCHDOG,)
+    wait_long(pytest.MonkeyPatch())
     sys.exit(main())

@@ -328,7 +328,7 @@ async def test_touch_does_not_wait_for_an_onset_that_loads_too_slowly(
 async def test_pattern_plays_on_when_its_endings_load_too_slowly(
     link: Link, shapes: Shapes
 ) -> None:
-    """For as long as the finger rests; the next pattern replaces it and does not start from rest."""
+    """For as long as the finger rests; the next pattern replaces it and starts from there."""
     async with running(far_ends=[link], timing=shapes) as bench:
         bench.table.excitation = {"SW": Tone(110.0, 2e-5), "NE": Tone(110.0, 4e-5)}
         await bench.hold(FINGER, OTHER, seconds=0.1)

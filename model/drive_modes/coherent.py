@@ -318,22 +318,23 @@ def _optimise_target_phases(
         s = len(starts)
         target_factors = np.repeat(starts[:, :, None], n, axis=2)
         forms = np.broadcast_to(R, (s, *R.shape)).reshape(-1, eras, eras)
-        tried, values = [], []
+        tried, magnitudes = [], []
         solved = None
         for _ in range(iterations):
-            c = np.einsum("stn,tne->sne", target_factors, conjugate)
+            c = np.add.reduce(target_factors[..., None] * conjugate, axis=1)
             solved = solve(forms, c.reshape(-1, eras), solved)
             w = solved.reshape(s, n, eras)
-            reached = np.einsum("tne,sne->stn", targets, w)
+            reached = np.vecdot(conjugate, w[:, None])  # (s, t, n)
             magnitude = np.maximum(np.abs(reached), 1e-20)
-            cost = np.einsum("sne,nef,snf->sn", w.conj(), R, w).real
             tried.append(w)
-            values.append(magnitude.min(axis=1) / np.sqrt(np.maximum(cost, 1e-30)))
-            lacking = np.sqrt(magnitude.mean(axis=1, keepdims=True) / magnitude)
-            target_factors = np.abs(target_factors) * lacking * reached / magnitude
-        every = np.concatenate(values)
-        best = every.argmax(axis=0)
-        w = np.concatenate(tried)[best, np.arange(n)]
-        value = every[best, np.arange(n)]
+            magnitudes.append(np.minimum.reduce(magnitude, axis=1))
+            if len(tried) < iterations:
+                lacking = np.sqrt(magnitude.mean(axis=1, keepdims=True) / magnitude)
+                target_factors = np.abs(target_factors) * lacking * reached / magnitude
+        every = np.concatenate(tried)
+        cost = np.vecdot(every, np.matvec(R, every)).real
+        values = np.concatenate(magnitudes) / np.sqrt(np.maximum(cost, 1e-30))
+        best = (values.argmax(axis=0), np.arange(n))
+        w, value = every[best], values[best]
     size = np.maximum.reduce(np.abs(w), axis=-1, keepdims=True)
     return np.asarray(w / np.maximum(size, 1e-30), dtype=np.complex64), value

@@ -4,7 +4,7 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array
 from model.drive_modes.coherent import Coherent
-from model.drive_modes.phased import solve_phased
+from model.drive_modes.signed import solve_signed
 
 EXCHANGES = 8
 SWEEPS = 2
@@ -19,7 +19,7 @@ def _solve(R: Complex64Array, c: Complex64Array, similar: Complex64Array | None)
     follow for the forms left.
     """
     w = np.empty_like(c.real)
-    left, form, pull = np.arange(len(w)), np.ascontiguousarray(R.real), c.real
+    left, form, pull = np.arange(len(w)), np.ascontiguousarray(R.real), np.ascontiguousarray(c.real)
     driven = pull > 0 if similar is None else similar.real > 0
     # A weight outside the set is held at zero by a row of its own.
     identity = np.eye(w.shape[1], dtype=form.dtype)
@@ -28,11 +28,11 @@ def _solve(R: Complex64Array, c: Complex64Array, similar: Complex64Array | None)
         found = np.linalg.solve(np.where(both, form, identity), (driven * pull)[..., None])[..., 0]
         w[left] = found
         wrong = np.where(driven, found < 0, np.matvec(form, found) < pull)
-        again = np.flatnonzero(wrong.any(axis=1))
-        left, form, pull = left[again], form[again], pull[again]
+        again = np.logical_or.reduce(wrong, axis=1).nonzero()[0]
+        left = left[again]
         if len(left) == 0:
             break
-        driven = driven[again] ^ wrong[again]
+        form, pull, driven = form[again], pull[again], driven[again] ^ wrong[again]
     np.maximum(w, 0, out=w)
     if len(left):
         w[left] = _swept(w[left], form, pull)
@@ -48,5 +48,8 @@ def _swept(w: Float32Array, form: Float32Array, pull: Float32Array) -> Float32Ar
     return w
 
 
-GRADED = Coherent(_solve, phases=(5, 5), iterations=3, bound=solve_phased)
-"""With several starting phases of a target, since weights cannot be negative."""
+GRADED = Coherent(_solve, phases=(5, 5), iterations=3, bound=solve_signed)
+"""With several starting phases of a target, since weights cannot be negative.
+
+Bounded by signed weights, of which its own are some.
+"""

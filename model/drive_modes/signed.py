@@ -7,7 +7,9 @@ from model.drive_modes.coherent import Coherent
 from model.drive_modes.phased import solve_phased
 
 
-def _solve(R: Complex64Array, c: Complex64Array, _: Complex64Array | None) -> Complex64Array:
+def solve_signed(
+    R: Complex64Array, c: Complex64Array, _: Complex64Array | None = None
+) -> Complex64Array:
     """Real weights for which |c^H w| is largest for its w^H R w, which then is w^T Re(R) w.
 
     A common phase of all targets is free; the best one follows from the top eigenvector of the form
@@ -21,4 +23,4 @@ def _solve(R: Complex64Array, c: Complex64Array, _: Complex64Array | None) -> Co
     return np.asarray(w, dtype=np.complex64)
 
 
-SIGNED = Coherent(_solve, phases=(1, 5), iterations=8, bound=solve_phased)
+SIGNED = Coherent(solve_signed, phases=(1, 5), iterations=8, bound=solve_phased)

@@ -1,13 +1,15 @@
 """Output of a channel in time: a sum of sinusoids that fade, or follow an envelope.
 
-Every change is a cross-fade along a raised cosine, whose two gains add up to one.
+Every change is a cross-fade along a raised cosine, whose two gains add up to one. At most two
+voices sound, each of one frequency and phase. A third set leaves of the oldest its present value,
+which decays: a tone of 0 Hz here.
 """
 
 import cmath
 import math
 from collections import defaultdict
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import TypeAlias
 
 from model.transients.base_motion import Term, fade
@@ -153,6 +155,8 @@ class ShapedTone:
 
 ToneSegment: TypeAlias = FadingTone | ShapedTone
 
+REMAINDER_RAMP = 0.005  # s; along which the value of a voice decays that has to make room
+
 Output: TypeAlias = tuple[ToneSegment, ...]
 """The output of one channel: the sum of these tones."""
 
@@ -168,19 +172,18 @@ def fade_to(
 ) -> Output:
     """The output after a command at a time [s] to fade to a tone within ramp [s].
 
-    amplitude in full strokes, 0 for silence. Its phase counts from `time`; with keep_phase, from
-    the origin of a lasting tone of the same frequency.
+    amplitude in full strokes, 0 for silence. Its phase counts from `time`; with keep_phase a
+    lasting tone of the same frequency goes on from its present amplitude.
     """
-    faded = (tone.fade_out(time, ramp=ramp) for tone in playing)
-    fading = tuple(tone for tone in faded if tone.silent_from > time)
     if amplitude == 0:
-        return fading
-    origin = time
-    if keep_phase:
-        same = [tone for tone in playing if tone.is_lasting and tone.frequency == frequency]
-        origin = same[0].origin if same else time
+        return _faded(playing, time, ramp=ramp)
+    voice, others = _continued(playing, time, frequency if keep_phase else None)
+    origin = voice[0].origin if voice else time
+    here = sum(tone.amplitude(time) for tone in voice)
     gain_from = 1.0 if ramp == 0 else 0.0
-    return (*fading, FadingTone(frequency, amplitude, origin, time, ramp, gain_from, 1.0))
+    before = (FadingTone(frequency, here, origin, time, ramp, 1.0, 0.0),) if here and ramp else ()
+    after = FadingTone(frequency, amplitude, origin, time, ramp, gain_from, 1.0)
+    return (*_one_voice(_faded(others, time, ramp=ramp), time), *before, after)
 
 
 def shape_to(
@@ -197,22 +200,54 @@ def shape_to(
     """The output after a command at a time [s] to follow an envelope to a tone.
 
     amplitude and knots in full strokes, ramp and step in s. With keep_phase a lasting tone of the
-    same frequency continues from its present amplitude; else the new one begins at zero. All others
+    same frequency goes on from its present amplitude; else the new one begins at zero. All others
     fade out within ramp.
     """
-    continuing = next(
-        (
-            tone
-            for tone in playing
-            if keep_phase and tone.is_lasting and tone.frequency == frequency
-        ),
-        None,
+    voice, others = _continued(playing, time, frequency if keep_phase else None)
+    origin = voice[0].origin if voice else time
+    begin = sum((tone.amplitude(time) for tone in voice), start=0j)
+    shaped = ShapedTone(frequency, origin, time, step, (begin, *knots, amplitude))
+    return (*_one_voice(_faded(others, time, ramp=ramp), time), shaped)
+
+
+def _continued(playing: Output, time: float, frequency: float | None) -> tuple[Output, Output]:
+    """The tones of the voice that goes on at a frequency [Hz], None for none, and all others."""
+    lasting = next((tone for tone in playing if tone.is_lasting), None)
+    if lasting is None or lasting.frequency != frequency:
+        return (), playing
+    voice = tuple(tone for tone in playing if _voice_of(tone) == _voice_of(lasting))
+    others = tuple(tone for tone in playing if _voice_of(tone) != _voice_of(lasting))
+    return tuple(tone for tone in voice if tone.silent_from > time), others
+
+
+def _voice_of(tone: ToneSegment) -> tuple[float, float]:
+    """What the tones of one voice have in common: their oscillator."""
+    return tone.frequency, tone.origin
+
+
+def _faded(playing: Output, time: float, *, ramp: float) -> Output:
+    """These tones, silent within ramp [s]; a voice of several as one."""
+    faded: list[ToneSegment] = []
+    for (frequency, origin), tones in groupby(playing, key=_voice_of):
+        voice = tuple(tones)
+        if len(voice) > 1 and max(tone.silent_from for tone in voice) > time + ramp:
+            here = sum(tone.amplitude(time) for tone in voice)
+            voice = (FadingTone(frequency, here, origin, time, ramp, 1.0, 0.0),)
+        faded += (tone.fade_out(time, ramp=ramp) for tone in voice)
+    return tuple(tone for tone in faded if tone.silent_from > time)
+
+
+def _one_voice(fading: Output, time: float) -> Output:
+    """The newest of the fading voices, and the present value of the others, which decays."""
+    voices = [_voice_of(tone) for tone in fading if tone.frequency > 0]
+    if len(set(voices)) < 2:
+        return fading
+    kept = tuple(tone for tone in fading if _voice_of(tone) == voices[-1])
+    turns = [(tone, 2j * math.pi * tone.frequency * (time - tone.origin)) for tone in fading]
+    value = sum(
+        (tone.amplitude(time) * cmath.exp(turn)).imag for tone, turn in turns if tone not in kept
     )
-    faded = (tone.fade_out(time, ramp=ramp) for tone in playing if tone is not continuing)
-    fading = tuple(tone for tone in faded if tone.silent_from > time)
-    begin = 0j if continuing is None else continuing.amplitude(time)
-    origin = time if continuing is None else continuing.origin
-    return (*fading, ShapedTone(frequency, origin, time, step, (begin, *knots, amplitude)))
+    return (FadingTone(0.0, 1j * value, time, time, REMAINDER_RAMP, 1.0, 0.0), *kept)
 
 
 def end_along(

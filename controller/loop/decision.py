@@ -303,9 +303,9 @@ class Decider:
         self._selected = selection
         return decision
 
-    def silence(self, *, ramp: float) -> SafeSets:
-        """Build the sets that ramp [s] every wired channel to zero; never fails."""
-        return self._builder.build_silence(ramp=ramp)
+    def silence(self, *, ramp: float, before: SafeSets | None = None) -> SafeSets:
+        """Build the sets that ramp [s] every wired channel to zero; see `SetBuilder`."""
+        return self._builder.build_silence(ramp=ramp, before=before)
 
     def _capabilities_at(self, now: float) -> PlaybackCapabilities:
         """Return the capabilities at a time [s]: without envelopes while loading is too slow."""

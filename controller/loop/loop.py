@@ -334,7 +334,7 @@ class Controller:
         try:
             if self._group.is_set_incomplete and is_pattern:
                 # Silence an incomplete set before the next pattern.
-                silence = self._decider.silence(ramp=RELEASE_RAMP)
+                silence = self._decider.silence(ramp=RELEASE_RAMP, before=sets)
                 if await self._group.play(silence.sets) is None:
                     return None
             played = await self._group.play(

@@ -37,6 +37,11 @@ class SafeSets:
     ready_at: float = -math.inf
 
     @property
+    def token(self) -> int:
+        """The token, which all its sets have."""
+        return next(iter(self.sets.values())).token
+
+    @property
     def is_silence(self) -> bool:
         """Whether all channels fall silent along the ramp, without endings."""
         return all(
@@ -177,9 +182,12 @@ class SetBuilder:
             _logger.warning("loop: silencing along a ramp, endings refused: %s", error)
             return self.build_silence(ramp=FADE_RAMP)
 
-    def build_silence(self, *, ramp: float) -> SafeSets:
-        """Build the sets that ramp [s] every wired channel to zero; never fails."""
-        token = self._next_token()
+    def build_silence(self, *, ramp: float, before: SafeSets | None = None) -> SafeSets:
+        """Build the sets that ramp [s] every wired channel to zero; never fails.
+
+        before: sets that are played later but were built already.
+        """
+        token = self._next_token() if before is None else before.token - 1
         return SafeSets(
             {
                 name: guard.silence(
@@ -218,8 +226,10 @@ class SetBuilder:
         }
 
     def _next_token(self) -> int:
-        """Return a token for all amplifiers: 1..65535, then from 1 again."""
-        self._token = token_after(self._token)
+        """Return a token for all amplifiers; the one before it is free for a silence."""
+        self._token = token_after(token_after(self._token))
+        if self._token == 1:
+            self._token = 2
         return self._token
 
 

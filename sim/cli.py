@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from drivers.errors import LinkError
+from model.commands.options import ExactOption, SeedOption, seed_of_plate
 from model.errors import InputError
 from sim.witness_cli import witness
 
@@ -78,17 +79,8 @@ def sim(
         list[str] | None,
         typer.Option(metavar="X,Y", help="Place a finger [m]; repeatable."),
     ] = None,
-    exact: Annotated[
-        bool, typer.Option("--exact", help="Simulate the rig's own plate, with no deviation.")
-    ] = False,
-    seed: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Draw another plate, ERAs, channels and fingers within the rig's uncertainty.",
-            min=0,
-        ),
-    ] = None,
+    exact: ExactOption = False,
+    seed: SeedOption = None,
     sensor: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=X,Y", help="Place an accelerometer [m]; repeatable."),
@@ -140,8 +132,7 @@ def sim(
         )
         if virtual_time and control is None:
             raise InputError("--virtual-time needs --control PATH, which advances the time")
-        if exact and seed is not None:
-            raise InputError("--exact and --seed exclude each other; give one")
+        drawn = seed_of_plate(exact=exact, seed=seed)
         loaded = load_rig(rig)
         _check_rate(rate, frequency_max=loaded.limits.frequency_max)
         simulation = Simulation(
@@ -152,7 +143,9 @@ def sim(
                 str(number): parse_point(text, what="--finger")
                 for number, text in enumerate(finger or [], start=1)
             },
-            imperfections=Imperfections() if exact else draw_imperfections(loaded, seed=seed or 0),
+            imperfections=(
+                Imperfections() if drawn is None else draw_imperfections(loaded, seed=drawn)
+            ),
             sensors=[_sensor(text) for text in sensor or []],
             sample_rate=rate,
             control=control,

@@ -10,6 +10,7 @@ import drivers.cli
 from controller.cli.layout import layout_app
 from controller.cli.rig import rig_app
 from model.commands.next_line import next_line
+from model.commands.options import ExactOption, SeedOption, seed_of_plate
 from model.counting import counted
 from model.errors import InputError
 
@@ -42,17 +43,8 @@ def demo(
         typer.Option(metavar="FILE", help="TUIO capture, or evemu recording (.events)."),
     ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the picture.")] = Path("out"),
-    exact: Annotated[
-        bool, typer.Option("--exact", help="Simulate the table's own plate, with no deviation.")
-    ] = False,
-    seed: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Draw another plate, ERAs, channels and fingers within the rig's uncertainty.",
-            min=0,
-        ),
-    ] = None,
+    exact: ExactOption = False,
+    seed: SeedOption = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object and nothing else.")
     ] = False,
@@ -84,9 +76,7 @@ def demo(
         raise InputError(f"--wire must be one of {', '.join(WIRES)}, got {wire}")
     if dashboard and (touches is not None or as_json):
         raise InputError("--dashboard takes its touches from the page; omit --touches and --json")
-    if exact and seed is not None:
-        raise InputError("--exact and --seed exclude each other; give one")
-    drawn = None if exact else seed or 0
+    drawn = seed_of_plate(exact=exact, seed=seed)
     recorded = read_touches(touches or example_touches_path())
     rig_file = example_rig_path()
     rig = load_rig(rig_file)

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from model.errors import InputError
+
 RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g. RIG.yaml.")]
 TableArgument = Annotated[Path, typer.Argument(metavar="TABLE", help="Table file, e.g. T.npz.")]
 MeshOption = Annotated[
@@ -15,3 +17,24 @@ FolderOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write into.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+ExactOption = Annotated[
+    bool, typer.Option("--exact", help="Simulate the rig's own plate, with no deviation.")
+]
+SeedOption = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N",
+        help="Draw another plate, ERAs, channels and fingers within the rig's uncertainty.",
+        min=0,
+    ),
+]
+
+
+def seed_of_plate(*, exact: bool, seed: int | None) -> int | None:
+    """Seed of a simulated plate, by default 0; None for the rig's own.
+
+    Raises InputError for both.
+    """
+    if exact and seed is not None:
+        raise InputError("--exact and --seed exclude each other; give one")
+    return None if exact else seed or 0

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from numbers import Real
+from typing import Protocol
 
 from model.errors import InputError
 from model.fem.plate_mesh import PlateMesh
@@ -86,45 +87,64 @@ class Rig:
     @property
     def fingerprint(self) -> str:
         """Fingerprint of all that decides what is felt; see `physics_fingerprint`."""
-        return physics_fingerprint(
-            self.plate,
-            self.eras,
-            masses=self.masses,
-            uncertainty=self.uncertainty,
-            fingertip=self.fingertip,
-            threshold=self.threshold,
-        )
+        return physics_fingerprint(self)
 
 
-def physics_fingerprint(
-    plate: Plate,
-    eras: Sequence[Era],
-    *,
-    masses: Sequence[PointLoad],
-    uncertainty: Uncertainty,
-    fingertip: Fingertip | None,
-    threshold: str,
-) -> str:
+class Physics(Protocol):
+    """All that decides what is felt, as a rig and its tables have it."""
+
+    @property
+    def plate(self) -> Plate:
+        """Plate without what it carries."""
+        ...
+
+    @property
+    def eras(self) -> Sequence[Era]:
+        """ERAs in order."""
+        ...
+
+    @property
+    def masses(self) -> Sequence[PointLoad]:
+        """Masses on the plate."""
+        ...
+
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """How well all of it is known."""
+        ...
+
+    @property
+    def fingertip(self) -> Fingertip | None:
+        """Load of a finger, None for none."""
+        ...
+
+    @property
+    def threshold(self) -> str:
+        """Name of the detection thresholds."""
+        ...
+
+
+def physics_fingerprint(felt: Physics) -> str:
     """SHA-256 over all that decides what fingers feel; not mesh or wiring.
 
     Over plate, ERAs, masses, their uncertainty, and load, contact and thresholds of a finger. Rigs
     with the same fingerprint share localization tables, also with other names of materials.
     """
-    numbers = asdict(plate)
+    numbers = asdict(felt.plate)
     del numbers["material"]["name"]
     # ERAs without gains have the fingerprint of a rig that has no such key.
     held = [
         {key: value for key, value in asdict(era).items() if key != "gains" or value}
-        for era in eras
+        for era in felt.eras
     ]
     physics = {
         "plate": numbers,
         "eras": held,
-        "masses": sorted(list(map(float, mass.numbers.values())) for mass in masses),
-        "uncertainty": asdict(uncertainty),
-        "fingertip": None if fingertip is None else asdict(fingertip),
+        "masses": sorted(list(map(float, mass.numbers.values())) for mass in felt.masses),
+        "uncertainty": asdict(felt.uncertainty),
+        "fingertip": None if felt.fingertip is None else asdict(felt.fingertip),
         "fingertip_radius": FINGERTIP_RADIUS,
-        "threshold": threshold,
+        "threshold": felt.threshold,
     }
     return hashlib.sha256(canonical_json(physics).encode()).hexdigest()
 

@@ -108,14 +108,7 @@ class LocalizationTable:
     @property
     def fingerprint(self) -> str:
         """Fingerprint of the rig that this table is for."""
-        return physics_fingerprint(
-            self.plate,
-            self.eras,
-            masses=self.masses,
-            uncertainty=self.uncertainty,
-            fingertip=self.fingertip,
-            threshold=self.threshold,
-        )
+        return physics_fingerprint(self)
 
     @property
     def pattern_count(self) -> int:

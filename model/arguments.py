@@ -1,5 +1,6 @@
 """Checks of arguments of the Python API, whose callers may not use a type checker."""
 
+import math
 import os
 from numbers import Integral, Real
 from pathlib import Path
@@ -21,6 +22,12 @@ def expect_number(value: object, *, what: str, unit: str) -> None:
     """Raise InputError for anything but a real number."""
     if not isinstance(value, Real):
         raise InputError(f"{what} must be a number of {unit}, got {shown(value)}")
+
+
+def expect_at_least(value: float, least: float, *, what: str) -> None:
+    """Raise InputError for a value that is not finite or below the least."""
+    if not (math.isfinite(value) and value >= least):
+        raise InputError(f"{what} must be finite and at least {least:g}, got {value}")
 
 
 def is_whole(value: object) -> bool:

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, fields
 
-from model.errors import InputError
+from model.arguments import expect_at_least
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,8 @@ class Uncertainty:
     def __post_init__(self) -> None:
         """Refuse values that are not finite, negative ones, and a factor below 1."""
         for key in (field.name for field in fields(self)):
-            least, value = (1.0 if key == "damping" else 0.0), getattr(self, key)
-            if not (math.isfinite(value) and value >= least):
-                raise InputError(f"uncertainty: {key} must be at least {least:g}, got {value}")
+            least = 1.0 if key == "damping" else 0.0
+            expect_at_least(getattr(self, key), least, what=f"uncertainty: {key}")
 
     @classmethod
     def none(cls) -> "Uncertainty":

@@ -6,12 +6,12 @@ the real part of the dynamic stiffness is 69, -87 and -358 N/m where a phalanx a
 921 and 507. How well the values are known: docs/concepts/people.md.
 """
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
 
+from model.arguments import expect_at_least
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 
@@ -39,9 +39,7 @@ class Fingertip:
     def __post_init__(self) -> None:
         """Refuse values not finite or negative, no damping of the pulp, and no phalanx."""
         for key in (field.name for field in fields(self)):
-            value = getattr(self, key)
-            if not (math.isfinite(value) and value >= 0):
-                raise InputError(f"fingertip: {key} must be finite and at least 0, got {value}")
+            expect_at_least(getattr(self, key), 0.0, what=f"fingertip: {key}")
         for key, unit in (("damping", "N s/m"), ("phalanx_mass", "kg")):
             if getattr(self, key) == 0:
                 raise InputError(f"fingertip: {key} must be above 0 {unit}, got 0")

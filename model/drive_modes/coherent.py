@@ -127,8 +127,7 @@ class Coherent:
         tried: list[_Tried] = []
         shares = np.ones_like(expected)
         for _ in range(LAWSON_STEPS):
-            shares = shares * np.sqrt(expected)
-            shares /= np.add.reduce(shares, axis=-1, keepdims=True)
+            shares = _moved(shares, expected)
             weights, bound = self._weights(forms, _weighted(forms, shares))
             expected = forms.quiet_power(weights)
             tried.append((weights, expected, bound))
@@ -169,8 +168,7 @@ class Coherent:
             # Beyond any level that can be reached they would grow without end.
             multipliers = multipliers * np.minimum(power, MAX_GROWTH)
             if shares.shape[1] > 1:
-                shares = shares * np.sqrt(expected)
-                shares /= np.maximum(np.add.reduce(shares, axis=-1, keepdims=True), _LEAST)
+                shares = _moved(shares, expected)
                 R = _weighted(some, shares)
 
     def _relax_level(self, forms: Forms, found: "_BestCandidates") -> None:
@@ -263,6 +261,13 @@ class _BestCandidates:
 def _saturated(weights: Complex64Array, gain: float) -> Complex64Array:
     """Weights times a gain, limited to full stroke."""
     return np.asarray(weights / np.maximum(np.abs(weights), 1 / gain), dtype=np.complex64)
+
+
+def _moved(shares: Float32Array, expected: Float32Array) -> Float32Array:
+    """Shares of the quiet fingertips (f, q) after a step of Lawson's, by their expected powers."""
+    moved = shares * np.sqrt(expected)
+    total = np.add.reduce(moved, axis=-1, keepdims=True)
+    return np.asarray(moved / np.maximum(total, _LEAST))
 
 
 def _mean(forms: Forms, *, sigma: float = 0.0) -> Complex64Array:

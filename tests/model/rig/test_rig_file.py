@@ -308,7 +308,7 @@ def test_load_rig_reads_fingertip_and_threshold(tmp_path: Path) -> None:
     assert none.fingertip is None
     known = load_rig(write(tmp_path, GOOD + "uncertainty: {}\n"))
     assert len({rig.fingerprint for rig in (light, firm, none, known)}) == 4
-    for wrong in ("fingertip: heavy", "fingertip: {damping: 0}", "threshold: nobody"):
+    for wrong in ("fingertip: heavy", "fingertip: {damping: 0}", "threshold: loud"):
         with pytest.raises(ConfigError):
             load_rig(write(tmp_path, GOOD + wrong + "\n"))
 

@@ -105,7 +105,7 @@ def test_honest_amplifiers_are_never_a_fault(
     async def main() -> None:
         async with supervised_chain(wire, names, shaped=shaped) as chain:
             for interval in (TOUCHES, 0.031, 0.007, 0.1):
-                await chain.play(0.4, interval=interval, moves=True)
+                await chain.play(0.3, interval=interval, moves=True)
                 chain.lift()
                 await chain.rest(0.07)
             assert chain.causes == []

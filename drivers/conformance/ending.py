@@ -20,15 +20,15 @@ async def quick_stop(bench: Bench) -> None:
 
 async def silence_never_later(bench: Bench) -> None:
     """It lets a further stop shorten the ramp to silence, never extend it."""
-    longest = bench.can.ramp_max
-    for first, then in ((longest, 0.0), (0.0, longest), (longest / 4, longest)):
+    full_ramp = bench.can.ramp_max
+    for first, then in ((full_ramp, 0.0), (0.0, full_ramp), (full_ramp / 4, full_ramp)):
         await bench.arm()
         await bench.amplifier.apply(bench.tones(1.0))
         await bench.amplifier.stop(first)
         begin = clock.now()
         await bench.amplifier.stop(then)
         await bench.until(lambda status: not any(status.levels), what="silence", feed=False)
-        due = min(first, then) + longest / 4
+        due = min(first, then) + full_ramp / 4
         took = clock.now() - begin
         expect(took <= due, f"silence must come within {due:g} s of both stops, took {took:.3f} s")
         await bench.rest()

@@ -132,14 +132,21 @@ class Page:
             await self.call("Input.dispatchKeyEvent", type=kind, key=key, code=code or key)
 
     async def click(self, selector: str) -> None:
-        """Click an element where it is, as a mouse would; it must be visible and uncovered."""
-        place = await self.evaluate(
-            f"(() => {{ const e = document.querySelector({json.dumps(selector)});"
-            "e.scrollIntoView({block: 'nearest'}); const b = e.getBoundingClientRect();"
-            "const [x, y] = [b.x + b.width / 2, b.y + b.height / 2];"
-            "return e.contains(document.elementFromPoint(x, y)) ? [x, y] : null; })()"
+        """Click an element as a mouse would, once it is enabled, uncovered and has stopped moving.
+
+        What is disabled would take the click without a word; what moves would miss it.
+        """
+        place = await self.until(
+            f"(async () => {{ const e = document.querySelector({json.dumps(selector)});"
+            "if (!e || e.matches(':disabled')) return null;"
+            "e.scrollIntoView({block: 'nearest'});"
+            "const middle = () => { const b = e.getBoundingClientRect();"
+            " return [b.x + b.width / 2, b.y + b.height / 2]; };"
+            "const frame = () => new Promise(requestAnimationFrame);"
+            "const before = middle(); await frame(); await frame(); const [x, y] = middle();"
+            "const isStill = x === before[0] && y === before[1];"
+            "return isStill && e.contains(document.elementFromPoint(x, y)) ? [x, y] : null; })()"
         )
-        assert place is not None, f"{selector} is covered by something else"
         await self.mouse("mousePressed", *place)
         await self.mouse("mouseReleased", *place)
 

@@ -290,15 +290,20 @@ def wait_for_daemon(gateway: GatewayProcess) -> None:
 
 
 @contextmanager
-def real_daemon(folder: Path, more: str = "") -> Iterator[Path]:
-    """The socket of `era daemon` with a simulated amplifier; more: further lines of its file."""
+def real_daemon(
+    folder: Path, more: str = "", *, program: Sequence[str | Path] = (ERA,)
+) -> Iterator[Path]:
+    """The socket of `era daemon` with a simulated amplifier.
+
+    more: further lines of its file; program: the command before `daemon`.
+    """
     save_table(daemon_table(), folder / "table.npz")
     config = write_daemon(folder, {}, f"table: table.npz\n{more}")
     daemon_socket = folder / "era.sock"
     with (
         (folder / "daemon.log").open("a", encoding="utf-8") as log,
         subprocess.Popen(
-            [ERA, "daemon", str(config)],
+            [*program, "daemon", str(config)],
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,

@@ -12,6 +12,7 @@ from controller.cli.main import main
 from drivers.amplifier import Amplifier
 from drivers.operation.checked_amplifier import CheckedAmplifier
 
+PROGRAM = (sys.executable, __file__)
 REPLY_TIMEOUT = 5.0  # s; in place of 30 ms
 WATCHDOG = 2.0  # s; in place of 0.25 s, the longest of the protocol
 

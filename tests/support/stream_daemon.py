@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import signal
-import sys
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -45,7 +44,7 @@ async def running_daemon(folder: Path, url: str, *, table: Path) -> AsyncIterato
         encoding="utf-8",
     )
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, patient_daemon.__file__, "daemon", config),
+        *(*patient_daemon.PROGRAM, "daemon", config),
         stdin=asyncio.subprocess.DEVNULL,
         stderr=asyncio.subprocess.PIPE,
     )

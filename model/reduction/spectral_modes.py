@@ -2,7 +2,8 @@
 
 The residual vectors of the points of the first layout are solved for alone. For a second one those
 of all polynomials of the deflection are: the residual vectors of a force at any point are then a
-product with the polynomials there, and so are the sums over truncated modes.
+product with the polynomials there, and so are the sums over truncated modes. With many polynomials,
+where that takes much longer than modes and layouts together, the first few are solved alone.
 """
 
 import math
@@ -25,6 +26,7 @@ from model.structure.footprint import check_on_plate
 from model.structure.plate import Plate
 
 _MAX_CACHED = 4  # sets of points whose polynomials are kept
+_PER_POINT = 50  # polynomials of a class for each point that is solved alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +51,7 @@ class SpectralModes:
         self.eigenvalues = np.concatenate([part.eigenvalues for part in classes])
         self.largest_truncated = max(part.largest_truncated for part in classes)
         self._first: PointSolutions | None = None
+        self._alone_count = 0
         self._operators: tuple[FloatArray, ...] | None = None
         self._known: dict[bytes, _Observed] = {}
 
@@ -59,6 +62,8 @@ class SpectralModes:
             self._first = self._solve_alone(points, at)
         if np.array_equal(self._first.points, points):
             return self._first
+        if self._is_solved_alone(len(points)):
+            return self._solve_alone(points, at)
         residuals = tuple(
             np.moveaxis(operator[:RESIDUAL_ORDER] @ own.T, 2, 0)
             for own, operator in zip(at.deflections, self._solved_operators(), strict=True)
@@ -67,6 +72,10 @@ class SpectralModes:
 
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Sums between points (n, 2) and others (m, 2), as in `PointSolutions`."""
+        if self._is_solved_alone(len(points) + len(others)):
+            both = np.vstack([points, others])
+            solved = self._solve_alone(both, self._observe(both))
+            return solved.truncated_terms[:, : len(points), len(points) :]
         own, other = self._observe(points), self._observe(others)
         truncated_terms = np.zeros((2 * RESIDUAL_ORDER, len(points), len(others)))
         pairs = zip(own.deflections, other.deflections, self._solved_operators(), strict=True)
@@ -94,8 +103,14 @@ class SpectralModes:
             self.largest_truncated
         )
 
+    def _is_solved_alone(self, count: int) -> bool:
+        """Whether so many further points take less without the operators."""
+        most = max(part.deflections for part in self._classes) // _PER_POINT
+        return self._operators is None and self._alone_count + count <= most
+
     def _solve_alone(self, points: FloatArray, at: _Observed) -> PointSolutions:
         """Solve for these points, without the operators."""
+        self._alone_count += len(points)
         residuals = []
         truncated_terms = np.zeros((2 * RESIDUAL_ORDER, len(points), len(points)))
         for own, part in zip(at.deflections, self._classes, strict=True):

@@ -85,14 +85,20 @@ def test_response_on_feet_is_that_of_fine_elements(layout, foot):
     assert np.linalg.norm(high - exact) / size < 0.001
 
 
-@pytest.mark.parametrize("before", [[], ["edges"]], ids=["first layout", "further layout"])
+@pytest.mark.parametrize(
+    ("before", "polynomials_per_point"),
+    [([], 50), (["edges"], 50), (["edges"], 1)],
+    ids=["first layout", "further layout", "further layout alone"],
+)
 @pytest.mark.parametrize("foot", [0.0, 0.004])
 @pytest.mark.parametrize("layout", ["corners", "inside", "close together"])
-def test_reduction_equals_direct_solution(layout, foot, before):
+def test_reduction_equals_direct_solution(layout, foot, before, polynomials_per_point, monkeypatch):
     """Modes and truncated ones against a solution of all unknowns at each frequency, 1e-5.
 
-    Places of the first layout are solved for, those of others come from residual operators.
+    Places of the first layout are solved for, those of others come from residual operators, or with
+    many polynomials for each point are solved for as well.
     """
+    monkeypatch.setattr("model.reduction.spectral_modes._PER_POINT", polynomials_per_point)
     eras = [replace(era, foot=foot) for era in _on_plate(PAPER, LAYOUTS[layout])]
     loads = [PointLoad(0.1, 0.05, 2e3, 1.0, 0.01)]
     frequencies = np.array([45.0, 106.4, 250.0, 480.0])

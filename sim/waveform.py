@@ -243,9 +243,9 @@ def _one_voice(fading: Output, time: float) -> Output:
     if len(set(voices)) < 2:
         return fading
     kept = tuple(tone for tone in fading if _voice_of(tone) == voices[-1])
-    turns = [(tone, 2j * math.pi * tone.frequency * (time - tone.origin)) for tone in fading]
+    phases = [(tone, 2j * math.pi * tone.frequency * (time - tone.origin)) for tone in fading]
     value = sum(
-        (tone.amplitude(time) * cmath.exp(turn)).imag for tone, turn in turns if tone not in kept
+        (tone.amplitude(time) * cmath.exp(phase)).imag for tone, phase in phases if tone not in kept
     )
     return (FadingTone(0.0, 1j * value, time, time, REMAINDER_RAMP, 1.0, 0.0), *kept)
 

@@ -25,11 +25,11 @@ async def silence_never_later(bench: Bench) -> None:
         await bench.arm()
         await bench.amplifier.apply(bench.tones(1.0))
         await bench.amplifier.stop(first)
-        begin = clock.now()
+        started_at = clock.now()
         await bench.amplifier.stop(then)
         await bench.until(lambda status: not any(status.levels), what="silence", feed=False)
         due = min(first, then) + full_ramp / 4
-        took = clock.now() - begin
+        took = clock.now() - started_at
         expect(took <= due, f"silence must come within {due:g} s of both stops, took {took:.3f} s")
         await bench.rest()
 

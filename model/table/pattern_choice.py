@@ -251,7 +251,7 @@ def _pattern(
     each = np.concatenate(measures)
     ordered = np.sort(each[:, 1:], axis=1)
     levels = [percentile_of_sorted(ordered, percent) for percent in _PERCENTS]
-    nominal, robust, median, most = decibels(np.array([each[:, 0], *levels])).tolist()
+    nominal, robust, median, highest = decibels(np.array([each[:, 0], *levels])).tolist()
     gain_db = min(0.0, question.level_db_sl - robust[0])
     gain = 10 ** (gain_db / 20)
     pattern = partial(
@@ -279,7 +279,7 @@ def _pattern(
     return pattern(
         contrast_db=nominal[2],
         quiet_level_db_sl=gain_db + nominal[1],
-        robust_quiet_level_db_sl=gain_db + most[1],
+        robust_quiet_level_db_sl=gain_db + highest[1],
         robust_contrast_db=robust[2],
         robust_felt_contrast_db=robust[3],
         median_felt_contrast_db=median[3],

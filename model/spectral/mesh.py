@@ -37,9 +37,9 @@ _AS_IF_RIGID = (
 _FINER = 2  # further degrees to compare with
 
 MAX_POLYNOMIALS = 6000
-"""Of the deflection, that are chosen; they take some seconds of processor time."""
+"""Of the deflection, that are chosen; they take some seconds of processor time and 1.5 GB."""
 
-_MAX_NAMED = 8000  # ten seconds
+_MAX_NAMED = 8000  # ten seconds and 2 GB
 
 _POINTS_PER_DEGREE = 8  # of the raster that shows a field: fifty to a wavelength
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import patient_daemon
 from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import RpcError
 from daemon_bench import PATIENCE, far_end, holding, until
@@ -41,7 +42,10 @@ async def stop_by_new_client(daemon: DaemonProcess) -> None:
 
 async def test_daemon_plays_on_with_idle_and_unreading_clients(tmp_path: Path) -> None:
     """With 2000 idle and 10 unreading ones memory is bounded, and a new client can stop it."""
-    async with far_end(tmp_path) as far, daemon_process(tmp_path, far) as daemon:
+    async with (
+        far_end(tmp_path) as far,
+        daemon_process(tmp_path, far, program=patient_daemon.PROGRAM) as daemon,
+    ):
         journal = Journal(far)
         async with await daemon.client() as era, holding(era):
             await play(era, far)
@@ -63,7 +67,10 @@ async def test_daemon_plays_on_with_idle_and_unreading_clients(tmp_path: Path) -
 @pytest.mark.parametrize("kind", ["garbage", "asking"])
 async def test_daemon_plays_on_when_clients_flood(tmp_path: Path, kind: str) -> None:
     """With malformed or endless requests any client can stop it, and the log stays short."""
-    async with far_end(tmp_path) as far, daemon_process(tmp_path, far) as daemon:
+    async with (
+        far_end(tmp_path) as far,
+        daemon_process(tmp_path, far, program=patient_daemon.PROGRAM) as daemon,
+    ):
         journal = Journal(far)
         async with await daemon.client() as era, holding(era):
             await play(era, far)

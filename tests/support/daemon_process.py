@@ -202,7 +202,8 @@ async def plays_on(
 ) -> None:
     """Assert that it stays enabled for a period, and tell the widest gap between signs of life.
 
-    what: the disturbance, for the printed figure.
+    By a daemon that waits for a busy machine, see `patient_daemon`. what: the disturbance, for the
+    printed figure.
     """
     await play(era, daemon.far)
     window = await watch(daemon, era, journal, seconds)

@@ -1,7 +1,8 @@
 """`era` on a machine whose wall clock jumps: `python tests/support/jumping_clock.py daemon ...`.
 
 Every SIGVTALRM sets it to the next of `JUMPS`. Only what Python reads as the time of day jumps, not
-what the kernel and CLOCK_MONOTONIC tell, as when an administrator or NTP sets the clock.
+what the kernel and CLOCK_MONOTONIC tell, as when an administrator or NTP sets the clock. It waits
+for a busy machine.
 """
 
 import itertools
@@ -11,7 +12,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import pytest
+
 from controller.cli.main import main
+from patient_daemon import wait_long
 
 JUMPS = (86_400.0, -86_400.0, 0.4, -0.4, 3e8, -1.7e9, 0.0)
 """How far [s] it is from the real one: days, less than a lease, another decade, near 1970."""
@@ -37,5 +41,6 @@ def _jumping() -> None:
 
 
 if __name__ == "__main__":
+    wait_long(pytest.MonkeyPatch())
     _jumping()
     sys.exit(main())

@@ -31,7 +31,12 @@ SIM = [sys.executable, "-P", "-m", "sim"]
 CHILD = [sys.executable, "-P", "-m", "controller.daemon.child_main"]
 PROGRAMS = {
     (sys.executable, str(Path(__file__).with_name(name)))
-    for name in ("interrupted.py", "live_demonstration.py", "patient_daemon.py")
+    for name in (
+        "interrupted.py",
+        "jumping_clock.py",
+        "live_demonstration.py",
+        "patient_daemon.py",
+    )
 }
 """Programs of the tests that do with `era` what no user can."""
 _PARENTS = ("daemon", "live_demonstration.py", "planted_daemon.py")

@@ -36,6 +36,9 @@ FLOODERS = 4  # of one kind
 STOPS = 300  # measured per case with flooders
 _SETTLE = 1.0  # s
 
+DAEMON: Sequence[object] = (ERA, "daemon")
+"""The command that is measured, without its file."""
+
 
 @dataclass(frozen=True)
 class Case:
@@ -125,7 +128,7 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
         else:
             port = _free_port()
             config = _daemon_file(folder, url, table_file, port, case.touch_wait)
-            tested = Program(all_, ERA, "daemon", config, rank=Rank.SERVICE)
+            tested = Program(all_, *DAEMON, config, rank=Rank.SERVICE)
             daemon = _client(all_, path, tested)
             all_.enter_context(daemon.armed("latency"))
         panel = Program(

@@ -1,13 +1,14 @@
 """Clicks of a layout over a serial line in real time, daemon and far end in their own processes.
 
-Ten equal presses of a finger that loads the plate; what it feels is read from the plate.
+Ten equal presses of a finger that loads the plate; what it feels is read from the plate. Each press
+waits for its pattern, however slow the machine is.
 """
 
 import asyncio
 import contextlib
 import socket
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -15,21 +16,23 @@ import numpy as np
 import pytest
 
 from controller.api.async_client import AsyncClient
+from controller.api.client_protocol import Notification
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
-from daemon_process import ERA
 from far_end_process import FarEndProcess, far_end_process
 from heard import PATIENCE
 from model.finger.perception import detection_threshold
 from model.rig.file import load_rig
 from model.table.build import build_table
 from model.table.file import save_table
+from patient_daemon import PROGRAM
 from rig_files import write_rig
 from touch_stream import LENGTH, WIDTH
+from tuio_panel import free_port
 
 pytestmark = pytest.mark.real_time
 
-PRESSES, HELD, PAUSE, FRAME = 10, 0.25, 0.31, 0.010  # s
+PRESSES, FELT, PAUSE, FRAME = 10, 0.15, 0.31, 0.010  # s
 PLACE = (0.09, 0.07)
 LEVEL, DURATION = 20.0, 0.040  # dB SL, s
 LAYOUT = "effects: {it: {kind: click}}\nelsewhere: it\n"
@@ -43,15 +46,13 @@ async def panel(folder: Path, far_end: FarEndProcess) -> AsyncIterator[tuple[Asy
     table = build_table(load_rig(rig_file), frequencies=np.arange(80.0, 321.0, 40.0))
     save_table(table, folder / "table.npz")
     (folder / "layout.yaml").write_text(LAYOUT, encoding="utf-8")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     (folder / "daemon.yaml").write_text(
         "rig: rig.yaml\ntable: table.npz\nsocket: era.sock\nlayout: layout.yaml\n"
-        f'touch:\n  - {{name: panel, url: "tuio:127.0.0.1:{port}"}}\n',
+        f'touch:\n  - {{name: panel, url: "tuio:127.0.0.1:{port}?timeout={PATIENCE:g}"}}\n',
         encoding="utf-8",
     )
-    process = await asyncio.create_subprocess_exec(ERA, "daemon", folder / "daemon.yaml")
+    process = await asyncio.create_subprocess_exec(*PROGRAM, "daemon", folder / "daemon.yaml")
     try:
         end = time.monotonic() + PATIENCE
         while not (folder / "era.sock").is_socket():
@@ -82,33 +83,40 @@ async def felt_of_presses(folder: Path, *wire: str) -> tuple[list[float], list[f
         sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         number = 0
 
-        async def hold(seconds: float, *touches: Touch) -> None:
+        async def hold(is_over: Callable[[], bool], *touches: Touch) -> None:
             nonlocal number
-            end = time.monotonic() + seconds
-            while time.monotonic() < end:
+            while not is_over():
                 number += 1
                 frame = TouchFrame("table", time.monotonic(), touches)
                 sender.sendto(tuio_datagram(frame, number), ("127.0.0.1", port))
                 await asyncio.sleep(FRAME)
 
+        def after(seconds: float) -> Callable[[], bool]:
+            end = time.monotonic() + seconds
+            return lambda: time.monotonic() > end
+
+        def is_felt() -> bool:
+            return bool(patterns) and time.monotonic() > patterns[-1].time + FELT
+
         async def listen() -> None:
             async for event in client.events():
                 if event.data.get("drive"):
-                    patterns.append(event.data)
+                    patterns.append(event)
 
-        patterns: list[dict] = []
+        patterns: list[Notification] = []
         listening = asyncio.create_task(listen())
         async with client.armed("test", lease_s=60):
-            await hold(0.5)
+            await hold(after(0.5))
             for press in range(PRESSES):
                 since = time.monotonic()
-                await hold(HELD, Touch(press, PLACE[0] / LENGTH, 1 - PLACE[1] / WIDTH))
+                await hold(is_felt, Touch(press, PLACE[0] / LENGTH, 1 - PLACE[1] / WIDTH))
                 signals = await far_end.ask(
                     "signals", since_s=since, until_s=time.monotonic() - 0.02
                 )
-                (drive,) = [each["drive"] for each in patterns]
+                (pattern,) = patterns
+                drive = pattern.data["drive"]
                 (frequency,) = {tone["frequency_hz"] for tone in drive.values()}
-                (contact,) = patterns[0]["contacts"]
+                (contact,) = pattern.data["contacts"]
                 promised.append(contact["level_db_sl"])
                 patterns.clear()
                 samples = np.array(signals["sensors"]["tip"]["m_s2"])
@@ -117,7 +125,7 @@ async def felt_of_presses(folder: Path, *wire: str) -> tuple[list[float], list[f
                 rms = np.sqrt((samples[start : start + length] ** 2).mean())
                 threshold = detection_threshold(np.array(frequency))
                 levels.append(float(20 * np.log10(np.sqrt(2) * rms / threshold)))
-                await hold(PAUSE)
+                await hold(after(PAUSE))
         listening.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await listening

@@ -105,8 +105,8 @@ class SpectralModes:
 
     def _is_solved_alone(self, count: int) -> bool:
         """Whether so many further points take less without the operators."""
-        most = max(part.deflections for part in self._classes) // _PER_POINT
-        return self._operators is None and self._alone_count + count <= most
+        max_alone = max(part.deflections for part in self._classes) // _PER_POINT
+        return self._operators is None and self._alone_count + count <= max_alone
 
     def _solve_alone(self, points: FloatArray, at: _Observed) -> PointSolutions:
         """Solve for these points, without the operators."""

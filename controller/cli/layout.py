@@ -82,6 +82,9 @@ def check(
         raise typer.Exit(FAILED)
 
 
+_SHOWN_FROM = 0.05  # dB
+
+
 def _lines(each: "CheckedEffect") -> list[str]:
     """Format one effect of a region."""
     promised = (
@@ -94,6 +97,8 @@ def _lines(each: "CheckedEffect") -> list[str]:
         lines.append(f"  felt {_span(each.felt)} dB SL at {tones}")
     if each.contrasts:
         lines.append(f"  {_span(each.contrasts)} dB above what a resting second finger feels")
+    if each.held_back_db > _SHOWN_FROM:
+        lines.append(f"  up to {each.held_back_db:.1f} dB weaker so that it feels no more")
     return [*lines, *(f"  PROBLEM {problem}" for problem in each.problems)]
 
 

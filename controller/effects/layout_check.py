@@ -60,6 +60,11 @@ class CheckedEffect:
         ]
 
     @property
+    def held_back_db(self) -> float:
+        """By how much [dB] a touch is weaker at most so that the resting finger feels no more."""
+        return max((each.held_back_db for each in self.touches), default=0.0)
+
+    @property
     def frequencies(self) -> list[float]:
         """All frequencies that play [Hz], ascending."""
         return sorted({frequency for each in self.touches for frequency in each.frequencies})
@@ -73,6 +78,7 @@ class CheckedEffect:
             "promised_db_sl": self.promised_db_sl,
             "felt_db_sl": summary(self.felt),
             "felt_contrast_db": summary(self.contrasts),
+            "held_back_db": self.held_back_db,
             "frequency_hz": self.frequencies,
             "touches": len(self.touches),
             "problems": [*self.problems],

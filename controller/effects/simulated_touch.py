@@ -38,7 +38,8 @@ class SimulatedTouch:
     """A touch at a position [m], with a resting finger [m] or None.
 
     frequencies [Hz]; felt_db_sl: over the duration of the effect; resting_db_sl: the strongest that
-    the resting finger feels over as long, None without one; reason: why nothing plays.
+    the resting finger feels over as long, None without one; held_back_db: by how much it is weaker
+    for that finger; reason: why nothing plays.
     """
 
     at: Position
@@ -47,6 +48,7 @@ class SimulatedTouch:
     felt_db_sl: float | None = None
     resting_db_sl: float | None = None
     reason: str | None = None
+    held_back_db: float = 0.0
 
 
 class TouchSimulator:
@@ -111,7 +113,12 @@ class TouchSimulator:
             over = self._levels_at(transients, resting, bases, length=duration, until=end + _AFTER)
             resting_level = float(over[round(since * SAMPLE_RATE) :].max())
         return SimulatedTouch(
-            at, resting, tuple(frequency for frequency, _ in bases), level, resting_level
+            at,
+            resting,
+            tuple(frequency for frequency, _ in bases),
+            level,
+            resting_level,
+            held_back_db=answer.held_back_db,
         )
 
     def _loaded_plate(self, contacts: Sequence[Position]) -> PlateInTime:

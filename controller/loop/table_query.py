@@ -12,7 +12,7 @@ from controller.sources.contacts import Contact
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, decibels
-from model.table.effect_level import SHAPED_FROM, DriveLimits, EffectLevels
+from model.table.effect_level import SHAPED_FROM, DriveLimits, EffectLevels, allowed_quiet_db_sl
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, Pattern
 from model.table.pattern_choice import UnreachableLevel
 from model.table.question import MAX_LEVEL_DB_SL, Question
@@ -28,6 +28,8 @@ _SHORT_OF = 0.1  # dB; a level closer to the wanted one is reached
 class TableAnswer:
     """The question that was finally answered, its pattern, and the level felt of it [dB SL].
 
+    held_back_db: by how much it is weaker so that quiet fingers feel no more than promised.
+
     felt_db_sl: over the duration of a pulse whose level is felt, onset included, or the steady one
     in a band, both on the plate as modelled; else the steady level of nine of ten plates.
     """
@@ -35,6 +37,7 @@ class TableAnswer:
     question: Question
     pattern: Pattern
     felt_db_sl: float
+    held_back_db: float = 0.0
 
 
 def query_table(
@@ -55,14 +58,14 @@ def query_table(
         felt = pattern.level_db_sl
         if duration is not None and levels is not None:
             # Along the ramp of its duration, but no stronger: the neighbours feel it as long.
-            pattern, felt = levels.raised(
+            raised = levels.raised(
                 pattern,
+                question,
                 level_db_sl=math.inf,
                 duration=duration,
-                targets=question.targets,
                 limits=DriveLimits({n: tone.amplitude for n, tone in pattern.excitation.items()}),
-                is_shaped=question.envelopes,
             )
+            pattern, felt = raised.pattern, raised.level_db_sl
         return TableAnswer(question, pattern, felt)
     if duration is None and all(target.allow_weaker for _, target in targets):
         return _as_neighbours_allow(table, question, capabilities)
@@ -156,29 +159,29 @@ def _over_duration(
     """Return a pattern whose level is felt over a duration [s].
 
     Where the drive of the first answer cannot be raised enough, the table is asked for as much
-    more, which another frequency may reach.
+    more, which another frequency may reach. Quiet fingers feel no more of either than the first
+    one promises, or they stay unaware; the drive of the first is not lowered for them.
     """
     limits = DriveLimits(capabilities.max_amplitudes, capabilities.max_power, capabilities.slew)
     level = question.level_db_sl
 
-    def answer(question: Question) -> TableAnswer:
-        question, pattern = _query(table, question, allow_weaker=True)
-        raised, felt = levels.raised(
-            pattern,
-            level_db_sl=level,
-            duration=duration,
-            targets=question.targets,
-            limits=limits,
-            is_shaped=question.envelopes,
+    def raised(question: Question, pattern: Pattern, limits: DriveLimits) -> TableAnswer:
+        found = levels.raised(
+            pattern, question, level_db_sl=level, duration=duration, limits=limits
         )
-        return TableAnswer(question, raised, felt)
+        return TableAnswer(question, found.pattern, found.level_db_sl, found.held_back_db)
 
-    first = answer(question)
+    question, pattern = _query(table, question, allow_weaker=True)
+    first = raised(question, pattern, limits)
     missing = level - first.felt_db_sl
     if missing < _SHORT_OF:
         return first
     requested = min(first.pattern.level_db_sl + missing, MAX_LEVEL_DB_SL)
-    second = answer(replace(question, level_db_sl=requested))
+    allowed = None if pattern.quiet_level_db_sl is None else allowed_quiet_db_sl(pattern)
+    second = raised(
+        *_query(table, replace(question, level_db_sl=requested), allow_weaker=True),
+        replace(limits, quiet_db_sl=allowed),
+    )
     return max(first, second, key=lambda each: each.felt_db_sl)
 
 

@@ -44,13 +44,14 @@ class Fingertip:
             if getattr(self, key) == 0:
                 raise InputError(f"fingertip: {key} must be above 0 {unit}, got 0")
 
-    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
+    def dynamic_stiffness(self, omega: FloatArray | ComplexArray) -> ComplexArray:
         """Force on the plate per displacement of the contact at omega [rad/s], of its shape [N/m].
 
+        A complex omega is that of exp(i omega t).
         D = -omega² m_c + Z_p Z_b / (Z_p + Z_b), with Z_p = k + i omega c of the pulp and
         Z_b = k_j + i omega c_j - omega² m_p of the phalanx on its joint.
         """
-        w = np.asarray(omega, dtype=float)
+        w = np.asarray(omega)
         pulp = self.stiffness + 1j * w * self.damping
         phalanx = self.joint_stiffness + 1j * w * self.joint_damping - w**2 * self.phalanx_mass
         return np.asarray(pulp * phalanx / (pulp + phalanx) - w**2 * self.contact_mass)

@@ -6,29 +6,23 @@ is predicted from the response to the ramp of each ERA, and the drive is raised 
 """
 
 import math
-from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from model.arrays import ComplexArray
-from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import decibels, detection_threshold
-from model.table.pattern import ONSET_RAMP, Pattern
-from model.table.question import Point
+from model.structure.fingertip import fingertip_loads
+from model.table.pattern import IMPERCEPTIBLE_DB_SL, ONSET_RAMP, Pattern
+from model.table.question import Question
 from model.table.table import LocalizationTable
-from model.transients.onset import ramp_responses
+from model.transients.loaded_ramps import ramped_accelerations
 from model.transients.shaping import RISE
 from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes
 
 SHAPED_FROM = 0.2
 """Shortest duration [s] with a shaped onset, which settles in half of it."""
-
-_STEP = 0.001  # s; between the times of a mean, which is of a demodulated response
-_MAX_TIMES = 64
-_MAX_KEPT = 128  # responses of one frequency to one ramp, some 100 kB each
 
 
 def pulse_ramp(duration: float) -> float:
@@ -51,80 +45,120 @@ def shaped_gain_db(duration: float) -> float:
 
 @dataclass(frozen=True)
 class DriveLimits:
-    """Limits of a drive: largest amplitude [m] by ERA, sum of squared levels, rise of one [1/s]."""
+    """Limits of a drive.
+
+    amplitudes: largest ones [m], by ERA; power: sum of squared levels; slew: rise of one [1/s];
+    quiet_db_sl: level of quiet fingers over the duration up to which it may be raised, None for
+    those of the pattern's promise, or -10 dB SL; without it no drive is lowered for them.
+    """
 
     amplitudes: Mapping[str, float]
     power: float = math.inf
     slew: float = math.inf
+    quiet_db_sl: float | None = None
+
+
+@dataclass(frozen=True)
+class PulseGains:
+    """A vibration of limited duration compared with the steady one.
+
+    targets: level over the duration relative to the steady one [dB], of each; quiet_db_sl: level
+    over the duration at the loudest quiet point on the plate as modelled, None without one.
+    """
+
+    targets: list[float]
+    quiet_db_sl: float | None
+
+
+@dataclass(frozen=True)
+class RaisedPattern:
+    """A pattern, whose measures are the steady ones, and the level felt over a duration [dB SL].
+
+    held_back_db: by how much more it would have been raised but for the quiet fingers.
+    """
+
+    pattern: Pattern
+    level_db_sl: float
+    held_back_db: float
 
 
 class EffectLevels:
-    """Levels over limited durations on the plate of a table."""
+    """Levels over limited durations on the plate of a table, under the fingers of a question."""
 
     def __init__(self, table: LocalizationTable) -> None:
-        self._plate, self._threshold = table.in_time, table.threshold
+        self._table, self._plate = table, table.in_time
         self._strokes = {era.name: era.stroke for era in table.eras}
-        self._kept: OrderedDict[tuple[float, float, float], ComplexArray] = OrderedDict()
 
-    def gain_db(
-        self, excitation: Excitation, *, ramp: float, duration: float, targets: Sequence[Point]
-    ) -> list[float]:
-        """Level over the duration [s] along a plain ramp [s], relative to the steady one [dB].
-
-        One value for each target [m].
-        """
-        eras = self._plate.eras
-        frequencies, phasors = base_amplitudes(excitation, eras)
-        weights = phasors / [era.stroke for era in eras]
-        thresholds = detection_threshold(frequencies, self._threshold)
-        responses = [
-            np.tensordot(row, self._responses(frequency, ramp, duration), 1) / threshold
-            for frequency, row, threshold in zip(
-                frequencies.tolist(), weights, thresholds, strict=True
+    def gains_db(
+        self, excitation: Excitation, question: Question, *, ramp: float, duration: float
+    ) -> PulseGains:
+        """Levels over the duration [s] along a plain ramp [s], relative to steady ones."""
+        table, contacts, t = self._table, question.contacts, len(question.targets)
+        tips = table.read_fingertips(contacts)
+        k, p, r = tips.fine.shape
+        loads = fingertip_loads(table.fingertip, contacts, question.loads)
+        centres = tips.fine[: len(loads), 0].astype(float)
+        fingers = [(c, load.fingertip) for c, load in zip(centres, loads, strict=True)]
+        length = min(duration, SHAPED_FROM)  # the rest is steady
+        power, steady = np.zeros(k * p), np.zeros(k * p)
+        frequencies, bases = base_amplitudes(excitation, table.eras)
+        thresholds = detection_threshold(frequencies, table.threshold)
+        for frequency, base, threshold in zip(
+            frequencies.tolist(), bases, thresholds.tolist(), strict=True
+        ):
+            found = ramped_accelerations(
+                self._plate,
+                base,
+                frequency,
+                points=tips.fine.reshape(-1, r).astype(float),
+                fingers=fingers,
+                ramp=ramp,
+                duration=length,
             )
-        ]
-        gains = []
-        for x, y in targets:
-            plate = self._plate.reduced.plate
-            shapes = self._plate.shapes_at(fingertip_points(x, y, plate))
-            mean = fingertip_weights(x, y, plate)
-            power = sum(np.abs(each @ shapes.T) ** 2 for each in responses)
-            # The last row is the steady state.
-            felt, steady = np.sqrt(power[:-1].mean(axis=0)), np.sqrt(power[-1])
-            gains.append(float(decibels(felt @ mean / (steady @ mean))))
-        return gains
+            squares = np.abs(found / threshold) ** 2
+            share = length / duration
+            power += share * squares[:-1].mean(axis=0) + (1 - share) * squares[-1]
+            steady += squares[-1]
+        levels = np.sqrt(power).reshape(k, p)
+        weights = tips.fine_weights[:t].astype(float)
+        felt = (levels[:t] * weights).sum(axis=1)
+        gains = decibels(felt / (np.sqrt(steady).reshape(k, p)[:t] * weights).sum(axis=1))
+        loudest = float(decibels(levels[t:].max())) if k > t else None
+        return PulseGains(gains.tolist(), loudest)
 
     def raised(
         self,
         pattern: Pattern,
+        question: Question,
         *,
         level_db_sl: float,
         duration: float,
-        targets: Sequence[Point],
         limits: DriveLimits,
-        is_shaped: bool = False,
-    ) -> tuple[Pattern, float]:
+    ) -> RaisedPattern:
         """Raise or lower a pattern so that its weakest target feels a level over a duration [s].
 
-        As far as the limits allow; returns the pattern, whose measures are the steady ones, and the
-        level that is felt over the duration [dB SL].
+        As far as the limits allow.
         """
         room = self._headroom_db(pattern.excitation, limits)
+        is_shaped = question.envelopes
         ramp = pattern.ramp if is_shaped else pulse_ramp(duration)
         for _ in range(2):  # once more where the raised drive needs a longer ramp
-            gain = (
-                shaped_gain_db(duration)
-                if is_shaped
-                else min(
-                    self.gain_db(pattern.excitation, ramp=ramp, duration=duration, targets=targets)
-                )
-            )
-            raise_db = min(level_db_sl - pattern.level_db_sl - gain, room)
+            if is_shaped:
+                gain, allowed = shaped_gain_db(duration), math.inf
+            else:
+                gains = self.gains_db(pattern.excitation, question, ramp=ramp, duration=duration)
+                gain, allowed = min(gains.targets), _allowed_db(pattern, gains, limits)
+            wanted = min(level_db_sl - pattern.level_db_sl - gain, room)
+            raise_db = min(wanted, allowed)
             min_ramp = self._largest(pattern.excitation) * 10 ** (raise_db / 20) / limits.slew
             if min_ramp <= ramp:
                 break
             ramp = min_ramp
-        return replace(pattern.scaled(raise_db), ramp=ramp), pattern.level_db_sl + raise_db + gain
+        return RaisedPattern(
+            replace(pattern.scaled(raise_db), ramp=ramp),
+            level_db_sl=pattern.level_db_sl + raise_db + gain,
+            held_back_db=wanted - raise_db,
+        )
 
     def _largest(self, excitation: Excitation) -> float:
         """The highest level 0..1 of an ERA."""
@@ -143,18 +177,24 @@ class EffectLevels:
         # A little less, so that rounding to the steps of a wire stays within.
         return float(decibels(min([*room, math.sqrt(limits.power / power)]))) - 1e-3
 
-    def _responses(self, frequency: float, ramp: float, duration: float) -> ComplexArray:
-        """Demodulated accelerations of the reduced coordinates, (eras, n + 1, r), at full stroke.
 
-        At n times evenly over the duration, and in the steady state.
-        """
-        key = (frequency, ramp, duration)
-        if key not in self._kept:
-            count = min(_MAX_TIMES, max(1, math.ceil(duration / _STEP)))
-            times = duration * (np.arange(count) + 0.5) / count
-            omega = np.array([2 * math.pi * frequency])
-            self._kept[key] = ramp_responses(self._plate, omega, times, ramp, with_steady=True)[0]
-            if len(self._kept) > _MAX_KEPT:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(key)
-        return self._kept[key]
+def allowed_quiet_db_sl(pattern: Pattern) -> float:
+    """Level that quiet fingers may feel of a pattern as promised: its robust one, or unaware."""
+    promised = pattern.highest_quiet_level_db_sl
+    return IMPERCEPTIBLE_DB_SL if promised is None else max(promised, IMPERCEPTIBLE_DB_SL)
+
+
+def _allowed_db(pattern: Pattern, gains: PulseGains, limits: DriveLimits) -> float:
+    """By how much [dB] the quiet fingers allow to raise a pattern.
+
+    What they feel over the duration is the ringing of the modelled plate, and what other plates
+    add to the steady vibration, which lags as at the targets.
+    """
+    promised = pattern.highest_quiet_level_db_sl
+    if promised is None or gains.quiet_db_sl is None:
+        return math.inf
+    steady = promised + min(gains.targets)
+    felt = 10 * math.log10(10 ** (gains.quiet_db_sl / 10) + 10 ** (steady / 10))
+    if limits.quiet_db_sl is None:
+        return max(0.0, allowed_quiet_db_sl(pattern) - felt)
+    return limits.quiet_db_sl - felt

@@ -60,18 +60,12 @@ class RampedOnsets:
 
 
 def ramp_responses(
-    plate: PlateInTime,
-    omega: FloatArray,
-    times: FloatArray,
-    ramp: float,
-    *,
-    with_steady: bool = False,
+    plate: PlateInTime, omega: FloatArray, times: FloatArray, ramp: float
 ) -> ComplexArray:
     """Acceleration of the reduced coordinates to each ERA's ramp alone, (f, eras, n, r).
 
     Demodulated: without the factor exp(i omega t). Before the ramp is over the base moves as the
-    sum of three exponentials, see `model.transients.base_motion.fade`. with_steady: one time more,
-    the steady state.
+    sum of three exponentials, see `model.transients.base_motion.fade`.
     """
     f, eras = len(omega), len(plate.eras)
     side = np.pi / ramp
@@ -96,7 +90,4 @@ def ramp_responses(
     later = np.exp((times[~rising, None] - ramp) * rates[:, None, :])[:, None]
     free = start[:, :, None] * decay
     free[:, :, ~rising] += end[:, :, None] * later
-    responses = forced + free @ plate.acceleration.T
-    if with_steady:
-        responses = np.concatenate([responses, accelerations[:, :, :1]], axis=2)
-    return np.asarray(responses)
+    return np.asarray(forced + free @ plate.acceleration.T)

@@ -60,7 +60,7 @@ class PlateInTime:
 
     eigenvalues (2 r,) [1/s], in conjugate pairs; vectors (2 r, 2 r): displacement and velocity of
     the r coordinates, the reduced plate's and one for each phalanx, are vectors @ z; inverse: of
-    the vectors; participation (2 r, eras).
+    the vectors; participation (2 r, eras); forced (2 r, r): z' by a force on each coordinate.
     """
 
     reduced: Reduced
@@ -69,6 +69,7 @@ class PlateInTime:
     vectors: ComplexArray
     inverse: ComplexArray
     participation: ComplexArray
+    forced: ComplexArray
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Shapes of all coordinates at points (p, 2) [m], (p, r)."""
@@ -205,9 +206,15 @@ def plate_in_time(
         )
     input_shapes = np.zeros((r, len(eras)))
     input_shapes[: attachment_shapes.shape[1]] = attachment_shapes[: len(eras)].T
-    input_matrix = np.vstack([np.zeros((r, len(eras))), inverse @ input_shapes])
+    forced = np.asarray(inverse_vectors[:, r:] @ inverse)
     return PlateInTime(
-        reduced, tuple(eras), eigenvalues, vectors, inverse_vectors, inverse_vectors @ input_matrix
+        reduced,
+        tuple(eras),
+        eigenvalues,
+        vectors,
+        inverse_vectors,
+        forced @ input_shapes,
+        forced,
     )
 
 

@@ -68,7 +68,8 @@ def test_check_says_what_the_plate_behind_a_wire_makes_felt(effect: Effect, rest
     assert touch.frequencies == (felt.frequency,)
     assert touch.felt_db_sl is not None
     assert felt.level_db_sl(duration, since=since) == pytest.approx(touch.felt_db_sl, abs=1.0)
-    assert effect.level - 0.5 <= touch.felt_db_sl <= effect.level + 2.0
+    expected = effect.level - touch.held_back_db
+    assert expected - 0.5 <= touch.felt_db_sl <= expected + 2.0
 
 
 def test_check_says_by_how_much_a_level_cannot_be_had() -> None:
@@ -158,11 +159,12 @@ def test_command_prints_one_object_and_writes_a_picture(tmp_path: Path) -> None:
     assert key["problems"] == []
     assert set(key["felt_db_sl"]) == {"min", "median", "max"}
     assert 18 <= key["felt_db_sl"]["min"] <= key["felt_db_sl"]["max"] <= 22
-    assert len(strip["problems"]) == 1
+    assert len(strip["problems"]) == 2  # its level beside a second finger, and its frequency
+    assert strip["held_back_db"] > 2.0 > key["held_back_db"] > 0.0
 
 
 def test_command_ends_with_zero_for_a_good_layout(tmp_path: Path) -> None:
     """With a band for the slider, too."""
-    status, output = run(tmp_path, LAYOUT.replace("notches}\n", "notches, band: [90, 150]}\n"))
+    status, output = run(tmp_path, LAYOUT.replace("notches}\n", "notches, band: [130, 190]}\n"))
     assert status == 0
     assert "strip, on_move: notches, 20 dB SL" in output

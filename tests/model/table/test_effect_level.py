@@ -7,14 +7,17 @@ import numpy as np
 import pytest
 
 from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.perception import detection_threshold
 from model.table.effect_level import DriveLimits, EffectLevels, pulse_ramp, shaped_gain_db
 from model.table.pattern import Pattern
+from model.table.question import Question
 from model.transients.envelope import ramped_onset
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.vibration.excitation import Excitation, Tone
 from small_table import small_table
 
-TARGET = (0.09, 0.07)
+TARGET, QUIET = (0.09, 0.07), (0.24, 0.17)
+ALONE = Question((TARGET,))
 STROKE = 100e-6  # m
 
 
@@ -31,27 +34,50 @@ def pattern(level_db_sl: float = 20.0, *, level: float = 0.2) -> Pattern:
     return Pattern(excitation(110.0, level=level), 0.04, level_db_sl, None, None)
 
 
+@pytest.mark.parametrize("loads", [(), (2.5, 0.4)])
 @pytest.mark.parametrize("frequency", [60.0, 110.0, 250.0])
 @pytest.mark.parametrize("duration", [0.02, 0.04, 0.15])
-def test_gain_is_that_of_the_plate_in_time(frequency: float, duration: float) -> None:
+def test_gain_is_that_of_the_plate_in_time(
+    frequency: float, duration: float, loads: tuple[float, ...]
+) -> None:
     """Root mean square of samples over the duration, relative to a second later, within 0.5 dB.
 
-    A carrier of 60 Hz has little more than a period in 20 ms, where its own phase counts: 1.5 dB.
+    Under a finger, and at the loudest point of another one, both on the plate. A carrier of 60 Hz
+    has little more than a period in 20 ms, where its own phase counts: 1.5 dB.
     """
     table = small_table()
     drive, ramp = excitation(frequency), pulse_ramp(duration)
-    (found,) = EffectLevels(table).gain_db(drive, ramp=ramp, duration=duration, targets=[TARGET])
-    acceleration = Transients(table.in_time).acceleration(
-        ramped_onset(drive, table.eras, ramp=ramp),
-        fingertip_points(*TARGET, table.plate),
-        duration=2.0,
+    question = Question((TARGET,), (QUIET,), loads=loads)
+    gains = EffectLevels(table).gains_db(drive, question, ramp=ramp, duration=duration)
+    points = [fingertip_points(*at, table.plate) for at in (TARGET, QUIET)]
+    acceleration = Transients(table.in_time_under((TARGET, QUIET), loads)).acceleration(
+        ramped_onset(drive, table.eras, ramp=ramp), np.concatenate(points), duration=2.0
     )
     weights = fingertip_weights(*TARGET, table.plate)
     count = round(duration * SAMPLE_RATE)
-    first = np.sqrt((acceleration[:count] ** 2).mean(axis=0)) @ weights
-    steady = np.sqrt((acceleration[-round(0.5 * SAMPLE_RATE) :] ** 2).mean(axis=0)) @ weights
+    first = np.sqrt((acceleration[:count] ** 2).mean(axis=0))
+    steady = np.sqrt((acceleration[-round(0.5 * SAMPLE_RATE) :] ** 2).mean(axis=0))
+    at_target, at_quiet = np.split(first, [len(points[0])])
+    lag = 20 * math.log10(at_target @ weights / (steady[: len(weights)] @ weights))
+    quiet = math.sqrt(2) * at_quiet.max() / detection_threshold(np.array(frequency))
     tolerance = 1.5 if frequency * duration < 2 else 0.5
-    assert found == pytest.approx(20 * math.log10(first / steady), abs=tolerance)
+    assert gains.targets == pytest.approx([lag], abs=tolerance)
+    assert gains.quiet_db_sl == pytest.approx(20 * math.log10(quiet), abs=tolerance + 0.3)
+
+
+def test_fingers_lag_otherwise_than_the_plate_alone() -> None:
+    """By more than half a decibel at some frequency."""
+    table, question = small_table(), Question((TARGET,), (QUIET,))
+    lags = []
+    for fingertip in (table.fingertip, None):
+        levels = EffectLevels(replace(table, fingertip=fingertip))
+        lags.append(
+            [
+                levels.gains_db(excitation(f), question, ramp=0.01, duration=0.04).targets[0]
+                for f in table.frequencies.tolist()
+            ]
+        )
+    assert np.abs(np.subtract(*lags)).max() > 0.5
 
 
 def test_shaped_gain_is_that_of_a_raised_cosine() -> None:
@@ -63,9 +89,11 @@ def test_shaped_gain_is_that_of_a_raised_cosine() -> None:
 
 def raised(limits: DriveLimits, *, level_db_sl: float = 20.0) -> tuple[Pattern, float, float]:
     """The raised pattern, its felt level, and the level 0..1 of SW."""
-    found, felt = EffectLevels(small_table()).raised(
-        pattern(), level_db_sl=level_db_sl, duration=0.04, targets=[TARGET], limits=limits
+    raised = EffectLevels(small_table()).raised(
+        pattern(), ALONE, level_db_sl=level_db_sl, duration=0.04, limits=limits
     )
+    found, felt = raised.pattern, raised.level_db_sl
+    assert raised.held_back_db == 0
     return found, felt, found.excitation["SW"].amplitude / STROKE
 
 
@@ -93,8 +121,10 @@ def test_drive_stays_within_its_limits(limits: DriveLimits, level: float) -> Non
     """Of 40 dB more it gives what they allow, and says how much is felt."""
     found, felt, reached = raised(limits, level_db_sl=60.0)
     assert reached == pytest.approx(level, rel=1e-3)
-    (lag,) = EffectLevels(small_table()).gain_db(
-        found.excitation, ramp=0.01, duration=0.04, targets=[TARGET]
+    (lag,) = (
+        EffectLevels(small_table())
+        .gains_db(found.excitation, ALONE, ramp=0.01, duration=0.04)
+        .targets
     )
     assert felt == pytest.approx(20 + 20 * math.log10(level / 0.2) + lag, abs=0.01)
 
@@ -104,3 +134,41 @@ def test_ramp_is_as_long_as_the_rise_of_levels_allows() -> None:
     slow, _, level = raised(replace(DriveLimits(FULL), slew=8.0))
     assert slow.ramp == pytest.approx(level / 8.0, rel=0.1)
     assert slow.ramp > 0.02
+
+
+@pytest.mark.parametrize(
+    ("promised", "limit", "raised_db"),
+    [
+        (60.0, None, 2.0),  # promised more than is felt
+        (-11.0, None, 0.0),  # what the plate rings is more than is promised: no raise
+        (-11.0, -50.0, None),  # nor is another answer to be louder than a limit
+    ],
+)
+def test_quiet_fingers_limit_a_raise(
+    promised: float, limit: float | None, raised_db: float | None
+) -> None:
+    """By what they feel over the duration, of 2 dB more; without a limit nothing is lowered.
+
+    The pattern's own level is 2 dB below the wanted one, lag included.
+    """
+    levels, question = EffectLevels(small_table()), Question((TARGET,), (QUIET,))
+    gains = levels.gains_db(excitation(110.0), question, ramp=0.01, duration=0.04)
+    assert gains.quiet_db_sl is not None
+    answer = levels.raised(
+        replace(pattern(), quiet_level_db_sl=promised),
+        question,
+        level_db_sl=22.0 + gains.targets[0],
+        duration=0.04,
+        limits=DriveLimits(FULL, quiet_db_sl=limit),
+    )
+    found = answer.pattern
+    raised = answer.level_db_sl - 20.0 - gains.targets[0]
+    assert answer.held_back_db == pytest.approx(2.0 - raised)
+    assert 20 * math.log10(found.excitation["SW"].amplitude / (0.2 * STROKE)) == pytest.approx(
+        raised
+    )
+    if raised_db is not None:
+        assert raised == pytest.approx(raised_db, abs=1e-6)
+    else:
+        power = 10 ** (gains.quiet_db_sl / 10) + 10 ** ((promised + gains.targets[0]) / 10)
+        assert raised == pytest.approx(-50.0 - 10 * math.log10(power), abs=1e-6)

@@ -31,7 +31,7 @@ FLAGS = (
     "about:blank",
 )
 STARTING = 60.0  # s; a loaded machine takes its time
-WAITING = 30.0  # s; for anything that should be seen
+WAITING = 60.0  # s; for anything that should be seen
 
 
 class Navigated(Exception):

@@ -26,7 +26,7 @@ from rig_files import write_rig
 from small_table import small_table
 from wires import WIRES, FarSide, far_side
 
-PATIENCE = 20.0  # s; generous, for a loaded machine
+PATIENCE = 60.0  # s; generous, for a loaded machine
 PLACE = (0.1, 0.1)
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 

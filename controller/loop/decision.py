@@ -37,6 +37,8 @@ RELEASE_RAMP = 0.010
 MIN_VALID_FOR = 2.0
 _VALIDITY_MARGIN = 0.2  # s; after the contact is lifted, for late frames
 _MIN_LEFT = 0.001  # s; of a pulse that is about to end
+# s; a plate rings for 50 ms to a second after a vibration, louder than a localized onset is quiet.
+_RING_DOWN = 1.0
 _ENDINGS_MARGIN = 0.1  # s; endings are loaded and committed in less
 
 _logger = logging.getLogger(__name__)
@@ -46,7 +48,8 @@ _logger = logging.getLogger(__name__)
 class Decision:
     """A selection and what the amplifiers are to play for it.
 
-    from_rest: whether nothing played before; triggered_at [s]: when the change arrived.
+    from_rest: whether nothing has played for a second, so that the plate is at rest;
+    triggered_at [s]: when the change arrived.
     sets: None if all channels are silent already; pattern: with the ramp and onset of the sets,
     None for silence; adds_endings_only: whether the sets only add endings to the playback; refusal:
     why a guard refused the pattern, which makes it silence; retry_at [s]: when the guard would pass
@@ -121,6 +124,7 @@ class Decider:
         self._selected: Selection | None = None
         self._playing = self._playing_before = _Playback()
         self._triggered_at: float | None = None
+        self._played_until = -math.inf  # s; as far as known
 
     @property
     def capabilities(self) -> PlaybackCapabilities:
@@ -273,17 +277,20 @@ class Decider:
         contacts, playing = self._tracker.contacts, self._playing
         triggered_at = now if self._triggered_at is None else min(self._triggered_at, now)
         self._triggered_at = None
+        if playing.confirmed_commands:
+            self._played_until = now
+        from_rest = now - self._played_until >= _RING_DOWN
         decision, has_failed = None, False
         try:
             selection = self._select(contacts, now)
             is_new = selection != self._selected or _is_due(playing.retry_at, now)
-            draft = Decision(contacts, selection, not playing.confirmed_commands, triggered_at)
+            draft = Decision(contacts, selection, from_rest, triggered_at)
             decision = self._with_pattern(draft, now) if is_new else self._with_endings(draft, now)
         except Exception as error:
             has_failed = True
             selection = Selection((), contacts, None, failure_text(error))
             is_new = selection != self._selected
-            draft = Decision(contacts, selection, not playing.confirmed_commands, triggered_at)
+            draft = Decision(contacts, selection, from_rest, triggered_at)
             if is_new:
                 _logger.exception("loop: decision failed, silencing all channels")
         if decision is None and is_new:

@@ -20,7 +20,7 @@ class Applied:
     contacts: all, in order of arrival; targets: a prediction for each; quiet: quiet contacts;
     pattern: as it is played, with its ramp and envelopes; drive: what the amplifiers play, by ERA,
     without silent ones; latency [s]: from the touch frame to the last byte of the command on the
-    wire; time [s] of that byte; from_rest: whether nothing played before.
+    wire; time [s] of that byte; from_rest: whether the plate was at rest.
     """
 
     contacts: tuple[Contact, ...]
@@ -39,7 +39,8 @@ class Applied:
         """Predicted contrast over the first 100 ms [dB], with the onset as it is played.
 
         Computed when it is first read, in about two milliseconds, so that no touch waits for it.
-        None without quiet contacts, after another pattern, or without `timing`.
+        None without quiet contacts, within a second of another pattern, whose ringing it does not
+        include, or without `timing`.
         """
         if self.timing is None or self.question is None or not (self.from_rest and self.quiet):
             return None

@@ -103,6 +103,18 @@ async def test_controller_decides_anew_for_a_load_that_doubles_not_for_one_that_
 
 
 @in_virtual_time
+async def test_touch_is_from_rest_a_second_after_the_last_vibration() -> None:
+    """Not while the plate still rings after it, where an onset has another contrast."""
+    async with running() as bench:
+        for pause in (0.3, 0.9, 1.2):
+            await bench.hold(FINGER, seconds=0.2)
+            bench.touch()
+            await asyncio.sleep(pause)
+        await bench.hold(FINGER, seconds=0.1)
+        assert [each.from_rest for each in bench.reports.applied] == [True, False, False, True]
+
+
+@in_virtual_time
 async def test_touch_is_being_prepared_until_its_set_is_sent() -> None:
     """Not while its reply is awaited; nor for a frame without a change or without a new set."""
     async with running() as bench:

@@ -37,8 +37,8 @@ RELEASE_RAMP = 0.010
 MIN_VALID_FOR = 2.0
 _VALIDITY_MARGIN = 0.2  # s; after the contact is lifted, for late frames
 _MIN_LEFT = 0.001  # s; of a pulse that is about to end
-# s; a plate rings for 50 ms to a second after a vibration, louder than a localized onset is quiet.
-_RING_DOWN = 1.0
+# s; after a vibration a plate first rings louder than the next onset is at a quiet finger.
+_RING_DOWN = 0.4
 _ENDINGS_MARGIN = 0.1  # s; endings are loaded and committed in less
 
 _logger = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ _logger = logging.getLogger(__name__)
 class Decision:
     """A selection and what the amplifiers are to play for it.
 
-    from_rest: whether nothing has played for a second, so that the plate is at rest;
+    from_rest: whether nothing has played for 0.4 s, so that the plate is at rest;
     triggered_at [s]: when the change arrived.
     sets: None if all channels are silent already; pattern: with the ramp and onset of the sets,
     None for silence; adds_endings_only: whether the sets only add endings to the playback; refusal:

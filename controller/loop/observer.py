@@ -39,7 +39,7 @@ class Applied:
         """Predicted contrast over the first 100 ms [dB], with the onset as it is played.
 
         Computed when it is first read, in about two milliseconds, so that no touch waits for it.
-        None without quiet contacts, within a second of another pattern, whose ringing it does not
+        None without quiet contacts, within 0.4 s of another pattern, whose ringing it does not
         include, or without `timing`.
         """
         if self.timing is None or self.question is None or not (self.from_rest and self.quiet):

@@ -20,6 +20,7 @@ from drivers.command import CommandSet
 from drivers.errors import CommandRefused, LinkError, LinkTimeout
 from drivers.line.priority import PREEMPTION_GRACE
 from drivers.operation.watchdog import HEARTBEAT
+from drivers.protocol.definition import token_after
 from drivers.protocol.messages import (
     AmplifierEvent,
     AmplifierState,
@@ -498,7 +499,8 @@ async def test_amplifier_that_plays_another_set_after_a_stall_is_stopped() -> No
         await daemon.handle(ARM)
         await asyncio.sleep(0.02)
         await stall(daemon, 0.15)
-        daemon.far_end.obey(Apply(CommandSet(7, (), ramp=0.0, valid_for=0.0)))
+        newer = token_after(daemon.far_end.status().token)
+        daemon.far_end.obey(Apply(CommandSet(newer, (), ramp=0.0, valid_for=0.0)))
         await asyncio.sleep(0.2)
         assert daemon.state is DaemonState.FAULT
         assert daemon.far_end.requests(Stop)

@@ -129,9 +129,11 @@ class ShapedTone:
         return here + (there - here) * (steps - before)
 
     def fade_out(self, time: float, *, ramp: float) -> "FadingTone | ShapedTone":
-        """Fade from the present amplitude, within ramp [s], unless it ends sooner."""
-        if self.silent_from <= time + ramp:
-            return self
+        """Fade from the present amplitude within ramp [s], or by its own end where that is sooner.
+
+        Without its further knots, which may be higher.
+        """
+        ramp = max(0.0, min(ramp, self.silent_from - time))
         reached = self.amplitude(time)
         return FadingTone(self.frequency, reached, self.origin, time, ramp, 1.0, 0.0)
 

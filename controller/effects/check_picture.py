@@ -37,7 +37,7 @@ def check_figure(
     ratio = table.plate.width / table.plate.length
     figure = Figure(figsize=(18.0, 5.0 * ratio + 1.6), layout="constrained")
     panels: list[tuple[str, Callable[[CheckedEffect, SimulatedTouch], float | None]]] = [
-        ("felt less promised / dB", _off_level),
+        ("felt minus promised / dB", _off_level),
         ("frequency / Hz", _frequency),
         ("above what a resting second finger feels / dB", _contrast),
     ]

@@ -28,10 +28,12 @@ class LoadingTimes:
         self._pause = FIRST_PAUSE  # the next
         self._resumes = float("-inf")
         self._last = 0.0
+        self._was_given_up = False
 
     def note(self, duration: float, *, now: float, is_late: bool = False) -> None:
         """Note that a loading took so long [s]; is_late: and was given up."""
         self._last = duration
+        self._was_given_up = is_late
         if duration <= self._max_loading_time and not is_late:
             self._slow_in_a_row = 0
             self._in_time_in_a_row += 1
@@ -53,8 +55,12 @@ class LoadingTimes:
         left = self._resumes - now
         if left <= 0:
             return None
+        took = (
+            f"given up after {1000 * self._last:.0f} ms since it would have exceeded"
+            if self._was_given_up
+            else f"took {1000 * self._last:.0f} ms, more than"
+        )
         return (
-            f"loading envelopes took {1000 * self._last:.0f} ms, more than the "
-            f"{1000 * self._max_loading_time:.0f} ms that a touch may wait; retrying in "
-            f"{left:.0f} s; use a faster wire, or allow a longer wait"
+            f"loading envelopes {took} the {1000 * self._max_loading_time:.0f} ms that a touch may "
+            f"wait; retrying in {left:.0f} s; use a faster wire, or allow a longer wait"
         )

@@ -187,6 +187,8 @@ class SetBuilder:
 
         before: sets that are played later but were built already.
         """
+        if before is not None:
+            before = before.plain or before  # which was built first, and may take its place
         token = self._next_token() if before is None else before.token - 1
         return SafeSets(
             {

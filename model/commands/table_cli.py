@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from model.commands.options import JsonOption, TableArgument
+from model.rig.uncertainty import Uncertainty
 
 table_app = typer.Typer(help="Build, query and check localization tables.")
 
@@ -86,10 +87,10 @@ def query(
     if as_json:
         print(json.dumps(answer))
     else:
-        _print_answer(answer)
+        _print_answer(answer, table.uncertainty)
 
 
-def _print_answer(answer: dict[str, Any]) -> None:
+def _print_answer(answer: dict[str, Any], uncertainty: Uncertainty) -> None:
     for era, tone in answer["drive"].items():
         print(
             f"{era:4s} {tone['frequency_hz']:7.2f} Hz  level {tone['level']:.4f}  "
@@ -107,26 +108,32 @@ def _print_answer(answer: dict[str, Any]) -> None:
             ("  typically", answer["median_felt_contrast_db"], "dB"),
             ("  as modelled", answer["felt_contrast_db"], "dB"),
             ("  as acceleration", answer["robust_contrast_db"], "dB or more"),
-            ("  in the first 100 ms", answer["transient_contrast_db"], "dB"),
+            ("  in the first 100 ms", answer["transient_contrast_db"], "dB as modelled"),
             (
                 "loudest quiet finger",
                 answer["robust_quiet_level_db_sl"],
                 f"dB SL or less, {awareness}",
             ),
-            ("level that leaves it at -10", answer["usable_level_db_sl"], "dB SL"),
+            ("level that leaves it at -10", answer["usable_level_db_sl"], _usable(answer)),
         ]
     else:
         rows += [
-            ("contrast to the rest of the plate", answer["surroundings_contrast_db"], "dB"),
-            ("  to its 95th percentile", answer["surroundings_contrast_95_db"], "dB or more"),
+            ("contrast to rest of the plate", answer["surroundings_contrast_db"], "dB as modelled"),
+            ("  to its 95th percentile", answer["surroundings_contrast_95_db"], "dB as modelled"),
             ("area above half the target", 1e4 * answer["area_above_half_m2"], "cm²"),
             ("energy within 5 cm", 100 * answer["energy_share_near"], "%"),
         ]
-    rows.append(("residual after the end", answer["residual_db"], "dB"))
+    rows.append(("residual after the end", answer["residual_db"], "dB as modelled"))
     for name, value, unit in rows:
         print(f"{name:30s} {value:6.1f} {unit}")
-    print("'or more', 'or less': on nine of ten plates within the rig's uncertainty")
+    print(f"'or more', 'or less': nine of ten plates within the rig's uncertainty ({uncertainty})")
     print(f"solved in {1000 * answer['solve_time_s']:.1f} ms")
+
+
+def _usable(answer: dict[str, Any]) -> str:
+    """The unit of the level that leaves quiet fingers at -10, judged up to the level that plays."""
+    is_bound = answer["usable_level_db_sl"] >= answer["level_db_sl"]
+    return "dB SL or more" if is_bound else "dB SL"
 
 
 def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> None:

@@ -34,6 +34,20 @@ class Uncertainty:
         """A rig whose every parameter is known exactly."""
         return cls(0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
+    def __str__(self) -> str:
+        """Its terms that are not none, as 'gain 5 %, phase 5°, damping x 1.5'."""
+        percents = [
+            f"{key} {100 * getattr(self, key):g} %"
+            for key in ("gain", "thickness", "stiffness")
+            if getattr(self, key)
+        ]
+        others = [
+            f"phase {self.phase_deg:g}°" if self.phase_deg else "",
+            f"damping x {self.damping:g}" if self.damping > 1 else "",
+            f"fingertip x {math.exp(self.fingertip):.2g}" if self.fingertip else "",
+        ]
+        return ", ".join([*percents, *filter(None, others)]) or "none"
+
     @property
     def gain_variance(self) -> float:
         """Mean square of a channel's relative error, phase included: (1 + g²) exp(p²) - 1.

@@ -3,6 +3,7 @@
 import cmath
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -87,6 +88,17 @@ def test_fade_interrupted_is_continuous() -> None:
         100.0: pytest.approx(0.03),
         150.0: pytest.approx(0.07),
     }
+
+
+@pytest.mark.parametrize("ramp", [0.001, 0.02, 1.0])
+def test_envelope_that_is_stopped_does_not_rise(ramp: float) -> None:
+    """Of an ending that still rises: it falls from its present level, silent by the sooner end."""
+    ending = ShapedTone(100.0, 0.0, 0.0, 0.01, (0.2 + 0j, 0.3 + 0j, 0.9 + 0j, 0.4 + 0j, 0j))
+    stopped = fade_to((ending,), 0.01, ramp=ramp)
+    levels = [level_of(stopped, 0.01 + 0.0005 * step) for step in range(100)]
+    assert levels[0] == pytest.approx(0.3)
+    assert all(here >= later for here, later in pairwise(levels))
+    assert max(tone.silent_from for tone in stopped) == pytest.approx(0.01 + min(ramp, 0.03))
 
 
 @pytest.mark.parametrize("start", [0.0, 1000.1, 23193.384082])

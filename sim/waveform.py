@@ -1,7 +1,7 @@
 """Output of a channel in time: a sum of sinusoids that fade, or follow an envelope.
 
 Every change is a cross-fade along a raised cosine, whose two gains add up to one. At most two
-voices sound, each of one frequency and phase. A third set leaves of the oldest its present value,
+voices sound, each of one frequency. A third frequency leaves of the oldest voice its present value,
 which decays: a tone of 0 Hz here.
 """
 
@@ -9,7 +9,7 @@ import cmath
 import math
 from collections import defaultdict
 from dataclasses import dataclass, replace
-from itertools import groupby, pairwise
+from itertools import pairwise
 from typing import TypeAlias
 
 from model.transients.base_motion import Term, fade
@@ -174,14 +174,14 @@ def fade_to(
 ) -> Output:
     """The output after a command at a time [s] to fade to a tone within ramp [s].
 
-    amplitude in full strokes, 0 for silence. Its phase counts from `time`; with keep_phase a
-    lasting tone of the same frequency goes on from its present amplitude.
+    amplitude in full strokes, 0 for silence. Its phase counts from `time`; with keep_phase as
+    before, if a tone of the same frequency lasts.
     """
     if amplitude == 0:
         return _faded(playing, time, ramp=ramp)
-    voice, others = _continued(playing, time, frequency if keep_phase else None)
-    origin = voice[0].origin if voice else time
-    here = sum(tone.amplitude(time) for tone in voice)
+    origin = _kept_origin(playing, frequency) if keep_phase else None
+    origin = time if origin is None else origin
+    here, others = _split(playing, time, frequency, origin)
     gain_from = 1.0 if ramp == 0 else 0.0
     before = (FadingTone(frequency, here, origin, time, ramp, 1.0, 0.0),) if here and ramp else ()
     after = FadingTone(frequency, amplitude, origin, time, ramp, gain_from, 1.0)
@@ -205,49 +205,67 @@ def shape_to(
     same frequency goes on from its present amplitude; else the new one begins at zero. All others
     fade out within ramp.
     """
-    voice, others = _continued(playing, time, frequency if keep_phase else None)
-    origin = voice[0].origin if voice else time
-    begin = sum((tone.amplitude(time) for tone in voice), start=0j)
-    shaped = ShapedTone(frequency, origin, time, step, (begin, *knots, amplitude))
-    return (*_one_voice(_faded(others, time, ramp=ramp), time), shaped)
+    origin = _kept_origin(playing, frequency) if keep_phase else None
+    begin, others = 0j, playing
+    if origin is not None:
+        begin, others = _split(playing, time, frequency, origin)
+    shaped = ShapedTone(
+        frequency, time if origin is None else origin, time, step, (begin, *knots, amplitude)
+    )
+    fading = _faded(others, time, ramp=ramp)
+    same = tuple(tone for tone in fading if tone.frequency == frequency)
+    rest = tuple(tone for tone in fading if tone.frequency != frequency)
+    return (*_one_voice(rest, time, has_room=not same), *same, shaped)
 
 
-def _continued(playing: Output, time: float, frequency: float | None) -> tuple[Output, Output]:
-    """The tones of the voice that goes on at a frequency [Hz], None for none, and all others."""
-    lasting = next((tone for tone in playing if tone.is_lasting), None)
-    if lasting is None or lasting.frequency != frequency:
-        return (), playing
-    voice = tuple(tone for tone in playing if _voice_of(tone) == _voice_of(lasting))
-    others = tuple(tone for tone in playing if _voice_of(tone) != _voice_of(lasting))
-    return tuple(tone for tone in voice if tone.silent_from > time), others
+def _kept_origin(playing: Output, frequency: float) -> float | None:
+    """Origin of the phase of a lasting tone of this frequency [Hz]; None without one."""
+    same = (tone.origin for tone in playing if tone.is_lasting and tone.frequency == frequency)
+    return next(same, None)
 
 
-def _voice_of(tone: ToneSegment) -> tuple[float, float]:
-    """What the tones of one voice have in common: their oscillator."""
-    return tone.frequency, tone.origin
+def _split(playing: Output, time: float, frequency: float, origin: float) -> tuple[complex, Output]:
+    """The amplitude of a frequency [Hz] at a time, its phase from origin [s], and the rest."""
+    same = [tone for tone in playing if tone.frequency == frequency and tone.silent_from > time]
+    here = sum(
+        (
+            tone.amplitude(time) * cmath.exp(2j * math.pi * frequency * (origin - tone.origin))
+            for tone in same
+        ),
+        start=0j,
+    )
+    return here, tuple(tone for tone in playing if tone.frequency != frequency)
 
 
 def _faded(playing: Output, time: float, *, ramp: float) -> Output:
-    """These tones, silent within ramp [s]; a voice of several as one."""
+    """These tones, silent within ramp [s]; several of one frequency as one."""
     faded: list[ToneSegment] = []
-    for (frequency, origin), tones in groupby(playing, key=_voice_of):
-        voice = tuple(tones)
-        if len(voice) > 1 and max(tone.silent_from for tone in voice) > time + ramp:
-            here = sum(tone.amplitude(time) for tone in voice)
-            voice = (FadingTone(frequency, here, origin, time, ramp, 1.0, 0.0),)
-        faded += (tone.fade_out(time, ramp=ramp) for tone in voice)
+    for frequency in dict.fromkeys(tone.frequency for tone in playing):
+        same = [tone for tone in playing if tone.frequency == frequency]
+        if len(same) == 1:
+            faded.append(same[0].fade_out(time, ramp=ramp))
+            continue
+        left = min(ramp, max(tone.silent_from for tone in same) - time)
+        here, _ = _split(playing, time, frequency, time)
+        faded.append(FadingTone(frequency, here, time, time, max(left, 0.0), 1.0, 0.0))
     return tuple(tone for tone in faded if tone.silent_from > time)
 
 
-def _one_voice(fading: Output, time: float) -> Output:
-    """The newest of the fading voices, and the present value of the others, which decays."""
-    voices = [_voice_of(tone) for tone in fading if tone.frequency > 0]
-    if len(set(voices)) < 2:
+def _one_voice(fading: Output, time: float, *, has_room: bool = True) -> Output:
+    """The newest of the fading voices, and the present value of the others, which decays.
+
+    has_room: whether there is an oscillator for one at all.
+    """
+    voices = [tone for tone in fading if tone.frequency > 0]
+    kept = voices[-1:] if has_room else []
+    if len(kept) == len(voices):
         return fading
-    kept = tuple(tone for tone in fading if _voice_of(tone) == voices[-1])
-    phases = [(tone, 2j * math.pi * tone.frequency * (time - tone.origin)) for tone in fading]
     value = sum(
-        (tone.amplitude(time) * cmath.exp(phase)).imag for tone, phase in phases if tone not in kept
+        (
+            tone.amplitude(time) * cmath.exp(2j * math.pi * tone.frequency * (time - tone.origin))
+        ).imag
+        for tone in fading
+        if tone not in kept
     )
     return (FadingTone(0.0, 1j * value, time, time, REMAINDER_RAMP, 1.0, 0.0), *kept)
 

@@ -28,6 +28,9 @@ STEADY_WINDOW = 0.25
 MARGIN = 0.005
 """Time [s] from the last byte on the wire to the plate, and before the next command."""
 
+RESPONSE = 0.5
+"""Longest time [s] on a busy machine from a change of fingers to the reply to what it led to."""
+
 STEADY_DURATION = 0.4
 """Shortest pattern [s] that counts as steady; the plate rings for 50 ms to 1 s."""
 
@@ -79,6 +82,7 @@ class TouchRecorder:
         self._start = clock.now()
         self._touches: dict[ContactKey, _Touch] = {}
         self._playing: _Playing | None = None
+        self._changed_at = -math.inf  # when a finger landed or lifted last
         self._sensors: dict[str, Position] = {}
         self._loads: dict[str, float] = {}
         self._tasks: set[asyncio.Task[Any]] = set()
@@ -109,6 +113,8 @@ class TouchRecorder:
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
         self._move_sensors(contacts)
+        if change.down or change.up:
+            self._changed_at = clock.now()
         for contact in change.down:
             others = {_id(other): (other.x, other.y) for other in contacts if other != contact}
             self._touches[contact.key] = _Touch(contact, others)
@@ -144,7 +150,9 @@ class TouchRecorder:
             return
         ended.until = now
         settled = ended.applied.time + ended.applied.pattern.ramp
-        since, until = max(settled, now - STEADY_WINDOW) + MARGIN, now - MARGIN
+        # Its end is reported with the reply to what ended it: a finger that lifted is the end.
+        end = self._changed_at if now - RESPONSE < self._changed_at < now else now
+        since, until = max(settled, end - STEADY_WINDOW) + MARGIN, end - MARGIN
         if since < until:
             ended.steady = self._run(self._plate.vibration(since, until))
         for touch in ended.touches:

@@ -9,12 +9,19 @@ from typing import final
 
 from drivers import clock, trace
 from drivers.backend import Backend
-from drivers.errors import CommandError, DriverError, FrameError, LinkError
+from drivers.errors import (
+    CommandError,
+    DriverError,
+    FrameError,
+    LinkError,
+    Preempted,
+)
 from drivers.guard import SafeCommandSet, SafeEnvelope, require_safe
 from drivers.guard.recorder import PlayRecorder
+from drivers.line.sender import SUPERSEDED
 from drivers.link.link import REPLY_TIMEOUT, Link, ReplyT
 from drivers.link.refusals import PROTOCOL_VIOLATION
-from drivers.protocol.definition import PROTOCOL, random_token, token_after
+from drivers.protocol.definition import PROTOCOL, random_session, random_token, token_after
 from drivers.protocol.messages import (
     Achieved,
     AmplifierEvent,
@@ -53,7 +60,7 @@ WATCHDOG_REACTION = 0.005 + PROTOCOL.reaction
 _logger = logging.getLogger(__name__)
 
 # Requests that do not feed the watchdog, or silence the amplifier where they arrive.
-_NOT_FEEDING = (Hello, GetCaps, GetStatus, GetFaults, Stop, Disarm)
+_NOT_FEEDING = (Hello, GetCaps, GetStatus, GetFaults, LoadEnvelope, Clear, Stop, Disarm)
 
 
 @final
@@ -84,6 +91,9 @@ class Amplifier:
         self._serial_number = serial_number
         self._listeners: list[Callable[[AmplifierEvent], None]] = []
         self._token = 0
+        self.session = 0
+        """Number of the last arming that was granted; requests carry it."""
+        self._stop_count = 0
         self._watchdog: float | None = None
         self._last_fed_at: float | None = None
         self._feeding_count = 0  # requests in progress that feed the watchdog
@@ -151,6 +161,11 @@ class Amplifier:
         """Durations on its wire."""
         return self._link.backend.wire_times
 
+    @property
+    def carries_sessions(self) -> bool:
+        """Whether its wire carries sessions; else the host itself is the session."""
+        return self._link.backend.carries_sessions
+
     def round_trip(self) -> float:
         """Wire time [s] of its longest exchange, an apply of all channels; 0 if unknown."""
         return self.wire_times.round_trip(self.capabilities.channels)
@@ -187,10 +202,11 @@ class Amplifier:
     async def identify(self) -> None:
         """Read identity and capabilities; raises LinkError for another amplifier or version."""
         identity = await self._request(Hello(), expect=Identity, timeout=OPEN_TIMEOUT)
-        if identity.protocol_version != PROTOCOL.version:
+        if PROTOCOL.version not in identity.versions:
+            spoken = ", ".join(map(str, identity.versions)) or "none"
             raise LinkError(
-                f"protocol version must be {PROTOCOL.version}, got {identity.protocol_version} "
-                f"from {identity.vendor} {identity.product} {identity.serial_number}; update "
+                f"protocol version must be {PROTOCOL.version}, got {spoken} from "
+                f"{identity.vendor} {identity.product} {identity.serial_number}; update "
                 "the older side"
             )
         if self._serial_number not in (None, identity.serial_number):
@@ -209,11 +225,14 @@ class Amplifier:
         """Close the wire; disarm before, or the vibration lasts until the watchdog trips."""
         await self._link.close()
 
-    async def arm(self, watchdog: float = WATCHDOG) -> Status:
+    async def arm(self, watchdog: float = WATCHDOG, *, session: int | None = None) -> Status:
         """Switch the high voltage on and enable every channel at level zero; watchdog [s].
 
+        session: the number of this arming, the same for amplifiers that start together; None: a
+        random one.
+
         Raises CommandError for a watchdog outside the amplifier's range, and CommandRefused if a
-        stop or disarm came first.
+        stop or disarm came first or it is armed already.
         """
         low, high = self.capabilities.watchdog_min, self.capabilities.watchdog_max
         if not low <= watchdog <= high:
@@ -222,8 +241,9 @@ class Amplifier:
                 f"{watchdog:g} s"
             )
         self._watchdog = max(watchdog, self._watchdog or 0.0)
-        status = await self._request(Arm(watchdog=watchdog), expect=Status)
-        self._watchdog = watchdog
+        arm = Arm(watchdog, session or random_session())
+        status = await self._request(arm, expect=Status)
+        self._watchdog, self.session = watchdog, arm.session
         return status
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> Status:
@@ -238,6 +258,7 @@ class Amplifier:
         CommandRefused, or is repeated afterwards if it is of the stop class. A request that is not
         on the wire yet is preempted at once.
         """
+        self._stop_count += 1
         return await self._request(Stop(ramp=self._ramp(ramp)), expect=Status)
 
     async def load_envelope(self, safe: SafeEnvelope) -> None:
@@ -257,7 +278,7 @@ class Amplifier:
 
         Raises CommandRefused if a newer set, a stop or a disarm came first.
         """
-        achieved = await self._request(Stage(safe), expect=Achieved)
+        achieved = await self._request(Stage(safe, self.session), expect=Achieved)
         return _of_token(achieved, safe.token)
 
     async def commit(self, token: int) -> Achieved:
@@ -265,7 +286,7 @@ class Amplifier:
 
         Raises CommandRefused if a newer set, a stop or a disarm came first.
         """
-        achieved = await self._request(Commit(token=token), expect=Achieved)
+        achieved = await self._request(Commit(token, self.session), expect=Achieved)
         return _of_token(achieved, token)
 
     async def apply(self, safe: SafeCommandSet) -> Achieved:
@@ -274,7 +295,8 @@ class Amplifier:
         A silent set overtakes the queue as a stop does. Raises CommandRefused if a newer set or a
         stop superseded it.
         """
-        return _of_token(await self._request(Apply(safe), expect=Achieved), safe.token)
+        achieved = await self._request(Apply(safe, self.session), expect=Achieved)
+        return _of_token(achieved, safe.token)
 
     async def status(self) -> Status:
         """Read the status; does not feed the watchdog."""
@@ -284,19 +306,25 @@ class Amplifier:
         """Read latched and past faults, newest first."""
         return (await self._request(GetFaults(), expect=FaultList)).faults
 
-    async def clear(self) -> Status:
+    async def clear(self, latch: int | None = None) -> Status:
         """Acknowledge a stop, or faults whose cause is gone; the amplifier stays disarmed.
 
-        Raises CommandRefused if another stop came first: that one is not acknowledged.
+        latch: its number in a status; None: that of the last one, which is read first. Raises
+        CommandRefused if another stop or fault has come: that one is not acknowledged.
         """
-        return await self._request(Clear(), expect=Status)
+        before = self._stop_count
+        if latch is None:
+            latch = (await self.status()).latch
+        if self._stop_count != before:
+            raise Preempted(SUPERSEDED)
+        return await self._request(Clear(latch), expect=Status)
 
     async def heartbeat(self) -> Status:
         """Feed the watchdog; called by the control loop itself, after it has run.
 
         On a degraded link it only reads the status, so that the watchdog expires without replies.
         """
-        request = GetStatus() if self.is_degraded else Ping()
+        request = GetStatus() if self.is_degraded else Ping(self.session)
         return await self._request(request, expect=Status)
 
     def abort_unsent(self) -> None:
@@ -309,15 +337,17 @@ class Amplifier:
     async def commit_on_bus(self, token: int) -> None:
         """Let every amplifier of the bus play its staged set of this token at the same time.
 
-        There are no replies: read the status of each. Raises CommandError if the bus does not
-        support broadcasts.
+        It must be armed by the same session. There are no replies: read the status of each. Raises
+        CommandError if the bus does not support broadcasts.
         """
-        self._recorder.sending(Commit(token=token))
+        commit = Commit(token, self.session)
+        self._recorder.sending(commit)
         with self._feeding():
-            await self._link.broadcast(Commit(token=token))
+            await self._link.broadcast(commit)
 
     async def stop_on_bus(self, ramp: float = STOP_RAMP) -> None:
         """Stop every amplifier of the bus, before all queued requests; there are no replies."""
+        self._stop_count += 1
         request = Stop(ramp=self._ramp(ramp))
         with _errors_logged_for_stop(request):
             self._recorder.sending(request)

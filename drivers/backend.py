@@ -85,6 +85,11 @@ class Backend(ABC):
         )
 
     @property
+    def carries_sessions(self) -> bool:
+        """Whether requests carry their session; else the host itself is the session."""
+        return True
+
+    @property
     def wire_times(self) -> WireTimes:
         """Durations on its wire; zero if unknown."""
         return WireTimes()

@@ -30,8 +30,9 @@ from drivers.registry import open_backend
 # %% [markdown]
 """
 ## A frame by hand
-first · address · sequence · payload · CRC-32, little-endian, encoded by COBS so that it contains no
-zero, between two zeros. A Ping (type 12, version 1, so first = 2C) to address 1 with sequence 7:
+type · version · address · sequence · payload · CRC-32, little-endian, encoded by COBS so that it
+contains no zero, between two zeros. A Ping (type 12, version 2) of session 9 to address 1 with
+sequence 7:
 """
 
 
@@ -41,9 +42,9 @@ def stuffed(data):
     return b"".join(bytes([len(piece) + 1]) + piece for piece in data.split(b"\0"))
 
 
-body = struct.pack("<BBH", 0x2C, 1, 7)
+body = struct.pack("<BBBHH", 12, 2, 1, 7, 9)
 by_hand = b"\0" + stuffed(body + struct.pack("<I", zlib.crc32(body))) + b"\0"
-request = encode_request(Ping(), address=1, sequence=7)
+request = encode_request(Ping(session=9), address=1, sequence=7)
 by_codec = encode_frame(request)
 print("by hand ", by_hand.hex(" ").upper())
 print("by codec", by_codec.hex(" ").upper())

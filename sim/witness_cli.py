@@ -30,7 +30,7 @@ def witness(
     ] = None,
     frequency: Annotated[
         str, typer.Option(metavar="LOW,HIGH", help="Allowed frequencies [Hz].")
-    ] = "10,655.35",
+    ] = "10,3276.75",
     level: Annotated[
         float, typer.Option(metavar="LEVEL", help="Highest allowed level, 0..1.")
     ] = 1.0,

@@ -44,7 +44,7 @@ async def armed(wire: Wire, rig: Rig) -> AsyncIterator[tuple[FarSide, dict[str, 
         for amplifier in both.values():
             await amplifier.open()
         for amplifier in both.values():  # after opening, which may outlast a watchdog
-            await amplifier.arm(2.0)
+            await amplifier.arm(2.0, session=9)
         yield far, both
         for amplifier in both.values():
             await amplifier.close()

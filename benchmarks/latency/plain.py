@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 import serial
 from pythonosc.osc_packet import OscPacket
 
-from benchmarks.wires.bench import make_sets
+from benchmarks.wires.bench import SESSION, make_sets
 from drivers.backends.urls.serial_line import SerialUrl
 from drivers.codec.serial_line.exchanges import encode_request
 from drivers.codec.serial_line.frame import encode_frame
@@ -37,7 +37,7 @@ class Panel(asyncio.DatagramProtocol):
     def __init__(self, port: int) -> None:
         self._port = port
         self._sets = [
-            encode_request(Apply(safe), address=1, sequence=0)
+            encode_request(Apply(safe, SESSION), address=1, sequence=0)
             for safe in make_sets(capabilities(4), SETS)
         ]
 
@@ -83,7 +83,9 @@ def _opened(url: SerialUrl) -> serial.Serial | socket.socket:
 async def main() -> None:
     loop = asyncio.get_running_loop()
     with _opened(SerialUrl.parse(sys.argv[2])) as port:
-        os.write(port.fileno(), encode_frame(encode_request(Arm(2.0), address=1, sequence=0)))
+        os.write(
+            port.fileno(), encode_frame(encode_request(Arm(2.0, SESSION), address=1, sequence=0))
+        )
         loop.add_reader(port.fileno(), os.read, port.fileno(), 4096)
         transport, _ = await loop.create_datagram_endpoint(
             lambda: Panel(port.fileno()), local_addr=("127.0.0.1", 0)

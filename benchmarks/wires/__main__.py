@@ -17,6 +17,7 @@ from benchmarks.wires.bare import bare_modbus, bare_serial
 from benchmarks.wires.bare_can import bare_can, can_codec
 from benchmarks.wires.bench import (
     CHANNELS,
+    SESSION,
     Times,
     all_at_once,
     far_end,
@@ -70,7 +71,7 @@ _READER = FrameReader()
 
 
 def _serial_codec(safe: SafeCommandSet) -> None:
-    data = encode_frame(encode_request(Apply(safe), address=1, sequence=1))
+    data = encode_frame(encode_request(Apply(safe, SESSION), address=1, sequence=1))
     decode_request(_READER.feed(data)[0])
 
 
@@ -94,7 +95,7 @@ _UNIT = ModbusUnit(_Accepting())
 
 
 def _modbus_codec(safe: SafeCommandSet) -> None:
-    exchange = exchanges.encode_request(Apply(safe), tag=1, channels=CHANNELS)
+    exchange = exchanges.encode_request(Apply(safe, SESSION), tag=1, channels=CHANNELS)
     adu = build_adu(exchange.read, exchange.write, unit=1, transaction=1, is_rtu=False)
     answer = _UNIT.reply(adu.frame[7:])
     assert answer is not None

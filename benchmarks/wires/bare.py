@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import serial
 from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 
+from benchmarks.wires.bench import SESSION
 from drivers.backends.urls.modbus import ModbusUrl
 from drivers.backends.urls.serial_line import SerialUrl
 from drivers.codec.modbus import exchanges
@@ -24,10 +25,10 @@ def bare_serial(url: str, sets: Sequence[SafeCommandSet]) -> list[float]:
     """pyserial: write the frame, read until the zero that ends the reply."""
     parsed = SerialUrl.parse(url)
     requests = [
-        encode_frame(encode_request(Apply(safe), address=1, sequence=number & 0xFFFF))
+        encode_frame(encode_request(Apply(safe, SESSION), address=1, sequence=number & 0xFFFF))
         for number, safe in enumerate(sets)
     ]
-    arm = encode_frame(encode_request(Arm(2.0), address=1, sequence=0))
+    arm = encode_frame(encode_request(Arm(2.0, SESSION), address=1, sequence=0))
     times = []
     with serial.Serial(parsed.port, parsed.baud, timeout=1, exclusive=True) as port:
         _exchange(port, arm)
@@ -75,8 +76,8 @@ async def _with_pymodbus(url: ModbusUrl, sets: Sequence[SafeCommandSet]) -> list
         times.append(time.perf_counter() - begin)
 
     times: list[float] = []
-    await ask(Arm(2.0), 1)
+    await ask(Arm(2.0, SESSION), 1)
     for number, safe in enumerate(sets):
-        await ask(Apply(safe), number % 65535 + 1)
+        await ask(Apply(safe, SESSION), number % 65535 + 1)
     client.close()
     return times[1:]

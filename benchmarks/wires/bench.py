@@ -20,6 +20,7 @@ from drivers.protocol.messages import Capabilities
 from drivers.registry import open_backend
 
 CHANNELS = 4
+SESSION = 1
 CALM = 2.0  # s; the longest watchdog
 
 

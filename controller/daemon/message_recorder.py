@@ -126,6 +126,11 @@ class RecordedBackend(Backend):
         return self._inner.bus
 
     @property
+    def carries_sessions(self) -> bool:
+        """See `Backend.carries_sessions`."""
+        return self._inner.carries_sessions
+
+    @property
     def wire_times(self) -> WireTimes:
         """See `Backend.wire_times`."""
         return self._inner.wire_times

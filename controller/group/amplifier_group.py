@@ -27,6 +27,8 @@ from drivers.line.priority import PREEMPTION_GRACE
 from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.operation.silence import StopOutcome
 from drivers.operation.watchdog import check_watchdog
+from drivers.protocol.definition import random_session
+from drivers.protocol.messages import AmplifierState
 
 # How often, and how far apart [s], levels are read back after the closing ramp has ended.
 _READ_BACKS = 5
@@ -64,10 +66,10 @@ class AmplifierGroup:
         }
         self._playback = SynchronizedPlay(self._checked)
         self._quick_stops = QuickStops(self._amplifiers)
+        self._arming = asyncio.Lock()  # a second arm waits for the first
         self._closing = asyncio.Lock()  # a second close waits for the first
         self._silence_count = 0  # disarms, stops and closes so far
         self._silencing_count = 0  # disarms and stops in progress
-        self._arm_count = 0
         self._stop_count = self._cleared_count = 0  # stops so far, and at the last clear
         self._may_be_armed = False  # since the amplifiers were opened
         self._limit: asyncio.Timeout | None = None  # of a play or heartbeat in progress
@@ -104,39 +106,65 @@ class AmplifierGroup:
         self._cleared_count = self._stop_count  # each amplifier says itself what it has latched
 
     async def arm(self) -> None:
-        """Switch the high voltage on at level zero: on all amplifiers, or none stays armed."""
+        """Switch the high voltage on at level zero: on all amplifiers, or none stays armed.
+
+        If all are armed, also by a request that came first, nothing changes.
+        """
+        before = self._silence_count
+        async with self._arming:
+            self._check_open()
+            if self._stop_count > self._cleared_count:  # an amplifier that restarted does not know
+                raise CommandRefused("a stop must be cleared before arming; clear, then arm again")
+            if self._silencing_count:  # the result would depend on the order of frames
+                raise CommandRefused(
+                    "amplifiers are being stopped or disarmed; arm again if that is still wanted"
+                )
+            self._check_not_silenced(before)
+            if self.state is GroupState.ARMED:
+                statuses = await self._gather(amplifier.status() for amplifier in self._all)
+                if all(each.state is AmplifierState.OPERATION_ENABLED for each in statuses):
+                    return
+                before = await self._disarm_rest()
+            await self._arm(before)
+
+    async def _disarm_rest(self) -> int:
+        """Disarm those that still are, when others no longer are; the count of silences then."""
+        self._leave_armed()
+        before = self._silence_count
+        with self._silencing():
+            await self._gather(amplifier.disarm(0.0) for amplifier in self._all)
+        self._check_not_silenced(before)
+        return before
+
+    async def _arm(self, before: int) -> None:
+        """Arm all amplifiers; before: count of silences at the request."""
+        self._may_be_armed = True
+        session = random_session()  # one for all, so that a broadcast reaches them
+        try:
+            await self._gather(each.arm(session=session) for each in self._checked.values())
+            self._check_not_silenced(before)
+        except BaseException:
+            with self._silencing():
+                await self._finish(
+                    retry_while_degraded(amplifier.disarm) for amplifier in self._all
+                )
+            raise
+        self._playback.forget()
+        self.state = GroupState.ARMED
+
+    def _check_open(self) -> None:
         if self.state in (GroupState.CLOSED, GroupState.LOST):
             raise CommandError(
                 f"amplifiers must be open to be armed, got {self.state.name}; close and open all "
                 "of them again"
             )
-        if self._stop_count > self._cleared_count:  # an amplifier that restarted does not know
-            raise CommandRefused("a stop must be cleared before arming; clear, then arm again")
-        if self._silencing_count:  # the result would depend on the order of frames
+
+    def _check_not_silenced(self, before: int) -> None:
+        if self._silence_count != before:
             raise CommandRefused(
-                "amplifiers are being stopped or disarmed; arm again if that is still wanted"
+                "amplifiers were disarmed, stopped or closed while arming, and stay disarmed; "
+                "arm again if that is still wanted"
             )
-        before = self._silence_count
-        self._arm_count += 1
-        number = self._arm_count
-        self._may_be_armed = True
-        try:
-            await self._gather(checked.arm() for checked in self._checked.values())
-            if self._silence_count != before:
-                raise CommandRefused(
-                    "amplifiers were disarmed, stopped or closed while arming, and stay disarmed; "
-                    "arm again if that is still wanted"
-                )
-        except BaseException:
-            if number == self._arm_count:  # else a newer request may have armed them
-                self._leave_armed()
-                with self._silencing():
-                    await self._finish(
-                        retry_while_degraded(amplifier.disarm) for amplifier in self._all
-                    )
-            raise
-        self._playback.forget()
-        self.state = GroupState.ARMED
 
     async def play(
         self,

@@ -5,6 +5,7 @@ an amplifier's Nak.
 """
 
 import struct
+from collections.abc import Iterable
 from enum import IntEnum
 from typing import TypeVar
 
@@ -147,3 +148,13 @@ def pack_text(text: str) -> bytes:
 def pack_optional_channel(channel: int | None) -> bytes:
     """Pack a channel, 255 for None."""
     return bytes([_NO_CHANNEL]) if channel is None else pack((_CHANNEL, channel))
+
+
+def versions_of(mask: int) -> tuple[int, ...]:
+    """Return the versions of the protocol in a mask: version n for bit n."""
+    return tuple(version for version in range(1, 16) if mask >> version & 1)
+
+
+def versions_mask(versions: Iterable[int]) -> int:
+    """Return the mask of versions; see `versions_of`."""
+    return sum(1 << version for version in set(versions))

@@ -5,7 +5,7 @@ The first checks only read. The others arm the amplifier and drive its channels;
 ends disarmed.
 """
 
-from drivers.conformance import ending, envelopes, playing, reading
+from drivers.conformance import ending, envelopes, playing, reading, sessions
 from drivers.conformance.bench import LEVEL
 from drivers.conformance.check import Check, CheckResult, Steps, run_check
 
@@ -27,7 +27,9 @@ _DRIVING: tuple[Steps, ...] = (
     playing.staged_sets_expire,
     playing.ramps,
     playing.cancelled_requests,
+    sessions.sessions,
     ending.quick_stop,
+    sessions.clear_names_the_stop,
     ending.silence_never_later,
     ending.disarm,
     ending.watchdog,

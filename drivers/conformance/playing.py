@@ -22,7 +22,7 @@ async def plays_nothing_disarmed(bench: Bench) -> None:
 async def achieved(bench: Bench) -> None:
     """It reports what it really plays: the nearest steps; token and levels read back."""
     await bench.arm()
-    requested = DriveCommand(0, bench.frequency + 0.0049, bench.level * 0.987654, 12.3456)
+    requested = DriveCommand(0, bench.frequency + 0.0249, bench.level * 0.987654, 12.3456)
     token = bench.amplifier.next_token()
     achieved = await bench.amplifier.apply(
         bench.guard.check(CommandSet(token, (requested,), ramp=0.0, valid_for=0.0))
@@ -143,3 +143,4 @@ async def cancelled_requests(bench: Bench) -> None:
         await asyncio.gather(requesting, return_exceptions=True)
         status = await bench.arm()
         bench.expect_state(status, AmplifierState.OPERATION_ENABLED, after="Arm")
+        await bench.amplifier.disarm(0.0)

@@ -2,6 +2,7 @@
 
 from drivers.amplifier import WATCHDOG
 from drivers.conformance.bench import Bench, expect
+from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import AmplifierState
 
 
@@ -12,7 +13,10 @@ async def identity(bench: Bench) -> None:
         bool(who.vendor and who.serial_number),
         f"vendor and serial number must not be empty, got {who}",
     )
-    expect(who.protocol_version == 1, f"protocol version must be 1, got {who.protocol_version}")
+    expect(
+        PROTOCOL.version in who.versions,
+        f"versions must include {PROTOCOL.version}, got {who.versions}",
+    )
 
 
 async def capabilities(bench: Bench) -> None:

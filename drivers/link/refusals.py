@@ -14,6 +14,9 @@ _REASONS = {
     NakCode.BUSY: "busy after 3 attempts; try again",
     NakCode.NO_ENVELOPE: "a slot of the set holds no envelope",
     NakCode.UNSUPPORTED_VERSION: "its protocol version differs",
+    NakCode.WRONG_SESSION: "another host has armed it, or it has been armed anew; disarm it, then "
+    "arm it again",
+    NakCode.WRONG_LATCH: "a newer stop or fault has come; read its status, then clear that",
 }
 
 PROTOCOL_VIOLATION = (

@@ -30,10 +30,10 @@ class CheckedAmplifier:
         self._check_if_used: PlausibilityCheck | None = None
         self._running_checked_at = -math.inf
 
-    async def arm(self, watchdog: float = WATCHDOG) -> Status:
+    async def arm(self, watchdog: float = WATCHDOG, *, session: int | None = None) -> Status:
         """Arm with a watchdog [s]; what was expected before is forgotten."""
         started_at = clock.now()
-        status = await self.amplifier.arm(watchdog)
+        status = await self.amplifier.arm(watchdog, session=session)
         check = self._new_check()
         check.expect_armed(watchdog, sent_at=started_at, now=clock.now())
         self._check_if_used = check

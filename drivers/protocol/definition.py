@@ -110,7 +110,10 @@ class Quantities:
     temperature: WireQuantity
     voltage: WireQuantity
     age: WireQuantity
-    protocol_version: WireQuantity
+    versions: WireQuantity
+    session: WireQuantity
+    held_session: WireQuantity
+    latch: WireQuantity
 
 
 @dataclass(frozen=True)
@@ -187,5 +190,13 @@ def is_newer_token(token: int, than: int) -> bool:
 
 def random_token() -> int:
     """Return a random initial token, so that tokens of an earlier host are not repeated."""
-    token = PROTOCOL.quantities.token
-    return random.randint(token.minimum, token.maximum)  # noqa: S311  not a secret
+    return _random(PROTOCOL.quantities.token)
+
+
+def random_session() -> int:
+    """Return a random session, so that no other host has it, nor an earlier one."""
+    return _random(PROTOCOL.quantities.session)
+
+
+def _random(quantity: WireQuantity) -> int:
+    return random.randint(quantity.minimum, quantity.maximum)  # noqa: S311  not a secret

@@ -66,6 +66,8 @@ class NakCode(ExtensibleEnum):
     BUSY = 7
     UNSUPPORTED_VERSION = 8
     NO_ENVELOPE = 9
+    WRONG_SESSION = 10
+    WRONG_LATCH = 11
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,9 +82,13 @@ class GetCaps:
 
 @dataclass(frozen=True, slots=True)
 class Arm:
-    """Switch on and enable at level zero; watchdog [s]: longest time between heartbeats."""
+    """Switch on and enable at level zero; watchdog [s]: longest time between heartbeats.
+
+    session: a number drawn for this arming; only requests with it play and feed the watchdog.
+    """
 
     watchdog: float
+    session: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +103,7 @@ class Stage:
     """Keep this set ready; outputs do not change."""
 
     command_set: CommandSet
+    session: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +111,7 @@ class Commit:
     """Play the staged set with this token; no effect if it is already playing."""
 
     token: int
+    session: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +119,7 @@ class Apply:
     """Stage and commit at once."""
 
     command_set: CommandSet
+    session: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,12 +141,19 @@ class GetFaults:
 
 @dataclass(frozen=True, slots=True)
 class Clear:
-    """Acknowledge; leave FAULT or QUICK_STOP_ACTIVE if the cause is gone."""
+    """Acknowledge; leave FAULT or QUICK_STOP_ACTIVE if the cause is gone.
+
+    latch: the number of the stop or fault, from a status; a newer one is not acknowledged.
+    """
+
+    latch: int
 
 
 @dataclass(frozen=True, slots=True)
 class Ping:
-    """Heartbeat: feeds the watchdog while armed."""
+    """Heartbeat: feeds the watchdog of the session while armed."""
+
+    session: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,13 +165,13 @@ class LoadEnvelope:
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Identity of an amplifier; the serial number is unique."""
+    """Identity of an amplifier; the serial number is unique; versions: of the protocol."""
 
     vendor: str
     product: str
     serial_number: str
     firmware: str
-    protocol_version: int
+    versions: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +204,8 @@ class Status:
     """Status of an amplifier: state, fault, playing token and present level of each channel.
 
     token 0: nothing played since arming; temperature [°C]; watchdog_left [s]; voltage [V] of the
-    high-voltage supply, 0 if not measured; other_flags: those that are not defined here.
+    high-voltage supply, 0 if not measured; latch: number of the last stop or fault, 0 before the
+    first; other_flags: those that are not defined here.
     """
 
     state: AmplifierState
@@ -199,6 +216,7 @@ class Status:
     watchdog_left: float
     levels: tuple[float, ...]
     voltage: float = 0.0
+    latch: int = 0
     other_flags: int = 0
 
 

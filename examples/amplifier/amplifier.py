@@ -1,7 +1,7 @@
 """An amplifier without its wire: states, watchdog, sets and fades of the wire protocol.
 
 It imports nothing of era-haptics, and could be rewritten in C. Units are those of the wire:
-frequency in 0.01 Hz, level in 1/10000 of full stroke, phase in 0.01 degrees, times in ms. Envelopes
+frequency in 0.05 Hz, level in 1/10000 of full stroke, phase in 0.01 degrees, times in ms. Envelopes
 are not supported. A waveform generator reads `levels`: each channel plays
 level * sin(2 pi frequency t + phase) from the commit on.
 """
@@ -13,9 +13,10 @@ from collections import deque
 DISARMED, SWITCHED_ON, ARMED, STOPPED, REACTING, FAULT = 1, 3, 4, 5, 6, 7
 NO_FAULT, WATCHDOG = 0, 1
 BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN, NO_ENVELOPE = 3, 4, 5, 6, 9
+WRONG_SESSION, WRONG_LATCH = 10, 11
 
 CHANNELS = 4
-FREQUENCY = (2000, 60000)  # range
+FREQUENCY = (400, 12000)  # range
 MAX_RAMP = 1000
 WATCHDOG_RANGE = (100, 2000)
 SHORT_FADE = 5
@@ -35,6 +36,7 @@ class Amplifier:
     def __init__(self, clock=lambda: 1000 * time.monotonic()):
         self._clock = clock
         self.state, self.fault = DISARMED, NO_FAULT
+        self.session = self.latch = 0
         self._faults = deque(maxlen=16)
         self._before = self._after = [0] * CHANNELS
         self._ramp, self._begin = 0, clock()
@@ -49,6 +51,7 @@ class Amplifier:
             self._fade_to([0] * CHANNELS, ramp=SHORT_FADE, begin=self._expires_at)
             self._ends_at = self._staged = None
             self.state, self.fault = REACTING, WATCHDOG
+            self._count_latch()
             self._faults.appendleft((WATCHDOG, self._expires_at))
         if self._is_silent():
             self.state = {SWITCHED_ON: DISARMED, REACTING: FAULT}.get(self.state, self.state)
@@ -95,20 +98,30 @@ class Amplifier:
         self.token, self._staged, self._ends_at = 0, None, None
         self._playing, self._staged_at = None, 0
 
-    def feed(self):
-        """Restart the watchdog, after every request but those that only read."""
+    def _count_latch(self):
+        self.latch = self.latch % 255 + 1
+
+    def ping(self, session):
+        """Restart the watchdog; other requests with the session do, too."""
         if self.state == ARMED:
+            if session != self.session:
+                raise Refused(WRONG_SESSION)
             self._expires_at = self._clock() + self._watchdog
 
-    def arm(self, watchdog):
+    def arm(self, watchdog, session):
         """Switch the high voltage on and enable all channels at level zero."""
-        if not WATCHDOG_RANGE[0] <= watchdog <= WATCHDOG_RANGE[1]:
+        if not WATCHDOG_RANGE[0] <= watchdog <= WATCHDOG_RANGE[1] or not 1 <= session <= 65535:
             raise Refused(BAD_VALUE)
         if self.state not in (DISARMED, SWITCHED_ON, ARMED):
             raise Refused(WRONG_STATE)
-        self._silence(SHORT_FADE)
-        self._forget()
-        self.state, self._watchdog = ARMED, watchdog
+        if (session == self.session) != (self.state == ARMED):  # another's, or one that has ended
+            raise Refused(WRONG_SESSION)
+        self._watchdog = watchdog
+        if self.state != ARMED:
+            self._silence(SHORT_FADE)
+            self._forget()
+            self.state, self.session = ARMED, session
+        self.ping(session)
 
     def disarm(self, ramp):
         """Fade to silence, then switch the high voltage off; a latched state stays."""
@@ -119,40 +132,45 @@ class Amplifier:
     def stop(self, ramp):
         """Stop quickly and latch."""
         self._silence(ramp)
+        self._count_latch()
         if self.state in (DISARMED, SWITCHED_ON, ARMED):
             self.state = STOPPED
 
-    def clear(self):
-        """Leave a stop or a fault once silent."""
+    def clear(self, latch):
+        """Leave a stop or a fault once silent; latch: its number."""
+        if self.state in (STOPPED, FAULT) and latch != self.latch:
+            raise Refused(WRONG_LATCH)
         if self.state == FAULT or (self.state == STOPPED and self._is_silent()):
             self.state, self.fault = DISARMED, NO_FAULT
 
-    def stage(self, token, ramp, valid_for, commands):
+    def stage(self, session, token, ramp, valid_for, commands):
         """Hold a set of (channel, frequency, level, phase) until its commit; return it."""
-        self._check(token, ramp, valid_for, commands)
+        self._check(session, token, ramp, valid_for, commands)
         if self.token and not 1 <= (token - self.token) % 65536 <= 32767:
             raise Refused(BAD_TOKEN)  # a late copy
         self._staged, self._staged_at = (token, ramp, valid_for, commands), self._clock()
+        self.ping(session)
         return token, commands
 
-    def commit(self, token):
+    def commit(self, session, token):
         """Play the set staged under a token; repeat the reply for the one playing."""
-        self._check_token(token)
+        self._check_token(session, token)
         if token != self.token:
             is_old = self._clock() - self._staged_at > STAGED_LIFE
             if self._staged is None or token != self._staged[0] or is_old:
                 raise Refused(BAD_TOKEN)
             self._play(self._staged)
+        self.ping(session)
         return token, self._playing[3]
 
-    def apply(self, token, ramp, valid_for, commands):
+    def apply(self, session, token, ramp, valid_for, commands):
         """Stage and commit at once; repeat the reply for the same set again."""
         if token != self.token:
-            self.stage(token, ramp, valid_for, commands)
+            self.stage(session, token, ramp, valid_for, commands)
         elif self._playing != (token, ramp, valid_for, commands):
-            self._check_token(token)
+            self._check_token(session, token)
             raise Refused(BAD_TOKEN)
-        return self.commit(token)
+        return self.commit(session, token)
 
     def _play(self, wanted):
         self._playing, self._staged = wanted, None
@@ -170,15 +188,17 @@ class Amplifier:
             self._fade_to([0] * CHANNELS, ramp=ramp)
         self._staged, self._ends_at = None, None
 
-    def _check_token(self, token):
+    def _check_token(self, session, token):
         if self.state != ARMED:
             raise Refused(WRONG_STATE)
+        if session != self.session:
+            raise Refused(WRONG_SESSION)
         if not 1 <= token <= 65535:
             raise Refused(BAD_TOKEN)
 
-    def _check(self, token, ramp, valid_for, commands):
+    def _check(self, session, token, ramp, valid_for, commands):
         """Check a whole set; raise Refused."""
-        self._check_token(token)
+        self._check_token(session, token)
         if not (0 <= ramp <= MAX_RAMP and 0 <= valid_for <= 60000):
             raise Refused(BAD_VALUE)
         seen = set()

@@ -20,9 +20,10 @@ MAX_FRAME = 249  # bytes between two zeros
 IDENTITY = ("Example", "Bench amplifier", "EX-1", "0.1")
 HELLO, GET_CAPS, ARM, DISARM, STAGE, COMMIT, APPLY, STOP = range(1, 9)
 GET_STATUS, GET_FAULTS, CLEAR, PING, LOAD_ENVELOPE, NAK = 9, 10, 11, 12, 13, 31
-READ_ONLY = (HELLO, GET_CAPS, GET_STATUS, GET_FAULTS)
-UNKNOWN_TYPE, BAD_LENGTH = 1, 2
-REPLY, VERSION_1 = 0x80, 0x20
+READ_ONLY = (GET_CAPS, GET_STATUS, GET_FAULTS)
+NUMBERS = {ARM: "<HH", DISARM: "<H", COMMIT: "<HH", STOP: "<H", CLEAR: "<B", PING: "<H"}
+UNKNOWN_TYPE, BAD_LENGTH, UNSUPPORTED_VERSION = 1, 2, 8
+REPLY, NEUTRAL, VERSION = 0x80, 0, 2
 
 
 def stuff(data):
@@ -42,9 +43,9 @@ def unstuff(data):
     return b"\0".join(pieces)
 
 
-def framed(kind, address, sequence, payload):
+def framed(kind, version, address, sequence, payload):
     """Make a frame with its delimiters."""
-    body = struct.pack("<BBH", VERSION_1 | kind, address, sequence) + payload
+    body = struct.pack("<BBBH", kind, version, address, sequence) + payload
     return b"\0" + stuff(body + struct.pack("<I", zlib.crc32(body))) + b"\0"
 
 
@@ -63,14 +64,19 @@ class SerialEnd:
 
     def _frame(self, stuffed):
         frame = unstuff(stuffed)
-        if frame is None or len(frame) < 8:
+        if frame is None or len(frame) < 9:
             return b""
         body, (crc,) = frame[:-4], struct.unpack("<I", frame[-4:])
-        first, address, sequence = struct.unpack("<BBH", body[:4])
-        if crc != zlib.crc32(body) or first & 0xE0 != VERSION_1 or address not in (0, ADDRESS):
+        kind, version, address, sequence = struct.unpack("<BBBH", body[:5])
+        if crc != zlib.crc32(body) or kind & REPLY or address not in (0, ADDRESS):
             return b""
-        kind, payload = first & 0x1F, body[4:]
-        if address == 0 and kind not in (COMMIT, STOP):
+        payload = body[5:]
+        if kind == HELLO and address:
+            return framed(REPLY | HELLO, NEUTRAL, address, sequence, hello())
+        if version != VERSION and address:
+            refusal = bytes([kind, UNSUPPORTED_VERSION, 255])
+            return framed(REPLY | NAK, NEUTRAL, address, sequence, refusal)
+        if version != VERSION or (address == 0 and kind not in (COMMIT, STOP)):
             return b""
         self.amplifier.update()
         try:
@@ -78,14 +84,13 @@ class SerialEnd:
         except Refused as refused:
             channel = 255 if refused.channel is None else refused.channel
             reply_kind, reply = REPLY | NAK, bytes([kind, refused.code, channel])
-        return framed(reply_kind, address, sequence, reply) if address else b""
+        return framed(reply_kind, VERSION, address, sequence, reply) if address else b""
 
     def _answer(self, kind, payload):
         """The payload of the reply; raises Refused."""
         if kind in READ_ONLY:
             return self._read(kind, payload)
         done = self._carry_out(kind, payload)
-        self.amplifier.feed()
         return self._status() if done is None else achieved(*done)
 
     def _carry_out(self, kind, payload):
@@ -94,26 +99,20 @@ class SerialEnd:
         if kind in (STAGE, APPLY):
             command_set = read_set(payload)
             return a.stage(*command_set) if kind == STAGE else a.apply(*command_set)
-        if kind in (ARM, DISARM, COMMIT, STOP):
-            if len(payload) != 2:
-                raise Refused(BAD_LENGTH)
-            number = int.from_bytes(payload, "little")
-            return {ARM: a.arm, DISARM: a.disarm, COMMIT: a.commit, STOP: a.stop}[kind](number)
         if kind == LOAD_ENVELOPE:
             raise Refused(parts.BAD_VALUE)  # there are no slots
-        if kind not in (CLEAR, PING):
+        if kind not in NUMBERS:
             raise Refused(UNKNOWN_TYPE)
-        if payload:
+        if len(payload) != struct.calcsize(NUMBERS[kind]):
             raise Refused(BAD_LENGTH)
-        return a.clear() if kind == CLEAR else None
+        numbers = struct.unpack(NUMBERS[kind], payload)
+        doing = {ARM: a.arm, DISARM: a.disarm, COMMIT: a.commit, STOP: a.stop, CLEAR: a.clear}
+        return doing.get(kind, a.ping)(*numbers)
 
     def _read(self, kind, payload):
         a = self.amplifier
         if payload:
             raise Refused(BAD_LENGTH)
-        if kind == HELLO:
-            texts = (text.encode() for text in IDENTITY)
-            return b"\1" + b"".join(bytes([len(text)]) + text for text in texts)
         if kind == GET_CAPS:
             steps = (1, 10000, 1, 1, parts.MAX_RAMP, *parts.WATCHDOG_RANGE)
             no_envelopes, no_events = bytes(6), bytes(1)
@@ -128,16 +127,16 @@ class SerialEnd:
         a = self.amplifier
         a.update()
         head = struct.pack("<BBHB", a.state, a.fault, a.token, a.high_voltage)
-        rest = struct.pack("<hHHB", 250, a.watchdog_left, 0, parts.CHANNELS)
+        rest = struct.pack("<hHHBB", 250, a.watchdog_left, 0, a.latch, parts.CHANNELS)
         return head + rest + struct.pack(f"<{parts.CHANNELS}H", *a.levels)
 
 
 def read_set(payload):
-    """Token, ramp, valid_for and commands of a set; raises Refused."""
-    if len(payload) < 7:
+    """Session, token, ramp, valid_for and commands of a set; raises Refused."""
+    if len(payload) < 9:
         raise Refused(BAD_LENGTH)
-    token, ramp, valid_for, count = struct.unpack("<HHHB", payload[:7])
-    commands, payload = [], payload[7:]
+    *head, count = struct.unpack("<HHHHB", payload[:9])
+    commands, payload = [], payload[9:]
     for _ in range(count):
         if len(payload) < 8:
             raise Refused(BAD_LENGTH)
@@ -154,7 +153,14 @@ def read_set(payload):
         commands.append((channel, frequency, level, phase))
     if payload:
         raise Refused(BAD_LENGTH)
-    return token, ramp, valid_for, commands
+    return *head, commands
+
+
+def hello():
+    """The payload of a reply to Hello, in any version: a bit for each version, and the texts."""
+    texts = (text.encode() for text in IDENTITY)
+    packed = (bytes([len(text)]) + text for text in texts)
+    return struct.pack("<H", 1 << VERSION) + b"".join(packed)
 
 
 def achieved(token, commands):

@@ -3,8 +3,8 @@
     python on_text_lines.py 7010
 
 It serves one host at a time, on 127.0.0.1. A request is a line as {"id": 7, "ask": "arm",
-"watchdog": 250}, its answer one as {"id": 7, "state": 4, ...} or {"id": 7, "refused": 5}. It feeds
-the watchdog as the wire protocol's page says.
+"watchdog": 250, "session": 9}, its answer one as {"id": 7, "state": 4, ...} or {"id": 7,
+"refused": 5}. Sessions and the watchdog are those of the wire protocol's page.
 """
 
 import contextlib
@@ -49,14 +49,12 @@ def carry_out(amplifier, ask, values):
         return CAPABILITIES
     if ask == "faults":
         return {"faults": amplifier.faults}
-    if ask in ("arm", "disarm", "stop", "clear", "stage", "commit", "apply"):
+    if ask in ("arm", "disarm", "stop", "clear", "stage", "commit", "apply", "ping"):
         done = getattr(amplifier, ask)(**values)
-    elif ask in ("ping", "status"):
+    elif ask == "status":
         done = None
     else:
         raise Refused(1)
-    if ask != "status":
-        amplifier.feed()
     if done is not None:
         return {"token": done[0], "commands": done[1]}
     amplifier.update()
@@ -64,6 +62,7 @@ def carry_out(amplifier, ask, values):
         "state": amplifier.state,
         "fault": amplifier.fault,
         "token": amplifier.token,
+        "latch": amplifier.latch,
         "high_voltage": amplifier.high_voltage,
         "watchdog_left": amplifier.watchdog_left,
         "levels": amplifier.levels,

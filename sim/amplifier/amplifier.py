@@ -26,12 +26,12 @@ from drivers.protocol.messages import (
     FaultRecord,
     GetCaps,
     GetFaults,
-    GetStatus,
     Hello,
     Identity,
     LoadEnvelope,
     Nak,
     NakCode,
+    Ping,
     Reply,
     Request,
     Stage,
@@ -50,7 +50,8 @@ _FAULTS_KEPT = 16
 _HIGH_VOLTAGE = 1800.0  # V
 _DISCHARGE = 0.02  # s; time constant of the supply once it is off
 _SLOTS = 63
-_NON_FEEDING_REQUESTS = (Hello, GetCaps, GetStatus, GetFaults)
+_LATCHED = (AmplifierState.QUICK_STOP_ACTIVE, AmplifierState.FAULT)
+_FEEDING_REQUESTS = (Arm, Ping, Stage, Commit, Apply)  # with the session that is held
 
 
 def capabilities(channels: int) -> Capabilities:
@@ -86,7 +87,7 @@ class SimulatedAmplifier:
             product="simulated amplifier",
             serial_number=f"SIM-{name}",
             firmware="1",
-            protocol_version=PROTOCOL.version,
+            versions=(PROTOCOL.version,),
         )
         self.capabilities = capabilities(channels)
         self.state = AmplifierState.SWITCH_ON_DISABLED
@@ -94,6 +95,8 @@ class SimulatedAmplifier:
         self.listeners: list[Callable[[AmplifierEvent, float], None]] = []
         self._heat = ThermalState(since=-math.inf)
         self._faults: deque[tuple[Fault, int | None, float]] = deque(maxlen=_FAULTS_KEPT)
+        self.session = 0  # held while armed, or the one that ended last
+        self.latch = 0
         self._start()
 
     def _start(self) -> None:
@@ -146,11 +149,14 @@ class SimulatedAmplifier:
         following = next_state(self.state, type(request))
         if following is None:
             return Nak(NakCode.WRONG_STATE)
+        if isinstance(request, _FEEDING_REQUESTS) and self._is_foreign(request.session, request):
+            return Nak(NakCode.WRONG_SESSION)
         try:
             reply = self._carry_out(request, following, now)
         except RefusedSet as refusal:
             reply = refusal.nak
-        if not isinstance(request, _NON_FEEDING_REQUESTS) and not isinstance(reply, Nak):
+        is_feeding = isinstance(request, _FEEDING_REQUESTS) and self.state in ENABLED
+        if is_feeding and not isinstance(reply, Nak):
             self._last_fed = now
         # After feeding the watchdog, so that the status shows it full.
         return self.status(now) if reply is None else reply
@@ -170,6 +176,7 @@ class SimulatedAmplifier:
             watchdog_left=left,
             levels=levels,
             voltage=_HIGH_VOLTAGE if is_on else round(_HIGH_VOLTAGE * decayed),
+            latch=self.latch,
         )
 
     def trip(self, fault: Fault, moment: float, *, channel: int | None = None) -> None:
@@ -181,6 +188,7 @@ class SimulatedAmplifier:
         if self.state in (*ENABLED, AmplifierState.SWITCHED_ON, AmplifierState.QUICK_STOP_ACTIVE):
             self._silence(moment, ramp=SILENCING_RAMP)
             self.fault = fault
+            self._count_latch()
             self._enter(AmplifierState.FAULT_REACTION_ACTIVE, moment, channel=channel)
 
     def set_temperature(self, temperature: float, moment: float) -> None:
@@ -211,13 +219,17 @@ class SimulatedAmplifier:
                         FaultRecord(fault, channel, now - at) for fault, channel, at in self._faults
                     )
                 )
-            case Arm(watchdog=watchdog):
-                return self._arm(watchdog, now)
+            case Arm(watchdog=watchdog, session=session):
+                return self._arm(watchdog, session, now)
             case Disarm(ramp=ramp) | Stop(ramp=ramp):
+                if isinstance(request, Stop):
+                    self._count_latch()
                 self._silence(now, ramp=self._stopping_ramp(ramp))
                 self._enter(following, now)
                 self.tick(now)
-            case Clear():
+            case Clear(latch=latch):
+                if latch != self.latch and self.state in _LATCHED:
+                    return Nak(NakCode.WRONG_LATCH)
                 if self._silent_from <= now and self._has_cooled(now):
                     self.fault = Fault.NONE
                     self._enter(following, now)
@@ -235,13 +247,26 @@ class SimulatedAmplifier:
                 pass
         return None
 
-    def _arm(self, watchdog: float, now: float) -> Reply | None:
+    def _is_foreign(self, session: int, request: Request) -> bool:
+        """Whether a session is not the one that is held, or to arm, has ended."""
+        if self.state in ENABLED:
+            return session != self.session
+        return isinstance(request, Arm) and session == self.session != 0
+
+    def _count_latch(self) -> None:
+        """Number a stop or fault: 1 to 255, then 1 again."""
+        self.latch = self.latch % _Q.latch.maximum + 1
+
+    def _arm(self, watchdog: float, session: int, now: float) -> Reply | None:
         low, high = self.capabilities.watchdog_min, self.capabilities.watchdog_max
         if not low <= watchdog <= high:
             return Nak(NakCode.BAD_VALUE)
-        # Arming starts at level zero, even if another host left it playing.
-        self._silence(now, ramp=SILENCING_RAMP)
         self._watchdog = watchdog
+        if self.state in ENABLED:  # the same again: its reply was lost
+            return None
+        # Arming starts at level zero, even if the last session left a fade.
+        self._silence(now, ramp=SILENCING_RAMP)
+        self.session = session
         self._last_fed = now
         self._sets.forget()
         self._enter(AmplifierState.OPERATION_ENABLED, now)

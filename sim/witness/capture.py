@@ -65,7 +65,7 @@ def _piece(text: str, where: str) -> Piece:
         piece = Piece(float(time), wire, arrows[arrow], bytes.fromhex(digits))
     except (ValueError, KeyError):
         raise InputError(
-            f"{where}: must be TIME WIRE > HEX (or <), as in 0.0125 wire1 > 00 04 21, got "
+            f"{where}: must be TIME WIRE > HEX (or <), as in 0.0125 wire1 > 00 02 01, got "
             f"{text[:60]!r}"
         ) from None
     if not math.isfinite(piece.time):

@@ -44,7 +44,7 @@ STATE_CHANGING = SETS | {
 }
 """Requests that change what the amplifier does."""
 
-WATCHDOG_FEEDING = STATE_CHANGING | {RequestKind.PING, RequestKind.ENVELOPE}
+WATCHDOG_FEEDING = SETS | {RequestKind.ARM, RequestKind.PING}
 """Requests that feed the watchdog unless they are refused."""
 
 INCOMPLETE_SET = "incomplete set"
@@ -85,7 +85,8 @@ class EnvelopeLoad:
 class Request:
     """A request. address: 0 for broadcast; key: matches its reply, None where there is none.
 
-    ramp, valid_for, watchdog [s]; commands by channel; problem: what is wrong with it, or "".
+    ramp, valid_for, watchdog [s]; session: None where the wire carries none; commands by channel;
+    problem: what is wrong with it, or "".
     """
 
     kind: RequestKind
@@ -95,6 +96,7 @@ class Request:
     ramp: float = 0.0
     valid_for: float = 0.0
     watchdog: float = 0.0
+    session: int | None = None
     commands: Mapping[int, ChannelCommand] = field(default_factory=dict)
     envelope: EnvelopeLoad | None = None
     problem: str = ""

@@ -22,7 +22,7 @@ from sim.witness.decoded import (
 from sim.witness.modbus_frames import Adu, RtuSplitter, Splitter, TcpSplitter
 from sim.witness.quantities import INVALID, OutOfRange, signed
 
-_CONTROL, _HEARTBEAT, _LOOK, _SET, _ENVELOPE = 0, 8, 10, 14, 100
+_CONTROL, _HEARTBEAT, _LOOK, _SET, _ENVELOPE = 0, 8, 12, 14, 100
 _STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS = 1000, 1032, 1040, 1064, 1140, 1220
 _WORDS = {15: RequestKind.ARM, 0: RequestKind.DISARM, 2: RequestKind.STOP, 128: RequestKind.CLEAR}
 _READ_KINDS = {
@@ -30,7 +30,7 @@ _READ_KINDS = {
     _CAPABILITIES: RequestKind.CAPABILITIES,
     _FAULTS: RequestKind.FAULTS,
 }
-_TAGGED = (_CONTROL, _SET, _ENVELOPE)
+_TAGGED = (_CONTROL, _HEARTBEAT, _SET, _ENVELOPE)
 _READ_TAGS = (*_TAGGED, _STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS)
 
 
@@ -128,7 +128,7 @@ class ModbusDecoder:
 
     def _tag(self, unit: int, at: int, words: Sequence[int]) -> int | None:
         """The tag of a write, which reads repeat."""
-        if at in (*_TAGGED, _HEARTBEAT, _LOOK):
+        if at in (*_TAGGED, _LOOK):
             self._tags[unit] = words[0]
             if at in _TAGGED and words[1] not in (0, check(words[2:])):
                 raise OutOfRange("wrong CRC of a block")
@@ -175,8 +175,6 @@ def _of_write(
     unit: int, key: object, at: int, words: list[int], *, read_from: int | None
 ) -> Request:
     """Decode a write."""
-    if at == _HEARTBEAT:
-        return Request(RequestKind.PING, unit, key)
     if at == _LOOK:
         kind = RequestKind.FAULTS if read_from == _FAULTS else RequestKind.STATUS
         return Request(kind, unit, key)
@@ -185,6 +183,8 @@ def _of_write(
     match block:
         case 2:
             return _control(unit, key, body)
+        case 10:
+            return q.request_of(RequestKind.PING, unit, key, session=body[0])
         case 16:
             return _set(unit, key, body)
         case 102:
@@ -197,16 +197,16 @@ def _control(unit: int, key: object, body: list[int]) -> Request:
     if body[0] not in _WORDS:
         raise OutOfRange(f"controlword {body[0]}")
     kind = _WORDS[body[0]]
-    watchdog, ramp = (body[1:] + [250, 5][len(body) - 1 :])[:2]
+    watchdog, ramp, session = (body[1:4] + [250, 5, 0][len(body) - 1 :])[:3]
     if kind is RequestKind.ARM:
-        return q.request_of(kind, unit, key, watchdog=watchdog)
+        return q.request_of(kind, unit, key, watchdog=watchdog, session=session)
     return q.request_of(kind, unit, key, ramp=ramp)
 
 
 def _set(unit: int, key: object, body: list[int]) -> Request:
-    if len(body) == 1:
-        return q.request_of(RequestKind.COMMIT, unit, key, token=body[0])
-    commit, token, ramp, valid_for = body[:4]
+    if len(body) == 2:
+        return q.request_of(RequestKind.COMMIT, unit, key, token=body[0], session=body[1])
+    commit, session, token, ramp, valid_for = body[:5]
     if commit not in (0, token):
         raise OutOfRange(f"commit_token {commit} with token {token}")
     return q.request_of(
@@ -216,7 +216,8 @@ def _set(unit: int, key: object, body: list[int]) -> Request:
         token=token,
         ramp=ramp,
         valid_for=valid_for,
-        commands=_channel_commands(body[4:]),
+        session=session,
+        commands=_channel_commands(body[5:]),
     )
 
 
@@ -276,7 +277,7 @@ def _of_read(unit: int, pdu: bytes, request: _Open) -> Reply:
 
 
 def _decode_status(body: Sequence[int]) -> Status:
-    state, fault, token, high_voltage, _, temperature, left, count = body[:8]
+    state, fault, token, high_voltage, _, temperature, left, _, count = body[:9]
     return q.status_of(
         state,
         fault,
@@ -284,5 +285,5 @@ def _decode_status(body: Sequence[int]) -> Status:
         left=left,
         high_voltage=bool(high_voltage),
         temperature=signed(temperature),
-        levels=body[8 : 8 + count],
+        levels=body[9 : 9 + count],
     )

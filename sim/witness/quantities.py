@@ -37,7 +37,7 @@ class Quantity(NamedTuple):
         return self.whole(integer) * self.step
 
 
-FREQUENCY = Quantity("frequency", 0.01, 0, 65535)  # Hz
+FREQUENCY = Quantity("frequency", 0.05, 0, 65535)  # Hz
 LEVEL = Quantity("level", 0.0001, 0, 10000)
 PHASE = Quantity("phase", 0.01, -18000, 17999)  # degrees
 RAMP = Quantity("ramp", 0.001, 0, 1000)  # s
@@ -60,7 +60,7 @@ SLOT = Quantity("envelope_slot", 1, 0, 63)
 STEP = Quantity("envelope_step", 0.0001, 0, 1000)  # s
 TEMPERATURE = Quantity("temperature", 0.1, -1000, 2000)  # °C
 STATE = Quantity("state", 1, 0, 7)
-FAULT = Quantity("fault", 1, 0, 6)
+FAULT = Quantity("fault", 1, 0, 255)
 
 
 def request_of(
@@ -72,6 +72,7 @@ def request_of(
     ramp: int = 0,
     valid_for: int = 0,
     watchdog: int | None = None,
+    session: int | None = None,
     commands: Mapping[int, ChannelCommand] | None = None,
     problem: str = "",
 ) -> Request:
@@ -84,6 +85,7 @@ def request_of(
         ramp=RAMP.value(ramp),
         valid_for=VALID_FOR.value(valid_for),
         watchdog=0.0 if watchdog is None else WATCHDOG.value(watchdog),
+        session=session,
         commands=commands or {},
         problem=problem,
     )

@@ -79,6 +79,7 @@ class ReferenceAmplifier:
         self._states_before: tuple[set[int], float] = (set(), -math.inf)  # of a stop
         self._broadcast_stop: Request | None = None  # the last one
         self._stopped_between = (-math.inf, -math.inf)  # when it took effect
+        self._session: int | None = None  # None: unknown
         self._staged: Request | None = None
         self._staged_until = -math.inf
         self._outputs = ReferenceOutputs(name, config, slack=times.slack, report=report)
@@ -95,7 +96,7 @@ class ReferenceAmplifier:
 
     def forget_state(self) -> None:
         """Treat the state as unknown until the next status."""
-        self.state = self._token = None
+        self.state = self._token = self._session = None
         self._fault = 0
         self.watchdog.forget()
         self._staged = None
@@ -132,13 +133,16 @@ class ReferenceAmplifier:
         """Apply a request sent at `begin` and granted by a reply at `end` [s]."""
         self.advance(begin)
         self._check_state_allows(request, end)
+        self._check_session(request, end)
         is_late = reply.status is not None and reply.status.state in (_REACTING, _FAULT)
         if request.kind in WATCHDOG_FEEDING and not is_late:  # else it may have expired before
             self.watchdog.feed((begin, end))
         match request.kind:
             case RequestKind.ARM:
-                self._silence((begin, end), SILENCING_RAMP, "Arm")
-                self.state, self._fault, self._token = _ENABLED, 0, 0
+                if self.state != _ENABLED:
+                    self._silence((begin, end), SILENCING_RAMP, "Arm")
+                    self._token = 0
+                self.state, self._fault, self._session = _ENABLED, 0, request.session
                 self.watchdog.time = request.watchdog
             case RequestKind.DISARM | RequestKind.STOP:
                 self._stopped(request, begin, end)
@@ -173,7 +177,7 @@ class ReferenceAmplifier:
             self.watchdog.may_feed(between[1])
         match request.kind:
             case RequestKind.ARM:
-                self.watchdog.time = request.watchdog
+                self.watchdog.time, self._session = request.watchdog, request.session
                 self._token = 0
                 self._states_before[0].add(_ENABLED)
             case RequestKind.DISARM:
@@ -208,6 +212,17 @@ class ReferenceAmplifier:
         ):
             self._token_before = (self._token, soon[1])
             self._play(self._staged, self._staged.commands, *soon)
+
+    def _check_session(self, request: Request, end: float) -> None:
+        """Only the session that is held plays, and feeds the watchdog."""
+        known = None not in (self._session, request.session)
+        if self.state == _ENABLED and known and request.session != self._session:
+            self._report(
+                "session",
+                end,
+                f"{self._name} accepted {request.kind.value} of session {request.session}, held by "
+                f"{self._session}",
+            )
 
     def _check_state_allows(self, request: Request, end: float) -> None:
         sets = (RequestKind.STAGE, RequestKind.COMMIT, RequestKind.APPLY)

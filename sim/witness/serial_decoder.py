@@ -41,7 +41,15 @@ _KINDS = {
 _EVENT, _NAK = 30, 31
 _MAX_LENGTH = 249  # bytes of a frame
 _DAMAGED = 16  # damaged requests kept, to recognise replies to them
-_WITH_NUMBER = {RequestKind.ARM, RequestKind.DISARM, RequestKind.COMMIT, RequestKind.STOP}
+_SIZES = {  # of the payload
+    RequestKind.ARM: 4,
+    RequestKind.DISARM: 2,
+    RequestKind.COMMIT: 4,
+    RequestKind.STOP: 2,
+    RequestKind.CLEAR: 1,
+    RequestKind.PING: 2,
+}
+_HELLO, _NEUTRAL, _VERSION = 1, 0, 2
 _WITH_STATUS = {
     RequestKind.ARM,
     RequestKind.DISARM,
@@ -73,7 +81,7 @@ class SerialDecoder:
         message = _decode(direction, piece)
         if direction == "amplifier":
             content = _cobs_decode(piece) or b""
-            sequence = int.from_bytes(content[2:4], "little")
+            sequence = int.from_bytes(content[3:5], "little")
             if isinstance(message, Damaged):
                 self._damaged.append(sequence)
             elif sequence in self._damaged:
@@ -85,24 +93,24 @@ class SerialDecoder:
 
 def _decode(direction: Direction, piece: bytes) -> Message:
     body = _cobs_decode(piece)
-    if body is None or len(body) < 8:
+    if body is None or len(body) < 9:
         return Damaged("a frame of invalid COBS or length")
     content, crc = body[:-4], int.from_bytes(body[-4:], "little")
     if zlib.crc32(content) != crc:
         return Damaged("a wrong CRC")
-    first, address, sequence = struct.unpack_from("<BBH", content)
-    payload = content[4:]
-    if first >> 5 & 3 != 1:
-        return Damaged(f"protocol version {first >> 5 & 3}")
+    first, version, address, sequence = struct.unpack_from("<BBBH", content)
+    number, payload = first & 0x7F, content[5:]
+    if version != (_NEUTRAL if number == _HELLO else _VERSION):
+        return Damaged(f"protocol version {version}")
     if bool(first & 0x80) != (direction == "host"):
         return Damaged("a frame of the wrong direction")
     try:
         if direction == "amplifier":
-            return _decode_request(first & 0x1F, address, sequence, payload)
-        return _decode_reply(first & 0x1F, address, sequence, payload)
+            return _decode_request(number, address, sequence, payload)
+        return _decode_reply(number, address, sequence, payload)
     except INVALID as problem:
         if direction == "amplifier":
-            kind = _KINDS.get(first & 0x1F, RequestKind.READ)
+            kind = _KINDS.get(number, RequestKind.READ)
             return Request(kind, address, (sequence, kind), problem=str(problem) or "too short")
         return Damaged(f"an invalid payload: {problem}")
 
@@ -135,24 +143,37 @@ def _decode_request(number: int, address: int, sequence: int, payload: bytes) ->
     kind = _KINDS[number]
     key = None if address == 0 else (sequence, kind)
     if kind in (RequestKind.STAGE, RequestKind.APPLY):
-        token, ramp, valid_for = struct.unpack_from("<HHH", payload)
-        commands = _channel_commands(payload[6:])
+        session, token, ramp, valid_for = struct.unpack_from("<HHHH", payload)
         return q.request_of(
-            kind, address, key, token=token, ramp=ramp, valid_for=valid_for, commands=commands
+            kind,
+            address,
+            key,
+            token=token,
+            ramp=ramp,
+            valid_for=valid_for,
+            session=session,
+            commands=_channel_commands(payload[8:]),
         )
     if kind is RequestKind.ENVELOPE:
         return Request(kind, address, key, envelope=_envelope(payload))
-    size = 2 if kind in _WITH_NUMBER else 0
+    if kind is RequestKind.HELLO:
+        return Request(kind, address, key)
+    size = _SIZES.get(kind, 0)
     if len(payload) != size:
         raise OutOfRange(f"{kind.value} payload must have {size} bytes, got {len(payload)}")
-    given = int.from_bytes(payload, "little")
+    first = int.from_bytes(payload[:2], "little")
+    second = int.from_bytes(payload[2:], "little")
     match kind:
         case RequestKind.ARM:
-            return q.request_of(kind, address, key, watchdog=given)
+            return q.request_of(kind, address, key, watchdog=first, session=second)
         case RequestKind.COMMIT:
-            return q.request_of(kind, address, key, token=given)
+            return q.request_of(kind, address, key, session=first, token=second)
+        case RequestKind.PING:
+            return q.request_of(kind, address, key, session=first)
+        case RequestKind.CLEAR:
+            return q.request_of(kind, address, key)
         case _:
-            return q.request_of(kind, address, key, ramp=given)
+            return q.request_of(kind, address, key, ramp=first)
 
 
 def _channel_commands(data: bytes) -> dict[int, ChannelCommand]:
@@ -184,10 +205,10 @@ def _envelope(payload: bytes) -> EnvelopeLoad:
 
 def _decode_reply(number: int, address: int, sequence: int, payload: bytes) -> Message:
     if number == _EVENT:
-        state, fault, _ = struct.unpack("<BBB", payload)
+        state, fault, _ = struct.unpack_from("<BBB", payload)
         return StateEvent(address, q.STATE.whole(state), q.FAULT.whole(fault))
     if number == _NAK:
-        refused, code, _ = struct.unpack("<BBB", payload)
+        refused, code, _ = struct.unpack_from("<BBB", payload)
         return Reply(address, (sequence, _KINDS.get(refused)), refusal=code)
     kind = _KINDS.get(number)
     if kind in _WITH_STATUS:
@@ -203,12 +224,10 @@ def _decode_reply(number: int, address: int, sequence: int, payload: bytes) -> M
 
 
 def _decode_status(payload: bytes) -> Status:
-    state, fault, token, flags, temperature, left, _, count = struct.unpack_from(
-        "<BBHBhHHB", payload
+    state, fault, token, flags, temperature, left, _, _, count = struct.unpack_from(
+        "<BBHBhHHBB", payload
     )
-    levels = struct.unpack_from(f"<{count}H", payload, 12)
-    if len(payload) != 12 + 2 * count or flags & ~1:
-        raise OutOfRange("status length does not match its channels, or unknown flags")
+    levels = struct.unpack_from(f"<{count}H", payload, 13)
     return q.status_of(
         state,
         fault,

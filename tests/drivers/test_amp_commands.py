@@ -100,14 +100,14 @@ def result_of(*args: str) -> dict[str, Any]:
 
 
 def test_identify_reports_identity_capabilities_and_wire(background: BackgroundFarEnd) -> None:
-    """At 115 200 baud: 50 and 46 bytes are 8.33 ms, 120 sets a second, a watchdog of 158 ms."""
+    """At 115 200 baud: 53 and 47 bytes are 8.68 ms, 115 sets a second, a watchdog of 159 ms."""
     answer = result_of("identify", f"{background.end.url}?baud=115200")
     assert (answer["serial_number"], answer["channels"]) == ("A-17", 4)
     assert (answer["frequency_min_hz"], answer["frequency_max_hz"]) == (20.0, 600.0)
     assert answer["watchdog_min_s"] == 0.1
-    assert answer["wire_round_trip_s"] == pytest.approx(96 * 10 / 115200, abs=1e-6)
-    assert answer["sets_per_second_max"] == 120
-    assert answer["watchdog_shortest_s"] == pytest.approx(0.15 + 96 * 10 / 115200, abs=1e-6)
+    assert answer["wire_round_trip_s"] == pytest.approx(100 * 10 / 115200, abs=1e-6)
+    assert answer["sets_per_second_max"] == 115
+    assert answer["watchdog_shortest_s"] == pytest.approx(0.15 + 100 * 10 / 115200, abs=1e-6)
 
 
 def test_status_stop_and_clear(background: BackgroundFarEnd) -> None:
@@ -174,7 +174,7 @@ def test_drive_plays_and_ends_silent(background: BackgroundFarEnd) -> None:
     assert isinstance(arm, Arm)
     assert isinstance(apply, Apply)
     assert apply.command_set.valid_for == 0.12
-    assert Ping() in others
+    assert Ping(arm.session) in others
     assert isinstance(others[-2], Disarm)
 
 

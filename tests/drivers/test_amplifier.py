@@ -144,8 +144,8 @@ async def test_open_identifies_and_disarms(backend: ScriptedBackend, take_over: 
 
 async def test_open_refuses_another_protocol_version(backend: ScriptedBackend) -> None:
     """The wire is closed again."""
-    backend.identity = replace(IDENTITY, protocol_version=2)
-    with pytest.raises(LinkError, match="version must be 1, got 2"):
+    backend.identity = replace(IDENTITY, versions=(3,))
+    with pytest.raises(LinkError, match="version must be 2, got 3 from Acme"):
         await Amplifier(backend).open()
     assert backend.closed == 1
 
@@ -336,7 +336,10 @@ async def test_clear_is_superseded_by_a_stop_only(
         else:
             with pytest.raises(CommandRefused, match="superseded"):
                 await clear
-    assert kinds(backend) == [GetStatus, Disarm, Clear, GetStatus, Stop]
+    assert kinds(backend) == [
+        *(GetStatus, Disarm, GetStatus, Clear),
+        *(GetStatus, Stop, GetStatus),
+    ]
 
 
 @pytest.mark.parametrize("call", ["apply", "heartbeat", "commit", "apply before apply"])
@@ -395,7 +398,8 @@ async def test_arm_refuses_a_watchdog_out_of_range(
         with pytest.raises(CommandError, match="watchdog"):
             await amplifier.arm(watchdog)
     await amplifier.arm()
-    assert backend.requests == [Arm(0.25)]
+    assert backend.requests == [Arm(0.25, backend.requests[0].session)]
+    assert 1 <= backend.requests[0].session <= 65535
 
 
 @pytest.mark.parametrize(

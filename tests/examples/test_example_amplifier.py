@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 WIRE_PAGE = (ROOT / "docs" / "reference" / "wire-protocol.md").read_text("utf-8")
-WATCHDOG = 250
+WATCHDOG, SESSION = 250, 9
 WRONG_STATE = 5
 
 
@@ -42,9 +42,8 @@ def test_amplifier_is_silent_5_ms_after_its_watchdog_expired(serial: ModuleType)
     """Levels fall along a raised cosine from its expiry, however late read; the fault latches."""
     now = [1000.0]
     amplifier = amplifier_at(serial, now)
-    amplifier.arm(WATCHDOG)
-    amplifier.feed()
-    amplifier.apply(1, 0, 0, [(0, 11000, 10000, 0), (3, 11000, 5000, 0)])
+    amplifier.arm(WATCHDOG, SESSION)
+    amplifier.apply(SESSION, 1, 0, 0, [(0, 2200, 10000, 0), (3, 2200, 5000, 0)])
     for after, share in ((-0.1, 1.0), (1.25, (1 + math.cos(math.pi / 4)) / 2), (2.5, 0.5)):
         now[0] = 1000.0 + WATCHDOG + after
         amplifier.update()
@@ -55,7 +54,7 @@ def test_amplifier_is_silent_5_ms_after_its_watchdog_expired(serial: ModuleType)
     assert (amplifier.state, amplifier.fault) == (7, 1)
     assert not amplifier.high_voltage
     with pytest.raises(serial.Refused) as refused:
-        amplifier.arm(WATCHDOG)
+        amplifier.arm(WATCHDOG, SESSION + 1)
     assert refused.value.code == WRONG_STATE
 
 
@@ -63,9 +62,8 @@ def test_amplifier_ends_a_set_after_its_validity(serial: ModuleType) -> None:
     """valid_for counts from the commit, and the amplifier stays armed."""
     now = [0.0]
     amplifier = amplifier_at(serial, now)
-    amplifier.arm(2000)
-    amplifier.feed()
-    amplifier.apply(1, 10, 100, [(0, 11000, 10000, 0)])
+    amplifier.arm(2000, SESSION)
+    amplifier.apply(SESSION, 1, 10, 100, [(0, 2200, 10000, 0)])
     now[0] = 105.0
     amplifier.update()
     assert amplifier.levels == [5000, 0, 0, 0]
@@ -80,7 +78,7 @@ def test_serial_end_replies_to_the_frames_of_the_page(serial: ModuleType) -> Non
     end = serial.SerialEnd()
     assert end.take(frame_of("Commit request")) != b""
     reply = end.take(frame_of("Refused Apply request"))  # disarmed: WRONG_STATE
-    assert serial.unstuff(reply[1:-1])[:7] == bytes.fromhex("BF 01 07 00 07 05 FF")
+    assert serial.unstuff(reply[1:-1])[:8] == bytes.fromhex("9F 02 01 07 00 07 05 FF")
     assert end.take(frame_of("LoadEnvelope request")) != b""
     stop = frame_of("Stop request")
     assert b"".join(end.take(bytes([byte])) for byte in stop) != b""
@@ -108,7 +106,7 @@ def test_serial_end_obeys_only_stop_and_commit_as_broadcasts(
 ) -> None:
     """Other requests to address 0 are dropped."""
     end = serial.SerialEnd()
-    assert end.take(serial.framed(serial.ARM, 0, 1, (250).to_bytes(2, "little"))) == b""
+    assert end.take(serial.framed(serial.ARM, 2, 0, 1, b"\xfa\0\x09\0")) == b""
     assert end.amplifier.state == 1
-    assert end.take(serial.framed(serial.STOP, 0, 1, bytes(2))) == b""
+    assert end.take(serial.framed(serial.STOP, 2, 0, 1, bytes(2))) == b""
     assert end.amplifier.state == 5

@@ -18,6 +18,7 @@ from drivers.protocol.messages import AmplifierState, Apply, Nak, NakCode, Ping,
 MODULE = Path(__file__).parents[2] / "examples" / "plugins" / "backend" / "lines_backend.py"
 STATUS = {"state": 1, "fault": 0, "token": 0, "high_voltage": False} | {
     "watchdog_left": 0,
+    "latch": 0,
     "levels": [0, 2500],
 }
 SOON, LONG = 0.05, 5.0  # s

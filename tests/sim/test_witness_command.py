@@ -25,12 +25,12 @@ URL = "serial:///dev/ttyUSB0"
 # docs/reference/wire-protocol.md: Hello, Arm and Stop with their answers; then an Apply although
 # stopped.
 SESSION = """
-0.000 wire1 > 00 04 21 01 07 05 B7 EB 49 77 00   # Hello
-0.002 wire1 < 0004A1010719010441636D65045175616404412D313703312E323BC169D100
-0.010 wire1 > 00 04 23 01 07 02 FA 05 05 CE 1E 7E 00
-0.012 wire1 < 0004A30107020401010301FA02FA040807040101010101010105C005795C00
+0.000 wire1 > 00 02 01 03 01 07 05 5D 22 C1 B5 00   # Hello
+0.002 wire1 < 0002810301070204180441636D65045175616404412D313703312E326EA37E2400
+0.010 wire1 > 00 05 03 02 01 07 02 FA 02 09 05 90 59 CA 1E 00
+0.012 wire1 < 000583020107020401010301FA02FA030807020401010101010101056DDF034300
 """
-DAMAGED = "0.020 wire1 > 00 04 28 01 07 02 05 05 B4 C3 FD 86 00\n"
+DAMAGED = "0.020 wire1 > 00 05 08 02 01 07 02 05 05 5E D5 8B 3F 00\n"
 TIMEOUT = 30  # s; for a loaded machine, not an expectation
 LIMITS = {0: {"frequency_hz": [40, 500], "level": 1.0}}
 CONFIG = {"wires": {"a": "serial"}, "amplifiers": {"m": {"wire": "a", "channels": LIMITS}}}

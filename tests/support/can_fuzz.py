@@ -102,7 +102,7 @@ class CanEnds:
 
     def _revive(self) -> None:
         self._node.receive(CanFrame(0x000, b"\x01\x01"))
-        for order in (Clear(), Arm(2.0)):
+        for order in (Clear(self._device.amplifier.latch), Arm(2.0)):
             for frame in encode_request(order, node=1, sequence=9):
                 self._node.receive(frame)
 

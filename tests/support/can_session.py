@@ -94,9 +94,9 @@ class Session:
             "Read the product's name, 2000sub2",
             *(_read(0x2000, 2), _next_segment(0), _next_segment(1)),
         )
-        yield self._asked("Read the protocol version, 2001sub1", _read(0x2001, 1))
-        yield self._asked("Read the number of channels, 2001sub2", _read(0x2001, 2))
-        yield self._asked("Read the highest frequency, 2001sub4", _read(0x2001, 4))
+        yield self._asked("Read the versions of the protocol, 2000sub5", _read(0x2000, 5))
+        yield self._asked("Read the number of channels, 2001sub1", _read(0x2001, 1))
+        yield self._asked("Read the highest frequency, 2001sub3", _read(0x2001, 3))
         yield self._asked("NMT: start", CanFrame(0x000, bytes([1, NODE])))
         self.timers.ring()
         yield self._heard("Heartbeat, operational")
@@ -135,10 +135,10 @@ class Session:
         self.device.pass_time(0.3)
         yield self._heard("No heartbeat for 250 ms: an emergency, and another once silent")
         yield self._ordered("Arm, refused before Clear", Arm(0.25), 12)
-        yield self._ordered("Clear", Clear(), 13)
+        yield self._ordered("Clear of latch 1", Clear(1), 13)
         yield self._ordered("Stop, ramp 5 ms", Stop(0.005), 14)
         self.device.pass_time(0.01)
-        yield self._ordered("Clear", Clear(), 15)
+        yield self._ordered("Clear of latch 2", Clear(2), 15)
         yield self._ordered("Disarm, ramp 50 ms", Disarm(0.05), 16)
         yield self._asked("NMT: reset node", CanFrame(0x000, bytes([129, NODE])))
 

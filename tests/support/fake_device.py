@@ -1,9 +1,20 @@
 """A simulated amplifier with a clock of its own, for far ends without an event loop."""
 
-from drivers.protocol.messages import AmplifierState, Identity, Reply, Request, Status
+from drivers.protocol.messages import (
+    AmplifierState,
+    Arm,
+    Clear,
+    Disarm,
+    Identity,
+    Reply,
+    Request,
+    Status,
+)
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.faults.fault_window import Faults
 from sim.waveform import ShapedTone
+
+SESSION = 9
 
 
 class FakeDevice:
@@ -37,6 +48,12 @@ class FakeDevice:
 
     def restart(self) -> None:
         self.amplifier.restart(self.now)
+
+    def revive(self) -> None:
+        """Arm it as SESSION, whatever it was before; another session comes first, as that ends."""
+        for session in (SESSION + 1, SESSION):
+            for request in (Clear(self.amplifier.latch), Disarm(0.0), Arm(2.0, session)):
+                self.exchange(request)
 
     def pass_time(self, duration: float) -> None:
         """Let time [s] pass; AssertionError if an output is out of range, or plays disarmed."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from drivers.codec.modbus import exchanges
 from drivers.codec.modbus.adu import ResponseReader, build_adu
 from drivers.errors import FrameError
-from drivers.protocol.messages import Arm, Clear, Request
+from drivers.protocol.messages import Request
 from drivers.statistics import WireCounters
 from fake_device import FakeDevice
 from sim.far_ends.modbus.frames import FRAME_TIMEOUT, RtuReader, TcpReader, rtu_frame, tcp_frame
@@ -64,8 +64,7 @@ class ModbusEnds:
         """Feed bytes to both; the far end's requests and the host's replies."""
         self._taken += 1
         if self._taken % _REVIVAL == 0:
-            for request in (Clear(), Arm(2.0)):
-                self._device.exchange(request)
+            self._device.revive()
         self._device.asked.clear()
         for piece in self._pieces(data):
             for request in self._far.feed(piece, self._device.now):

@@ -21,6 +21,7 @@ from drivers.protocol.messages import (
     Apply,
     Arm,
     Capabilities,
+    Clear,
     Commit,
     GetStatus,
     Hello,
@@ -30,9 +31,10 @@ from drivers.protocol.messages import (
     Stage,
     Stop,
 )
+from fake_device import SESSION
 
 WIDE = Capabilities(
-    *(16, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1, True)
+    *(16, 20.0, 600.0, 0.05, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1, True)
 )
 
 
@@ -47,8 +49,9 @@ def sample_requests() -> list[Request]:
     )
     wanted = guard.check(CommandSet(513, commands, ramp=0.02, valid_for=0.5))
     return [
-        *(Hello(), GetStatus(), Ping(), Arm(0.25), Stop(0.005), Commit(513)),
-        *(Stage(wanted), Apply(wanted), LoadEnvelope(shape)),
+        *(Hello(), GetStatus(), Ping(SESSION), Arm(0.25, SESSION), Stop(0.005)),
+        *(Commit(513, SESSION), Stage(wanted, SESSION), Apply(wanted, SESSION)),
+        *(Clear(1), LoadEnvelope(shape)),
     ]
 
 
@@ -82,10 +85,10 @@ def _serial() -> Codec:
         return asked
 
     def mend(data: bytes) -> bytes:
-        kind, address, payload = data[0] & 0x9F, data[1], data[4:]
-        return encode_frame(Frame(kind, address, 7, payload[:240]))
+        kind, version, address, payload = data[0], data[1], data[2], data[5:]
+        return encode_frame(Frame(kind, address, 7, payload[:240], version))
 
-    bodies = [bytes([one.kind, one.address, 7, 0]) + one.payload for one in frames]
+    bodies = [bytes([one.kind, one.version, one.address, 7, 0]) + one.payload for one in frames]
     return Codec(
         telegrams=bodies,
         take=take,
@@ -139,7 +142,7 @@ def damage(data: bytes, chance: random.Random) -> bytes:
                 del damaged[at : at + chance.randint(1, 4)]
             case _:
                 damaged[at:at] = damaged[at : at + 10]
-    return bytes(damaged).ljust(4, b"\0")
+    return bytes(damaged).ljust(5, b"\0")
 
 
 def is_within_limits(asked: object) -> bool:
@@ -154,7 +157,7 @@ def is_within_limits(asked: object) -> bool:
                 and len(set(channels)) == len(channels)
                 and all(
                     0 <= command.channel <= 15
-                    and 0 <= command.frequency <= 655.35
+                    and 0 <= command.frequency <= 3276.75
                     and 0 <= command.level <= 1
                     and -180 <= command.phase < 180
                     for command in one.commands

@@ -39,7 +39,16 @@ from drivers.line import priority
 from drivers.line.sender import Sender
 from drivers.link.link import Link
 from drivers.protocol.definition import PROTOCOL, WireQuantity
-from drivers.protocol.messages import AmplifierState, Apply, Disarm, Hello, Identity, Stage, Status
+from drivers.protocol.messages import (
+    AmplifierState,
+    Apply,
+    Disarm,
+    GetStatus,
+    Hello,
+    Identity,
+    Stage,
+    Status,
+)
 from sim.amplifier import amplifier as simulated
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.amplifier.channels import Channels, PlayableSet
@@ -287,7 +296,7 @@ async def _sends_at_once(
 
 async def _knows_already(ask: Any, link: Link, request: Any, **how: Any) -> Any:
     if isinstance(request, Hello):
-        return Identity("", "", "", "", PROTOCOL.version)
+        return Identity("", "", "", "", (PROTOCOL.version,))
     return await ask(link, request, **how)
 
 
@@ -436,6 +445,12 @@ def _plays_on(carry_out: Any, amplifier: Any, request: Any, *args: Any) -> Any:
         del amplifier._silence
 
 
+def _fed_by_status(handle: Any, amplifier: Any, request: Any, now: float) -> Any:
+    if isinstance(request, GetStatus):
+        amplifier._last_fed = now
+    return handle(amplifier, request, now)
+
+
 def _forgetful(stage: Any, sets: SetStore, *args: Any, **kwargs: Any) -> Any:
     active, sets.active = sets.active, None
     try:
@@ -474,7 +489,9 @@ FAR_ENDS: dict[str, Bug] = {
     ),
     "there is no watchdog": Bug("watchdog", _watchdog_ends(lambda _: math.inf), scenarios.hung),
     "a status request feeds the watchdog": Bug(
-        "watchdog", replaced(simulated, "_NON_FEEDING_REQUESTS", ()), scenarios.hung
+        "watchdog",
+        wrapped(SimulatedAmplifier, "handle", _fed_by_status),
+        scenarios.hung,
     ),
     "the time left is reported in hundredths": Bug(
         "watchdog", _reports(lambda one: replace(one, watchdog_left=one.watchdog_left / 10))
@@ -563,6 +580,11 @@ FAR_ENDS: dict[str, Bug] = {
     ),
     "an answer comes without its levels": Bug(
         "answer", wrapped(RequestHandler, "_answer", _without_levels), wire="socketcand"
+    ),
+    "it obeys any session": Bug(
+        "session",
+        replaced(SimulatedAmplifier, "_is_foreign", lambda *_: False),
+        scenarios.strangers_heartbeat,
     ),
     "it forgets which set plays": Bug("token", _reports(lambda one: replace(one, token=0))),
 }

@@ -12,14 +12,14 @@ from collections.abc import Callable, Mapping
 from drivers.protocol.messages import (
     AmplifierEvent,
     AmplifierState,
+    Apply,
     Arm,
-    GetCaps,
-    GetFaults,
-    GetStatus,
-    Hello,
+    Commit,
     Nak,
+    Ping,
     Reply,
     Request,
+    Stage,
 )
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.bench.bench import Bench
@@ -36,7 +36,7 @@ TOGETHER = 0.6  # s; until all are silent after one of them has a fault
 _REMEMBERED = 16  # tokens since Arm, as docs/reference/wire-protocol.md has it
 STEP = 0.020  # s; check interval while a channel vibrates
 IDLE_STEP = 1.0
-_NON_FEEDING_REQUESTS = (Hello, GetCaps, GetStatus, GetFaults)
+_FEEDING_REQUESTS = (Arm, Ping, Stage, Commit, Apply)
 _FAULTED = (AmplifierState.FAULT, AmplifierState.FAULT_REACTION_ACTIVE)
 _PLAYING = (
     AmplifierState.OPERATION_ENABLED,
@@ -135,7 +135,7 @@ class Checks:
                 self.violate(f"{name} has played token {token} twice")
             self._tokens[name].append(token)
         self._check_limits(name)
-        if not isinstance(request, _NON_FEEDING_REQUESTS):
+        if isinstance(request, _FEEDING_REQUESTS):
             self._fed[name] = now
             if name not in self._starving:
                 self._expect_silence(name)

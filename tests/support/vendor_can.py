@@ -17,12 +17,14 @@ BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
 STATUS, APPLY, STAGE, COMMIT, ARM, DISARM, STOP, CLEAR = range(8)
 DISARMED, SWITCHED_ON, ARMED, STOPPED_QUICKLY, REACTING, FAULTY = 1, 3, 4, 5, 6, 7
 DONE, BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN, NO_ENVELOPE = 0, 3, 4, 5, 6, 9
+WRONG_SESSION, WRONG_LATCH = 10, 11
 INCOMPLETE_SET = 15
 NO_CHANNEL = 255
 CHANNELS = 4
-LOWEST, HIGHEST = 2000, 60000  # 0.01 Hz
+LOWEST, HIGHEST = 400, 12000  # 0.05 Hz
 HEARTBEAT, WATCHDOG_FADE = 0.05, 0.005  # s
 
+VERSIONS = 1 << 2
 TEXTS = {1: "Elsewhere Ltd", 2: "From the page", 3: "EL-0042", 4: "0.1"}
 CAPABILITIES = "BHHHHHHHHHBBHH"
 LIMITS = (CHANNELS, LOWEST, HIGHEST, 1, 10000, 1, 1, 1000, 100, 2000, 0, 0, 0, 0)
@@ -69,7 +71,7 @@ class VendorAmplifier:
         self._ending = threading.Event()
         self._beat_due = 0.0
         self.nmt = PRE_OPERATIONAL
-        self.state, self.fault = DISARMED, 0
+        self.state, self.fault, self.latch = DISARMED, 0, 0
         self.faults: list[tuple[int, float]] = []
         self.channels = [Channel() for _ in range(CHANNELS)]
         self._forget()
@@ -166,9 +168,12 @@ class VendorAmplifier:
                 result = WRONG_STATE
             elif not 100 <= span <= 2000 or not 1 <= host <= 127:
                 result = BAD_VALUE
+            elif self.state == ARMED and host != self.host:
+                result = WRONG_SESSION
             else:
-                self._silence(0.005, now)
-                self._forget()
+                if self.state != ARMED:
+                    self._silence(0.005, now)
+                    self._forget()
                 self.host, self.watchdog, self.fed = host, span / 1000, now
                 self._become(ARMED)
         elif action == DISARM:
@@ -178,11 +183,12 @@ class VendorAmplifier:
                 self._become(SWITCHED_ON)
         elif action == STOP:
             self._stop(ramp, now)
-        elif action == CLEAR and self._is_silent(now) and self.state in (STOPPED_QUICKLY, FAULTY):
-            was_fault, self.fault = self.state == FAULTY, 0
-            self._become(DISARMED, tells_fault=was_fault)
-        if result == DONE and action != STATUS:
-            self.fed = now
+        elif action == CLEAR and self.state in (STOPPED_QUICKLY, FAULTY):
+            if bits(order, 0, 16) != self.latch:
+                result = WRONG_LATCH
+            elif self._is_silent(now):
+                was_fault, self.fault = self.state == FAULTY, 0
+                self._become(DISARMED, tells_fault=was_fault)
         if result == DONE:
             self._tell_condition(sequence, now)
         self._answer(sequence, action, result, now)
@@ -271,6 +277,7 @@ class VendorAmplifier:
             self._silence(WATCHDOG_FADE, now)
             self.staged = None
             self.fault = 1
+            self.latch = self.latch % 255 + 1
             self.faults.insert(0, (1, now))
             self._become(REACTING, tells_fault=True)
         if self.state == REACTING and self._is_silent(now):
@@ -281,6 +288,7 @@ class VendorAmplifier:
     def _stop(self, ramp: int, now: float) -> None:
         self._silence(min(ramp, 1000) / 1000, now)
         self.staged = None
+        self.latch = self.latch % 255 + 1
         if self.state in (DISARMED, SWITCHED_ON, ARMED):
             self._become(STOPPED_QUICKLY)
 
@@ -317,7 +325,10 @@ class VendorAmplifier:
         is_on = self.state in (SWITCHED_ON, ARMED) or not self._is_silent(now)
         self._send(
             0x280 + NODE,
-            frame((sequence, 0, 8), (is_on, 8, 1), (250, 16, 16), (CHANNELS, 48, 5)),
+            frame(
+                *((sequence, 0, 8), (is_on, 8, 1), (250, 16, 16), (CHANNELS, 48, 5)),
+                (self.latch, 56, 8),
+            ),
         )
 
     def _answer(
@@ -370,10 +381,10 @@ class VendorAmplifier:
                 return struct.pack("<L", 42)
             case 0x2000, number if number in TEXTS:
                 return TEXTS[number].encode()
-            case 0x2001, 1:
-                return b"\x01"
-            case 0x2001, number if 2 <= number <= 15:
-                return struct.pack("<" + CAPABILITIES[number - 2], LIMITS[number - 2])
+            case 0x2000, 5:
+                return struct.pack("<H", VERSIONS)
+            case 0x2001, number if 1 <= number <= 14:
+                return struct.pack("<" + CAPABILITIES[number - 1], LIMITS[number - 1])
             case 0x2006, 0:
                 return self.achieved
             case 0x2008, 0:

@@ -38,9 +38,10 @@ from drivers.protocol.messages import (
 from sim.faults.fault_window import Faults
 
 CAPABILITIES = Capabilities(
-    *(4, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 16, 0.001, 0.1, False)
+    *(4, 20.0, 600.0, 0.05, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 16, 0.001, 0.1, False)
 )
-IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", 1)
+IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", (2,))
+SESSION = 9
 COMMANDS = (
     DriveCommand(channel=0, frequency=110.0, level=0.2, phase=0.0),
     DriveCommand(channel=3, frequency=250.5, level=1.0, phase=-90.0, keep_phase=True),
@@ -57,9 +58,10 @@ ARMED = Status(S.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4,
 LEVELS = (0.2, 0.0, 0.0, 1.0)
 PLAYING = Status(S.OPERATION_ENABLED, Fault.NONE, 513, True, 25.0, 0.25, LEVELS, 1800.0)
 FADING = Status(S.SWITCHED_ON, Fault.NONE, 513, True, 25.0, 0.0, LEVELS, 1800.0)
-STOPPED = Status(S.QUICK_STOP_ACTIVE, Fault.NONE, 513, True, 25.0, 0.0, LEVELS, 1800.0)
-HALTED = Status(S.QUICK_STOP_ACTIVE, Fault.NONE, 513, True, 25.0, 0.0, (0.0,) * 4, 1800.0)
-TRIPPED = Status(S.FAULT, Fault.WATCHDOG, 513, False, -5.3, 0.0, (0.0,) * 4)
+STOPPED = Status(S.QUICK_STOP_ACTIVE, Fault.NONE, 513, True, 25.0, 0.0, LEVELS, 1800.0, 1)
+HALTED = Status(S.QUICK_STOP_ACTIVE, Fault.NONE, 513, True, 25.0, 0.0, (0.0,) * 4, 1800.0, 1)
+TRIPPED = Status(S.FAULT, Fault.WATCHDOG, 513, False, -5.3, 0.0, (0.0,) * 4, latch=2)
+CLEARED = Status(S.SWITCH_ON_DISABLED, Fault.NONE, 513, False, 25.0, 0.0, (0.0,) * 4, latch=2)
 
 
 @dataclass(frozen=True)
@@ -75,14 +77,14 @@ class Example:
 EXAMPLES: dict[str, Example] = {
     "Hello": Example(Hello(), IDENTITY, OFF),
     "GetCaps": Example(GetCaps(), CAPABILITIES, OFF),
-    "Arm": Example(Arm(watchdog=0.25), ARMED, ARMED),
-    "Apply": Example(Apply(SET), Achieved(513, COMMANDS)),
-    "Ping": Example(Ping(), PLAYING),
-    "Stage": Example(Stage(SET), Achieved(513, COMMANDS), ARMED),
-    "Commit": Example(Commit(token=513), Achieved(513, COMMANDS)),
+    "Arm": Example(Arm(watchdog=0.25, session=SESSION), ARMED, ARMED),
+    "Apply": Example(Apply(SET, SESSION), Achieved(513, COMMANDS)),
+    "Ping": Example(Ping(SESSION), PLAYING),
+    "Stage": Example(Stage(SET, SESSION), Achieved(513, COMMANDS), ARMED),
+    "Commit": Example(Commit(513, SESSION), Achieved(513, COMMANDS)),
     "LoadEnvelope": Example(LoadEnvelope(SHAPE), Loaded(slot=5, knots=2)),
-    "Shaped Apply": Example(Apply(SHAPED), Achieved(514, SHAPED_COMMANDS)),
-    "Refused Apply": Example(Apply(SET), Nak(NakCode.BAD_CHANNEL, 3)),
+    "Shaped Apply": Example(Apply(SHAPED, SESSION), Achieved(514, SHAPED_COMMANDS)),
+    "Refused Apply": Example(Apply(SET, SESSION), Nak(NakCode.BAD_CHANNEL, 3)),
     "Disarm": Example(Disarm(ramp=0.05), FADING, FADING),
     "Stop": Example(Stop(ramp=0.005), STOPPED, STOPPED),
     "GetStatus": Example(GetStatus(), TRIPPED, TRIPPED),
@@ -91,7 +93,7 @@ EXAMPLES: dict[str, Example] = {
         FaultList((FaultRecord(Fault.WATCHDOG, None, 1.5), FaultRecord(Fault.ARC, 2, 65.536))),
         TRIPPED,
     ),
-    "Clear": Example(Clear(), OFF, OFF),
+    "Clear": Example(Clear(latch=2), CLEARED, CLEARED),
 }
 
 
@@ -99,7 +101,8 @@ def plain(request: Request) -> Request:
     """Return a request with plain contents, as decoders make them."""
     match request:
         case Stage(command_set=safe) | Apply(command_set=safe):
-            return type(request)(CommandSet(safe.token, safe.commands, safe.ramp, safe.valid_for))
+            wanted = CommandSet(safe.token, safe.commands, safe.ramp, safe.valid_for)
+            return type(request)(wanted, request.session)
         case LoadEnvelope(envelope=safe):
             return LoadEnvelope(Envelope(safe.slot, safe.step, safe.knots))
         case _:

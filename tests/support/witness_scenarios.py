@@ -8,7 +8,7 @@ from drivers.errors import CommandRefused
 from drivers.guard import Guard, GuardLimits
 from witnessed_chain import Chain, with_level
 
-_STOP = bytes.fromhex("00042801070205 05B4C3FD8600")  # one bit of its CRC is wrong
+_STOP = bytes.fromhex("0005080201070205055ED58B3F00")  # one bit of its CRC is wrong
 
 
 async def day(chain: Chain) -> None:
@@ -251,6 +251,20 @@ async def strangers_set(chain: Chain) -> None:
     with contextlib.suppress(CommandRefused):
         await chain.amplifier.apply(guard.silence(7, (0, 1), ramp=0.0))
     await chain.rest(0.02)
+
+
+async def strangers_heartbeat(chain: Chain) -> None:
+    """Another program feeds the watchdog while a finger is felt; on CAN it is the same host."""
+    await chain.operate("arm")
+    await chain.touch(1, rest=0.06)
+    amplifier, own = chain.amplifier, chain.amplifier.session
+    amplifier.session = own % 65535 + 1
+    beating = asyncio.ensure_future(amplifier.heartbeat())
+    await asyncio.sleep(0)
+    amplifier.session = own
+    with contextlib.suppress(CommandRefused):
+        await beating
+    await chain.touch(rest=0.05)
 
 
 async def touched_beside(chain: Chain) -> None:

@@ -81,6 +81,11 @@ class CanBackend(WireBackend):
         self._channels = PROTOCOL.quantities.channel_count.maximum
 
     @property
+    def carries_sessions(self) -> bool:
+        """No: the session is the number of the host."""
+        return False
+
+    @property
     def bus(self) -> str:
         """The bus: a broadcast reaches every amplifier on it."""
         return str(self._url.bus)

@@ -125,9 +125,8 @@ class ObjectClient:
                 name: self._client.upload(index_of("texts"), index)
                 for index, name in enumerate(TEXTS, start=1)
             }
-            version = CAPABILITY_ENTRIES[0]
-            data = self._client.upload(version.index, version.subindex)
-            return unpack_identity(texts, read_integer(version, data))
+            versions = self._client.upload(index_of("texts"), len(TEXTS) + 1)
+            return unpack_identity(texts, versions)
 
         return self._transfer(read, timeout)
 

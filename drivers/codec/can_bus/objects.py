@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from drivers.codec.can_bus.frame import BLOCK, CANOPEN, LAYOUTS
-from drivers.codec.payload import Cursor, pack, read_text
+from drivers.codec.payload import Cursor, pack, read_text, versions_of
 from drivers.command import DriveCommand
 from drivers.errors import FrameError
 from drivers.guard import require_safe
@@ -70,10 +70,12 @@ def read_integer(entry: Entry, data: bytes) -> int:
     return value
 
 
-def unpack_identity(texts: Mapping[str, bytes], version: int) -> Identity:
-    """Decode an identity from its texts; FrameError for an invalid text."""
+def unpack_identity(texts: Mapping[str, bytes], versions: bytes) -> Identity:
+    """Decode an identity from the subindices of its object; FrameError for an invalid one."""
     read = {name: read_text(texts[name].rstrip(b"\0"), name) for name in TEXTS}
-    return Identity(**read, protocol_version=version)
+    if len(versions) != _WIDTHS[_Q.versions.wire]:
+        raise FrameError(f"versions must have 2 bytes, got {len(versions)}")
+    return Identity(**read, versions=versions_of(int.from_bytes(versions, "little")))
 
 
 def unpack_capabilities(values: Mapping[str, int]) -> Capabilities:
@@ -83,7 +85,7 @@ def unpack_capabilities(values: Mapping[str, int]) -> Capabilities:
         value, quantity = values[entry.name], entry.quantity
         if quantity is not None and quantity.per_unit > 1:
             fields[entry.name] = quantity.from_wire(value)
-        elif entry.name != "protocol_version":  # a part of the identity
+        else:
             fields[entry.name] = value
     return Capabilities(**fields, events=True)  # type: ignore[arg-type]  # by name
 

@@ -131,6 +131,7 @@ class CanReplyReader:
             watchdog_left=_Q.watchdog_left.from_wire(reply["watchdog_left"]),
             levels=tuple(_Q.level.from_wire(level) for level in levels),
             voltage=_Q.voltage.from_wire(condition["voltage"]),
+            latch=condition["latch"],
         )
 
 

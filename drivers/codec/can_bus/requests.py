@@ -100,6 +100,8 @@ def _order(request: PdoRequest, node: int, sequence: int, *, fd: bool = False) -
             fields = {"token": host_number(node), "time": _Q.watchdog.to_wire(watchdog)}
         case Disarm(ramp=ramp) | Stop(ramp=ramp):
             fields = {"ramp": _Q.ramp.to_wire(ramp)}
+        case Clear(latch=latch):
+            fields = {"token": _Q.latch.to_wire(latch)}
         case Commit(token=token):
             fields = {"token": _Q.token.to_wire(token)}
         case Apply(command_set=requested) | Stage(command_set=requested):

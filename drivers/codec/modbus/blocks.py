@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Sequence
 from enum import IntEnum
 from typing import Any, TypeVar
 
-from drivers.codec.payload import read_text
+from drivers.codec.payload import read_text, versions_of
 from drivers.command import DriveCommand
 from drivers.errors import FrameError
 from drivers.protocol.definition import PROTOCOL, WireQuantity
@@ -91,8 +91,7 @@ def unpack_identity(registers: Sequence[int]) -> Identity:
         name: read_text(_raw(rest[number * TEXT_SIZE : (number + 1) * TEXT_SIZE]), name)
         for number, name in enumerate(block["texts"])
     }
-    version = _integer("protocol_version", found["protocol_version"])
-    return Identity(protocol_version=version, **texts)
+    return Identity(versions=versions_of(_integer("versions", found["versions"])), **texts)
 
 
 def _raw(registers: Sequence[int]) -> bytes:
@@ -102,7 +101,6 @@ def _raw(registers: Sequence[int]) -> bytes:
 def unpack_capabilities(registers: Sequence[int]) -> Capabilities:
     """Decode capabilities."""
     found, _ = _fields(_MAP["input"]["capabilities"]["registers"], registers)
-    _integer("protocol_version", found.pop("protocol_version"))
     whole: dict[str, Any] = {
         name: _integer(name, found.pop(name)) for name in ("envelope_knots", "envelope_slots")
     }
@@ -126,6 +124,7 @@ def unpack_status(registers: Sequence[int]) -> Status:
         watchdog_left=_number("watchdog_left", found["watchdog_left"]),
         levels=tuple(_number("level", register) for register in levels[:channels]),
         voltage=_number("voltage", found["voltage"]),
+        latch=_integer("latch", found["latch"]),
     )
 
 

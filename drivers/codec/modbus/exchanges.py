@@ -88,18 +88,20 @@ def encode_request(
         case GetFaults():
             beyond = min(records, _MAP["fault_count"]) * FAULT_SIZE
             return Exchange(_read("faults", beyond=beyond), Write(_MAP["look"], (tag,)))
-        case Ping():
-            return Exchange(_read("status", beyond=channels), Write(_MAP["heartbeat"], (tag,)))
+        case Ping(session=session):
+            held = _Q.held_session.to_wire(session)
+            return Exchange(_read("status", beyond=channels), _block("heartbeat", tag, [held]))
         case Arm() | Disarm() | Stop() | Clear():
             return Exchange(
                 _read("status", beyond=channels), _block("control", tag, _control(request))
             )
         case Stage(command_set=requested) | Apply(command_set=requested):
             commit = requested.token if isinstance(request, Apply) else 0
-            write = _block("set", tag, [commit, *_pack_set(requested)])
+            head = [commit, _Q.held_session.to_wire(request.session)]
+            write = _block("set", tag, [*head, *_pack_set(requested)])
             return Exchange(_read("achieved", beyond=channels * CHANNEL_SIZE), write)
-        case Commit(token=token):
-            write = _block("set", tag, [_Q.token.to_wire(token)])
+        case Commit():
+            write = _block("set", tag, _pack_commit(request))
             return Exchange(_read("achieved", beyond=channels * CHANNEL_SIZE), write)
         case LoadEnvelope(envelope=envelope):
             kept = _MAP["holding"]["envelope"]
@@ -110,10 +112,9 @@ def encode_request(
 
 
 def encode_broadcast(request: Broadcast) -> Write:
-    """Encode a write to all units; a commit is one register."""
+    """Encode a write to all units."""
     if isinstance(request, Commit):
-        address = _MAP["holding"]["set"]["address"] + HEAD
-        return Write(address, (_Q.token.to_wire(request.token),))
+        return _block("set", 0, _pack_commit(request))
     return _block("control", 0, _control(request))
 
 
@@ -183,11 +184,25 @@ def _block(name: str, tag: int, registers: Sequence[int]) -> Write:
 
 
 def _control(request: Arm | Disarm | Stop | Clear) -> list[int]:
-    """Controlword, watchdog and ramp; unused ones are at their minimum."""
+    """Controlword, watchdog, ramp, session, latch; unused ones are at their minimum."""
     watchdog = request.watchdog if isinstance(request, Arm) else _Q.watchdog.low
     ramp = request.ramp if isinstance(request, Disarm | Stop) else 0.0
+    session = request.session if isinstance(request, Arm) else 0
+    latch = request.latch if isinstance(request, Clear) else 0
     word = _CONTROLWORDS[type(request).__name__.upper()]
-    return [word, _Q.watchdog.to_wire(watchdog), _Q.ramp.to_wire(ramp)]
+    return [
+        word,
+        *_unsigned(
+            (_Q.watchdog, watchdog),
+            (_Q.ramp, ramp),
+            (_Q.held_session, session),
+            (_Q.latch, latch),
+        ),
+    ]
+
+
+def _pack_commit(commit: Commit) -> list[int]:
+    return _unsigned((_Q.token, commit.token), (_Q.held_session, commit.session))
 
 
 def _unsigned(*pairs: tuple[WireQuantity, float]) -> list[int]:

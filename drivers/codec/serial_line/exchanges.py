@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from drivers.codec.payload import Cursor, Malformed, pack, pack_optional_channel
-from drivers.codec.serial_line.frame import REPLY, Frame
+from drivers.codec.serial_line.frame import NEUTRAL, REPLY, Frame
 from drivers.codec.serial_line.reports import (
     pack_capabilities,
     pack_faults,
@@ -60,6 +60,7 @@ from drivers.protocol.messages import (
     Stop,
 )
 
+_HELLO = PROTOCOL.types["hello"]
 _NAK = PROTOCOL.types["nak"]
 _EVENT = PROTOCOL.types["event"]
 _Q = PROTOCOL.quantities
@@ -88,6 +89,11 @@ def _numbers(
     return _Layout(message, pack_numbers, unpack_numbers)
 
 
+def _value(cursor: Cursor, quantity: WireQuantity) -> float:
+    """Read a value in its unit, without one the integer."""
+    return cursor.number(quantity) if quantity.unit else cursor.integer(quantity)
+
+
 def _empty(message: type[Any]) -> _Layout:
     return _Layout(message, lambda _: b"", lambda _: message())
 
@@ -98,16 +104,20 @@ _STATUS = _Layout(Status, pack_status, unpack_status)
 _ACHIEVED = _Layout(Achieved, pack_achieved, unpack_achieved)
 _FAULTS = _Layout(FaultList, pack_faults, unpack_faults)
 
-_STAGE = _Layout(
-    Stage,
-    lambda stage: pack_set(stage.command_set),
-    lambda cursor: Stage(unpack_set(cursor)),
-)
-_APPLY = _Layout(
-    Apply,
-    lambda apply: pack_set(apply.command_set),
-    lambda cursor: Apply(unpack_set(cursor)),
-)
+
+def _set(message: type[Stage] | type[Apply]) -> _Layout:
+    """Return the layout of a message with a set, after its session."""
+
+    def pack_session_and_set(values: Any) -> bytes:
+        return pack((_Q.held_session, values.session)) + pack_set(values.command_set)
+
+    def unpack_session_and_set(cursor: Cursor) -> Any:
+        session = cursor.integer(_Q.held_session)
+        return message(unpack_set(cursor), session)
+
+    return _Layout(message, pack_session_and_set, unpack_session_and_set)
+
+
 _LOAD_ENVELOPE = _Layout(
     LoadEnvelope,
     lambda load: pack_envelope(load.envelope),
@@ -125,18 +135,27 @@ _EVENT_LAYOUT = _Layout(
 
 # Request and reply of every message type.
 _EXCHANGES: dict[int, tuple[_Layout, _Layout]] = {
-    PROTOCOL.types["hello"]: (_empty(Hello), _IDENTITY),
+    _HELLO: (_empty(Hello), _IDENTITY),
     PROTOCOL.types["get_caps"]: (_empty(GetCaps), _CAPABILITIES),
-    PROTOCOL.types["arm"]: (_numbers(Arm, read=Cursor.number, watchdog=_Q.watchdog), _STATUS),
+    PROTOCOL.types["arm"]: (
+        _numbers(Arm, read=_value, watchdog=_Q.watchdog, session=_Q.session),
+        _STATUS,
+    ),
     PROTOCOL.types["disarm"]: (_numbers(Disarm, read=Cursor.nearest, ramp=_Q.ramp), _STATUS),
-    PROTOCOL.types["stage"]: (_STAGE, _ACHIEVED),
-    PROTOCOL.types["commit"]: (_numbers(Commit, read=Cursor.integer, token=_Q.token), _ACHIEVED),
-    PROTOCOL.types["apply"]: (_APPLY, _ACHIEVED),
+    PROTOCOL.types["stage"]: (_set(Stage), _ACHIEVED),
+    PROTOCOL.types["commit"]: (
+        _numbers(Commit, read=Cursor.integer, session=_Q.held_session, token=_Q.token),
+        _ACHIEVED,
+    ),
+    PROTOCOL.types["apply"]: (_set(Apply), _ACHIEVED),
     PROTOCOL.types["stop"]: (_numbers(Stop, read=Cursor.nearest, ramp=_Q.ramp), _STATUS),
     PROTOCOL.types["get_status"]: (_empty(GetStatus), _STATUS),
     PROTOCOL.types["get_faults"]: (_empty(GetFaults), _FAULTS),
-    PROTOCOL.types["clear"]: (_empty(Clear), _STATUS),
-    PROTOCOL.types["ping"]: (_empty(Ping), _STATUS),
+    PROTOCOL.types["clear"]: (_numbers(Clear, read=Cursor.integer, latch=_Q.latch), _STATUS),
+    PROTOCOL.types["ping"]: (
+        _numbers(Ping, read=Cursor.integer, session=_Q.held_session),
+        _STATUS,
+    ),
     PROTOCOL.types["load_envelope"]: (
         _LOAD_ENVELOPE,
         _numbers(Loaded, read=Cursor.integer, slot=_Q.envelope_slot, knots=_Q.envelope_knots),
@@ -150,11 +169,15 @@ def encode_request(request: Request, *, address: int, sequence: int) -> Frame:
     require_safe(request)
     code = _TYPE_OF[type(request)]
     payload = _EXCHANGES[code][0].pack(request)
-    return Frame(kind=code, address=address, sequence=sequence, payload=payload)
+    return Frame(code, address, sequence, payload, _version(code))
 
 
 def decode_request(frame: Frame) -> Request:
-    """Decode a request; raises Malformed."""
+    """Decode a request; raises Malformed. A Hello may have any version and payload."""
+    if frame.kind == _HELLO:
+        return Hello()
+    if frame.version != PROTOCOL.version:
+        raise Malformed(f"version {frame.version}", code=NakCode.UNSUPPORTED_VERSION)
     if frame.is_reply or frame.type not in _EXCHANGES:
         raise Malformed(f"unknown request type {frame.kind:#04x}", code=NakCode.UNKNOWN_TYPE)
     cursor = Cursor(frame.payload)
@@ -168,21 +191,27 @@ def encode_reply(reply: Reply, to: Frame) -> Frame:
     if isinstance(reply, Nak):
         payload = bytes([to.type, reply.code]) + pack_optional_channel(reply.channel)
         kind = REPLY | _NAK
+        version = NEUTRAL if reply.code is NakCode.UNSUPPORTED_VERSION else _version(to.type)
     else:
         layout = _EXCHANGES[to.type][1]
         if not isinstance(reply, layout.message):
             raise TypeError(f"{type(reply).__name__} is not a reply to message type {to.type}")
         payload = layout.pack(reply)
-        kind = REPLY | to.type
-    return Frame(kind=kind, address=to.address, sequence=to.sequence, payload=payload)
+        kind, version = REPLY | to.type, _version(to.type)
+    return Frame(kind, to.address, to.sequence, payload, version)
 
 
 def decode_reply(frame: Frame, to: Frame) -> Reply:
     """Decode the reply to the request frame `to`, which has its sequence number.
 
     What follows the known fields is ignored. Raises Malformed, also for a reply to another type of
-    request.
+    request or of another version.
     """
+    if frame.version not in (NEUTRAL, PROTOCOL.version):
+        raise Malformed(
+            f"version must be {PROTOCOL.version}, got {frame.version}",
+            code=NakCode.UNSUPPORTED_VERSION,
+        )
     if frame.kind == REPLY | _NAK:
         return _decode_nak(frame.payload, to)
     if frame.kind != REPLY | to.type:
@@ -192,6 +221,11 @@ def decode_reply(frame: Frame, to: Frame) -> Reply:
         )
     reply: Reply = _EXCHANGES[to.type][1].unpack(Cursor(frame.payload))
     return reply
+
+
+def _version(code: int) -> int:
+    """Return the version of the frames of a message type."""
+    return NEUTRAL if code == _HELLO else PROTOCOL.version
 
 
 def is_event(frame: Frame) -> bool:

@@ -1,11 +1,10 @@
 """Frames on a serial line: bytes in, checked frames out.
 
-    0x00  COBS( version/type u8 · address u8 · sequence u16 · payload · CRC-32 u32 )  0x00
+    0x00  COBS( type u8 · version u8 · address u8 · sequence u16 · payload · CRC-32 u32 )  0x00
 
-Every integer is little-endian. The first byte holds the reply bit (7), the version (6, 5) and the
-message type (4..0). The CRC is that of zlib and Ethernet, over everything before it. COBS leaves no
-zero inside a frame, so a reader resynchronizes at the next zero. The leading zero ends preceding
-noise; empty frames are ignored.
+Every integer is little-endian. Bit 7 of the type is set in replies. The CRC is that of zlib and
+Ethernet, over everything before it. COBS leaves no zero inside a frame, so a reader resynchronizes
+at the next zero. The leading zero ends preceding noise; empty frames are ignored.
 """
 
 import struct
@@ -18,10 +17,11 @@ from cobs import cobs
 from drivers.protocol.definition import PROTOCOL
 
 REPLY = 0x80
-_TYPE_MASK = 0x1F
-_VERSION_SHIFT = 5
-_VERSION_MASK = 0x60
-_HEADER = struct.Struct("<BBH")
+NEUTRAL = 0
+"""Version of what every version of the protocol has: Hello, its reply, and a refused version."""
+
+_TYPE_MASK = 0x7F
+_HEADER = struct.Struct("<BBBH")
 _CRC = struct.Struct("<I")
 _OVERHEAD = _HEADER.size + _CRC.size
 _STUFFED_MAX = _OVERHEAD + PROTOCOL.serial.payload_max + 1
@@ -32,13 +32,14 @@ class Frame:
     """A delimited and checked frame with its raw payload.
 
     kind: message type, with the bit REPLY in replies; address 0..255; sequence 0..65535, which a
-    reply repeats from its request.
+    reply repeats from its request; version: of the protocol.
     """
 
     kind: int
     address: int
     sequence: int
     payload: bytes
+    version: int = PROTOCOL.version
 
     @property
     def type(self) -> int:
@@ -53,7 +54,7 @@ class Frame:
 
 @dataclass
 class FrameCounters:
-    """Received frames: good ones, and those with an invalid checksum, length, form or version."""
+    """Received frames: good ones, and those with an invalid checksum, length or form."""
 
     good: int = 0
     invalid_frames: int = 0
@@ -66,8 +67,8 @@ def encode_frame(frame: Frame) -> bytes:
             f"payload must have at most {PROTOCOL.serial.payload_max} bytes, got "
             f"{len(frame.payload)}"
         )
-    first = frame.kind | PROTOCOL.version << _VERSION_SHIFT
-    body = _HEADER.pack(first, frame.address, frame.sequence) + frame.payload
+    header = _HEADER.pack(frame.kind, frame.version, frame.address, frame.sequence)
+    body = header + frame.payload
     stuffed: bytes = cobs.encode(body + _CRC.pack(zlib.crc32(body)))
     return b"\0" + stuffed + b"\0"
 
@@ -139,12 +140,5 @@ def _decode_frame(stuffed: bytes) -> Frame | None:
     body, crc = content[: -_CRC.size], content[-_CRC.size :]
     if len(content) < _OVERHEAD or _CRC.unpack(crc) != (zlib.crc32(body),):
         return None
-    first, address, sequence = _HEADER.unpack_from(body)
-    if (first & _VERSION_MASK) >> _VERSION_SHIFT != PROTOCOL.version:
-        return None
-    return Frame(
-        kind=first & (REPLY | _TYPE_MASK),
-        address=address,
-        sequence=sequence,
-        payload=body[_HEADER.size :],
-    )
+    kind, version, address, sequence = _HEADER.unpack_from(body)
+    return Frame(kind, address, sequence, payload=body[_HEADER.size :], version=version)

@@ -6,7 +6,14 @@ Unpacking yields values in range or raises Malformed.
 from collections.abc import Mapping
 from typing import Any
 
-from drivers.codec.payload import Cursor, pack, pack_optional_channel, pack_text
+from drivers.codec.payload import (
+    Cursor,
+    pack,
+    pack_optional_channel,
+    pack_text,
+    versions_mask,
+    versions_of,
+)
 from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import (
     AmplifierState,
@@ -41,20 +48,20 @@ _CAPABILITIES: Mapping[str, WireQuantity] = {  # in the order of the payload; a 
 
 def pack_identity(identity: Identity) -> bytes:
     """Pack an identity."""
-    version = pack((_Q.protocol_version, identity.protocol_version))
+    version = pack((_Q.versions, versions_mask(identity.versions)))
     texts = (identity.vendor, identity.product, identity.serial_number, identity.firmware)
     return version + b"".join(pack_text(text) for text in texts)
 
 
 def unpack_identity(cursor: Cursor) -> Identity:
     """Unpack an identity."""
-    version = cursor.integer(_Q.protocol_version)
+    versions = versions_of(cursor.integer(_Q.versions))
     return Identity(
         vendor=cursor.text(),
         product=cursor.text(),
         serial_number=cursor.text(),
         firmware=cursor.text(),
-        protocol_version=version,
+        versions=versions,
     )
 
 
@@ -81,6 +88,7 @@ def pack_status(status: Status) -> bytes:
         (_Q.temperature, status.temperature),
         (_Q.watchdog_left, status.watchdog_left),
         (_Q.voltage, status.voltage),
+        (_Q.latch, status.latch),
         (_Q.channel_count, len(status.levels)),
     )
     return head + b"".join(pack((_Q.level, level)) for level in status.levels)
@@ -95,6 +103,7 @@ def unpack_status(cursor: Cursor) -> Status:
     temperature = cursor.number(_Q.temperature)
     watchdog_left = cursor.number(_Q.watchdog_left)
     voltage = cursor.number(_Q.voltage)
+    latch = cursor.integer(_Q.latch)
     channels = cursor.integer(_Q.channel_count)
     return Status(
         state=state,
@@ -104,6 +113,7 @@ def unpack_status(cursor: Cursor) -> Status:
         temperature=temperature,
         watchdog_left=watchdog_left,
         voltage=voltage,
+        latch=latch,
         levels=tuple(cursor.number(_Q.level) for _ in range(channels)),
         other_flags=flags & ~_HIGH_VOLTAGE,
     )

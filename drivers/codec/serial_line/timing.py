@@ -8,14 +8,14 @@ from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.wire_times import WireTimes
 
 _BITS_PER_BYTE = 10  # start, eight data, stop
-_SET_HEAD = 7  # token, ramp, valid_for, count
+_SET_HEAD = 9  # session, token, ramp, valid_for, count
 _ACHIEVED_HEAD = 3  # token, count
 _COMMAND = 8  # channel, flags, frequency, level, phase; two more with envelopes
-_COMMIT = 2  # token
+_COMMIT = 4  # session, token
 _ENVELOPE_HEAD = 4  # slot, step, count
 _KNOT = 4  # level, phase
 _LOADED = 2  # slot, count
-_STATUS_LENGTH = frame_length(12 + 2 * PROTOCOL.quantities.channel_count.maximum)
+_STATUS_LENGTH = frame_length(13 + 2 * PROTOCOL.quantities.channel_count.maximum)
 
 
 @final

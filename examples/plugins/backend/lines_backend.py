@@ -44,14 +44,12 @@ from era_haptics.plugins.backends import (
     require_safe,
 )
 
-HERTZ, LEVEL, DEGREES, SECONDS = 0.01, 1e-4, 0.01, 1e-3  # what one is worth on this wire
+HERTZ, LEVEL, DEGREES, SECONDS = 0.05, 1e-4, 0.01, 1e-3  # what one is worth on this wire
 PLAIN: dict[type[Request], str] = {
     Hello: "hello",
     GetCaps: "capabilities",
     GetFaults: "faults",
     GetStatus: "status",
-    Ping: "ping",
-    Clear: "clear",
 }
 
 
@@ -149,17 +147,22 @@ def encode(request: Request) -> dict[str, Any] | None:
     if type(request) in PLAIN:
         return {"ask": PLAIN[type(request)]}
     match request:
-        case Arm(watchdog):
-            return {"ask": "arm", "watchdog": round(watchdog / SECONDS)}
+        case Arm(watchdog, session):
+            return {"ask": "arm", "watchdog": round(watchdog / SECONDS), "session": session}
+        case Ping(session):
+            return {"ask": "ping", "session": session}
+        case Clear(latch):
+            return {"ask": "clear", "latch": latch}
         case Disarm(ramp):
             return {"ask": "disarm", "ramp": round(ramp / SECONDS)}
         case Stop(ramp):
             return {"ask": "stop", "ramp": round(ramp / SECONDS)}
-        case Commit(token):
-            return {"ask": "commit", "token": token}
-        case Stage(wanted) | Apply(wanted):
+        case Commit(token, session):
+            return {"ask": "commit", "session": session, "token": token}
+        case Stage(wanted, session) | Apply(wanted, session):
             return {
                 "ask": "stage" if isinstance(request, Stage) else "apply",
+                "session": session,
                 "token": wanted.token,
                 "ramp": round(wanted.ramp / SECONDS),
                 "valid_for": round(wanted.valid_for / SECONDS),
@@ -187,7 +190,7 @@ def read(request: Request, reply: dict[str, Any]) -> Reply:
                 reply["product"],
                 reply["serial_number"],
                 reply["firmware"],
-                protocol_version=1,
+                versions=(2,),
             )
         case GetCaps():
             (lowest, highest), (shortest, longest) = reply["frequency"], reply["watchdog"]
@@ -226,4 +229,5 @@ def read(request: Request, reply: dict[str, Any]) -> Reply:
         temperature=25.0,
         watchdog_left=reply["watchdog_left"] * SECONDS,
         levels=tuple(level * LEVEL for level in reply["levels"]),
+        latch=reply["latch"],
     )

@@ -123,8 +123,9 @@ class ObjectDictionary:
         numbers.append(zlib.crc32(identity.serial_number.encode()))
         self._record(_INDEX["identity"], [_pack("u32", value) for value in numbers])
         texts = (identity.vendor, identity.product, identity.serial_number, identity.firmware)
-        self._record(_INDEX["texts"], [text.encode() for text in texts])
-        values = asdict(self._device.capabilities) | {"protocol_version": identity.protocol_version}
+        versions = _pack("u16", sum(2**version for version in identity.versions))
+        self._record(_INDEX["texts"], [*(text.encode() for text in texts), versions])
+        values = asdict(self._device.capabilities)
         kinds = CANOPEN["objects"]["capabilities"]["types"]
         self._record(
             _INDEX["capabilities"],

@@ -11,6 +11,7 @@ from drivers.codec.can_bus.frame import CanFrame
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierState,
     Apply,
     Arm,
     Clear,
@@ -142,13 +143,16 @@ class RequestHandler:
             case Action.ARM:  # the token is the node of the host
                 if not _Q.watchdog.holds(request.time) or not 1 <= request.token <= 127:
                     raise RefusedRequest(NakCode.BAD_VALUE)
+                is_held = self._device.status().state is AmplifierState.OPERATION_ENABLED
+                if is_held and request.token != self._objects.host:
+                    raise RefusedRequest(NakCode.WRONG_SESSION)
                 return Arm(request.time / 1000)
             case Action.DISARM:
                 return Disarm(ramp)
             case Action.STOP:
                 return Stop(ramp)
             case Action.CLEAR:
-                return Clear()
+                return Clear(request.token)
             case _:
                 return GetStatus()
 
@@ -174,12 +178,13 @@ class RequestHandler:
         levels = [_Q.level.to_wire(min(level, 1.0)) for level in status.levels]
         blocks = [
             struct.pack(
-                "<BBhHBx",
+                "<BBhHBB",
                 request.sequence,
                 status.high_voltage,
                 _Q.temperature.to_wire(min(max(status.temperature, -100), 200)),
                 _Q.voltage.to_wire(status.voltage),
                 len(levels),
+                status.latch,
             )
         ]
         for begin in range(0, len(levels), 4):

@@ -142,7 +142,7 @@ class SetBuffer:
                 raise RefusedRequest(INCOMPLETE_SET)
         return DriveCommand(
             channel=channel,
-            frequency=command.frequency / 100,
+            frequency=command.frequency / 20,
             level=command.level / 10_000,
             phase=command.phase / 100,
             keep_phase=bool(command.flags & 1),

@@ -109,6 +109,7 @@ def status_words(status: Status) -> list[int]:
         "voltage": word_of(_Q.voltage, status.voltage),
         "temperature": word_of(_Q.temperature, status.temperature),
         "watchdog_left": word_of(_Q.watchdog_left, status.watchdog_left),
+        "latch": status.latch,
         "channel_count": len(status.levels),
     }
     words = [fields[name] for name in MAP["input"]["status"]["registers"]]
@@ -133,7 +134,6 @@ def achieved_words(achieved: Achieved | None, status: Status) -> list[int]:
 def capability_words(capabilities: Capabilities) -> list[int]:
     """The registers of capabilities."""
     fields = {
-        "protocol_version": PROTOCOL.version,
         "channel_count": capabilities.channels,
         "frequency_min": word_of(_Q.frequency, capabilities.frequency_min),
         "frequency_max": word_of(_Q.frequency, capabilities.frequency_max),
@@ -153,8 +153,8 @@ def capability_words(capabilities: Capabilities) -> list[int]:
 
 
 def identity_words(identity: Identity) -> list[int]:
-    """The protocol version, then the texts."""
-    words = [identity.protocol_version]
+    """The versions that are spoken, then the texts."""
+    words = [sum(2**version for version in identity.versions)]
     for name in MAP["input"]["identity"]["texts"]:
         size = 2 * MAP["text_registers"]
         raw = text_bytes(getattr(identity, name)).ljust(size, b"\0")
@@ -180,9 +180,11 @@ def fault_words(faults: FaultList) -> list[int]:
 
 def decode_set(words: Sequence[int]) -> Stage | Apply | Commit:
     """Decode the set block; raises RefusedWrite."""
-    commit, *rest = words
+    if len(words) < 2:
+        raise RefusedWrite(NakCode.BAD_LENGTH)
+    commit, session, *rest = words
     if not rest:
-        return Commit(token=int(value_of(_Q.token, commit)))
+        return Commit(int(value_of(_Q.token, commit)), session)
     if len(rest) < 3 or (len(rest) - 3) % _GROUP:
         raise RefusedWrite(NakCode.BAD_LENGTH)
     token = int(value_of(_Q.token, rest[0]))
@@ -190,7 +192,7 @@ def decode_set(words: Sequence[int]) -> Stage | Apply | Commit:
     wanted = CommandSet(token, commands_of(rest[3:]), ramp=ramp, valid_for=valid_for)
     if commit not in (0, token):
         raise RefusedWrite(NakCode.BAD_TOKEN)
-    return Apply(wanted) if commit else Stage(wanted)
+    return Apply(wanted, session) if commit else Stage(wanted, session)
 
 
 def decode_envelope(words: Sequence[int]) -> LoadEnvelope:

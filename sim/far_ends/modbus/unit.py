@@ -68,12 +68,14 @@ _Q = PROTOCOL.quantities
 _HEAD = 2
 _GROUP: int = MAP["channel_registers"]
 _CONTROL: int = MAP["holding"]["control"]["address"]
+_HEARTBEAT: int = MAP["holding"]["heartbeat"]["address"]
 _SET: int = MAP["holding"]["set"]["address"]
 _ENVELOPE: int = MAP["holding"]["envelope"]["address"]
 _CHANNELS, _KNOTS = 16, 32
 # How many registers follow those of a block that have names of their own.
 _FOLLOWING = {
     "control": 0,
+    "heartbeat": 0,
     "set": _CHANNELS * _GROUP,
     "envelope": 2 * _KNOTS,
     "status": _CHANNELS,
@@ -123,7 +125,8 @@ class ModbusUnit:
         self._refusal = [0, NO_CHANNEL, 0]
         self._achieved: Achieved | None = None
         # As written last; initially the defaults of watchdog and ramp.
-        self._written = {_CONTROL + 3: _Q.watchdog.to_wire(0.25), _CONTROL + 4: 5}
+        self._written = dict.fromkeys(range(_CONTROL, _ENDS[_CONTROL]), 0)
+        self._written |= {_CONTROL + 3: _Q.watchdog.to_wire(0.25), _CONTROL + 4: 5}
 
     def reply(self, pdu: bytes) -> bytes | None:
         """The reply to a request of at least one byte; None for no reply."""
@@ -139,9 +142,9 @@ class ModbusUnit:
     def handle_broadcast(self, pdu: bytes) -> None:
         """Execute a broadcast commit or stop; anything else is ignored."""
         try:
-            if pdu[0] not in (WRITE_ONE, WRITE):
+            if pdu[0] != WRITE:
                 return
-            address, words = to_write(pdu[0], pdu[1:])
+            address, words = to_write(WRITE, pdu[1:])
             request = self._request(address, self._without_head(address, words))
         except (ModbusException, _NoReply, RefusedWrite):
             return
@@ -152,7 +155,10 @@ class ModbusUnit:
         if function in (READ_HOLDING, READ_INPUT):
             return registers_read(function, self._read(*pair(body)))
         if function in (WRITE_ONE, WRITE):
-            self._write(*to_write(function, body))
+            address, words = to_write(function, body)
+            if function == WRITE_ONE and not _CONTROL + _HEAD <= address < _ENDS[_CONTROL]:
+                raise ModbusException(ILLEGAL_ADDRESS)
+            self._write(address, words)
             return bytes([function]) + body[:4]
         if function == READ_WRITE:
             if len(body) < 4:
@@ -219,7 +225,7 @@ class ModbusUnit:
     def _write(self, address: int, words: Sequence[int]) -> None:
         tag = 0
         try:
-            if address in (MAP["heartbeat"], MAP["look"]) or address in _ENDS:
+            if address == MAP["look"] or address in _ENDS:
                 tag = words[0]
             fields = self._without_head(address, words)
             if tag:
@@ -248,10 +254,10 @@ class ModbusUnit:
 
     def _request(self, address: int, words: Sequence[int]) -> Request | None:
         """Decode the words of a write, without tag and CRC; None where no request follows."""
-        if address in (MAP["heartbeat"], MAP["look"]):
+        if address == MAP["look"]:
             if len(words) > 1:
                 raise ModbusException(ILLEGAL_ADDRESS)
-            return Ping() if address == MAP["heartbeat"] else None
+            return None
         if address in _ENDS:
             address += _HEAD
         for begin, end in _ENDS.items():
@@ -263,6 +269,8 @@ class ModbusUnit:
             return self._control_request(address, words)
         if address != begin + _HEAD:  # no partial writes
             raise ModbusException(ILLEGAL_ADDRESS)
+        if begin == _HEARTBEAT:
+            return Ping(words[0])
         return decode_set(words) if begin == _SET else decode_envelope(words)
 
     def _control_request(self, address: int, words: Sequence[int]) -> Request | None:
@@ -273,12 +281,13 @@ class ModbusUnit:
         ramp = min(control[_CONTROL + 4], _Q.ramp.maximum) / _Q.ramp.per_unit
         match name:
             case "ARM":
-                return Arm(value_of(_Q.watchdog, control[_CONTROL + 3]))
+                session = int(value_of(_Q.session, control[_CONTROL + 5]))
+                return Arm(value_of(_Q.watchdog, control[_CONTROL + 3]), session)
             case "DISARM":
                 return Disarm(ramp)
             case "STOP":
                 return Stop(ramp)
             case "CLEAR":
-                return Clear()
+                return Clear(int(value_of(_Q.latch, control[_CONTROL + 6])))
             case _:
                 raise RefusedWrite(NakCode.BAD_VALUE)

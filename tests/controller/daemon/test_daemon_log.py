@@ -215,7 +215,7 @@ def test_dump_is_json_lines_for_owner_only(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "folder"
     status = Status(AmplifierState.FAULT, Fault.ARC, 7, False, 25.0, 0.0, (0.5, 0.0), 0.0)
     records = [
-        MessageRecord(1.5, "main", "out", Arm(watchdog=0.25)),
+        MessageRecord(1.5, "main", "out", Arm(watchdog=0.25, session=9)),
         MessageRecord(1.6, "main", "in", status),
         MessageRecord(1.7, "main", "none", "LinkTimeout: no reply"),
     ]
@@ -225,7 +225,7 @@ def test_dump_is_json_lines_for_owner_only(tmp_path: Path) -> None:
     head, *lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
     assert head["cause"] == "arc\nx"
     where = {"time_s": 1.5, "link": "main", "way": "out"}
-    assert lines[0] == {**where, "message": "Arm", "content": {"watchdog": 0.25}}
+    assert lines[0] == {**where, "message": "Arm", "content": {"watchdog": 0.25, "session": 9}}
     content = lines[1]["content"]
     assert (content["state"], content["fault"], content["levels"]) == ("FAULT", "ARC", [0.5, 0.0])
     assert lines[2]["content"] == "LinkTimeout: no reply"

@@ -293,8 +293,8 @@ async def test_amplifier_that_returns_armed_is_disarmed() -> None:
         daemon.cut()
         await asyncio.sleep(2)  # no blind stop is sent any more
         assert daemon.state is DaemonState.COMM_LOST
-        daemon.far_end.obey(Clear())
-        daemon.far_end.obey(Arm(2.0))
+        daemon.far_end.obey(Clear(daemon.far_end.status().latch))
+        daemon.far_end.obey(Arm(2.0, 9))
         daemon.obey()
         await asyncio.sleep(3)
         assert daemon.state is DaemonState.FAULT
@@ -500,7 +500,8 @@ async def test_amplifier_that_plays_another_set_after_a_stall_is_stopped() -> No
         await asyncio.sleep(0.02)
         await stall(daemon, 0.15)
         newer = token_after(daemon.far_end.status().token)
-        daemon.far_end.obey(Apply(CommandSet(newer, (), ramp=0.0, valid_for=0.0)))
+        wanted = CommandSet(newer, (), ramp=0.0, valid_for=0.0)
+        daemon.far_end.obey(Apply(wanted, daemon.far_end.amplifier.session))
         await asyncio.sleep(0.2)
         assert daemon.state is DaemonState.FAULT
         assert daemon.far_end.requests(Stop)

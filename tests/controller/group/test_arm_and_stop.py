@@ -257,10 +257,23 @@ async def test_arm_disarms_all_when_one_refuses() -> None:
         bench.far_ends[1].answer = lambda request: (
             Nak(NakCode.WRONG_STATE) if isinstance(request, Arm) else None
         )
+        await bench.controller.disarm()
         with pytest.raises(CommandRefused):
             await bench.controller.arm()
         assert bench.controller.group_state is GroupState.DISARMED
         assert bench.states() == {DISARMED}
+
+
+@in_virtual_time
+async def test_arm_arms_all_anew_when_one_no_longer_is() -> None:
+    """One that another program has disarmed plays again, in a session that all have."""
+    async with running("a", "b") as bench:
+        held = {end.amplifier.session for end in bench.far_ends}
+        bench.far_ends[0].obey(Disarm(0.0))
+        await bench.controller.arm()
+        assert bench.states() == {AmplifierState.OPERATION_ENABLED}
+        (session,) = {end.amplifier.session for end in bench.far_ends}
+        assert session not in held
 
 
 @in_virtual_time

@@ -57,7 +57,7 @@ def test_make_guards_applies_every_limit_of_the_file(tmp_path: Path) -> None:
         ({"frequency_min": 40.0}, {"frequency_min": 60.0}, {"frequency_min": 60.0}),
         ({"frequency_min": 1.0}, {"frequency_min": 2.0}, {"frequency_min": 10.0}),
         ({"frequency_max": 900.0}, {"frequency_max": 300.0}, {"frequency_max": 300.0}),
-        ({"frequency_max": 900.0}, {"frequency_max": 2000.0}, {"frequency_max": 655.35}),
+        ({"frequency_max": 5000.0}, {"frequency_max": 4000.0}, {"frequency_max": 3276.75}),
         ({"rate": 100.0}, {}, {"rate": 100.0}),
         ({"rate": math.inf}, {}, {"rate": 2000.0}),
         ({"slew": 20.0, "duty": 0.3}, {}, {"slew": 20.0, "duty": 0.3}),

@@ -257,9 +257,9 @@ class _Open:
 
 
 WAITING = {
-    SerialBackend: ("serial:///dev/none?address={}", [Ping(), Arm(watchdog=0.25)]),
-    ModbusBackend: ("modbus+rtu:///dev/none#{}", [Ping(), Arm(watchdog=0.25)]),
-    CanBackend: ("can+slcan:///dev/none#{}", [Arm(watchdog=0.25)]),  # listens first
+    SerialBackend: ("serial:///dev/none?address={}", [Ping(), Arm(watchdog=0.25, session=9)]),
+    ModbusBackend: ("modbus+rtu:///dev/none#{}", [Ping(), Arm(watchdog=0.25, session=9)]),
+    CanBackend: ("can+slcan:///dev/none#{}", [Arm(watchdog=0.25, session=9)]),  # listens first
 }
 STOP = Stop(0.005)
 

@@ -14,6 +14,7 @@ from drivers.command import CommandSet
 from drivers.conformance import CHECKS, run_check
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierState,
     Apply,
     Arm,
     Capabilities,
@@ -23,6 +24,7 @@ from drivers.protocol.messages import (
     Identity,
     LoadEnvelope,
     Nak,
+    Ping,
     Reply,
     Request,
     Stage,
@@ -82,7 +84,9 @@ def altered_set(alter: Callable[[CommandSet], dict[str, Any]]) -> Answer:
     """Apply another set."""
     return altered_request(
         Apply,
-        lambda asked: Apply(replace(plain(asked).command_set, **alter(asked.command_set))),
+        lambda asked: Apply(
+            replace(plain(asked).command_set, **alter(asked.command_set)), asked.session
+        ),
     )
 
 
@@ -92,7 +96,7 @@ def void(amplifier: SimulatedAmplifier, now: float) -> None:
 
 def clear(amplifier: SimulatedAmplifier, now: float) -> None:
     """Acknowledge a stop or fault."""
-    amplifier.handle(Clear(), now)
+    amplifier.handle(Clear(amplifier.latch), now)
 
 
 def beside(kind: type[Any], *, before: Deed = void, after: Deed = void) -> Answer:
@@ -157,7 +161,7 @@ def keeps_empty_slots(amplifier: SimulatedAmplifier, request: Request, now: floa
 def commits_anything(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
     """Play the staged set whatever the token."""
     if isinstance(request, Commit) and amplifier._sets.staged is not None:
-        reply = amplifier.handle(Commit(amplifier._sets.staged.token), now)
+        reply = amplifier.handle(Commit(amplifier._sets.staged.token, request.session), now)
         return Achieved(request.token, ()) if isinstance(reply, Achieved) else reply
     return amplifier.handle(request, now)
 
@@ -183,6 +187,28 @@ def does_not_beat(amplifier: SimulatedAmplifier, request: Request, now: float) -
     return amplifier.status(now) if isinstance(reply, Status) else reply
 
 
+def obeys_any_session(kind: type[Any]) -> Answer:
+    """Carry out requests of a kind whatever their session."""
+
+    def answer(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
+        if isinstance(request, kind):
+            request = replace(request, session=amplifier.session)
+        return amplifier.handle(request, now)
+
+    return answer
+
+
+def forget_session(amplifier: SimulatedAmplifier, now: float) -> None:
+    """Forget which session has ended."""
+    if amplifier.state is not AmplifierState.OPERATION_ENABLED:
+        amplifier.session = 0
+
+
+def silences(amplifier: SimulatedAmplifier, now: float) -> None:
+    """Begin anew at level zero."""
+    amplifier._silence(now, ramp=0.0)
+
+
 MISTAKES: list[tuple[str, Answer]] = [
     ("identity", altered_reply(Identity, serial_number="")),
     ("capabilities", altered_reply(Capabilities, level_max=0.0)),
@@ -193,13 +219,21 @@ MISTAKES: list[tuple[str, Answer]] = [
         "all_or_nothing",
         altered_set(lambda asked: {"commands": tuple(c for c in asked.commands if c.channel < 4)}),
     ),
-    ("stage_and_commit", altered_request(Stage, lambda stage: Apply(stage.command_set))),
+    (
+        "stage_and_commit",
+        altered_request(Stage, lambda stage: Apply(stage.command_set, stage.session)),
+    ),
     ("stage_and_commit", commits_anything),
     ("tokens", beside(Apply, before=forget_tokens)),
     ("tokens", ignore_contents),
     ("staged_sets_expire", beside(Commit, before=keep_staged)),
     ("ramps", altered_set(lambda asked: {"ramp": 0.0})),
+    *(("sessions", obeys_any_session(kind)) for kind in (Apply, Stage, Ping, Arm)),
+    ("sessions", beside(Arm, before=forget_session)),
+    ("sessions", beside(Arm, before=silences)),
     ("quick_stop", beside(Stop, after=clear)),
+    ("clear_names_the_stop", altered_reply(Status, latch=1)),
+    ("clear_names_the_stop", beside(Clear, before=lambda one, now: setattr(one, "latch", 1))),
     ("silence_never_later", beside(Stop, before=extend_ramp)),
     ("quick_stop", beside(Arm, before=clear)),
     ("disarm", ignores_disarm),

@@ -135,9 +135,9 @@ def test_silent_channel_may_have_any_frequency() -> None:
         (GuardLimits(1.0, 1000.0, 2.0), {}, GuardLimits(20.0, 600.0, 1.0)),
         (GuardLimits(1.0, 1000.0, 2.0), {"level_max": 0.3}, GuardLimits(20.0, 600.0, 0.3)),
         (
-            GuardLimits(1.0, 1000.0, 2.0),
-            {"frequency_min": 1.0, "frequency_max": 2000.0, "level_max": 5.0},
-            GuardLimits(10.0, 655.35, 1.0),
+            GuardLimits(1.0, 5000.0, 2.0),
+            {"frequency_min": 1.0, "frequency_max": 4000.0, "level_max": 5.0},
+            GuardLimits(10.0, 3276.75, 1.0),
         ),
         (GuardLimits(40.0, 500.0, 0.8), {}, GuardLimits(40.0, 500.0, 0.8)),
     ],

@@ -85,7 +85,7 @@ def test_only_the_amplifier_sends_sets() -> None:
             if name not in CARRIERS:
                 continue
             senders.add(file.name)
-            (argument,) = [*call.args, *(keyword.value for keyword in call.keywords)]
+            argument, *_ = [*call.args, *(keyword.value for keyword in call.keywords)]
             function = getattr(getattr(argument, "func", None), "id", "")
             if "codec" in file.parts:
                 is_checked = "unpack" in function or "decode" in function

@@ -112,7 +112,7 @@ LIES = {
         "frequency achieved on channel 0",
     ),
     "frequency is two steps high": (
-        achieved(frequency=lambda value: value + 0.02),
+        achieved(frequency=lambda value: value + 0.1),
         "frequency achieved on channel 0",
     ),
     "phase is negated": (

@@ -71,10 +71,10 @@ def test_temperature_derates_above_70_and_trips_above_85() -> None:
         False,
     )
     assert now.levels == (0.0,) * 4
-    amplifier.handle(Clear(), 1.3)
+    amplifier.handle(Clear(1), 1.3)
     assert amplifier.state is AmplifierState.FAULT
     amplifier.set_temperature(25.0, 1.4)
-    amplifier.handle(Clear(), 1.4)
+    amplifier.handle(Clear(1), 1.4)
     assert amplifier.state is AmplifierState.SWITCH_ON_DISABLED
     amplifier.handle(Arm(2.0), 1.5)
     reply = amplifier.handle(Apply(playing(3, 0.6)), 1.5)

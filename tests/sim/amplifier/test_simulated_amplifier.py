@@ -66,7 +66,7 @@ S = AmplifierState
 REQUESTS: list[Request] = [
     *(Hello(), GetCaps(), GetStatus(), GetFaults(), Ping()),
     *(Arm(0.25), Disarm(0.01), Stage(playing(7, 0.5)), Commit(7), Apply(playing(7, 0.5))),
-    *(Stop(0.01), Clear()),
+    *(Stop(0.01), Clear(1)),
 ]
 EXPECTED = {
     #                        hello..ping     arm   disarm stage commit apply stop  clear
@@ -166,14 +166,14 @@ def test_watchdog_expires_at_its_time_when_ticked_late() -> None:
 
 @pytest.mark.parametrize("request_", REQUESTS, ids=lambda request: type(request).__name__)
 def test_watchdog_is_fed_by_accepted_requests(request_: Request) -> None:
-    """Every good request feeds it but Hello, GetCaps, GetStatus and GetFaults."""
+    """Arm, Ping, Stage, Commit and Apply feed it, no other request does."""
     amplifier = armed()
     if isinstance(request_, Commit):
         amplifier.handle(Stage(playing(7, 0.5)), 0.0)
     amplifier.handle(request_, 0.2)
     amplifier.tick(0.3)
-    asking = isinstance(request_, Hello | GetCaps | GetStatus | GetFaults)
-    assert (amplifier.state is AmplifierState.FAULT) == asking
+    feeds = isinstance(request_, Arm | Ping | Stage | Commit | Apply)
+    assert (amplifier.state is AmplifierState.OPERATION_ENABLED) == feeds
 
 
 def test_watchdog_is_not_fed_by_refused_requests() -> None:
@@ -189,7 +189,7 @@ BAD = [
     (DriveCommand(-1, 110.0, 0.5), NakCode.BAD_CHANNEL, -1),
     (DriveCommand(0, 110.0, 0.5), NakCode.BAD_CHANNEL, 0),  # named twice
     (DriveCommand(1, 9.9, 0.5), NakCode.BAD_VALUE, 1),
-    (DriveCommand(1, 700.0, 0.5), NakCode.BAD_VALUE, 1),
+    (DriveCommand(1, 3276.8, 0.5), NakCode.BAD_VALUE, 1),
     (DriveCommand(1, math.nan, 0.5), NakCode.BAD_VALUE, 1),
     (DriveCommand(1, 110.0, 1.0001), NakCode.BAD_VALUE, 1),
     (DriveCommand(1, 110.0, -0.1), NakCode.BAD_VALUE, 1),
@@ -251,6 +251,7 @@ def test_apply_ignores_a_repeated_token() -> None:
     amplifier.handle(Apply(playing(2, 0.3)), 0.2)
     refused(amplifier.handle(Apply(playing(1, 0.5)), 0.2), NakCode.BAD_TOKEN)
     assert status(amplifier, 0.2).levels[0] == 0.3
+    amplifier.handle(Disarm(0.0), 0.3)
     amplifier.handle(Arm(0.25), 0.3)
     amplifier.handle(Apply(playing(1, 0.5)), 0.3)
     assert status(amplifier, 0.3).token == 1
@@ -304,17 +305,17 @@ def test_set_ends_after_valid_for() -> None:
 
 
 def test_achieved_reports_rounded_values() -> None:
-    """0.01 Hz, 1e-4 of full stroke, 0.01 degrees within half a turn, the protocol's steps."""
-    wanted = CommandSet(1, (DriveCommand(2, 110.00499, 0.123449, 270.0),), 0.0, 0.0)
+    """0.05 Hz, 1e-4 of full stroke, 0.01 degrees within half a turn, the protocol's steps."""
+    wanted = CommandSet(1, (DriveCommand(2, 110.0249, 0.123449, 270.0),), 0.0, 0.0)
     reply = armed().handle(Apply(wanted), 0.0)
     assert isinstance(reply, Achieved)
     assert reply.commands == (DriveCommand(2, 110.0, 0.1234, -90.0),)
     finer = dataclasses.replace(
-        wanted, token=2, commands=(DriveCommand(2, 110.00501, 0.123451, 12.3449),)
+        wanted, token=2, commands=(DriveCommand(2, 110.0251, 0.123451, 12.3449),)
     )
     reply = armed().handle(Apply(finer), 0.0)
     assert isinstance(reply, Achieved)
-    assert reply.commands == (DriveCommand(2, 110.01, 0.1235, 12.34),)
+    assert reply.commands == (DriveCommand(2, 110.05, 0.1235, 12.34),)
 
 
 def test_stop_is_latched() -> None:
@@ -323,14 +324,14 @@ def test_stop_is_latched() -> None:
     amplifier.handle(Apply(playing(1, 1.0)), 0.0)
     amplifier.handle(Stop(0.05), 0.1)
     assert status(amplifier, 0.125).levels[0] == pytest.approx(0.5)
-    amplifier.handle(Clear(), 0.125)
+    amplifier.handle(Clear(1), 0.125)
     assert amplifier.state is AmplifierState.QUICK_STOP_ACTIVE
     refused(amplifier.handle(Apply(playing(2, 1.0)), 0.13), NakCode.WRONG_STATE)
     stopped = status(amplifier, 10.0)
     assert (stopped.state, stopped.levels[0]) == (S.QUICK_STOP_ACTIVE, 0)
     assert stopped.fault is Fault.NONE
     assert not stopped.high_voltage
-    amplifier.handle(Clear(), 10.0)
+    amplifier.handle(Clear(1), 10.0)
     assert amplifier.state is AmplifierState.SWITCH_ON_DISABLED
 
 

@@ -4,8 +4,10 @@ import asyncio
 import contextlib
 import os
 import resource
+import struct
 import time
 import tty
+import zlib
 from collections.abc import AsyncIterator
 
 import pytest
@@ -100,8 +102,8 @@ async def test_serial_end_skips_noise(end: SerialEnd, host: Host) -> None:
     ("kind", "payload", "code"),
     [
         (PROTOCOL.types["arm"], b"", NakCode.BAD_LENGTH),
-        (PROTOCOL.types["arm"], b"\xff\xff", NakCode.BAD_VALUE),
-        (PROTOCOL.types["commit"], b"\x00\x00", NakCode.BAD_TOKEN),
+        (PROTOCOL.types["arm"], b"\xff\xff\x09\x00", NakCode.BAD_VALUE),
+        (PROTOCOL.types["commit"], b"\x09\x00\x00\x00", NakCode.BAD_TOKEN),
         (29, b"", NakCode.UNKNOWN_TYPE),
     ],
 )
@@ -114,6 +116,36 @@ async def test_serial_end_refuses_invalid_payloads(
     reply = decode_reply(await host.frame(), frame)
     assert isinstance(reply, Nak)
     assert reply.code is code
+
+
+def by_hand(kind: int, version: int, payload: bytes) -> bytes:
+    """A frame of sequence 9, from the words of the page."""
+    body = struct.pack("<BBBH", kind, version, ADDRESS, 9) + payload
+    content = body + struct.pack("<I", zlib.crc32(body))
+    return b"\0" + b"".join(bytes([len(p) + 1]) + p for p in content.split(b"\0")) + b"\0"
+
+
+@pytest.mark.parametrize(("version", "payload"), [(0, b""), (1, b""), (3, b"more"), (255, b"")])
+async def test_serial_end_answers_a_hello_of_any_version(
+    host: Host, version: int, payload: bytes
+) -> None:
+    """The reply is of version 0 and begins with the bits of the versions; bit 2 is set."""
+    os.write(host.fd, by_hand(1, version, payload))
+    reply = await host.frame()
+    assert (reply.kind, reply.version, reply.sequence) == (0x81, 0, 9)
+    assert reply.payload[:2] == b"\x04\x00"
+
+
+@pytest.mark.parametrize("version", [0, 1, 3, 255])
+async def test_serial_end_refuses_another_version_neutrally(host: Host, version: int) -> None:
+    """Type 31 of version 0: the refused type, UNSUPPORTED_VERSION, no channel. Nothing is done."""
+    os.write(host.fd, by_hand(8, version, b"\0\0"))  # a stop
+    reply = await host.frame()
+    assert (reply.kind, reply.version, reply.sequence) == (0x9F, 0, 9)
+    assert reply.payload == bytes([8, 8, 255])
+    status = await host.ask(GetStatus())
+    assert isinstance(status, Status)
+    assert status.state is AmplifierState.SWITCH_ON_DISABLED
 
 
 @pytest.mark.parametrize("address", [ADDRESS, 0])

@@ -132,10 +132,10 @@ def test_can_decoder_decodes_the_page() -> None:
     assert seen[-1] == BootUp(1)
 
 
-@pytest.mark.parametrize("place", range(1, 12))
+@pytest.mark.parametrize("place", range(1, 13))
 def test_serial_decoder_detects_a_flipped_bit(place: int) -> None:
     """No single flipped bit of a stop leaves a frame that means something else."""
-    frame = bytes.fromhex("00042801070205 05B4C3FD8700")
+    frame = bytes.fromhex("0005080201070205055ED58B3E00")
     for bit in range(8):
         data = bytearray(frame)
         data[place] ^= 1 << bit
@@ -165,7 +165,7 @@ def _over_tcp(number: int, pdu: str) -> bytes:
 
 # docs/reference/wire-modbus.md: a Ping with tag 22, refused with exception 2, and the block
 # refusal that is read then: tag, no check, BUSY, no channel, refused_tag.
-PING = _over_tcp(1, "17 03E8 000E 0008 0001 02 0016")
+PING = _over_tcp(1, "17 03E8 000F 0008 0003 06 0016 0000 0009")
 REFUSED = _over_tcp(1, "97 02")
 WHY = _over_tcp(2, "04 0408 0005")
 EARLIER = _over_tcp(2, "04 0A 0015 0000 0007 00FF 0003")
@@ -212,7 +212,7 @@ def test_witness_reports_a_stale_refusal_unless_disturbed(are_on: bool) -> None:
     witness = Witness(PLAN)
     if are_on:
         witness.faults(0.0, "line", are_on=True)
-    again = PING[:1] + b"\3" + PING[2:-1] + b"\x17"
+    again = PING[:1] + b"\3" + PING[2:-6] + b"\0\x17" + PING[-4:]
     pieces: tuple[tuple[float, Direction, bytes], ...] = (
         (0.001, "amplifier", PING),
         (0.002, "host", REFUSED),
@@ -294,7 +294,7 @@ def test_witness_accepts_a_late_reply_to_a_repeated_request() -> None:
         if token != 513:  # with no check, for other words have another one
             at = data.index((513).to_bytes(2, "big"), 14)
             data = data[:at] + data[at:].replace(b"\2\1", token.to_bytes(2, "big"))
-            check = data.index(b"\xc9\xd5" if toward == "amplifier" else b"\xe3\x48")
+            check = data.index(b"\x3c\xf7" if toward == "amplifier" else b"\xe0\xf5")
             data[check : check + 2] = b"\0\0"
         witness.record_bytes("line", toward, time, bytes(data))
 
@@ -321,7 +321,7 @@ def test_witness_accepts_a_late_reply_to_a_repeated_request() -> None:
 def test_decoders_check_the_bounds_of_envelopes(count: int, phase: int, problem: str) -> None:
     """The bounds of the page's table: an envelope beyond them is wrong, whichever wire it is on."""
     knots = [1000, phase] * count
-    head = bytes.fromhex("2D 01 07 00")  # of the page's LoadEnvelope
+    head = bytes.fromhex("0D 02 01 07 00")  # of the page's LoadEnvelope
     body = head + struct.pack(f"<BHB{2 * count}H", 5, 50, count, *knots)
     line = b"\0" + cobs.encode(body + struct.pack("<I", zlib.crc32(body))) + b"\0"
     block = struct.pack(f">{3 + 2 * count}H", 5, 50, count, *knots)

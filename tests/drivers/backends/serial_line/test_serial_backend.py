@@ -1,8 +1,10 @@
 import asyncio
 import errno
 import socket
+import struct
 import sys
 import threading
+import zlib
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from unittest.mock import Mock
@@ -16,7 +18,7 @@ from drivers.backends.serial_line.backend import SerialBackend
 from drivers.codec.serial_line.exchanges import decode_request, encode_reply
 from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
 from drivers.errors import FrameError, LinkError, LinkTimeout
-from drivers.protocol.messages import GetStatus, Hello, Nak, NakCode, Ping
+from drivers.protocol.messages import GetStatus, Hello, Nak, NakCode, Ping, Request
 from scripted_amplifier import FarEnd
 from vendor_pages import ARMED, IDENTITY, usual_reply
 
@@ -241,3 +243,20 @@ async def test_open_refuses_two_amplifiers_at_one_address(far_end: FarEnd) -> No
     far_end.answer = twice
     await amplifier.open()
     await amplifier.close()
+
+
+async def test_amplifier_of_version_3_alone_is_refused_by_name(far_end: FarEnd) -> None:
+    """Its Hello is understood: bit 3 of the versions, then the texts, and what version 3 added."""
+
+    def answer(request: Request, frame: Frame) -> bytes:
+        payload = b"\x08\0" + b"".join(bytes([len(t)]) + t for t in (b"Acme", b"Quad", b"A", b"9"))
+        head = struct.pack("<BBBH", 0x81, 0, 1, frame.sequence)
+        content = head + payload + b"and more"
+        content += struct.pack("<I", zlib.crc32(content))
+        return b"\0" + b"".join(bytes([len(p) + 1]) + p for p in content.split(b"\0")) + b"\0"
+
+    far_end.answer = answer
+    with pytest.raises(LinkError, match="version must be 2, got 3 from Acme Quad A"):
+        await Amplifier(SerialBackend(far_end.url)).open()
+    assert [type(request) for request in far_end.requests] == [Hello]
+    assert far_end.frames[0].version == 0

@@ -43,7 +43,7 @@ from drivers.protocol.messages import (
 )
 
 WIDE = Capabilities(
-    *(16, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1, True)
+    *(16, 20.0, 600.0, 0.05, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1, True)
 )
 
 
@@ -63,7 +63,7 @@ def test_set_is_a_frame_per_channel_an_order_and_a_sync() -> None:
         *(0x202, 0x302, 0x402, 0x502, 0x203, 0x303),
         *(0x482, 0x080),
     ]
-    assert frames[5].data == bytes.fromhex("0429 F401 0000 50 09")  # 105 Hz, 0.05, channel 5
+    assert frames[5].data == bytes.fromhex("3408 F401 0000 50 09")  # 105 Hz, 0.05, channel 5
     assert frames[6].data == bytes.fromhex("0201 0100 0000 31 09")  # six times eight plus apply
 
 
@@ -241,19 +241,19 @@ def test_objects_are_decoded() -> None:
         FaultRecord(Fault.WATCHDOG, None, 1.5),
         FaultRecord(Fault.ARC, 2, 65.536),
     )
-    achieved = unpack_achieved(bytes.fromhex("0102 01 F82A D007 D8DC 35 00 05 06"))
+    achieved = unpack_achieved(bytes.fromhex("0102 01 9808 D007 D8DC 35 00 05 06"))
     assert achieved.token == 513
     assert achieved.commands == (
         DriveCommand(3, 110.0, 0.2, -90.0, keep_phase=True, onset=5, ending=6),
     )
     texts = {"vendor": b"Acme", "product": b"Quad\0", "serial_number": b"A", "firmware": b"1"}
-    assert unpack_identity(texts, 1).product == "Quad"
+    assert unpack_identity(texts, b"\4\0").product == "Quad"
     with pytest.raises(FrameError, match=r"vendor .*control characters"):
-        unpack_identity({**texts, "vendor": b"A\nB"}, 1)
+        unpack_identity({**texts, "vendor": b"A\nB"}, b"\4\0")
     with pytest.raises(FrameError, match="product must be UTF-8"):
-        unpack_identity({**texts, "product": b"\xff"}, 1)
+        unpack_identity({**texts, "product": b"\xff"}, b"\4\0")
     numbers = {
-        **{"protocol_version": 1, "channels": 4, "frequency_min": 2000, "frequency_max": 60000},
+        **{"channels": 4, "frequency_min": 400, "frequency_max": 12000},
         **{"frequency_step": 1, "level_max": 10000, "level_step": 1, "phase_step": 1},
         **{"ramp_max": 1000, "watchdog_min": 100, "watchdog_max": 2000, "envelope_knots": 32},
         **{"envelope_slots": 63, "envelope_step_min": 10, "envelope_step_max": 1000},

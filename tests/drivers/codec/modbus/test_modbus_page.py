@@ -10,7 +10,7 @@ from drivers.codec.modbus.adu import RequestAdu, ResponseReader, build_adu
 from drivers.codec.modbus.exchanges import Exchange, Read, Write
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import Apply, Commit, Nak, Ping, Request, Stop
+from drivers.protocol.messages import Apply, Commit, Disarm, Nak, Request, Stop
 from drivers.statistics import WireCounters
 from sim.far_ends.modbus.frames import RequestAdu as Asked
 from sim.far_ends.modbus.frames import rtu_frame, tcp_frame
@@ -29,8 +29,8 @@ FRAMES = {
 }
 MAP = PROTOCOL.modbus
 NUMBERED = [(name, number) for number, name in enumerate(EXAMPLES, start=1)]
-BESIDE = ("Refusal", "FC16 Apply", "FC4 Apply", "FC43 Identification", "FC6 Ping")
-BROADCASTS = {"Broadcast Commit": (22, Commit(513)), "Broadcast Stop": (23, Stop(0.005))}
+BESIDE = ("Refusal", "FC16 Apply", "FC4 Apply", "FC43 Identification", "FC6 Disarm")
+BROADCASTS = {"Broadcast Commit": (22, Commit(513, 9)), "Broadcast Stop": (23, Stop(0.005))}
 every_wire = pytest.mark.parametrize("wire", ["RTU", "TCP"])
 every_example = pytest.mark.parametrize(("name", "number"), NUMBERED, ids=EXAMPLES)
 
@@ -173,8 +173,8 @@ def test_other_masters_are_served(wire: str) -> None:
     for number, text in ((0, b"Acme"), (1, b"Quad"), (2, b"1.2"), (0x80, b"A-17")):
         assert bytes([number, len(text)]) + text in reply
     device = ScriptedDevice()
-    assert answered(device, "FC6 Ping", wire) == FRAMES[f"FC6 Ping reply, {wire}"]
-    assert device.asked == [Ping()]
+    assert answered(device, "FC6 Disarm", wire) == FRAMES[f"FC6 Disarm reply, {wire}"]
+    assert device.asked == [Disarm(0.005)]
 
 
 @pytest.mark.parametrize("flag", ["keep_phase", "skip_ending"])
@@ -190,7 +190,7 @@ def test_flags_reach_the_far_end(flag: str) -> None:
 
 def addresses() -> dict[int, str]:
     """Return the registers of the definition by address."""
-    named = {MAP["heartbeat"]: "heartbeat", MAP["look"]: "look"}
+    named = {MAP["look"]: "look"}
     behind = {"set": "channels", "envelope": "knots", "status": "levels", "achieved": "channels"}
     for name, block in [*MAP["holding"].items(), *MAP["input"].items()]:
         registers = [*MAP["head"], *block["registers"]]

@@ -26,6 +26,8 @@ from drivers.protocol.messages import (
     Apply,
     Arm,
     Capabilities,
+    Clear,
+    Commit,
     Fault,
     FaultList,
     FaultRecord,
@@ -35,6 +37,7 @@ from drivers.protocol.messages import (
     LoadEnvelope,
     Nak,
     NakCode,
+    Ping,
     Reply,
     Request,
     Stage,
@@ -44,10 +47,10 @@ from drivers.protocol.messages import (
 from vendor_pages import plain
 
 Q = PROTOCOL.quantities
-FREQUENCIES = WireQuantity("frequency", "u16", 100, "Hz", 2000, 60000)  # within the limits
+FREQUENCIES = WireQuantity("frequency", "u16", 20, "Hz", 400, 12000)  # within the limits
 
 
-WIDE = Capabilities(16, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1)
+WIDE = Capabilities(16, 20.0, 600.0, 0.05, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1)
 GUARD = Guard(GuardLimits(20.0, 600.0, 1.0), WIDE)
 SET = CommandSet(
     token=513,
@@ -58,19 +61,19 @@ SET = CommandSet(
     ramp=0.02,
     valid_for=0.5,
 )
-# token 513 = 01 02, ramp 20 ms = 14 00, valid 500 ms = f4 01, two channels;
-# channel 0: 11000 = f8 2a, 2000 = d0 07, 0; channel 3 keeping phase: 25050 = da 61, 10000 = 10 27,
+# session 9 = 09 00, token 513 = 01 02, ramp 20 ms = 14 00, valid 500 ms = f4 01, two channels;
+# channel 0: 2200 = 98 08, 2000 = d0 07, 0; channel 3 keeping phase: 5010 = 92 13, 10000 = 10 27,
 # -9000 = d8 dc
-SET_BYTES = "01 02 14 00 f4 01 02  00 00 f8 2a d0 07 00 00  03 01 da 61 10 27 d8 dc"
+SET_BYTES = "09 00  01 02 14 00 f4 01 02  00 00 98 08 d0 07 00 00  03 01 92 13 10 27 d8 dc"
 
 
 @pytest.mark.parametrize(("wrap", "code"), [(Stage, 5), (Apply, 7)])
-def test_set_is_these_bytes(wrap: Callable[[CommandSet], Request], code: int) -> None:
+def test_set_is_these_bytes(wrap: Callable[[CommandSet, int], Request], code: int) -> None:
     """Counted out by hand; decoding yields a plain CommandSet."""
     frame = Frame(kind=code, address=1, sequence=2, payload=bytes.fromhex(SET_BYTES))
-    assert encode_request(wrap(GUARD.check(SET)), address=1, sequence=2) == frame
+    assert encode_request(wrap(GUARD.check(SET), 9), address=1, sequence=2) == frame
     decoded = decode_request(frame)
-    assert decoded == wrap(SET)
+    assert decoded == wrap(SET, 9)
     assert type(decoded.command_set) is CommandSet
 
 
@@ -102,8 +105,14 @@ def largest(pick: Callable[[WireQuantity], float]) -> tuple[list[Request], dict[
         value["watchdog_left"],
         (value["level"],) * 16,
         value["voltage"],
+        whole["latch"],
     )
-    requests = [Stage(safe), Apply(safe), load, Arm(value["watchdog"]), Stop(value["ramp"])]
+    held = whole["held_session"]
+    requests = [
+        *(Stage(safe, held), Apply(safe, held), Commit(whole["token"], held), Ping(held)),
+        *(load, Arm(value["watchdog"], whole["session"]), Stop(value["ramp"])),
+        Clear(whole["latch"]),
+    ]
     replies: dict[int, Reply] = {
         7: Achieved(whole["token"], commands),
         9: status,
@@ -133,7 +142,7 @@ def in_range(command_set: CommandSet | Achieved) -> bool:
         and len(set(channels)) == len(channels)
         and all(
             0 <= command.channel <= 15
-            and 0 <= command.frequency <= 655.35
+            and 0 <= command.frequency <= 3276.75
             and 0 <= command.level <= 1
             and -180 <= command.phase < 180
             for command in command_set.commands
@@ -141,7 +150,7 @@ def in_range(command_set: CommandSet | Achieved) -> bool:
     )
 
 
-@given(st.integers(0, 31), st.binary(max_size=60))
+@given(st.integers(0, 127), st.binary(max_size=60))
 def test_any_payload_is_a_valid_request_or_malformed(code: int, payload: bytes) -> None:
     """Never another exception or a value out of range."""
     frame = Frame(kind=code, address=1, sequence=1, payload=payload)
@@ -183,17 +192,20 @@ def test_any_payload_is_a_valid_reply_or_malformed(
         (13, "05 32 00 02 e803 0000", NakCode.BAD_LENGTH),
         (13, "40 32 00 00", NakCode.BAD_VALUE),
         (13, "05 32 00 01 1127 0000", NakCode.BAD_VALUE),
-        (3, "fa", NakCode.BAD_LENGTH),
-        (3, "fa 00 00", NakCode.BAD_LENGTH),
-        (3, "63 00", NakCode.BAD_VALUE),
-        (6, "00 00", NakCode.BAD_TOKEN),
-        (7, "0100 0000 0000 01 10 00 f82a d007 0000", NakCode.BAD_CHANNEL),
-        (7, "0100 0000 0000 01 00 08 f82a d007 0000", NakCode.BAD_VALUE),
-        (7, "0100 0000 0000 01 00 04 f82a d007 0000 40 00", NakCode.BAD_VALUE),
-        (7, "0100 0000 0000 01 00 00 f82a 1127 0000", NakCode.BAD_VALUE),
-        (7, "0100 0000 0000 01 00 00 f82a d007 5046", NakCode.BAD_VALUE),
-        (7, "0100 e903 0000 00", NakCode.BAD_VALUE),
-        (7, "0100 0000 0000 11", NakCode.BAD_VALUE),
+        (3, "fa 00", NakCode.BAD_LENGTH),
+        (3, "fa 00 09 00 00", NakCode.BAD_LENGTH),
+        (3, "63 00 09 00", NakCode.BAD_VALUE),
+        (3, "fa 00 00 00", NakCode.BAD_VALUE),
+        (6, "09 00 00 00", NakCode.BAD_TOKEN),
+        (11, "", NakCode.BAD_LENGTH),
+        (12, "", NakCode.BAD_LENGTH),
+        (7, "0900 0100 0000 0000 01 10 00 9808 d007 0000", NakCode.BAD_CHANNEL),
+        (7, "0900 0100 0000 0000 01 00 08 9808 d007 0000", NakCode.BAD_VALUE),
+        (7, "0900 0100 0000 0000 01 00 04 9808 d007 0000 40 00", NakCode.BAD_VALUE),
+        (7, "0900 0100 0000 0000 01 00 00 9808 1127 0000", NakCode.BAD_VALUE),
+        (7, "0900 0100 0000 0000 01 00 00 9808 d007 5046", NakCode.BAD_VALUE),
+        (7, "0900 0100 e903 0000 00", NakCode.BAD_VALUE),
+        (7, "0900 0100 0000 0000 11", NakCode.BAD_VALUE),
     ],
 )
 def test_malformed_request_has_a_nak_code(code: int, payload: str, nak: NakCode) -> None:
@@ -206,8 +218,8 @@ def test_malformed_request_has_a_nak_code(code: int, payload: str, nak: NakCode)
 
 def test_repeated_channel_is_malformed() -> None:
     """The refusal names the channel."""
-    one = "02 00 f82a d007 0000"
-    payload = bytes.fromhex(f"0100 0000 0000 02 {one} {one}")
+    one = "02 00 9808 d007 0000"
+    payload = bytes.fromhex(f"0900 0100 0000 0000 02 {one} {one}")
     with pytest.raises(Malformed) as caught:
         decode_request(Frame(kind=7, address=1, sequence=1, payload=payload))
     assert (caught.value.code, caught.value.channel) == (NakCode.BAD_CHANNEL, 2)
@@ -219,7 +231,7 @@ def test_repeated_channel_is_malformed() -> None:
 )
 def test_unprintable_text_is_malformed(raw: bytes, problem: str) -> None:
     """Escape sequences and invalid UTF-8 do not reach the terminal."""
-    payload = b"\x01" + bytes([len(raw)]) + raw + b"\0\0\0"
+    payload = b"\x04\0" + bytes([len(raw)]) + raw + b"\0\0\0"
     request = Frame(kind=1, address=1, sequence=1, payload=b"")
     with pytest.raises(Malformed, match=problem):
         decode_reply(Frame(kind=0x81, address=1, sequence=1, payload=payload), request)
@@ -228,7 +240,7 @@ def test_unprintable_text_is_malformed(raw: bytes, problem: str) -> None:
 @pytest.mark.parametrize(
     ("asked", "payload", "problem"),
     [
-        (Hello(), "01 21", "got 33"),
+        (Hello(), "0400 21", "got 33"),
         (GetStatus(), "08", "unknown AmplifierState 8"),
         (GetFaults(), "01 04 10 00000000", "channel 16 does not exist"),
         (GetFaults(), "ff", "fault_count must be 0 to 32, got 255"),
@@ -250,12 +262,12 @@ def test_reply_may_have_more_than_is_known() -> None:
         frame = Frame(kind=kind, address=1, sequence=1, payload=bytes.fromhex(payload))
         return decode_reply(frame, request)
 
-    status = reply(REPLY | 9, "07 42 0100 83 FA00 0000 0807 01 0000 07 07")
+    status = reply(REPLY | 9, "07 42 0100 83 FA00 0000 0807 03 01 0000 07 07")
     assert status == Status(
-        AmplifierState.FAULT, Fault(66), 1, True, 25.0, 0.0, (0.0,), 1800.0, other_flags=0x82
+        AmplifierState.FAULT, Fault(66), 1, True, 25.0, 0.0, (0.0,), 1800.0, 3, other_flags=0x82
     )
-    assert reply(REPLY | 31, "09 0B FF 00") == Nak(NakCode(11))
-    assert [Fault(66).name, NakCode(11).name] == ["VENDOR_66", "NUMBER_11"]
+    assert reply(REPLY | 31, "09 0C FF 00") == Nak(NakCode(12))
+    assert [Fault(66).name, NakCode(12).name] == ["VENDOR_66", "NUMBER_12"]
 
 
 def test_reply_to_another_type_is_malformed() -> None:
@@ -270,7 +282,7 @@ def test_reply_to_another_type_is_malformed() -> None:
         encode_reply(status, request)
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, -0.01, 655.36, 1e300])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, -0.01, 3276.8, 1e300])
 def test_quantity_refuses_values_out_of_range(value: float) -> None:
     """NaN, infinities and values out of range are not clipped."""
     with pytest.raises(CommandError, match="frequency"):
@@ -281,9 +293,9 @@ def test_quantity_refuses_values_out_of_range(value: float) -> None:
 
 
 def test_quantity_rounds_and_angles_wrap() -> None:
-    """Values go to the nearest step, u16 in 0.01 Hz ends at 655.35, angles are modulo a turn."""
-    assert Q.frequency.to_wire(655.35) == 65535
-    assert Q.frequency.quantise(110.004) == 110.0
+    """Values go to the nearest step, u16 in 0.05 Hz ends at 3276.75, angles are modulo a turn."""
+    assert Q.frequency.to_wire(3276.75) == 65535
+    assert Q.frequency.quantise(110.02) == 110.0
     assert Q.level.to_wire(1.0) == 10000
     assert Q.ramp.to_wire(0.0204) == 20
     assert [Q.phase.to_wire(angle) for angle in (180, -180, 270, 360, 539.99)] == [

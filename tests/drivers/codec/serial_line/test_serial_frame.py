@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.codec.serial_line.frame import REPLY, Frame, FrameReader, encode_frame, frame_length
+from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame, frame_length
 from drivers.protocol.definition import PROTOCOL
 
 FRAMES = st.builds(
@@ -14,6 +14,7 @@ FRAMES = st.builds(
     address=st.integers(0, 255),
     sequence=st.integers(0, 65535),
     payload=st.binary(max_size=PROTOCOL.serial.payload_max),
+    version=st.integers(0, 255),
 )
 
 
@@ -22,35 +23,35 @@ def cobs_by_hand(data: bytes) -> bytes:
     return b"".join(bytes([len(part) + 1]) + part for part in data.split(b"\0"))
 
 
-def frame_by_hand(first: int, address: int, sequence: int, payload: bytes) -> bytes:
+def frame_by_hand(kind: int, version: int, address: int, sequence: int, payload: bytes) -> bytes:
     """A frame from the specification, without the code under test."""
-    body = struct.pack("<BBH", first, address, sequence) + payload
+    body = struct.pack("<BBBH", kind, version, address, sequence) + payload
     return b"\0" + cobs_by_hand(body + struct.pack("<I", zlib.crc32(body))) + b"\0"
 
 
 def test_ping_is_these_bytes() -> None:
-    """A ping to address 1, sequence 7, by hand."""
-    # 2C = version 1 << 5 | type 12; the zero of the sequence's high byte is stuffed.
-    body = bytes.fromhex("2c 01 07 00")
+    """A ping of session 9 to address 1, sequence 7, by hand."""
+    # Type 12, version 2; the zeros of the high bytes of sequence and session are stuffed.
+    body = bytes.fromhex("0c 02 01 07 00 09 00")
     crc = zlib.crc32(body)
-    expected = b"\0\x04\x2c\x01\x07\x05" + crc.to_bytes(4, "little") + b"\0"
-    assert encode_frame(Frame(kind=12, address=1, sequence=7, payload=b"")) == expected
+    expected = b"\0\x05\x0c\x02\x01\x07\x02\x09\x05" + crc.to_bytes(4, "little") + b"\0"
+    assert encode_frame(Frame(kind=12, address=1, sequence=7, payload=b"\x09\0")) == expected
 
 
 def test_crc_has_its_published_value() -> None:
     """0xCBF43926 over "123456789", low byte first."""
-    # A frame whose CRC-covered bytes are exactly "123456789": 0x31 is version 1, type 17.
+    # A frame whose CRC-covered bytes are exactly "123456789": 0x31 is type 49, 0x32 version 50.
     stuffed = b"\x0e123456789\x26\x39\xf4\xcb"
     frames = FrameReader().feed(b"\0" + stuffed + b"\0")
-    assert frames == [Frame(kind=0x11, address=0x32, sequence=0x3433, payload=b"56789")]
+    assert frames == [Frame(0x31, address=0x33, sequence=0x3534, payload=b"6789", version=0x32)]
 
 
 @given(FRAMES)
 def test_frame_equals_its_specification(frame: Frame) -> None:
     """Bytes and length; it is decoded again."""
     wire = encode_frame(frame)
-    first = (frame.kind & REPLY) | 1 << 5 | (frame.kind & 0x1F)
-    assert wire == frame_by_hand(first, frame.address, frame.sequence, frame.payload)
+    head = (frame.kind, frame.version, frame.address, frame.sequence)
+    assert wire == frame_by_hand(*head, frame.payload)
     assert len(wire) == frame_length(len(frame.payload))
     assert FrameReader().feed(wire) == [frame]
 
@@ -91,12 +92,12 @@ def test_noise_gives_no_frame(noise: bytes) -> None:
 
 
 def test_damaged_frames_are_counted() -> None:
-    """By CRC, length, truncation and version; the next good frame is understood."""
-    good = frame_by_hand(0x2C, 1, 7, b"")
-    bad_crc = bytearray(frame_by_hand(0x2C, 1, 7, b"abc"))
+    """By CRC, length and truncation; the next good frame is understood."""
+    good = frame_by_hand(12, 2, 1, 7, b"")
+    bad_crc = bytearray(frame_by_hand(12, 2, 1, 7, b"abc"))
     bad_crc[-2] ^= 0x40
     too_long, truncated = b"\0" + b"\x01" * 1000 + b"\0", good[:5] + b"\0"
-    damaged = (bytes(bad_crc), too_long, truncated, frame_by_hand(0x4C, 1, 7, b""))
+    damaged = (bytes(bad_crc), too_long, truncated)
     reader = FrameReader()
     for count, data in enumerate(damaged, start=1):
         assert reader.feed(data) == []

@@ -43,7 +43,7 @@ EXCHANGES: dict[str, tuple[Request, Reply]] = {
     **{name: (example.request, example.reply) for name, example in EXAMPLES.items()},
     "GetCaps": (GetCaps(), replace(CAPABILITIES, events=True)),
     "GetStatus": (GetStatus(), replace(TRIPPED, temperature=25.0)),
-    "Refused Arm": (Arm(watchdog=0.25), Nak(NakCode.WRONG_STATE)),
+    "Refused Arm": (Arm(watchdog=0.25, session=9), Nak(NakCode.WRONG_STATE)),
 }
 
 

@@ -257,7 +257,7 @@ def test_node_sends_emcy_for_a_fault_and_its_end(bench: Bench) -> None:
         CanFrame(0x081, bytes.fromhex("4023 03 47 FF 000000")),
     ]
     assert CanFrame(0x081, bytes.fromhex("0000 00 01 FF 000000")) in bench.tell(
-        REQUEST, "0000 0000 0000 07 05"
+        REQUEST, "0100 0000 0000 07 05"
     )
 
 

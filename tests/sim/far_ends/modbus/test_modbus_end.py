@@ -34,7 +34,7 @@ FRAMES = {
     )
 }
 MAP = PROTOCOL.modbus
-STATUS, TOKEN, LEVELS = 1000, 1004, 1010  # of the vendor page
+STATUS, TOKEN, LEVELS = 1000, 1004, 1011  # of the vendor page
 TIMEOUT = 5.0  # s; for what is expected to come
 
 
@@ -189,7 +189,7 @@ async def test_modbus_ignores_other_units(wire: str) -> None:
         master.send(ping)
         reply = FRAMES[f"Ping reply, {wire}"]
         assert await master.receive(len(reply)) == reply
-        assert device.asked.count(Ping()) == 1
+        assert device.asked.count(Ping(9)) == 1
 
 
 async def test_modbus_tcp_unit_255_is_the_only_unit() -> None:
@@ -208,7 +208,7 @@ async def test_modbus_tcp_unit_255_is_the_only_unit() -> None:
         pair[0].follow(EXAMPLES["Ping"])
         master.send(FRAMES["Ping request, TCP"])
         assert await master.receive(len(reply)) == reply
-        assert pair[0].asked.count(Ping()) == 1
+        assert pair[0].asked.count(Ping(9)) == 1
 
 
 @every_wire
@@ -227,7 +227,7 @@ async def test_modbus_broadcast_reaches_every_unit_without_reply(wire: str) -> N
         await master.receive(len(FRAMES[f"Ping reply, {wire}"]))
         assert master.received == b""
     for device in pair:
-        assert device.heard == [Commit(513), Stop(0.005)]
+        assert device.heard == [Commit(513, 9), Stop(0.005)]
 
 
 async def test_modbus_hung_amplifier_does_not_reply() -> None:
@@ -242,6 +242,7 @@ async def test_modbus_hung_amplifier_does_not_reply() -> None:
     assert device.asked == []
 
 
+_LOUD = "10 00 10 00 09 12 00 01 00 09 00 01 00 00 00 00 08 98"  # one channel, at 110 Hz
 EXCEPTIONS = {
     "unknown function": ("07", "87 01"),
     "unknown encapsulation": ("2B 0D 00 00", "AB 01"),
@@ -253,20 +254,24 @@ EXCEPTIONS = {
     "read of 126": ("03 03 E8 00 7E", "83 03"),
     "short read": ("04 03 E8", "84 03"),
     "write to a status": ("06 03 EA 00 04", "86 02"),
-    "write amid a set": ("06 00 11 00 04", "86 02"),
-    "write beyond a set": ("10 00 10 00 45 8A" + 69 * " 00 01", "90 02"),
+    "write amid a set": ("10 00 11 00 01 02 00 04", "90 02"),
+    "one register of a set": ("06 00 10 00 05", "86 02"),
+    "one register of a heartbeat": ("06 00 0A 00 09", "86 02"),
+    "write beyond a set": ("10 00 10 00 46 8C" + 70 * " 00 01", "90 02"),
     "byte count": ("10 00 02 00 03 05 00 0F 00 FA 00", "90 03"),
     "write of nothing": ("10 00 02 00 00 00", "90 03"),
     "read and write, short": ("17 03 E8 00", "97 03"),
     "controlword": ("06 00 02 00 07", "86 03"),
-    "watchdog": ("10 00 02 00 03 06 00 0F 00 63 00 00", "90 03"),
-    "token 0": ("06 00 10 00 00", "86 03"),
-    "two tokens": ("10 00 10 00 04 08 00 02 00 01 00 00 00 00", "90 03"),
-    "ragged set": ("10 00 10 00 05 0A 00 01 00 01 00 00 00 00 2A F8", "90 03"),
-    "ramp": ("10 00 10 00 04 08 00 01 00 01 03 E9 00 00", "90 03"),
-    "level": ("10 00 10 00 08 10 00 01 00 01 00 00 00 00 2A F8 27 11 00 00 00 00", "90 03"),
-    "reserved flag": ("10 00 10 00 08 10 00 01 00 01 00 00 00 00 2A F8 03 E8 00 00 00 04", "90 03"),
-    "disarmed": ("10 00 10 00 08 10 00 01 00 01 00 00 00 00 2A F8 03 E8 00 00 00 00", "90 04"),
+    "watchdog": ("10 00 02 00 04 08 00 0F 00 63 00 00 00 09", "90 03"),
+    "session 0": ("10 00 02 00 04 08 00 0F 00 FA 00 00 00 00", "90 03"),
+    "set without a session": ("10 00 10 00 01 02 00 05", "90 03"),
+    "token 0": ("10 00 10 00 02 04 00 00 00 09", "90 03"),
+    "two tokens": ("10 00 10 00 05 0A 00 02 00 09 00 01 00 00 00 00", "90 03"),
+    "ragged set": ("10 00 10 00 06 0C 00 01 00 09 00 01 00 00 00 00 08 98", "90 03"),
+    "ramp": ("10 00 10 00 05 0A 00 01 00 09 00 01 03 E9 00 00", "90 03"),
+    "level": (f"{_LOUD} 27 11 00 00 00 00", "90 03"),
+    "reserved flag": (f"{_LOUD} 03 E8 00 00 00 04", "90 03"),
+    "disarmed": (f"{_LOUD} 03 E8 00 00 00 00", "90 04"),
     "envelope length": ("10 00 66 00 03 06 00 05 00 32 00 02", "90 03"),
     "envelope slot": ("10 00 66 00 03 06 00 00 00 32 00 00", "90 03"),
 }
@@ -276,7 +281,7 @@ EXCEPTIONS = {
 async def test_modbus_read_write_is_atomic(tcp: FarSide, read: str) -> None:
     """Function 23 is one transaction: with a range that cannot be read, nothing of it is done."""
     async with Master(tcp.url) as master:
-        pdu = bytes.fromhex(f"17 {read} 00 02 00 03 06 00 0F 00 FA 00 00")  # and ARM
+        pdu = bytes.fromhex(f"17 {read} 00 02 00 04 08 00 0F 00 FA 00 00 00 09")  # and ARM
         master.send(struct.pack(">HHHB", 5, 0, len(pdu) + 1, 1) + pdu)
         assert (await master.receive(9))[7] == 0x97
         assert tcp.amplifier.state is AmplifierState.SWITCH_ON_DISABLED
@@ -301,11 +306,11 @@ async def test_modbus_exceptions(tcp: FarSide, request_: str, answer: str) -> No
 async def test_modbus_exceptions_do_not_feed_the_watchdog(tcp: FarSide) -> None:
     """Refusals without end, of every kind: the watchdog trips at its time all the same."""
     client = await foreign_client(tcp.url)
-    await client.write_registers(2, [MAP["controlwords"]["ARM"], 100, 0], device_id=1)
+    await client.write_registers(2, [MAP["controlwords"]["ARM"], 100, 0, 9], device_id=1)
     armed = time.monotonic()
     refused = 0
     while tcp.amplifier.state is AmplifierState.OPERATION_ENABLED and time.monotonic() < armed + 5:
-        for address, words in ((16, [999]), (2, [7]), (1002, [4])):
+        for address, words in ((16, [999, 9]), (10, [8]), (2, [7]), (1002, [4])):
             refused += (await client.write_registers(address, words, device_id=1)).isError()
         await client.read_input_registers(STATUS, count=26, device_id=1)
     assert refused >= 3
@@ -323,7 +328,7 @@ async def foreign_client(url: str) -> AsyncModbusTcpClient:
 
 
 async def test_modbus_identification_by_pymodbus(tcp: FarSide) -> None:
-    """Device identification and the identity block say the same, as does protocol version 1."""
+    """Device identification and the identity block say the same, as does version 2."""
     client = await foreign_client(tcp.url)
     reply = await client.read_device_information(read_code=3, object_id=0, device_id=1)
     own = tcp.amplifier.identity
@@ -340,7 +345,7 @@ async def test_modbus_identification_by_pymodbus(tcp: FarSide) -> None:
         client.convert_from_registers(block.registers[at : at + 16], client.DATATYPE.STRING)
         for at in range(1, 65, 16)
     ]
-    assert block.registers[0] == 1
+    assert block.registers[0] == 1 << 2
     assert texts == [own.vendor, own.product, own.serial_number, own.firmware]
     client.close()
 
@@ -348,28 +353,28 @@ async def test_modbus_identification_by_pymodbus(tcp: FarSide) -> None:
 async def test_modbus_set_by_pymodbus(tcp: FarSide) -> None:
     """Arm, a set in one write, its heartbeat and read-back, stop: without tag and check."""
     client = await foreign_client(tcp.url)
-    await client.write_registers(2, [MAP["controlwords"]["ARM"], 1000, 0], device_id=1)
-    channels = [11000, 2000, 0, 0, *4 * [0], *4 * [0], 25050, 10000, 0x10000 - 9000, 1]
-    written = await client.write_registers(16, [513, 513, 0, 0, *channels], device_id=1)
-    assert (written.address, written.count) == (16, 20)
+    await client.write_registers(2, [MAP["controlwords"]["ARM"], 1000, 0, 9], device_id=1)
+    channels = [2200, 2000, 0, 0, *4 * [0], *4 * [0], 5010, 10000, 0x10000 - 9000, 1]
+    written = await client.write_registers(16, [513, 9, 513, 0, 0, *channels], device_id=1)
+    assert (written.address, written.count) == (16, 21)
     both = await client.readwrite_registers(
-        read_address=1144, read_count=18, write_address=8, values=[4711], device_id=1
+        read_address=1144, read_count=18, write_address=8, values=[4711, 0, 9], device_id=1
     )
     assert both.registers == [513, 4, *channels]
-    status = await client.read_input_registers(STATUS, count=14, device_id=1)
+    status = await client.read_input_registers(STATUS, count=15, device_id=1)
     assert status.registers[0] == 4711
     assert status.registers[2:5] == [AmplifierState.OPERATION_ENABLED, Fault.NONE, 513]
-    assert status.registers[10:] == [2000, 0, 0, 10000]
+    assert status.registers[11:] == [2000, 0, 0, 10000]
     played = tcp.amplifier.outputs[3][0]
     assert (played.frequency, played.start) == (250.5, tcp.amplifier.outputs[0][0].start)
-    again = await client.write_register(16, 513, device_id=1)
+    again = await client.write_registers(16, [513, 9], device_id=1)
     assert not again.isError()
     await client.write_register(2, MAP["controlwords"]["STOP"], device_id=1)
     async with asyncio.timeout(TIMEOUT):
         while True:
-            status = await client.read_input_registers(STATUS, count=14, device_id=1)
+            status = await client.read_input_registers(STATUS, count=15, device_id=1)
             assert status.registers[2] == AmplifierState.QUICK_STOP_ACTIVE
-            if not any(status.registers[10:]):
+            if not any(status.registers[11:]):
                 break
     client.close()
 
@@ -389,16 +394,16 @@ def play_with_minimalmodbus(url: str) -> None:
     master.serial.timeout = 0.5  # s; it waits so long for the rest of what is an exception
     try:
         assert master.read_string(1067, 16, functioncode=4).rstrip("\0") == "era-haptics"
-        assert master.read_register(1043, functioncode=4) == 4
-        assert master.read_register(1045, 2, functioncode=4) == pytest.approx(655.35)
-        master.write_registers(2, [MAP["controlwords"]["ARM"], 2000, 0])
-        master.write_registers(16, [7, 7, 0, 0, 11000, 5000, 0, 0])
-        master.write_register(8, 123, functioncode=6)
+        assert master.read_register(1042, functioncode=4) == 4
+        assert master.read_register(1044, functioncode=4) == 65535
+        master.write_registers(2, [MAP["controlwords"]["ARM"], 2000, 0, 9])
+        master.write_registers(16, [7, 9, 7, 0, 0, 2200, 5000, 0, 0])
+        master.write_registers(10, [9])
         assert master.read_registers(STATUS, 5, functioncode=3)[2:] == [4, 0, 7]
         assert master.read_register(LEVELS, 4, functioncode=4) == pytest.approx(0.5)
         assert master.read_register(1007, 1, functioncode=4, signed=True) >= 25.0
         with pytest.raises(minimalmodbus.IllegalRequestError):
-            master.write_register(16, 8, functioncode=6)
+            master.write_registers(16, [8, 9])
         assert master.read_register(1034, functioncode=4) == NakCode.BAD_TOKEN
         master.write_register(2, MAP["controlwords"]["DISARM"], functioncode=6)
         time.sleep(0.02)

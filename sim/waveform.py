@@ -1,8 +1,6 @@
 """Output of a channel in time: a sum of sinusoids that fade, or follow an envelope.
 
-Every change is a cross-fade along a raised cosine, whose two gains add up to one. At most two
-voices sound, each of one frequency. A third frequency leaves of the oldest voice its present value,
-which decays: a tone of 0 Hz here.
+Every change is a cross-fade along a raised cosine, whose two gains add up to one.
 """
 
 import cmath
@@ -157,8 +155,6 @@ class ShapedTone:
 
 ToneSegment: TypeAlias = FadingTone | ShapedTone
 
-REMAINDER_RAMP = 0.005  # s; along which the value of a voice decays that has to make room
-
 Output: TypeAlias = tuple[ToneSegment, ...]
 """The output of one channel: the sum of these tones."""
 
@@ -174,18 +170,19 @@ def fade_to(
 ) -> Output:
     """The output after a command at a time [s] to fade to a tone within ramp [s].
 
-    amplitude in full strokes, 0 for silence. Its phase counts from `time`; with keep_phase as
-    before, if a tone of the same frequency lasts.
+    amplitude in full strokes, 0 for silence. Its phase counts from `time`; with keep_phase, from
+    the origin of a lasting tone of the same frequency.
     """
+    faded = (tone.fade_out(time, ramp=ramp) for tone in playing)
+    fading = tuple(tone for tone in faded if tone.silent_from > time)
     if amplitude == 0:
-        return _faded(playing, time, ramp=ramp)
-    origin = _kept_origin(playing, frequency) if keep_phase else None
-    origin = time if origin is None else origin
-    here, others = _split(playing, time, frequency, origin)
+        return fading
+    origin = time
+    if keep_phase:
+        same = [tone for tone in playing if tone.is_lasting and tone.frequency == frequency]
+        origin = same[0].origin if same else time
     gain_from = 1.0 if ramp == 0 else 0.0
-    before = (FadingTone(frequency, here, origin, time, ramp, 1.0, 0.0),) if here and ramp else ()
-    after = FadingTone(frequency, amplitude, origin, time, ramp, gain_from, 1.0)
-    return (*_one_voice(_faded(others, time, ramp=ramp), time), *before, after)
+    return (*fading, FadingTone(frequency, amplitude, origin, time, ramp, gain_from, 1.0))
 
 
 def shape_to(
@@ -202,72 +199,22 @@ def shape_to(
     """The output after a command at a time [s] to follow an envelope to a tone.
 
     amplitude and knots in full strokes, ramp and step in s. With keep_phase a lasting tone of the
-    same frequency goes on from its present amplitude; else the new one begins at zero. All others
+    same frequency continues from its present amplitude; else the new one begins at zero. All others
     fade out within ramp.
     """
-    origin = _kept_origin(playing, frequency) if keep_phase else None
-    begin, others = 0j, playing
-    if origin is not None:
-        begin, others = _split(playing, time, frequency, origin)
-    shaped = ShapedTone(
-        frequency, time if origin is None else origin, time, step, (begin, *knots, amplitude)
-    )
-    fading = _faded(others, time, ramp=ramp)
-    same = tuple(tone for tone in fading if tone.frequency == frequency)
-    rest = tuple(tone for tone in fading if tone.frequency != frequency)
-    return (*_one_voice(rest, time, has_room=not same), *same, shaped)
-
-
-def _kept_origin(playing: Output, frequency: float) -> float | None:
-    """Origin of the phase of a lasting tone of this frequency [Hz]; None without one."""
-    same = (tone.origin for tone in playing if tone.is_lasting and tone.frequency == frequency)
-    return next(same, None)
-
-
-def _split(playing: Output, time: float, frequency: float, origin: float) -> tuple[complex, Output]:
-    """The amplitude of a frequency [Hz] at a time, its phase from origin [s], and the rest."""
-    same = [tone for tone in playing if tone.frequency == frequency and tone.silent_from > time]
-    here = sum(
+    continuing = next(
         (
-            tone.amplitude(time) * cmath.exp(2j * math.pi * frequency * (origin - tone.origin))
-            for tone in same
+            tone
+            for tone in playing
+            if keep_phase and tone.is_lasting and tone.frequency == frequency
         ),
-        start=0j,
+        None,
     )
-    return here, tuple(tone for tone in playing if tone.frequency != frequency)
-
-
-def _faded(playing: Output, time: float, *, ramp: float) -> Output:
-    """These tones, silent within ramp [s]; several of one frequency as one."""
-    faded: list[ToneSegment] = []
-    for frequency in dict.fromkeys(tone.frequency for tone in playing):
-        same = [tone for tone in playing if tone.frequency == frequency]
-        if len(same) == 1:
-            faded.append(same[0].fade_out(time, ramp=ramp))
-            continue
-        left = min(ramp, max(tone.silent_from for tone in same) - time)
-        here, _ = _split(playing, time, frequency, time)
-        faded.append(FadingTone(frequency, here, time, time, max(left, 0.0), 1.0, 0.0))
-    return tuple(tone for tone in faded if tone.silent_from > time)
-
-
-def _one_voice(fading: Output, time: float, *, has_room: bool = True) -> Output:
-    """The newest of the fading voices, and the present value of the others, which decays.
-
-    has_room: whether there is an oscillator for one at all.
-    """
-    voices = [tone for tone in fading if tone.frequency > 0]
-    kept = voices[-1:] if has_room else []
-    if len(kept) == len(voices):
-        return fading
-    value = sum(
-        (
-            tone.amplitude(time) * cmath.exp(2j * math.pi * tone.frequency * (time - tone.origin))
-        ).imag
-        for tone in fading
-        if tone not in kept
-    )
-    return (FadingTone(0.0, 1j * value, time, time, REMAINDER_RAMP, 1.0, 0.0), *kept)
+    faded = (tone.fade_out(time, ramp=ramp) for tone in playing if tone is not continuing)
+    fading = tuple(tone for tone in faded if tone.silent_from > time)
+    begin = 0j if continuing is None else continuing.amplitude(time)
+    origin = time if continuing is None else continuing.origin
+    return (*fading, ShapedTone(frequency, origin, time, step, (begin, *knots, amplitude)))
 
 
 def end_along(

@@ -2,13 +2,10 @@
 
 import cmath
 import math
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from driven_bases import motion_of
 from sim.waveform import FadingTone, Output, ShapedTone, fade_to, level_of
@@ -108,109 +105,3 @@ def test_pieces_of_a_shaped_tone_join(start: float) -> None:
     terms = tone.terms(stroke=1e-4)
     assert [one.end for one in terms[:-1]] == [one.start for one in terms[1:]]
     assert (terms[0].start, terms[-1].end) == (start, math.inf)
-
-
-@dataclass
-class Voice:
-    """An oscillator whose complex amplitude moves along a raised cosine."""
-
-    frequency: float
-    origin: float
-    start: float
-    ramp: float
-    here: complex
-    there: complex
-
-    def at(self, time: float) -> complex:
-        s = min((time - self.start) / self.ramp, 1.0) if self.ramp else 1.0
-        return self.here + (self.there - self.here) * (1 - math.cos(math.pi * s)) / 2
-
-    def sounds(self, time: float) -> bool:
-        return self.there != 0 or time < self.start + self.ramp
-
-    def value(self, time: float) -> float:
-        turn = cmath.exp(2j * math.pi * self.frequency * (time - self.origin))
-        return (self.at(time) * turn).imag if self.sounds(time) else 0.0
-
-    def fade(self, time: float, ramp: float) -> None:
-        if self.there != 0 or self.start + self.ramp > time + ramp:
-            self.here, self.there, self.start, self.ramp = self.at(time), 0j, time, ramp
-
-
-class Oscillators:
-    """A channel as a small microcontroller plays it: two voices and a remainder, by the page."""
-
-    def __init__(self) -> None:
-        self.old: Voice | None = None
-        self.new: Voice | None = None
-        self.left = Voice(0.0, 0.0, 0.0, 0.0, 0j, 0j)
-
-    def play(self, time: float, frequency: float, level: complex, ramp: float, keep: bool) -> None:
-        voices = [one for one in (self.old, self.new) if one and one.sounds(time)]
-        same = [one for one in voices if level and one.frequency == frequency]
-        others = [one for one in voices if one not in same]
-        for other in (*others, self.left):
-            other.fade(time, ramp)
-        if not level:
-            return
-        others = [one for one in others if one.sounds(time)]
-        if len(others) == 2:  # no oscillator is free
-            left = self.left.value(time) + others[0].value(time)
-            self.left = Voice(0.0, time, time, 0.005, 1j * left, 0j)
-        here, origin = 0j, time
-        if same:
-            origin = same[0].origin if keep and same[0].there else time
-            turn = cmath.exp(2j * math.pi * frequency * (origin - same[0].origin))
-            here = same[0].at(time) * turn
-        self.old = others[-1] if others else None
-        self.new = Voice(frequency, origin, time, ramp, here, level)
-
-    def value(self, time: float) -> float:
-        return sum(voice.value(time) for voice in (self.old, self.new, self.left) if voice)
-
-
-SETS = st.tuples(
-    st.sampled_from([0.0002, 0.003, 0.011, 0.2]),  # s; since the last
-    st.sampled_from([90.0, 150.0, 210.0]),
-    st.sampled_from([0j, 0.3 + 0j, cmath.rect(1.0, 2.0)]),
-    st.sampled_from([0.0, 0.005, 0.04, 1.0]),
-    st.booleans(),
-)
-
-
-@given(st.lists(SETS, min_size=3, max_size=12))
-def test_output_is_that_of_two_oscillators(sets: list[tuple[float, float, complex, float, bool]]):
-    """Whatever sets come how soon: an independent channel of two voices plays the same."""
-    small, playing, now = Oscillators(), (), 0.0
-    for pause, frequency, amplitude, ramp, keep in sets:
-        now += pause
-        small.play(now, frequency, amplitude, ramp, keep)
-        playing = fade_to(
-            playing, now, ramp=ramp, frequency=frequency, amplitude=amplitude, keep_phase=keep
-        )
-        assert len({tone.frequency for tone in playing} - {0.0}) <= 2
-        for later in (0.0, 0.0011, 0.0027):
-            played = [
-                (tone.amplitude(now + later), tone.frequency, now + later - tone.origin)
-                for tone in playing
-            ]
-            value = sum((a * cmath.exp(2j * math.pi * f * t)).imag for a, f, t in played)
-            assert value == pytest.approx(small.value(now + later), abs=1e-9)
-
-
-def test_set_during_a_fade_makes_no_jump() -> None:
-    """A hundred sets in a second, ramps of one second: at most 2 pi f and the ramps per second."""
-    playing: Output = ()
-
-    def value(time: float) -> float:
-        return sum(
-            (t.amplitude(time) * cmath.exp(2j * math.pi * t.frequency * (time - t.origin))).imag
-            for t in playing
-        )
-
-    for number in range(100):
-        time = 0.01 * number
-        before = value(time)
-        playing = fade_to(playing, time, ramp=1.0, frequency=100.0 + number, amplitude=1.0)
-        assert value(time) == pytest.approx(before, abs=1e-12)
-        assert len(playing) <= 3

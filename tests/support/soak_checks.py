@@ -183,10 +183,7 @@ class Checks:
         limits = self._bench.rig.limits
         for output in self._bench.amplifiers[name].outputs:
             for tone in output:
-                is_remainder = tone.frequency == 0  # of a voice that had to make room
-                if not (
-                    is_remainder or limits.frequency_min <= tone.frequency <= limits.frequency_max
-                ):
+                if not limits.frequency_min <= tone.frequency <= limits.frequency_max:
                     self.violate(f"{name} plays {tone.frequency} Hz")
 
     def _check_loud(self, name: str, level: float, now: float) -> None:

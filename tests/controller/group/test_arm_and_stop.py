@@ -1,6 +1,7 @@
 """Arming, stopping, closing, and what several amplifiers do together."""
 
 import asyncio
+import logging
 
 import pytest
 
@@ -379,6 +380,7 @@ async def test_incomplete_set_is_silenced_before_the_next() -> None:
 @in_virtual_time
 async def test_close_ramps_reads_back_and_disarms(caplog: pytest.LogCaptureFixture) -> None:
     """In 50 ms, then ends the loop; a second close at the same time waits for the first."""
+    caplog.set_level(logging.INFO)
     async with running() as bench:
         bench.touch(FINGER)
         await asyncio.sleep(0.01)
@@ -413,6 +415,7 @@ async def test_close_waits_for_zero_then_stops(
     def lag(request: Request) -> Reply | None:
         return status(level=levels.pop(0)) if levels and isinstance(request, GetStatus) else None
 
+    caplog.set_level(logging.INFO)
     async with running() as bench:
         bench.far_end.answer = lag
     assert [type(request) for _, request in bench.far_end.asked][-len(last) :] == last

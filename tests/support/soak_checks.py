@@ -15,11 +15,13 @@ from drivers.protocol.messages import (
     Apply,
     Arm,
     Commit,
+    Disarm,
     Nak,
     Ping,
     Reply,
     Request,
     Stage,
+    Stop,
 )
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.bench.bench import Bench
@@ -36,7 +38,8 @@ TOGETHER = 0.6  # s; until all are silent after one of them has a fault
 _REMEMBERED = 16  # tokens since Arm, as docs/reference/wire-protocol.md has it
 STEP = 0.020  # s; check interval while a channel vibrates
 IDLE_STEP = 1.0
-_FEEDING_REQUESTS = (Arm, Ping, Stage, Commit, Apply)
+# Those that feed the watchdog, and those with a ramp to silence of their own, which ends it.
+_FEEDING_REQUESTS = (Arm, Ping, Stage, Commit, Apply, Disarm, Stop)
 _FAULTED = (AmplifierState.FAULT, AmplifierState.FAULT_REACTION_ACTIVE)
 _PLAYING = (
     AmplifierState.OPERATION_ENABLED,

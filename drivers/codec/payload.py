@@ -48,6 +48,10 @@ class Cursor:
         """Read a value in its unit."""
         return quantity.from_wire(self.integer(quantity))
 
+    def value(self, quantity: WireQuantity) -> float:
+        """Read a value in its unit; as an integer if it has whole steps."""
+        return self.integer(quantity) if quantity.per_unit == 1 else self.number(quantity)
+
     def nearest(self, quantity: WireQuantity) -> float:
         """Read a value in its unit, clipped into range: for what must never be refused."""
         value = self._raw(quantity.struct_code)

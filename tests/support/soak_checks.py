@@ -35,7 +35,7 @@ RELEASE = 0.020  # s; from the last finger up to zero
 # s; three unanswered requests, then the watchdog, and a heartbeat that was on its way.
 RELEASE_WITH_FAULTS = 3 * 0.15 + WATCHDOG + 0.1
 TOGETHER = 0.6  # s; until all are silent after one of them has a fault
-_REMEMBERED = 16  # tokens since Arm, as docs/reference/wire-protocol.md has it
+_REMEMBERED = 16  # tokens since Arm
 STEP = 0.020  # s; check interval while a channel vibrates
 IDLE_STEP = 1.0
 # Those that feed the watchdog, and those with a ramp to silence of their own, which ends it.

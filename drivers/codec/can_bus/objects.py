@@ -73,9 +73,8 @@ def read_integer(entry: Entry, data: bytes) -> int:
 def unpack_identity(texts: Mapping[str, bytes], versions: bytes) -> Identity:
     """Decode an identity from the subindices of its object; FrameError for an invalid one."""
     read = {name: read_text(texts[name].rstrip(b"\0"), name) for name in TEXTS}
-    if len(versions) != _WIDTHS[_Q.versions.wire]:
-        raise FrameError(f"versions must have 2 bytes, got {len(versions)}")
-    return Identity(**read, versions=versions_of(int.from_bytes(versions, "little")))
+    entry = Entry(index_of("texts"), len(TEXTS) + 1, "versions", "u16", _Q.versions)
+    return Identity(**read, versions=versions_of(read_integer(entry, versions)))
 
 
 def unpack_capabilities(values: Mapping[str, int]) -> Capabilities:

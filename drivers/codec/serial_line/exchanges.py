@@ -76,7 +76,10 @@ class _Layout:
 
 
 def _numbers(
-    message: type[Any], *, read: Callable[[Cursor, WireQuantity], float], **quantities: WireQuantity
+    message: type[Any],
+    *,
+    read: Callable[[Cursor, WireQuantity], float] = Cursor.value,
+    **quantities: WireQuantity,
 ) -> _Layout:
     """Return the layout of a message that consists of these numbers."""
 
@@ -87,11 +90,6 @@ def _numbers(
         return message(**{name: read(cursor, quantity) for name, quantity in quantities.items()})
 
     return _Layout(message, pack_numbers, unpack_numbers)
-
-
-def _value(cursor: Cursor, quantity: WireQuantity) -> float:
-    """Read a value in its unit, without one the integer."""
-    return cursor.number(quantity) if quantity.unit else cursor.integer(quantity)
 
 
 def _empty(message: type[Any]) -> _Layout:
@@ -138,27 +136,27 @@ _EXCHANGES: dict[int, tuple[_Layout, _Layout]] = {
     _HELLO: (_empty(Hello), _IDENTITY),
     PROTOCOL.types["get_caps"]: (_empty(GetCaps), _CAPABILITIES),
     PROTOCOL.types["arm"]: (
-        _numbers(Arm, read=_value, watchdog=_Q.watchdog, session=_Q.session),
+        _numbers(Arm, watchdog=_Q.watchdog, session=_Q.session),
         _STATUS,
     ),
     PROTOCOL.types["disarm"]: (_numbers(Disarm, read=Cursor.nearest, ramp=_Q.ramp), _STATUS),
     PROTOCOL.types["stage"]: (_set(Stage), _ACHIEVED),
     PROTOCOL.types["commit"]: (
-        _numbers(Commit, read=Cursor.integer, session=_Q.held_session, token=_Q.token),
+        _numbers(Commit, session=_Q.held_session, token=_Q.token),
         _ACHIEVED,
     ),
     PROTOCOL.types["apply"]: (_set(Apply), _ACHIEVED),
     PROTOCOL.types["stop"]: (_numbers(Stop, read=Cursor.nearest, ramp=_Q.ramp), _STATUS),
     PROTOCOL.types["get_status"]: (_empty(GetStatus), _STATUS),
     PROTOCOL.types["get_faults"]: (_empty(GetFaults), _FAULTS),
-    PROTOCOL.types["clear"]: (_numbers(Clear, read=Cursor.integer, latch=_Q.latch), _STATUS),
+    PROTOCOL.types["clear"]: (_numbers(Clear, latch=_Q.latch), _STATUS),
     PROTOCOL.types["ping"]: (
-        _numbers(Ping, read=Cursor.integer, session=_Q.held_session),
+        _numbers(Ping, session=_Q.held_session),
         _STATUS,
     ),
     PROTOCOL.types["load_envelope"]: (
         _LOAD_ENVELOPE,
-        _numbers(Loaded, read=Cursor.integer, slot=_Q.envelope_slot, knots=_Q.envelope_knots),
+        _numbers(Loaded, slot=_Q.envelope_slot, knots=_Q.envelope_knots),
     ),
 }
 _TYPE_OF = {request.message: code for code, (request, _) in _EXCHANGES.items()}

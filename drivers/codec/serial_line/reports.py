@@ -74,8 +74,7 @@ def pack_capabilities(capabilities: Capabilities) -> bytes:
 def unpack_capabilities(cursor: Cursor) -> Capabilities:
     """Unpack capabilities."""
     values: dict[str, Any] = {
-        name: cursor.integer(quantity) if quantity.per_unit == 1 else cursor.number(quantity)
-        for name, quantity in _CAPABILITIES.items()
+        name: cursor.value(quantity) for name, quantity in _CAPABILITIES.items()
     }
     return Capabilities(**values, events=bool(cursor.byte() & _EVENTS))
 

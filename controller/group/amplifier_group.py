@@ -122,6 +122,7 @@ class AmplifierGroup:
             self._check_not_silenced(before)
             if self.state is GroupState.ARMED:
                 statuses = await self._gather(amplifier.status() for amplifier in self._all)
+                self._check_not_silenced(before)
                 if all(each.state is AmplifierState.OPERATION_ENABLED for each in statuses):
                     return
                 before = await self._disarm_rest()

@@ -277,6 +277,25 @@ async def test_arm_arms_all_anew_when_one_no_longer_is() -> None:
         assert session not in held
 
 
+@pytest.mark.parametrize("silencing", ["disarm", "stop"])
+@in_virtual_time
+async def test_silencing_wins_over_arming_what_is_armed(silencing: str) -> None:
+    """What a disarm or stop has switched off is not armed anew by an earlier request."""
+    bench = make_bench("a", "b")
+    await bench.controller.open()
+    await bench.controller.arm()
+    for far_end in bench.far_ends:
+        far_end.delay = 0.005
+    arming = asyncio.create_task(bench.controller.arm())
+    await asyncio.sleep(0.001)
+    await getattr(bench.controller, silencing)()
+    with pytest.raises(CommandRefused):
+        await arming
+    assert bench.controller.group_state is GroupState.DISARMED
+    assert ENABLED not in bench.states()
+    assert [len(far_end.requests(Arm)) for far_end in bench.far_ends] == [1, 1]
+
+
 @in_virtual_time
 async def test_failed_disarm_stops_all() -> None:
     """The error is raised after that."""

@@ -19,7 +19,7 @@ from drivers.protocol.messages import AmplifierState, Commit, Fault, NakCode, Pi
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
 from sim.far_ends.modbus.end import ModbusRtuEnd, ModbusTcpEnd
-from sim.far_ends.modbus.frames import FRAME_TIMEOUT, crc
+from sim.far_ends.modbus.frames import FRAME_TIMEOUT, RtuReader, TcpReader, crc
 from sim.far_ends.wires import Wire
 from vendor_pages import EXAMPLES, ScriptedDevice
 from wires import FarSide, far_side
@@ -134,8 +134,22 @@ every_wire = pytest.mark.parametrize("wire", ["RTU", "TCP"])
 
 
 @every_wire
-async def test_modbus_requests_in_any_pieces(wire: str) -> None:
-    """Both are answered in their order; slow bytes make one request all the same."""
+def test_slow_bytes_make_one_request(wire: str) -> None:
+    """Bytes just less than the pause that ends a frame apart are one, those further apart none."""
+    arm = FRAMES[f"Arm request, {wire}"]
+    for pause, expected in ((0.99 * FRAME_TIMEOUT, 1), (1.01 * FRAME_TIMEOUT, 0)):
+        reader = TcpReader() if wire == "TCP" else RtuReader()
+        found = [
+            request
+            for number, byte in enumerate(arm)
+            for request in reader.feed(bytes([byte]), number * pause)
+        ]
+        assert len(found) == expected
+
+
+@every_wire
+async def test_requests_in_one_piece_are_answered_in_order(wire: str) -> None:
+    """The second of two requests that came together has its own reply."""
     arm, ping = (FRAMES[f"{name} request, {wire}"] for name in ("Arm", "Ping"))
     expected = FRAMES[f"Arm reply, {wire}"]
     device = ScriptedDevice()
@@ -144,10 +158,6 @@ async def test_modbus_requests_in_any_pieces(wire: str) -> None:
         master.send(ping + arm)
         replies = await master.receive(2 * len(expected))
         assert replies[len(expected) :] == expected
-        for byte in arm:
-            master.send(bytes([byte]))
-            await asyncio.sleep(0.001)
-        assert await master.receive(len(expected)) == expected
         assert master.received == b""
 
 

@@ -10,12 +10,16 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint format docs fuzz kill-test fault-test stop-test estimate-test soak bench bench-latency \
+.PHONY: demo firmware test lint format docs fuzz kill-test fault-test stop-test estimate-test soak bench bench-latency \
 	bench-localization bench-plant bench-promise bench-wires dist smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
 demo: .venv/installed
 	$(BIN)/era demo
+
+# An amplifier in C for this machine, in out/firmware; firmware/README.md tells the rest.
+firmware:
+	$(MAKE) -C firmware
 
 # What needs the processors; what plays in real time; what loads the processors itself.
 test: .venv/installed-test

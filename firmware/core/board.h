@@ -1,0 +1,44 @@
+// SPDX-License-Identifier: MIT
+//
+// The dozen functions that a board must give; all of them return at once, but for `board_wait`.
+// They are called from the main loop alone (loop.c). See README.md, "To another board".
+
+#ifndef BOARD_H
+#define BOARD_H
+
+#include "config.h"
+
+enum line { LINE_SERIAL, LINE_MODBUS, LINE_CAN };
+
+// Time and samples.
+
+// Samples that are due since the last call: the one clock, which should be that of the converter.
+uint32_t board_samples_due(void);
+// Hand the next sample of every channel to the converter; 32767 is full stroke.
+void board_output(const int16_t samples[CHANNELS]);
+// Sleep until a sample is due or a byte has arrived.
+void board_wait(void);
+
+// Lines.
+
+// The next byte that has arrived, or -1.
+int board_read(enum line line);
+// Begin to send; the bytes are copied.
+void board_write(enum line line, const uint8_t *bytes, uint16_t length);
+// Microseconds since the last byte arrived (Modbus RTU ends its frames with silence).
+uint32_t board_silence(enum line line);
+
+// High voltage, and what is measured.
+
+void board_high_voltage(bool on);
+int16_t board_temperature(void); // 0.1 degrees Celsius
+uint16_t board_voltage(void);    // V, of the high-voltage supply; 0: not measured
+// The cause of a fault while there is one, and its channel (NO_CHANNEL: none).
+enum fault board_fault(uint8_t *channel);
+
+// Who it is.
+
+const char *board_serial_number(void); // unique, at most 32 bytes of UTF-8; never changes
+uint8_t board_address(void);           // on serial and Modbus 1 to 247, on CAN 1 to 63
+
+#endif

@@ -1,0 +1,20 @@
+// SPDX-License-Identifier: MIT
+
+#include "capabilities.h"
+
+const struct capability CAPABILITIES[CAPABILITY_COUNT] = {
+    {CHANNELS, 1},
+    {FREQUENCY_MIN, 2},
+    {FREQUENCY_MAX, 2},
+    {1, 2}, // frequency step
+    {LEVEL_MAX, 2},
+    {1, 2}, // level step
+    {1, 2}, // phase step
+    {RAMP_MAX, 2},
+    {WATCHDOG_MIN, 2},
+    {WATCHDOG_MAX, 2},
+    {ENVELOPE_KNOTS, 1},
+    {ENVELOPE_SLOTS, 1},
+    {ENVELOPE_STEP_MIN, 2},
+    {ENVELOPE_STEP_MAX, 2},
+};

@@ -1,0 +1,123 @@
+// SPDX-License-Identifier: MIT
+
+#include "channel.h"
+#include "sine.h"
+
+#include <stddef.h>
+
+static bool is_silent(const struct command *command)
+{
+    return command->level == 0 && command->onset == 0;
+}
+
+// Keep phase applies to what the channel plays last, as long as it sounds, at exactly this frequency.
+static bool keeps_phase(const struct channel *channel, const struct command *command)
+{
+    const struct voice *voice = &channel->voices[channel->newest];
+    return (command->flags & KEEP_PHASE) != 0 && voice->is_sounding &&
+           voice->frequency == command->frequency;
+}
+
+bool channel_has_room(const struct channel *channel, const struct command *command, uint16_t ramp)
+{
+    bool needs_no_voice = is_silent(command) || (keeps_phase(channel, command) && command->onset);
+    bool has_free_voice = !channel->voices[0].is_sounding || !channel->voices[1].is_sounding;
+    return needs_no_voice || has_free_voice || ramp == 0;
+}
+
+static void fall_all(struct channel *channel, uint16_t ramp)
+{
+    voice_fall(&channel->voices[0], ramp);
+    voice_fall(&channel->voices[1], ramp);
+}
+
+static struct voice *begin_voice(struct channel *channel, const struct command *command,
+                                 struct complex amplitude, uint16_t ramp)
+{
+    bool is_kept = keeps_phase(channel, command);
+    uint32_t angle = channel->voices[channel->newest].angle;
+    fall_all(channel, ramp);
+    channel->newest = channel->voices[0].is_sounding ? 1 : 0;
+    struct voice *voice = &channel->voices[channel->newest];
+    voice_begin(voice, command->frequency, amplitude, command->onset ? 0 : ramp);
+    if (is_kept)
+        voice->angle = angle;
+    return voice;
+}
+
+static void play_onset(struct channel *channel, const struct command *command, uint16_t ramp,
+                       const struct envelope *onset)
+{
+    static const struct complex silence = {0, 0};
+    struct voice *voice = &channel->voices[channel->newest];
+    if (keeps_phase(channel, command))
+        voice_fall(&channel->voices[1 - channel->newest], ramp);
+    else
+        voice = begin_voice(channel, command, silence, ramp);
+    voice_walk(voice, onset, amplitude_of(command->level, command->phase));
+}
+
+void channel_play(struct channel *channel, const struct command *command, uint16_t ramp,
+                  const struct envelope *onset, const struct envelope *ending)
+{
+    if (is_silent(command)) {
+        if (command->flags & SKIP_ENDING)
+            channel_quiet(channel, ramp);
+        else
+            channel_end(channel, ramp);
+        return;
+    }
+    if (onset != NULL)
+        play_onset(channel, command, ramp, onset);
+    else
+        begin_voice(channel, command, amplitude_of(command->level, command->phase), ramp);
+    channel->has_command = true;
+    channel->ramp = ramp;
+    channel->ending.knots = 0;
+    if (ending != NULL)
+        channel->ending = *ending;
+}
+
+void channel_end(struct channel *channel, uint16_t ramp)
+{
+    static const struct complex silence = {0, 0};
+    struct voice *voice = &channel->voices[channel->newest];
+    if (channel->has_command && channel->ending.knots > 0 && voice->is_sounding) {
+        voice_fall(&channel->voices[1 - channel->newest], ramp);
+        voice_walk(voice, &channel->ending, silence);
+    } else {
+        fall_all(channel, ramp);
+    }
+    channel->has_command = false;
+}
+
+void channel_quiet(struct channel *channel, uint16_t ramp)
+{
+    fall_all(channel, ramp);
+    channel->has_command = false;
+}
+
+bool channel_is_sounding(const struct channel *channel)
+{
+    return channel->voices[0].is_sounding || channel->voices[1].is_sounding;
+}
+
+uint16_t channel_level(const struct channel *channel)
+{
+    if (!channel_is_sounding(channel))
+        return 0;
+    int64_t size = (int64_t)voice_size(&channel->voices[0]) + voice_size(&channel->voices[1]);
+    int64_t level = (size * FULL_STROKE + ONE / 2) / ONE;
+    if (level < 1)
+        return 1;
+    return level > FULL_STROKE ? FULL_STROKE : (uint16_t)level;
+}
+
+int16_t channel_sample(struct channel *channel)
+{
+    int64_t sum = (int64_t)voice_sample(&channel->voices[0]) + voice_sample(&channel->voices[1]);
+    int32_t value = (int32_t)((sum + (1 << 14)) >> 15);
+    if (value > INT16_MAX)
+        return INT16_MAX;
+    return value < -INT16_MAX ? -INT16_MAX : (int16_t)value;
+}

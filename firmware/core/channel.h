@@ -1,0 +1,46 @@
+// SPDX-License-Identifier: MIT
+//
+// A channel: two voices, and the command that it plays.
+
+#ifndef CHANNEL_H
+#define CHANNEL_H
+
+#include "voice.h"
+
+struct command {
+    uint8_t channel, flags;
+    uint16_t frequency, level;
+    int16_t phase;
+    uint8_t onset, ending; // slots; 0: none
+};
+
+struct channel {
+    struct voice voices[2];
+    uint8_t newest;         // the voice that began last
+    bool has_command;       // plays one, as against falling silent
+    uint16_t ramp;          // of its set
+    struct envelope ending; // of its command; without knots: none
+};
+
+// Whether a command can be played now: a third voice would have no place.
+bool channel_has_room(const struct channel *channel, const struct command *command, uint16_t ramp);
+
+// Play a command for which there is room; onset and ending: its envelopes, or null.
+void channel_play(struct channel *channel, const struct command *command, uint16_t ramp,
+                  const struct envelope *onset, const struct envelope *ending);
+
+// Fall silent along the ending of the command, or else along a ramp [ms].
+void channel_end(struct channel *channel, uint16_t ramp);
+
+// Fall silent along a ramp [ms], whatever the ending.
+void channel_quiet(struct channel *channel, uint16_t ramp);
+
+bool channel_is_sounding(const struct channel *channel);
+
+// Present level: the sum of both voices, at least one step while anything sounds.
+uint16_t channel_level(const struct channel *channel);
+
+// Value at this sample, 32767 being full stroke; then move on by one sample.
+int16_t channel_sample(struct channel *channel);
+
+#endif

@@ -1,0 +1,32 @@
+// SPDX-License-Identifier: MIT
+//
+// What this amplifier is and can do: edit this file for another product. It is all that GetCaps,
+// the capability registers and the capability objects report.
+
+#ifndef CONFIG_H
+#define CONFIG_H
+
+#include "protocol.h"
+
+#define VENDOR "ERA haptics"
+#define PRODUCT "Example firmware"
+#define FIRMWARE_VERSION "1.0"
+
+#define CHANNELS 4
+#define SAMPLE_RATE 16000 // per second and channel; a multiple of 1000
+#define SAMPLES_PER_MS (SAMPLE_RATE / 1000)
+
+#define FREQUENCY_MIN (20 * FREQUENCY_PER_HZ)
+#define FREQUENCY_MAX (2000 * FREQUENCY_PER_HZ) // at most a quarter of the sample rate
+#define LEVEL_MAX FULL_STROKE
+#define WATCHDOG_MIN 100
+#define WATCHDOG_MAX 2000
+
+#define ENVELOPE_SLOTS 16
+#define ENVELOPE_KNOTS 32
+#define ENVELOPE_STEP_MIN 10
+#define ENVELOPE_STEP_MAX 1000
+
+#define FAULTS_KEPT 8
+
+#endif

@@ -1,0 +1,13 @@
+// SPDX-License-Identifier: MIT
+//
+// The main loop of an amplifier on a board.
+
+#ifndef LOOP_H
+#define LOOP_H
+
+void loop_init(void);
+
+// Make the samples that are due, then carry out what has arrived. Call it for ever.
+void loop_once(void);
+
+#endif

@@ -1,0 +1,198 @@
+// SPDX-License-Identifier: MIT
+//
+// States, session, watchdog, stops and faults.
+
+#include "amplifier.h"
+
+#include <string.h>
+
+const struct verdict ACCEPTED = {NAK_NONE, NO_CHANNEL};
+
+struct verdict refused(enum nak nak)
+{
+    struct verdict verdict = {nak, NO_CHANNEL};
+    return verdict;
+}
+
+void amplifier_init(struct amplifier *amplifier, const char *serial_number)
+{
+    memset(amplifier, 0, sizeof *amplifier);
+    amplifier->serial_number = serial_number;
+    amplifier->state = SWITCH_ON_DISABLED;
+    amplifier->fault_channel = NO_CHANNEL;
+    amplifier->cause_channel = NO_CHANNEL;
+    amplifier->answered = &amplifier->active;
+}
+
+static bool is_sounding(const struct amplifier *amplifier)
+{
+    for (unsigned i = 0; i < CHANNELS; i++)
+        if (channel_is_sounding(&amplifier->channels[i]))
+            return true;
+    return false;
+}
+
+// Every channel falls silent along a ramp; endings are skipped.
+static void quiet(struct amplifier *amplifier, uint16_t ramp)
+{
+    for (unsigned i = 0; i < CHANNELS; i++)
+        channel_quiet(&amplifier->channels[i], ramp);
+}
+
+static void leave_operation(struct amplifier *amplifier, enum state next)
+{
+    if (amplifier->state == OPERATION_ENABLED) {
+        amplifier->ended_session = amplifier->session;
+        amplifier->session = 0;
+        amplifier->watchdog_left = 0;
+        amplifier->staged_left = 0;
+        amplifier->valid_left = 0;
+    }
+    amplifier->state = next;
+}
+
+static void next_latch(struct amplifier *amplifier)
+{
+    amplifier->latch = amplifier->latch == 255 ? 1 : amplifier->latch + 1;
+}
+
+// Once silent: what only waited for that.
+void settle(struct amplifier *amplifier)
+{
+    if (amplifier->state == OPERATION_ENABLED || is_sounding(amplifier))
+        return;
+    amplifier->high_voltage = false;
+    if (amplifier->state == SWITCHED_ON)
+        amplifier->state = SWITCH_ON_DISABLED;
+    if (amplifier->state == FAULT_REACTION_ACTIVE)
+        amplifier->state = FAULT;
+}
+
+static void fail(struct amplifier *amplifier, enum fault fault, uint8_t channel)
+{
+    leave_operation(amplifier, FAULT_REACTION_ACTIVE);
+    amplifier->fault = fault;
+    amplifier->fault_channel = channel;
+    next_latch(amplifier);
+    memmove(&amplifier->faults[1], &amplifier->faults[0],
+            (FAULTS_KEPT - 1) * sizeof amplifier->faults[0]);
+    amplifier->faults[0].fault = (uint8_t)fault;
+    amplifier->faults[0].channel = channel;
+    amplifier->faults[0].at = amplifier->now;
+    if (amplifier->fault_count < FAULTS_KEPT)
+        amplifier->fault_count++;
+    quiet(amplifier, SAFETY_RAMP);
+    settle(amplifier);
+}
+
+void amplifier_measured(struct amplifier *amplifier, int16_t temperature, uint16_t voltage,
+                        enum fault cause, uint8_t channel)
+{
+    amplifier->temperature = temperature;
+    amplifier->voltage = voltage;
+    amplifier->cause = cause;
+    amplifier->cause_channel = channel;
+    if (cause != FAULT_NONE && amplifier->high_voltage && amplifier->fault == FAULT_NONE)
+        fail(amplifier, cause, channel);
+}
+
+void watchdog_feed(struct amplifier *amplifier)
+{
+    amplifier->watchdog_left = amplifier->watchdog;
+}
+
+struct verdict session_check(const struct amplifier *amplifier, uint16_t session)
+{
+    if (amplifier->state != OPERATION_ENABLED)
+        return refused(NAK_WRONG_STATE);
+    return session == amplifier->session ? ACCEPTED : refused(NAK_WRONG_SESSION);
+}
+
+struct verdict amplifier_arm(struct amplifier *amplifier, uint16_t watchdog, uint16_t session)
+{
+    if (watchdog < WATCHDOG_MIN || watchdog > WATCHDOG_MAX || session == 0)
+        return refused(NAK_BAD_VALUE);
+    if (amplifier->state > OPERATION_ENABLED)
+        return refused(NAK_WRONG_STATE);
+    if (amplifier->state == OPERATION_ENABLED) {
+        if (session != amplifier->session)
+            return refused(NAK_WRONG_SESSION);
+    } else {
+        if (session == amplifier->ended_session)
+            return refused(NAK_WRONG_SESSION);
+        amplifier->state = OPERATION_ENABLED;
+        amplifier->session = session;
+        amplifier->high_voltage = true;
+        amplifier->active.token = 0;
+        quiet(amplifier, SAFETY_RAMP);
+    }
+    amplifier->watchdog = (uint32_t)watchdog * SAMPLES_PER_MS;
+    watchdog_feed(amplifier);
+    return ACCEPTED;
+}
+
+void amplifier_disarm(struct amplifier *amplifier, uint16_t ramp)
+{
+    if (amplifier->state == OPERATION_ENABLED)
+        leave_operation(amplifier, SWITCHED_ON);
+    quiet(amplifier, ramp > RAMP_MAX ? RAMP_MAX : ramp);
+    settle(amplifier);
+}
+
+void amplifier_stop(struct amplifier *amplifier, uint16_t ramp)
+{
+    next_latch(amplifier);
+    if (amplifier->state < QUICK_STOP_ACTIVE)
+        leave_operation(amplifier, QUICK_STOP_ACTIVE);
+    quiet(amplifier, ramp > RAMP_MAX ? RAMP_MAX : ramp);
+    settle(amplifier);
+}
+
+struct verdict amplifier_clear(struct amplifier *amplifier, uint8_t latch)
+{
+    if (amplifier->state != QUICK_STOP_ACTIVE && amplifier->state != FAULT)
+        return ACCEPTED;
+    if (latch != amplifier->latch)
+        return refused(NAK_WRONG_LATCH);
+    if (is_sounding(amplifier) || (amplifier->state == FAULT && amplifier->cause != FAULT_NONE))
+        return ACCEPTED; // too early: nothing changes, as the status shows
+    amplifier->state = SWITCH_ON_DISABLED;
+    amplifier->fault = FAULT_NONE;
+    amplifier->fault_channel = NO_CHANNEL;
+    return ACCEPTED;
+}
+
+struct verdict amplifier_ping(struct amplifier *amplifier, uint16_t session)
+{
+    if (amplifier->state != OPERATION_ENABLED)
+        return ACCEPTED;
+    if (session != amplifier->session)
+        return refused(NAK_WRONG_SESSION);
+    watchdog_feed(amplifier);
+    return ACCEPTED;
+}
+
+void amplifier_sample(struct amplifier *amplifier, int16_t samples[CHANNELS])
+{
+    for (unsigned i = 0; i < CHANNELS; i++)
+        samples[i] = channel_sample(&amplifier->channels[i]);
+    amplifier->now++;
+    settle(amplifier);
+    if (amplifier->state != OPERATION_ENABLED)
+        return;
+    sets_sample(amplifier);
+    amplifier->watchdog_left--;
+    if (amplifier->watchdog_left == 0)
+        fail(amplifier, FAULT_WATCHDOG, NO_CHANNEL);
+}
+
+uint16_t amplifier_watchdog_left(const struct amplifier *amplifier)
+{
+    return (uint16_t)((amplifier->watchdog_left + SAMPLES_PER_MS - 1) / SAMPLES_PER_MS);
+}
+
+uint32_t amplifier_fault_age(const struct amplifier *amplifier, uint8_t number)
+{
+    uint64_t age = (amplifier->now - amplifier->faults[number].at) / SAMPLES_PER_MS;
+    return age > UINT32_MAX ? UINT32_MAX : (uint32_t)age;
+}

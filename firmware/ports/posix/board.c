@@ -1,0 +1,169 @@
+// SPDX-License-Identifier: MIT
+//
+// A program in the place of a board: lines are pseudo-terminals, samples go to a file or pipe.
+//
+// Its outputs are numbers and its high voltage is 1800 V by definition. Of a time in which the
+// program did not run, only 50 ms pass for it, as if a board had stood still: its watchdog watches
+// the host, not the machine's other load.
+
+#define _XOPEN_SOURCE 700
+
+#include "board.h"
+#include "line.h"
+#include "options.h"
+
+#include <poll.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+#define LINES 3
+#define LONGEST_PAUSE 50000 // us
+
+static int lines_in[LINES] = {-1, -1, -1}, lines_out[LINES];
+static uint8_t received[LINES][512];
+static ssize_t received_length[LINES], received_at[LINES];
+static uint64_t heard_at[LINES];
+static const char *serial_number = "FW-1";
+static bool ends_with_input;
+static bool is_high_voltage;
+static FILE *samples_file;
+static uint64_t clock_at; // us of the clock that have become samples or were left out
+static uint64_t samples_made, time_made;
+
+uint32_t board_samples_due(void)
+{
+    uint64_t now = microseconds();
+    if (now - clock_at > LONGEST_PAUSE)
+        clock_at = now - LONGEST_PAUSE;
+    time_made += now - clock_at;
+    clock_at = now;
+    uint64_t due = time_made * SAMPLE_RATE / 1000000 - samples_made;
+    samples_made += due;
+    return (uint32_t)due;
+}
+
+void board_output(const int16_t samples[CHANNELS])
+{
+    if (samples_file != NULL)
+        fwrite(samples, sizeof samples[0], CHANNELS, samples_file);
+}
+
+void board_wait(void)
+{
+    struct pollfd watched[LINES + 1];
+    for (int i = 0; i < LINES; i++) {
+        watched[i].fd = lines_in[i];
+        watched[i].events = POLLIN;
+    }
+    watched[LINES].fd = ends_with_input ? STDIN_FILENO : -1;
+    watched[LINES].events = POLLIN;
+    char ignored[64];
+    if (samples_file != NULL)
+        fflush(samples_file);
+    if (poll(watched, LINES + 1, 1) > 0 && watched[LINES].revents != 0 &&
+        read(STDIN_FILENO, ignored, sizeof ignored) <= 0)
+        exit(0);
+}
+
+int board_read(enum line line)
+{
+    if (received_at[line] == received_length[line]) {
+        received_at[line] = 0;
+        received_length[line] = 0;
+        if (lines_in[line] >= 0)
+            received_length[line] = read(lines_in[line], received[line], sizeof received[line]);
+        if (received_length[line] <= 0) {
+            if (received_length[line] == 0 && lines_in[line] == STDIN_FILENO)
+                exit(0);
+            received_length[line] = 0;
+            return -1;
+        }
+        heard_at[line] = microseconds();
+    }
+    return received[line][received_at[line]++];
+}
+
+void board_write(enum line line, const uint8_t *bytes, uint16_t length)
+{
+    // What a full line does not take is lost, as on a wire that nobody reads.
+    if (write(lines_out[line], bytes, length) < 0)
+        return;
+}
+
+uint32_t board_silence(enum line line)
+{
+    return (uint32_t)(microseconds() - heard_at[line]);
+}
+
+void board_high_voltage(bool on)
+{
+    is_high_voltage = on;
+}
+
+int16_t board_temperature(void)
+{
+    return 250;
+}
+
+uint16_t board_voltage(void)
+{
+    return is_high_voltage ? 1800 : 0;
+}
+
+enum fault board_fault(uint8_t *channel)
+{
+    *channel = NO_CHANNEL;
+    return FAULT_NONE;
+}
+
+const char *board_serial_number(void)
+{
+    return serial_number;
+}
+
+uint8_t board_address(void)
+{
+    return 1;
+}
+
+static void usage(const char *program)
+{
+    fprintf(stderr,
+            "usage: %s [--serial | --pipe] [--samples FILE] [--serial-number TEXT] [--until-eof]\n",
+            program);
+    exit(2);
+}
+
+static void open_line(enum line line, const char *scheme)
+{
+    const char *path;
+    lines_in[line] = lines_out[line] = open_terminal(&path);
+    printf("%s%s\n", scheme, path);
+}
+
+void board_open(int count, char **arguments)
+{
+    for (int i = 1; i < count; i++) {
+        const char *option = arguments[i], *value = i + 1 < count ? arguments[i + 1] : NULL;
+        if (strcmp(option, "--serial") == 0) {
+            open_line(LINE_SERIAL, "serial://");
+        } else if (strcmp(option, "--pipe") == 0) {
+            lines_in[LINE_SERIAL] = STDIN_FILENO;
+            lines_out[LINE_SERIAL] = STDOUT_FILENO;
+        } else if (strcmp(option, "--until-eof") == 0) {
+            ends_with_input = true;
+        } else if (strcmp(option, "--samples") == 0 && value != NULL) {
+            samples_file = fopen(arguments[++i], "wb");
+            if (samples_file == NULL)
+                fail(value);
+        } else if (strcmp(option, "--serial-number") == 0 && value != NULL && strlen(value) <= 32) {
+            serial_number = arguments[++i];
+        } else {
+            usage(arguments[0]);
+        }
+    }
+    fflush(stdout);
+    clock_at = microseconds();
+}

@@ -1,0 +1,17 @@
+// SPDX-License-Identifier: MIT
+//
+// The amplifier as a program.
+
+#include "board.h"
+#include "loop.h"
+#include "options.h"
+
+int main(int count, char **arguments)
+{
+    board_open(count, arguments);
+    loop_init();
+    for (;;) {
+        loop_once();
+        board_wait();
+    }
+}

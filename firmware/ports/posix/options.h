@@ -1,0 +1,17 @@
+// SPDX-License-Identifier: MIT
+//
+// Command-line options of the POSIX port:
+//
+//     --serial              serve the serial protocol on a pseudo-terminal; prints its URL
+//     --pipe                serve it on standard input and output (for scripts, see test/replay.c)
+//     --samples FILE        write the samples: 16-bit integers, the channels one after another
+//     --serial-number TEXT  of the amplifier
+//     --until-eof           end with standard input
+
+#ifndef OPTIONS_H
+#define OPTIONS_H
+
+// Open what the options ask for, or exit with a message.
+void board_open(int count, char **arguments);
+
+#endif

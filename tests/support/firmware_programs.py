@@ -1,0 +1,29 @@
+"""The firmware, built by the compiler of this machine, and its programs."""
+
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+FIRMWARE = Path(__file__).parents[2] / "firmware"
+
+
+def build_firmware(folder: Path) -> Path:
+    """Build the programs for this machine into a folder; return it."""
+    subprocess.run(["make", "-s", "-C", FIRMWARE, f"OUT={folder}"], check=True)
+    return folder
+
+
+@contextmanager
+def running_firmware(folder: Path, *options: str) -> Iterator[str]:
+    """Run the amplifier with an option for its line; yield the URL of that line."""
+    with subprocess.Popen(
+        [folder / "era-firmware", "--until-eof", *options],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        yield process.stdout.readline().strip()
+        process.stdin.close()

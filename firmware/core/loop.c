@@ -3,16 +3,21 @@
 #include "loop.h"
 #include "amplifier.h"
 #include "board.h"
+#include "modbus_rtu.h"
 #include "serial.h"
 
 static struct amplifier amplifier;
 static struct serial serial;
+static struct modbus modbus;
+static struct rtu rtu;
 static uint32_t samples_to_measuring;
 
 void loop_init(void)
 {
     amplifier_init(&amplifier, board_serial_number());
     serial_init(&serial, &amplifier, board_address());
+    modbus_init(&modbus, &amplifier, board_address());
+    rtu_init(&rtu, &modbus);
     board_high_voltage(false);
 }
 
@@ -37,20 +42,35 @@ static void make_samples(void)
     }
 }
 
-static void read_serial(void)
+// What a request changed must reach the board, and its measurements the reply.
+static void send(enum line line, const uint8_t *reply, uint16_t length)
 {
-    for (int byte = board_read(LINE_SERIAL); byte >= 0; byte = board_read(LINE_SERIAL)) {
-        uint16_t length = serial_byte(&serial, (uint8_t)byte);
-        board_high_voltage(amplifier.high_voltage);
-        if (length > 0) {
-            measure();
-            board_write(LINE_SERIAL, serial.reply, length);
-        }
-    }
+    board_high_voltage(amplifier.high_voltage);
+    if (length > 0)
+        board_write(line, reply, length);
+}
+
+static void serve_serial(void)
+{
+    for (int byte = board_read(LINE_SERIAL); byte >= 0; byte = board_read(LINE_SERIAL))
+        send(LINE_SERIAL, serial.reply, serial_byte(&serial, (uint8_t)byte));
+}
+
+static void serve_modbus(void)
+{
+    for (int byte = board_read(LINE_MODBUS); byte >= 0; byte = board_read(LINE_MODBUS))
+        rtu_byte(&rtu, (uint8_t)byte);
+    send(LINE_MODBUS, rtu.reply, rtu_silence(&rtu, board_silence(LINE_MODBUS)));
+}
+
+struct modbus *loop_modbus(void)
+{
+    return &modbus;
 }
 
 void loop_once(void)
 {
     make_samples();
-    read_serial();
+    serve_serial();
+    serve_modbus();
 }

@@ -10,4 +10,7 @@ void loop_init(void);
 // Make the samples that are due, then carry out what has arrived. Call it for ever.
 void loop_once(void);
 
+// For a board with Modbus on other lines than LINE_MODBUS.
+struct modbus *loop_modbus(void);
+
 #endif

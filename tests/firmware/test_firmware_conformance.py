@@ -14,10 +14,12 @@ REPLY_TIMEOUT = 2.0  # s; a busy machine delays replies
 pytestmark = pytest.mark.real_time
 
 
-@pytest.mark.parametrize("line", ["--serial"])
-async def test_firmware_conforms(firmware: Path, line: str) -> None:
+@pytest.mark.parametrize(
+    "line", [["--serial"], ["--modbus-rtu"], ["--modbus-tcp", "0"]], ids=" ".join
+)
+async def test_firmware_conforms(firmware: Path, line: list[str]) -> None:
     """It passes every check."""
-    with running_firmware(firmware, line) as url:
+    with running_firmware(firmware, *line) as url:
         amplifier = Amplifier(open_backend(url), reply_timeout=REPLY_TIMEOUT)
         await amplifier.open()
         results = [await run_check(check, amplifier) for check in CHECKS]

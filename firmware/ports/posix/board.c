@@ -10,6 +10,7 @@
 
 #include "board.h"
 #include "line.h"
+#include "modbus_tcp.h"
 #include "options.h"
 
 #include <poll.h>
@@ -52,17 +53,18 @@ void board_output(const int16_t samples[CHANNELS])
 
 void board_wait(void)
 {
-    struct pollfd watched[LINES + 1];
+    struct pollfd watched[LINES + 1 + TCP_WATCHED];
     for (int i = 0; i < LINES; i++) {
         watched[i].fd = lines_in[i];
         watched[i].events = POLLIN;
     }
     watched[LINES].fd = ends_with_input ? STDIN_FILENO : -1;
     watched[LINES].events = POLLIN;
+    tcp_watch(&watched[LINES + 1]);
     char ignored[64];
     if (samples_file != NULL)
         fflush(samples_file);
-    if (poll(watched, LINES + 1, 1) > 0 && watched[LINES].revents != 0 &&
+    if (poll(watched, LINES + 1 + TCP_WATCHED, 1) > 0 && watched[LINES].revents != 0 &&
         read(STDIN_FILENO, ignored, sizeof ignored) <= 0)
         exit(0);
 }
@@ -131,7 +133,8 @@ uint8_t board_address(void)
 static void usage(const char *program)
 {
     fprintf(stderr,
-            "usage: %s [--serial | --pipe] [--samples FILE] [--serial-number TEXT] [--until-eof]\n",
+            "usage: %s [--serial] [--modbus-rtu] [--modbus-tcp PORT]\n"
+            "       [--pipe] [--samples FILE] [--serial-number TEXT] [--until-eof]\n",
             program);
     exit(2);
 }
@@ -149,6 +152,11 @@ void board_open(int count, char **arguments)
         const char *option = arguments[i], *value = i + 1 < count ? arguments[i + 1] : NULL;
         if (strcmp(option, "--serial") == 0) {
             open_line(LINE_SERIAL, "serial://");
+        } else if (strcmp(option, "--modbus-rtu") == 0) {
+            open_line(LINE_MODBUS, "modbus+rtu://");
+        } else if (strcmp(option, "--modbus-tcp") == 0 && value != NULL) {
+            int port = atoi(arguments[++i]);
+            printf("modbus+tcp://127.0.0.1:%d/1\n", tcp_open((uint16_t)port));
         } else if (strcmp(option, "--pipe") == 0) {
             lines_in[LINE_SERIAL] = STDIN_FILENO;
             lines_out[LINE_SERIAL] = STDOUT_FILENO;
@@ -164,6 +172,8 @@ void board_open(int count, char **arguments)
             usage(arguments[0]);
         }
     }
+    if (count == 1)
+        open_line(LINE_SERIAL, "serial://");
     fflush(stdout);
     clock_at = microseconds();
 }

@@ -4,6 +4,7 @@
 
 #include "board.h"
 #include "loop.h"
+#include "modbus_tcp.h"
 #include "options.h"
 
 int main(int count, char **arguments)
@@ -12,6 +13,7 @@ int main(int count, char **arguments)
     loop_init();
     for (;;) {
         loop_once();
+        tcp_serve(loop_modbus());
         board_wait();
     }
 }

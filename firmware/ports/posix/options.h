@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: MIT
 //
-// Command-line options of the POSIX port:
+// Command-line options of the POSIX port; without any it is --serial:
 //
 //     --serial              serve the serial protocol on a pseudo-terminal; prints its URL
+//     --modbus-rtu          serve Modbus RTU on a pseudo-terminal; prints its URL
+//     --modbus-tcp PORT     serve Modbus TCP on 127.0.0.1, 0 being any port; prints its URL
 //     --pipe                serve it on standard input and output (for scripts, see test/replay.c)
 //     --samples FILE        write the samples: 16-bit integers, the channels one after another
 //     --serial-number TEXT  of the amplifier

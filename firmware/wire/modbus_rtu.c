@@ -1,0 +1,81 @@
+// SPDX-License-Identifier: MIT
+
+#include "modbus_rtu.h"
+#include "crc.h"
+
+#include <string.h>
+
+#define CRC_SIZE 2
+
+void rtu_init(struct rtu *rtu, struct modbus *modbus)
+{
+    memset(rtu, 0, sizeof *rtu);
+    rtu->modbus = modbus;
+}
+
+void rtu_byte(struct rtu *rtu, uint8_t byte)
+{
+    if (rtu->length < RTU_FRAME_MAX)
+        rtu->received[rtu->length++] = byte;
+}
+
+// Length of the request that begins here, 0 if that is not known yet.
+static uint16_t expected_length(const uint8_t *frame, uint16_t length)
+{
+    uint16_t count_at; // of the byte that tells how many follow
+    if (length < 2)
+        return 0;
+    switch (frame[1]) {
+    case 16:
+        count_at = 6;
+        break;
+    case 23:
+        count_at = 10;
+        break;
+    case 43:
+        return 5 + CRC_SIZE;
+    default:
+        return 6 + CRC_SIZE;
+    }
+    return length > count_at ? (uint16_t)(count_at + 1 + frame[count_at] + CRC_SIZE) : 0;
+}
+
+static bool has_good_crc(const uint8_t *frame, uint16_t length)
+{
+    uint16_t crc = crc16_of(frame, (uint16_t)(length - CRC_SIZE));
+    return frame[length - 2] == (uint8_t)crc && frame[length - 1] == (uint8_t)(crc >> 8);
+}
+
+static uint16_t request_received(struct rtu *rtu, uint16_t length)
+{
+    uint8_t unit = rtu->received[0];
+    uint16_t size = modbus_request(rtu->modbus, unit, rtu->received + 1,
+                                   (uint16_t)(length - 1 - CRC_SIZE), rtu->reply + 1);
+    if (size == 0)
+        return 0;
+    rtu->reply[0] = unit;
+    uint16_t crc = crc16_of(rtu->reply, (uint16_t)(size + 1));
+    rtu->reply[size + 1] = (uint8_t)crc;
+    rtu->reply[size + 2] = (uint8_t)(crc >> 8);
+    return (uint16_t)(size + 1 + CRC_SIZE);
+}
+
+uint16_t rtu_silence(struct rtu *rtu, uint32_t microseconds)
+{
+    if (rtu->length == 0 || microseconds < RTU_SILENCE)
+        return 0;
+    uint16_t length = expected_length(rtu->received, rtu->length);
+    bool is_whole = length > 0 && length <= rtu->length;
+    if (!is_whole && microseconds < RTU_LONGEST_PAUSE && length <= RTU_FRAME_MAX)
+        return 0;
+    if (!is_whole || !has_good_crc(rtu->received, length)) {
+        rtu->discarded++;
+        rtu->length = 0;
+        return 0;
+    }
+    uint16_t reply = request_received(rtu, length);
+    // A request that came while this program did not look follows without silence.
+    rtu->length = (uint16_t)(rtu->length - length);
+    memmove(rtu->received, rtu->received + length, rtu->length);
+    return reply;
+}

@@ -16,7 +16,8 @@ from controller.loop.loading_times import LoadingTimes
 from controller.loop.safe_sets import FADE_RAMP, SafeSets, SetBuilder
 from controller.loop.selection import Selection, Selector
 from controller.loop.table_query import is_short
-from controller.sources.contacts import MAX_CONTACT_TIMEOUT, Change, Contact, ContactTracker
+from controller.loop.validity import Validity, first_end, valid_for
+from controller.sources.contacts import Change, Contact, ContactTracker
 from controller.sources.touch import TouchFrame
 from drivers.command import DriveCommand
 from drivers.errors import CommandRefused
@@ -31,12 +32,6 @@ from registry.plugins import failure_text
 # With no finger left on the plate the end may be short: zero within 20 ms of the lift.
 RELEASE_RAMP = 0.010
 
-# Shortest time [s] until a vibration ends by itself on the amplifier, so that a slow wire or a rate
-# limit of one set a second does not interrupt it. It is renewed at half its time while its targets
-# are confirmed.
-MIN_VALID_FOR = 2.0
-_VALIDITY_MARGIN = 0.2  # s; after the contact is lifted, for late frames
-_MIN_LEFT = 0.001  # s; of a pulse that is about to end
 # s; after a vibration a plate first rings louder than the next onset is at a quiet finger.
 _RING_DOWN = 0.4
 _ENDINGS_MARGIN = 0.1  # s; endings are loaded and committed in less
@@ -83,9 +78,7 @@ class _Playback:
     has_endings: bool = False
     endings_due: float | None = None
     retry_at: float | None = None
-    confirmed_until: float = math.inf
-    renewal_due: float = math.inf
-    renewable_until: float = math.inf
+    validity: Validity = field(default_factory=Validity)
 
     @property
     def is_silent(self) -> bool:
@@ -220,24 +213,20 @@ class Decider:
         elif self._capabilities_at(now).envelope_support.endings and self._timing is not None:
             endings_due = now + decision.sets.settled_after
             # A commit after the end of a pulse would start it again.
-            if endings_due + _ENDINGS_MARGIN < _first_end(decision.selection):
+            if endings_due + _ENDINGS_MARGIN < first_end(decision.selection):
                 self._playing = replace(self._playing, endings_due=endings_due)
 
     def renewal(self, now: float) -> SafeSets | None:
-        """Return the sets that prolong the playback, if due at a time [s]; else None.
-
-        Only while sources confirm its targets; and not if a guard has shortened it, since renewal
-        would circumvent the limit. Then it ends by itself.
-        """
+        """Return the sets that prolong the playback, if due at a time [s]; else None."""
         decision = self._playing.decision
         if decision is None or decision.sets is None:
             return None
-        if not self._playing.renewal_due <= now < self._playing.renewable_until:
+        confirmed_until = self._confirmed_until(decision.selection)
+        if not self._playing.validity.is_renewal_due(now, confirmed_until=confirmed_until):
             return None
-        if self._confirmed_until(decision.selection) <= self._playing.confirmed_until:
-            return None
-        valid_for = self._valid_for(decision.selection, now)
-        return self._builder.build_renewal(decision.sets, valid_for=valid_for)
+        return self._builder.build_renewal(
+            decision.sets, valid_for=self._valid_for(decision.selection, now)
+        )
 
     def confirm_renewal(self, sets: SafeSets, *, now: float) -> None:
         """Note that the amplifiers have accepted the sets of a renewal."""
@@ -377,40 +366,18 @@ class Decider:
         return min(expiries, default=-math.inf)
 
     def _valid_for(self, selection: Selection, now: float) -> float:
-        """Return for how long [s] a vibration at a time [s] may last by itself.
-
-        The amplifiers end a pulse; the last one, where several play.
-        """
-        lasts = self._confirmed_until(selection) - now + _VALIDITY_MARGIN
-        valid_for = min(max(lasts, MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
-        pulses = [target.pulse for _, target in selection.targets]
-        left = [
-            pulse.duration if pulse.started_at is None else max(pulse.end - now, _MIN_LEFT)
-            for pulse in pulses
-            if pulse is not None
-        ]
-        return min(valid_for, max(left)) if left and len(left) == len(pulses) else valid_for
+        return valid_for(selection, confirmed_until=self._confirmed_until(selection), now=now)
 
     def _note_validity(self, sets: SafeSets, selection: Selection, now: float) -> None:
-        """Note until when sets committed by now [s] last and their targets are confirmed."""
-        is_shortened = sets.valid_for < MIN_VALID_FOR
-        self._playing = replace(
-            self._playing,
-            confirmed_until=self._confirmed_until(selection),
-            renewal_due=math.inf if is_shortened else now + sets.valid_for / 2,
-            renewable_until=now + sets.valid_for - _VALIDITY_MARGIN / 2,
-        )
+        """Note how long sets committed by now [s] last."""
+        until = self._confirmed_until(selection)
+        validity = Validity.begun(sets.valid_for, confirmed_until=until, now=now)
+        self._playing = replace(self._playing, validity=validity)
 
     def _note(self, change: Change, time: float) -> None:
         """Note when the first change since the last decision arrived."""
         if change and self._triggered_at is None:
             self._triggered_at = time
-
-
-def _first_end(selection: Selection) -> float:
-    """Return when [s] the first pulse ends; infinite without any."""
-    pulses = [target.pulse for _, target in selection.targets]
-    return min((pulse.end for pulse in pulses if pulse is not None), default=math.inf)
 
 
 def _is_due(moment: float | None, now: float) -> bool:

@@ -1,0 +1,70 @@
+"""How long a vibration lasts by itself on the amplifiers, and when it is renewed.
+
+It ends if the host or a touch source falls silent, so it is renewed only while sources confirm the
+contacts that it is for.
+"""
+
+import math
+from dataclasses import dataclass
+
+from controller.loop.selection import Selection
+from controller.sources.contacts import MAX_CONTACT_TIMEOUT
+
+# Shortest time [s] until a vibration ends by itself on the amplifier, so that a slow wire or a rate
+# limit of one set a second does not interrupt it. It is renewed at half its time.
+_MIN_VALID_FOR = 2.0
+_MARGIN = 0.2  # s; after the contact is lifted, for late frames
+_MIN_LEFT = 0.001  # s; of a pulse that is about to end
+
+
+@dataclass(frozen=True)
+class Validity:
+    """When a vibration may be renewed [s].
+
+    confirmed_until: when its first target would have been lifted, as known when it was sent;
+    renewal_due, renewable_until: between these it is renewed if all targets have been confirmed
+    since.
+    """
+
+    confirmed_until: float = math.inf
+    renewal_due: float = math.inf
+    renewable_until: float = math.inf
+
+    @classmethod
+    def begun(cls, valid_for: float, *, confirmed_until: float, now: float) -> "Validity":
+        """Return the validity of sets committed by now that last `valid_for` [s].
+
+        What a guard has shortened is not renewed, since that would circumvent its limit.
+        """
+        is_shortened = valid_for < _MIN_VALID_FOR
+        return cls(
+            confirmed_until=confirmed_until,
+            renewal_due=math.inf if is_shortened else now + valid_for / 2,
+            renewable_until=now + valid_for - _MARGIN / 2,
+        )
+
+    def is_renewal_due(self, now: float, *, confirmed_until: float) -> bool:
+        """Whether to renew at a time [s], with targets that are confirmed until another."""
+        is_due = self.renewal_due <= now < self.renewable_until
+        return is_due and confirmed_until > self.confirmed_until
+
+
+def valid_for(selection: Selection, *, confirmed_until: float, now: float) -> float:
+    """Return for how long [s] a vibration at a time [s] may last by itself.
+
+    The amplifiers end a pulse; the last one, where several play.
+    """
+    longest = min(max(confirmed_until - now + _MARGIN, _MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
+    pulses = [target.pulse for _, target in selection.targets]
+    left = [
+        pulse.duration if pulse.started_at is None else max(pulse.end - now, _MIN_LEFT)
+        for pulse in pulses
+        if pulse is not None
+    ]
+    return min(longest, max(left)) if left and len(left) == len(pulses) else longest
+
+
+def first_end(selection: Selection) -> float:
+    """Return when [s] the first pulse ends; infinite without any."""
+    pulses = [target.pulse for _, target in selection.targets]
+    return min((pulse.end for pulse in pulses if pulse is not None), default=math.inf)

@@ -19,7 +19,7 @@ from drivers.operation.keep_alive import keep_alive
 from drivers.operation.silence import stop_and_confirm, stop_outcome
 from drivers.operation.watchdog import check_watchdog, shortest_watchdog
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import AmplifierState, Status
+from drivers.protocol.messages import AmplifierState, Feature, Status
 from drivers.registry import open_backend
 
 _STOP_TIMEOUT = 2.0  # s; for boards that restart when their port is opened
@@ -37,10 +37,17 @@ async def identify(url: str) -> dict[str, Any]:
     """Read identity, capabilities and wire times."""
     async with _opened(url) as amplifier:
         capabilities = asdict(amplifier.capabilities)
+        features = capabilities.pop("features")
+        limits = [
+            {f"{name}{_UNITS.get(name, '')}": value for name, value in one.items()}
+            for one in capabilities.pop("channel_limits")
+        ]
         return {
             "url": url,
             **asdict(amplifier.identity),
             **{f"{name}{_UNITS.get(name, '')}": value for name, value in capabilities.items()},
+            "channel_limits": limits,
+            "features": _feature_names(features),
             **_wire_rows(amplifier),
         }
 
@@ -184,10 +191,17 @@ def _wire_rows(amplifier: Amplifier) -> dict[str, Any]:
     }
 
 
+def _feature_names(features: Feature) -> list[str]:
+    """Names of features in the order of their bits; an unknown one is its bit."""
+    names = {1 << bit: name for name, bit in PROTOCOL.features.items()}
+    return [names.get(bit, f"{bit:#06x}") for bit in (1 << n for n in range(16)) if features & bit]
+
+
 def _status_rows(status: Status) -> dict[str, Any]:
     return {
         "state": status.state.name,
         "fault": status.fault.name,
+        "interlock_open": status.interlock_open,
         "token": status.token,
         "high_voltage": status.high_voltage,
         "high_voltage_v": status.voltage,

@@ -23,7 +23,7 @@ from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.link.link import REPLY_TIMEOUT as USUAL_TIMEOUT
 from drivers.operation.garbage_collection import no_long_collections
 from drivers.operation.watchdog import HEARTBEAT, MIN_HEARTBEATS_PER_WATCHDOG, loss_detection_time
-from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault
+from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault, Feature
 from drivers.registry import open_backend
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
@@ -548,7 +548,7 @@ async def test_amplifier_fault_silences_and_latches(far: FarSide, kind: FaultKin
         assert not status.high_voltage
         with pytest.raises(CommandRefused):
             await link.amplifier.apply(link.tone())
-        if link.amplifier.capabilities.events:
+        if Feature.EVENTS in link.amplifier.capabilities.features:
             await eventually(lambda: AmplifierState.FAULT in [event.state for event in link.events])
         await link.amplifier.clear()
         assert (await link.amplifier.arm(2.0)).state is AmplifierState.OPERATION_ENABLED

@@ -39,6 +39,7 @@ from drivers.protocol.messages import (
     Broadcast,
     Capabilities,
     Fault,
+    Feature,
     Reply,
     Request,
     Status,
@@ -50,7 +51,8 @@ PAGE = ROOT / "docs" / "measured" / "wire-benchmarks.md"
 COUNT = 1500
 ROUNDS = 5  # ours and bare take turns, so that both see the same machine
 WIDE = Capabilities(
-    *(16, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1, True)
+    *(16, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1),
+    features=Feature.WHOLE,
 )
 
 

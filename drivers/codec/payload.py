@@ -7,14 +7,15 @@ an amplifier's Nak.
 import struct
 from collections.abc import Iterable
 from enum import IntEnum
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from drivers.errors import FrameError
 from drivers.protocol.definition import PROTOCOL, WireQuantity
-from drivers.protocol.messages import NakCode
+from drivers.protocol.messages import NakCode, Status
 
 _CHANNEL = PROTOCOL.quantities.channel
 _NO_CHANNEL = 255
+_STATUS_FLAGS = PROTOCOL.status_flags
 _TEXT_MAX = 32
 _LAYOUTS = {code: struct.Struct("<" + code) for code in "BHIh"}
 
@@ -152,6 +153,18 @@ def pack_text(text: str) -> bytes:
 def pack_optional_channel(channel: int | None) -> bytes:
     """Pack a channel, 255 for None."""
     return bytes([_NO_CHANNEL]) if channel is None else pack((_CHANNEL, channel))
+
+
+def status_flags(status: Status) -> int:
+    """Return the flags of a status."""
+    known = (bool(getattr(status, name)) << bit for name, bit in _STATUS_FLAGS.items())
+    return status.other_flags | sum(known)
+
+
+def flags_of(flags: int) -> dict[str, Any]:
+    """Return the fields of a status that its flags give."""
+    known = {name: bool(flags >> bit & 1) for name, bit in _STATUS_FLAGS.items()}
+    return {**known, "other_flags": flags & ~sum(1 << bit for bit in _STATUS_FLAGS.values())}
 
 
 def versions_of(mask: int) -> tuple[int, ...]:

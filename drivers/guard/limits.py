@@ -1,11 +1,14 @@
-"""Limits in force: the least of the configuration, the amplifier's report and built-in ceilings."""
+"""Limits in force: the least of the configuration, the amplifier's report and built-in ceilings.
+
+Where the channels of an amplifier differ, the least of all holds for each: the pattern needs all.
+"""
 
 import math
 from dataclasses import replace
 
 from drivers.errors import CommandError
 from drivers.protocol.definition import PROTOCOL, WireQuantity
-from drivers.protocol.messages import Capabilities
+from drivers.protocol.messages import Capabilities, ChannelLimits
 from registry.limits import GuardLimits
 
 # Below 10 Hz a plate on springs only moves as a rigid body and nothing is felt.
@@ -20,13 +23,17 @@ _SLACK = 1e-6  # of a step; sums of floats
 
 
 def limits_in_force(configured: GuardLimits, capabilities: Capabilities) -> GuardLimits:
-    """Combine configured limits with an amplifier's and the ceilings.
+    """Combine configured limits with an amplifier's, its channels' and the ceilings.
 
     Raises CommandError for limits that are not finite or leave nothing to play.
     """
     for source, values, names in (
         ("configured", configured, ("frequency_min", "frequency_max", "level")),
         ("amplifier's", capabilities, ("frequency_min", "frequency_max", "level_max", "ramp_max")),
+        *(
+            ("channel's", channel, ("frequency_min", "frequency_max", "level_max"))
+            for channel in capabilities.channel_limits
+        ),
     ):
         for name in names:
             if not math.isfinite(getattr(values, name)):
@@ -37,14 +44,20 @@ def limits_in_force(configured: GuardLimits, capabilities: Capabilities) -> Guar
         if not getattr(configured, name) > 0:
             raise CommandError(f"{name} limit must be positive, got {getattr(configured, name):g}")
     frequency, level = PROTOCOL.quantities.frequency, PROTOCOL.quantities.level
-    lowest = max(configured.frequency_min, capabilities.frequency_min, FREQUENCY_FLOOR)
-    highest = min(configured.frequency_max, capabilities.frequency_max, FREQUENCY_CEILING)
+    reported: list[Capabilities | ChannelLimits] = [capabilities, *capabilities.channel_limits]
+    lowest = max(
+        FREQUENCY_FLOOR, configured.frequency_min, *(one.frequency_min for one in reported)
+    )
+    highest = min(
+        FREQUENCY_CEILING, configured.frequency_max, *(one.frequency_max for one in reported)
+    )
+    levels = (one.level_max for one in reported)
     limits = replace(
         configured,
         # In whole steps of the wire, so that no value is rounded beyond its limit.
         frequency_min=-_whole_steps(-lowest, frequency),
         frequency_max=_whole_steps(highest, frequency),
-        level=_whole_steps(min(configured.level, capabilities.level_max, LEVEL_CEILING), level),
+        level=_whole_steps(min(configured.level, LEVEL_CEILING, *levels), level),
         rate=min(configured.rate, RATE_CEILING),
     )
     if limits.frequency_min > limits.frequency_max:

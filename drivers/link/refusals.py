@@ -8,8 +8,8 @@ _REASONS = {
     NakCode.BAD_LENGTH: "wrong payload length; its firmware version may differ",
     NakCode.BAD_VALUE: "a value is out of its range",
     NakCode.BAD_CHANNEL: "no such channel, or the channel occurs twice",
-    NakCode.WRONG_STATE: "it is not armed, or it is stopped or in a fault; read its status, then "
-    "clear it",
+    NakCode.WRONG_STATE: "it is not armed, its interlock is open, or it is stopped or in a fault; "
+    "read its status, then clear it",
     NakCode.BAD_TOKEN: "no set is staged under this token",
     NakCode.BUSY: "busy after 3 attempts; try again",
     NakCode.NO_ENVELOPE: "a slot of the set holds no envelope",

@@ -14,13 +14,13 @@ from drivers.guard import SafeCommandSet
 from drivers.guard.channel_state import ChannelState, Interval
 from drivers.guard.record import states_after
 from drivers.protocol.definition import PROTOCOL, WireQuantity
-from drivers.protocol.messages import Achieved, AmplifierState, Capabilities, Status
+from drivers.protocol.messages import Achieved, AmplifierState, Capabilities, Feature, Status
 
 MAX_CONTRADICTIONS = 2
 """Contradictions in a row that are a fault; a single one may be a moment between two sets."""
 
 MEASURING_ERROR = 0.002
-"""Of full stroke; for amplifiers that measure their levels (`drivers.conformance`)."""
+"""Of full stroke, of amplifiers that measure their levels."""
 
 CYCLE = 0.002
 """Longest lag [s] of playback and reports behind a commit."""
@@ -241,13 +241,15 @@ class PlausibilityCheck:
     def _level_problems(self, status: Status, when: Interval) -> Iterator[str]:
         step = max(_Q.level.step, self._capabilities.level_step)
         tolerance = 2 * step
+        is_measured = Feature.LEVELS_MEASURED in self._capabilities.features
+        measuring_error = MEASURING_ERROR if is_measured else 0.0
         for channel, (state, level) in enumerate(zip(self._states, status.levels, strict=False)):
             low, high = state.low(when), state.high(when)
             # Fading tones may cancel the lasting one, but not to zero twice in a row.
             if level == 0 and state.lasting_low(when) > 0.75 * step:
                 yield f"level of channel {channel} must be above 0, got 0"
-            low -= tolerance + min(MEASURING_ERROR, _WEAK * low)
-            high += tolerance + min(MEASURING_ERROR, _WEAK * high)
+            low -= tolerance + min(measuring_error, _WEAK * low)
+            high += tolerance + min(measuring_error, _WEAK * high)
             if not low <= level <= high:
                 expected = f"{max(0.0, low):.4g} to {high:.4g}"
                 yield f"level of channel {channel} must be {expected}, got {level:g}"

@@ -111,6 +111,7 @@ class Quantities:
     voltage: WireQuantity
     age: WireQuantity
     versions: WireQuantity
+    features: WireQuantity
     session: WireQuantity
     held_session: WireQuantity
     latch: WireQuantity
@@ -132,8 +133,8 @@ class Protocol:
     """The numbers on which host and amplifier agree.
 
     vendor_numbers: the first type, fault and refusal that are the vendor's; reaction [s]: longest
-    time until a reply begins; staged_life [s]: of a set that is not committed; modbus, canopen: the
-    sections of these names in the file.
+    time until a reply begins; staged_life [s]: of a set that is not committed; features,
+    status_flags: bits by name; modbus, canopen: the sections of these names in the file.
     """
 
     version: int
@@ -144,6 +145,8 @@ class Protocol:
     types: Mapping[str, int]
     states: Mapping[str, int]
     faults: Mapping[str, int]
+    features: Mapping[str, int]
+    status_flags: Mapping[str, int]
     naks: Mapping[str, int]
     quantities: Quantities
     modbus: Mapping[str, Any]
@@ -163,6 +166,8 @@ def _load() -> Protocol:
         types=raw["types"],
         states=raw["states"],
         faults=raw["faults"],
+        features=raw["features"],
+        status_flags=raw["status_flags"],
         naks=raw["naks"],
         quantities=Quantities(
             **{

@@ -21,8 +21,8 @@ these into bytes and back.
 A Commit or a Stop may be broadcast to all amplifiers of a bus; there are no replies then.
 """
 
-from dataclasses import dataclass
-from enum import IntEnum
+from dataclasses import dataclass, field
+from enum import IntEnum, IntFlag
 from typing import TypeAlias
 
 from drivers.command import CommandSet, DriveCommand, Envelope
@@ -52,6 +52,26 @@ class Fault(ExtensibleEnum):
     ARC = 4
     CHANNEL = 5
     INTERNAL = 6
+    INTERLOCK = 7
+    OVER_CURRENT = 8
+
+
+class Feature(IntFlag):
+    """Features of an amplifier; the bits are those on the wire, unknown ones are kept."""
+
+    EVENTS = 1 << 0
+    WATCHDOG = 1 << 1
+    STAGING = 1 << 2
+    VALID_FOR = 1 << 3
+    PHASE = 1 << 4
+    BROADCAST = 1 << 5
+    LEVELS_MEASURED = 1 << 6
+    VOLTAGE = 1 << 7
+    INTERLOCK = 1 << 8
+    ELECTRICAL = 1 << 9
+    SENSORS = 1 << 10
+    ADDRESS = 1 << 11
+    WHOLE = WATCHDOG | STAGING | VALID_FOR | PHASE  # without envelopes, which have no bit
 
 
 class NakCode(ExtensibleEnum):
@@ -175,11 +195,20 @@ class Identity:
 
 
 @dataclass(frozen=True, slots=True)
+class ChannelLimits:
+    """Limits of one channel: frequencies [Hz], level."""
+
+    frequency_min: float
+    frequency_max: float
+    level_max: float
+
+
+@dataclass(frozen=True, slots=True)
 class Capabilities:
     """Capabilities of an amplifier: frequencies [Hz], steps, watchdog range [s], longest ramp [s].
 
     envelope_knots: most knots of an envelope; envelope_slots: number of slots; envelope steps [s];
-    all 0 without envelopes. events: whether it sends unsolicited events.
+    all 0 without envelopes. channel_limits: of each channel; empty: those of the amplifier.
     """
 
     channels: int
@@ -196,7 +225,14 @@ class Capabilities:
     envelope_slots: int = 0
     envelope_step_min: float = 0.0
     envelope_step_max: float = 0.0
-    events: bool = False
+    channel_limits: tuple[ChannelLimits, ...] = ()
+    features: Feature = field(kw_only=True)
+
+    @property
+    def limits_of_channels(self) -> tuple[ChannelLimits, ...]:
+        """The limits of each channel."""
+        each = ChannelLimits(self.frequency_min, self.frequency_max, self.level_max)
+        return self.channel_limits or (each,) * self.channels
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,6 +253,7 @@ class Status:
     levels: tuple[float, ...]
     voltage: float = 0.0
     latch: int = 0
+    interlock_open: bool = False
     other_flags: int = 0
 
 

@@ -17,6 +17,7 @@ from amplifier import Amplifier, Refused
 
 ADDRESS = 1
 MAX_FRAME = 249  # bytes between two zeros
+FEATURES = 0b111110  # watchdog, staging, valid_for, phase, broadcast; it sends no events
 IDENTITY = ("Example", "Bench amplifier", "EX-1", "0.1")
 HELLO, GET_CAPS, ARM, DISARM, STAGE, COMMIT, APPLY, STOP = range(1, 9)
 GET_STATUS, GET_FAULTS, CLEAR, PING, LOAD_ENVELOPE, NAK = 9, 10, 11, 12, 13, 31
@@ -115,9 +116,10 @@ class SerialEnd:
             raise Refused(BAD_LENGTH)
         if kind == GET_CAPS:
             steps = (1, 10000, 1, 1, parts.MAX_RAMP, *parts.WATCHDOG_RANGE)
-            no_envelopes, no_events = bytes(6), bytes(1)
             numbers = struct.pack("<B9H", parts.CHANNELS, *parts.FREQUENCY, *steps)
-            return numbers + no_envelopes + no_events
+            no_envelopes, features = bytes(6), struct.pack("<H", FEATURES)
+            each = struct.pack("<3H", *parts.FREQUENCY, 10000)
+            return numbers + no_envelopes + features + parts.CHANNELS * each
         if kind == GET_FAULTS:
             records = [struct.pack("<BBI", fault, 255, age) for fault, age in a.faults]
             return bytes([len(records)]) + b"".join(records)

@@ -12,7 +12,11 @@ struct capability {
     uint8_t size; // bytes on the serial line and on CAN; always one Modbus register
 };
 
-#define CAPABILITY_COUNT 14
+#define CAPABILITY_COUNT 15
 extern const struct capability CAPABILITIES[CAPABILITY_COUNT];
+
+// Of each channel, here the same for all: lowest and highest frequency, highest level.
+#define LIMIT_COUNT 3
+extern const uint16_t CHANNEL_LIMITS[LIMIT_COUNT];
 
 #endif

@@ -52,7 +52,9 @@ static uint16_t refusal_field(const struct modbus *modbus, uint16_t field)
 static uint16_t capabilities_field(const struct modbus *modbus, uint16_t field)
 {
     (void)modbus;
-    return CAPABILITIES[field].value;
+    if (field < CAPABILITY_COUNT)
+        return CAPABILITIES[field].value;
+    return CHANNEL_LIMITS[(field - CAPABILITY_COUNT) % LIMIT_COUNT];
 }
 
 static uint16_t identity_field(const struct modbus *modbus, uint16_t field)
@@ -140,7 +142,7 @@ static const struct block {
     {ENVELOPE_AT, ENVELOPE_FIELDS, envelope_field},
     {STATUS_AT, 9 + CHANNELS, status_field},
     {REFUSAL_AT, 3, refusal_field},
-    {CAPABILITIES_AT, CAPABILITY_COUNT, capabilities_field},
+    {CAPABILITIES_AT, CAPABILITY_COUNT + CHANNELS * LIMIT_COUNT, capabilities_field},
     {IDENTITY_AT, 1 + 4 * TEXT_REGISTERS, identity_field},
     {ACHIEVED_AT, 4 + CHANNELS * CHANNEL_REGISTERS, achieved_field},
     {FAULTS_AT, 1 + FAULTS_KEPT * FAULT_REGISTERS, faults_field},

@@ -36,7 +36,8 @@ static void write_capabilities(struct writer *writer)
         else
             write_u16(writer, CAPABILITIES[i].value);
     }
-    write_u8(writer, 0); // flags: it sends no events
+    for (unsigned i = 0; i < CHANNELS * LIMIT_COUNT; i++)
+        write_u16(writer, CHANNEL_LIMITS[i % LIMIT_COUNT]);
 }
 
 static void write_status(struct writer *writer, const struct amplifier *amplifier)

@@ -24,6 +24,7 @@ from drivers.protocol.messages import (
     Fault,
     FaultList,
     FaultRecord,
+    Feature,
     GetCaps,
     GetFaults,
     Hello,
@@ -50,6 +51,7 @@ _FAULTS_KEPT = 16
 _HIGH_VOLTAGE = 1800.0  # V
 _DISCHARGE = 0.02  # s; time constant of the supply once it is off
 _SLOTS = 63
+FEATURES = Feature.WHOLE | Feature.EVENTS | Feature.BROADCAST | Feature.INTERLOCK
 _LATCHED = (AmplifierState.QUICK_STOP_ACTIVE, AmplifierState.FAULT)
 _FEEDING_REQUESTS = (Arm, Ping, Stage, Commit, Apply)  # with the session that is held
 
@@ -71,14 +73,15 @@ def capabilities(channels: int) -> Capabilities:
         envelope_slots=_SLOTS,
         envelope_step_min=0.001,
         envelope_step_max=_Q.envelope_step.high,
-        events=True,
+        features=FEATURES,
     )
 
 
 class SimulatedAmplifier:
     """An amplifier with a name and a number of channels; times [s] are of any one clock.
 
-    listeners: called with every change of state or fault, and its time [s].
+    listeners: called with every change of state or fault, and its time [s]. capabilities: others
+    hold from the next restart.
     """
 
     def __init__(self, name: str, *, channels: int) -> None:
@@ -97,6 +100,7 @@ class SimulatedAmplifier:
         self._faults: deque[tuple[Fault, int | None, float]] = deque(maxlen=_FAULTS_KEPT)
         self.session = 0  # held while armed, or the one that ended last
         self.latch = 0
+        self._is_interlock_open = False
         self._start()
 
     def _start(self) -> None:
@@ -151,6 +155,8 @@ class SimulatedAmplifier:
             return Nak(NakCode.WRONG_STATE)
         if isinstance(request, _FEEDING_REQUESTS) and self._is_foreign(request.session, request):
             return Nak(NakCode.WRONG_SESSION)
+        if isinstance(request, Arm) and self._is_interlock_open:
+            return Nak(NakCode.WRONG_STATE)
         try:
             reply = self._carry_out(request, following, now)
         except RefusedSet as refusal:
@@ -177,6 +183,7 @@ class SimulatedAmplifier:
             levels=levels,
             voltage=_HIGH_VOLTAGE if is_on else round(_HIGH_VOLTAGE * decayed),
             latch=self.latch,
+            interlock_open=self._is_interlock_open,
         )
 
     def trip(self, fault: Fault, moment: float, *, channel: int | None = None) -> None:
@@ -190,6 +197,12 @@ class SimulatedAmplifier:
             self.fault = fault
             self._count_latch()
             self._enter(AmplifierState.FAULT_REACTION_ACTIVE, moment, channel=channel)
+
+    def set_interlock(self, moment: float, *, is_open: bool) -> None:
+        """Open or close the interlock, with its consequences."""
+        if is_open and self.state is not AmplifierState.SWITCH_ON_DISABLED:
+            self.trip(Fault.INTERLOCK, moment)
+        self._is_interlock_open = is_open
 
     def set_temperature(self, temperature: float, moment: float) -> None:
         """Set the temperature [°C], with its consequences."""
@@ -230,7 +243,7 @@ class SimulatedAmplifier:
             case Clear(latch=latch):
                 if latch != self.latch and self.state in _LATCHED:
                     return Nak(NakCode.WRONG_LATCH)
-                if self._silent_from <= now and self._has_cooled(now):
+                if self._silent_from <= now and self._is_cause_gone(now):
                     self.fault = Fault.NONE
                     self._enter(following, now)
             case LoadEnvelope(envelope=envelope):
@@ -337,6 +350,8 @@ class SimulatedAmplifier:
         self._channels.derate(moment, DERATED)
         self._warm(moment)
 
-    def _has_cooled(self, now: float) -> bool:
-        """Whether no over-temperature fault persists."""
+    def _is_cause_gone(self, now: float) -> bool:
+        """Whether the cause of the fault no longer persists."""
+        if self.fault is Fault.INTERLOCK:
+            return not self._is_interlock_open
         return self.fault is not Fault.OVER_TEMPERATURE or self._heat.at(now) < GOOD_BELOW

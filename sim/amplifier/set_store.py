@@ -129,8 +129,9 @@ def _quantised(command: DriveCommand, capabilities: Capabilities) -> DriveComman
         level=_in_steps(_Q.level, command.level, channel=command.channel),
         phase=_in_steps(_Q.phase, command.phase, channel=command.channel),
     )
-    low, high = capabilities.frequency_min, capabilities.frequency_max
-    if played.level > 0 and not low <= played.frequency <= high:
+    limits = capabilities.limits_of_channels[command.channel]
+    is_playable = limits.frequency_min <= played.frequency <= limits.frequency_max
+    if played.level > limits.level_max or (played.level > 0 and not is_playable):
         raise RefusedSet(NakCode.BAD_VALUE, command.channel)
     return played
 

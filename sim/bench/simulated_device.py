@@ -26,6 +26,7 @@ from sim.faults.fault_window import Faults, FaultWindow
 _FAULTS = {
     "over_voltage": Fault.OVER_VOLTAGE,
     "arc": Fault.ARC,
+    "over_current": Fault.OVER_CURRENT,
     "channel": Fault.CHANNEL,
 }
 
@@ -154,8 +155,10 @@ class SimulatedDevice:
                     self._plug(is_plugged=True)
             case "reboot", "begin":
                 self._amplifier.restart(now)
-            case ("over_voltage" | "arc" | "channel") as fault, "begin":
+            case ("over_voltage" | "arc" | "over_current" | "channel") as fault, "begin":
                 self._amplifier.trip(_FAULTS[fault], now)
+            case "interlock", "begin" | "end":
+                self._amplifier.set_interlock(now, is_open=edge == "begin")
             case "over_temperature", _:
                 self._amplifier.set_temperature(_TEMPERATURES[edge], now)
         self._bench.advance(now)

@@ -29,7 +29,9 @@ FaultKind: TypeAlias = Literal[
     "over_temperature",  # derated, from halfway a fault, cool at the end
     "over_voltage",
     "arc",
+    "over_current",
     "channel",  # one channel fails
+    "interlock",  # open until the end
 ]
 Toward: TypeAlias = Literal["amplifier", "host"]
 

@@ -23,7 +23,7 @@ from sim.witness.modbus_frames import Adu, RtuSplitter, Splitter, TcpSplitter
 from sim.witness.quantities import INVALID, OutOfRange, signed
 
 _CONTROL, _HEARTBEAT, _LOOK, _SET, _ENVELOPE = 0, 8, 12, 14, 100
-_STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS = 1000, 1032, 1040, 1064, 1140, 1220
+_STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS = 1000, 1032, 1350, 1064, 1140, 1220
 _WORDS = {15: RequestKind.ARM, 0: RequestKind.DISARM, 2: RequestKind.STOP, 128: RequestKind.CLEAR}
 _READ_KINDS = {
     _IDENTITY: RequestKind.HELLO,
@@ -277,13 +277,13 @@ def _of_read(unit: int, pdu: bytes, request: _Open) -> Reply:
 
 
 def _decode_status(body: Sequence[int]) -> Status:
-    state, fault, token, high_voltage, _, temperature, left, _, count = body[:9]
+    state, fault, token, flags, _, temperature, left, _, count = body[:9]
     return q.status_of(
         state,
         fault,
         token,
         left=left,
-        high_voltage=bool(high_voltage),
+        high_voltage=bool(flags & 1),
         temperature=signed(temperature),
         levels=body[9 : 9 + count],
     )

@@ -215,8 +215,11 @@ def test_broadcast_stop_is_repeated_after_a_possible_collision(coarse_rig: Rig) 
     on_a_line("serial", coarse_rig, use)
 
 
-def test_stop_preempts_an_arm_that_listens_on_can(coarse_rig: Rig) -> None:
-    """An arm listens up to 60 ms for another host; a stop supersedes it meanwhile."""
+def test_stop_preempts_an_arm_that_listens_on_can(
+    coarse_rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An arm listens for another host, here longer than opening takes; a stop supersedes it."""
+    monkeypatch.setattr("drivers.backends.can_bus.node._HOST_HEARTBEAT", 0.2)
 
     async def use(chain: Chain) -> None:
         await chain.east.close()

@@ -97,6 +97,8 @@ class Session:
         yield self._asked("Read the versions of the protocol, 2000sub5", _read(0x2000, 5))
         yield self._asked("Read the number of channels, 2001sub1", _read(0x2001, 1))
         yield self._asked("Read the highest frequency, 2001sub3", _read(0x2001, 3))
+        yield self._asked("Read the features, 2001sub15", _read(0x2001, 15))
+        yield self._asked("Read the highest level of channel 3, 200Bsub4", _read(0x200B, 4))
         yield self._asked("NMT: start", CanFrame(0x000, bytes([1, NODE])))
         self.timers.ring()
         yield self._heard("Heartbeat, operational")

@@ -23,6 +23,7 @@ from drivers.protocol.messages import (
     Capabilities,
     Clear,
     Commit,
+    Feature,
     GetStatus,
     Hello,
     LoadEnvelope,
@@ -34,7 +35,8 @@ from drivers.protocol.messages import (
 from fake_device import SESSION
 
 WIDE = Capabilities(
-    *(16, 20.0, 600.0, 0.05, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1, True)
+    *(16, 20.0, 600.0, 0.05, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1),
+    features=Feature.WHOLE,
 )
 
 

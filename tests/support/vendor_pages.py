@@ -13,12 +13,14 @@ from drivers.protocol.messages import (
     Arm,
     Broadcast,
     Capabilities,
+    ChannelLimits,
     Clear,
     Commit,
     Disarm,
     Fault,
     FaultList,
     FaultRecord,
+    Feature,
     GetCaps,
     GetFaults,
     GetStatus,
@@ -38,7 +40,9 @@ from drivers.protocol.messages import (
 from sim.faults.fault_window import Faults
 
 CAPABILITIES = Capabilities(
-    *(4, 20.0, 600.0, 0.05, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 16, 0.001, 0.1, False)
+    *(4, 20.0, 600.0, 0.05, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 16, 0.001, 0.1),
+    channel_limits=(ChannelLimits(20.0, 600.0, 1.0),) * 3 + (ChannelLimits(20.0, 500.0, 1.0),),
+    features=Feature.WHOLE | Feature.BROADCAST | Feature.INTERLOCK,
 )
 IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", (2,))
 SESSION = 9

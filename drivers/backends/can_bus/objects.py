@@ -6,7 +6,7 @@ first reads an object that is not used otherwise until its reply arrives.
 
 import queue
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TypeVar
 
 import canopen
@@ -20,7 +20,9 @@ from drivers.codec.can_bus.frame import cob_id
 from drivers.codec.can_bus.objects import (
     CAPABILITY_ENTRIES,
     TEXTS,
+    Entry,
     index_of,
+    limit_entries,
     nak_of_abort,
     pack_envelope,
     read_integer,
@@ -144,13 +146,19 @@ class ObjectClient:
         """Read the capabilities."""
 
         def read() -> Capabilities:
-            values = {}
-            for entry in CAPABILITY_ENTRIES:
-                data = self._client.upload(entry.index, entry.subindex)
-                values[entry.name] = read_integer(entry, data)
-            return unpack_capabilities(values)
+            values = self._integers(CAPABILITY_ENTRIES)
+            limits = [
+                self._integers(limit_entries(channel)) for channel in range(values["channels"])
+            ]
+            return unpack_capabilities(values, limits)
 
         return self._transfer(read, timeout)
+
+    def _integers(self, entries: Iterable[Entry]) -> dict[str, int]:
+        return {
+            entry.name: read_integer(entry, self._client.upload(entry.index, entry.subindex))
+            for entry in entries
+        }
 
     def faults(self, *, timeout: float) -> FaultList:
         """Read the faults."""

@@ -1,6 +1,6 @@
 """The object dictionary of an amplifier, and its objects as messages; no I/O."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,9 +13,11 @@ from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import (
     Achieved,
     Capabilities,
+    ChannelLimits,
     Fault,
     FaultList,
     FaultRecord,
+    Feature,
     Identity,
     LoadEnvelope,
     NakCode,
@@ -25,6 +27,11 @@ _Q = PROTOCOL.quantities
 _QUANTITIES: Mapping[str, WireQuantity] = vars(_Q)
 _OBJECTS: Mapping[str, Mapping[str, Any]] = CANOPEN["objects"]
 _NAKS = {code: NakCode[name] for name, code in CANOPEN["aborts"].items()}
+_LIMITS: Mapping[str, WireQuantity] = {  # of a channel
+    "frequency_min": _Q.frequency,
+    "frequency_max": _Q.frequency,
+    "level_max": _Q.level,
+}
 _WIDTHS = {"u8": 1, "u16": 2, "u32": 4, "i16": 2}
 TEXTS = ("vendor", "product", "serial_number", "firmware")
 
@@ -57,6 +64,14 @@ CAPABILITY_ENTRIES = tuple(_capability_entries())
 """Entries of the capabilities, in order, named as their fields."""
 
 
+def limit_entries(channel: int) -> tuple[Entry, ...]:
+    """Return the entries of the limits of a channel, named as their fields."""
+    return tuple(
+        Entry(index_of(f"channel_{name}"), channel + 1, name, quantity.wire, quantity)
+        for name, quantity in _LIMITS.items()
+    )
+
+
 def read_integer(entry: Entry, data: bytes) -> int:
     """Decode the integer of an entry; FrameError for a wrong length or value."""
     if len(data) != _WIDTHS[entry.type]:
@@ -77,16 +92,23 @@ def unpack_identity(texts: Mapping[str, bytes], versions: bytes) -> Identity:
     return Identity(**read, versions=versions_of(read_integer(entry, versions)))
 
 
-def unpack_capabilities(values: Mapping[str, int]) -> Capabilities:
-    """Decode capabilities from the integers of `CAPABILITY_ENTRIES`, by name."""
-    fields: dict[str, float] = {}
+def unpack_capabilities(
+    values: Mapping[str, int], limits: Sequence[Mapping[str, int]]
+) -> Capabilities:
+    """Decode capabilities from the integers of their entries by name, limits channel by channel."""
+    fields: dict[str, Any] = {}
     for entry in CAPABILITY_ENTRIES:
         value, quantity = values[entry.name], entry.quantity
         if quantity is not None and quantity.per_unit > 1:
             fields[entry.name] = quantity.from_wire(value)
         else:
             fields[entry.name] = value
-    return Capabilities(**fields, events=True)  # type: ignore[arg-type]  # by name
+    fields["features"] = Feature(fields["features"])
+    fields["channel_limits"] = tuple(
+        ChannelLimits(**{name: quantity.from_wire(one[name]) for name, quantity in _LIMITS.items()})
+        for one in limits
+    )
+    return Capabilities(**fields)
 
 
 def unpack_faults(data: bytes) -> FaultList:

@@ -127,6 +127,7 @@ class CanReplyReader:
             fault=event.fault,
             token=reply["active_token"],
             high_voltage=bool(condition["high_voltage"]),
+            interlock_open=bool(condition["interlock_open"]),
             temperature=_Q.temperature.from_wire(condition["temperature"]),
             watchdog_left=_Q.watchdog_left.from_wire(reply["watchdog_left"]),
             levels=tuple(_Q.level.from_wire(level) for level in levels),

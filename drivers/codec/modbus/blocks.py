@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Sequence
 from enum import IntEnum
 from typing import Any, TypeVar
 
-from drivers.codec.payload import read_text, versions_of
+from drivers.codec.payload import flags_of, read_text, versions_of
 from drivers.command import DriveCommand
 from drivers.errors import FrameError
 from drivers.protocol.definition import PROTOCOL, WireQuantity
@@ -16,9 +16,11 @@ from drivers.protocol.messages import (
     Achieved,
     AmplifierState,
     Capabilities,
+    ChannelLimits,
     Fault,
     FaultList,
     FaultRecord,
+    Feature,
     Identity,
     Loaded,
     Nak,
@@ -30,6 +32,7 @@ _MAP = PROTOCOL.modbus
 _Q = PROTOCOL.quantities
 HEAD = len(_MAP["head"])  # registers at the start of every block
 CHANNEL_SIZE: int = _MAP["channel_registers"]
+LIMIT_SIZE: int = _MAP["limit_registers"]
 FAULT_SIZE: int = _MAP["fault_registers"]
 TEXT_SIZE: int = _MAP["text_registers"]
 _NO_CHANNEL = 255
@@ -100,31 +103,40 @@ def _raw(registers: Sequence[int]) -> bytes:
 
 def unpack_capabilities(registers: Sequence[int]) -> Capabilities:
     """Decode capabilities."""
-    found, _ = _fields(_MAP["input"]["capabilities"]["registers"], registers)
+    found, rest = _fields(_MAP["input"]["capabilities"]["registers"], registers)
     whole: dict[str, Any] = {
         name: _integer(name, found.pop(name)) for name in ("envelope_knots", "envelope_slots")
     }
-    channels = _integer("channel_count", found.pop("channel_count"))
+    channels = _channel_count(found.pop("channel_count"), read=len(rest) // LIMIT_SIZE)
+    features = Feature(found.pop("features"))
+    limits = tuple(
+        ChannelLimits(
+            frequency_min=_number("frequency_min", lowest),
+            frequency_max=_number("frequency_max", highest),
+            level_max=_number("level_max", level),
+        )
+        for lowest, highest, level in list(_groups(rest, LIMIT_SIZE))[:channels]
+    )
     numbers: dict[str, Any] = {name: _number(name, register) for name, register in found.items()}
-    return Capabilities(channels=channels, **numbers, **whole)
+    return Capabilities(
+        channels=channels, channel_limits=limits, features=features, **numbers, **whole
+    )
 
 
 def unpack_status(registers: Sequence[int]) -> Status:
     """Decode a status."""
     found, levels = _fields(_MAP["input"]["status"]["registers"], registers)
     channels = _channel_count(found["channel_count"], read=len(levels))
-    if found["high_voltage"] > 1:
-        raise FrameError(f"high_voltage must be 0 or 1, got {found['high_voltage']}")
     return Status(
         state=_one_of(AmplifierState, found["state"]),
         fault=_one_of(Fault, found["fault"]),
         token=_integer("active_token", found["active_token"]),
-        high_voltage=bool(found["high_voltage"]),
         temperature=_number("temperature", found["temperature"]),
         watchdog_left=_number("watchdog_left", found["watchdog_left"]),
         levels=tuple(_number("level", register) for register in levels[:channels]),
         voltage=_number("voltage", found["voltage"]),
         latch=_integer("latch", found["latch"]),
+        **flags_of(found["flags"]),
     )
 
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from drivers.codec.modbus import blocks
-from drivers.codec.modbus.blocks import CHANNEL_SIZE, FAULT_SIZE, HEAD, TEXT_SIZE
+from drivers.codec.modbus.blocks import CHANNEL_SIZE, FAULT_SIZE, HEAD, LIMIT_SIZE, TEXT_SIZE
 from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.guard import require_safe
 from drivers.protocol.definition import PROTOCOL, WireQuantity
@@ -82,7 +82,7 @@ def encode_request(
             texts = len(_MAP["input"]["identity"]["texts"])
             return Exchange(_read("identity", beyond=texts * TEXT_SIZE))
         case GetCaps():
-            return Exchange(_read("capabilities"))
+            return Exchange(_read("capabilities", beyond=CHANNELS_MAX * LIMIT_SIZE))
         case GetStatus():
             return Exchange(_read("status", beyond=channels), Write(_MAP["look"], (tag,)))
         case GetFaults():

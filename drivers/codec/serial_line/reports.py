@@ -8,9 +8,11 @@ from typing import Any
 
 from drivers.codec.payload import (
     Cursor,
+    flags_of,
     pack,
     pack_optional_channel,
     pack_text,
+    status_flags,
     versions_mask,
     versions_of,
 )
@@ -18,17 +20,17 @@ from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import (
     AmplifierState,
     Capabilities,
+    ChannelLimits,
     Fault,
     FaultList,
     FaultRecord,
+    Feature,
     Identity,
     Status,
 )
 
 _Q = PROTOCOL.quantities
-_HIGH_VOLTAGE = 0x01
-_EVENTS = 0x01
-_CAPABILITIES: Mapping[str, WireQuantity] = {  # in the order of the payload; a flags byte follows
+_CAPABILITIES: Mapping[str, WireQuantity] = {  # in the order of the payload; the limits follow
     "channels": _Q.channel_count,
     "frequency_min": _Q.frequency,
     "frequency_max": _Q.frequency,
@@ -43,6 +45,12 @@ _CAPABILITIES: Mapping[str, WireQuantity] = {  # in the order of the payload; a 
     "envelope_slots": _Q.envelope_slots,
     "envelope_step_min": _Q.envelope_step,
     "envelope_step_max": _Q.envelope_step,
+    "features": _Q.features,
+}
+_LIMITS: Mapping[str, WireQuantity] = {  # of a channel, in the order of the payload
+    "frequency_min": _Q.frequency,
+    "frequency_max": _Q.frequency,
+    "level_max": _Q.level,
 }
 
 
@@ -68,7 +76,12 @@ def unpack_identity(cursor: Cursor) -> Identity:
 def pack_capabilities(capabilities: Capabilities) -> bytes:
     """Pack capabilities."""
     numbers = [(quantity, getattr(capabilities, name)) for name, quantity in _CAPABILITIES.items()]
-    return pack(*numbers) + bytes([_EVENTS if capabilities.events else 0])
+    limits = [
+        (quantity, getattr(channel, name))
+        for channel in capabilities.limits_of_channels
+        for name, quantity in _LIMITS.items()
+    ]
+    return pack(*numbers, *limits)
 
 
 def unpack_capabilities(cursor: Cursor) -> Capabilities:
@@ -76,13 +89,18 @@ def unpack_capabilities(cursor: Cursor) -> Capabilities:
     values: dict[str, Any] = {
         name: cursor.value(quantity) for name, quantity in _CAPABILITIES.items()
     }
-    return Capabilities(**values, events=bool(cursor.byte() & _EVENTS))
+    values["features"] = Feature(values["features"])
+    limits = tuple(
+        ChannelLimits(**{name: cursor.number(quantity) for name, quantity in _LIMITS.items()})
+        for _ in range(values["channels"])
+    )
+    return Capabilities(**values, channel_limits=limits)
 
 
 def pack_status(status: Status) -> bytes:
     """Pack a status."""
     head = bytes([status.state, status.fault]) + pack((_Q.active_token, status.token))
-    head += bytes([status.other_flags | (_HIGH_VOLTAGE if status.high_voltage else 0)])
+    head += bytes([status_flags(status)])
     head += pack(
         (_Q.temperature, status.temperature),
         (_Q.watchdog_left, status.watchdog_left),
@@ -98,7 +116,7 @@ def unpack_status(cursor: Cursor) -> Status:
     state = cursor.one_of(AmplifierState)
     fault = cursor.one_of(Fault)
     token = cursor.integer(_Q.active_token)
-    flags = cursor.byte()
+    flags = flags_of(cursor.byte())
     temperature = cursor.number(_Q.temperature)
     watchdog_left = cursor.number(_Q.watchdog_left)
     voltage = cursor.number(_Q.voltage)
@@ -108,13 +126,12 @@ def unpack_status(cursor: Cursor) -> Status:
         state=state,
         fault=fault,
         token=token,
-        high_voltage=bool(flags & _HIGH_VOLTAGE),
         temperature=temperature,
         watchdog_left=watchdog_left,
         voltage=voltage,
         latch=latch,
         levels=tuple(cursor.number(_Q.level) for _ in range(channels)),
-        other_flags=flags & ~_HIGH_VOLTAGE,
+        **flags,
     )
 
 

@@ -24,6 +24,7 @@ from era_haptics.plugins.backends import (
     Fault,
     FaultList,
     FaultRecord,
+    Feature,
     GetCaps,
     GetFaults,
     GetStatus,
@@ -206,6 +207,7 @@ def read(request: Request, reply: dict[str, Any]) -> Reply:
                 watchdog_min=shortest * SECONDS,
                 watchdog_max=longest * SECONDS,
                 envelope_knots=0,
+                features=Feature.WHOLE,
             )
         case GetFaults():
             return FaultList(

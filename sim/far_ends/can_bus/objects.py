@@ -12,7 +12,7 @@ from typing import Any
 
 from drivers.command import Envelope, Knot
 from drivers.protocol.definition import PROTOCOL, WireQuantity
-from drivers.protocol.messages import FaultList, GetFaults, LoadEnvelope, Nak, NakCode
+from drivers.protocol.messages import FaultList, GetFaults, LoadEnvelope, Nak, NakCode, Status
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.sdo import (
     BAD_LENGTH,
@@ -48,6 +48,11 @@ def sent_ids(node: int, channels: int) -> tuple[int, ...]:
     """TPDO identifiers of a node: reply, status, then levels of four channels each."""
     levels = (IDS["levels"] + node + group for group in range(-(-channels // 4)))
     return (IDS["answer"] + node, IDS["condition"] + node, *levels)
+
+
+def flags_of(status: Status) -> int:
+    """The flags of a status."""
+    return status.high_voltage | status.interlock_open << 1
 
 
 class ObjectDictionary:
@@ -125,12 +130,21 @@ class ObjectDictionary:
         texts = (identity.vendor, identity.product, identity.serial_number, identity.firmware)
         versions = _pack("u16", sum(2**version for version in identity.versions))
         self._record(_INDEX["texts"], [*(text.encode() for text in texts), versions])
-        values = asdict(self._device.capabilities)
+        capabilities = self._device.capabilities
+        values = asdict(capabilities)
         kinds = CANOPEN["objects"]["capabilities"]["types"]
         self._record(
             _INDEX["capabilities"],
             [_scaled(getattr(_Q, kind), values[name]) for name, kind in kinds.items()],
         )
+        limits = capabilities.limits_of_channels
+        for name, quantity in (
+            ("frequency_min", _Q.frequency),
+            ("frequency_max", _Q.frequency),
+            ("level_max", _Q.level),
+        ):
+            each = [_scaled(quantity, getattr(one, name)) for one in limits]
+            self._record(_INDEX[f"channel_{name}"], each)
 
     def _status(self) -> None:
         status, index = self._device.status, _INDEX["status"]
@@ -138,7 +152,7 @@ class ObjectDictionary:
         self._reads[index, 1] = lambda: bytes([status().state])
         self._reads[index, 2] = lambda: bytes([status().fault])
         self._reads[index, 3] = lambda: _pack("u16", status().token)
-        self._reads[index, 4] = lambda: bytes([status().high_voltage])
+        self._reads[index, 4] = lambda: bytes([flags_of(status())])
         self._reads[index, 5] = lambda: _scaled(_Q.voltage, status().voltage)
         self._reads[index, 6] = lambda: _scaled(_Q.temperature, status().temperature)
         self._reads[index, 7] = lambda: _scaled(_Q.watchdog_left, status().watchdog_left)

@@ -28,7 +28,7 @@ from drivers.protocol.messages import (
 )
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.bus import LENGTHS
-from sim.far_ends.can_bus.objects import IDS, ObjectDictionary, channel_ids, sent_ids
+from sim.far_ends.can_bus.objects import IDS, ObjectDictionary, channel_ids, flags_of, sent_ids
 from sim.far_ends.can_bus.set_buffer import (
     INCOMPLETE_SET,
     NO_CHANNEL,
@@ -180,7 +180,7 @@ class RequestHandler:
             struct.pack(
                 "<BBhHBB",
                 request.sequence,
-                status.high_voltage,
+                flags_of(status),
                 _Q.temperature.to_wire(min(max(status.temperature, -100), 200)),
                 _Q.voltage.to_wire(status.voltage),
                 len(levels),

@@ -105,7 +105,7 @@ def status_words(status: Status) -> list[int]:
         "state": int(status.state),
         "fault": int(status.fault),
         "active_token": status.token,
-        "high_voltage": int(status.high_voltage),
+        "flags": status.high_voltage + 2 * status.interlock_open,
         "voltage": word_of(_Q.voltage, status.voltage),
         "temperature": word_of(_Q.temperature, status.temperature),
         "watchdog_left": word_of(_Q.watchdog_left, status.watchdog_left),
@@ -148,8 +148,16 @@ def capability_words(capabilities: Capabilities) -> list[int]:
         "envelope_slots": capabilities.envelope_slots,
         "envelope_step_min": word_of(_Q.envelope_step, capabilities.envelope_step_min),
         "envelope_step_max": word_of(_Q.envelope_step, capabilities.envelope_step_max),
+        "features": int(capabilities.features),
     }
-    return [fields[name] for name in MAP["input"]["capabilities"]["registers"]]
+    words = [fields[name] for name in MAP["input"]["capabilities"]["registers"]]
+    for each in capabilities.limits_of_channels:
+        words += [
+            word_of(_Q.frequency, each.frequency_min),
+            word_of(_Q.frequency, each.frequency_max),
+        ]
+        words.append(word_of(_Q.level, each.level_max))
+    return words
 
 
 def identity_words(identity: Identity) -> list[int]:

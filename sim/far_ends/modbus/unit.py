@@ -80,7 +80,7 @@ _FOLLOWING = {
     "envelope": 2 * _KNOTS,
     "status": _CHANNELS,
     "refusal": 0,
-    "capabilities": 0,
+    "capabilities": _CHANNELS * MAP["limit_registers"],
     "identity": len(MAP["input"]["identity"]["texts"]) * MAP["text_registers"],
     "achieved": _CHANNELS * _GROUP,
     "faults": MAP["fault_count"] * MAP["fault_registers"],
@@ -95,7 +95,7 @@ _ENDS = {
 }
 _STARTS = {*_ENDS, *(block["address"] for block in MAP["input"].values())}
 _CONTROLWORDS: Mapping[int, str] = {word: name for name, word in MAP["controlwords"].items()}
-_END = MAP["input"]["faults"]["address"] + _SIZES["faults"]
+_END = max(block["address"] + _SIZES[name] for name, block in MAP["input"].items())
 
 
 class Amplifier(Protocol):

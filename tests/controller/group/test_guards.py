@@ -12,13 +12,14 @@ from controller.loop.routing import route
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused
 from drivers.guard import GuardLimits
-from drivers.protocol.messages import Capabilities
+from drivers.protocol.messages import Capabilities, Feature
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.vibration.excitation import Tone
 
 CAPABILITIES = Capabilities(
-    *(4, 20.0, 600.0, 0.01, 0.9, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 16, 0.001, 0.1, False)
+    *(4, 20.0, 600.0, 0.01, 0.9, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 16, 0.001, 0.1),
+    features=Feature.WHOLE,
 )
 
 

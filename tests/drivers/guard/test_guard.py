@@ -11,9 +11,11 @@ from drivers.codec.serial_line.exchanges import decode_request, encode_request
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandError, CommandRefused
 from drivers.guard import Guard, GuardLimits, SafeCommandSet
-from drivers.protocol.messages import Apply, Capabilities
+from drivers.protocol.messages import Apply, Capabilities, Feature
 
-CAPABILITIES = Capabilities(4, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 0.5, 0.1, 2.0, 0)
+CAPABILITIES = Capabilities(
+    *(4, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 0.5, 0.1, 2.0, 0), features=Feature.WHOLE
+)
 GUARD = Guard(GuardLimits(40.0, 500.0, 0.8), CAPABILITIES)
 GOOD = CommandSet(token=7, commands=(DriveCommand(1, 110.0, 0.5, 30.0),), ramp=0.02, valid_for=1.0)
 

@@ -9,10 +9,11 @@ import pytest
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError, CommandRefused
 from drivers.guard import Guard, GuardLimits, SafeCommandSet, SafeEnvelope
-from drivers.protocol.messages import Capabilities
+from drivers.protocol.messages import Capabilities, ChannelLimits, Feature
 
 CAPABILITIES = Capabilities(
-    *(4, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 16, 0.001, 0.1, False)
+    *(4, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 16, 0.001, 0.1),
+    features=Feature.WHOLE,
 )
 
 
@@ -270,6 +271,18 @@ def test_protocol_bounds_reported_capabilities() -> None:
 
 
 DELAY = 0.25  # s; from a check until the set plays, while another one does
+
+
+def test_channels_bound_the_limits_of_all() -> None:
+    """The highest of the lowest frequencies, the lowest of the rest: a pattern needs them all."""
+    limits = (ChannelLimits(50.0, 600.0, 0.9), ChannelLimits(20.0, 300.0, 0.6)) * 2
+    bounded = Guard(
+        GuardLimits(40.0, 500.0, 0.8), replace(CAPABILITIES, channel_limits=limits)
+    ).limits
+    assert (bounded.frequency_min, bounded.frequency_max, bounded.level) == (50.0, 300.0, 0.6)
+    disjoint = (ChannelLimits(20.0, 90.0, 1.0), ChannelLimits(100.0, 600.0, 1.0)) * 2
+    with pytest.raises(CommandError, match="frequency range"):
+        Guard(GuardLimits(40.0, 500.0, 0.8), replace(CAPABILITIES, channel_limits=disjoint))
 
 
 def test_on_time_shortens_valid_for() -> None:

@@ -101,7 +101,9 @@ def test_high_voltage_is_on_while_armed_and_discharges() -> None:
     assert SimulatedAmplifier("main", channels=1).status(0.0).voltage == 0.0
 
 
-@pytest.mark.parametrize("fault", [Fault.OVER_VOLTAGE, Fault.ARC, Fault.CHANNEL])
+@pytest.mark.parametrize(
+    "fault", [Fault.OVER_VOLTAGE, Fault.ARC, Fault.OVER_CURRENT, Fault.CHANNEL]
+)
 def test_fault_silences_and_latches(fault: Fault) -> None:
     """Silent within 5 ms, high voltage off, recorded with its channel; listeners in order."""
     amplifier = armed()
@@ -121,6 +123,26 @@ def test_fault_silences_and_latches(fault: Fault) -> None:
     ]
     assert [time for _, time in events] == pytest.approx([1.0, 1.005])
     assert amplifier.handle(Arm(2.0), 2.0) == Nak(NakCode.WRONG_STATE)
+
+
+def test_open_interlock_trips_and_keeps_disarmed() -> None:
+    """Silent within 5 ms; neither cleared nor armed until it is closed."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.8)), 0.0)
+    amplifier.set_interlock(1.0, is_open=True)
+    now = amplifier.status(1.0)
+    assert (now.state, now.fault) == (AmplifierState.FAULT_REACTION_ACTIVE, Fault.INTERLOCK)
+    amplifier.tick(1.0051)
+    now = amplifier.status(1.0051)
+    assert (now.state, now.levels, now.interlock_open) == (AmplifierState.FAULT, (0.0,) * 4, True)
+    amplifier.handle(Clear(1), 1.1)
+    assert amplifier.state is AmplifierState.FAULT
+    amplifier.set_interlock(1.2, is_open=False)
+    amplifier.handle(Clear(1), 1.2)
+    assert amplifier.state is AmplifierState.SWITCH_ON_DISABLED
+    amplifier.set_interlock(1.3, is_open=True)
+    assert amplifier.handle(Arm(2.0), 1.3) == Nak(NakCode.WRONG_STATE)
+    assert (amplifier.state, amplifier.fault) == (AmplifierState.SWITCH_ON_DISABLED, Fault.NONE)
 
 
 def test_fault_while_disarmed_is_only_recorded() -> None:

@@ -12,6 +12,7 @@ from drivers.protocol.messages import (
     Apply,
     Arm,
     Capabilities,
+    ChannelLimits,
     Clear,
     Commit,
     Disarm,
@@ -226,6 +227,25 @@ def test_apply_refuses_an_invalid_header(header: tuple[int, float, float], code:
     token, ramp, valid_for = header
     wanted = CommandSet(token, (DriveCommand(0, 110.0, 0.5),), ramp, valid_for)
     refused(armed().handle(Apply(wanted), 0.1), code)
+
+
+def test_channel_has_its_own_limits() -> None:
+    """Beyond them the whole set is refused with the channel; silence has any frequency."""
+    limits = (ChannelLimits(20.0, 600.0, 1.0), ChannelLimits(50.0, 300.0, 0.5))
+    amplifier = SimulatedAmplifier("main", channels=2)
+    amplifier.capabilities = dataclasses.replace(amplifier.capabilities, channel_limits=limits)
+    amplifier.restart(0.0)
+    amplifier.handle(Arm(0.25), 0.0)
+    for token, frequency, level in ((1, 40.0, 0.1), (2, 310.0, 0.1), (3, 110.0, 0.6)):
+        commands = (DriveCommand(0, frequency, level), DriveCommand(1, frequency, level))
+        refused(
+            amplifier.handle(Apply(CommandSet(token, commands, ramp=0.0, valid_for=0.0)), 0.0),
+            NakCode.BAD_VALUE,
+            1,
+        )
+    commands = (DriveCommand(0, 40.0, 1.0), DriveCommand(1, 40.0, 0.0))
+    reply = amplifier.handle(Apply(CommandSet(4, commands, ramp=0.0, valid_for=0.0)), 0.0)
+    assert isinstance(reply, Achieved)
 
 
 def test_apply_silences_unnamed_channels() -> None:

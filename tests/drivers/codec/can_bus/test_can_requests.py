@@ -32,9 +32,11 @@ from drivers.protocol.messages import (
     AmplifierState,
     Apply,
     Capabilities,
+    ChannelLimits,
     Commit,
     Fault,
     FaultRecord,
+    Feature,
     Nak,
     NakCode,
     Stage,
@@ -43,7 +45,8 @@ from drivers.protocol.messages import (
 )
 
 WIDE = Capabilities(
-    *(16, 20.0, 600.0, 0.05, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1, True)
+    *(16, 20.0, 600.0, 0.05, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1),
+    features=Feature.WHOLE,
 )
 
 
@@ -257,8 +260,14 @@ def test_objects_are_decoded() -> None:
         **{"frequency_step": 1, "level_max": 10000, "level_step": 1, "phase_step": 1},
         **{"ramp_max": 1000, "watchdog_min": 100, "watchdog_max": 2000, "envelope_knots": 32},
         **{"envelope_slots": 63, "envelope_step_min": 10, "envelope_step_max": 1000},
+        "features": 0b1_0000_0001_1110,  # bit 12 is not defined yet
     }
-    assert unpack_capabilities(numbers) == replace(WIDE, channels=4)
+    limits = [{"frequency_min": 400, "frequency_max": 6000, "level_max": 5000}] * 4
+    known = Feature.WHOLE | Feature(1 << 12)
+    each = (ChannelLimits(20.0, 300.0, 0.5),) * 4
+    assert unpack_capabilities(numbers, limits) == replace(
+        WIDE, channels=4, features=known, channel_limits=each
+    )
 
 
 def test_invalid_integer_of_an_entry_is_a_frame_error() -> None:

@@ -192,6 +192,7 @@ def addresses() -> dict[int, str]:
     """Return the registers of the definition by address."""
     named = {MAP["look"]: "look"}
     behind = {"set": "channels", "envelope": "knots", "status": "levels", "achieved": "channels"}
+    behind["capabilities"] = "limits"
     for name, block in [*MAP["holding"].items(), *MAP["input"].items()]:
         registers = [*MAP["head"], *block["registers"]]
         if name in behind:

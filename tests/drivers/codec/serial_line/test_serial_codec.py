@@ -31,6 +31,7 @@ from drivers.protocol.messages import (
     Fault,
     FaultList,
     FaultRecord,
+    Feature,
     GetFaults,
     GetStatus,
     Hello,
@@ -50,7 +51,10 @@ Q = PROTOCOL.quantities
 FREQUENCIES = WireQuantity("frequency", "u16", 20, "Hz", 400, 12000)  # within the limits
 
 
-WIDE = Capabilities(16, 20.0, 600.0, 0.05, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1)
+WIDE = Capabilities(
+    *(16, 20.0, 600.0, 0.05, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1),
+    features=Feature.WHOLE,
+)
 GUARD = Guard(GuardLimits(20.0, 600.0, 1.0), WIDE)
 SET = CommandSet(
     token=513,
@@ -262,9 +266,9 @@ def test_reply_may_have_more_than_is_known() -> None:
         frame = Frame(kind=kind, address=1, sequence=1, payload=bytes.fromhex(payload))
         return decode_reply(frame, request)
 
-    status = reply(REPLY | 9, "07 42 0100 83 FA00 0000 0807 03 01 0000 07 07")
+    status = reply(REPLY | 9, "07 42 0100 85 FA00 0000 0807 03 01 0000 07 07")
     assert status == Status(
-        AmplifierState.FAULT, Fault(66), 1, True, 25.0, 0.0, (0.0,), 1800.0, 3, other_flags=0x82
+        AmplifierState.FAULT, Fault(66), 1, True, 25.0, 0.0, (0.0,), 1800.0, 3, other_flags=0x84
     )
     assert reply(REPLY | 31, "09 0C FF 00") == Nak(NakCode(12))
     assert [Fault(66).name, NakCode(12).name] == ["VENDOR_66", "NUMBER_12"]

@@ -23,6 +23,7 @@ from drivers.protocol.messages import (
     AmplifierState,
     Arm,
     Fault,
+    Feature,
     GetCaps,
     GetStatus,
     Nak,
@@ -41,7 +42,7 @@ FRAMES = {
 }
 EXCHANGES: dict[str, tuple[Request, Reply]] = {
     **{name: (example.request, example.reply) for name, example in EXAMPLES.items()},
-    "GetCaps": (GetCaps(), replace(CAPABILITIES, events=True)),
+    "GetCaps": (GetCaps(), replace(CAPABILITIES, features=CAPABILITIES.features | Feature.EVENTS)),
     "GetStatus": (GetStatus(), replace(TRIPPED, temperature=25.0)),
     "Refused Arm": (Arm(watchdog=0.25, session=9), Nak(NakCode.WRONG_STATE)),
 }

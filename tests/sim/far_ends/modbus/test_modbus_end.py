@@ -258,7 +258,7 @@ EXCEPTIONS = {
     "unknown encapsulation": ("2B 0D 00 00", "AB 01"),
     "identification code": ("2B 0E 05 00", "AB 03"),
     "identification object": ("2B 0E 04 07", "AB 02"),
-    "register that is not there": ("04 05 3F 00 01", "84 02"),
+    "register that is not there": ("04 05 87 00 01", "84 02"),
     "read beyond the end": ("04 03 E8 FF FF", "84 03"),
     "read of nothing": ("04 03 E8 00 00", "84 03"),
     "read of 126": ("03 03 E8 00 7E", "83 03"),
@@ -287,7 +287,7 @@ EXCEPTIONS = {
 }
 
 
-@pytest.mark.parametrize("read", ["03 E8 00 7E", "05 3F 00 01"], ids=["126", "not there"])
+@pytest.mark.parametrize("read", ["03 E8 00 7E", "05 87 00 01"], ids=["126", "not there"])
 async def test_modbus_read_write_is_atomic(tcp: FarSide, read: str) -> None:
     """Function 23 is one transaction: with a range that cannot be read, nothing of it is done."""
     async with Master(tcp.url) as master:
@@ -404,8 +404,8 @@ def play_with_minimalmodbus(url: str) -> None:
     master.serial.timeout = 0.5  # s; it waits so long for the rest of what is an exception
     try:
         assert master.read_string(1067, 16, functioncode=4).rstrip("\0") == "era-haptics"
-        assert master.read_register(1042, functioncode=4) == 4
-        assert master.read_register(1044, functioncode=4) == 65535
+        assert master.read_register(1352, functioncode=4) == 4
+        assert master.read_register(1354, functioncode=4) == 65535
         master.write_registers(2, [MAP["controlwords"]["ARM"], 2000, 0, 9])
         master.write_registers(16, [7, 9, 7, 0, 0, 2200, 5000, 0, 0])
         master.write_registers(10, [9])

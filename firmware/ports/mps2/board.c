@@ -1,0 +1,200 @@
+// SPDX-License-Identifier: MIT
+//
+// Arm's MPS2 board with image AN385 (Cortex-M3, 25 MHz), as QEMU's machine mps2-an385 has it.
+//
+//     UART0 serial protocol, UART1 Modbus RTU, UART2 samples, UART3 CAN as slcan
+//
+// Interrupts stay masked: a byte and the SysTick only wake the main loop from its sleep. On the real
+// board, which has one byte of buffer in each UART, samples must leave the main loop enough time.
+//
+// It has no converter: UART2 stands in for one, 16-bit little-endian integers, the channels one after
+// another. It has no high voltage either; that of this file is 1800 V by definition.
+
+#include "board.h"
+#include "open.h"
+
+#define CLOCK 25000000 // Hz
+
+struct uart { // CMSDK APB UART
+    volatile uint32_t data, state, control, interrupt, divider;
+};
+#define TX_FULL 1
+#define RX_FULL 2
+#define TX_AND_RX_ENABLED 3
+#define RX_WAKES 8
+#define WOKEN_BY_RX 2
+
+struct timer { // CMSDK APB timer; counts down
+    volatile uint32_t control, value, reload, interrupt;
+};
+#define TIMER_ENABLED 1
+
+struct systick {
+    volatile uint32_t control, reload, value;
+};
+#define SYSTICK_WAKES 7 // enabled, interrupt, clock of the processor
+
+#define SYSTICK ((struct systick *)0xE000E010)
+#define INTERRUPTS_ENABLE (*(volatile uint32_t *)0xE000E100)
+#define INTERRUPTS_CLEAR (*(volatile uint32_t *)0xE000E280)
+#define SYSTEM_CLEAR (*(volatile uint32_t *)0xE000ED04)
+#define SYSTICK_PENDING (UINT32_C(1) << 25)
+
+#define TIMER0 ((struct timer *)0x40000000)
+#define UART0 ((struct uart *)0x40004000)
+#define UART1 ((struct uart *)0x40005000)
+#define UART2 ((struct uart *)0x40006000)
+#define UART3 ((struct uart *)0x40007000)
+
+#define SENDING_SIZE 1024 // a power of 2
+
+static struct line_state {
+    struct uart *uart;
+    uint32_t receive_interrupt; // its number
+    uint32_t heard_at;
+    uint32_t put, taken;        // bytes, ever
+} lines[] = {[LINE_SERIAL] = {.uart = UART0, .receive_interrupt = 0},
+             [LINE_MODBUS] = {.uart = UART1, .receive_interrupt = 2},
+             [LINE_CAN] = {.uart = UART3, .receive_interrupt = 18}};
+#define LINES (sizeof lines / sizeof lines[0])
+
+static uint8_t sending[LINES][SENDING_SIZE];
+
+static bool is_high_voltage;
+static uint32_t ticks_seen, half_ticks;
+
+static uint32_t ticks(void)
+{
+    return UINT32_MAX - TIMER0->value;
+}
+
+static void open_uart(struct uart *uart, uint32_t baud)
+{
+    uart->divider = CLOCK / baud;
+    uart->control = TX_AND_RX_ENABLED | RX_WAKES;
+}
+
+void board_open(void)
+{
+    __asm__ volatile("cpsid i");
+    open_uart(UART0, 921600);
+    open_uart(UART1, 115200);
+    open_uart(UART2, 1562500);
+    open_uart(UART3, 921600);
+    TIMER0->reload = UINT32_MAX;
+    TIMER0->value = UINT32_MAX;
+    TIMER0->control = TIMER_ENABLED;
+    ticks_seen = ticks();
+    SYSTICK->reload = CLOCK / 1000 - 1;
+    SYSTICK->value = 0;
+    SYSTICK->control = SYSTICK_WAKES;
+    for (unsigned i = 0; i < LINES; i++)
+        INTERRUPTS_ENABLE = UINT32_C(1) << lines[i].receive_interrupt;
+}
+
+uint32_t board_samples_due(void)
+{
+    uint32_t now = ticks(), elapsed = now - ticks_seen;
+    ticks_seen = now;
+    // An emulator may stand still while its host is busy; of that, 50 ms pass.
+    if (elapsed > CLOCK / 20)
+        elapsed = CLOCK / 20;
+    half_ticks += 2 * elapsed; // 3125 of them are a sample
+    uint32_t due = half_ticks / (2 * CLOCK / SAMPLE_RATE);
+    half_ticks -= due * (2 * CLOCK / SAMPLE_RATE);
+    return due;
+}
+
+static void send_now(struct uart *uart, uint8_t byte)
+{
+    while (uart->state & TX_FULL) {
+    }
+    uart->data = byte;
+}
+
+void board_output(const int16_t samples[CHANNELS])
+{
+    for (unsigned i = 0; i < CHANNELS; i++) {
+        send_now(UART2, (uint8_t)samples[i]);
+        send_now(UART2, (uint8_t)((uint16_t)samples[i] >> 8));
+    }
+}
+
+static bool send_some(void)
+{
+    bool is_sending = false;
+    for (unsigned i = 0; i < LINES; i++) {
+        if (lines[i].taken == lines[i].put)
+            continue;
+        is_sending = true;
+        if (!(lines[i].uart->state & TX_FULL))
+            lines[i].uart->data = sending[i][lines[i].taken++ % SENDING_SIZE];
+    }
+    return is_sending;
+}
+
+void board_wait(void)
+{
+    if (send_some())
+        return;
+    __asm__ volatile("wfi");
+    SYSTEM_CLEAR = SYSTICK_PENDING;
+    for (unsigned i = 0; i < LINES; i++) {
+        lines[i].uart->interrupt = WOKEN_BY_RX;
+        INTERRUPTS_CLEAR = UINT32_C(1) << lines[i].receive_interrupt;
+    }
+}
+
+int board_read(enum line line)
+{
+    struct line_state *state = &lines[line];
+    if (!(state->uart->state & RX_FULL))
+        return -1;
+    state->heard_at = ticks();
+    return (uint8_t)state->uart->data;
+}
+
+void board_write(enum line line, const uint8_t *bytes, uint16_t length)
+{
+    struct line_state *state = &lines[line];
+    if (state->put - state->taken + length > SENDING_SIZE)
+        return; // nobody reads: the reply is lost
+    while (length-- > 0)
+        sending[line][state->put++ % SENDING_SIZE] = *bytes++;
+}
+
+uint32_t board_silence(enum line line)
+{
+    return (ticks() - lines[line].heard_at) / (CLOCK / 1000000);
+}
+
+void board_high_voltage(bool on)
+{
+    is_high_voltage = on;
+}
+
+int16_t board_temperature(void)
+{
+    return 250;
+}
+
+uint16_t board_voltage(void)
+{
+    return is_high_voltage ? 1800 : 0;
+}
+
+enum fault board_fault(uint8_t *channel)
+{
+    *channel = NO_CHANNEL;
+    return FAULT_NONE;
+}
+
+const char *board_serial_number(void)
+{
+    return "MPS2-1"; // a product reads the number of its processor
+}
+
+uint8_t board_address(void)
+{
+    return 1;
+}

@@ -1,0 +1,9 @@
+// SPDX-License-Identifier: MIT
+
+#ifndef OPEN_H
+#define OPEN_H
+
+// Start clock and lines.
+void board_open(void);
+
+#endif

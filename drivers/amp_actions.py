@@ -18,6 +18,7 @@ from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.operation.keep_alive import keep_alive
 from drivers.operation.silence import stop_and_confirm, stop_outcome
 from drivers.operation.watchdog import check_watchdog, shortest_watchdog
+from drivers.protocol.classes import amplifier_class
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import AmplifierState, Feature, Status
 from drivers.registry import open_backend
@@ -45,6 +46,7 @@ async def identify(url: str) -> dict[str, Any]:
         return {
             "url": url,
             **asdict(amplifier.identity),
+            "class": amplifier_class(amplifier.capabilities).value,
             **{f"{name}{_UNITS.get(name, '')}": value for name, value in capabilities.items()},
             "channel_limits": limits,
             "features": _feature_names(features),

@@ -34,6 +34,7 @@ from drivers.protocol.messages import (
     Disarm,
     FaultList,
     FaultRecord,
+    Feature,
     GetCaps,
     GetFaults,
     GetStatus,
@@ -129,7 +130,10 @@ class Amplifier:
 
     @property
     def watchdog(self) -> float | None:
-        """The longest watchdog [s] that may be in force since it was armed; None before."""
+        """The longest watchdog [s] that may be in force since it was armed.
+
+        None before, and of an amplifier that has none.
+        """
         return self._watchdog
 
     @property
@@ -235,15 +239,17 @@ class Amplifier:
         stop or disarm came first or it is armed already.
         """
         low, high = self.capabilities.watchdog_min, self.capabilities.watchdog_max
-        if not low <= watchdog <= high:
+        has_watchdog = Feature.WATCHDOG in self.capabilities.features
+        if has_watchdog and not low <= watchdog <= high:
             raise CommandError(
                 f"watchdog must be {low:g} to {high:g} s, as the amplifier reports, got "
                 f"{watchdog:g} s"
             )
-        self._watchdog = max(watchdog, self._watchdog or 0.0)
+        self._watchdog = max(watchdog, self._watchdog or 0.0) if has_watchdog else None
         arm = Arm(watchdog, session or random_session())
         status = await self._request(arm, expect=Status)
-        self._watchdog, self.session = watchdog, arm.session
+        self.session = arm.session
+        self._watchdog = watchdog if has_watchdog else None
         return status
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> Status:

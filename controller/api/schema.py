@@ -34,6 +34,9 @@ DaemonStateName: TypeAlias = Literal[
 GroupStateName: TypeAlias = Literal["closed", "disarmed", "armed", "lost"]
 """State of all amplifiers together."""
 
+AmplifierClassName: TypeAlias = Literal["A", "B", "C"]
+"""Class of an amplifier, by what it has."""
+
 Topic: TypeAlias = Literal[
     "state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "layout"
 ]
@@ -161,6 +164,9 @@ class AmplifierStatus(Message):
     name: str
     url: str
     serial_number: str | None
+    amplifier_class: AmplifierClassName | None = Field(
+        None, description="what it has; C: no watchdog, so that it plays on without the daemon"
+    )
     state: str | None = Field(description="its own state, by the names of CiA 402")
     fault: str | None
     levels: list[float] = Field(

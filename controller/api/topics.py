@@ -55,6 +55,11 @@ class SilenceEvent(Message):
     contacts: list[ContactStatus]
     reason: str
     latency_ms: float | None = Field(description="null if no command was needed")
+    late_ms: float | None = Field(
+        None,
+        description="how long after its time the vibration was ended; null where amplifiers end it "
+        "themselves",
+    )
 
 
 class AmplifiersEvent(Message):

@@ -285,7 +285,11 @@ def show_status(status: "StatusResult") -> str:
     if status.remedy:
         lines.append(f"  remedy: {status.remedy}")
     if status.lost_for_s is not None:
-        watchdog = f"its watchdog silences it after {status.watchdog_s:g} s without heartbeats"
+        watchdog = (
+            "one without a watchdog plays on until it is switched off"
+            if status.watchdog_s is None
+            else f"its watchdog silences it after {status.watchdog_s:g} s without heartbeats"
+        )
         lines.append(
             f"  ASSUME ENERGISED: a lost amplifier may still be playing; {watchdog}"
             if status.assume_energised
@@ -315,6 +319,10 @@ def show_status(status: "StatusResult") -> str:
         )
     for amplifier in status.amplifiers:
         parts = [amplifier.state] if amplifier.state else []
+        if amplifier.amplifier_class == "C":
+            parts.append("CLASS C: no watchdog, plays on without the daemon")
+        elif amplifier.amplifier_class == "B":
+            parts.append("class B")
         if amplifier.degraded:
             parts.append("does not reply, may play")
         if amplifier.lost:

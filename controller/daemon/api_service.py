@@ -41,6 +41,7 @@ from controller.daemon.states import (
 )
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches
+from controller.group.guards import is_known_unwatched
 from controller.group.quick_stops import QuickStops
 from controller.loop.loop import Controller
 from drivers import clock
@@ -124,6 +125,7 @@ class ApiService:
         machine, view, now = self._supervisor.machine, self._publisher.view, clock.now()
         lease = self._valid_lease.current(now)
         pattern = view.pattern_event() if machine.state is _ENABLED else None
+        is_unwatched = any(map(is_known_unwatched, self._amplifiers.values()))
         return StatusResult(
             time_s=now,
             unix_time_s=time.time(),
@@ -131,9 +133,10 @@ class ApiService:
             cause=machine.cause,
             remedy=machine.remedy,
             amplifiers_state=cast("GroupStateName", self._controller.group_state.name.lower()),
-            assume_energised=machine.assume_energised(now),
+            assume_energised=machine.assume_energised(now)
+            or (is_unwatched and machine.lost_for(now) is not None),
             lost_for_s=machine.lost_for(now),
-            watchdog_s=WATCHDOG,
+            watchdog_s=None if is_unwatched else WATCHDOG,
             armed_by=lease.owner if lease else None,
             lease_left_s=lease.expires_at - now if lease else None,
             contacts=view.contact_statuses(),

@@ -3,7 +3,13 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from controller.api.schema import AmplifierStatus, ContactStatus, LinkCounters, PlayedTone
+from controller.api.schema import (
+    AmplifierClassName,
+    AmplifierStatus,
+    ContactStatus,
+    LinkCounters,
+    PlayedTone,
+)
 from controller.api.topics import ContactsEvent, PatternEvent, SilenceEvent
 from controller.daemon.message_recorder import RecordedBackend
 from controller.loop.observer import Applied, Silenced
@@ -11,6 +17,7 @@ from controller.sources.contacts import Contact, ContactKey
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandError
+from drivers.protocol.classes import amplifier_class
 
 
 @dataclass
@@ -64,6 +71,7 @@ class PlateView:
             contacts=[contact_status(contact, None) for contact in silenced.contacts],
             reason=silenced.reason,
             latency_ms=None if silenced.latency is None else 1e3 * silenced.latency,
+            late_ms=None if silenced.late is None else 1e3 * silenced.late,
         )
 
     def drive(self) -> dict[str, PlayedTone]:
@@ -147,6 +155,7 @@ def _amplifier_status(
         name=name,
         url=url,
         serial_number=serial_number(amplifier),
+        amplifier_class=class_of(amplifier),
         state=status.state.name if status else None,
         fault=status.fault.name if status else None,
         levels=list(status.levels) if status else [],
@@ -169,6 +178,14 @@ def _amplifier_status(
             round_trip_ms=None if round_trip is None else 1e3 * round_trip,
         ),
     )
+
+
+def class_of(amplifier: Amplifier) -> AmplifierClassName | None:
+    """The class of an amplifier; None before it was identified."""
+    try:
+        return amplifier_class(amplifier.capabilities).value
+    except CommandError:
+        return None
 
 
 def serial_number(amplifier: Amplifier) -> str | None:

@@ -109,6 +109,7 @@ class Daemon:
             timing=Timing(table),
             drive_mode=config.section.mode,
             max_loading_time=config.section.touch_wait,
+            is_supervised=config.section.supervised,
         )
         self._touches = ApiTouches(config.rig.plate, self._deliver)
         self._inputs = TouchInputs(self._deliver, failed=self._input_failed)

@@ -89,7 +89,10 @@ class EventPublisher:
             # The control loop does not report the end of what others have silenced.
             self.view.applied = None
             silence = SilenceEvent(
-                contacts=self.view.contact_statuses(), reason=new.cause, latency_ms=None
+                contacts=self.view.contact_statuses(),
+                reason=new.cause,
+                latency_ms=None,
+                late_ms=None,
             )
             self.hub.publish("silence", lambda: silence)
 

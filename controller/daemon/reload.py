@@ -8,7 +8,7 @@ from controller.daemon.config import DaemonConfig
 DEFERRED = ("touch_wait", "socket", "log.file", "metrics", "dashboard")
 """Keys that take effect at the next start."""
 
-BLOCKING = ("rig", "table", "mode", "serial_numbers")
+BLOCKING = ("rig", "table", "mode", "serial_numbers", "supervised")
 """Keys on which all others depend: a change of any blocks the reload."""
 
 
@@ -52,6 +52,7 @@ def changed_keys(old: DaemonConfig, new: DaemonConfig) -> list[str]:
         "table": old.table != new.table,
         "mode": old.section.mode != new.section.mode,
         "serial_numbers": old.section.serial_numbers != new.section.serial_numbers,
+        "supervised": old.section.supervised != new.section.supervised,
         "touch_wait": old.section.touch_wait != new.section.touch_wait,
         "layout": old.effective_layout != new.effective_layout,
         "touch": old.touch != new.touch,

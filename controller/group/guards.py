@@ -1,11 +1,32 @@
-"""A guard for every amplifier of a rig, by the limits of the rig file."""
+"""A guard for every amplifier of a rig, by the limits of the rig file; which ones are driven."""
 
 from collections.abc import Mapping
 
 from drivers.amplifier import Amplifier
+from drivers.errors import CommandError
 from drivers.guard import Guard
+from drivers.protocol.messages import Feature
 from model.errors import InputError
 from model.rig.rig import Rig
+
+
+def check_watchdogs(amplifiers: Mapping[str, Amplifier]) -> None:
+    """Raise CommandError for an open amplifier without a watchdog, by its name."""
+    for name, amplifier in amplifiers.items():
+        if Feature.WATCHDOG not in amplifier.capabilities.features:
+            raise CommandError(
+                f"amplifier {name} must have a watchdog, got one of class C, which plays on when "
+                "this program ends; use another, or set supervised: true in the daemon's file if "
+                "somebody can always switch it off"
+            )
+
+
+def is_known_unwatched(amplifier: Amplifier) -> bool:
+    """Whether an amplifier was identified and has no watchdog."""
+    try:
+        return Feature.WATCHDOG not in amplifier.capabilities.features
+    except CommandError:
+        return False
 
 
 def make_guards(

@@ -11,7 +11,7 @@ from drivers import clock
 from drivers.guard import SafeCommandSet, SafeEnvelope
 from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.operation.simultaneous import simultaneous_commits
-from drivers.protocol.messages import Achieved
+from drivers.protocol.messages import Achieved, Feature
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,10 @@ class SynchronizedPlay:
                 return None  # playing now would undo the silence that came meanwhile
             if not all(in_time):
                 return Played({}, start, loading_time, is_late=True)
-        if len(sets) == 1 or all(safe.is_silent for safe in sets.values()):
+        is_silence = all(safe.is_silent for safe in sets.values())
+        if len(sets) == 1 or is_silence or not self._can_stage:
             # A single amplifier needs no staging, and silence is not delayed by it.
+            self.is_set_incomplete = self.is_set_incomplete or (len(sets) > 1 and not is_silence)
             achieved = await gather_all(
                 self._amplifiers[name].apply(safe) for name, safe in sets.items()
             )
@@ -93,6 +95,14 @@ class SynchronizedPlay:
             await self._confirm_commits(sets, committed_at)
         self.is_set_incomplete = False
         return Played(dict(zip(sets, achieved, strict=True)), sent_at, loading_time)
+
+    @property
+    def _can_stage(self) -> bool:
+        """Whether all amplifiers stage sets, so that they can start together."""
+        return all(
+            Feature.STAGING in each.amplifier.capabilities.features
+            for each in self._amplifiers.values()
+        )
 
     @property
     def _last_sent_at(self) -> float:
@@ -122,7 +132,9 @@ class SynchronizedPlay:
         """Commit all staged sets so that they arrive at one moment; once for each shared bus."""
         by_bus: dict[tuple[str, int], list[str]] = {}
         for name, safe in sets.items():
-            bus = self._amplifiers[name].amplifier.bus or name
+            amplifier = self._amplifiers[name].amplifier
+            takes_broadcasts = Feature.BROADCAST in amplifier.capabilities.features
+            bus = (amplifier.bus if takes_broadcasts else None) or name
             by_bus.setdefault((bus, safe.token), []).append(name)
         return simultaneous_commits(
             [

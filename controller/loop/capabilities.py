@@ -1,7 +1,7 @@
 """Capabilities of the open amplifiers of a rig together, in the terms of the table."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from controller.loop.envelopes import (
@@ -11,6 +11,7 @@ from controller.loop.envelopes import (
     envelope_support,
 )
 from drivers.guard import limits_in_force
+from drivers.protocol.messages import Capabilities, Feature
 from model.drive_modes import DRIVE_MODES, playable_drive_modes
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -23,7 +24,8 @@ class PlaybackCapabilities:
     drive_mode: of the questions to the table; playable: the drive modes that every amplifier can
     play; frequencies: the lowest and highest [Hz]; max_amplitudes [m] by ERA;
     envelope_support: which envelopes every amplifier plays; max_power: sum of squared levels of
-    all ERAs; slew [1/s]: highest rise of a level.
+    all ERAs; slew [1/s]: highest rise of a level. eras_at_most: how many ERAs may play together;
+    ends_itself: whether every amplifier ends a vibration after its time.
     """
 
     drive_mode: str
@@ -33,6 +35,8 @@ class PlaybackCapabilities:
     envelope_support: EnvelopeSupport
     max_power: float = math.inf
     slew: float = math.inf
+    eras_at_most: int = 2
+    ends_itself: bool = True
 
 
 def playback_capabilities(
@@ -53,6 +57,9 @@ def playback_capabilities(
         for caps in capabilities.values()
     ]
     playable = tuple(name for name in DRIVE_MODES if all(name in modes for modes in each))
+    is_coherent = _are_coherent(tuple(capabilities.values()))
+    if not is_coherent:
+        playable = ("switched",)
     if drive_mode is not None and drive_mode not in playable:
         raise InputError(
             f"drive mode must be one that all amplifiers play ({', '.join(playable)}), got "
@@ -73,4 +80,12 @@ def playback_capabilities(
         envelope_support=envelope_support(rig, amplifiers, max_loading_time=max_loading_time),
         max_power=min(one.power for one in limits.values()),
         slew=min(one.slew for one in limits.values()),
+        eras_at_most=2 if is_coherent else 1,
+        ends_itself=all(Feature.VALID_FOR in caps.features for caps in capabilities.values()),
     )
+
+
+def _are_coherent(each: Sequence[Capabilities]) -> bool:
+    """Whether phases hold between all channels: within each amplifier, and from a common start."""
+    needed = Feature.PHASE if len(each) == 1 else Feature.PHASE | Feature.STAGING
+    return all(needed in caps.features for caps in each)

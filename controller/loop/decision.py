@@ -16,7 +16,7 @@ from controller.loop.loading_times import LoadingTimes
 from controller.loop.safe_sets import FADE_RAMP, SafeSets, SetBuilder
 from controller.loop.selection import Selection, Selector
 from controller.loop.table_query import is_short
-from controller.loop.validity import Validity, first_end, valid_for
+from controller.loop.validity import Validity, first_end, last_end, valid_for
 from controller.sources.contacts import Change, Contact, ContactTracker
 from controller.sources.touch import TouchFrame
 from drivers.command import DriveCommand
@@ -48,7 +48,8 @@ class Decision:
     sets: None if all channels are silent already; pattern: with the ramp and onset of the sets,
     None for silence; adds_endings_only: whether the sets only add endings to the playback; refusal:
     why a guard refused the pattern, which makes it silence; retry_at [s]: when the guard would pass
-    it, None for never.
+    it, None for never. ends_due [s]: when the vibration that it ends was to end, if the amplifiers
+    do not end it themselves.
     """
 
     contacts: tuple[Contact, ...]
@@ -60,6 +61,7 @@ class Decision:
     adds_endings_only: bool = False
     refusal: str | None = None
     retry_at: float | None = None
+    ends_due: float | None = None
 
 
 @dataclass(frozen=True)
@@ -145,6 +147,7 @@ class Decider:
             level_db_sl=-100.0,
             drive_mode=self._capabilities.drive_mode,
             playable=self._capabilities.playable,
+            eras_at_most=self._capabilities.eras_at_most,
             frequencies=self._capabilities.frequencies,
             envelopes=support.onsets,
         )
@@ -286,7 +289,7 @@ class Decider:
             decision = draft
             if not playing.is_silent:
                 sets = self._end(contacts, along_endings=playing.has_endings and not has_failed)
-                decision = replace(draft, sets=sets)
+                decision = replace(draft, sets=sets, ends_due=self._missed_end(now))
         if decision is not None and decision.sets is not None:
             self._playing_before = playing
             self._playing = _Playback(decision, retry_at=decision.retry_at)
@@ -366,7 +369,18 @@ class Decider:
         return min(expiries, default=-math.inf)
 
     def _valid_for(self, selection: Selection, now: float) -> float:
+        """How long [s] a vibration may last by itself; 0 where the host ends it."""
+        if not self._capabilities.ends_itself:
+            return 0.0
         return valid_for(selection, confirmed_until=self._confirmed_until(selection), now=now)
+
+    def _missed_end(self, now: float) -> float | None:
+        """Return when [s] the pulses that play were to end, if the host has to end them."""
+        decision = self._playing.decision
+        if self._capabilities.ends_itself or decision is None or decision.pattern is None:
+            return None
+        end = last_end(decision.selection)
+        return end if end <= now else None
 
     def _note_validity(self, sets: SafeSets, selection: Selection, now: float) -> None:
         """Note how long sets committed by now [s] last."""

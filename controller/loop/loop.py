@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import ParamSpec
 
 from controller.group.amplifier_group import AmplifierGroup, GroupState
-from controller.group.guards import make_guards
+from controller.group.guards import check_watchdogs, make_guards
 from controller.group.synchronized_play import Played
 from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
 from controller.loop.decision import RELEASE_RAMP, Decider, Decision
@@ -53,6 +53,7 @@ class Controller:
     intent_source: by default the newest contact buzzes where it is. timing: shapes the patterns of
     the table, ramps only without it. drive_mode: None for the best that the amplifiers can play.
     max_loading_time [s]: how long loading envelopes may delay a touch, 0 for ramps only.
+    is_supervised: whether amplifiers without a watchdog are driven.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class Controller:
         timing: Timing | None = None,
         drive_mode: str | None = None,
         max_loading_time: float = MAX_LOADING_TIME,
+        is_supervised: bool = False,
     ) -> None:
         if amplifiers.keys() != rig.amplifiers.keys():
             raise InputError(
@@ -75,6 +77,7 @@ class Controller:
             )
         self._rig = rig
         self._table = table
+        self._is_supervised = is_supervised
         self._amplifiers = amplifiers
         self._group = AmplifierGroup(amplifiers)
         self._sources = sources
@@ -131,11 +134,13 @@ class Controller:
     async def open(self) -> None:
         """Open every amplifier, or none, and prepare what they can play; all stay disarmed.
 
-        Raises LinkError, CommandError, and InputError for a wired channel that its amplifier does
-        not have or a drive mode that one cannot play.
+        Raises LinkError, CommandError, also for one without a watchdog, and InputError for a wired
+        channel that its amplifier does not have or a drive mode that one cannot play.
         """
         await self._group.open()
         try:
+            if not self._is_supervised:
+                check_watchdogs(self._amplifiers)
             self._guards = make_guards(self._rig, self._amplifiers, self._guards)
             decider = Decider(
                 self._rig,

@@ -53,7 +53,8 @@ class Silenced:
     """All channels are silent, for a reason; latency and time [s].
 
     targets: contacts for which a pattern was requested. latency: up to the last byte of the
-    command, None if none was needed.
+    command, None if none was needed. late [s]: how long after its time a vibration was ended, None
+    where the amplifiers end it themselves.
     """
 
     contacts: tuple[Contact, ...]
@@ -61,6 +62,7 @@ class Silenced:
     reason: str
     latency: float | None
     time: float
+    late: float | None = None
 
 
 def applied_by(
@@ -88,12 +90,14 @@ def applied_by(
 
 def silenced_by(decision: Decision, *, sent_at: float | None, now: float) -> Silenced:
     """Report a decision for silence; sent_at [s]: of its last byte, None if nothing was sent."""
+    due = decision.ends_due
     return Silenced(
         contacts=decision.contacts,
         targets=tuple(contact for contact, _ in decision.selection.targets),
         reason=decision.refusal or decision.selection.reason or "",
         latency=None if sent_at is None else sent_at - decision.triggered_at,
         time=now,
+        late=None if sent_at is None or due is None else sent_at - due,
     )
 
 

@@ -106,6 +106,7 @@ def _question(
         softer_db=tuple(level - each for each in levels),
         drive_mode=capabilities.drive_mode,
         playable=capabilities.playable,
+        eras_at_most=capabilities.eras_at_most,
         frequencies=_frequencies(targets, capabilities.frequencies, frequencies),
         envelopes=capabilities.envelope_support.onsets and not is_short(targets),
         loads=() if all(load == 1 for load in loads) else loads,

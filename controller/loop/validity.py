@@ -68,3 +68,9 @@ def first_end(selection: Selection) -> float:
     """Return when [s] the first pulse ends; infinite without any."""
     pulses = [target.pulse for _, target in selection.targets]
     return min((pulse.end for pulse in pulses if pulse is not None), default=math.inf)
+
+
+def last_end(selection: Selection) -> float:
+    """Return when [s] the last pulse ends; infinite where a target has none."""
+    pulses = [target.pulse for _, target in selection.targets]
+    return max((math.inf if pulse is None else pulse.end for pulse in pulses), default=math.inf)

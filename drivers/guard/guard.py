@@ -10,7 +10,7 @@ from typing import final
 
 from drivers.clock import now
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
-from drivers.errors import CommandRefused
+from drivers.errors import CommandError, CommandRefused
 from drivers.guard.channel_state import duration
 from drivers.guard.limits import capabilities_in_force, limits_in_force
 from drivers.guard.record import PlayRecord, skips_endings, vibrates
@@ -23,7 +23,7 @@ from drivers.guard.rules import (
     is_token,
 )
 from drivers.protocol.definition import PROTOCOL, token_after
-from drivers.protocol.messages import Capabilities
+from drivers.protocol.messages import Capabilities, Feature
 from registry.limits import GuardLimits
 
 _KEY = object()
@@ -103,6 +103,12 @@ class Guard:
     ) -> None:
         self._made_for = (limits, capabilities)
         self._limits = limits_in_force(limits, capabilities)
+        is_bounded = self._limits.on_time < math.inf or self._limits.duty < 1
+        if is_bounded and Feature.VALID_FOR not in capabilities.features:
+            raise CommandError(
+                "limits of on-time and duty need an amplifier that ends vibrations itself "
+                "(valid_for), got one that does not; remove them from the rig file, or use another"
+            )
         self._capabilities = capabilities_in_force(capabilities)
         self._record = PlayRecord(self._limits, self._capabilities.channels, clock)
 

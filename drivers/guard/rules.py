@@ -14,10 +14,11 @@ from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.errors import CommandRefused
 from drivers.guard.channel_state import steepest_rise
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import Capabilities
+from drivers.protocol.messages import Capabilities, Feature
 from registry.limits import GuardLimits
 
 _ROUNDING = 1 + 1e-9  # sums of floats
+_VALID_FOR = PROTOCOL.quantities.valid_for
 
 
 @dataclass(frozen=True)
@@ -89,9 +90,10 @@ def _check_token(command_set: CommandSet, context: GuardContext) -> None:
 
 
 def _check_times(command_set: CommandSet, context: GuardContext) -> None:
+    ends_itself = Feature.VALID_FOR in context.capabilities.features
     for name, value, highest in (
         ("ramp", command_set.ramp, context.capabilities.ramp_max),
-        ("valid_for", command_set.valid_for, PROTOCOL.quantities.valid_for.high),
+        ("valid_for", command_set.valid_for, _VALID_FOR.high if ends_itself else 0.0),
     ):
         if not (is_finite(value) and 0 <= value <= highest):
             raise CommandRefused(f"{name} must be 0 to {highest:g} s, got {value!r} s")

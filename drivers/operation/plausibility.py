@@ -68,7 +68,8 @@ class PlausibilityCheck:
         """Expect silence and a full watchdog [s] after an Arm was confirmed."""
         self._states = (ChannelState(),) * self._capabilities.channels
         self._tokens = {0}
-        self._watchdog = _Q.watchdog.quantise(watchdog)
+        has_watchdog = Feature.WATCHDOG in self._capabilities.features
+        self._watchdog = _Q.watchdog.quantise(watchdog) if has_watchdog else None
         self._fed = Interval(sent_at, now)
         self._achieved_problem = None
         self._contradictions = self._stalled_watchdog_count = 0
@@ -218,15 +219,12 @@ class PlausibilityCheck:
                         other.frequency,
                         _tolerance(_Q.frequency, can.frequency_step),
                     ),
-                    (
-                        "phase",
-                        one.phase,
-                        one.phase + phase,
-                        _tolerance(_Q.phase, can.phase_step),
-                    ),
                     ("onset", one.onset, other.onset, 0.0),
                     ("ending", one.ending, other.ending, 0.0),
                 ]
+                if Feature.PHASE in can.features:
+                    step = _tolerance(_Q.phase, can.phase_step)
+                    compared.append(("phase", one.phase, one.phase + phase, step))
             for name, expected, got, tolerance in compared:
                 if not abs(got - expected) <= tolerance + _ROUNDING:
                     yield f"{name} achieved on channel {channel} must be {expected:g}, got {got:g}"

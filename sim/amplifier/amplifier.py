@@ -151,6 +151,8 @@ class SimulatedAmplifier:
         """Reply to a request at a time [s]; a Nak means that nothing was applied."""
         self.tick(now)
         following = next_state(self.state, type(request))
+        if isinstance(request, Stage | Commit) and Feature.STAGING not in self._features:
+            return Nak(NakCode.UNKNOWN_TYPE)
         if following is None:
             return Nak(NakCode.WRONG_STATE)
         if isinstance(request, _FEEDING_REQUESTS) and self._is_foreign(request.session, request):
@@ -170,7 +172,7 @@ class SimulatedAmplifier:
     def status(self, now: float) -> Status:
         """Status at a time [s] up to which it has been ticked."""
         levels = self._channels.levels(now)
-        left = self._last_fed + self._watchdog - now if self.state in ENABLED else 0.0
+        left = self._watchdog_end - now if self._watchdog_end < math.inf else 0.0
         is_on = self.state in (AmplifierState.SWITCHED_ON, *ENABLED) or any(levels)
         decayed = math.exp(min(0.0, (self._silent_from - now) / _DISCHARGE))
         return Status(
@@ -297,6 +299,10 @@ class SimulatedAmplifier:
         return active.achieved
 
     @property
+    def _features(self) -> Feature:
+        return self.capabilities.features
+
+    @property
     def _derating_factor(self) -> float:
         """Factor on every level."""
         return DERATED if self._is_derated else 1.0
@@ -325,7 +331,9 @@ class SimulatedAmplifier:
 
     @property
     def _watchdog_end(self) -> float:
-        return self._last_fed + self._watchdog if self.state in ENABLED else math.inf
+        if self.state not in ENABLED or Feature.WATCHDOG not in self._features:
+            return math.inf
+        return self._last_fed + self._watchdog
 
     @property
     def _silence_reached(self) -> float:

@@ -6,10 +6,11 @@ from dataclasses import replace
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError
 from drivers.protocol.definition import PROTOCOL, WireQuantity, is_newer_token
-from drivers.protocol.messages import Achieved, Capabilities, Loaded, Nak, NakCode
+from drivers.protocol.messages import Achieved, Capabilities, Feature, Loaded, Nak, NakCode
 from sim.amplifier.channels import PlayableSet
 
 _Q = PROTOCOL.quantities
+_ANY_PHASE = 137.0  # degrees from channel to channel, of an amplifier without phases
 
 
 class RefusedSet(Exception):
@@ -93,6 +94,8 @@ def _quantised_set(wanted: CommandSet, capabilities: Capabilities) -> CommandSet
     """
     if not _Q.token.holds(wanted.token):
         raise RefusedSet(NakCode.BAD_TOKEN)
+    if wanted.valid_for and Feature.VALID_FOR not in capabilities.features:
+        raise RefusedSet(NakCode.BAD_VALUE)
     channels = [command.channel for command in wanted.commands]
     for channel in channels:
         if not 0 <= channel < capabilities.channels or channels.count(channel) > 1:
@@ -123,11 +126,13 @@ def _quantised_envelope(wanted: Envelope, capabilities: Capabilities) -> Envelop
 
 
 def _quantised(command: DriveCommand, capabilities: Capabilities) -> DriveCommand:
+    has_phase = Feature.PHASE in capabilities.features
+    phase = command.phase if has_phase else _ANY_PHASE * command.channel
     played = replace(
         command,
         frequency=_in_steps(_Q.frequency, command.frequency, channel=command.channel),
         level=_in_steps(_Q.level, command.level, channel=command.channel),
-        phase=_in_steps(_Q.phase, command.phase, channel=command.channel),
+        phase=_in_steps(_Q.phase, phase, channel=command.channel),
     )
     limits = capabilities.limits_of_channels[command.channel]
     is_playable = limits.frequency_min <= played.frequency <= limits.frequency_max

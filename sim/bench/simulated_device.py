@@ -12,6 +12,7 @@ from drivers.protocol.messages import (
     Broadcast,
     Capabilities,
     Fault,
+    Feature,
     Identity,
     Nak,
     NakCode,
@@ -89,7 +90,8 @@ class SimulatedDevice:
 
     def broadcast(self, request: Broadcast) -> None:
         """Execute a broadcast, which has no reply."""
-        self.exchange(request)
+        if Feature.BROADCAST in self.capabilities.features:
+            self.exchange(request)
 
     def restart(self) -> None:
         """Power-cycle it."""

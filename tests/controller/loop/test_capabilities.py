@@ -17,7 +17,7 @@ from controller.loop.envelopes import (
 )
 from drivers.command import Envelope as WireEnvelope
 from drivers.command import Knot
-from drivers.protocol.messages import Capabilities
+from drivers.protocol.messages import Capabilities, Feature
 from drivers.protocol.wire_times import WireTimes
 from model.errors import InputError
 from model.fem.mesh import Mesh
@@ -87,6 +87,28 @@ def test_capabilities_choose_the_best_common_drive_mode(
     capabilities = playback_capabilities(rig(), {"left": left, "right": right})
     assert capabilities.drive_mode == mode
     assert capabilities.playable[-1] == mode
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "is_coherent"),
+    [
+        (Feature(0), Feature(0), True),
+        (Feature.PHASE, Feature(0), False),
+        (Feature(0), Feature.STAGING, False),
+        (Feature.VALID_FOR | Feature.WATCHDOG | Feature.BROADCAST, Feature(0), True),
+    ],
+)
+def test_capabilities_need_phases_and_a_common_start(
+    left: Feature, right: Feature, is_coherent: bool
+) -> None:
+    """Else one ERA plays at a time; of what each amplifier lacks."""
+    each = {
+        name: Opened(replace(FINE, features=FINE.features & ~lacking))
+        for name, lacking in (("left", left), ("right", right))
+    }
+    capabilities = playback_capabilities(rig(), each)
+    assert (capabilities.playable == ("switched",)) is not is_coherent
+    assert capabilities.eras_at_most == (2 if is_coherent else 1)
 
 
 def test_capabilities_refuse_an_unplayable_drive_mode() -> None:

@@ -273,6 +273,19 @@ def test_protocol_bounds_reported_capabilities() -> None:
 DELAY = 0.25  # s; from a check until the set plays, while another one does
 
 
+def test_bounded_on_time_needs_an_amplifier_that_ends_vibrations() -> None:
+    """Nothing else would end them in time; without such limits only valid_for is refused."""
+    plain = replace(CAPABILITIES, features=Feature.WHOLE & ~Feature.VALID_FOR)
+    for limits in ({"on_time": 5.0}, {"duty": 0.5}):
+        with pytest.raises(CommandError, match="valid_for"):
+            Guard(GuardLimits(40.0, 500.0, 0.8, **limits), plain)
+    unlimited = Guard(GuardLimits(40.0, 500.0, 0.8), plain)
+    commands = (DriveCommand(0, 110.0, 0.5),)
+    assert unlimited.check(CommandSet(1, commands, ramp=0.0, valid_for=0.0)).valid_for == 0.0
+    with pytest.raises(CommandRefused, match="valid_for"):
+        unlimited.check(CommandSet(2, commands, ramp=0.0, valid_for=0.1))
+
+
 def test_channels_bound_the_limits_of_all() -> None:
     """The highest of the lowest frequencies, the lowest of the rest: a pattern needs them all."""
     limits = (ChannelLimits(50.0, 600.0, 0.9), ChannelLimits(20.0, 300.0, 0.6)) * 2

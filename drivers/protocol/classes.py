@@ -1,0 +1,102 @@
+"""Classes of amplifiers by what they have, and what the host does without each of it.
+
+A has everything, B lacks what class A needs but has a watchdog, C has no watchdog.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from drivers.protocol.messages import Capabilities, Feature
+
+
+class AmplifierClass(StrEnum):
+    """Class of an amplifier."""
+
+    A = "A"
+    B = "B"
+    C = "C"
+
+
+@dataclass(frozen=True)
+class Lack:
+    """What an amplifier may lack, its class then, and what controller, daemon and promise do.
+
+    feature: None for envelopes, which have no bit.
+    """
+
+    name: str
+    feature: Feature | None
+    highest_class: AmplifierClass
+    controller: str
+    daemon: str
+    promise: str
+
+    def is_in(self, capabilities: Capabilities) -> bool:
+        """Whether an amplifier lacks it."""
+        if self.feature is None:
+            return not capabilities.envelope_knots
+        return self.feature not in capabilities.features
+
+
+LACKS = (
+    Lack(
+        "watchdog",
+        Feature.WATCHDOG,
+        AmplifierClass.C,
+        "sends heartbeats all the same; nothing ends the vibration when they cease",
+        "refuses it without `supervised: true`; shows class C; a stop that is not confirmed lasts "
+        "until it is switched off",
+        "unchanged",
+    ),
+    Lack(
+        "staging",
+        Feature.STAGING,
+        AmplifierClass.B,
+        "applies; several amplifiers start one after the other, so one ERA plays at a time",
+        "shows the class",
+        "of one ERA at one frequency, if there are several amplifiers",
+    ),
+    Lack(
+        "envelopes",
+        None,
+        AmplifierClass.B,
+        "plays ramps",
+        "shows the class",
+        "of ramps: less contrast while a vibration begins and ends",
+    ),
+    Lack(
+        "valid_for",
+        Feature.VALID_FOR,
+        AmplifierClass.B,
+        "ends effects itself; refuses limits of on-time and duty",
+        "shows the class; the event `silence` says how late",
+        "levels over a duration hold as far as effects end in time",
+    ),
+    Lack(
+        "phase",
+        Feature.PHASE,
+        AmplifierClass.B,
+        "asks the table for `switched` and one ERA at a time",
+        "shows the class; refuses another `mode`",
+        "of one ERA at one frequency",
+    ),
+    Lack(
+        "broadcast",
+        Feature.BROADCAST,
+        AmplifierClass.A,
+        "commits and stops each amplifier of a line by itself",
+        "nothing",
+        "unchanged; several amplifiers of a line start one after the other",
+    ),
+)
+"""What amplifiers may lack, the gravest first."""
+
+
+def amplifier_class(capabilities: Capabilities) -> AmplifierClass:
+    """Return the class of an amplifier."""
+    return max((lack.highest_class for lack in missing(capabilities)), default=AmplifierClass.A)
+
+
+def missing(capabilities: Capabilities) -> tuple[Lack, ...]:
+    """Return what an amplifier lacks."""
+    return tuple(lack for lack in LACKS if lack.is_in(capabilities))

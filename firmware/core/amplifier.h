@@ -32,13 +32,18 @@ struct verdict {
     uint8_t channel;
 };
 
-struct amplifier {
-    const char *serial_number; // at most 32 bytes
-    // Of the board: its measurements, and the cause of a fault while there is one.
+// What the board measures: temperature, voltage, and the cause of a fault while there is one.
+struct measured {
     int16_t temperature;
     uint16_t voltage;
+    bool is_interlock_open;
     enum fault cause;
-    uint8_t cause_channel;
+    uint8_t channel; // of the cause
+};
+
+struct amplifier {
+    const char *serial_number; // at most 32 bytes
+    struct measured measured; // of the board
     // For the board: whether the high voltage is on.
     bool high_voltage;
 
@@ -66,9 +71,8 @@ void amplifier_init(struct amplifier *amplifier, const char *serial_number);
 // Make the next sample of every channel, and let one sample's time pass.
 void amplifier_sample(struct amplifier *amplifier, int16_t samples[CHANNELS]);
 
-// Hand over what the board measures, and the cause of a fault; a cause acts at once.
-void amplifier_measured(struct amplifier *amplifier, int16_t temperature, uint16_t voltage,
-                        enum fault cause, uint8_t channel);
+// Hand over what the board measures; an open interlock or another cause of a fault acts at once.
+void amplifier_measured(struct amplifier *amplifier, struct measured measured);
 
 // Requests. Times are in milliseconds, ramps of Stop and Disarm are clipped.
 struct verdict amplifier_arm(struct amplifier *amplifier, uint16_t watchdog, uint16_t session);
@@ -86,6 +90,7 @@ struct verdict amplifier_load(struct amplifier *amplifier, uint8_t slot, const s
 struct verdict set_add(struct set *set, const struct command *command);
 
 // What Status and FaultList report beside the fields above.
+uint8_t amplifier_flags(const struct amplifier *amplifier);
 uint16_t amplifier_watchdog_left(const struct amplifier *amplifier);
 uint32_t amplifier_fault_age(const struct amplifier *amplifier, uint8_t number);
 

@@ -33,7 +33,8 @@ uint32_t board_silence(enum line line);
 void board_high_voltage(bool on);
 int16_t board_temperature(void); // 0.1 degrees Celsius
 uint16_t board_voltage(void);    // V, of the high-voltage supply; 0: not measured
-// The cause of a fault while there is one, and its channel (NO_CHANNEL: none).
+bool board_interlock_open(void);
+// The cause of another fault while there is one, and its channel (NO_CHANNEL: none).
 enum fault board_fault(uint8_t *channel);
 
 // Who it is.

@@ -5,12 +5,25 @@
 #include "board.h"
 #include "modbus_rtu.h"
 #include "serial.h"
+#include "slcan.h"
+
+#include <string.h>
 
 static struct amplifier amplifier;
 static struct serial serial;
 static struct modbus modbus;
 static struct rtu rtu;
+static struct can_node node;
+static struct slcan slcan;
 static uint32_t samples_to_measuring;
+
+static void send_can(const struct can_frame *frame)
+{
+    char line[SLCAN_LINE_MAX];
+    uint16_t length = slcan_format(frame, line);
+    if (slcan.is_open)
+        board_write(LINE_CAN, (const uint8_t *)line, length);
+}
 
 void loop_init(void)
 {
@@ -18,14 +31,17 @@ void loop_init(void)
     serial_init(&serial, &amplifier, board_address());
     modbus_init(&modbus, &amplifier, board_address());
     rtu_init(&rtu, &modbus);
+    can_init(&node, &amplifier, board_address(), send_can);
+    slcan_init(&slcan, &node);
     board_high_voltage(false);
 }
 
 static void measure(void)
 {
-    uint8_t channel = NO_CHANNEL;
-    enum fault cause = board_fault(&channel);
-    amplifier_measured(&amplifier, board_temperature(), board_voltage(), cause, channel);
+    struct measured measured = {board_temperature(), board_voltage(), board_interlock_open(),
+                                FAULT_NONE, NO_CHANNEL};
+    measured.cause = board_fault(&measured.channel);
+    amplifier_measured(&amplifier, measured);
 }
 
 static void make_samples(void)
@@ -63,6 +79,16 @@ static void serve_modbus(void)
     send(LINE_MODBUS, rtu.reply, rtu_silence(&rtu, board_silence(LINE_MODBUS)));
 }
 
+static void serve_can(void)
+{
+    for (int byte = board_read(LINE_CAN); byte >= 0; byte = board_read(LINE_CAN)) {
+        const char *answer = slcan_byte(&slcan, (uint8_t)byte);
+        if (answer != NULL)
+            send(LINE_CAN, (const uint8_t *)answer, (uint16_t)strlen(answer));
+    }
+    can_time(&node);
+}
+
 struct modbus *loop_modbus(void)
 {
     return &modbus;
@@ -73,4 +99,5 @@ void loop_once(void)
     make_samples();
     serve_serial();
     serve_modbus();
+    serve_can();
 }

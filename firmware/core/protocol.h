@@ -29,7 +29,9 @@ enum fault {
     FAULT_OVER_VOLTAGE = 3,
     FAULT_ARC = 4,
     FAULT_CHANNEL = 5,
-    FAULT_INTERNAL = 6
+    FAULT_INTERNAL = 6,
+    FAULT_INTERLOCK = 7,
+    FAULT_OVER_CURRENT = 8
 };
 
 enum nak {
@@ -62,6 +64,10 @@ enum nak {
 #define STAGED_LIFE 1000    // ms until a staged set is forgotten
 #define SAFETY_RAMP 5       // ms; of the watchdog, of faults, and of what an Arm still finds playing
 #define ENVELOPE_SLOT_MAX 63
+
+// Flags of Status.
+#define HIGH_VOLTAGE_ON 0x01
+#define INTERLOCK_OPEN 0x02
 
 // Flags of a command.
 #define KEEP_PHASE 0x01

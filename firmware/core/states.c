@@ -20,7 +20,6 @@ void amplifier_init(struct amplifier *amplifier, const char *serial_number)
     amplifier->serial_number = serial_number;
     amplifier->state = SWITCH_ON_DISABLED;
     amplifier->fault_channel = NO_CHANNEL;
-    amplifier->cause_channel = NO_CHANNEL;
     amplifier->answered = &amplifier->active;
 }
 
@@ -85,15 +84,22 @@ static void fail(struct amplifier *amplifier, enum fault fault, uint8_t channel)
     settle(amplifier);
 }
 
-void amplifier_measured(struct amplifier *amplifier, int16_t temperature, uint16_t voltage,
-                        enum fault cause, uint8_t channel)
+void amplifier_measured(struct amplifier *amplifier, struct measured measured)
 {
-    amplifier->temperature = temperature;
-    amplifier->voltage = voltage;
-    amplifier->cause = cause;
-    amplifier->cause_channel = channel;
-    if (cause != FAULT_NONE && amplifier->high_voltage && amplifier->fault == FAULT_NONE)
-        fail(amplifier, cause, channel);
+    amplifier->measured = measured;
+    if (!amplifier->high_voltage || amplifier->fault != FAULT_NONE)
+        return;
+    if (measured.is_interlock_open)
+        fail(amplifier, FAULT_INTERLOCK, NO_CHANNEL);
+    else if (measured.cause != FAULT_NONE)
+        fail(amplifier, measured.cause, measured.channel);
+}
+
+static bool is_cause_gone(const struct amplifier *amplifier)
+{
+    if (amplifier->fault == FAULT_INTERLOCK)
+        return !amplifier->measured.is_interlock_open;
+    return amplifier->measured.cause == FAULT_NONE;
 }
 
 void watchdog_feed(struct amplifier *amplifier)
@@ -112,7 +118,7 @@ struct verdict amplifier_arm(struct amplifier *amplifier, uint16_t watchdog, uin
 {
     if (watchdog < WATCHDOG_MIN || watchdog > WATCHDOG_MAX || session == 0)
         return refused(NAK_BAD_VALUE);
-    if (amplifier->state > OPERATION_ENABLED)
+    if (amplifier->state > OPERATION_ENABLED || amplifier->measured.is_interlock_open)
         return refused(NAK_WRONG_STATE);
     if (amplifier->state == OPERATION_ENABLED) {
         if (session != amplifier->session)
@@ -154,7 +160,7 @@ struct verdict amplifier_clear(struct amplifier *amplifier, uint8_t latch)
         return ACCEPTED;
     if (latch != amplifier->latch)
         return refused(NAK_WRONG_LATCH);
-    if (is_sounding(amplifier) || (amplifier->state == FAULT && amplifier->cause != FAULT_NONE))
+    if (is_sounding(amplifier) || (amplifier->state == FAULT && !is_cause_gone(amplifier)))
         return ACCEPTED; // too early: nothing changes, as the status shows
     amplifier->state = SWITCH_ON_DISABLED;
     amplifier->fault = FAULT_NONE;
@@ -184,6 +190,12 @@ void amplifier_sample(struct amplifier *amplifier, int16_t samples[CHANNELS])
     amplifier->watchdog_left--;
     if (amplifier->watchdog_left == 0)
         fail(amplifier, FAULT_WATCHDOG, NO_CHANNEL);
+}
+
+uint8_t amplifier_flags(const struct amplifier *amplifier)
+{
+    return (uint8_t)((amplifier->high_voltage ? HIGH_VOLTAGE_ON : 0) |
+                     (amplifier->measured.is_interlock_open ? INTERLOCK_OPEN : 0));
 }
 
 uint16_t amplifier_watchdog_left(const struct amplifier *amplifier)

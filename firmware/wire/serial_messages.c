@@ -45,10 +45,10 @@ static void write_status(struct writer *writer, const struct amplifier *amplifie
     write_u8(writer, (uint8_t)amplifier->state);
     write_u8(writer, (uint8_t)amplifier->fault);
     write_u16(writer, amplifier->active.token);
-    write_u8(writer, amplifier->high_voltage ? 1 : 0);
-    write_u16(writer, (uint16_t)amplifier->temperature);
+    write_u8(writer, amplifier_flags(amplifier));
+    write_u16(writer, (uint16_t)amplifier->measured.temperature);
     write_u16(writer, amplifier_watchdog_left(amplifier));
-    write_u16(writer, amplifier->voltage);
+    write_u16(writer, amplifier->measured.voltage);
     write_u8(writer, amplifier->latch);
     write_u8(writer, CHANNELS);
     for (unsigned i = 0; i < CHANNELS; i++)

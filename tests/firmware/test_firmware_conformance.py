@@ -24,7 +24,7 @@ async def problems(url: str) -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(
-    "line", [["--serial"], ["--modbus-rtu"], ["--modbus-tcp", "0"]], ids=" ".join
+    "line", [["--serial"], ["--modbus-rtu"], ["--modbus-tcp", "0"], ["--slcan"]], ids=" ".join
 )
 async def test_firmware_conforms_on_this_machine(firmware: Path, line: list[str]) -> None:
     """It passes every check."""

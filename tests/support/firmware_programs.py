@@ -33,7 +33,7 @@ def running_firmware(folder: Path, *options: str) -> Iterator[str]:
 MACHINE = ("qemu-system-arm", "-M", "mps2-an385", "-display", "none", "-monitor", "none")
 """QEMU's board with a Cortex-M3."""
 
-UARTS = {"serial": 0, "modbus+rtu": 1}
+UARTS = {"serial": 0, "modbus+rtu": 1, "can+slcan": 3}
 """Number of the UART of each scheme."""
 
 
@@ -48,5 +48,5 @@ def running_machine(folder: Path, scheme: str) -> Iterator[str]:
     ) as process:
         assert process.stdout is not None
         (path,) = re.findall(r"/dev/\S+", process.stdout.readline())
-        yield f"{scheme}://{path}"
+        yield f"{scheme}://{path}" + ("#1" if scheme == "can+slcan" else "")
         process.terminate()

@@ -14,6 +14,7 @@
 #include "options.h"
 
 #include <poll.h>
+#include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -29,6 +30,7 @@ static uint64_t heard_at[LINES];
 static const char *serial_number = "FW-1";
 static bool ends_with_input;
 static bool is_high_voltage;
+static volatile sig_atomic_t is_interlock_open;
 static FILE *samples_file;
 static uint64_t clock_at; // us of the clock that have become samples or were left out
 static uint64_t samples_made, time_made;
@@ -114,6 +116,17 @@ uint16_t board_voltage(void)
     return is_high_voltage ? 1800 : 0;
 }
 
+bool board_interlock_open(void)
+{
+    return is_interlock_open;
+}
+
+static void move_interlock(int number)
+{
+    (void)number;
+    is_interlock_open = !is_interlock_open;
+}
+
 enum fault board_fault(uint8_t *channel)
 {
     *channel = NO_CHANNEL;
@@ -133,7 +146,7 @@ uint8_t board_address(void)
 static void usage(const char *program)
 {
     fprintf(stderr,
-            "usage: %s [--serial] [--modbus-rtu] [--modbus-tcp PORT]\n"
+            "usage: %s [--serial] [--modbus-rtu] [--modbus-tcp PORT] [--slcan]\n"
             "       [--pipe] [--samples FILE] [--serial-number TEXT] [--until-eof]\n",
             program);
     exit(2);
@@ -157,6 +170,10 @@ void board_open(int count, char **arguments)
         } else if (strcmp(option, "--modbus-tcp") == 0 && value != NULL) {
             int port = atoi(arguments[++i]);
             printf("modbus+tcp://127.0.0.1:%d/1\n", tcp_open((uint16_t)port));
+        } else if (strcmp(option, "--slcan") == 0) {
+            const char *path;
+            lines_in[LINE_CAN] = lines_out[LINE_CAN] = open_terminal(&path);
+            printf("can+slcan://%s#1\n", path);
         } else if (strcmp(option, "--pipe") == 0) {
             lines_in[LINE_SERIAL] = STDIN_FILENO;
             lines_out[LINE_SERIAL] = STDOUT_FILENO;
@@ -175,5 +192,6 @@ void board_open(int count, char **arguments)
     if (count == 1)
         open_line(LINE_SERIAL, "serial://");
     fflush(stdout);
+    signal(SIGUSR1, move_interlock);
     clock_at = microseconds();
 }

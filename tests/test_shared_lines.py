@@ -131,6 +131,25 @@ async def test_broadcast_commit_starts_all_together(wire: Wire, two_amplifiers: 
         assert max(origins) - min(origins) < 0.005
 
 
+@pytest.mark.parametrize("kind", ["can+socketcand", "can+slcan"])
+@in_virtual_time
+async def test_can_amplifiers_start_at_the_end_of_one_frame(kind: str, two_amplifiers: Rig) -> None:
+    """By their own clocks the same moment, whatever either of them has sent before."""
+    wire = replace(SHARED_WIRES[kind], speed=500_000)
+    async with armed(wire, two_amplifiers) as (far, amplifiers):
+        both = far.bench.amplifiers.values()
+        for token in range(1, 6):
+            for name, one in amplifiers.items():
+                for _ in range(token if name == "east" else 1):
+                    await one.status()
+                await one.stage(tones(one, 0.1 * token, token=token))
+            await amplifiers["east"].commit_on_bus(token)
+            for one in amplifiers.values():
+                assert (await one.status()).token == token
+            origins = [one.outputs[0][-1].origin for one in both]
+            assert origins[0] == origins[1] > 0
+
+
 @pytest.mark.parametrize("silence", [Amplifier.stop, Amplifier.disarm])
 @in_virtual_time
 async def test_stop_does_not_wait_for_a_stuck_amplifier(

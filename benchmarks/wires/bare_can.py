@@ -17,7 +17,7 @@ CALM = 2.0  # s; the longest watchdog
 
 
 def bare_can(url: str, sets: Sequence[SafeCommandSet]) -> list[float]:
-    """python-can: send the frames of a set and SYNC, receive until its answer."""
+    """python-can: send the frames of a set, receive until its answer."""
     parsed = CanUrl.parse(url)
     answer = cob_id("answer", parsed.node)
     numbered = [(number % 254 + 1, safe) for number, safe in enumerate(sets)]
@@ -44,10 +44,12 @@ def can_codec(safe: SafeCommandSet) -> None:
         if frame.id == cob_id("order", 1):
             token, ramp, duration, what, sequence = struct.unpack("<HHHBB", frame.data)
             action, count = Action(what & 7), what >> 3
-            order = RequestFrame(token, ramp, duration, action, count, sequence, True, False)
-        elif frame.data:
+            request = RequestFrame(token, ramp, duration, action, count, sequence, fd=False)
+            buffer.take_request(request)
+        else:
             buffer.take(frame.data[6] >> 4, frame.data)
-    buffer.command_set(order)
+    assert buffer.is_complete
+    buffer.command_set(request)
 
 
 def _open(url: CanUrl) -> can.BusABC:

@@ -60,7 +60,6 @@ def _messages(node: int, channels: int) -> Iterator[_Message]:
     groups = range(-(-channels // CANOPEN["channels_per_node"]))
     nmt = (Field("nmt_command", 0, 8), Field("node", 8, 8))
     yield _Message(cob_id("nmt"), "Nmt", _HOST, nmt, length=2)
-    yield _Message(cob_id("sync"), "Sync", _HOST, (), length=0)
     yield _block(cob_id("emergency", node), "Emergency", _AMPLIFIER, "emergency")
     yield _block(cob_id("order"), "Broadcast", _HOST, "order")
     yield _block(cob_id("order", node), "Order", _HOST, "order")

@@ -10,7 +10,7 @@ from drivers.protocol.definition import PROTOCOL, WireQuantity
 _TYPES = {"u8": 0x5, "u16": 0x6, "u32": 0x7, "u64": 0x1B, "i16": 0x3, "text": 0x9, "domain": 0xF}
 _MANDATORY = (0x1000, 0x1001, 0x1018)
 _VAR, _ARRAY, _RECORD = 7, 8, 9
-_SYNCHRONOUS, _EVENT_DRIVEN = 0, 255
+_EVENT_DRIVEN = 255
 _ORDER_PDO, _SLOTS_PDO = 0x10, 0x11  # RPDO 17 and 18 and so on
 _BAUD_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
 
@@ -157,7 +157,6 @@ def _limit(value: int) -> str:
 def _defaults() -> Mapping[tuple[int, int], str]:
     return {
         (index_of("device_type"), 0): f"0x{CANOPEN['device_type']:X}",
-        (index_of("sync_cob_id"), 0): f"0x{cob_id('sync'):X}",
         (index_of("emergency_cob_id"), 0): f"$NODEID+0x{cob_id('emergency'):X}",
         (index_of("heartbeat_consumer"), 1): "0x0",
         (index_of("heartbeat_producer"), 0): f"{CANOPEN['heartbeat_ms']}",
@@ -182,20 +181,19 @@ def _pdos(channels: int) -> dict[int, list[str]]:
     ]
     objects: dict[int, list[str]] = {}
     for number, identifier, index, subindex in received:
-        kind = _SYNCHRONOUS if index == command else _EVENT_DRIVEN
-        objects[0x1400 + number] = _parameter(0x1400 + number, "RPDO", identifier, kind)
+        objects[0x1400 + number] = _parameter(0x1400 + number, "RPDO", identifier)
         objects[0x1600 + number] = _mapping(0x1600 + number, "RPDO", index, subindex)
     for number, (identifier, index, subindex) in enumerate(sent):
-        objects[0x1800 + number] = _parameter(0x1800 + number, "TPDO", identifier, _EVENT_DRIVEN)
+        objects[0x1800 + number] = _parameter(0x1800 + number, "TPDO", identifier)
         objects[0x1A00 + number] = _mapping(0x1A00 + number, "TPDO", index, subindex)
     return objects
 
 
-def _parameter(index: int, what: str, identifier: int, kind: int) -> list[str]:
+def _parameter(index: int, what: str, identifier: int) -> list[str]:
     return [
         *_head_of(index, f"{what} communication parameter", count=2, kind=_RECORD),
         *_constant(index, 1, "COB-ID", "u32", f"$NODEID+0x{identifier:X}"),
-        *_constant(index, 2, "transmission type", "u8", f"{kind}"),
+        *_constant(index, 2, "transmission type", "u8", f"{_EVENT_DRIVEN}"),
     ]
 
 

@@ -35,7 +35,8 @@ _FAULTS = {
 class SimulatedDevice:
     """An amplifier of a bench by name; address: on its wire, from 1.
 
-    Its time is that of the running event loop.
+    Its time is that of the running event loop. time: of a request that arrives [s]; replaced by a
+    wire on which several receive one frame.
     """
 
     def __init__(
@@ -43,6 +44,7 @@ class SimulatedDevice:
     ) -> None:
         self.name = name
         self.address = address
+        self.time = clock.now
         self.faults = Faults() if faults is None else faults
         self._bench = bench
         self._amplifier = bench.amplifiers[name]
@@ -81,7 +83,7 @@ class SimulatedDevice:
 
     def exchange(self, request: Request) -> Reply | None:
         """The reply to a request that arrives now; None for no reply."""
-        now = clock.now()
+        now = self.time()
         if not self.is_answering:
             return None
         if self.faults.now("nak_storm", now):

@@ -1,19 +1,17 @@
 """Decoder for CAN, from docs/reference/wire-can.md: requests, replies, sets, heartbeats, EMCY.
 
-A set consists of the commands with the sequence number of its request. Of SDO and NMT only
-identification, envelope transfers and boot-up are decoded.
+Of SDO and NMT only identification, envelope transfers and boot-up are decoded.
 """
 
 import struct
 from collections.abc import Mapping
 
 from sim.witness import quantities as q
+from sim.witness.can_requests import ACTIONS, FILLING, PER_NODE, WITH_COMMANDS, CanRequests
 from sim.witness.can_text import CanFrame, SlcanText, SocketcandText
 from sim.witness.decoded import (
-    INCOMPLETE_SET,
     SETS,
     BootUp,
-    ChannelCommand,
     Damaged,
     DecodedFrame,
     Direction,
@@ -24,13 +22,6 @@ from sim.witness.decoded import (
     StateEvent,
 )
 from sim.witness.quantities import INVALID, OutOfRange
-
-_ACTIONS = (
-    *(RequestKind.STATUS, RequestKind.APPLY, RequestKind.STAGE, RequestKind.COMMIT),
-    *(RequestKind.ARM, RequestKind.DISARM, RequestKind.STOP, RequestKind.CLEAR),
-)
-_FILLING = b"\xff" * 8
-_PER_NODE = 4
 
 
 class CanDecoder:
@@ -51,18 +42,18 @@ class CanDecoder:
             if text.is_damaged:
                 seen.append((text.raw, Damaged("a malformed frame line")))
             elif text.frame is not None:
-                seen += [(text.raw, message) for message in self.take(direction, text.frame)]
+                seen += [(text.raw, message) for message in self.take(direction, time, text.frame)]
         return seen
 
     def has_partial_frame(self, direction: Direction) -> bool:
         """Whether the last bytes in this direction begin a frame."""
         return self._text[direction].has_partial_frame
 
-    def take(self, direction: Direction, frame: CanFrame) -> list[Message | None]:
-        """Decode one frame; one message for each amplifier that it concerns."""
+    def take(self, direction: Direction, time: float, frame: CanFrame) -> list[Message | None]:
+        """Decode one frame at a time [s]; a message for each amplifier and set that it concerns."""
         try:
             if direction == "amplifier":
-                return self._decode_request(frame)
+                return self._decode_request(time, frame)
             return self._decode_reply(frame)
         except INVALID as problem:
             node = frame.identifier & 0x7F
@@ -70,28 +61,22 @@ class CanDecoder:
                 return [Request(RequestKind.READ, node, problem=str(problem))]
             return [Damaged(f"an invalid frame: {problem}")]
 
-    def _decode_request(self, frame: CanFrame) -> list[Message | None]:
+    def _decode_request(self, time: float, frame: CanFrame) -> list[Message | None]:
         function, number = frame.identifier & 0x780, frame.identifier & 0x7F
         if frame.identifier == 0:
-            return [None]
-        if frame.identifier == 0x080:
-            for node in self._nodes.values():
-                node.commands.clear()
-                node.slots.clear()
             return [None]
         if function == 0x700:
             return [Request(RequestKind.PING, 128 - number)]
         if frame.identifier == 0x480:
             return [_broadcast(frame)]
-        if function == 0x480 and number in self._nodes:
-            return [self._nodes[number].request(frame)]
         for node in self._nodes.values():
-            if node.owns(frame):
-                node.take(frame)
-                return [None]
+            if node.requests.owns(frame):
+                return node.requests.take(time, frame) or [None]
         if function == 0x600 and number in self._nodes:
             index = int.from_bytes(frame.data[1:3], "little")
             identifies = frame.data[0] == 0x40 and index in (0x1018, 0x2000)
+            if frame.data[0] & 0xE3 == 0xC1:  # the end of a block: only envelopes are written so
+                return [Request(RequestKind.ENVELOPE, number)]
             return [Request(RequestKind.HELLO if identifies else RequestKind.READ, number)]
         return [None]
 
@@ -107,7 +92,7 @@ class CanDecoder:
             return [Reply(number, "objects")]
         for node in self._nodes.values():
             if frame.identifier == 0x180 + node.number:
-                return [node.reply(frame)]
+                return [*node.requests.end_set(frame.data[0]), node.reply(frame)]
             if frame.identifier == 0x280 + node.number:
                 node.status = frame.data
                 return [None]
@@ -118,87 +103,14 @@ class CanDecoder:
 
 
 class _Node:
-    """Frames to and from one amplifier whose message is incomplete."""
+    """Requests to one amplifier, and frames from it whose message is incomplete."""
 
     def __init__(self, number: int, channels: int) -> None:
         self.number = number
-        self.numbers = range(number, number + max(1, -(-channels // _PER_NODE)))
-        self.commands: dict[int, bytes] = {}
-        self.slots: dict[int, tuple[int, int, int]] = {}
+        self.numbers = range(number, number + max(1, -(-channels // PER_NODE)))
+        self.requests = CanRequests(number, self.numbers)
         self.status: bytes | None = None
         self.levels: dict[int, bytes] = {}
-
-    def owns(self, frame: CanFrame) -> bool:
-        """Whether a frame holds commands or slots for this amplifier."""
-        function, number = frame.identifier & 0x780, frame.identifier & 0x7F
-        if frame.identifier == 0x680 + self.number:
-            return True
-        return function in (0x200, 0x300, 0x400, 0x500) and number in self.numbers
-
-    def take(self, frame: CanFrame) -> None:
-        """Store a command, the commands of a CAN FD frame, or slots."""
-        if frame.identifier == 0x680 + self.number:
-            word, group = int.from_bytes(frame.data[:6], "little"), frame.data[6] & 3
-            for place in range(_PER_NODE):
-                pair = word >> 12 * place & 0xFFF
-                self.slots[_PER_NODE * group + place] = pair & 0x3F, pair >> 6, frame.data[7]
-        elif frame.is_fd:
-            self.take_blocks(frame.data)
-        else:
-            group = (frame.identifier & 0x7F) - self.number
-            self.commands[_PER_NODE * group + (frame.identifier >> 8) - 2] = frame.data
-
-    def take_blocks(self, data: bytes) -> None:
-        """Store consecutive commands; fillers are skipped."""
-        for at in range(0, len(data) - 7, 8):
-            block = data[at : at + 8]
-            if block != _FILLING:
-                self.commands[block[6] >> 4] = block
-
-    def request(self, frame: CanFrame) -> Request:
-        """Decode a request with the commands of its sequence number."""
-        token, ramp, time, what, sequence = struct.unpack_from("<HHHBB", frame.data)
-        kind, count = _ACTIONS[what & 7], what >> 3
-        self.commands = {at: block for at, block in self.commands.items() if block[7] == sequence}
-        if frame.is_fd:
-            self.take_blocks(frame.data[8:])
-        key = (self.number, sequence, kind)
-        problem = "" if sequence else "sequence number 0"
-        commands: dict[int, ChannelCommand] = {}
-        try:
-            if kind in (RequestKind.APPLY, RequestKind.STAGE):
-                commands = self._channel_commands(sequence)
-                if len(commands) != count:
-                    problem = f"{INCOMPLETE_SET}: {len(commands)} of {count} commands"
-            return q.request_of(
-                kind,
-                self.number,
-                key,
-                token=token if kind in SETS else None,
-                ramp=ramp,
-                valid_for=time if commands else 0,
-                watchdog=time if kind is RequestKind.ARM else None,
-                commands=commands,
-                problem=problem,
-            )
-        except OutOfRange as wrong:
-            return Request(kind, self.number, key, problem=str(wrong))
-
-    def _channel_commands(self, sequence: int) -> dict[int, ChannelCommand]:
-        commands = {}
-        for channel, block in self.commands.items():
-            frequency, level, phase, flags, own = struct.unpack("<HHhBB", block)
-            if own != sequence:
-                continue
-            if flags >> 4 != channel or flags & 8:
-                raise OutOfRange(f"command for channel {flags >> 4} in the frame of {channel}")
-            onset, ending, of = self.slots.get(channel, (0, 0, -1)) if flags & 4 else (0, 0, own)
-            if of != own:
-                raise OutOfRange(f"{INCOMPLETE_SET}: no slots for channel {channel}")
-            commands[channel] = q.command_of(
-                frequency, level, phase, flags, onset=onset, ending=ending
-            )
-        return commands
 
     def reply(self, frame: CanFrame) -> Message:
         """Decode a reply with the status and levels sent before it, or an event."""
@@ -216,14 +128,14 @@ class _Node:
             _, flag, temperature, _, count = struct.unpack_from("<BBhHB", status)
             high_voltage = bool(flag & 1)
             reported = _levels(levels, count & 0x1F, sequence)
-        kind = _ACTIONS[what & 7]
+        kind = ACTIONS[what & 7]
         is_whole = reported is not None or result or kind in SETS
         return Reply(
             self.number,
             (self.number, sequence, kind),
             refusal=result,
             problem="" if is_whole else "status or levels are missing",
-            is_exact=bool(what & 8) if kind in (RequestKind.APPLY, RequestKind.STAGE) else None,
+            is_exact=bool(what & 8) if kind in WITH_COMMANDS else None,
             status=q.status_of(
                 state,
                 fault,
@@ -237,7 +149,7 @@ class _Node:
 
     def _take_reply(self, data: bytes) -> None:
         blocks = [data[at : at + 8] for at in range(0, len(data) - 7, 8)]
-        blocks = [block for block in blocks if block != _FILLING]
+        blocks = [block for block in blocks if block != FILLING]
         if blocks:
             self.status = blocks[0]
             self.levels = dict(enumerate(blocks[1:]))
@@ -245,7 +157,7 @@ class _Node:
 
 def _broadcast(frame: CanFrame) -> Request:
     token, ramp, _, what, _ = struct.unpack_from("<HHHBB", frame.data)
-    kind = _ACTIONS[what & 7]
+    kind = ACTIONS[what & 7]
     if kind is RequestKind.COMMIT:
         return q.request_of(kind, 0, None, token=token)
     if kind is RequestKind.STOP:
@@ -256,10 +168,10 @@ def _broadcast(frame: CanFrame) -> Request:
 def _levels(blocks: dict[int, bytes], count: int, sequence: int) -> list[int] | None:
     """Levels of `count` channels; None where a block is missing."""
     levels: list[int] = []
-    for group in range(-(-count // _PER_NODE)):
+    for group in range(-(-count // PER_NODE)):
         block = blocks.get(group)
         if block is None or block[7] != sequence:
             return None
         word = int.from_bytes(block[:7], "little")
-        levels += [word >> 14 * place & 0x3FFF for place in range(_PER_NODE)]
+        levels += [word >> 14 * place & 0x3FFF for place in range(PER_NODE)]
     return levels[:count]

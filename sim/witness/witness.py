@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from sim.witness.amplifier_session import AmplifierSession
 from sim.witness.config import WitnessConfig, parse_config
-from sim.witness.decoded import STATE_CHANGING, Damaged, Data, Direction
+from sim.witness.decoded import STATE_CHANGING, Damaged, Data, Direction, Request
 from sim.witness.exchanges import Exchanges
 from sim.witness.host_rules import HostRules
 from sim.witness.reference_amplifier import ReferenceAmplifier
@@ -88,7 +88,7 @@ class Witness:
                 continue
             if isinstance(message, Damaged):
                 self._exchanges.damaged(wire, time, direction, message, begun=begun)
-            if direction == "amplifier":
+            if direction == "amplifier" or isinstance(message, Request):
                 self._exchanges.sent(wire, time, raw, message)
             else:
                 self._exchanges.received(wire, time, message)

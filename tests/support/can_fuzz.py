@@ -4,11 +4,10 @@ A telegram is the frames of a request: identifier (bit 15: CAN FD), length, data
 be damaged. The far end and the host's readers take the frames, and both kinds of adapters the text.
 """
 
-import asyncio
 import struct
 from collections.abc import Sequence
-from typing import cast
 
+from can_session import INCOMPLETE_LIFE, Timers
 from drivers.codec.can_bus.adapter_text import (
     SlcanReader,
     SocketcandReader,
@@ -42,15 +41,6 @@ _REVIVAL = 10  # telegrams until it is operational and armed again
 _ENVELOPE_SLOT = 5
 
 
-class _Never:
-    """A timer that never expires."""
-
-    def cancel(self) -> None: ...
-
-
-_NEVER = cast(asyncio.TimerHandle, _Never())
-
-
 class CanEnds:
     """A node and the host's readers; telegrams: frames of good requests and answers."""
 
@@ -58,7 +48,8 @@ class CanEnds:
         self._device = FakeDevice()
         self._said: list[CanFrame] = []
         self._node = CanNode(self._device, 1, send=self._said.append)  # type: ignore[arg-type]
-        self._node.start(lambda delay, callback: _NEVER)
+        self._timers = Timers()
+        self._node.start(self._timers.call_later)
         self._revive()
         self._answers = CanReplyReader(1)
         self._taken = 0
@@ -79,11 +70,12 @@ class CanEnds:
         for frame in self._said:
             self._hear(frame)
         self._device.pass_time(0.01)
+        self._timers.ring(INCOMPLETE_LIFE)
         return list(self._device.asked)
 
     def mend(self, data: bytes) -> bytes:
-        """Append a SYNC, so that a set takes effect."""
-        return data + _pack([CanFrame(0x80, b"")])
+        """Leave it as it is: the last frame of a set makes it take effect."""
+        return data
 
     def _hear(self, frame: CanFrame) -> None:
         """Feed the frame to every reader of the host."""
@@ -136,7 +128,7 @@ class CanTexts:
         self._client.transport = _Deaf()  # type: ignore[assignment]
         self._readers = (SlcanReader(), SocketcandReader())
         self._bus.join(self.asked.append)
-        frames = [CanFrame(0x481, bytes(range(8))), CanFrame(0x80, b"")]
+        frames = [CanFrame(0x481, bytes(range(8))), CanFrame(0x77F, b"\x05")]
         fd = CanFrame(0x481, bytes(48), fd=True)
         self.telegrams = [
             *(write(one) for one in (*frames, fd) for write in (slcan_line, socketcand_element)),

@@ -5,7 +5,7 @@ amplifier's by the far end, which shares no code with the encoder.
 """
 
 import asyncio
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -30,6 +30,7 @@ from fake_device import FakeDevice
 from sim.far_ends.can_bus.node import CanNode
 
 NODE = 1
+HEARTBEAT, INCOMPLETE_LIFE = 0.05, 0.1  # s, as on the page
 
 
 @dataclass(frozen=True)
@@ -48,23 +49,36 @@ class Step:
 
 
 class Timers:
-    """The heartbeat's timer, fired by the test."""
+    """Timers of a node, fired by the test, by their delay [s]."""
 
     def __init__(self) -> None:
-        self._due: list[object] = []
+        self._due: list[_Timer] = []
 
-    def call_later(self, delay: float, callback: object) -> asyncio.TimerHandle:
-        if delay > 0.02:
-            self._due = [callback]
-        return cast(asyncio.TimerHandle, self)
+    def call_later(self, delay: float, callback: Callable[[], None]) -> asyncio.TimerHandle:
+        timer = _Timer(delay, callback)
+        self._due.append(timer)
+        return cast(asyncio.TimerHandle, timer)
+
+    def ring(self, delay: float = HEARTBEAT) -> None:
+        """Fire the timers of this delay that are not cancelled."""
+        due = [timer for timer in self._due if timer.delay == delay]
+        self._due = [timer for timer in self._due if timer.delay != delay]
+        for timer in due:
+            if not timer.is_cancelled:
+                timer.callback()
+
+
+@dataclass
+class _Timer:
+    """A timer that was started."""
+
+    delay: float
+    callback: Callable[[], None]
+    is_cancelled: bool = False
 
     def cancel(self) -> None:
         """As a timer."""
-
-    def ring(self) -> None:
-        (callback,) = self._due
-        assert callable(callback)
-        callback()
+        self.is_cancelled = True
 
 
 class Session:
@@ -121,9 +135,11 @@ class Session:
             node=NODE,
             sequence=8,
         )
-        yield self._asked(
-            "Apply token 516, with the frame of channel 3 lost", incomplete[0], *incomplete[2:]
-        )
+        lost = self._asked("", incomplete[0], *incomplete[2:])
+        self.device.pass_time(INCOMPLETE_LIFE)
+        self.timers.ring(INCOMPLETE_LIFE)
+        title = "Apply token 516, with the frame of channel 3 lost: an answer after 100 ms"
+        yield Step(title, (*lost.frames, *self._heard("").frames))
         shape = self.guard.check_envelope(Envelope(5, 0.005, (Knot(0.1, 90.0), Knot(1.0, -0.01))))
         assert (
             pack_envelope(LoadEnvelope(shape))

@@ -300,10 +300,9 @@ async def _knows_already(ask: Any, link: Link, request: Any, **how: Any) -> Any:
     return await ask(link, request, **how)
 
 
-def _without_sync(encode: Any, request: Any, **how: Any) -> Any:
+def _without_order(encode: Any, request: Any, **how: Any) -> Any:
     frames = encode(request, **how)
-    is_set = isinstance(request, Apply | Stage)
-    return tuple(one for one in frames if one != requests.SYNC) if is_set else frames
+    return frames[:-1] if isinstance(request, Apply | Stage) else frames
 
 
 def _with_wrong_checksum(block: Any, *args: Any) -> Any:
@@ -368,8 +367,8 @@ DRIVERS: dict[str, Bug] = {
     ),
     "a stop is sent as a disarm": Bug("stop", replaced(Amplifier, "stop", Amplifier.disarm)),
     "no amplifier is identified": Bug("identified", wrapped(Link, "request", _knows_already)),
-    "sets are sent without their SYNC": Bug(
-        "answer", wrapped(can_backend, "encode_request", _without_sync), wire="slcan"
+    "sets are sent without their order": Bug(
+        "touch", wrapped(can_backend, "encode_request", _without_order), wire="slcan"
     ),
     "a command has the sequence number before": Bug(
         "commit",
@@ -470,12 +469,6 @@ def _all_but_the_ninth(write: Any, end: Any, data: bytes) -> None:
         write(end, data)
 
 
-def _incomplete(make: Any, buffer: SetBuffer, request: Any) -> CommandSet:
-    own = [one for one in buffer._commands.values() if one.sequence == request.sequence]
-    made: CommandSet = make(buffer, replace(request, count=len(own)))
-    return made
-
-
 def _without_levels(answer: Any, handler: Any, request: Any, **how: Any) -> None:
     answer(handler, request, **{**how, "condition": how.get("condition", ())[:1]})
 
@@ -559,7 +552,7 @@ FAR_ENDS: dict[str, Bug] = {
     ),
     "an incomplete set is played": Bug(
         "commit",
-        wrapped(SetBuffer, "command_set", _incomplete),
+        replaced(SetBuffer, "is_complete", property(lambda buffer: buffer.request is not None)),
         scenarios.incomplete_set,
         wire="slcan",
     ),

@@ -22,7 +22,7 @@ INCOMPLETE_SET = 15
 NO_CHANNEL = 255
 CHANNELS = 4
 LOWEST, HIGHEST = 400, 12000  # 0.05 Hz
-HEARTBEAT, WATCHDOG_FADE = 0.05, 0.005  # s
+HEARTBEAT, WATCHDOG_FADE, COLLECTING = 0.05, 0.005, 0.1  # s
 
 VERSIONS = 1 << 2
 TEXTS = {1: "Elsewhere Ltd", 2: "From the page", 3: "EL-0042", 4: "0.1"}
@@ -78,8 +78,7 @@ class VendorAmplifier:
         self.channels = [Channel() for _ in range(CHANNELS)]
         self._forget()
         self.host, self.watchdog, self.fed = 0, 0.0, 0.0
-        self.commands: dict[int, bytes] = {}
-        self.order: bytes | None = None
+        self._begin_set(0, 0.0)
         self.ends_at, self.end_ramp = math.inf, 0.0
         self.upload = b""
         self.achieved = b""
@@ -125,19 +124,20 @@ class VendorAmplifier:
         elif self.nmt != OPERATIONAL:
             return
         elif identifier in (0x200 + NODE, 0x300 + NODE, 0x400 + NODE, 0x500 + NODE):
-            if len(data) == 8:
+            if len(data) == 8 and self._belongs(bits(data, 56, 8), now):
                 self.commands[(identifier - 0x200) >> 8] = data
+                self._check_set(now)
+        elif identifier == 0x680 + NODE and len(data) == 8:
+            if self._belongs(bits(data, 56, 8), now):
+                self.has_slots = True
+                self._check_set(now)
         elif identifier == 0x480 + NODE and len(data) == 8:
             self._ordered(data, now)
         elif identifier == 0x480 and len(data) == 8:
-            if bits(data, 48, 3) == STOP:
-                self._take_place(0)
+            if data[7] == 0 and bits(data, 48, 3) == STOP:
                 self._stop(bits(data, 16, 16), now)
-            elif bits(data, 48, 3) == COMMIT:
-                self._take_place(0)
-                self.order = data
-        elif identifier == 0x080:
-            self._sync(now)
+            elif data[7] == 0 and bits(data, 48, 3) == COMMIT:
+                self._set(data, now)
 
     def _manage(self, command: int, now: float) -> None:
         if command == 129:
@@ -158,9 +158,15 @@ class VendorAmplifier:
         action, sequence = bits(order, 48, 3), bits(order, 56, 8)
         if sequence == 0:
             return
-        self._take_place(sequence)
-        if action in (APPLY, STAGE, COMMIT):
-            self.order = order  # until the SYNC
+        if action in (APPLY, STAGE):
+            if self._belongs(sequence, now):
+                self.order = order
+                self._check_set(now)
+            return
+        if self.collected and 1 <= (sequence - self.collected) % 255 <= 127:
+            self._begin_set(0, now)
+        if action == COMMIT:
+            self._carry_out(order, now)
             return
         result = DONE
         ramp, span = bits(order, 16, 16), bits(order, 32, 16)
@@ -195,33 +201,39 @@ class VendorAmplifier:
             self._tell_condition(sequence, now)
         self._answer(sequence, action, result, now)
 
-    def _take_place(self, sequence: int) -> None:
-        """Discard what waits for a SYNC under another number."""
-        self.order = None
-        self.commands = {
-            number: data for number, data in self.commands.items() if data[7] == sequence
-        }
+    def _begin_set(self, sequence: int, now: float) -> None:
+        """Discard what was collected; 0: collect nothing."""
+        self.collected, self.collected_since = sequence, now
+        self.commands: dict[int, bytes] = {}
+        self.has_slots = False  # of its only group
+        self.order: bytes | None = None
 
-    def _sync(self, now: float) -> None:
-        commands, order = self.commands, self.order
-        self.commands, self.order = {}, None
-        if order is None:
-            for data in list(commands.values())[:1]:
-                self._answer(bits(data, 56, 8), APPLY, INCOMPLETE_SET, now)
+    def _belongs(self, sequence: int, now: float) -> bool:
+        """Whether a frame belongs to the set that is collected, or begins one."""
+        if sequence == 0:
+            return False
+        if not self.collected or 1 <= (sequence - self.collected) % 255 <= 127:
+            self._begin_set(sequence, now)
+        return sequence == self.collected
+
+    def _check_set(self, now: float) -> None:
+        """Carry out the set as soon as it is complete."""
+        if self.order is None or len(self.commands) != bits(self.order, 51, 5):
             return
-        action, sequence = bits(order, 48, 3), bits(order, 56, 8)
-        result, channel = self._set(order, commands, now)
-        if sequence:
-            if result == DONE:
-                self.fed = now
-            self._answer(sequence, action, result, now, channel=channel)
+        if self.has_slots or not any(bits(data, 50, 1) for data in self.commands.values()):
+            self._carry_out(self.order, now)
+            self._begin_set(0, now)
 
-    def _set(self, order: bytes, commands: dict[int, bytes], now: float) -> tuple[int, int]:
-        """Carry out a set or commit at its SYNC; its result, and the channel at fault."""
-        action, token = bits(order, 48, 3), bits(order, 0, 16)
-        mine = {c: data for c, data in commands.items() if data[7] == order[7]}
-        if action != COMMIT and len(mine) != bits(order, 51, 5):
-            return INCOMPLETE_SET, NO_CHANNEL
+    def _carry_out(self, order: bytes, now: float) -> None:
+        action, sequence = bits(order, 48, 3), bits(order, 56, 8)
+        result, channel = self._set(order, now)
+        if result == DONE:
+            self.fed = now
+        self._answer(sequence, action, result, now, channel=channel)
+
+    def _set(self, order: bytes, now: float) -> tuple[int, int]:
+        """Carry out a complete set or a commit; its result, and the channel at fault."""
+        action, token, mine = bits(order, 48, 3), bits(order, 0, 16), self.commands
         if self.state != ARMED:
             return WRONG_STATE, NO_CHANNEL
         if token == 0:
@@ -275,6 +287,12 @@ class VendorAmplifier:
             self._send(0x700 + NODE, bytes([self.nmt]))
         if now >= self.ends_at:
             self._silence(self.end_ramp, now)
+        if self.collected and now - self.collected_since >= COLLECTING:
+            order = self.order
+            self._begin_set(0, now)
+            if order is not None:
+                action, sequence = bits(order, 48, 3), bits(order, 56, 8)
+                self._answer(sequence, action, INCOMPLETE_SET, now)
         if self.state == ARMED and now - self.fed > self.watchdog:
             self._silence(WATCHDOG_FADE, now)
             self.staged = None
@@ -343,11 +361,7 @@ class VendorAmplifier:
         self._send(
             0x180 + NODE,
             frame(
-                *(
-                    (sequence, 0, 8),
-                    (action, 8, 3),
-                    (is_exact, 11, 1),
-                ),
+                *((sequence, 0, 8), (action, 8, 3), (is_exact, 11, 1)),
                 *((result, 12, 4), (self.state, 16, 4), (self.fault, 20, 4), (channel, 24, 8)),
                 *((self.token, 32, 16), (round(left * 1000), 48, 16)),
             ),

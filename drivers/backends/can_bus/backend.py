@@ -43,6 +43,7 @@ from drivers.protocol.messages import (
     LoadEnvelope,
     Nak,
     NakCode,
+    Ping,
     Reply,
     Request,
     Stage,
@@ -52,6 +53,7 @@ from drivers.statistics import WireCounters
 
 _BROADCAST_TIMEOUT = 0.03  # s; for room in the transmit queue
 _MAX_SDO_RESPONSES = 40  # of one job
+_FRAMES_APART = 8  # from a heartbeat to its order: that long the bus may be busy
 _START = CANOPEN["nmt"]["start"]
 _T = TypeVar("_T")
 
@@ -176,6 +178,12 @@ class CanBackend(WireBackend):
         bus = self._url.bus
         timeout = max(timeout, 2 * self.wire_times.frames(frames) + PROTOCOL.reaction)
         deadline = clock.now() + timeout
+        if isinstance(request, Ping):
+            # An adapter that transmits by priority would send the status order before it.
+            beat, *frames_left = frames
+            await self._send([beat], request, timeout)
+            await asyncio.sleep(_FRAMES_APART * self.wire_times.frames([beat]))
+            frames = tuple(frames_left)
         await self._send(frames, request, timeout)
         try:
             can_reply = await self._pending.reply_to(

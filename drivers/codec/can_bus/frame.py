@@ -90,8 +90,9 @@ def command_id(node: int, channel: int) -> int:
 
 
 _FUNCTION = 0x780  # bits of a COB-ID besides the node
+_SYNC = 0x080  # of other devices; that of the emergency of node 0, which does not exist
 _KINDS: Mapping[int, str] = {
-    **{base: kind for kind, base in CANOPEN["cob_ids"].items() if kind != "sync"},
+    **{base: kind for kind, base in CANOPEN["cob_ids"].items()},
     **{cob_id("command") + 0x100 * index: "command" for index in range(4)},
 }
 
@@ -99,7 +100,7 @@ _KINDS: Mapping[int, str] = {
 def meaning(frame: CanFrame) -> str:
     """Describe a frame: its kind, its node, and the fields of its blocks."""
     kind = _KINDS.get(frame.id & _FUNCTION, "unknown")
-    if frame.id == cob_id("sync"):
+    if frame.id == _SYNC:
         return "sync"
     layout = LAYOUTS.get(kind)
     blocks = [frame.data[at : at + BLOCK] for at in range(0, len(frame.data), BLOCK)]

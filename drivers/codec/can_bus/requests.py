@@ -1,8 +1,8 @@
 """Time-critical requests as CAN frames; no I/O.
 
 A request is an *order* PDO, and its reply a PDO with the same sequence number (see `replies`). The
-commands of a set precede its order, one PDO per channel with the same sequence number, and take
-effect at the SYNC that follows: all or, if a frame is missing, none. On CAN FD the order and its
+commands of a set are one PDO per channel with the same sequence number. It takes effect with the
+last of its frames, in whatever order an adapter transmits them. On CAN FD the order and its
 commands are one frame. Identity, capabilities, faults and envelopes are SDO transfers (`objects`).
 """
 
@@ -36,8 +36,6 @@ _FD_BLOCKS = 8
 _FD_LENGTHS = (8, 12, 16, 20, 24, 32, 48, 64)
 _FILLING = b"\xff"  # filler; its level is out of range
 
-SYNC = CanFrame(cob_id("sync"), b"")
-
 
 def action_of(request: PdoRequest) -> int:
     """Return the action code of a request; a Ping is a heartbeat and the action status."""
@@ -63,20 +61,17 @@ def encode_request(
         case Ping():
             beat = CanFrame(cob_id("heartbeat", host_number(node)), bytes([_OPERATIONAL]))
             return (beat, order)
-        case Commit():
-            return (order, SYNC)
         case Apply(command_set=requested) | Stage(command_set=requested):
             together = _in_fd_frames if fd else _in_classic_frames
             shapes = _slots(requested.commands, node, sequence)
-            return (*shapes, *together(order, requested.commands, node, sequence), SYNC)
+            return (*shapes, *together(order, requested.commands, node, sequence))
         case _:
             return (order,)
 
 
 def encode_broadcast(request: Broadcast) -> tuple[CanFrame, ...]:
     """Encode a request to every amplifier of the bus; there are no replies."""
-    order = _order(request, 0, 0)
-    return (order, SYNC) if isinstance(request, Commit) else (order,)
+    return (_order(request, 0, 0),)
 
 
 def requested_commands(requested: CommandSet) -> tuple[DriveCommand, ...]:

@@ -44,14 +44,13 @@ class CanTimes(WireTimes):
 
     def round_trip(self, channels: int) -> float:
         """See `WireTimes`."""
-        sync = self.frame(0)
         if self.fd:
-            return self.fd_frame(BLOCK * (1 + channels)) + sync + self.fd_frame(BLOCK)
-        return (channels + 2) * self.frame(BLOCK) + sync
+            return self.fd_frame(BLOCK * (1 + channels)) + self.fd_frame(BLOCK)
+        return (channels + 2) * self.frame(BLOCK)
 
     def commit(self) -> float:
-        """See `WireTimes`; with its SYNC."""
-        return self.frame(BLOCK) + self.frame(0)
+        """See `WireTimes`."""
+        return self.frame(BLOCK)
 
     def loading(self, knots: int) -> float:
         """See `WireTimes`; an SDO block transfer with its replies.

@@ -1,13 +1,15 @@
-"""A CAN bus within this process: a frame of one member is received by all others.
+"""A CAN bus within this process: a frame of one member is received by all others, at one time.
 
-Each amplifier has a line of its own each way, with transmission time and faults; a damaged frame
-fails its CRC and is dropped. Not modelled: arbitration, retransmission, bus-off.
+Each amplifier has faults of its own each way; a damaged frame fails its CRC and is dropped. Not
+modelled: arbitration, retransmission, bus-off.
 """
 
+import asyncio
 import struct
 import zlib
 from collections.abc import Callable
 
+from drivers import clock
 from drivers.codec.can_bus.frame import CanFrame
 from sim.faults.fault_window import Faults
 from sim.transport.line import TwoWayLine
@@ -17,15 +19,23 @@ LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 
 Listener = Callable[[CanFrame], None]
 
+_OVERHEAD = 8  # bytes of a frame beside its data, about, with stuffing and gap
 _HEAD = struct.Struct("<L")
 _FD = 1 << 31
 
 
 class CanBus:
-    """A bus whose members are identified by their listeners."""
+    """A bus whose members are identified by their listeners.
 
-    def __init__(self) -> None:
+    bitrate [bit/s]: None for no transmission time.
+    """
+
+    def __init__(self, bitrate: int | None = None) -> None:
         self._members: list[Listener] = []
+        self._bitrate = bitrate
+        self._free_from = 0.0
+        self._in_flight: set[asyncio.TimerHandle] = set()
+        self._end_of_frame: float | None = None
 
     def join(self, listener: Listener) -> None:
         """Add a member."""
@@ -36,32 +46,48 @@ class CanBus:
         if listener in self._members:
             self._members.remove(listener)
 
+    def time(self) -> float:
+        """The time [s]; the same for all members while they receive a frame."""
+        return clock.now() if self._end_of_frame is None else self._end_of_frame
+
     def send(self, frame: CanFrame, *, sender: Listener) -> None:
-        """Deliver a frame to all but its sender."""
-        for member in tuple(self._members):
-            if member is not sender:
-                member(frame)
+        """Deliver a frame to all but its sender, after the frames that were sent before."""
+        if self._bitrate is None:
+            self._deliver(frame, sender)
+            return
+
+        def arrive() -> None:
+            self._in_flight.discard(timer)
+            self._deliver(frame, sender)
+
+        bits = 8 * (_OVERHEAD + len(frame.data))
+        self._free_from = max(clock.now(), self._free_from) + bits / self._bitrate
+        timer = asyncio.get_running_loop().call_at(self._free_from, arrive)
+        self._in_flight.add(timer)
+
+    def close(self) -> None:
+        """Discard the frames in flight."""
+        for timer in self._in_flight:
+            timer.cancel()
+        self._in_flight.clear()
+
+    def _deliver(self, frame: CanFrame, sender: Listener) -> None:
+        before, self._end_of_frame = self._end_of_frame, self.time()
+        try:
+            for member in tuple(self._members):
+                if member is not sender:
+                    member(frame)
+        finally:
+            self._end_of_frame = before
 
 
 class Stub:
-    """The connection of one amplifier; receive: called with each frame.
+    """The connection of one amplifier; receive: called with each frame."""
 
-    bitrate [bit/s]: None for no transmission time.
-    """
-
-    def __init__(
-        self, bus: CanBus, receive: Listener, *, faults: Faults, bitrate: int | None = None
-    ) -> None:
+    def __init__(self, bus: CanBus, receive: Listener, *, faults: Faults) -> None:
         self._bus = bus
         self._hears = receive
-        # Eight bytes beside the data, about the overhead of a frame with stuffing and gap.
-        self._line = TwoWayLine(
-            to_amplifier=self._arrive,
-            to_host=self._leave,
-            faults=faults,
-            bits_per_second=bitrate,
-            bits_per_byte=8,
-        )
+        self._line = TwoWayLine(to_amplifier=self._arrive, to_host=self._leave, faults=faults)
         self._listener = self._hear  # one object, which identifies the member
         bus.join(self._listener)
 

@@ -18,18 +18,15 @@ _PER_NODE: int = PROTOCOL.canopen["channels_per_node"]
 
 @asynccontextmanager
 async def nodes_on(
-    bus: CanBus, devices: Sequence[SimulatedDevice], *, bitrate: int | None = None
+    bus: CanBus, devices: Sequence[SimulatedDevice]
 ) -> AsyncIterator[dict[str, int]]:
-    """Put amplifiers on a bus; yields the node of each by name.
-
-    bitrate [bit/s]: None for no transmission time.
-    """
+    """Put amplifiers on a bus; yields the node of each by name."""
     with contextlib.ExitStack() as stack:
         numbers = {}
         number = 1
         for device in devices:
             numbers[device.name] = number
-            stack.enter_context(_node_on(bus, device, number, bitrate))
+            stack.enter_context(_node_on(bus, device, number))
             number += -(-device.capabilities.channels // _PER_NODE)
         yield numbers
 
@@ -39,7 +36,7 @@ async def socketcand(
     devices: Sequence[SimulatedDevice], *, port: int = 0, bitrate: int | None = None
 ) -> AsyncIterator[Mapping[str, str]]:
     """Serve amplifiers on one bus by socketcand; yields their URLs by name."""
-    bus = CanBus()
+    bus = CanBus(bitrate)
     end = SocketcandEnd(bus, port=port)
     opening: set[asyncio.Task[None]] = set()
 
@@ -52,9 +49,10 @@ async def socketcand(
             task.add_done_callback(opening.discard)
 
     async with AsyncExitStack() as stack:
+        stack.callback(bus.close)
         await end.open()
         stack.push_async_callback(end.close)
-        nodes = await stack.enter_async_context(nodes_on(bus, devices, bitrate=bitrate))
+        nodes = await stack.enter_async_context(nodes_on(bus, devices))
         devices[0].on_plug(plug)
         speed = f"?bitrate={bitrate}" if bitrate not in (None, _BITRATE) else ""
         yield {
@@ -69,11 +67,12 @@ async def slcan(
     devices: Sequence[SimulatedDevice], *, bitrate: int | None = None, unpluggable: bool = False
 ) -> AsyncIterator[Mapping[str, str]]:
     """Serve amplifiers on one bus behind a serial adapter; yields their URLs by name."""
-    bus = CanBus()
+    bus = CanBus(bitrate)
     end = SlcanEnd(bus, unpluggable=unpluggable)
     async with AsyncExitStack() as stack:
+        stack.callback(bus.close)
         stack.callback(end.close)
-        nodes = await stack.enter_async_context(nodes_on(bus, devices, bitrate=bitrate))
+        nodes = await stack.enter_async_context(nodes_on(bus, devices))
         devices[0].on_plug(end.plug)
         yield {
             name: f"can+slcan://{end.path}?bitrate={bitrate or _BITRATE}#{node}"
@@ -82,11 +81,10 @@ async def slcan(
 
 
 @contextlib.contextmanager
-def _node_on(
-    bus: CanBus, device: SimulatedDevice, number: int, bitrate: int | None
-) -> Iterator[None]:
-    stub = Stub(bus, lambda frame: node.receive(frame), faults=device.faults, bitrate=bitrate)
+def _node_on(bus: CanBus, device: SimulatedDevice, number: int) -> Iterator[None]:
+    stub = Stub(bus, lambda frame: node.receive(frame), faults=device.faults)
     node = CanNode(device, number, send=stub.send)
+    device.time = bus.time
     node.start()
     try:
         yield

@@ -6,14 +6,13 @@ Written from protocol.yaml, without code of the host's side. Not modelled: frame
 import asyncio
 import struct
 from collections.abc import Callable
-from typing import TypeAlias
 
 from drivers import clock
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault, Ping, Stop
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.objects import CANOPEN, IDS, ObjectDictionary
-from sim.far_ends.can_bus.requests import RequestHandler
+from sim.far_ends.can_bus.requests import CallLater, RequestHandler
 from sim.far_ends.can_bus.sdo import SdoServer
 from sim.far_ends.can_bus.set_buffer import NO_CHANNEL, Action
 
@@ -23,9 +22,6 @@ _OPERATIONAL, _STOPPED = _NMT_STATES["OPERATIONAL"], _NMT_STATES["STOPPED"]
 _PRE_OPERATIONAL = _NMT_STATES["PRE_OPERATIONAL"]
 _SHORTEST_RAMP = 0.005  # s
 _POLL_INTERVAL = 0.02  # s; between checks whether the supply is back
-
-
-CallLater: TypeAlias = Callable[[float, Callable[[], None]], asyncio.TimerHandle]
 
 
 class CanNode:
@@ -44,7 +40,13 @@ class CanNode:
             write=self._objects.write,
             send=lambda data: send(CanFrame(IDS["sdo_answer"] + node, data)),
         )
-        self._requests = RequestHandler(device, node, objects=self._objects, send=send)
+        self._requests = RequestHandler(
+            device,
+            node,
+            objects=self._objects,
+            send=send,
+            call_later=lambda delay, callback: self._call_later(delay, callback),
+        )
         self._fault = Fault.NONE
         self._was_off = False
         self._poll_timer: asyncio.TimerHandle | None = None
@@ -59,6 +61,7 @@ class CanNode:
 
     def close(self) -> None:
         """Stop the timers."""
+        self._requests.forget()
         for timer in (self._poll_timer, self._heartbeat_timer):
             if timer is not None:
                 timer.cancel()
@@ -73,8 +76,6 @@ class CanNode:
             self._sdo.receive(frame.data)
         elif frame.id == IDS["heartbeat"] + self._objects.host and self._objects.host:
             self._device.exchange(Ping())
-        elif frame.id == IDS["sync"] and len(frame.data) <= 1:
-            self._requests.sync()
         else:
             self._pdo(frame.id, frame.data, fd=frame.fd)
 

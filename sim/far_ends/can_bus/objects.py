@@ -30,7 +30,7 @@ _Q = PROTOCOL.quantities
 _INDEX = {name: declared["index"] for name, declared in CANOPEN["objects"].items()}
 _ABORTS = {NakCode[name]: code for name, code in CANOPEN["aborts"].items()}
 _WIDTH = {"u8": "<B", "u16": "<H", "u32": "<L", "i16": "<h"}
-_PDO_SYNCHRONOUS, _PDO_ASYNCHRONOUS = 0, 255
+_EVENT_DRIVEN = 255
 _RPDO, _RPDO_MAP, _TPDO, _TPDO_MAP = 0x1400, 0x1600, 0x1800, 0x1A00
 _REQUEST_PDO, _SLOTS_PDO = 16, 17  # RPDO 17, 18, ..., for any number of channels
 _SLOTS = 63
@@ -112,7 +112,6 @@ class ObjectDictionary:
         self._reads[_INDEX["error_register"], 0] = lambda: bytes(
             [CANOPEN["emergencies"][self._device.status().fault.name]["error_register"]]
         )
-        self._constant(_INDEX["sync_cob_id"], 0, _pack("u32", IDS["sync"]))
         emergency = IDS["emergency"] + self._node
         self._constant(_INDEX["emergency_cob_id"], 0, _pack("u32", emergency))
         consumer, producer = _INDEX["heartbeat_consumer"], _INDEX["heartbeat_producer"]
@@ -172,7 +171,7 @@ class ObjectDictionary:
         self._count(command, self._channels)
         self._count(slots, groups)
         for cob_id, channel in channel_ids(self._node, self._channels).items():
-            self._received_pdo(channel, cob_id, command, channel + 1, kind=_PDO_SYNCHRONOUS)
+            self._received_pdo(channel, cob_id, command, channel + 1)
         self._received_pdo(_REQUEST_PDO, IDS["order"] + self._node, request, 0)
         for group in range(groups):
             self._received_pdo(_SLOTS_PDO + group, IDS["slots"] + self._node, slots, group + 1)
@@ -182,29 +181,12 @@ class ObjectDictionary:
         for number, (cob_id, (name, subindex)) in enumerate(zip(sent_by, sent, strict=True)):
             self._pdo(_TPDO + number, _TPDO_MAP + number, cob_id, _INDEX[name], subindex)
 
-    def _received_pdo(
-        self,
-        number: int,
-        cob_id: int,
-        index: int,
-        subindex: int,
-        *,
-        kind: int = _PDO_ASYNCHRONOUS,
-    ) -> None:
-        self._pdo(_RPDO + number, _RPDO_MAP + number, cob_id, index, subindex, kind=kind)
+    def _received_pdo(self, number: int, cob_id: int, index: int, subindex: int) -> None:
+        self._pdo(_RPDO + number, _RPDO_MAP + number, cob_id, index, subindex)
         self._writes[index, subindex] = partial(self._write_pdo, cob_id)
 
-    def _pdo(
-        self,
-        parameter: int,
-        mapping: int,
-        cob_id: int,
-        index: int,
-        subindex: int,
-        *,
-        kind: int = _PDO_ASYNCHRONOUS,
-    ) -> None:
-        self._record(parameter, [_pack("u32", cob_id), bytes([kind])])
+    def _pdo(self, parameter: int, mapping: int, cob_id: int, index: int, subindex: int) -> None:
+        self._record(parameter, [_pack("u32", cob_id), bytes([_EVENT_DRIVEN])])
         self._record(mapping, [_pack("u32", index << 16 | subindex << 8 | 64)])
         self._reads[index, subindex] = lambda: self.blocks.get(cob_id, bytes(8))
 

@@ -1,11 +1,13 @@
 """Requests and sets sent to an operational CANopen node, and its replies.
 
-A request is executed on arrival, a set at the SYNC that follows it; a new request discards whatever
-still waits for a SYNC. Written from protocol.yaml, without code of the host's side.
+A request is executed on arrival, a set with the last of its frames. Written from protocol.yaml and
+docs/reference/wire-can.md, without code of the host's side.
 """
 
+import asyncio
 import struct
 from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.protocol.definition import PROTOCOL
@@ -28,12 +30,18 @@ from drivers.protocol.messages import (
 )
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.bus import LENGTHS
-from sim.far_ends.can_bus.objects import IDS, ObjectDictionary, channel_ids, flags_of, sent_ids
+from sim.far_ends.can_bus.objects import (
+    CANOPEN,
+    IDS,
+    ObjectDictionary,
+    channel_ids,
+    flags_of,
+    sent_ids,
+)
 from sim.far_ends.can_bus.set_buffer import (
     INCOMPLETE_SET,
     NO_CHANNEL,
     SETS,
-    TO_ALL,
     Action,
     RefusedRequest,
     RequestFrame,
@@ -43,6 +51,9 @@ from sim.far_ends.can_bus.set_buffer import (
 )
 
 _Q = PROTOCOL.quantities
+_INCOMPLETE_LIFE: float = CANOPEN["incomplete_life"]
+
+CallLater: TypeAlias = Callable[[float, Callable[[], None]], asyncio.TimerHandle]
 
 
 class RequestHandler:
@@ -55,16 +66,18 @@ class RequestHandler:
         *,
         objects: ObjectDictionary,
         send: Callable[[CanFrame], None],
+        call_later: CallLater,
     ) -> None:
         self._device = device
         self._node = node
         self._objects = objects
         self._send = send
+        self._call_later = call_later
         channels = device.capabilities.channels
         self._channel_of = channel_ids(node, channels)
         self._sent_ids = sent_ids(node, channels)
         self._buffer = SetBuffer(channels)
-        self._waiting: RequestFrame | None = None  # for SYNC
+        self._expiry: tuple[int, asyncio.TimerHandle] | None = None  # of which sequence number
         self._asked: tuple[int, list[tuple[object, ...]]] = (0, [])  # token and commands
 
     def take(self, cob_id: int, data: bytes, *, fd: bool = False) -> None:
@@ -72,52 +85,61 @@ class RequestHandler:
         if len(data) < 8:
             return
         if cob_id == IDS["order"] + self._node:
-            self._request(data, own=True, fd=fd)
+            self._request(data, fd=fd)
         elif cob_id == IDS["order"]:
-            self._request(data, own=False, fd=False)
+            self._broadcast(data)
         elif cob_id == IDS["slots"] + self._node and len(data) == 8:
             self._buffer.take_slots(data)
         elif fd and cob_id == IDS["command"] + self._node:
             self._buffer.take_blocks(data)
         elif cob_id in self._channel_of and len(data) == 8:
             self._buffer.take(self._channel_of[cob_id], data)
-
-    def sync(self) -> None:
-        """Execute the set that waits for SYNC, if any."""
-        request, self._waiting = self._waiting, None
-        if request is not None and request.own:
-            self._carry_out(request, lambda: self._set_request(request))
-        elif request is not None and _Q.token.holds(request.token):
-            self._device.broadcast(Commit(request.token))
-        elif request is None and self._buffer.sequence is not None:
-            # Commands whose request was lost: reply, since the host waits.
-            lost = RequestFrame(0, 0, 0, Action.APPLY, 0, self._buffer.sequence, own=True, fd=False)
-            self._answer(lost, result=INCOMPLETE_SET)
-        self.forget()
+        self._check_set()
 
     def forget(self) -> None:
-        """Discard what was received since the last SYNC."""
+        """Discard the frames of an incomplete set."""
         self._buffer.clear()
-        self._waiting = None
+        self._check_set()
 
-    def _request(self, data: bytes, *, own: bool, fd: bool) -> None:
-        token, ramp, duration, what, sequence = struct.unpack_from("<HHHBB", data)
-        request = RequestFrame(
-            token, ramp, duration, Action(what & 7), what >> 3, sequence, own, fd
-        )
-        is_dropped = sequence == 0 if own else request.action not in TO_ALL
-        if is_dropped:
+    def _check_set(self) -> None:
+        """Execute the set if it is complete; a new one expires after a while."""
+        if self._buffer.is_complete and (request := self._buffer.request):
+            self._carry_out(request, lambda: self._set_request(request))
+            self._buffer.clear()
+        sequence = self._buffer.sequence
+        if self._expiry is not None and self._expiry[0] != sequence:
+            self._expiry[1].cancel()
+            self._expiry = None
+        if self._expiry is None and sequence is not None:
+            self._expiry = sequence, self._call_later(_INCOMPLETE_LIFE, self._expire)
+
+    def _expire(self) -> None:
+        request = self._buffer.request
+        self.forget()
+        if request is not None and self._device.is_answering:
+            self._answer(request, result=INCOMPLETE_SET)
+
+    def _request(self, data: bytes, *, fd: bool) -> None:
+        request = _request_frame(data, fd=fd)
+        if request.sequence == 0:
             return
-        self._waiting = None
-        self._buffer.clear_others(sequence)
-        if fd:
-            self._buffer.take_blocks(data[8:])
         if request.action in SETS:
-            self._waiting = request
-        elif own:
-            self._carry_out(request, lambda: self._plain_request(request))
+            self._buffer.take_request(request)
+            self._buffer.take_blocks(data[8:])
         else:
-            self._device.broadcast(Stop(_nearest_ramp(ramp)))
+            self._buffer.clear_before(request.sequence)
+            self._carry_out(request, lambda: self._plain_request(request))
+
+    def _broadcast(self, data: bytes) -> None:
+        request = _request_frame(data, fd=False)
+        if request.sequence == 0 and request.action is Action.STOP:
+            self._device.broadcast(Stop(_nearest_ramp(request.ramp)))
+        elif (
+            request.sequence == 0
+            and request.action is Action.COMMIT
+            and _Q.token.holds(request.token)
+        ):
+            self._device.broadcast(Commit(request.token))
 
     def _carry_out(self, request: RequestFrame, make: Callable[[], Request]) -> None:
         try:
@@ -153,14 +175,13 @@ class RequestHandler:
                 return Stop(ramp)
             case Action.CLEAR:
                 return Clear(request.token)
+            case Action.COMMIT:
+                return Commit(_token(request))
             case _:
                 return GetStatus()
 
     def _set_request(self, request: RequestFrame) -> Request:
-        if not _Q.token.holds(request.token):
-            raise RefusedRequest(NakCode.BAD_TOKEN)
-        if request.action is Action.COMMIT:
-            return Commit(request.token)
+        _token(request)
         wanted = self._buffer.command_set(request)
         self._asked = request.token, [integers_of(command) for command in wanted.commands]
         return Apply(wanted) if request.action is Action.APPLY else Stage(wanted)
@@ -223,6 +244,18 @@ class RequestHandler:
             return
         for cob_id, block in reversed(sent.items()):
             self._send(CanFrame(cob_id, block))
+
+
+def _request_frame(data: bytes, *, fd: bool) -> RequestFrame:
+    token, ramp, duration, what, sequence = struct.unpack_from("<HHHBB", data)
+    return RequestFrame(token, ramp, duration, Action(what & 7), what >> 3, sequence, fd)
+
+
+def _token(request: RequestFrame) -> int:
+    """The token of a set; raises RefusedRequest."""
+    if not _Q.token.holds(request.token):
+        raise RefusedRequest(NakCode.BAD_TOKEN)
+    return request.token
 
 
 def _nearest_ramp(ramp: int) -> float:

@@ -1,7 +1,7 @@
 """Command sets over CAN: a request frame and the command frames with its sequence number.
 
 A set is complete when the announced number of commands, and the envelope slots that they refer to,
-carry the sequence number of the request.
+have come with the sequence number of the request, in any order.
 """
 
 import struct
@@ -15,6 +15,7 @@ from drivers.protocol.messages import Achieved, NakCode
 
 INCOMPLETE_SET = 15  # result code; the others are those of refusals
 NO_CHANNEL = 255
+_SEQUENCES = 255  # 1 to 255
 _Q = PROTOCOL.quantities
 
 
@@ -31,16 +32,13 @@ class Action(IntEnum):
     CLEAR = 7
 
 
-SETS = (Action.APPLY, Action.STAGE, Action.COMMIT)
-"""Actions that wait for SYNC."""
-
-TO_ALL = (Action.COMMIT, Action.STOP)
-"""Actions that may be broadcast."""
+SETS = (Action.APPLY, Action.STAGE)
+"""Actions that need the frames of a set."""
 
 
 @dataclass(frozen=True, slots=True)
 class RequestFrame:
-    """A request frame as received; own: not broadcast."""
+    """A request frame as received."""
 
     token: int
     ramp: int
@@ -48,7 +46,6 @@ class RequestFrame:
     action: Action
     count: int
     sequence: int
-    own: bool
     fd: bool
 
 
@@ -63,7 +60,7 @@ class _Command(NamedTuple):
 
 
 class RefusedRequest(Exception):
-    """An invalid request, or an incomplete set."""
+    """An invalid request."""
 
     def __init__(self, code: int, channel: int = NO_CHANNEL) -> None:
         super().__init__(code, channel)
@@ -71,33 +68,61 @@ class RefusedRequest(Exception):
         self.channel = channel
 
 
+def is_newer(sequence: int, other: int) -> bool:
+    """Whether a sequence number is newer than another, by less than half of all."""
+    return 1 <= (sequence - other) % _SEQUENCES <= _SEQUENCES // 2
+
+
 class SetBuffer:
-    """Frames received since the last SYNC, for an amplifier with the given number of channels."""
+    """Frames of one set, for an amplifier with the given number of channels.
+
+    request: its request frame, if it has come. Frames of a newer sequence number replace all.
+    """
 
     def __init__(self, channels: int) -> None:
         self._channels = channels
-        self._commands: dict[int, _Command] = {}
-        self._slots: dict[int, tuple[int, int]] = {}  # by channel: both slots, sequence
+        self.clear()
 
     @property
     def sequence(self) -> int | None:
-        """Sequence number of some buffered command, None for none."""
-        return next((command.sequence for command in self._commands.values()), None)
+        """Sequence number of the set, None without frames."""
+        return self._sequence
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all frames of the set have come."""
+        return (
+            self.request is not None
+            and len(self._commands) == self.request.count
+            and all(
+                channel in self._slots
+                for channel, command in self._commands.items()
+                if command.flags & 4
+            )
+        )
 
     def clear(self) -> None:
         """Discard all frames."""
-        self._commands.clear()
-        self._slots.clear()
+        self._sequence: int | None = None
+        self.request: RequestFrame | None = None
+        self._commands: dict[int, _Command] = {}
+        self._slots: dict[int, int] = {}  # by channel: both slots
 
-    def clear_others(self, sequence: int) -> None:
-        """Discard commands and slots that carry another sequence number than a new request."""
-        own = {channel: one for channel, one in self._commands.items() if one.sequence == sequence}
-        self._commands = own
-        self._slots = {channel: one for channel, one in self._slots.items() if one[1] == sequence}
+    def clear_before(self, sequence: int) -> None:
+        """Discard all frames if a sequence number is newer."""
+        if self._sequence is not None and is_newer(sequence, self._sequence):
+            self.clear()
+
+    def take_request(self, request: RequestFrame) -> None:
+        """Buffer the request frame of a set."""
+        if self._admits(request.sequence):
+            self.request = request
 
     def take(self, channel: int, block: bytes) -> None:
         """Buffer a command of the channel of its identifier."""
-        self._commands[channel] = _Command(*struct.unpack("<HHhBB", block))
+        command = _Command(*struct.unpack("<HHhBB", block))
+        if self._admits(command.sequence):
+            self._commands[channel] = command
 
     def take_blocks(self, data: bytes) -> None:
         """Buffer the commands of a CAN FD frame; eight bytes FF are fillers."""
@@ -108,25 +133,29 @@ class SetBuffer:
 
     def take_slots(self, data: bytes) -> None:
         """Buffer the envelope slots of four channels."""
-        word = int.from_bytes(data[:6], "little")
-        for place in range(4):
-            self._slots[4 * (data[6] & 3) + place] = (word >> 12 * place & 0xFFF, data[7])
+        if self._admits(data[7]):
+            word = int.from_bytes(data[:6], "little")
+            for place in range(4):
+                self._slots[4 * (data[6] & 3) + place] = word >> 12 * place & 0xFFF
 
     def command_set(self, request: RequestFrame) -> CommandSet:
-        """The set of a request; raises RefusedRequest."""
+        """The set, if it is complete; raises RefusedRequest."""
         if not (_Q.ramp.holds(request.ramp) and _Q.valid_for.holds(request.time)):
             raise RefusedRequest(NakCode.BAD_VALUE)
-        own = {
-            channel: command
-            for channel, command in self._commands.items()
-            if command.sequence == request.sequence
-        }
-        if len(own) != request.count:
-            raise RefusedRequest(INCOMPLETE_SET)
         commands = tuple(
-            self._drive_command(channel, command) for channel, command in sorted(own.items())
+            self._drive_command(channel, command)
+            for channel, command in sorted(self._commands.items())
         )
         return CommandSet(request.token, commands, request.ramp / 1000, request.time / 1000)
+
+    def _admits(self, sequence: int) -> bool:
+        """Whether a frame with this number belongs to the set; a newer one begins another."""
+        if sequence == 0:
+            return False
+        self.clear_before(sequence)
+        if self._sequence is None:
+            self._sequence = sequence
+        return sequence == self._sequence
 
     def _drive_command(self, channel: int, command: _Command) -> DriveCommand:
         if command.flags >> 4 != channel or channel >= self._channels:
@@ -135,11 +164,7 @@ class SetBuffer:
             _Q.level.holds(command.level) and _Q.phase.holds(command.phase)
         ):
             raise RefusedRequest(NakCode.BAD_VALUE, channel)
-        slots = 0
-        if command.flags & 4:
-            slots, of = self._slots.get(channel, (0, -1))
-            if of != command.sequence:
-                raise RefusedRequest(INCOMPLETE_SET)
+        slots = self._slots[channel] if command.flags & 4 else 0
         return DriveCommand(
             channel=channel,
             frequency=command.frequency / 20,

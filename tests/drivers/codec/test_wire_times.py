@@ -24,8 +24,8 @@ GAP = 0.00175  # s of silence between RTU frames above 19 200 baud, by the stand
         ),
         (RTU.format(9600), 115 * 11 / 9600, 24.5 * 11 / 9600, 53 * 11 / 9600),
         ("modbus+tcp://h/1?baud=9600", 115 * 11 / 9600, 24.5 * 11 / 9600, 53 * 11 / 9600),
-        # frames of 135 bits with worst stuffing, a SYNC of 55; two segments and five frames
-        (CAN, (6 * 135 + 55) / 500_000, (135 + 55) / 500_000, 7 * 135 / 500_000),
+        # frames of 135 bits with worst stuffing; two segments and five frames
+        (CAN, 6 * 135 / 500_000, 135 / 500_000, 7 * 135 / 500_000),
         # unknown speed
         *(
             (url, 0.0, 0.0, 0.0)

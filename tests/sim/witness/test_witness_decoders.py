@@ -120,7 +120,7 @@ def test_modbus_decoder_decodes_the_page(transport: str) -> None:
 def test_can_decoder_decodes_the_page() -> None:
     """The session of the page: complete and incomplete sets, classic and FD, watchdog, end."""
     decoder = CanDecoder("slcan", {1: 4})
-    seen = [meaning for toward, frame in _can() for meaning in decoder.take(toward, frame)]
+    seen = [meaning for toward, frame in _can() for meaning in decoder.take(toward, 0.0, frame)]
     assert not any(isinstance(meaning, Damaged) for meaning in seen)
     sets = [one for one in seen if isinstance(one, Request) and one.kind is RequestKind.APPLY]
     assert [one.token for one in sets] == [513, 513, 516, 517, 518]

@@ -19,7 +19,6 @@ from drivers.codec.can_bus.objects import (
 )
 from drivers.codec.can_bus.replies import CanReplyReader, decode_emergency
 from drivers.codec.can_bus.requests import (
-    SYNC,
     encode_broadcast,
     encode_request,
     requested_commands,
@@ -59,12 +58,12 @@ def make(channels: int) -> SafeCommandSet:
     return guard.check(CommandSet(token=258, commands=commands, ramp=0.001, valid_for=0.0))
 
 
-def test_set_is_a_frame_per_channel_an_order_and_a_sync() -> None:
+def test_set_is_a_frame_per_channel_and_an_order() -> None:
     """Channels 4 and on have the identifiers of the next node; the count stands in the order."""
     frames = encode_request(Apply(make(6)), node=2, sequence=9)
     assert [frame.id for frame in frames] == [
         *(0x202, 0x302, 0x402, 0x502, 0x203, 0x303),
-        *(0x482, 0x080),
+        0x482,
     ]
     assert frames[5].data == bytes.fromhex("3408 F401 0000 50 09")  # 105 Hz, 0.05, channel 5
     assert frames[6].data == bytes.fromhex("0201 0100 0000 31 09")  # six times eight plus apply
@@ -72,12 +71,12 @@ def test_set_is_a_frame_per_channel_an_order_and_a_sync() -> None:
 
 def test_can_fd_set_of_seven_channels_is_one_frame() -> None:
     """Eight bytes of order, seven commands; of sixteen channels the rest goes before it."""
-    (one, sync) = encode_request(Apply(make(7)), node=1, sequence=2, fd=True)
-    assert (one.id, len(one.data), one.fd, sync) == (0x481, 64, True, SYNC)
+    (one,) = encode_request(Apply(make(7)), node=1, sequence=2, fd=True)
+    assert (one.id, len(one.data), one.fd) == (0x481, 64, True)
     frames = encode_request(Apply(make(16)), node=1, sequence=2, fd=True)
     assert [(frame.id, len(frame.data)) for frame in frames] == [
         *((0x201, 64), (0x201, 8)),
-        *((0x481, 64), (0x080, 0)),
+        (0x481, 64),
     ]
     five = encode_request(Stage(make(4)), node=1, sequence=2, fd=True)[0]
     assert len(five.data) == 48
@@ -85,11 +84,8 @@ def test_can_fd_set_of_seven_channels_is_one_frame() -> None:
 
 
 def test_broadcast_is_for_node_zero() -> None:
-    """A commit takes effect at the SYNC, a stop at once."""
-    assert encode_broadcast(Commit(7)) == (
-        CanFrame(0x480, bytes.fromhex("0700 0000 0000 03 00")),
-        SYNC,
-    )
+    """One frame each, with sequence number 0."""
+    assert encode_broadcast(Commit(7)) == (CanFrame(0x480, bytes.fromhex("0700 0000 0000 03 00")),)
     assert encode_broadcast(Stop(0.01)) == (CanFrame(0x480, bytes.fromhex("0000 0A00 0000 06 00")),)
 
 

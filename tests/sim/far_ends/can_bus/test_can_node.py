@@ -1,17 +1,17 @@
 """A node of the far end, with frames written by hand: NMT, sets, heartbeats, emergencies."""
 
+import itertools
 import struct
-from collections.abc import Callable
 
 import pytest
 
-from can_session import Timers
+from can_session import INCOMPLETE_LIFE, Timers
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.protocol.messages import AmplifierState, Fault, Ping
 from fake_device import FakeDevice
 from sim.far_ends.can_bus.node import CanNode
 
-REQUEST, ANSWER, SYNC = 0x481, 0x181, CanFrame(0x080, b"")
+REQUEST, ANSWER = 0x481, 0x181
 BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN, INCOMPLETE = 3, 4, 5, 6, 15
 
 
@@ -31,15 +31,17 @@ class Bench:
         self.node.receive(CanFrame(id, bytes.fromhex(data)))
         return list(self.sent)
 
-    def sync(self) -> CanFrame:
-        """A SYNC, and the one answer to it."""
-        (reply,) = self.tell(SYNC.id, "")
+    def result(self, id: int, data: str) -> int:
+        """What the one answer to the last frame of a set says."""
+        (reply,) = self.tell(id, data)
         assert reply.id == ANSWER
-        return reply
+        return reply.data[1] >> 4
 
-    def result(self) -> int:
-        """What the answer to a SYNC says."""
-        return self.sync().data[1] >> 4
+    def expire(self) -> list[CanFrame]:
+        """Let 100 ms pass for frames of an incomplete set; what the node says."""
+        self.sent.clear()
+        self.timers.ring(INCOMPLETE_LIFE)
+        return list(self.sent)
 
     @property
     def state(self) -> AmplifierState:
@@ -55,6 +57,11 @@ class Bench:
 @pytest.fixture
 def bench() -> Bench:
     """In operation and armed for 250 ms by host 127."""
+    return armed()
+
+
+def armed() -> Bench:
+    """A node in operation and armed."""
     bench = Bench()
     bench.tell(0x000, "01 01")
     bench.tell(REQUEST, "7F00 0000 FA00 04 01")
@@ -85,68 +92,125 @@ def test_node_ignores_requests_before_start() -> None:
     assert bench.tell(REQUEST, "7F00 0000 FA00 04 01")[-1].id == ANSWER
 
 
-def test_node_applies_a_set_at_sync(bench: Bench) -> None:
-    """Two commands and their request change nothing until SYNC; the reply is exact."""
-    for channel in (0, 2):
-        assert bench.tell(0x201 + 0x100 * channel, command(channel, 2)) == []
-    assert bench.tell(REQUEST, apply(9, 2, 2)) == []
-    assert not any(bench.levels)
-    reply = bench.sync()
-    assert reply.data[:2] == bytes([2, 1 | 1 << 3])
+def envelope(slot: int) -> list[tuple[int, str]]:
+    """The frames that load an envelope of one knot, level 0.3, into a slot."""
+    return [(0x601, f"21 00 21 {slot:02X} 07000000"), (0x601, "01 3200 01 B80B 0000")]
+
+
+SHAPED_SET = (
+    (REQUEST, apply(9, 4, 5)),
+    *((0x201 + 0x100 * channel, command(channel, 5, flags=4)) for channel in range(4)),
+    (0x681, "41 10 04 41 10 04 00 05"),  # onset 1 of every channel
+)
+
+
+@pytest.mark.parametrize("last", range(6))
+def test_node_plays_a_set_with_the_last_of_its_frames(last: int) -> None:
+    """Four channels with envelopes, in each of 720 orders: nothing before, all together then."""
+    bench = armed()
+    for id, data in envelope(1):
+        bench.tell(id, data)
+    others = [frame for frame in SHAPED_SET if frame is not SHAPED_SET[last]]
+    for token, order in enumerate(itertools.permutations(others), start=1):
+        frames = [(id, data) for id, data in (*order, SHAPED_SET[last])]
+        frames = [(id, apply(token, 4, 5) if id == REQUEST else data) for id, data in frames]
+        for id, data in frames[:-1]:
+            assert bench.tell(id, data) == []
+        assert bench.device.status().token == token - 1
+        assert bench.result(*frames[-1]) == 0
+        assert bench.device.status().token == token
+        bench.device.pass_time(0.2 / 120)
+        assert bench.expire() == []
+
+
+def test_node_ignores_a_foreign_sync(bench: Bench) -> None:
+    """Another device's SYNC between any two frames neither plays nor discards a set."""
+    for id, data in ((0x201, command(0, 2)), (0x401, command(2, 2))):
+        assert bench.tell(id, data) == []
+        assert bench.tell(0x080, "") == bench.tell(0x080, "07") == []
+        assert not any(bench.levels)
+    assert bench.result(REQUEST, apply(9, 2, 2)) == 0
     assert bench.levels == pytest.approx((0.2, 0.0, 0.2, 0.0))
 
 
+def test_node_answers_an_exact_set(bench: Bench) -> None:
+    """With its sequence number and action, exact, and its token."""
+    bench.tell(0x201, command(0, 2))
+    (reply,) = bench.tell(REQUEST, apply(9, 1, 2))
+    assert reply.data[:2] == bytes([2, 1 | 1 << 3])
+    assert reply.data[4:6] == b"\x09\x00"
+
+
 @pytest.mark.parametrize(
-    "send",
+    "frames",
     [
-        lambda bench: bench.tell(REQUEST, apply(9, 2, 2)),  # one command of two
-        lambda bench: (bench.tell(0x301, command(1, 1)), bench.tell(REQUEST, apply(9, 2, 2))),
-        lambda bench: None,  # the request itself is lost
-        lambda bench: (
-            bench.tell(0x301, command(1, 2, flags=4)),  # shaped, but no slots come
-            bench.tell(REQUEST, apply(9, 2, 2)),
-        ),
-        lambda bench: (
-            bench.tell(0x681, "0500 0000 0000 00 01"),  # slots of another set
-            bench.tell(0x301, command(1, 2, flags=4)),
-            bench.tell(REQUEST, apply(9, 2, 2)),
-        ),
+        [(REQUEST, apply(9, 2, 2))],  # one command of two
+        [(0x301, command(1, 1)), (REQUEST, apply(9, 2, 2))],  # the other of an older set
+        [(0x301, command(1, 0)), (REQUEST, apply(9, 2, 2))],
+        [(0x301, command(1, 2)), (REQUEST, apply(9, 1, 2))],  # more than announced
+        [(0x301, command(1, 2, flags=4)), (REQUEST, apply(9, 2, 2))],  # shaped, no slots
+        [
+            (0x681, "0500 0000 0000 00 01"),  # slots of an older set
+            (0x301, command(1, 2, flags=4)),
+            (REQUEST, apply(9, 2, 2)),
+        ],
     ],
 )
-def test_node_refuses_an_incomplete_set(bench: Bench, send: Callable[[Bench], None]) -> None:
-    """Missing frames or another sequence number: result incomplete, no output, nothing kept."""
+def test_node_discards_an_incomplete_set(bench: Bench, frames: list[tuple[int, str]]) -> None:
+    """After 100 ms, with an answer since its order has come; no output, nothing kept."""
     bench.tell(0x201, command(0, 2))
-    send(bench)
-    assert bench.result() == INCOMPLETE
+    for frame in frames:
+        assert bench.tell(*frame) == []
+    (reply,) = bench.expire()
+    assert (reply.id, reply.data[0], reply.data[1]) == (ANSWER, 2, 1 | INCOMPLETE << 4)
     assert not any(bench.levels)
-    bench.tell(REQUEST, apply(9, 1, 2))  # what came before the SYNC is forgotten
-    assert bench.result() == INCOMPLETE
+    assert bench.tell(REQUEST, apply(9, 1, 2)) == []  # the command is forgotten
+    assert bench.result(0x201, command(0, 2)) == 0
 
 
-@pytest.mark.parametrize(
-    "next_request", [(REQUEST, apply(0, 0, 3, action=0)), (0x480, apply(8, 0, 0, action=3))]
-)
-@pytest.mark.parametrize("has_request", [False, True])
-def test_node_discards_a_set_without_sync(
-    bench: Bench, next_request: tuple[int, str], has_request: bool
-) -> None:
-    """Commands, with or without their request, then another request before SYNC."""
+def test_node_discards_commands_without_an_order(bench: Bench) -> None:
+    """After 100 ms, without an answer, also with slots."""
     bench.tell(0x201, command(0, 2))
-    if has_request:
-        bench.tell(REQUEST, apply(9, 1, 2))
-    bench.tell(*next_request)
-    assert bench.tell(SYNC.id, "") == []
-    assert not any(bench.levels)
+    bench.tell(0x681, "0500 0000 0000 00 02")
+    assert bench.expire() == []
+    assert bench.tell(REQUEST, apply(9, 1, 2)) == []
 
 
-def test_node_does_not_complete_a_set_with_earlier_commands(bench: Bench) -> None:
-    """A reused sequence number does not replace a lost command by an old one."""
+@pytest.mark.parametrize(("late", "new"), [(5, 6), (255, 1), (200, 72), (2, 129)])
+def test_node_discards_late_frames_of_an_abandoned_set(bench: Bench, late: int, new: int) -> None:
+    """An adapter sends frames of an attempt that was given up between those of the next."""
+    bench.tell(0x301, command(1, late, level=9000))
+    bench.tell(REQUEST, apply(9, 2, late))
+    assert bench.tell(0x201, command(0, new)) == []  # takes the place of the older set
+    assert bench.tell(0x201, command(0, late, level=9000)) == []
+    assert bench.tell(REQUEST, apply(9, 2, late)) == []
+    assert bench.tell(REQUEST, apply(9, 2, new)) == []
+    assert bench.tell(0x401, command(2, late, level=9000)) == []
+    assert bench.result(0x301, command(1, new)) == 0
+    assert bench.levels == pytest.approx((0.2, 0.2, 0.0, 0.0))
+    bench.tell(0x201, command(0, late, level=9000))  # one more, when the set plays already
+    assert bench.expire() == []
+    assert bench.levels == pytest.approx((0.2, 0.2, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("action", [0, 3, 7])
+def test_newer_order_discards_an_incomplete_set(bench: Bench, action: int) -> None:
+    """Its late frame plays nothing; an older order leaves the set as it is."""
+    bench.tell(0x201, command(0, 5))
+    bench.tell(REQUEST, apply(7, 0, 4, action=action))
+    assert bench.result(REQUEST, apply(9, 1, 5)) == 0
+    bench.tell(REQUEST, apply(10, 1, 6))
+    bench.tell(REQUEST, apply(7, 0, 7, action=action))
+    assert bench.tell(0x201, command(0, 6, level=9000)) == []
+    assert bench.levels[0] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("broadcast", [apply(8, 0, 0, action=3), apply(0, 0, 0, action=0)])
+def test_broadcast_leaves_the_frames_of_a_set(bench: Bench, broadcast: str) -> None:
+    """It has no sequence number of this host."""
     bench.tell(0x201, command(0, 2))
-    bench.tell(REQUEST, apply(0, 0, 3, action=0))
-    bench.tell(0x301, command(1, 2))
-    bench.tell(REQUEST, apply(9, 2, 2))
-    assert bench.result() == INCOMPLETE
-    assert not any(bench.levels)
+    assert bench.tell(0x480, broadcast) == []
+    assert bench.result(REQUEST, apply(9, 1, 2)) == 0
 
 
 @pytest.mark.parametrize(
@@ -164,8 +228,7 @@ def test_node_refuses_an_invalid_set(
 ) -> None:
     """Out of range, an unknown bit, the wrong channel, no token: reason and channel."""
     bench.tell(0x201, frame)
-    bench.tell(REQUEST, request_frame)
-    reply = bench.sync()
+    (reply,) = bench.tell(REQUEST, request_frame)
     assert (reply.data[1] >> 4, reply.data[3]) == (result, channel)
     assert not any(bench.levels)
 
@@ -173,11 +236,10 @@ def test_node_refuses_an_invalid_set(
 def test_node_commits_by_broadcast(bench: Bench) -> None:
     """A broadcast commit of 8 leaves the staged set 9, one of 9 plays it; no replies."""
     bench.tell(0x201, command(0, 2))
-    bench.tell(REQUEST, apply(9, 1, 2, action=2))
-    assert bench.result() == 0
+    assert bench.result(REQUEST, apply(9, 1, 2, action=2)) == 0
+    assert not any(bench.levels)
     for token, level in ((8, 0.0), (9, 0.2)):
-        bench.tell(0x480, apply(token, 0, 0, action=3))
-        assert bench.tell(SYNC.id, "") == []
+        assert bench.tell(0x480, apply(token, 0, 0, action=3)) == []
         assert bench.levels[0] == pytest.approx(level)
     bench.tell(0x480, "0000 0000 0000 06 00")
     assert bench.state is AmplifierState.QUICK_STOP_ACTIVE
@@ -197,7 +259,6 @@ def test_node_accepts_any_ramp_for_silencing(
     """A stop, a disarm and a broadcast stop along 65.5 s are carried out along the longest ramp."""
     bench.tell(0x201, command(0, 1))
     bench.tell(REQUEST, apply(9, 1, 1))
-    bench.sync()
     sent = bench.tell(id, request_frame)
     assert bench.state is state
     assert all(frame.data[1] >> 4 == 0 for frame in sent if frame.id == ANSWER)
@@ -223,7 +284,6 @@ def test_node_stops_when_leaving_operational(bench: Bench, nmt: str) -> None:
     """Stop, pre-operational, reset communication: a host that is not heard must not be needed."""
     bench.tell(0x201, command(0, 2))
     bench.tell(REQUEST, apply(9, 1, 2))
-    bench.sync()
     bench.tell(0x000, nmt)
     assert bench.state is AmplifierState.QUICK_STOP_ACTIVE
     bench.device.pass_time(0.005)
@@ -240,7 +300,6 @@ def test_node_reset_discards_everything(bench: Bench) -> None:
     """Silent at once, disarmed, the host forgotten; a boot-up message."""
     bench.tell(0x201, command(0, 2))
     bench.tell(REQUEST, apply(9, 1, 2))
-    bench.sync()
     assert bench.tell(0x000, "81 01")[-1] == CanFrame(0x701, b"\x00")
     assert bench.state is AmplifierState.SWITCH_ON_DISABLED
     assert not any(bench.levels)
@@ -262,13 +321,14 @@ def test_node_sends_emcy_for_a_fault_and_its_end(bench: Bench) -> None:
 
 
 def test_node_accepts_commands_by_sdo(bench: Bench) -> None:
-    """2020sub1 and 2021 written by SDO, then SYNC: the same as by RPDO."""
+    """2020sub1 and 2021 written by SDO: the same as by RPDO."""
     for index, data in ((0x2020, command(0, 2)), (0x2021, apply(9, 1, 2))):
         subindex = 1 if index == 0x2020 else 0
         value = bytes.fromhex(data)
         begin = struct.pack("<BHBL", 0x21, index, subindex, 8).hex()
         assert bench.tell(0x601, begin)[0].data[0] == 0x60
         assert bench.tell(0x601, "00" + value[:7].hex())[0].data[0] == 0x20
-        bench.tell(0x601, "1D" + value[7:].hex() + "00" * 6)
-    assert bench.result() == 0
+        sent = bench.tell(0x601, "1D" + value[7:].hex() + "00" * 6)
+    (answer,) = [frame for frame in sent if frame.id == ANSWER]
+    assert answer.data[1] >> 4 == 0
     assert bench.levels[0] == pytest.approx(0.2)

@@ -1,0 +1,138 @@
+"""Two amplifiers on one CAN bus under one plate, from a touch stream, in virtual time.
+
+Their ERAs play one frequency together, so that what they differ by in time is felt.
+"""
+
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import drivers
+from can_mailboxes import MailboxBus
+from felt_assertions import CHECKS, Truth, contrasts
+from felt_chain import Chain, Played
+from model.finger.grid import Grid
+from model.rig.file import load_rig
+from model.table.build import build_table
+from rig_files import TWO_AMPLIFIERS, write_rig
+from sim.far_ends.can_bus import ends
+from touch_stream import Stream
+
+STREAM = Stream(
+    {"A": (0.07, 0.06), "B": (0.04, 0.17), "C": (0.16, 0.19), "D": (0.24, 0.08)},
+    [
+        (0.1, {1: "B", 2: "C"}),
+        (0.8, {1: "B", 2: "C", 3: "D"}),
+        (1.4, {}),
+        (1.7, {5: "A"}),
+        (2.3, {}),
+        (2.6, {}),
+    ],
+)
+ONE, TWO = {"main": "slcan"}, {"main": "slcan", "side": "slcan"}
+PAGE = Path(drivers.__file__).parent.parent / "docs" / "reference" / "several-amplifiers.md"
+CHANGES: Mapping[str, tuple[tuple[str, str], ...]] = {
+    "one": (),
+    "two": TWO_AMPLIFIERS,
+    "two, restless": TWO_AMPLIFIERS,
+}
+
+
+@pytest.fixture(scope="module")
+def truths(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Truth]:
+    """The rigs as they are meant, and their tables, asked without any of the chain."""
+    folder = tmp_path_factory.mktemp("truth")
+    made: dict[str, Truth] = {}
+    for name, changes in CHANGES.items():
+        rig = load_rig(write_rig(folder / "rig.yaml", *changes, mesh="auto"))
+        table = build_table(rig, frequencies=np.arange(80.0, 321.0, 40.0), grid=Grid(4, 3))
+        made[name] = Truth(rig, table, STREAM)
+    return made
+
+
+@pytest.fixture(scope="module")
+def buses() -> list[MailboxBus]:
+    """The buses with a foreign SYNC, whose adapter transmits by priority."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def played(
+    truths: Mapping[str, Truth],
+    buses: list[MailboxBus],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Mapping[str, Played]:
+    """What came of the stream over one amplifier, two, and two on a restless bus."""
+    folder = tmp_path_factory.mktemp("chain")
+
+    def restless(bitrate: int | None) -> MailboxBus:
+        buses.append(MailboxBus(bitrate))
+        return buses[-1]
+
+    results = {}
+    for name, changes in CHANGES.items():
+        rig_file = write_rig(folder / "rig.yaml", *changes)
+        rig = load_rig(rig_file)
+        chain = Chain(rig, truths[name].table, rig, TWO if changes else ONE, rig_file)
+        with pytest.MonkeyPatch.context() as patch:
+            if name == "two, restless":
+                patch.setattr(ends, "CanBus", restless)
+            results[name] = chain.play(STREAM)
+    return results
+
+
+@pytest.mark.parametrize("check", CHECKS)
+@pytest.mark.parametrize("name", CHANGES)
+def test_fingers_feel_the_commanded_pattern_over_one_bus(
+    played: Mapping[str, Played], truths: Mapping[str, Truth], name: str, check: str
+) -> None:
+    """What holds for one amplifier holds for two, in whatever order frames are transmitted."""
+    CHECKS[check](played[name], truths[name])
+
+
+@pytest.mark.parametrize("name", ["two", "two, restless"])
+def test_contrast_over_two_amplifiers_equals_that_over_one(
+    played: Mapping[str, Played], name: str
+) -> None:
+    """Within 1 dB at every situation: they start together."""
+    for alone, together in zip(contrasts(played["one"]), contrasts(played[name]), strict=True):
+        assert together == pytest.approx(alone, abs=1.0)
+
+
+def test_both_amplifiers_take_part(
+    played: Mapping[str, Played], truths: Mapping[str, Truth]
+) -> None:
+    """Each pattern has ERAs of both, at one frequency."""
+    patterns = [pattern for heard in played["two"].heard for pattern in heard.patterns]
+    wiring = truths["two"].rig.wiring
+    assert len(patterns) == 3
+    for pattern in patterns:
+        assert {wiring[era].amplifier for era in pattern["drive"]} == {"main", "side"}
+
+
+def test_frames_were_reordered(played: Mapping[str, Played], buses: list[MailboxBus]) -> None:
+    """The adapter transmitted hundreds of frames, many before earlier ones."""
+    (bus,) = buses
+    assert sorted(bus.given) == sorted(bus.transmitted)
+    moved = sum(one != other for one, other in zip(bus.given, bus.transmitted, strict=True))
+    assert moved > 50
+
+
+def test_table_of_skews_follows_from_the_formula() -> None:
+    """-20 log10(2 sin(pi f t)), at least 0, in whole dB, as the page says."""
+    table = PAGE.read_text("utf-8").partition("| skew | ")[2].partition("\n\n")[0]
+    frequencies = [float(each) for each in re.findall(r"(\d+) Hz", table.splitlines()[0])]
+    rows = re.findall(r"^\| ([\d.]+) (µs|ms) \| (.*) \|$", table, re.MULTILINE)
+    assert [(row[0], row[1]) for row in rows] == [
+        *(("10", "µs"), ("0.1", "ms"), ("0.5", "ms"), ("1", "ms"))
+    ]
+    for size, unit, cells in rows:
+        skew = float(size) * (1e-6 if unit == "µs" else 1e-3)
+        shown = [int(cell.removesuffix(" dB")) for cell in cells.split(" | ")]
+        for frequency, cell in zip(frequencies, shown, strict=True):
+            left = 2 * math.sin(math.pi * frequency * skew)
+            assert cell == max(0, round(-20 * math.log10(left)))

@@ -155,7 +155,7 @@ class ReferenceAmplifier:
             case RequestKind.COMMIT:
                 self._committed(request, reply, begin, end)
             case RequestKind.CLEAR if self.state in (_STOPPED, _FAULT, _REACTING):
-                self._cleared(reply)
+                self._cleared(reply, begin)
             case RequestKind.ENVELOPE if request.envelope is not None:
                 self._outputs.load(request.envelope)
             case _:
@@ -245,12 +245,14 @@ class ReferenceAmplifier:
         elif self.state == _ENABLED:
             self.state = 3
 
-    def _cleared(self, reply: Reply) -> None:
+    def _cleared(self, reply: Reply, begin: float) -> None:
         """Apply Clear, which may leave the state as it is."""
         reported = reply.status
+        # The event that ends the reaction is not heard while other requests are pending.
+        is_reacting = self.state == _REACTING and begin <= self._last_status + SILENCING_RAMP
         if reported is None:
             self.state = None
-        elif reported.state in _OFF and not (self.state == _REACTING and self._is_reported):
+        elif reported.state in _OFF and not (is_reacting and self._is_reported):
             self.state, self._fault = 1, 0
             self._outputs.cause = "Clear"
 

@@ -13,6 +13,7 @@ ARM = Request(RequestKind.ARM, 1, key=1, watchdog=0.25)
 STOP = Request(RequestKind.STOP, 1, key=2)
 DISARM = Request(RequestKind.DISARM, 1, key=4, ramp=0.05)
 STATUS = Request(RequestKind.STATUS, 1, key=5)
+CLEAR = Request(RequestKind.CLEAR, 1, key=6)
 STOP_ALL = Request(RequestKind.STOP, 0)
 # Plays 0.2 for 0.3 s, then fades out along 50 ms.
 BRIEF = Request(
@@ -70,6 +71,16 @@ def test_reference_forgets_an_unobserved_fault() -> None:
     watched.amplifier.forget_state()
     watched.grants(STOP, 9.0, STOPPED)
     assert watched.broken == []
+
+
+@pytest.mark.parametrize(("time", "broken"), [(1.255, ["latched"]), (1.5, [])])
+def test_reference_knows_that_a_fault_reaction_ends(time: float, broken: list[str]) -> None:
+    """Clear ends a fault once silent, 5 ms after it began, also if that event was not heard."""
+    watched = Watched()
+    watched.grants(ARM, 1.0, ENABLED)
+    watched.amplifier.event_received(REACTING, WATCHDOG, 1.252)
+    watched.grants(CLEAR, time, 1)
+    assert watched.broken == broken
 
 
 def test_reference_reports_an_early_watchdog_fault() -> None:

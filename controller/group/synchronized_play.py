@@ -11,6 +11,7 @@ from drivers import clock
 from drivers.guard import SafeCommandSet, SafeEnvelope
 from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.operation.simultaneous import simultaneous_commits
+from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import Achieved, Feature
 
 
@@ -115,15 +116,21 @@ class SynchronizedPlay:
         may_play: Callable[[], bool],
         until: float,
     ) -> bool:
-        """Load envelopes one after the other; False once those left would not be in time [s]."""
+        """Load envelopes one after the other; False once those left would not be in time [s].
+
+        They do not feed the watchdog: a heartbeat that is due meanwhile is sent between them.
+        """
+        checked = self._amplifiers[name]
         start = clock.now()
         for number, envelope in enumerate(envelopes):
             now = clock.now()
             each = (now - start) / number if number else 0.0
             if now + each * (len(envelopes) - number) > until:
                 return False
+            if now - (checked.amplifier.last_fed_at or now) >= HEARTBEAT:
+                await checked.heartbeat(may_feed=may_play)
             if may_play():
-                await self._amplifiers[name].amplifier.load_envelope(envelope)
+                await checked.amplifier.load_envelope(envelope)
         return True
 
     def _commits(

@@ -35,6 +35,7 @@ URLs:
   can+socketcan://can0#NODE                     CAN on a network interface
   can+slcan:///dev/ttyACM0?bitrate=500000#NODE  CAN on a serial adapter
   can+socketcand://HOST:PORT/can0#NODE          CAN through a socketcand server
+  can+pcan://PCAN_USBBUS1#NODE                  CAN on any interface of python-can, by its name
   sim://RIG.yaml                                a simulated amplifier of a rig
 Quote URLs that contain ?, # or &.
 """

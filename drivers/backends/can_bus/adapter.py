@@ -39,7 +39,7 @@ async def open_adapter(
         return await hardware.open_adapter(url, on_frame=on_frame, on_loss=on_loss)
     try:
         bus = await in_thread(lambda: open_bus(url), name=f"era-open {url}", undo=_shut)
-    except _CAN_ERRORS as problem:
+    except Exception as problem:  # of the drivers of many vendors
         raise LinkError(_open_error_message(url, problem)) from problem
     return _ThreadedAdapter(bus, url, on_frame, on_loss)
 
@@ -152,5 +152,5 @@ def _open_error_message(url: CanBusUrl, problem: Exception) -> str:
             f"up type can bitrate {url.bitrate}"
         )
     else:
-        remedy = "check its name"
+        remedy = "check its name, and that the driver of its vendor is installed"
     return f"CAN bus {url} cannot be opened: {remedy} (the system says: {system_message(problem)})"

@@ -14,6 +14,7 @@ import time
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import can
 from can.interfaces.slcan import slcanBus
@@ -29,6 +30,8 @@ from drivers.codec.can_bus.adapter_text import (
 )
 from drivers.codec.can_bus.frame import CanFrame
 
+_PCAN_CLOCK = 80_000_000  # Hz
+_SAMPLE_POINT = 80.0  # % of a bit
 _SERIAL_TIMEOUT = 0.05  # s; of a read of the serial port
 _CONNECT_TIMEOUT = 2.0  # s
 _READ_MAX = 4096
@@ -38,7 +41,7 @@ _IS_FRAME = re.compile(rb"\s*< (fd)?frame ")
 
 
 def open_bus(url: CanBusUrl) -> can.BusABC:
-    """Open the adapter to a bus; raises can.CanError, OSError or ValueError."""
+    """Open the adapter to a bus; raises whatever its driver raises."""
     match url.interface:
         case "socketcand":
             return _Socketcand(url)
@@ -50,7 +53,37 @@ def open_bus(url: CanBusUrl) -> can.BusABC:
                 interface="socketcan", channel=url.channel, fd=bool(url.fd), ignore_config=True
             )
         case _:
-            return can.Bus(interface=url.interface, channel=url.channel, ignore_config=True)
+            channel = int(url.channel) if url.channel.isdecimal() else url.channel
+            options: dict[str, Any] = {
+                name: can.util.cast_from_string(text) for name, text in url.options
+            }
+            return can.Bus(
+                interface=url.interface,
+                channel=channel,
+                ignore_config=True,
+                bitrate=url.bitrate,
+                receive_own_messages=False,
+                **options,
+                **(_fd_arguments(url) if url.fd else {}),
+            )
+
+
+def _fd_arguments(url: CanBusUrl) -> dict[str, Any]:
+    """Arguments of python-can for CAN FD, as its interfaces call them."""
+    match url.interface:
+        case "nixnet":
+            return {"fd": True, "fd_bitrate": url.fd}
+        case "pcan":
+            timing = can.BitTimingFd.from_sample_point(
+                f_clock=_PCAN_CLOCK,
+                nom_bitrate=url.bitrate,
+                nom_sample_point=_SAMPLE_POINT,
+                data_bitrate=url.fd,
+                data_sample_point=_SAMPLE_POINT,
+            )
+            return {"timing": timing}
+        case _:
+            return {"fd": True, "data_bitrate": url.fd}
 
 
 def send_some(bus: can.BusABC, frames: Sequence[CanFrame]) -> int:

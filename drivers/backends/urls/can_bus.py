@@ -1,4 +1,7 @@
-"""CAN amplifier URLs, such as can+socketcan://can0#NODE, with the node after the hash sign."""
+"""CAN amplifier URLs, such as can+socketcan://can0#NODE, with the node after the hash sign.
+
+Every interface of python-can has one by its name; see also `drivers.backends.can_bus.interfaces`.
+"""
 
 from dataclasses import dataclass
 from urllib.parse import unquote
@@ -9,13 +12,23 @@ from drivers.errors import CommandError
 
 _FORMS = (
     "can+socketcan://can0#1, can+slcan:///dev/ttyACM0?bitrate=500000#1, "
-    "can+socketcand://HOST:PORT/can0#1 or can+virtual://CHANNEL#1"
+    "can+socketcand://HOST:PORT/can0#1 or can+INTERFACE://CHANNEL#1 with an interface of python-can"
 )
 _OPTIONS = {  # lowest and highest
     "bitrate": (10_000, 1_000_000),
     "fd": (1, 8_000_000),  # bit/s of the data of CAN FD
     "heartbeat": (10, 10_000),  # ms
     "baud": (9_600, 12_000_000),  # of the serial port of an slcan adapter
+}
+_ADAPTER_OPTIONS = {  # of python-can, passed on as they are: which of several adapters it is
+    "canalystii": ("device",),
+    "ixxat": ("unique_hardware_id",),
+    "neousys": ("device",),
+    "neovi": ("serial",),
+    "pcan": ("device_id",),
+    "systec": ("device_number",),
+    "udp_multicast": ("port",),
+    "vector": ("app_name", "serial"),
 }
 
 
@@ -24,7 +37,7 @@ class CanBusUrl:
     """A bus: interface as named by python-can, channel, host and port of a server.
 
     bitrate [bit/s]; fd: that of the data in CAN FD frames, 0 for classic frames only; baud of the
-    adapter's serial port.
+    adapter's serial port; options: of python-can, by name.
     """
 
     interface: str
@@ -34,6 +47,7 @@ class CanBusUrl:
     bitrate: int
     fd: int
     baud: int
+    options: tuple[tuple[str, str], ...] = ()
 
     def __str__(self) -> str:
         where = f"{self.host}:{self.port}/" if self.host else ""
@@ -51,22 +65,27 @@ class CanUrl:
     @classmethod
     def parse(cls, url: str) -> "CanUrl":
         """Parse a URL; CommandError names the invalid part."""
-        is_server = url.startswith("can+socketcand:")
-        parts = split_url(url, kind="a CAN", forms=_FORMS, has_port=is_server)
-        port = parts.port if is_server else None
-        options = options_of(parts.query, known=_OPTIONS, url=url, kind="a CAN")
-        interface, host = parts.scheme.removeprefix("can+"), ""
+        scheme, _, rest = url.partition("://")
+        interface = scheme.lower().removeprefix("can+")
+        is_server = interface == "socketcand"
+        # The names of some interfaces are no schemes for urlsplit.
+        parts = split_url(f"can://{rest}", kind="a CAN", forms=_FORMS, has_port=is_server)
+        adapter_options = _ADAPTER_OPTIONS.get(interface, ())
+        known = (*_OPTIONS, *adapter_options)
+        options = options_of(parts.query, known=known, url=url, kind="a CAN")
+        host, port = "", None
         match interface:
-            case "socketcan" | "virtual":
+            case "socketcan":
                 channel, rest = parts.netloc, parts.path.strip("/")
             case "slcan":
                 channel, rest = device_of(unquote(parts.path)), parts.netloc
             case "socketcand":
+                port = parts.port
                 channel, rest = parts.path.strip("/"), "" if port else "no port"
                 host = parts.hostname or ""
             case _:
-                raise CommandError(f"{url!r} must name a CAN interface; use {_FORMS}")
-        if not channel.strip("/") or rest or (interface == "socketcand" and not host):
+                channel, rest = device_of(unquote(parts.netloc + parts.path)), ""
+        if not channel.strip("/") or rest or (is_server and not host):
             raise CommandError(f"{url!r} must name the bus; use {_FORMS}")
         bus = CanBusUrl(
             interface=interface,
@@ -76,6 +95,7 @@ class CanUrl:
             bitrate=_whole(options, "bitrate", default=CANOPEN["bitrate"], url=url),
             fd=_whole(options, "fd", default=0, url=url),
             baud=_whole(options, "baud", default=115_200, url=url),
+            options=tuple((name, options[name]) for name in adapter_options if name in options),
         )
         heartbeat = _whole(options, "heartbeat", default=CANOPEN["heartbeat_ms"], url=url)
         return cls(bus=bus, node=_node(parts.fragment, url), heartbeat=heartbeat / 1000)

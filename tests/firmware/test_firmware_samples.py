@@ -1,0 +1,188 @@
+"""The samples that the firmware synthesizes, against the formulas of the wire page."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_script import (
+    KEEP_PHASE,
+    NAK,
+    PER_MS,
+    RATE,
+    SESSION,
+    Script,
+    apply,
+    arm,
+    command,
+    load,
+    replay,
+    replay_on_the_machine,
+    request,
+)
+from model.arrays import FloatArray
+
+TOLERANCE = 6e-5  # of full stroke: two steps of a 16-bit sample, and phases over seconds
+STOP, FADING = 8, 12
+
+
+def seconds(count: int) -> FloatArray:
+    """Times [s] of so many samples."""
+    return np.arange(count) / RATE
+
+
+def tone(times: FloatArray, frequency: float, level: float, phase: float = 0.0) -> FloatArray:
+    """Level x sin(2 pi frequency t + phase)."""
+    return np.asarray(level * np.sin(2 * np.pi * frequency * times + np.radians(phase)))
+
+
+def falling(times: FloatArray, ramp: float) -> FloatArray:
+    """(1 + cos(pi s)) / 2, with s from 0 to 1 over the ramp [s]."""
+    return np.asarray((1 + np.cos(np.pi * np.clip(times / ramp, 0, 1))) / 2)
+
+
+def test_channels_start_together_with_their_phases(firmware: Path) -> None:
+    """Every channel plays the formula of the page, with t from the commit, for three seconds."""
+    tones = [(110.0, 0.2, 0.0), (250.05, 1.0, -90.0), (20.0, 0.5, 179.99), (1999.95, 0.7, 12.34)]
+    set_ = apply(513, *(command(n, *each) for n, each in enumerate(tones)))
+    samples, _ = replay(
+        firmware, [(10, arm()), (50, set_), (1900, request(2)), (1500, arm())], 3000
+    )
+    assert not samples[: 50 * PER_MS].any()
+    playing = samples[50 * PER_MS :]
+    for channel, each in enumerate(tones):
+        expected = tone(seconds(len(playing)), *each)
+        assert np.abs(playing[:, channel] - expected).max() < TOLERANCE
+
+
+def test_sets_cross_fade_along_raised_cosines(firmware: Path) -> None:
+    """An interrupted fade goes on from its present gain; one that ends sooner keeps its end."""
+    script: Script = [
+        (0, arm()),
+        (0, apply(1, command(0, 100, 0.5))),
+        (100, apply(2, command(0, 130, 0.4, 90), ramp_ms=40)),
+        (120, apply(3, ramp_ms=100)),
+    ]
+    samples, _ = replay(firmware, script, 230)
+    t = seconds(len(samples))
+    first = tone(t, 100, 0.5) * falling(t - 0.1, 0.04)
+    rising = np.where(t < 0.12, 1 - falling(t - 0.1, 0.04), 0.5 * falling(t - 0.12, 0.1))
+    second = np.where(t >= 0.1, tone(t - 0.1, 130, 0.4, 90) * rising, 0)
+    assert np.abs(samples[:, 0] - first - second).max() < TOLERANCE
+    assert not samples[220 * PER_MS :].any()
+
+
+def test_third_voice_is_refused_and_changes_nothing(firmware: Path) -> None:
+    """A set that comes while a channel cross-fades is refused with FADING; silence is not."""
+    script: Script = [
+        (0, arm()),
+        (0, apply(1, command(0, 100, 0.5))),
+        (100, apply(2, command(0, 130, 0.4), ramp_ms=40)),
+    ]
+    third = (120, apply(3, command(0, 160, 0.4), command(1, 160, 0.4), ramp_ms=10))
+    samples, replies = replay(firmware, [*script, third], 200)
+    assert replies[-1] == (NAK, bytes([7, FADING, 0]))
+    assert np.array_equal(samples, replay(firmware, script, 200)[0])
+    _, replies = replay(firmware, [*script, (120, apply(3, ramp_ms=10))], 200)
+    assert replies[-1][0] == 0x87
+
+
+def test_keep_phase_changes_the_level_alone(firmware: Path) -> None:
+    """The channel keeps its own t, which began with the first set."""
+    script: Script = [
+        (0, arm()),
+        (7, apply(1, command(0, 123.45, 0.5))),
+        (100, apply(2, command(0, 123.45, 0.25, flags=KEEP_PHASE), ramp_ms=20)),
+    ]
+    samples, _ = replay(firmware, script, 200)
+    t = seconds(len(samples))
+    level = 0.25 + 0.25 * falling(t - 0.1, 0.02)
+    expected = np.where(t >= 0.007, level * tone(t - 0.007, 123.45, 1), 0)
+    assert np.abs(samples[:, 0] - expected).max() < TOLERANCE
+
+
+def test_envelopes_move_along_straight_lines(firmware: Path) -> None:
+    """An onset from zero over two knots to the level, the ending to silence by valid_for."""
+    onset, ending = [(0.1, 90.0), (1.0, -0.01)], [(0.3, -120.0)]
+    script: Script = [
+        (0, load(5, 12.5, *onset)),
+        (0, load(6, 7.3, *ending)),
+        (0, arm()),
+        (3, apply(1, command(2, 110, 0.2, 30, onset=5, ending=6), valid_for_ms=60)),
+    ]
+    samples, _ = replay(firmware, script, 100)
+    t = seconds(len(samples)) - 0.003
+    steps = [0, 0.0125, 0.025, 0.0375, 0.06, 0.0673, 0.0746]
+    knots = [(0, 0), *onset, (0.2, 30), (0.2, 30), *ending, (0, 0)]
+    values = [level * np.exp(1j * np.radians(phase)) for level, phase in knots]
+    amplitude = np.interp(t, steps, values, left=0)
+    expected = (amplitude * np.exp(2j * np.pi * 110 * t)).imag
+    assert np.abs(samples[:, 2] - expected).max() < TOLERANCE
+    assert not samples[:, [0, 1, 3]].any()
+
+
+def test_brake_goes_on_from_the_present_amplitude(firmware: Path) -> None:
+    """With keep phase, an onset to level 0 begins where the vibration is, on its own t."""
+    script: Script = [
+        (0, load(1, 10, (0.5, -180.0))),
+        (0, arm()),
+        (0, apply(1, command(0, 90, 0.4, 20))),
+        (50, apply(2, command(0, 90, 0, flags=KEEP_PHASE, onset=1), ramp_ms=500)),
+    ]
+    samples, _ = replay(firmware, script, 100)
+    t = seconds(len(samples))
+    values = [0.4 * np.exp(1j * np.radians(20))] * 2 + [-0.5, 0]
+    amplitude = np.interp(t, [0, 0.05, 0.06, 0.07], values)
+    expected = (amplitude * np.exp(2j * np.pi * 90 * t)).imag
+    assert np.abs(samples[:, 0] - expected).max() < TOLERANCE
+
+
+def test_watchdog_silences_to_the_sample(firmware: Path) -> None:
+    """It trips at its time after the last request of the session, and fades over 5 ms."""
+    ping = request(12, SESSION.to_bytes(2, "little"))
+    script: Script = [
+        (0, arm(100)),
+        (0, apply(1, command(3, 200, 1.0, 90))),
+        (60, ping),
+        (90, request(9)),
+        (100, request(12, bytes([1, 0]))),
+    ]
+    samples, _ = replay(firmware, script, 200)
+    t = seconds(len(samples))
+    expected = tone(t, 200, 1.0, 90) * falling(t - 0.16, 0.005)
+    assert np.abs(samples[:, 3] - expected).max() < TOLERANCE
+    assert not samples[165 * PER_MS :].any()
+
+
+def test_shorter_stop_ends_sooner_and_a_longer_one_changes_nothing(firmware: Path) -> None:
+    """From the present amplitude along the ramp that ends first."""
+    script: Script = [
+        (0, arm()),
+        (0, apply(1, command(0, 150, 0.8))),
+        (100, request(STOP, bytes([100, 0]))),
+        (140, request(STOP, bytes([20, 0]))),
+        (150, request(STOP, bytes([200, 0]))),
+    ]
+    samples, _ = replay(firmware, script, 200)
+    t = seconds(len(samples))
+    at_140 = falling(np.array([0.04]), 0.1)[0]
+    gain = np.where(t < 0.14, falling(t - 0.1, 0.1), at_140 * falling(t - 0.14, 0.02))
+    assert np.abs(samples[:, 0] - gain * tone(t, 150, 0.8)).max() < TOLERANCE
+
+
+@pytest.mark.real_time
+def test_cortex_m3_makes_the_same_samples_bit_for_bit(bare_metal: Path) -> None:
+    """Of a script with fades, envelopes, a brake, valid_for and a stop."""
+    script: Script = [
+        (0, load(1, 10, (0.5, -180.0))),
+        (0, load(2, 7.3, (0.1, 45.0), (0.9, -60.0))),
+        (1, arm()),
+        (5, apply(1, command(0, 90, 0.4, 20), command(1, 333.35, 0.9, onset=2), ramp_ms=13)),
+        (60, apply(2, command(0, 90, 0, flags=KEEP_PHASE, onset=1), command(3, 700, 1), ramp_ms=9)),
+        (120, apply(3, command(3, 701, 0.5, ending=2), ramp_ms=30, valid_for_ms=50)),
+        (180, apply(4, command(2, 50, 0.25, -90), ramp_ms=5)),
+        (200, request(STOP, bytes([50, 0]))),
+    ]
+    samples, _ = replay(bare_metal, script, 300)
+    assert np.array_equal(replay_on_the_machine(bare_metal, script, 300), samples)
+    assert np.abs(samples).max(axis=0).min() > 0.2

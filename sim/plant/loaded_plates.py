@@ -5,7 +5,7 @@ reduced basis is extended by the static vectors of the point, and the small syst
 again. Solutions are cached. Structural damping remains that of the plate on its ERAs.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TypeAlias
@@ -47,6 +47,28 @@ class LoadedPlate:
             self._tables.clear()
             self._tables[sample_rate] = np.hstack([grid.real, -grid.imag])
         return self._tables[sample_rate]
+
+
+Under: TypeAlias = tuple[LoadedPlate, Mapping[str, FingertipLoad]]
+"""A loaded plate with its contacts by id of the finger, in the order of its coordinates."""
+
+
+def carried_state(state: FloatArray, before: Under, after: Under) -> FloatArray:
+    """Displacement and velocity of all coordinates, (2 r,), carried to another set of contacts.
+
+    Those of the plate, and of the phalanges of fingers that stay, are continuous; a new finger's
+    phalanx is at rest.
+    """
+    (plate, contacts), (other, wanted) = before, after
+    count = len(plate.reduced.omega)
+    halves = np.split(state, 2)
+    moving = dict(zip(contacts, np.transpose([half[count:] for half in halves]), strict=True))
+    phalanges = np.reshape([moving.get(id, (0.0, 0.0)) for id in wanted], (-1, 2)).T
+    motion = [half[:count] for half in halves]
+    if other.reduced is not plate.reduced:
+        carried = other.reduced.projection_from(plate.reduced)
+        motion = [carried @ half for half in motion]
+    return np.concatenate([motion[0], phalanges[0], motion[1], phalanges[1]])
 
 
 class LoadedPlateCache:

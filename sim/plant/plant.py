@@ -16,7 +16,7 @@ from model.structure.fingertip import FingertipLoad
 from model.structure.point_load import PointLoad
 from model.transients.base_motion import Term
 from model.transients.time_response import ParticularSolution
-from sim.plant.loaded_plates import BLOCK, LoadedPlate, LoadedPlateCache
+from sim.plant.loaded_plates import BLOCK, LoadedPlate, LoadedPlateCache, carried_state
 
 SAMPLE_RATE = 10_000.0
 """Default sampling rate [Hz]: peaks at 500 Hz are sampled to within 1.3 %."""
@@ -94,20 +94,15 @@ class Plant:
         """
         if contacts == self._contacts:
             return
-        phalanges = dict(zip(self._contacts, np.transpose(self.phalanges), strict=True))
-        q, v = self.state
-        before = self._current.reduced
+        before = self._current, self._contacts
+        state = np.concatenate(self._state())
         self._current = self._plates.under(tuple(contacts.values()), time=self.time)
         self._contacts = dict(contacts)
-        if self._current.reduced is not before:
-            carried = self._current.reduced.projection_from(before)
-            q, v = carried @ q, carried @ v
-        x, dx = np.reshape([phalanges.get(id, (0.0, 0.0)) for id in contacts], (-1, 2)).T
         self._particular = [
             self._current.plate.particular_solutions(era, [solution.term for solution in solutions])
             for era, solutions in enumerate(self._particular)
         ]
-        remainder = np.concatenate([q, x, v, dx])
+        remainder = carried_state(state, before, (self._current, contacts))
         for solution in self._active():
             remainder = remainder - solution.state(self.time)
         self._free = self._current.plate.to_free @ remainder

@@ -1,0 +1,165 @@
+"""The samples of the firmware drive the plate in time: what fingers feel of a pattern."""
+
+import cmath
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from controller.loop.envelopes import ending_slots, onset_slots, wire_envelopes
+from firmware_script import RATE, Script, apply, arm, command, load, replay
+from model.arrays import FloatArray
+from model.finger.felt_band import felt_part
+from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.rig import Rig
+from model.structure.fingertip import fingertip_loads
+from model.structure.point_load import footprints_of
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.table.timing import Timing
+from model.transients.base_motion import Term
+from model.transients.envelope import shaped
+from paper_table import smooth_rig, smooth_table
+from sim.plant.fingers import Record
+from sim.plant.plant import Plant
+from sim.plant.playback import Playback
+from sim.plant.sampled import SampledPlant
+
+QUESTION = Question(((0.10, 0.03),), ((0.22, 0.16),))
+COMMIT, END = 50.0, 1250.0  # ms; the set plays from one to the other
+AFTER = 200.0  # ms
+SETTLED = 0.3  # s
+
+
+@dataclass(frozen=True)
+class Played:
+    """A pattern, and accelerations (n, p) [m/s²] under both fingers while the firmware played it.
+
+    exact: the same by the envelopes themselves, without samples.
+    """
+
+    pattern: Pattern
+    accelerations: FloatArray
+    exact: FloatArray
+
+
+def script_of(pattern: Pattern, rig: Rig) -> Script:
+    """Load the envelopes, arm, and play the pattern until it ends by itself."""
+    (envelopes,) = wire_envelopes(pattern, rig).values()
+    loads = [
+        load(each.slot, each.step * 1000, *((knot.level, knot.phase) for knot in each.knots))
+        for each in envelopes
+    ]
+    onsets, endings = onset_slots(rig), ending_slots(rig)
+    commands = []
+    for name in (pattern.onset or {}).keys() | (pattern.ending or {}).keys():
+        tone = pattern.excitation.get(name)
+        degrees = math.degrees(math.remainder(tone.phase, math.tau)) if tone else 0.0
+        commands.append(
+            command(
+                rig.wiring[name].number,
+                (pattern.onset or pattern.ending or {})[name].frequency,
+                tone.amplitude / rig.era(name).stroke if tone else 0.0,
+                degrees if degrees < 179.995 else -180.0,
+                onset=onsets[name] if name in (pattern.onset or {}) else 0,
+                ending=endings[name] if name in (pattern.ending or {}) else 0,
+            )
+        )
+    set_ = apply(1, *commands, valid_for_ms=round(END - COMMIT))
+    return [*((0.0, each) for each in loads), (COMMIT, arm()), (COMMIT, set_)]
+
+
+@pytest.fixture(scope="module")
+def played(firmware: Path) -> Played:
+    """A pattern with a shaped onset and ending, played by the firmware."""
+    rig, table = smooth_rig(), smooth_table()
+    timing = Timing(table)
+    pattern = timing.with_envelopes(QUESTION, table.query(QUESTION))
+    pattern = timing.with_transient_measures(QUESTION, pattern)
+    samples, _ = replay(firmware, script_of(pattern, rig), END + AFTER)
+    channels = [rig.wiring[era.name].number for era in rig.eras]
+    bases = samples[round(COMMIT / 1000 * RATE) :, channels] * [era.stroke for era in rig.eras]
+
+    reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras, rig.masses))
+    resting = fingertip_loads(rig.fingertip, QUESTION.contacts, QUESTION.loads)
+    contacts = {str(number): each for number, each in enumerate(resting)}
+    points = np.concatenate([fingertip_points(*at, rig.plate) for at in QUESTION.contacts])
+    sampled = SampledPlant(reduced, rig.eras, rate=RATE, loads=rig.masses)
+    sampled.set_contacts(contacts)
+    felt = sampled.advance(bases, shapes=sampled.reduced.at(points))
+    plant = Plant(reduced, rig.eras, loads=rig.masses, time=-1 / RATE)
+    plant.set_contacts(contacts)
+    for number, terms in enumerate(motion(pattern, rig)):
+        plant.set_input(number, terms)
+    until = (len(bases) - 0.5) / RATE
+    _, exact = plant.advance(until, sample_rate=RATE, shapes=plant.reduced.at(points))
+    return Played(pattern, felt, exact)
+
+
+def on_the_wire(term: Term) -> float:
+    """Its angular frequency [rad/s] in steps of 0.05 Hz."""
+    return 2 * math.pi * round(20 * term.omega / (2 * math.pi)) / 20
+
+
+def motion(pattern: Pattern, rig: Rig) -> list[list[Term]]:
+    """The base motion of each ERA by the formulas of the pattern: onset, then ending.
+
+    At the nearest frequency of the wire: within a second the phases would drift apart.
+    """
+    assert pattern.onset is not None
+    assert pattern.ending is not None
+    end = (END - COMMIT) / 1000
+    onsets, endings = shaped(pattern.onset, rig.eras), shaped(pattern.ending, rig.eras)
+    whole = []
+    for onset, ending in zip(onsets, endings, strict=True):
+        before = [replace(term, end=min(term.end, end), omega=on_the_wire(term)) for term in onset]
+        after = [
+            replace(
+                term,
+                start=term.start + end,
+                end=term.end + end,
+                omega=on_the_wire(term),
+                c0=cmath.exp(1j * on_the_wire(term) * end) * term.c0,
+                c1=cmath.exp(1j * on_the_wire(term) * end) * term.c1,
+            )
+            for term in ending
+        ]
+        whole.append([*before, *after])
+    return whole
+
+
+def test_fingers_feel_what_the_pattern_promised(played: Played) -> None:
+    """Level at the target and felt contrast, steady and over the first 100 ms, within 0.5 dB."""
+    rig, pattern = smooth_rig(), played.pattern
+    times = np.arange(len(played.accelerations)) / RATE
+    playing = times < (END - COMMIT) / 1000
+    discs = [fingertip_points(*at, rig.plate) for at in QUESTION.contacts]
+    target, quiet = (
+        Record(disc, fingertip_weights(*at, rig.plate), times[playing], part[playing])
+        for at, disc, part in zip(
+            QUESTION.contacts,
+            discs,
+            np.split(played.accelerations, [len(discs[0])], axis=1),
+            strict=True,
+        )
+    )
+    frequencies = tuple(sorted({tone.frequency for tone in pattern.excitation.values()}))
+    felt = Playback(frequencies, (target,), (quiet,), SETTLED, rig.threshold)
+    assert felt.level_db_sl == pytest.approx(pattern.level_db_sl, abs=0.5)
+    assert felt.felt_contrast_db == pytest.approx(pattern.felt_contrast_db, abs=0.5)
+    assert felt.transient_contrast_db == pytest.approx(pattern.transient_contrast_db, abs=0.5)
+
+
+def test_onset_and_brake_move_the_plate_as_their_formulas(played: Played) -> None:
+    """Of what skin can feel, at every sample, also once the bases stand still.
+
+    Within 2 % of the steady vibration. Beyond that band the steps of 16-bit samples show.
+    """
+    exact, made = (felt_part(each, RATE) for each in (played.exact, played.accelerations))
+    steady = np.abs(exact).max()
+    assert np.abs(made - exact).max() < 0.02 * steady
+    still = made[round((END - COMMIT + 50) / 1000 * RATE) :]
+    assert 0 < np.abs(still).max() < 0.1 * steady

@@ -3,6 +3,7 @@
 import asyncio
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 
 from controller.group.tasks import CoalescedCalls
@@ -15,7 +16,8 @@ _logger = logging.getLogger(__name__)
 class QuickStops:
     """Stops every amplifier once more for all requests that arrive while it is being stopped.
 
-    The first of these is sent at once, before the previous stop is confirmed.
+    The first of these is sent at once, before the previous stop is confirmed; no clear or other
+    request that was queued is sent before it.
 
     Lost amplifiers are sent stops as long as their wires are open. Amplifiers that share a bus
     get one broadcast before each of them is stopped individually, so that none waits for the reply
@@ -35,6 +37,9 @@ class QuickStops:
 
         waits_for_lost: else returns once those are stopped whose link is not lost.
         """
+        for amplifier in self._amplifiers.values():
+            with suppress(Exception):  # the stop does not depend on it
+                amplifier.expect_stop()
         for broadcasts, sharing in self._broadcasts:
             broadcasts.request(partial(_broadcast, sharing))
         for requested in self._requested.values():

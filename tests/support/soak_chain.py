@@ -42,7 +42,10 @@ from virtual_loop import START, Stuck, VirtualLoop, run_virtual
 
 _ON_THE_WIRE = 0.002  # s; through driver, adapter and back
 # Bytes of a silent set for four channels and what may precede it on the line, there and back.
-_BYTES = {"serial": 200, "modbus-rtu": 200, "slcan": 200, "socketcand": 200, "modbus-tcp": 0}
+_BYTES = 200
+# Bytes between two feeds of one of two amplifiers on a line, there and back: another request, a
+# status and a heartbeat of both, and a silent set of both.
+_BYTES_BETWEEN_FEEDS = 350
 _PATTERN = 0.25  # s; from a touch to its pattern
 _NOTICED = 0.3  # s; from an unplugged wire to the controller's reaction
 _TIMERS_MAX = 2_000
@@ -178,6 +181,7 @@ class _Run:
                 self.contacts,
                 channels=1 + max(channel.number for channel in self.rig.wiring.values()),
                 release=self._release(),
+                heartbeat=self._release(_BYTES_BETWEEN_FEEDS),
             )
             self.checks.sense = self.witness.sense
             self.serving = asyncio.create_task(self._serve())
@@ -195,11 +199,12 @@ class _Run:
             names = sorted(str(task.get_coro()) for task in left)
             self.checks.violate(f"{len(left)} tasks are left: {names}")
 
-    def _release(self) -> float:
-        """How long after the last finger the plate may play, without faults [s]."""
-        on_wire = [
-            _BYTES[line.kind] * 10 / line.speed if line.speed else 0.0 for line in self.plan.lines
-        ]
+    def _release(self, preceding: int = _BYTES) -> float:
+        """How long after the last finger the plate may play, without faults [s].
+
+        preceding: bytes that may be on the line before.
+        """
+        on_wire = [preceding * 10 / line.speed if line.speed else 0.0 for line in self.plan.lines]
         return RELEASE + max(on_wire) + _ON_THE_WIRE
 
     def _devices(self) -> dict[str, SimulatedDevice]:

@@ -15,7 +15,7 @@ from virtual_loop import START, VirtualLoop
 from witness_config import sense, witness_config
 
 _TOUCH = 0.19  # s; from a touch to its pattern
-_HEARTBEAT = 0.055  # s; between two signs of life, and as long as what is on the wire takes
+_HEARTBEAT = 0.055  # s; between two signs of life on an idle line
 _RAMP = 0.040  # s; along which what plays may fall silent after the last lift
 _ENDED = 1e-6  # s; after a lease has ended
 
@@ -23,7 +23,8 @@ _ENDED = 1e-6  # s; after a lease has ended
 class SoakWitness:
     """A witness on all wires of a run, by amplifiers' URLs; channels: how many each has.
 
-    release [s]: from the last lift to the command of silence, on the slowest wire of them.
+    release [s]: from the last lift to the command of silence, on the slowest wire of them;
+    heartbeat [s]: that a sign of life may be late by.
     """
 
     def __init__(
@@ -34,13 +35,14 @@ class SoakWitness:
         *,
         channels: int,
         release: float,
+        heartbeat: float,
     ) -> None:
         times = {
             "lift": release,
             "release": release + _RAMP,
             "touch": _TOUCH,
             "stop": release,
-            "heartbeat": _HEARTBEAT + release,
+            "heartbeat": _HEARTBEAT + heartbeat,
         }
         self._loop = loop
         self._witness = Witness(witness_config(urls, channels=channels, times_s=times))

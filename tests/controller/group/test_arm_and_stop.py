@@ -14,6 +14,7 @@ from drivers.protocol.messages import (
     AmplifierState,
     Apply,
     Arm,
+    Clear,
     Commit,
     Disarm,
     Fault,
@@ -347,6 +348,25 @@ async def test_concurrent_stops_share_one_stop() -> None:
         assert bench.states() == {STOPPED}
         await bench.controller.stop()
         assert [len(far_end.requests(Stop)) for far_end in bench.far_ends] == [3, 3]
+
+
+@in_virtual_time
+async def test_no_clear_is_sent_between_a_stop_and_its_frame() -> None:
+    """Whenever a second stop is requested, also while the first is still being confirmed."""
+    for step in range(20):
+        async with running() as bench:
+            bench.touch(FINGER)
+            await asyncio.sleep(0.05)  # so that silence takes the ramp of the stop
+            bench.far_end.delay = 0.003
+            first = asyncio.create_task(bench.controller.stop())
+            await asyncio.sleep(0.011)  # its clear waits behind a status of the first stop
+            clearing = asyncio.create_task(bench.controller.clear())
+            await asyncio.sleep(0.0005 * step)
+            requested = asyncio.get_running_loop().time()
+            await bench.controller.stop()
+            await asyncio.gather(first, clearing, return_exceptions=True)
+            sent = min(at for at in bench.far_end.times(Stop) if at >= requested)
+            assert not any(requested < at < sent for at in bench.far_end.times(Clear))
 
 
 @in_virtual_time

@@ -8,7 +8,7 @@
 #include "modbus.h"
 
 // Registers from the tag of a block to its first field.
-#define TAG_BEFORE 2
+#define TAG_BEFORE 1
 
 // First fields of the blocks.
 #define CONTROL_AT 2

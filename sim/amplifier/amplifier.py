@@ -172,7 +172,8 @@ class SimulatedAmplifier:
     def status(self, now: float) -> Status:
         """Status at a time [s] up to which it has been ticked."""
         levels = self._channels.levels(now)
-        left = self._watchdog_end - now if self._watchdog_end < math.inf else 0.0
+        is_watched = self.state in ENABLED and Feature.WATCHDOG in self._features
+        left = self._last_fed + self._watchdog - now if is_watched else 0.0
         is_on = self.state in (AmplifierState.SWITCHED_ON, *ENABLED) or any(levels)
         decayed = math.exp(min(0.0, (self._silent_from - now) / _DISCHARGE))
         return Status(

@@ -34,6 +34,7 @@ FaultKind: TypeAlias = Literal[
     "interlock",  # open until the end
 ]
 Toward: TypeAlias = Literal["amplifier", "host"]
+_DAMAGING = ("corrupt", "truncate", "incomplete_set")
 
 
 @dataclass(frozen=True)
@@ -77,12 +78,19 @@ class Faults:
         """Whether a fault is active at a time [s]."""
         return any(self._is_on(window, time) for window in self.windows if window.fault == fault)
 
-    def pass_on(self, frame: bytes, *, toward: Toward, time: float) -> list[tuple[float, bytes]]:
-        """Delivered pieces of a frame sent at a time [s], each with its delay [s]."""
+    def pass_on(
+        self, frame: bytes, *, toward: Toward, time: float, finds_damage: bool = False
+    ) -> list[tuple[float, bytes]]:
+        """Delivered pieces of a frame sent at a time [s], each with its delay [s].
+
+        finds_damage: whether the wire itself discards what is damaged, as TCP does.
+        """
         arriving = [(0.0, frame)]
         for window in self.windows:
             is_hit = self._is_on(window, time) and window.toward in (None, toward)
             if is_hit and self._random.random() < window.share:
+                if finds_damage and window.fault in _DAMAGING:
+                    return []
                 arriving = self._apply(window, arriving, toward)
                 arriving = [(delay, data) for delay, data in arriving if data]
         return arriving

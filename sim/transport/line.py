@@ -15,7 +15,7 @@ class Line:
     """One direction of a wire, in the running event loop.
 
     deliver: called with each frame that arrives; bits_per_second: None for no transmission time;
-    bits_per_byte: framing included.
+    bits_per_byte: framing included; finds_damage: see `Faults.pass_on`.
     """
 
     def __init__(
@@ -26,8 +26,10 @@ class Line:
         faults: Faults,
         bits_per_second: float | None = None,
         bits_per_byte: float = 10.0,
+        finds_damage: bool = False,
     ) -> None:
         self._deliver = deliver
+        self._finds_damage = finds_damage
         self._toward = toward
         self._faults = faults
         self._byte_time = bits_per_byte / bits_per_second if bits_per_second else 0.0
@@ -37,7 +39,9 @@ class Line:
     def send(self, frame: bytes) -> None:
         """Send a frame; it queues behind earlier ones."""
         now = clock.now()
-        arriving = self._faults.pass_on(frame, toward=self._toward, time=now)
+        arriving = self._faults.pass_on(
+            frame, toward=self._toward, time=now, finds_damage=self._finds_damage
+        )
         for delay, data in arriving:
             self._free_from = max(now, self._free_from) + len(data) * self._byte_time
             due = self._free_from + delay
@@ -72,9 +76,14 @@ class TwoWayLine:
         faults: Faults,
         bits_per_second: float | None = None,
         bits_per_byte: float = 10.0,
+        finds_damage: bool = False,
     ) -> None:
         make = partial(
-            Line, faults=faults, bits_per_second=bits_per_second, bits_per_byte=bits_per_byte
+            Line,
+            faults=faults,
+            bits_per_second=bits_per_second,
+            bits_per_byte=bits_per_byte,
+            finds_damage=finds_damage,
         )
         self.inward = make(to_amplifier, toward="amplifier")
         self.outward = make(to_host, toward="host")

@@ -1,6 +1,5 @@
 """Decoder for Modbus, from docs/reference/wire-modbus.md."""
 
-import binascii
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,8 +21,8 @@ from sim.witness.decoded import (
 from sim.witness.modbus_frames import Adu, RtuSplitter, Splitter, TcpSplitter
 from sim.witness.quantities import INVALID, OutOfRange, signed
 
-_CONTROL, _HEARTBEAT, _LOOK, _SET, _ENVELOPE = 0, 8, 12, 14, 100
-_STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS = 1000, 1032, 1350, 1064, 1140, 1220
+_CONTROL, _HEARTBEAT, _LOOK, _SET, _ENVELOPE = 1, 9, 12, 15, 101
+_STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS = 1001, 1033, 1351, 1065, 1141, 1221
 _WORDS = {15: RequestKind.ARM, 0: RequestKind.DISARM, 2: RequestKind.STOP, 128: RequestKind.CLEAR}
 _READ_KINDS = {
     _IDENTITY: RequestKind.HELLO,
@@ -98,9 +97,6 @@ class ModbusDecoder:
         match function:
             case 3 | 4:
                 read = struct.unpack(">HH", body)
-            case 6:
-                at, word = struct.unpack(">HH", body)
-                written = at, [word]
             case 16:
                 written = _written(body)
             case 23:
@@ -130,8 +126,6 @@ class ModbusDecoder:
         """The tag of a write, which reads repeat."""
         if at in (*_TAGGED, _LOOK):
             self._tags[unit] = words[0]
-            if at in _TAGGED and words[1] not in (0, check(words[2:])):
-                raise OutOfRange("wrong CRC of a block")
             return words[0]
         return None
 
@@ -158,11 +152,6 @@ class ModbusDecoder:
         return reply
 
 
-def check(words: Sequence[int]) -> int:
-    """CRC of a block: CRC-16, polynomial 1021, initial FFFF; 0 becomes FFFF."""
-    return binascii.crc_hqx(struct.pack(f">{len(words)}H", *words), 0xFFFF) or 0xFFFF
-
-
 def _written(body: bytes) -> tuple[int, list[int]]:
     at, count, size = struct.unpack_from(">HHB", body)
     words = list(struct.unpack(f">{count}H", body[5:]))
@@ -178,7 +167,7 @@ def _of_write(
     if at == _LOOK:
         kind = RequestKind.FAULTS if read_from == _FAULTS else RequestKind.STATUS
         return Request(kind, unit, key)
-    head = 2 if at in _TAGGED else 0
+    head = 1 if at in _TAGGED else 0
     block, body = at + head, words[head:]
     match block:
         case 2:
@@ -256,16 +245,14 @@ def _of_read(unit: int, pdu: bytes, request: _Open) -> Reply:
         raise OutOfRange(f"{len(words)} registers, expected {request.count}")
     if request.read_from not in _READ_TAGS:
         return Reply(unit, request.key)
-    if words[1] not in (0, check(words[2:])):
-        raise OutOfRange("wrong CRC of a block")
     constant = request.read_from in (_CAPABILITIES, _IDENTITY)
     if request.tag is not None and words[0] != request.tag and not constant:
         problem = f"tag {words[0]}, expected {request.tag}"
         # A damaged write is refused before its tag is stored: the refusal read then is that of an
         # earlier write, and matches this read all the same.
-        is_earlier = request.read_from == _REFUSAL and words[4] != request.tag
+        is_earlier = request.read_from == _REFUSAL and words[3] != request.tag
         return Reply(unit, request.key if is_earlier else None, problem=problem)
-    body = words[2:]
+    body = words[1:]
     if request.read_from == _STATUS:
         return Reply(unit, request.key, status=_decode_status(body))
     if request.read_from == _ACHIEVED:

@@ -16,7 +16,7 @@ from sim.far_ends.modbus.unit import ModbusUnit
 _REVIVAL = 10  # telegrams until it is armed again: most damaged ones stop or disarm it
 _TAG = 7
 _READ_WRITE = 23
-_BLOCK = 10  # offset of the written block of function 23; its check is second
+_BLOCK = 10  # offset of the written block of function 23
 
 
 class ModbusEnds:
@@ -46,14 +46,14 @@ class ModbusEnds:
             self._requests_by_size[answer[1]] = request
 
     def mend(self, pdu: bytes) -> bytes:
-        """Make a frame with a valid header or CRC, mostly valid lengths, and no check."""
+        """Make a frame with a valid header or CRC, and mostly valid lengths."""
         pdu = pdu[:200]
         block = pdu[_BLOCK : _BLOCK + (len(pdu) - _BLOCK) // 2 * 2]
         if self._chance.random() < 0.3:  # as a response
-            pdu = pdu[:1] + bytes([len(pdu) - 2]) + pdu[2:4] + bytes(2) + pdu[6:]
+            pdu = pdu[:1] + bytes([len(pdu) - 2]) + pdu[2:]
         elif pdu[0] == _READ_WRITE and len(block) >= 4 and self._chance.random() < 0.8:
             size = bytes([0, len(block) // 2, len(block)])
-            pdu = pdu[:7] + size + block[:2] + bytes(2) + block[4:]
+            pdu = pdu[:7] + size + block
         elif pdu[0] in (3, 4):
             pdu = pdu[:5]
         if self._is_rtu:

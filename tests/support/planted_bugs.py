@@ -305,12 +305,6 @@ def _without_order(encode: Any, request: Any, **how: Any) -> Any:
     return frames[:-1] if isinstance(request, Apply | Stage) else frames
 
 
-def _with_wrong_checksum(block: Any, *args: Any) -> Any:
-    write = block(*args)
-    tag, crc, *rest = write.registers
-    return replace(write, registers=(tag, crc ^ 1, *rest))
-
-
 def _level_first(pack: Any, command: DriveCommand) -> list[int]:
     frequency, level, *rest = pack(command)
     return [level, frequency, *rest]
@@ -385,9 +379,6 @@ DRIVERS: dict[str, Bug] = {
             requests, "command_id", lambda id_of, node, channel: id_of(node, _swapped(channel))
         ),
         wire="slcan",
-    ),
-    "a block carries a wrong checksum": Bug(
-        "garbage", wrapped(exchanges, "_block", _with_wrong_checksum), wire="modbus-tcp"
     ),
     "registers of channels begin with the level": Bug(
         "limits", wrapped(exchanges, "_pack_channel", _level_first), wire="modbus-rtu"

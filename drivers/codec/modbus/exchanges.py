@@ -5,8 +5,6 @@ two. Its tag, written and read back, matches responses to requests, since RTU fr
 number. Identity and capabilities are only read, so that nothing is written to an unknown device.
 """
 
-import binascii
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -130,15 +128,8 @@ def refusal_read() -> Read:
 
 
 def is_of(registers: Sequence[int], *, tag: int | None) -> bool:
-    """Whether a block has this tag (any for None) and a valid CRC."""
-    if len(registers) < HEAD or (tag is not None and registers[0] != tag):
-        return False
-    return registers[1] in (0, crc_of(registers[HEAD:]))
-
-
-def crc_of(registers: Sequence[int]) -> int:
-    """CRC-16 (polynomial 1021, initial FFFF) of registers, high byte first; FFFF instead of 0."""
-    return binascii.crc_hqx(struct.pack(f">{len(registers)}H", *registers), 0xFFFF) or 0xFFFF
+    """Whether a block has this tag (any for None)."""
+    return len(registers) >= HEAD and tag in (None, registers[0])
 
 
 def decode_reply(request: Request, registers: Sequence[int]) -> Reply:
@@ -180,7 +171,7 @@ def _read(name: str, *, beyond: int = 0) -> Read:
 
 def _block(name: str, tag: int, registers: Sequence[int]) -> Write:
     address: int = _MAP["holding"][name]["address"]
-    return Write(address, (tag, crc_of(registers), *registers))
+    return Write(address, (tag, *registers))
 
 
 def _control(request: Arm | Disarm | Stop | Clear) -> list[int]:

@@ -17,7 +17,6 @@ from drivers import clock
 from drivers.protocol.definition import PROTOCOL
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.modbus.frames import (
-    FRAME_TIMEOUT,
     Reader,
     RequestAdu,
     RtuReader,
@@ -70,6 +69,7 @@ class _Wire(ABC):
             faults=units.devices[0].faults,
             bits_per_second=speed,
             bits_per_byte=_BITS_PER_BYTE,
+            finds_damage=isinstance(reader, TcpReader),
         )
 
     def abandon(self) -> None:
@@ -102,7 +102,7 @@ class _Wire(ABC):
         if self.reader.has_partial_frame:
             # Timers may be early by the clock's resolution.
             self._timer = asyncio.get_running_loop().call_later(
-                FRAME_TIMEOUT + 0.002, self._frame_timeout
+                self.reader.timeout + 0.002, self._frame_timeout
             )
 
 

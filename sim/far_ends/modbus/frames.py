@@ -1,14 +1,17 @@
 """Modbus ADUs at the amplifier's end: RTU with CRC, TCP with MBAP header. No I/O.
 
-Written without code of the host's side. A pause of more than `FRAME_TIMEOUT` ends a frame.
+Written without code of the host's side. A long pause ends a frame.
 """
 
 import struct
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-# s; less than the 50 ms after which a host repeats a request.
 FRAME_TIMEOUT = 0.04
+"""Longest pause [s] within an RTU frame: less than the 50 ms after which a host repeats it."""
+
+TCP_TIMEOUT = 1.0
+"""Longest pause [s] within a TCP frame, whose segments may be delayed."""
 
 _MBAP = struct.Struct(">HHHB")  # transaction, protocol, length, unit
 _LENGTH_MAX = 254
@@ -56,7 +59,9 @@ def tcp_frame(request: RequestAdu, pdu: bytes) -> bytes:
 
 
 class Reader(ABC):
-    """Splits a stream of bytes into requests."""
+    """Splits a stream of bytes into requests; timeout [s]: the longest pause within one."""
+
+    timeout = FRAME_TIMEOUT
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -76,7 +81,7 @@ class Reader(ABC):
 
     def pause(self, now: float) -> list[RequestAdu]:
         """Discard a partial frame after a timeout; requests behind it are returned."""
-        is_late = bool(self._buffer) and now - self._last > FRAME_TIMEOUT
+        is_late = bool(self._buffer) and now - self._last > self.timeout
         return self._give_up() if is_late else []
 
     @abstractmethod
@@ -90,6 +95,8 @@ class Reader(ABC):
 
 class TcpReader(Reader):
     """Requests over TCP, whose header holds the length."""
+
+    timeout = TCP_TIMEOUT
 
     def _take(self) -> list[RequestAdu]:
         found = []

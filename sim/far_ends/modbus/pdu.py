@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Sequence
 
-READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE, READ_WRITE = 3, 4, 6, 16, 23
+READ_HOLDING, READ_INPUT, WRITE, READ_WRITE = 3, 4, 16, 23
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3
 _READ_MAX, _WRITE_MAX, _WRITE_BESIDE_READ_MAX = 125, 123, 121
 
@@ -17,7 +17,7 @@ class ModbusException(Exception):
 
 
 def pair(body: bytes) -> tuple[int, int]:
-    """Two words: an address and a count, or a value."""
+    """Two words: an address and a count."""
     if len(body) != 4:
         raise ModbusException(ILLEGAL_VALUE)
     first, second = struct.unpack(">HH", body)
@@ -34,9 +34,6 @@ def check_range(address: int, count: int, *, end: int) -> None:
 
 def to_write(function: int, body: bytes) -> tuple[int, Sequence[int]]:
     """The address and the words of a write."""
-    if function == WRITE_ONE:
-        address, word = pair(body)
-        return address, [word]
     maximum = _WRITE_MAX if function == WRITE else _WRITE_BESIDE_READ_MAX
     if len(body) < 5:
         raise ModbusException(ILLEGAL_VALUE)

@@ -3,7 +3,6 @@
 Written from protocol.yaml, without code of the host's side.
 """
 
-import binascii
 import struct
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -38,11 +37,6 @@ class RefusedWrite(Exception):
         super().__init__(code.name)
         self.code = code
         self.channel = channel
-
-
-def checksum(words: Sequence[int]) -> int:
-    """CRC-16 with polynomial 1021, initial FFFF; 0, which means no CRC, becomes FFFF."""
-    return binascii.crc_hqx(struct.pack(f">{len(words)}H", *words), 0xFFFF) or 0xFFFF
 
 
 def value_of(quantity: WireQuantity, word: int, *, channel: int | None = None) -> float:

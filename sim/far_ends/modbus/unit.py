@@ -1,7 +1,7 @@
 """The registers of a simulated amplifier: request PDUs in, reply PDUs out.
 
 Written from protocol.yaml, without code of the host's side. A refused write is not applied and does
-not feed the watchdog; a damaged one gets no reply.
+not feed the watchdog.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,7 +40,6 @@ from sim.far_ends.modbus.pdu import (
     READ_INPUT,
     READ_WRITE,
     WRITE,
-    WRITE_ONE,
     ModbusException,
     check_range,
     pair,
@@ -53,7 +52,6 @@ from sim.far_ends.modbus.registers import (
     RefusedWrite,
     achieved_words,
     capability_words,
-    checksum,
     decode_envelope,
     decode_set,
     fault_words,
@@ -65,9 +63,10 @@ from sim.far_ends.modbus.registers import (
 _T = TypeVar("_T")
 
 _Q = PROTOCOL.quantities
-_HEAD = 2
+_HEAD = len(MAP["head"])
 _GROUP: int = MAP["channel_registers"]
 _CONTROL: int = MAP["holding"]["control"]["address"]
+_WORD = _CONTROL + _HEAD  # of the control block
 _HEARTBEAT: int = MAP["holding"]["heartbeat"]["address"]
 _SET: int = MAP["holding"]["set"]["address"]
 _ENVELOPE: int = MAP["holding"]["envelope"]["address"]
@@ -126,7 +125,7 @@ class ModbusUnit:
         self._achieved: Achieved | None = None
         # As written last; initially the defaults of watchdog and ramp.
         self._written = dict.fromkeys(range(_CONTROL, _ENDS[_CONTROL]), 0)
-        self._written |= {_CONTROL + 3: _Q.watchdog.to_wire(0.25), _CONTROL + 4: 5}
+        self._written |= {_WORD + 1: _Q.watchdog.to_wire(0.25), _WORD + 2: 5}
 
     def reply(self, pdu: bytes) -> bytes | None:
         """The reply to a request of at least one byte; None for no reply."""
@@ -154,11 +153,8 @@ class ModbusUnit:
     def _carry_out(self, function: int, body: bytes) -> bytes:
         if function in (READ_HOLDING, READ_INPUT):
             return registers_read(function, self._read(*pair(body)))
-        if function in (WRITE_ONE, WRITE):
-            address, words = to_write(function, body)
-            if function == WRITE_ONE and not _CONTROL + _HEAD <= address < _ENDS[_CONTROL]:
-                raise ModbusException(ILLEGAL_ADDRESS)
-            self._write(address, words)
+        if function == WRITE:
+            self._write(*to_write(function, body))
             return bytes([function]) + body[:4]
         if function == READ_WRITE:
             if len(body) < 4:
@@ -197,12 +193,11 @@ class ModbusUnit:
         for name, block in MAP["input"].items():
             begin = block["address"]
             if begin < address + count and address < begin + _SIZES[name]:
-                for at, word in enumerate([self._tag, 0, *self._block(name)], start=begin):
+                for at, word in enumerate([self._tag, *self._block(name)], start=begin):
                     if address <= at < address + count:
                         words[at - address] = word
         if address in _STARTS:
-            words[:1] = [self._tag]
-            words[1:2] = [checksum(words[_HEAD:])] * (count > 1)
+            words[0] = self._tag
         return words
 
     def _block(self, name: str) -> list[int]:
@@ -240,20 +235,19 @@ class ModbusUnit:
             self._achieved = reply
         self._written.update(enumerate(words, start=address))
         if isinstance(reply, Loaded):  # reads return it as stored
-            self._written.update({_ENVELOPE + 2: reply.slot, _ENVELOPE + 4: reply.knots})
+            slot = _ENVELOPE + _HEAD
+            self._written.update({slot: reply.slot, slot + 2: reply.knots})
 
     def _without_head(self, address: int, words: Sequence[int]) -> Sequence[int]:
-        """The words after tag and CRC, where a write begins with them."""
+        """The words after the tag, where a write begins with it."""
         if address not in _ENDS:
             return words
         if len(words) <= _HEAD:
             raise RefusedWrite(NakCode.BAD_LENGTH)
-        if words[1] not in (0, checksum(words[_HEAD:])):
-            raise _NoReply
         return words[_HEAD:]
 
     def _request(self, address: int, words: Sequence[int]) -> Request | None:
-        """Decode the words of a write, without tag and CRC; None where no request follows."""
+        """Decode the words of a write, without the tag; None where no request follows."""
         if address == MAP["look"]:
             if len(words) > 1:
                 raise ModbusException(ILLEGAL_ADDRESS)
@@ -265,29 +259,27 @@ class ModbusUnit:
                 break
         else:
             raise ModbusException(ILLEGAL_ADDRESS)
-        if begin == _CONTROL:
-            return self._control_request(address, words)
-        if address != begin + _HEAD:  # no partial writes
+        if address != begin + _HEAD:
             raise ModbusException(ILLEGAL_ADDRESS)
+        if begin == _CONTROL:
+            return self._control_request(words)
         if begin == _HEARTBEAT:
             return Ping(words[0])
         return decode_set(words) if begin == _SET else decode_envelope(words)
 
-    def _control_request(self, address: int, words: Sequence[int]) -> Request | None:
-        control = {**self._written, **dict(enumerate(words, start=address))}
-        if address > _CONTROL + _HEAD:
-            return None
-        name = _CONTROLWORDS.get(words[0])
-        ramp = min(control[_CONTROL + 4], _Q.ramp.maximum) / _Q.ramp.per_unit
-        match name:
+    def _control_request(self, words: Sequence[int]) -> Request:
+        """The request of a controlword; registers left out have what was written last."""
+        control = {**self._written, **dict(enumerate(words, start=_WORD))}
+        ramp = min(control[_WORD + 2], _Q.ramp.maximum) / _Q.ramp.per_unit
+        match _CONTROLWORDS.get(words[0]):
             case "ARM":
-                session = int(value_of(_Q.session, control[_CONTROL + 5]))
-                return Arm(value_of(_Q.watchdog, control[_CONTROL + 3]), session)
+                session = int(value_of(_Q.session, control[_WORD + 3]))
+                return Arm(value_of(_Q.watchdog, control[_WORD + 1]), session)
             case "DISARM":
                 return Disarm(ramp)
             case "STOP":
                 return Stop(ramp)
             case "CLEAR":
-                return Clear(int(value_of(_Q.latch, control[_CONTROL + 6])))
+                return Clear(int(value_of(_Q.latch, control[_WORD + 4])))
             case _:
                 raise RefusedWrite(NakCode.BAD_VALUE)

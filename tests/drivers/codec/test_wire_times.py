@@ -15,15 +15,15 @@ GAP = 0.00175  # s of silence between RTU frames above 19 200 baud, by the stand
         # bytes of ten bits, there and back
         (SERIAL.format(115_200), 1000 / 115_200, 160 / 115_200, 380 / 115_200),
         (SERIAL.format(9600), 1000 / 9600, 160 / 9600, 380 / 9600),
-        # bytes of eleven bits, and silences: 59 and 49 bytes, 21, 31 and 15
+        # bytes of eleven bits, and silences: 57 and 47 bytes, 19, 29 and 13
         (
             RTU.format(115_200),
-            1188 / 115_200 + 2 * GAP,
-            231 / 115_200 + GAP,
-            506 / 115_200 + 2 * GAP,
+            1144 / 115_200 + 2 * GAP,
+            209 / 115_200 + GAP,
+            462 / 115_200 + 2 * GAP,
         ),
-        (RTU.format(9600), 115 * 11 / 9600, 24.5 * 11 / 9600, 53 * 11 / 9600),
-        ("modbus+tcp://h/1?baud=9600", 115 * 11 / 9600, 24.5 * 11 / 9600, 53 * 11 / 9600),
+        (RTU.format(9600), 111 * 11 / 9600, 22.5 * 11 / 9600, 49 * 11 / 9600),
+        ("modbus+tcp://h/1?baud=9600", 111 * 11 / 9600, 22.5 * 11 / 9600, 49 * 11 / 9600),
         # frames of 135 bits with worst stuffing; two segments and five frames
         (CAN, 6 * 135 / 500_000, 135 / 500_000, 7 * 135 / 500_000),
         # unknown speed

@@ -128,3 +128,12 @@ def test_faults_combine_on_one_frame() -> None:
     arrived = [faults.pass_on(b"ab", toward="amplifier", time=1.0) for _ in range(200)]
     assert {len(data) for frames in arrived for _, data in frames} <= {1}
     assert [] in arrived
+
+
+@pytest.mark.parametrize("kind", ["corrupt", "truncate", "incomplete_set"])
+def test_wire_that_finds_damage_loses_the_frame(kind: FaultKind) -> None:
+    """As TCP does; what is only late or double arrives."""
+    for fault, expected in ((kind, []), ("duplicate", [(0.0, FRAME)] * 2)):
+        faults = Faults((FaultWindow(fault),))  # type: ignore[arg-type]
+        arrived = faults.pass_on(FRAME, toward="amplifier", time=1.0, finds_damage=True)
+        assert arrived == expected

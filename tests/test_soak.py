@@ -98,8 +98,10 @@ def held(
     return Plan(3, (Line(wire, KINDS[wire][0]),), 1, ordered, 4.0, 4.0)
 
 
-def _never(*_: Any) -> float:
-    return float("inf")
+def _next_event_but_the_watchdog(amplifier: SimulatedAmplifier) -> float:
+    return min(
+        amplifier._vibration_end, amplifier._silence_reached, amplifier._overtemperature_from
+    )
 
 
 def _deaf_to_lifts(deliver: Callable[..., None]) -> Callable[..., None]:
@@ -113,8 +115,8 @@ def _deaf_to_lifts(deliver: Callable[..., None]) -> Callable[..., None]:
 BUGS: dict[str, tuple[Any, str, Any, Plan, str]] = {
     "an amplifier without a watchdog": (
         SimulatedAmplifier,
-        "_watchdog_end",
-        property(_never),
+        "next_event",
+        property(_next_event_but_the_watchdog),
         held(FaultInjection(2.0, 0, FaultWindow("unplug", lasts=1.5))),
         "after it was fed",
     ),

@@ -385,7 +385,7 @@ class Decider:
     def _note_validity(self, sets: SafeSets, selection: Selection, now: float) -> None:
         """Note how long sets committed by now [s] last."""
         until = self._confirmed_until(selection)
-        validity = Validity.begun(sets.valid_for, confirmed_until=until, now=now)
+        validity = Validity.started(sets.valid_for, confirmed_until=until, now=now)
         self._playing = replace(self._playing, validity=validity)
 
     def _note(self, change: Change, time: float) -> None:

@@ -31,7 +31,7 @@ class Validity:
     renewable_until: float = math.inf
 
     @classmethod
-    def begun(cls, valid_for: float, *, confirmed_until: float, now: float) -> "Validity":
+    def started(cls, valid_for: float, *, confirmed_until: float, now: float) -> "Validity":
         """Return the validity of sets committed by now that last `valid_for` [s].
 
         What a guard has shortened is not renewed, since that would circumvent its limit.
@@ -54,14 +54,14 @@ def valid_for(selection: Selection, *, confirmed_until: float, now: float) -> fl
 
     The amplifiers end a pulse; the last one, where several play.
     """
-    longest = min(max(confirmed_until - now + _MARGIN, _MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
+    unlimited = min(max(confirmed_until - now + _MARGIN, _MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
     pulses = [target.pulse for _, target in selection.targets]
     left = [
         pulse.duration if pulse.started_at is None else max(pulse.end - now, _MIN_LEFT)
         for pulse in pulses
         if pulse is not None
     ]
-    return min(longest, max(left)) if left and len(left) == len(pulses) else longest
+    return min(unlimited, max(left)) if left and len(left) == len(pulses) else unlimited
 
 
 def first_end(selection: Selection) -> float:

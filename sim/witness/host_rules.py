@@ -13,6 +13,7 @@ from sim.witness.set_rules import ExpectedSets, check_envelope, check_set
 
 _IN_FLIGHT = 0.001  # s; from the host's write until a frame is seen
 _REORDER_WINDOW = 0.020  # s; of two commands given within it the earlier may still be sent first
+_HEARTBEAT_STATUS = 0.002  # s; over CAN a heartbeat is followed by the order of its status
 _UNORDERED = (RequestKind.READ, RequestKind.HELLO, RequestKind.CAPABILITIES)
 
 
@@ -140,6 +141,13 @@ class HostRules:
             and requested_at < self._inputs.last_disarm + _REORDER_WINDOW
         ):
             return  # silences as well
+        if (
+            request.kind is RequestKind.STATUS
+            and session.last_feed is not None
+            and session.last_feed <= requested_at
+            and time <= session.last_feed + _HEARTBEAT_STATUS
+        ):
+            return  # part of a heartbeat that was on the line
         session.report(
             "stop",
             time,

@@ -100,7 +100,9 @@ def _decode(direction: Direction, piece: bytes) -> Message:
         return Damaged("a wrong CRC")
     first, version, address, sequence = struct.unpack_from("<BBBH", content)
     number, payload = first & 0x7F, content[5:]
-    if version != (_NEUTRAL if number == _HELLO else _VERSION):
+    if version != (_NEUTRAL if number == _HELLO else _VERSION) and not (
+        number == _NAK and version == _NEUTRAL  # of a Hello, or of another version
+    ):
         return Damaged(f"protocol version {version}")
     if bool(first & 0x80) != (direction == "host"):
         return Damaged("a frame of the wrong direction")

@@ -331,3 +331,12 @@ def test_decoders_check_the_bounds_of_envelopes(count: int, phase: int, problem:
         ((_, meaning),) = decoder.feed("amplifier", 0.0, data)
         assert isinstance(meaning, Request)
         assert meaning.problem == problem
+
+
+def test_refusal_of_a_hello_has_version_0() -> None:
+    """It is a reply like one of the present version, not a damaged frame."""
+    for version in (0, 2):
+        content = struct.pack("<BBBH", 0x9F, version, 1, 7) + bytes([1, 7, 255])
+        body = content + zlib.crc32(content).to_bytes(4, "little")
+        (frame,) = SerialDecoder().feed("host", 0.0, b"\0" + cobs.encode(body) + b"\0")
+        assert isinstance(frame[1], Reply)

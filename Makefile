@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware test lint format docs fuzz kill-test fault-test stop-test estimate-test soak bench bench-latency \
+.PHONY: demo firmware firmware-test test lint format docs fuzz kill-test fault-test stop-test estimate-test soak bench bench-latency \
 	bench-localization bench-plant bench-promise bench-wires dist smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -20,6 +20,12 @@ demo: .venv/installed
 # An amplifier in C for this machine, in out/firmware; firmware/README.md tells the rest.
 firmware:
 	$(MAKE) -C firmware
+
+# Conformance of the firmware on this machine and on a Cortex-M3 in QEMU, its samples, mutated frames
+# under sanitizers, and its sizes; a million frames: make firmware-test FIRMWARE=--long
+firmware-test: .venv/installed-test
+	.ci/install gcc-arm-none-eabi:arm-none-eabi-gcc libnewlib-arm-none-eabi: qemu-system-arm:qemu-system-arm
+	$(BIN)/python firmware/test/run.py $(FIRMWARE)
 
 # What needs the processors; what plays in real time; what loads the processors itself.
 test: .venv/installed-test

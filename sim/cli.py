@@ -56,6 +56,14 @@ def sim(
     slcan: Annotated[
         bool, typer.Option("--slcan", help="Serve a CAN bus behind a serial adapter (slcan).")
     ] = False,
+    firmware: Annotated[
+        bool,
+        typer.Option(
+            "--firmware",
+            help="Run the firmware of `make firmware` for each amplifier, in QEMU where installed; "
+            "its samples move the plate.",
+        ),
+    ] = False,
     wire: Annotated[
         list[str] | None,
         typer.Option(
@@ -116,6 +124,7 @@ def sim(
         from sim.far_ends.wire_assignment import assign_wires
         from sim.far_ends.wires import Wire
         from sim.faults.fault_file import FaultFile, load_faults
+        from sim.firmware.programs import find_firmware
         from sim.plant.imperfections import Imperfections, draw_imperfections
         from sim.process.simulation import Simulation
 
@@ -135,9 +144,18 @@ def sim(
         drawn = seed_of_plate(exact=exact, seed=seed)
         loaded = load_rig(rig)
         _check_rate(rate, frequency_max=loaded.limits.frequency_max)
+        if firmware and (common is not None or wire or faults or virtual_time):
+            raise InputError("--firmware has a serial line and real time; omit the other options")
+        programs = find_firmware() if firmware else None
+        if programs is not None:
+            print(f"firmware: {programs.description}", file=sys.stderr)
         simulation = Simulation(
             loaded,
-            assign_wires(loaded.amplifiers, common=common, options=wire or [], defaults=defaults),
+            {}
+            if firmware
+            else assign_wires(
+                loaded.amplifiers, common=common, options=wire or [], defaults=defaults
+            ),
             faults=load_faults(faults, amplifiers=loaded.amplifiers) if faults else FaultFile(()),
             fingers={
                 str(number): parse_point(text, what="--finger")
@@ -151,6 +169,7 @@ def sim(
             control=control,
             record=record,
             until_eof=until_eof,
+            firmware=programs,
         )
         _run(simulation, virtual_time=virtual_time)
 
@@ -194,7 +213,7 @@ def _run(simulation: "Simulation", *, virtual_time: bool) -> None:
     from sim.process.simulation import run_simulation
     from sim.process.virtual_time import SteppedLoop
 
-    view = _LiveView() if sys.stdout.isatty() else None
+    view = _LiveView() if sys.stdout.isatty() and simulation.firmware is None else None
     factory = SteppedLoop if virtual_time else None
     try:
         with asyncio.Runner(loop_factory=factory) as runner:

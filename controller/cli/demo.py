@@ -35,7 +35,8 @@ def demo(
     wire: Annotated[
         str,
         typer.Option(
-            help="Wire: serial (a pseudo-terminal), modbus (TCP), can (socketcand) or sim (none)."
+            help="Wire: serial (a pseudo-terminal), modbus (TCP), can (socketcand), firmware (the "
+            "amplifier in C on serial, after `make firmware`) or sim (none)."
         ),
     ] = "serial",
     touches: Annotated[

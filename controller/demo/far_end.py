@@ -28,6 +28,7 @@ SIM_OPTIONS: Mapping[str, Sequence[str]] = {
     "serial": ("--serial",),
     "modbus": ("--modbus-tcp", "0"),
     "can": ("--socketcand", "0"),
+    "firmware": ("--firmware",),
 }
 """Options of `era sim` by wire."""
 

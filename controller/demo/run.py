@@ -17,6 +17,7 @@ from controller.sources.evemu import EvemuSource
 from controller.sources.touch import TouchSource
 from controller.sources.tuio import TuioSource
 from drivers.amplifier import Amplifier
+from drivers.link.link import REPLY_TIMEOUT
 from drivers.operation.garbage_collection import no_long_collections
 from drivers.registry import open_backend
 from model.figures import save_figure
@@ -28,6 +29,10 @@ Play: TypeAlias = Callable[[], Awaitable[None]]
 RecordedTouches: TypeAlias = Callable[[], Awaitable[tuple[TouchSource, Play]]]
 
 WIRES = (*SIM_OPTIONS, "sim")
+
+EMULATOR_TIMEOUT = 0.15
+"""Time [s] to wait for a reply of emulated firmware, whose UART takes a byte each time the machine
+gets round to it; within the watchdog of 250 ms."""
 
 DECAY = 0.1
 """Time [s] for the plate to ring down after the last touch."""
@@ -88,7 +93,13 @@ async def run_demo(
         controller = Controller(
             rig,
             table,
-            amplifiers={name: Amplifier(open_backend(url)) for name, url in plate.urls.items()},
+            amplifiers={
+                name: Amplifier(
+                    open_backend(url),
+                    reply_timeout=EMULATOR_TIMEOUT if wire == "firmware" else REPLY_TIMEOUT,
+                )
+                for name, url in plate.urls.items()
+            },
             sources=[source],
             observer=recorder.observer,
             timing=Timing(table),

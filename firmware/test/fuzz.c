@@ -12,10 +12,13 @@
 #include "crc.h"
 #include "modbus_rtu.h"
 #include "serial.h"
+#include "slcan.h"
 
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+
+#define HOST 127 // on CAN
 
 static struct amplifier amplifier;
 static uint64_t seed = 1;
@@ -94,7 +97,8 @@ static void arm_again(void)
 {
     amplifier_stop(&amplifier, 0);
     amplifier_clear(&amplifier, amplifier.latch);
-    amplifier_arm(&amplifier, WATCHDOG_MAX, (uint16_t)(1 + any(3)));
+    amplifier.ended_session = 0;
+    amplifier_arm(&amplifier, WATCHDOG_MAX, any(2) ? HOST : (uint16_t)(1 + any(3)));
 }
 
 static uint8_t *put_u16(uint8_t *at, uint32_t value)
@@ -279,33 +283,106 @@ static void fuzz_modbus(struct rtu *rtu)
     require(size == 0 || (size >= 5 && size <= RTU_FRAME_MAX), "size of a reply");
 }
 
+static unsigned long frames_sent;
+
+static void frame_sent(const struct can_frame *frame)
+{
+    require(frame->length <= 8 && frame->id <= 0x7FF, "frame");
+    frames_sent++;
+}
+
+static uint64_t some_command(uint8_t channel, uint8_t sequence)
+{
+    return (400 + any(4)) | (uint64_t)any(10001) << 16 | (uint64_t)any(18000) << 32 |
+           (uint64_t)any(8) << 48 | (uint64_t)channel << 52 | (uint64_t)sequence << 56;
+}
+
+// The next frame of a host: mostly a set in pieces, of one sequence number for some frames.
+static struct can_frame some_frame(uint8_t sequence)
+{
+    static const uint16_t IDS[] = {0x481, 0x481, 0x481, 0x201, 0x301, 0x401, 0x501, 0x681, 0x681,
+                                   0x601, 0x601, 0x601, 0x77F, 0x480, 0x000};
+    struct can_frame frame = {IDS[any(sizeof IDS / sizeof IDS[0])], 8, {0}};
+    uint64_t data = (uint64_t)any(UINT32_MAX) << 32 | any(UINT32_MAX);
+    if (frame.id == 0x481 || frame.id == 0x480) { // an order
+        uint32_t action = any(8), first = some_token();
+        first = action == 4 ? HOST : action == 7 ? amplifier.latch : first;
+        data = first | (uint64_t)any(100) << 16 | (uint64_t)(action == 4 ? 2000 : 0) << 32 |
+               (uint64_t)action << 48 | (uint64_t)any(3) << 51 |
+               (uint64_t)(frame.id == 0x480 ? 0 : sequence) << 56;
+    } else if (frame.id >= 0x201 && frame.id <= 0x501) {
+        data = some_command((uint8_t)((frame.id - 0x201) >> 8), sequence);
+    } else if (frame.id == 0x681) {
+        data = any(3) | (uint64_t)any(3) << 6 | (uint64_t)sequence << 56;
+    } else if (frame.id == 0x601 && any(2)) { // objects of the page
+        data = (data & ~UINT64_C(0xFFFFFF00)) | (uint64_t)(0x2000 + any(0x40)) << 8;
+    } else if (frame.id == 0x77F) {
+        frame.length = 1;
+    } else if (frame.id == 0x000) { // mostly start
+        frame.length = 2;
+        data = any(8) ? 1 : 128 + any(3);
+    }
+    for (unsigned i = 0; i < 8; i++)
+        frame.data[i] = (uint8_t)(data >> 8 * i);
+    return frame;
+}
+
+static void fuzz_can(struct slcan *slcan)
+{
+    static uint8_t sequence = 1;
+    if (slcan->node->consumer == 0) // reset
+        slcan->node->consumer = (uint32_t)HOST << 16;
+    char line[SLCAN_LINE_MAX + 8];
+    if (any(4) == 0)
+        sequence = (uint8_t)(1 + sequence % 255);
+    struct can_frame frame = some_frame(sequence);
+    frame.length = (uint8_t)mutate(frame.data, frame.length, 8);
+    uint16_t length = slcan_format(&frame, line);
+    if (any(8) == 0)
+        length = mutate((uint8_t *)line, length, sizeof line);
+    slcan_byte(slcan, 'O');
+    slcan_byte(slcan, '\r');
+    for (uint16_t i = 0; i < length; i++)
+        slcan_byte(slcan, (uint8_t)line[i]);
+    can_time(slcan->node);
+}
+
 int main(int count, char **arguments)
 {
     static struct serial serial;
     static struct modbus modbus;
     static struct rtu rtu;
-    unsigned long played[2] = {0, 0}, frames = count > 1 ? strtoul(arguments[1], NULL, 10) : 20000;
+    static struct can_node node;
+    static struct slcan slcan;
+    unsigned long played[3] = {0, 0, 0}, frames = count > 1 ? strtoul(arguments[1], NULL, 10) : 20000;
     if (count > 2)
         seed = strtoull(arguments[2], NULL, 10);
     amplifier_init(&amplifier, "FUZZ-1");
     serial_init(&serial, &amplifier, 1);
     modbus_init(&modbus, &amplifier, 1);
     rtu_init(&rtu, &modbus);
-    for (int codec = 0; codec < 2; codec++) {
+    can_init(&node, &amplifier, 1, frame_sent);
+    slcan_init(&slcan, &node);
+    for (int codec = 0; codec < 3; codec++) {
         for (mutated = 0; mutated < frames;) {
             if (amplifier.state != OPERATION_ENABLED && any(4) == 0)
                 arm_again();
             uint16_t token = amplifier.active.token;
             if (codec == 0)
                 fuzz_serial(&serial);
-            else
+            else if (codec == 1)
                 fuzz_modbus(&rtu);
+            else
+                fuzz_can(&slcan);
             played[codec] += amplifier.active.token != token && amplifier.active.token != 0;
             check_amplifier();
         }
     }
-    printf("%lu mutated frames each: serial played %lu sets, discarded %lu; Modbus %lu, %lu\n",
-           frames, played[0], (unsigned long)serial.discarded, played[1],
-           (unsigned long)rtu.discarded);
+    printf("%lu mutated frames for each codec, and as many whole ones:\n"
+           "  serial discarded %lu, and played %lu sets\n"
+           "  Modbus discarded %lu, and played %lu sets\n"
+           "  CAN sent %lu frames, and played %lu sets\n",
+           frames, (unsigned long)serial.discarded, played[0], (unsigned long)rtu.discarded,
+           played[1], frames_sent, played[2]);
     return 0;
 }

@@ -28,6 +28,8 @@ void modbus_init(struct modbus *modbus, struct amplifier *amplifier, uint8_t uni
     modbus->amplifier = amplifier;
     modbus->unit = unit;
     modbus->refusal = ACCEPTED;
+    modbus->control[1] = 250; // watchdog, ms
+    modbus->control[2] = 5;   // ramp, ms
 }
 
 static uint16_t u16_at(const uint8_t *bytes)
@@ -201,7 +203,7 @@ static void broadcast(struct modbus *modbus, const uint8_t *pdu, uint16_t length
         first = CONTROL_AT;
         fields = CONTROL_FIELDS;
     }
-    if (address + count == first + fields)
+    if (address + count == first + fields || first == CONTROL_AT)
         write_request(modbus, pdu, length, reply);
 }
 

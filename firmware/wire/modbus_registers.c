@@ -162,10 +162,14 @@ uint16_t modbus_read(const struct modbus *modbus, uint16_t address)
     return 0;
 }
 
-static struct verdict write_control(struct modbus *modbus, const uint16_t *fields, uint16_t count)
+// The block may end after any of its registers: those left out are as written last.
+static struct verdict write_control(struct modbus *modbus, const uint16_t *written, uint16_t count)
 {
-    if (count != CONTROL_FIELDS)
+    uint16_t fields[CONTROL_FIELDS];
+    if (count > CONTROL_FIELDS)
         return refused(NAK_BAD_LENGTH);
+    memcpy(fields, modbus->control, sizeof fields);
+    memcpy(fields, written, count * sizeof fields[0]);
     switch (fields[0]) {
     case ARM:
         return amplifier_arm(modbus->amplifier, fields[1], fields[3]);
@@ -248,13 +252,11 @@ static struct verdict write_envelope(struct modbus *modbus, const uint16_t *fiel
 }
 
 // What was accepted is kept, to be read.
-static struct verdict keep(struct verdict verdict, uint16_t *kept, uint16_t size,
-                           const uint16_t *fields, uint16_t count)
+static struct verdict keep(struct verdict verdict, uint16_t *kept, const uint16_t *fields,
+                           uint16_t count)
 {
-    if (verdict.nak == NAK_NONE) {
-        memset(kept, 0, size * sizeof *kept);
+    if (verdict.nak == NAK_NONE)
         memcpy(kept, fields, count * sizeof *kept);
-    }
     return verdict;
 }
 
@@ -263,16 +265,14 @@ struct verdict modbus_write(struct modbus *modbus, uint16_t first_field, const u
 {
     switch (first_field) {
     case CONTROL_AT:
-        return keep(write_control(modbus, fields, count), modbus->control, CONTROL_FIELDS, fields,
-                    count);
+        return keep(write_control(modbus, fields, count), modbus->control, fields, count);
     case HEARTBEAT_AT:
         if (count != 1)
             return refused(NAK_BAD_LENGTH);
-        return keep(amplifier_ping(modbus->amplifier, fields[0]), &modbus->heartbeat, 1, fields, 1);
+        return keep(amplifier_ping(modbus->amplifier, fields[0]), &modbus->heartbeat, fields, 1);
     case SET_AT:
-        return keep(write_set(modbus, fields, count), modbus->set, SET_FIELDS, fields, count);
+        return keep(write_set(modbus, fields, count), modbus->set, fields, count);
     default:
-        return keep(write_envelope(modbus, fields, count), modbus->envelope, ENVELOPE_FIELDS,
-                    fields, count);
+        return keep(write_envelope(modbus, fields, count), modbus->envelope, fields, count);
     }
 }

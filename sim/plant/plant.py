@@ -53,6 +53,11 @@ class Plant:
         return self._current.reduced
 
     @property
+    def loaded(self) -> LoadedPlate:
+        """The plate under the present contacts."""
+        return self._current
+
+    @property
     def contacts(self) -> Mapping[str, FingertipLoad]:
         """The present contacts by id of the finger."""
         return self._contacts

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import os
 import signal
+import tempfile
 import threading
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from contextlib import asynccontextmanager
@@ -20,6 +21,8 @@ from sim.control.server import control_socket
 from sim.far_ends.wire_assignment import WireAssignment
 from sim.far_ends.wires import open_wires
 from sim.faults.fault_file import FaultFile
+from sim.firmware.bench import FirmwareBench
+from sim.firmware.programs import Firmware, running
 from sim.plant.fingers import Position
 from sim.plant.imperfections import Imperfections
 from sim.plant.plant import SAMPLE_RATE
@@ -27,6 +30,7 @@ from sim.process.virtual_time import SteppedLoop
 from sim.sensors.accelerometer import Accelerometer
 
 _VIEW_INTERVAL = 0.2  # s
+_NICE = 5  # beside firmware: its replies are due in milliseconds, while its samples can wait
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,7 @@ class Simulation:
     faults: with times from when the URLs are printed; fingers: initial positions [m];
     imperfections: in what the bench differs from the rig; sample_rate [Hz]: of sensors and fingers;
     control: path of the control socket; record: file for the readings of the whole run; until_eof:
-    end with standard input.
+    end with standard input; firmware: in the place of the simulated amplifiers.
     """
 
     rig: Rig
@@ -49,6 +53,7 @@ class Simulation:
     control: Path | None = None
     record: Path | None = None
     until_eof: bool = False
+    firmware: Firmware | None = None
 
 
 async def run_simulation(
@@ -69,13 +74,7 @@ async def run_simulation(
     if simulation.until_eof:
         # In a thread, since not every kind of standard input can be polled.
         threading.Thread(target=_await_eof, args=(loop, ended), daemon=True).start()
-    bench = await asyncio.to_thread(
-        Bench,
-        simulation.rig,
-        now=clock.now(),
-        sample_rate=simulation.sample_rate,
-        imperfections=simulation.imperfections,
-    )
+    bench = await asyncio.to_thread(_make_bench, simulation)
     if ended.is_set():
         return None
     bench.place_fingers(simulation.fingers, now=clock.now())
@@ -90,6 +89,14 @@ async def run_simulation(
     return message
 
 
+def _make_bench(simulation: Simulation) -> Bench:
+    rig, imperfections = simulation.rig, simulation.imperfections
+    if simulation.firmware is not None:
+        return FirmwareBench(rig, now=clock.now(), imperfections=imperfections)
+    rate = simulation.sample_rate
+    return Bench(rig, now=clock.now(), sample_rate=rate, imperfections=imperfections)
+
+
 async def _serve(
     simulation: Simulation,
     context: SimulationContext,
@@ -101,21 +108,13 @@ async def _serve(
     """Open the wires and serve until the end."""
     bench = context.bench
     async with contextlib.AsyncExitStack() as stack:
-        devices = [
-            SimulatedDevice(
-                bench,
-                name,
-                address=simulation.wires[name].address or number,
-                faults=simulation.faults.of(name, begin=clock.now()),
-            )
-            for number, name in enumerate(bench.amplifiers, start=1)
-        ]
-        wires = {name: choice.wire for name, choice in simulation.wires.items()}
-        context.urls = await stack.enter_async_context(open_wires(wires, devices))
-        context.devices = {device.name: device for device in devices}
+        if isinstance(bench, FirmwareBench) and simulation.firmware is not None:
+            context.urls = await _start_firmware(stack, bench, simulation.firmware)
+        else:
+            await _open_devices(stack, simulation, context)
         if simulation.control is not None:
             await stack.enter_async_context(control_socket(context, simulation.control))
-        for device in devices:
+        for device in context.devices.values():
             stack.callback(device.close)
             device.start()
         await stack.enter_async_context(_in_background(keep_time(bench), ended))
@@ -124,6 +123,37 @@ async def _serve(
         stack.enter_context(no_long_collections())
         ready(context.urls)
         await ended.wait()
+
+
+async def _open_devices(
+    stack: contextlib.AsyncExitStack, simulation: Simulation, context: SimulationContext
+) -> None:
+    """Put a simulated amplifier on each wire."""
+    devices = [
+        SimulatedDevice(
+            context.bench,
+            name,
+            address=simulation.wires[name].address or number,
+            faults=simulation.faults.of(name, begin=clock.now()),
+        )
+        for number, name in enumerate(context.bench.amplifiers, start=1)
+    ]
+    wires = {name: choice.wire for name, choice in simulation.wires.items()}
+    context.urls = await stack.enter_async_context(open_wires(wires, devices))
+    context.devices = {device.name: device for device in devices}
+
+
+async def _start_firmware(
+    stack: contextlib.AsyncExitStack, bench: FirmwareBench, firmware: Firmware
+) -> dict[str, str]:
+    """Run the firmware for each amplifier; returns the URLs by name."""
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="era-")))
+    bench.firmware = {
+        name: await stack.enter_async_context(running(firmware, folder, name))
+        for name in bench.amplifiers
+    }
+    os.nice(_NICE)
+    return {name: each.url for name, each in bench.firmware.items()}
 
 
 def _await_eof(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:

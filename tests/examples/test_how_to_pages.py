@@ -29,12 +29,13 @@ NAMES = [
 
 @pytest.fixture
 def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
-    """A reader in a checkout with the examples alone; `pip` installs prebuilt packages."""
+    """A reader in a checkout with examples and firmware alone; `pip` installs prebuilt packages."""
     home = Path(tempfile.mkdtemp(prefix="era"))
     folder, site, programs = tmp_path / "checkout", home / "site", home / "bin"
     folder.mkdir()
     programs.mkdir()
-    shutil.copytree(ROOT / "examples", folder / "examples")
+    for part in ("examples", "firmware"):
+        shutil.copytree(ROOT / part, folder / part)
     pip = programs / "pip"
     words = [sys.executable, str(PIP), str(installed), str(site)]
     pip.write_text(f'#!/bin/sh\nexec {shlex.join(words)} "$@"\n', encoding="utf-8")

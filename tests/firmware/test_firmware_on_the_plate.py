@@ -87,11 +87,11 @@ def played(firmware: Path) -> Played:
     resting = fingertip_loads(rig.fingertip, QUESTION.contacts, QUESTION.loads)
     contacts = {str(number): each for number, each in enumerate(resting)}
     points = np.concatenate([fingertip_points(*at, rig.plate) for at in QUESTION.contacts])
-    sampled = SampledPlant(reduced, rig.eras, rate=RATE, loads=rig.masses)
-    sampled.set_contacts(contacts)
-    felt = sampled.advance(bases, shapes=sampled.reduced.at(points))
     plant = Plant(reduced, rig.eras, loads=rig.masses, time=-1 / RATE)
+    sampled = SampledPlant(plant, rate=RATE)
     plant.set_contacts(contacts)
+    sampled.follow()
+    felt = sampled.advance(bases, shapes=plant.reduced.at(points))
     for number, terms in enumerate(motion(pattern, rig)):
         plant.set_input(number, terms)
     until = (len(bases) - 0.5) / RATE

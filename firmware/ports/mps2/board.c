@@ -61,7 +61,8 @@ static struct line_state {
 static uint8_t sending[LINES][SENDING_SIZE];
 
 static bool is_high_voltage;
-static uint32_t ticks_seen, half_ticks;
+static uint32_t ticks_seen;
+static uint64_t half_ticks;
 
 static uint32_t ticks(void)
 {
@@ -96,12 +97,9 @@ uint32_t board_samples_due(void)
 {
     uint32_t now = ticks(), elapsed = now - ticks_seen;
     ticks_seen = now;
-    // An emulator may stand still while its host is busy; of that, 50 ms pass.
-    if (elapsed > CLOCK / 20)
-        elapsed = CLOCK / 20;
-    half_ticks += 2 * elapsed; // 3125 of them are a sample
-    uint32_t due = half_ticks / (2 * CLOCK / SAMPLE_RATE);
-    half_ticks -= due * (2 * CLOCK / SAMPLE_RATE);
+    half_ticks += 2 * (uint64_t)elapsed; // 3125 of them are a sample
+    uint32_t due = (uint32_t)(half_ticks / (2 * CLOCK / SAMPLE_RATE));
+    half_ticks -= (uint64_t)due * (2 * CLOCK / SAMPLE_RATE);
     return due;
 }
 
@@ -127,15 +125,15 @@ static bool send_some(void)
         if (lines[i].taken == lines[i].put)
             continue;
         is_sending = true;
-        if (!(lines[i].uart->state & TX_FULL))
+        while (lines[i].taken != lines[i].put && !(lines[i].uart->state & TX_FULL))
             lines[i].uart->data = sending[i][lines[i].taken++ % SENDING_SIZE];
     }
     return is_sending;
 }
 
-void board_wait(void)
+void board_wait(bool may_sleep)
 {
-    if (send_some())
+    if (send_some() || !may_sleep)
         return;
     __asm__ volatile("wfi");
     SYSTEM_CLEAR = SYSTICK_PENDING;

@@ -2,9 +2,7 @@
 //
 // A program in the place of a board: lines are pseudo-terminals, samples go to a file or pipe.
 //
-// Its outputs are numbers and its high voltage is 1800 V by definition. Of a time in which the
-// program did not run, only 50 ms pass for it, as if a board had stood still: its watchdog watches
-// the host, not the machine's other load.
+// Its outputs are numbers and its high voltage is 1800 V by definition.
 
 #define _XOPEN_SOURCE 700
 
@@ -21,7 +19,6 @@
 #include <unistd.h>
 
 #define LINES 3
-#define LONGEST_PAUSE 50000 // us
 
 static int lines_in[LINES] = {-1, -1, -1}, lines_out[LINES];
 static uint8_t received[LINES][512];
@@ -32,19 +29,14 @@ static bool ends_with_input;
 static bool is_high_voltage;
 static volatile sig_atomic_t is_interlock_open;
 static FILE *samples_file;
-static uint64_t clock_at; // us of the clock that have become samples or were left out
-static uint64_t samples_made, time_made;
+static uint64_t started_at; // us
+static uint64_t samples_counted;
 
 uint32_t board_samples_due(void)
 {
-    uint64_t now = microseconds();
-    if (now - clock_at > LONGEST_PAUSE)
-        clock_at = now - LONGEST_PAUSE;
-    time_made += now - clock_at;
-    clock_at = now;
-    uint64_t due = time_made * SAMPLE_RATE / 1000000 - samples_made;
-    samples_made += due;
-    return (uint32_t)due;
+    uint64_t due = (microseconds() - started_at) * SAMPLE_RATE / 1000000 - samples_counted;
+    samples_counted += due;
+    return due > UINT32_MAX ? UINT32_MAX : (uint32_t)due;
 }
 
 void board_output(const int16_t samples[CHANNELS])
@@ -53,7 +45,7 @@ void board_output(const int16_t samples[CHANNELS])
         fwrite(samples, sizeof samples[0], CHANNELS, samples_file);
 }
 
-void board_wait(void)
+void board_wait(bool may_sleep)
 {
     struct pollfd watched[LINES + 1 + TCP_WATCHED];
     for (int i = 0; i < LINES; i++) {
@@ -64,9 +56,9 @@ void board_wait(void)
     watched[LINES].events = POLLIN;
     tcp_watch(&watched[LINES + 1]);
     char ignored[64];
-    if (samples_file != NULL)
+    if (samples_file != NULL && may_sleep)
         fflush(samples_file);
-    if (poll(watched, LINES + 1 + TCP_WATCHED, 1) > 0 && watched[LINES].revents != 0 &&
+    if (poll(watched, LINES + 1 + TCP_WATCHED, may_sleep ? 1 : 0) > 0 && watched[LINES].revents != 0 &&
         read(STDIN_FILENO, ignored, sizeof ignored) <= 0)
         exit(0);
 }
@@ -193,5 +185,5 @@ void board_open(int count, char **arguments)
         open_line(LINE_SERIAL, "serial://");
     fflush(stdout);
     signal(SIGUSR1, move_interlock);
-    clock_at = microseconds();
+    started_at = microseconds();
 }

@@ -1,0 +1,1 @@
+"""The project's firmware in the place of simulated amplifiers: its samples move the plate."""

@@ -1,0 +1,132 @@
+"""Start the firmware as a process for each amplifier: in QEMU where installed, else as a program.
+
+`make firmware` builds both from the sources of a checkout; they are not part of the wheel.
+"""
+
+import asyncio
+import contextlib
+import fcntl
+import os
+import re
+import shutil
+from collections.abc import AsyncIterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drivers.errors import LinkError
+from model.arrays import FloatArray
+from model.errors import InputError
+
+RATE = 16_000.0
+"""Samples per second and channel [Hz]."""
+
+CHANNELS = 4
+"""Channels of an amplifier."""
+
+FOLDER = Path(__file__).parents[2] / "out" / "firmware"
+"""Where `make firmware` puts its programs."""
+
+_FULL_STROKE = 32767.0  # as a sample
+_PIPE_SIZE = 1 << 20  # bytes; eight seconds
+_STARTUP_TIMEOUT = 10.0  # s
+_QEMU = "qemu-system-arm"
+_QEMU_LOOKS = 1.1  # s; it looks once a second whether its pseudo-terminal has been opened
+
+
+@dataclass(frozen=True)
+class Firmware:
+    """A program that is an amplifier; description: where it runs."""
+
+    command: Sequence[str | Path]
+    description: str
+    is_emulated: bool
+
+    def arguments(self, samples: Path) -> list[str | Path]:
+        """The command with its serial line on a pseudo-terminal; samples: a file for them."""
+        if self.is_emulated:
+            return [
+                *self.command,
+                *("-serial", "pty", "-serial", "null", "-serial"),
+                f"file:{samples}",
+            ]
+        return [*self.command, "--serial", "--samples", samples]
+
+
+def find_firmware() -> Firmware:
+    """The built firmware, in QEMU where that is installed; InputError where there is none."""
+    emulated, program = FOLDER / "mps2-amplifier.elf", FOLDER / "era-firmware"
+    if shutil.which(_QEMU) and emulated.exists():
+        machine = (_QEMU, "-M", "mps2-an385", "-display", "none", "-monitor", "none", "-kernel")
+        return Firmware((*machine, emulated), "on a Cortex-M3 in QEMU (mps2-an385)", True)
+    if program.exists():
+        missing = "is not installed" if not shutil.which(_QEMU) else "has no program to run"
+        return Firmware((program,), f"as a program of this machine ({_QEMU} {missing})", False)
+    if (FOLDER.parents[1] / "firmware").is_dir():
+        raise InputError(f"firmware: {program} does not exist; run `make firmware` first")
+    raise InputError(
+        "firmware: its C sources are not part of this installation; run from a checkout of "
+        "era-haptics, after `make firmware`"
+    )
+
+
+class RunningFirmware:
+    """A running amplifier: its URL, and its samples as they come."""
+
+    def __init__(self, url: str, pipe: int) -> None:
+        self.url = url
+        self._pipe = pipe
+        self._rest = b""
+
+    def read(self) -> FloatArray:
+        """The samples since the last call, (n, channels) in full strokes."""
+        with contextlib.suppress(BlockingIOError):
+            while piece := os.read(self._pipe, _PIPE_SIZE):
+                self._rest += piece
+        size = len(self._rest) // (2 * CHANNELS) * 2 * CHANNELS
+        whole, self._rest = self._rest[:size], self._rest[size:]
+        return np.frombuffer(whole, "<i2").reshape(-1, CHANNELS) / _FULL_STROKE
+
+
+@contextlib.asynccontextmanager
+async def running(firmware: Firmware, folder: Path, name: str) -> AsyncIterator[RunningFirmware]:
+    """Run the firmware for an amplifier; folder: for its pipe. Raises LinkError."""
+    path = folder / f"{name}.samples"
+    os.mkfifo(path)
+    async with contextlib.AsyncExitStack() as stack:
+        pipe = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+        stack.callback(os.close, pipe)
+        fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
+        process = await asyncio.create_subprocess_exec(
+            *firmware.arguments(path),
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.DEVNULL,  # the emulator tells how it was ended
+        )
+        stack.push_async_callback(_terminate, process)
+        terminal = await _terminal_of(process, name)
+        # Held open, or the emulator would see it closed between two hosts, and look again later.
+        stack.callback(os.close, os.open(terminal, os.O_RDWR | os.O_NOCTTY))
+        if firmware.is_emulated:
+            await asyncio.sleep(_QEMU_LOOKS)
+        yield RunningFirmware(f"serial://{terminal}", pipe)
+
+
+async def _terminal_of(process: asyncio.subprocess.Process, name: str) -> str:
+    """The pseudo-terminal that the process prints; raises LinkError."""
+    assert process.stdout is not None  # noqa: S101  a pipe was requested
+    try:
+        async with asyncio.timeout(_STARTUP_TIMEOUT):
+            line = (await process.stdout.readline()).decode()
+    except TimeoutError:
+        raise LinkError(f"firmware of {name}: not ready in {_STARTUP_TIMEOUT:g} s") from None
+    found = re.search(r"/dev/\S+", line)
+    if found is None:
+        raise LinkError(f"firmware of {name}: no line was opened, got {line.strip()!r}")
+    return found[0]
+
+
+async def _terminate(process: asyncio.subprocess.Process) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        process.terminate()
+    await process.wait()

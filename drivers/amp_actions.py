@@ -11,7 +11,7 @@ from typing import Any
 from drivers import clock
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.command import CommandSet, DriveCommand
-from drivers.conformance import Check, CheckResult, run_check
+from drivers.conformance import Check, CheckResult, raw_line, run_check
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, Guard, GuardLimits
 from drivers.operation.checked_amplifier import CheckedAmplifier
@@ -149,8 +149,9 @@ async def drive(
 async def conform(url: str, checks: tuple[Check, ...]) -> AsyncIterator[CheckResult]:
     """Run checks in turn on one open amplifier."""
     async with _opened(url) as amplifier:
+        raw = raw_line(url)
         for check in checks:
-            yield await run_check(check, amplifier)
+            yield await run_check(check, amplifier, raw, url=url)
 
 
 @asynccontextmanager

@@ -221,6 +221,7 @@ def conformance(
 ) -> None:
     """Check that an amplifier fulfils the contract. Reads only, unless --write is given."""
     from drivers.conformance import CHECKS, LEVEL
+    from drivers.conformance.report import ConformanceReport
 
     reading = tuple(check for check in CHECKS if not check.drives)
     driving = tuple(check for check in CHECKS if check.drives)
@@ -232,19 +233,14 @@ def conformance(
         )
     if write and all(outcome.problem is None for outcome in outcomes):
         outcomes += _run(_conform(url, driving, quiet=json_), trace)
-    failed = [outcome for outcome in outcomes if outcome.problem is not None]
-    skipped = len(CHECKS) - len(outcomes)
+    report = ConformanceReport(url, tuple(outcomes), len(CHECKS) - len(outcomes))
     if json_:
-        rows = [
-            {"check": one.check.name, "requirement": one.check.requirement, "problem": one.problem}
-            for one in outcomes
-        ]
-        print(json.dumps({"url": url, "passed": not failed, "skipped": skipped, "checks": rows}))
+        print(json.dumps(report.to_json()))
     else:
-        print(f"{len(outcomes) - len(failed)} passed, {len(failed)} failed, {skipped} skipped")
-        if skipped:
+        print(report.summary)
+        if report.left_out:
             print(f"Next: era amp conformance {shlex.quote(url)} --write")
-    if failed:
+    if any(outcome.problem is not None for outcome in outcomes):
         raise typer.Exit(1)
 
 
@@ -255,10 +251,11 @@ async def _conform(url: str, checks: "tuple[Check, ...]", *, quiet: bool) -> "li
     async for outcome in conform(url, checks):
         outcomes.append(outcome)
         if not quiet:
-            mark = "passed" if outcome.problem is None else "FAILED"
-            print(f"{mark}  It {outcome.check.requirement}.")
-            if outcome.problem is not None:
-                print(f"        {outcome.problem}")
+            mark = outcome.result.value
+            mark = mark if outcome.problem is None else mark.upper()
+            print(f"{mark:<7}  It {outcome.check.requirement}.")
+            if outcome.reason:
+                print(f"         {outcome.reason} ({outcome.place})")
     return outcomes
 
 

@@ -16,7 +16,8 @@ class SharedLine(ABC, Generic[_OpenT]):
     """A serial line, a Modbus line or a CAN bus; its users are identified by a number.
 
     `join` blocks during open and close. After a loss each user must rejoin; the first one to do so
-    reopens the line. name: of the line, in messages.
+    reopens the line. name: of the line, in messages; tap: of streams of bytes, called with all that
+    is received.
     """
 
     address_term: ClassVar[str]
@@ -24,6 +25,7 @@ class SharedLine(ABC, Generic[_OpenT]):
 
     def __init__(self, name: str) -> None:
         self.name = name
+        self.tap: Callable[[bytes], None] | None = None
         self._users: dict[int, Callable[[str], None]] = {}
         self._notified: set[int] = set()  # of the loss, and not joined since
         self._loss: str | None = None

@@ -1,14 +1,26 @@
-"""An amplifier under test: sets for it, and expectations on its status."""
+"""An amplifier under test: sets for it, its statuses with their times, and expectations on them."""
 
 import asyncio
+import math
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
+from drivers.conformance.findings import (
+    ContractViolation,
+    Inconclusive,
+    NotApplicable,
+    expect,
+)
+from drivers.conformance.raw.line import RawLine
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, GuardLimits, SafeCommandSet
-from drivers.protocol.messages import AmplifierState, Capabilities, Status
+from drivers.guard.channel_state import Interval
+from drivers.operation.plausibility import CYCLE, MEASURING_ERROR
+from drivers.protocol.messages import AmplifierState, Capabilities, Feature, Status
 
 LEVEL = 0.2
 """Level of driven channels: perceptible, and far from any limit."""
@@ -16,22 +28,72 @@ LEVEL = 0.2
 LONG_WATCHDOG = 2.0  # s; does not trip during a check, on amplifiers that support it
 EVENT_TIMEOUT = 5.0  # s; for changes without a request
 _LEAST_POLLS = 100
-LEVEL_TOLERANCE = 0.002  # of full stroke; for amplifiers that measure their levels
+_PREPARATION = 5  # exchanges whose fastest is the usual one
+_POLL = 0.001  # s; pause between polls for an event
+_SLACK = 0.002  # s; of the amplifier's clock, and of times in milliseconds
+_DRIFT = 1e-3  # of a time; of the amplifier's clock
+_COARSE = 0.01  # s; uncertainty of an event's time beyond the wire's that proves nothing
+
+_T = TypeVar("_T")
 
 
-class ContractViolation(Exception):
-    """The amplifier does not behave as the contract says."""
+@dataclass(frozen=True)
+class Sample:
+    """A status, and the interval [s] in which it was taken."""
+
+    when: Interval
+    status: Status
 
 
 class Bench:
-    """An open amplifier under test, and sets for it."""
+    """An open amplifier under test, and sets for it; raw, url: see `run_check`."""
 
-    def __init__(self, amplifier: Amplifier) -> None:
+    def __init__(self, amplifier: Amplifier, raw: RawLine | None = None, *, url: str = "") -> None:
         self.amplifier = amplifier
+        self.url = url
+        self._raw = raw
         self.can = amplifier.capabilities
-        self.frequency = min(max(110.0, self.can.frequency_min), self.can.frequency_max)
-        self.level = min(LEVEL, self.can.level_max)
         self.guard = self.guard_as(self.can)
+        limits = self.guard.limits
+        self.frequency = min(max(110.0, limits.frequency_min), limits.frequency_max)
+        self.level = min(LEVEL, limits.level)
+        self.exchange_time = 0.0  # s; the usual one of a status
+        self.longest_delay = 0.0  # s; of a reply, beyond the usual
+        self.fed = Interval(-math.inf, math.inf)  # when the watchdog was fed last
+        self.watchdog = 0.0
+
+    def has(self, feature: Feature) -> bool:
+        """Whether the amplifier has a feature."""
+        return feature in self.can.features
+
+    def require(self, feature: Feature) -> None:
+        """Raise NotApplicable without a feature."""
+        if not self.has(feature):
+            raise NotApplicable(f"it states no {(feature.name or '').lower()}")
+
+    @property
+    def has_raw(self) -> bool:
+        """Whether there is raw access to the line."""
+        return self._raw is not None
+
+    @property
+    def raw(self) -> RawLine:
+        """Raw access to the line; NotApplicable without."""
+        if self._raw is None:
+            raise NotApplicable("there is no raw access to this wire")
+        return self._raw
+
+    async def prepare(self) -> None:
+        """Open the amplifier again if it was lost, and measure its usual exchange."""
+        if self.amplifier.is_lost:
+            await self.amplifier.close()
+            await self.amplifier.open()
+        durations = []
+        for _ in range(_PREPARATION):
+            when = (await self.sample()).when
+            durations.append(when.latest - when.earliest)
+        self.exchange_time = min(durations)
+        self.longest_delay = 0.0
 
     def guard_as(self, capabilities: Capabilities) -> Guard:
         """Make a guard for an amplifier with these capabilities."""
@@ -45,10 +107,25 @@ class Bench:
         valid_for: float = 0.0,
         guard: Guard | None = None,
         first: int = 0,
+        frequency: float | None = None,
+        phase: float = 0.0,
+        keep_phase: bool = False,
+        onset: int = 0,
+        ending: int = 0,
+        skip_ending: bool = False,
     ) -> SafeCommandSet:
         """Make a set that drives channels from `first` on at these fractions of the test level."""
         commands = tuple(
-            DriveCommand(first + number, self.frequency, fraction * self.level)
+            DriveCommand(
+                first + number,
+                frequency or self.frequency,
+                fraction * self.level,
+                phase,
+                keep_phase=keep_phase,
+                onset=onset,
+                ending=ending,
+                skip_ending=skip_ending,
+            )
             for number, fraction in enumerate(fractions)
         )
         return (guard or self.guard).check(
@@ -60,28 +137,91 @@ class Bench:
             )
         )
 
-    async def arm(self) -> Status:
-        """Arm with a long watchdog."""
-        return await self.amplifier.arm(min(LONG_WATCHDOG, self.can.watchdog_max))
+    # What is sent
+
+    async def timed(self, call: Awaitable[_T]) -> tuple[_T, Interval]:
+        """Await an exchange; returns its result and the interval [s] in which it was executed."""
+        earliest = clock.now()
+        result = await call
+        when = Interval(earliest, clock.now())
+        if self.exchange_time:
+            usual = 3 * self.exchange_time
+            self.longest_delay = max(self.longest_delay, when.latest - when.earliest - usual)
+        return result, when
+
+    async def arm(self, watchdog: float = LONG_WATCHDOG) -> Status:
+        """Arm with a watchdog [s], or the nearest that is possible."""
+        self.watchdog = min(max(watchdog, self.can.watchdog_min), self.can.watchdog_max)
+        status, self.fed = await self.timed(self.amplifier.arm(self.watchdog))
+        return status
+
+    async def beat(self) -> Sample:
+        """Feed the watchdog."""
+        status, when = await self.timed(self.amplifier.heartbeat())
+        self.fed = when
+        return Sample(when, status)
+
+    async def apply(self, wanted: SafeCommandSet) -> Interval:
+        """Apply a set; returns when."""
+        _, when = await self.timed(self.amplifier.apply(wanted))
+        self.fed = when
+        return when
+
+    async def play(self, *fractions: float, ramp: float = 0.0, valid_for: float = 0.0) -> Interval:
+        """Apply a set of the first channels at these fractions of the test level."""
+        return await self.apply(self.tones(*fractions, ramp=ramp, valid_for=valid_for))
+
+    async def sample(self) -> Sample:
+        """Read the status."""
+        status, when = await self.timed(self.amplifier.status())
+        return Sample(when, status)
+
+    async def rest(self) -> None:
+        """Bring it to silence, disarmed, nothing latched."""
+        await self.amplifier.stop(0.0)
+        await self.until(
+            lambda status: not any(status.levels), what="silence after a stop", feed=False
+        )
+        await self.amplifier.clear()
+
+    async def wait(self, duration: float) -> None:
+        """Feed the watchdog for a time [s]."""
+        end = clock.now() + duration
+        while clock.now() < end:
+            await self.beat()
+            await asyncio.sleep(min(0.05, max(0.0, end - clock.now())))
+
+    def has_passed(self, duration: float) -> bool:
+        """Whether so much time [s] has passed since the watchdog was fed."""
+        return clock.now() - self.fed.latest > duration
+
+    async def pause_until(self, time: float) -> None:
+        """Send nothing until a time [s]."""
+        await asyncio.sleep(max(0.0, time - clock.now()))
+
+    # What is expected
 
     async def levels(self) -> tuple[float, ...]:
         """Read the levels back."""
-        return (await self.amplifier.status()).levels
+        return (await self.sample()).status.levels
 
     async def expect_levels(self, *fractions: float, why: str) -> None:
         """Require the first channels at these fractions of the test level, all others silent."""
         levels = await self.levels()
         expected = [fraction * self.level for fraction in fractions]
         expected += [0.0] * (len(levels) - len(fractions))
-        is_met = all(abs(a - b) <= LEVEL_TOLERANCE for a, b in zip(levels, expected, strict=True))
-        expect(is_met, f"{why}: levels must be {tuple(expected)}, got {levels}")
+        is_met = all(abs(a - b) <= self.tolerance for a, b in zip(levels, expected, strict=True))
+        expect(is_met, f"levels ({why})", expected=_rounded(expected), seen=_rounded(levels))
 
-    async def wait(self, duration: float) -> None:
-        """Feed the watchdog for a time [s]."""
-        end = clock.now() + duration
-        while clock.now() < end:
-            await self.amplifier.heartbeat()
-            await asyncio.sleep(0.05)
+    @property
+    def ramp(self) -> float:
+        """A ramp [s] that is long against an exchange, if the amplifier plays such."""
+        return min(max(0.3, 40 * self.exchange_time), self.can.ramp_max)
+
+    @property
+    def tolerance(self) -> float:
+        """Of a level: two steps, or the error of an amplifier that measures its levels."""
+        return max(MEASURING_ERROR, 2 * self.can.level_step)
 
     async def until(self, reached: Callable[[Status], bool], *, what: str, feed: bool) -> Status:
         """Poll until a status is reached; feed: whether polling feeds the watchdog.
@@ -98,15 +238,59 @@ class Bench:
             polls += 1
             await asyncio.sleep(0.005)
         raise ContractViolation(
-            f"{what} must happen within {EVENT_TIMEOUT:g} s, got {status.state.name}, levels "
-            f"{status.levels}"
+            what,
+            expected=f"within {EVENT_TIMEOUT:g} s",
+            seen=f"{status.state.name}, levels {_rounded(status.levels)}",
         )
+
+    async def time_of(
+        self,
+        reached: Callable[[Status], bool],
+        *,
+        since: Interval,
+        due: float,
+        what: str,
+        margin: float = 0.04,
+        feed: bool = False,
+    ) -> Interval:
+        """Poll around a due time [s] after `since`; returns when a status was first reached.
+
+        The result is relative to since. Raises ContractViolation if it is not reached by `margin`
+        [s] after the due time.
+        """
+        before = since.latest
+        await self.pause_until(since.earliest + due - min(margin / 2, due / 4))
+        while True:
+            sample = await (self.beat() if feed else self.sample())
+            if reached(sample.status):
+                return Interval(before - since.latest, sample.when.latest - since.earliest)
+            before = sample.when.earliest
+            if before - since.latest > due + margin + 4 * self.exchange_time:
+                raise ContractViolation(
+                    what,
+                    expected=f"{due * 1e3:.0f} ms after its request",
+                    seen=f"not after {(before - since.latest) * 1e3:.0f} ms: "
+                    f"{sample.status.state.name}, levels {_rounded(sample.status.levels)}",
+                )
+            await asyncio.sleep(_POLL)
+
+    def expect_time(self, what: str, seen: Interval, *, low: float, high: float) -> None:
+        """Require that an event came between two times [s]; Inconclusive if that is not certain."""
+        bounds = f"{low * 1e3:.0f} to {high * 1e3:.0f} ms"
+        found = f"{seen.earliest * 1e3:.1f} to {seen.latest * 1e3:.1f} ms"
+        early, late = low * (1 - _DRIFT) - _SLACK, high * (1 + _DRIFT) + _SLACK
+        expect(early <= seen.latest and seen.earliest <= late, what, expected=bounds, seen=found)
+        uncertain = _COARSE + 4 * self.exchange_time
+        if seen.earliest < early - uncertain or seen.latest > late + uncertain:
+            raise Inconclusive(f"{what} must be {bounds}, and was within {found}")
 
     def expect_state(self, status: Status, state: AmplifierState, *, after: str) -> None:
         """Require a state."""
         expect(
             status.state is state,
-            f"state after {after} must be {state.name}, got {status.state.name}",
+            f"state after {after}",
+            expected=state.name,
+            seen=status.state.name,
         )
 
     async def refused(self, call: Awaitable[object], *, what: str) -> None:
@@ -115,18 +299,39 @@ class Bench:
             await call
         except CommandRefused:
             return
-        raise ContractViolation(f"{what} must be refused, got a reply")
+        raise ContractViolation(what, expected="refused", seen="a reply")
 
-    async def rest(self) -> None:
-        """Bring it to silence, disarmed, nothing latched."""
-        await self.amplifier.stop(0.0)
-        await self.until(
-            lambda status: not any(status.levels), what="silence after a stop", feed=False
+    def expect_not_fed(self, sample: Sample, *, by: str) -> None:
+        """Require that the watchdog runs down since it was fed last."""
+        elapsed = sample.when.earliest - self.fed.latest
+        highest = self.watchdog - elapsed * (1 - _DRIFT) + _SLACK
+        expect(
+            sample.status.watchdog_left <= highest,
+            f"watchdog_left after {by}",
+            expected=f"at most {highest * 1e3:.0f} ms",
+            seen=f"{sample.status.watchdog_left * 1e3:.0f} ms",
         )
-        await self.amplifier.clear()
+
+    def expect_fed(self, sample: Sample, *, by: str) -> None:
+        """Require the time that is left of the watchdog, fed by the last request that does."""
+        elapsed = sample.when.latest - self.fed.earliest
+        lowest = self.watchdog - elapsed * (1 + _DRIFT) - _SLACK
+        expect(
+            sample.status.watchdog_left >= lowest,
+            f"watchdog_left after {by}",
+            expected=f"at least {lowest * 1e3:.0f} ms",
+            seen=f"{sample.status.watchdog_left * 1e3:.0f} ms",
+        )
+        self.expect_not_fed(sample, by=by)
+
+    def wider(self, **changes: object) -> Guard:
+        """Make a guard for an amplifier that could do more than this one."""
+        values: dict[str, Any] = {"channel_limits": (), **changes}
+        return self.guard_as(replace(self.can, **values))
 
 
-def expect(condition: bool, problem: str) -> None:
-    """Raise ContractViolation with the problem unless the condition holds."""
-    if not condition:
-        raise ContractViolation(problem)
+def _rounded(levels: object) -> tuple[float, ...]:
+    return tuple(round(level, 4) for level in levels)  # type: ignore[attr-defined]
+
+
+__all__ = ["CYCLE", "Bench", "Sample", "expect"]

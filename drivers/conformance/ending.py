@@ -1,110 +1,244 @@
-"""Checks of how a vibration ends: stop, disarm, watchdog, valid_for."""
+"""Checks of how a vibration ends: stop, disarm, valid_for; and of what is latched then."""
+
+import asyncio
 
 from drivers import clock
-from drivers.conformance.bench import LONG_WATCHDOG, Bench, expect
-from drivers.protocol.messages import AmplifierState, Fault
+from drivers.conformance.bench import Bench
+from drivers.conformance.check import driving
+from drivers.conformance.curve import expect_curve, raised_cosine, samples_until
+from drivers.conformance.findings import expect
+from drivers.guard.channel_state import Interval
+from drivers.protocol.messages import AmplifierState, Feature, Status
+
+_STATES = "wire-protocol.md#states"
+_SETS = "wire-protocol.md#sets-tokens-and-ramps"
+PROMPT = 0.01  # s; of the longest reaction, for what follows at once
 
 
+def is_silent(status: Status) -> bool:
+    """Whether no channel has a level."""
+    return not any(status.levels)
+
+
+def _is_off(status: Status) -> bool:
+    return is_silent(status) and not status.high_voltage
+
+
+@driving("wire-protocol.md#stop")
 async def quick_stop(bench: Bench) -> None:
     """It stops on request, and stays stopped until cleared."""
     await bench.arm()
-    await bench.amplifier.apply(bench.tones(1.0))
+    await bench.play(*(1.0,) * bench.can.channels)
     status = await bench.amplifier.stop(0.0)
-    bench.expect_state(status, AmplifierState.QUICK_STOP_ACTIVE, after="a stop")
-    expect(not any(status.levels), f"levels after a stop are {status.levels}")
-    await bench.refused(bench.amplifier.apply(bench.tones(1.0)), what="an apply while stopped")
-    await bench.refused(bench.arm(), what="arming while stopped")
+    bench.expect_state(status, AmplifierState.QUICK_STOP_ACTIVE, after="a Stop")
+    expect(not any(status.levels), "levels after a Stop", expected="0", seen=status.levels)
+    await bench.refused(bench.amplifier.apply(bench.tones(1.0)), what="an Apply while stopped")
+    await bench.refused(bench.arm(), what="Arm while stopped")
+    status = await bench.amplifier.disarm(0.0)
+    bench.expect_state(status, AmplifierState.QUICK_STOP_ACTIVE, after="Disarm while stopped")
+    status = (await bench.sample()).status
+    expect(
+        not status.high_voltage, "high voltage while stopped and silent", expected="off", seen="on"
+    )
     status = await bench.amplifier.clear()
     bench.expect_state(status, AmplifierState.SWITCH_ON_DISABLED, after="Clear")
+    status = await bench.amplifier.stop(0.0)
+    bench.expect_state(status, AmplifierState.QUICK_STOP_ACTIVE, after="a Stop while disarmed")
 
 
+@driving("wire-protocol.md#stop")
+async def stop_ramp(bench: Bench) -> None:
+    """It falls silent along the ramp of a Stop, a raised cosine, then switches the voltage off."""
+    await bench.arm()
+    await bench.play(*(1.0,) * bench.can.channels)
+    ramp = bench.ramp
+    status, when = await bench.timed(bench.amplifier.stop(ramp))
+    bench.expect_state(status, AmplifierState.QUICK_STOP_ACTIVE, after="a Stop")
+    samples = await samples_until(bench, when.latest + 1.1 * ramp, feed=False)
+    falling = raised_cosine(ramp, begin=bench.level, end=0.0)
+    for channel in range(bench.can.channels):
+        expect_curve(
+            bench, samples, falling, commit=when, lasts=ramp, channel=channel, what="of a Stop"
+        )
+    off = await bench.time_of(_is_off, since=when, due=ramp, what="high voltage off after a Stop")
+    expect(off.latest > 0, "high voltage", expected="off", seen="on")
+
+
+@driving("wire-protocol.md#numbers")
+async def stop_ramp_clipped(bench: Bench) -> None:
+    """It clips the ramp of a Stop into its range."""
+    await bench.arm()
+    await bench.play(1.0)
+    longest = bench.can.ramp_max
+    if bench.has_raw:
+        request, earliest = bench.raw.longest_stop(), clock.now()
+        outcome = await bench.raw.send(request)
+        expect(outcome in request.allowed, request.name, expected="a reply", seen=outcome)
+        when = Interval(earliest, earliest + 2 * bench.exchange_time)
+    else:
+        _, when = await bench.timed(bench.amplifier.stop(longest))
+    samples = await samples_until(bench, when.latest + 1.1 * longest, feed=False)
+    falling = raised_cosine(longest, begin=bench.level, end=0.0)
+    expect_curve(bench, samples, falling, commit=when, lasts=longest, what="of the longest Stop")
+
+
+@driving(_STATES)
+async def clear_too_early(bench: Bench) -> None:
+    """It clears no stop before it is silent."""
+    await bench.arm()
+    await bench.play(1.0)
+    ramp = bench.ramp
+    status, when = await bench.timed(bench.amplifier.stop(ramp))
+    for share in (0.2, 0.6):
+        await bench.pause_until(when.latest + share * ramp)
+        cleared, sent = await bench.timed(bench.amplifier.clear(status.latch))
+        if sent.latest < when.earliest + 0.9 * ramp:
+            bench.expect_state(cleared, AmplifierState.QUICK_STOP_ACTIVE, after="Clear amid a ramp")
+    falling = raised_cosine(ramp, begin=bench.level, end=0.0)
+    samples = await samples_until(bench, when.latest + 1.1 * ramp, feed=False)
+    for sample in samples:
+        highest = falling(sample.when.earliest - when.latest - 0.002) + bench.tolerance
+        level = sample.status.levels[0]
+        expect(
+            level <= highest, "level after Clear", expected=f"{highest:.4f}", seen=f"{level:.4f}"
+        )
+    await bench.amplifier.clear(status.latch)
+    await bench.until(
+        lambda status: status.state is AmplifierState.SWITCH_ON_DISABLED, what="Clear", feed=False
+    )
+
+
+@driving(_STATES)
 async def silence_never_later(bench: Bench) -> None:
-    """It lets a further stop shorten the ramp to silence, never extend it."""
-    full_ramp = bench.can.ramp_max
-    for first, then in ((full_ramp, 0.0), (0.0, full_ramp), (full_ramp / 4, full_ramp)):
+    """It lets a further Stop or Disarm shorten the ramp to silence, never extend it."""
+    amplifier, full = bench.amplifier, bench.can.ramp_max
+    stop, disarm = amplifier.stop, amplifier.disarm
+    for first, begin, then, after, share in (
+        (stop, full, stop, 0.0, 0.1),
+        (stop, full / 4, stop, full, 0.1),
+        (stop, full / 4, stop, full / 4, 0.15),
+        (stop, full, stop, full / 8, 0.25),
+        (disarm, full / 4, stop, full, 0.1),
+        (disarm, full, stop, 0.0, 0.1),
+        (stop, full / 4, disarm, full, 0.1),
+    ):
         await bench.arm()
-        await bench.amplifier.apply(bench.tones(1.0))
-        await bench.amplifier.stop(first)
-        started_at = clock.now()
-        await bench.amplifier.stop(then)
-        await bench.until(lambda status: not any(status.levels), what="silence", feed=False)
-        due = min(first, then) + full_ramp / 4
-        took = clock.now() - started_at
-        expect(took <= due, f"silence must come within {due:g} s of both stops, took {took:.3f} s")
+        await bench.play(1.0)
+        _, begun = await bench.timed(first(begin))
+        await bench.pause_until(begun.latest + share * begin)
+        _, second = await bench.timed(then(after))
+        due = min(begun.latest + begin, second.latest + after) - begun.latest
+        what = f"silence after {begin:g} s, then {after:g} s"
+        silent = await bench.time_of(is_silent, since=begun, due=due, what=what)
+        bench.expect_time(what, silent, low=0.0, high=due + PROMPT)
         await bench.rest()
 
 
+@driving("wire-protocol.md#sets-tokens-and-ramps")
+async def stop_ends_fades(bench: Bench) -> None:
+    """It ends a fade that a set has begun along the ramp of a Stop, if that is sooner."""
+    full = bench.can.ramp_max
+    for set_ramp, stop_ramp_ in ((full, full / 8), (full / 4, full)):
+        await bench.arm()
+        await bench.play(1.0)
+        begun = await bench.play(ramp=set_ramp)
+        await bench.pause_until(begun.latest + 0.1 * set_ramp)
+        _, stopped = await bench.timed(bench.amplifier.stop(stop_ramp_))
+        due = min(begun.latest + set_ramp, stopped.latest + stop_ramp_) - begun.latest
+        what = "silence of a fading set after a Stop"
+        silent = await bench.time_of(is_silent, since=begun, due=due, what=what)
+        bench.expect_time(what, silent, low=0.0, high=due + PROMPT)
+        await bench.rest()
+
+
+@driving("wire-protocol.md#disarm")
 async def disarm(bench: Bench) -> None:
-    """It falls silent on disarm, then switches the high voltage off."""
+    """It falls silent along the ramp of Disarm, then switches the high voltage off."""
     await bench.arm()
-    await bench.amplifier.apply(bench.tones(1.0))
-    await bench.amplifier.disarm(0.01)
-    status = await bench.until(
-        lambda status: status.state is AmplifierState.SWITCH_ON_DISABLED,
-        what="disarming",
-        feed=False,
-    )
+    await bench.play(*(1.0,) * bench.can.channels)
+    ramp = bench.ramp
+    status, when = await bench.timed(bench.amplifier.disarm(ramp))
+    bench.expect_state(status, AmplifierState.SWITCHED_ON, after="Disarm")
+    samples = await samples_until(bench, when.latest + 0.8 * ramp, feed=False)
+    falling = raised_cosine(ramp, begin=bench.level, end=0.0)
+    expect_curve(bench, samples, falling, commit=when, lasts=0.75 * ramp, what="of a Disarm")
+
+    def is_disarmed(status: Status) -> bool:
+        return status.state is AmplifierState.SWITCH_ON_DISABLED and is_silent(status)
+
+    off = await bench.time_of(is_disarmed, since=when, due=ramp, what="disarming")
+    bench.expect_time("disarming", off, low=ramp, high=ramp + PROMPT)
     # Some wires report levels, high voltage and state separately: once more, all after the state.
     status = await bench.amplifier.status()
-    expect(not any(status.levels), f"levels after Disarm are {status.levels}")
-    expect(not status.high_voltage, "high voltage after Disarm is on")
-    await bench.refused(bench.amplifier.apply(bench.tones(1.0)), what="an apply while disarmed")
-
-
-async def watchdog(bench: Bench) -> None:
-    """It trips its watchdog while the host only reads, and latches that."""
-    await bench.amplifier.arm(bench.can.watchdog_min)
-    await bench.amplifier.apply(bench.tones(1.0))
-    status = await bench.until(
-        lambda status: status.state is AmplifierState.FAULT, what="watchdog fault", feed=False
-    )
-    expect(status.fault is Fault.WATCHDOG, f"the fault is {status.fault.name}")
-    # Some wires report levels and state separately: read once more for the levels in FAULT.
-    status = await bench.amplifier.status()
-    expect(not any(status.levels), f"levels in FAULT are {status.levels}")
-    expect(not status.high_voltage, "high voltage in FAULT is on")
-    faults = await bench.amplifier.faults()
+    expect(not any(status.levels), "levels after Disarm", expected="0", seen=status.levels)
+    expect(not status.high_voltage, "high voltage after Disarm", expected="off", seen="on")
     expect(
-        bool(faults) and faults[0].fault is Fault.WATCHDOG,
-        f"faults must begin with WATCHDOG, got {faults}",
+        status.watchdog_left == 0,
+        "watchdog_left after Disarm",
+        expected=0,
+        seen=status.watchdog_left,
     )
-    await bench.amplifier.heartbeat()
-    await bench.refused(bench.arm(), what="arming in FAULT")
-    await bench.refused(bench.amplifier.apply(bench.tones(1.0)), what="an apply in FAULT")
-    status = await bench.amplifier.clear()
-    bench.expect_state(status, AmplifierState.SWITCH_ON_DISABLED, after="Clear")
+    await bench.refused(bench.amplifier.apply(bench.tones(1.0)), what="an Apply while disarmed")
 
 
-async def heartbeats(bench: Bench) -> None:
-    """It keeps playing while heartbeats come, each of which restarts the watchdog."""
-    watchdog = min(LONG_WATCHDOG, bench.can.watchdog_max)
-    await bench.arm()
-    await bench.amplifier.apply(bench.tones(1.0))
-    drained = await bench.until(
-        lambda status: status.watchdog_left < watchdog - 0.02,
-        what="count-down of the watchdog",
-        feed=False,
-    )
-    filled = await bench.amplifier.heartbeat()
-    expect(
-        drained.watchdog_left < filled.watchdog_left <= watchdog + 1e-3,
-        f"watchdog_left must rise with a heartbeat, got {drained.watchdog_left:g} s before and "
-        f"{filled.watchdog_left:g} s after it",
-    )
-    await bench.expect_levels(1.0, why="playing with heartbeats")
-
-
+@driving(_SETS)
 async def valid_for(bench: Bench) -> None:
-    """It ends a vibration after valid_for, stays armed, and keeps the staged set."""
+    """It ends a vibration when valid_for ends, stays armed, and keeps the staged set."""
+    bench.require(Feature.VALID_FOR)
     await bench.arm()
-    ending, staged = bench.tones(1.0, valid_for=0.05), bench.tones(0.5)
-    await bench.amplifier.apply(ending)
-    await bench.amplifier.stage(staged)
-    status = await bench.until(
-        lambda status: not any(status.levels), what="end of a vibration", feed=True
-    )
-    bench.expect_state(status, AmplifierState.OPERATION_ENABLED, after="valid_for")
-    await bench.amplifier.apply(ending)
-    await bench.expect_levels(why="ended set applied again")
-    await bench.amplifier.commit(staged.token)
-    await bench.expect_levels(0.5, why="commit of a set staged before another ended")
+    for lasts in (0.05, 0.3):
+        ending, staged = bench.tones(1.0, valid_for=lasts), bench.tones(0.5)
+        when = await bench.apply(ending)
+        if bench.has(Feature.STAGING):
+            await bench.amplifier.stage(staged)
+        what = f"end of a vibration of {lasts:g} s"
+        silent = await bench.time_of(is_silent, since=when, due=lasts, what=what, feed=True)
+        bench.expect_time(what, silent, low=lasts, high=lasts + PROMPT)
+        status = (await bench.sample()).status
+        bench.expect_state(status, AmplifierState.OPERATION_ENABLED, after="valid_for")
+        expect(status.high_voltage, "high voltage after valid_for", expected="on", seen="off")
+        await bench.amplifier.apply(ending)
+        await bench.expect_levels(why="ended set applied again")
+        if bench.has(Feature.STAGING):
+            await bench.amplifier.commit(staged.token)
+            await bench.expect_levels(0.5, why="commit of a set staged before another ended")
+
+
+@driving(_SETS)
+async def valid_for_is_of_its_set(bench: Bench) -> None:
+    """It ends a set by its own valid_for: not by that of an earlier one, not without one."""
+    bench.require(Feature.VALID_FOR)
+    await bench.arm()
+    first = await bench.play(1.0, valid_for=0.15)
+    repeated = bench.tones(0.75, valid_for=0.0)
+    await bench.apply(repeated)
+    await bench.pause_until(first.latest + 0.1)
+    await bench.beat()
+    await bench.pause_until(first.latest + 0.25)
+    await bench.expect_levels(0.75, why="of a set without valid_for, after that of the one before")
+    lasting = bench.tones(1.0, valid_for=0.2)
+    when = await bench.apply(lasting)
+    await asyncio.sleep(0.1)
+    await bench.apply(lasting)  # the same again: it changes nothing
+    what = "end of a vibration that was applied twice"
+    silent = await bench.time_of(is_silent, since=when, due=0.2, what=what, feed=True)
+    bench.expect_time(what, silent, low=0.2, high=0.2 + PROMPT)
+    await bench.wait(0.6)
+    await bench.play(1.0)
+    await bench.wait(0.6)
+    await bench.expect_levels(1.0, why="without valid_for, after 0.6 s")
+
+
+@driving(_STATES)
+async def arming_ends_fades(bench: Bench) -> None:
+    """It fades what still plays within 5 ms when it is armed amid a Disarm."""
+    await bench.arm()
+    await bench.play(1.0)
+    ramp = bench.can.ramp_max
+    _, begun = await bench.timed(bench.amplifier.disarm(ramp))
+    await bench.pause_until(begun.latest + 0.1 * ramp)
+    status = await bench.arm()
+    bench.expect_state(status, AmplifierState.OPERATION_ENABLED, after="Arm amid a Disarm")
+    what = "silence after Arm amid a Disarm"
+    silent = await bench.time_of(is_silent, since=bench.fed, due=0.005, what=what)
+    bench.expect_time(what, Interval(0.0, silent.latest), low=0.0, high=0.005)

@@ -1,54 +1,181 @@
 """Checks of envelopes, on amplifiers that support them."""
 
-from drivers.command import CommandSet, DriveCommand, Envelope, Knot
-from drivers.conformance.bench import LEVEL_TOLERANCE, Bench, expect
+from drivers.command import Envelope, Knot
+from drivers.conformance.bench import Bench
+from drivers.conformance.check import driving
+from drivers.conformance.curve import Curve, expect_curve, raised_cosine, samples_until
+from drivers.conformance.ending import is_silent
+from drivers.conformance.findings import NotApplicable, expect
+from drivers.protocol.messages import Feature
+
+_PLACE = "wire-protocol.md#envelopes"
 
 
-async def envelopes(bench: Bench) -> None:
-    """It plays onset and ending envelopes through their knots, if it reports any."""
+def _along(step: float, *values: complex) -> Curve:
+    """Make the level along straight lines between complex amplitudes, a step [s] apart."""
+
+    def level(time: float) -> float:
+        share = min(max(time / step, 0.0), len(values) - 1.0)
+        number = min(int(share), len(values) - 2)
+        here, there = values[number : number + 2]
+        return abs(here + (there - here) * (share - number))
+
+    return level
+
+
+def _step(bench: Bench) -> float:
+    """Return a step [s] that is long against an exchange; NotApplicable without envelopes."""
     if not bench.can.envelope_knots:
-        return
+        raise NotApplicable("it has no envelopes")
+    wanted = max(0.1, 20 * bench.exchange_time)
+    return min(max(wanted, bench.can.envelope_step_min), bench.can.envelope_step_max)
+
+
+async def _load(bench: Bench, slot: int, *amplitudes: complex) -> None:
+    """Load an envelope of knots at these complex amplitudes, relative to the test level."""
+    knots = tuple(
+        Knot(abs(one) * bench.level, 180.0 if one.real < 0 else 0.0) for one in amplitudes
+    )
+    envelope = Envelope(slot, _step(bench), knots)
+    await bench.amplifier.load_envelope(bench.guard.check_envelope(envelope))
+
+
+@driving(_PLACE)
+async def onsets(bench: Bench) -> None:
+    """It begins along an onset through its knots, from silence, whatever the ramp."""
+    step, level = _step(bench), bench.level
+    await _load(bench, 1, 0.75, 0.25)
     await bench.arm()
-    step = min(max(0.1, bench.can.envelope_step_min), bench.can.envelope_step_max)
-    for slot, fraction in ((1, 0.5), (2, 0.25)):
-        shape = Envelope(slot, step, (Knot(fraction * bench.level, 0.0),) * 2)
-        await bench.amplifier.load_envelope(bench.guard.check_envelope(shape))
-    shaped = DriveCommand(0, bench.frequency, bench.level, onset=1, ending=2)
-    token = bench.amplifier.next_token()
-    safe = bench.guard.check(CommandSet(token, (shaped,), ramp=0.0, valid_for=0.0))
-    achieved = await bench.amplifier.apply(safe)
-    expect(
-        (achieved.commands[0].onset, achieved.commands[0].ending) == (1, 2),
-        "achieved slots must be those requested",
-    )
-    status = await bench.amplifier.status()
-    expect(
-        status.levels[0] < bench.level * 0.9, f"level must begin at zero, got {status.levels[0]:g}"
-    )
-    await bench.until(
-        lambda status: abs(status.levels[0] - bench.level) <= LEVEL_TOLERANCE,
-        what="end of an onset",
-        feed=True,
-    )
-    await bench.amplifier.apply(bench.tones())
-    level = (await bench.levels())[0]
-    expect(level > 0, "level must follow the ending, got silence at once")
-    await bench.until(lambda status: not any(status.levels), what="end of an ending", feed=True)
+    shaped = bench.tones(1.0, onset=1, ending=0, ramp=0.0)
+    achieved = await bench.amplifier.apply(shaped)
+    slots = [(one.onset, one.ending) for one in achieved.commands]
+    expect(slots == [(1, 0)], "achieved slots", expected=[(1, 0)], seen=slots)
+    await bench.play()
+    when = await bench.apply(bench.tones(1.0, onset=1))
+    rising = _along(step, 0.0, 0.75 * level, 0.25 * level, level)
+    samples = await samples_until(bench, when.latest + 3.2 * step)
+    expect_curve(bench, samples, rising, commit=when, lasts=3 * step, what="of an onset")
+    await bench.expect_levels(1.0, why="after an onset")
 
 
+@driving(_PLACE)
+async def endings(bench: Bench) -> None:
+    """It ends along the ending of the set that plays: by a silent set, and by valid_for."""
+    step, level = _step(bench), bench.level
+    await _load(bench, 2, 0.5, -0.5)
+    falling = _along(step, level, 0.5 * level, -0.5 * level, 0.0)
+    await bench.arm()
+    for last in ((), (0.0,)):
+        await bench.apply(bench.tones(1.0, ending=2))
+        when = await bench.play(*last)
+        samples = await samples_until(bench, when.latest + 3.2 * step)
+        expect_curve(bench, samples, falling, commit=when, lasts=3 * step, what="of an ending")
+        await bench.expect_levels(why="after an ending")
+    if not bench.has(Feature.VALID_FOR):
+        return
+    lasts = 2 * step
+    when = await bench.apply(bench.tones(1.0, ending=2, valid_for=lasts))
+    samples = await samples_until(bench, when.latest + lasts + 3.2 * step)
+    expect_curve(
+        bench,
+        samples,
+        lambda time: falling(time - lasts),
+        commit=when,
+        lasts=lasts + 3 * step,
+        what="of an ending by valid_for",
+    )
+
+
+@driving(_PLACE)
+async def skipped_endings(bench: Bench) -> None:
+    """It skips an ending by the flag, by Stop and by Disarm, each along its ramp."""
+    _step(bench)
+    await _load(bench, 2, 1.0)
+    ramp = bench.ramp
+    falling = raised_cosine(ramp, begin=bench.level, end=0.0)
+    for name in ("flag", "Disarm", "Stop"):
+        await bench.arm()
+        await bench.apply(bench.tones(1.0, ending=2))
+        if name == "flag":
+            when = await bench.apply(bench.tones(0.0, skip_ending=True, ramp=ramp))
+        else:
+            end = bench.amplifier.disarm if name == "Disarm" else bench.amplifier.stop
+            _, when = await bench.timed(end(ramp))
+        samples = await samples_until(bench, when.latest + 1.3 * ramp, feed=name == "flag")
+        expect_curve(
+            bench, samples, falling, commit=when, lasts=ramp, what=f"of an ending skipped by {name}"
+        )
+        await bench.rest()
+
+
+@driving(_PLACE)
+async def loaded_while_playing(bench: Bench) -> None:
+    """It plays a set by the envelopes of its Stage, whatever is loaded afterwards."""
+    step, level = _step(bench), bench.level
+    await _load(bench, 1, 0.5)
+    await _load(bench, 2, 0.5)
+    bench.require(Feature.STAGING)
+    await bench.arm()
+    staged = bench.tones(1.0, onset=1, ending=2)
+    await bench.amplifier.stage(staged)
+    await _load(bench, 1, 1.0)
+    _, when = await bench.timed(bench.amplifier.commit(staged.token))
+    await _load(bench, 2, 1.0)
+    rising = _along(step, 0.0, 0.5 * level, level)
+    samples = await samples_until(bench, when.latest + 2.2 * step)
+    expect_curve(
+        bench, samples, rising, commit=when, lasts=2 * step, what="of an onset loaded before"
+    )
+    when = await bench.play()
+    falling = _along(step, level, 0.5 * level, 0.0)
+    samples = await samples_until(bench, when.latest + 2.2 * step)
+    expect_curve(
+        bench, samples, falling, commit=when, lasts=2 * step, what="of an ending loaded before"
+    )
+
+
+@driving(_PLACE)
+async def kept_phase_onset(bench: Bench) -> None:
+    """It begins an onset with keep phase at the present amplitude, and without at zero."""
+    step, level = _step(bench), bench.level
+    await _load(bench, 1, 0.5)
+    for keep_phase, begin in ((True, level), (False, 0.0)):
+        await bench.arm()
+        await bench.play(1.0)
+        wanted = bench.tones(1.0, onset=1, keep_phase=keep_phase, ramp=0.0)
+        when = await bench.apply(wanted)
+        curve = _along(step, begin, 0.5 * level, level)
+        samples = await samples_until(bench, when.latest + 2.2 * step)
+        after = [one for one in samples if one.when.earliest > when.latest + 0.002]
+        expect_curve(bench, after, curve, commit=when, lasts=2 * step, what="of an onset")
+        await bench.amplifier.disarm(0.0)
+
+
+@driving(_PLACE)
+async def watchdog_skips_endings(bench: Bench) -> None:
+    """It skips endings when the watchdog trips."""
+    bench.require(Feature.WATCHDOG)
+    _step(bench)
+    await _load(bench, 2, 1.0)
+    await bench.arm(bench.can.watchdog_min)
+    await bench.apply(bench.tones(1.0, ending=2))
+    what = "silence by the watchdog, of a set with an ending"
+    due = bench.watchdog + 0.005
+    silent = await bench.time_of(is_silent, since=bench.fed, due=due, what=what)
+    bench.expect_time(what, silent, low=bench.watchdog, high=due + 0.005)
+
+
+@driving(_PLACE)
 async def missing_envelopes(bench: Bench) -> None:
     """It refuses a set that refers to an empty slot; the playing set stays."""
-    if not bench.can.envelope_slots:
-        return
+    _step(bench)
     slot = bench.can.envelope_slots
-    step = bench.can.envelope_step_max
-    full = bench.guard.check_envelope(Envelope(slot, step, (Knot(0.0, 0.0),)))
-    await bench.amplifier.load_envelope(full)
+    await _load(bench, slot, 0.5)
     await bench.arm()
-    await bench.amplifier.apply(bench.tones(1.0))
-    shaped = DriveCommand(0, bench.frequency, bench.level, onset=slot)
-    token = bench.amplifier.next_token()
-    safe = bench.guard.check(CommandSet(token, (shaped,), ramp=0.0, valid_for=0.0))
-    await bench.amplifier.load_envelope(bench.guard.check_envelope(Envelope(slot, step, ())))
-    await bench.refused(bench.amplifier.apply(safe), what="a set with an empty slot")
-    await bench.expect_levels(1.0, why="after a refused set")
+    await bench.play(1.0)
+    shaped = {"onset": bench.tones(1.0, onset=slot), "ending": bench.tones(1.0, ending=slot)}
+    await _load(bench, slot)
+    for name, wanted in shaped.items():
+        await bench.refused(bench.amplifier.apply(wanted), what=f"an {name} from an empty slot")
+        await bench.refused(bench.amplifier.stage(wanted), what=f"an {name} from an empty slot")
+        await bench.expect_levels(1.0, why="after a refused set")

@@ -1,37 +1,70 @@
-"""Checks of sets, tokens and ramps."""
+"""Checks of what plays: channels, rounding, ranges."""
 
-import asyncio
+import math
 from dataclasses import replace
+from typing import Any
 
 from drivers.command import CommandSet, DriveCommand
-from drivers.conformance.bench import LEVEL_TOLERANCE, Bench, expect
+from drivers.conformance.bench import Bench
+from drivers.conformance.check import driving
+from drivers.conformance.findings import NotApplicable, expect
+from drivers.guard import Guard, SafeCommandSet
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import AmplifierState
+from drivers.protocol.messages import Achieved, AmplifierState, Feature
+
+_SETS = "wire-protocol.md#sets-tokens-and-ramps"
+_Q = PROTOCOL.quantities
 
 
+@driving("wire-protocol.md#states")
 async def plays_nothing_disarmed(bench: Bench) -> None:
-    """It plays nothing before it is armed, and plays no earlier set once armed."""
-    await bench.refused(bench.amplifier.apply(bench.tones(1.0)), what="an apply while disarmed")
+    """It plays nothing before it is armed, and is silent once armed."""
+    amplifier = bench.amplifier
+    await bench.refused(amplifier.apply(bench.tones(1.0)), what="an Apply while disarmed")
+    staged = bench.tones(1.0)
+    await bench.refused(amplifier.stage(staged), what="a Stage while disarmed")
+    await bench.refused(amplifier.commit(staged.token), what="a Commit while disarmed")
     status = await bench.arm()
     bench.expect_state(status, AmplifierState.OPERATION_ENABLED, after="Arm")
-    expect(status.high_voltage, "high voltage after Arm is off")
-    expect(status.token == 0, f"token after Arm must be 0, got {status.token}")
-    expect(not any(status.levels), f"levels after Arm are {status.levels}")
+    expect(status.high_voltage, "high voltage after Arm", expected="on", seen="off")
+    expect(status.token == 0, "active_token after Arm", expected=0, seen=status.token)
+    expect(not any(status.levels), "levels after Arm", expected="0", seen=status.levels)
 
 
+@driving("wire-protocol.md#arm")
+async def arming_forgets(bench: Bench) -> None:
+    """It forgets the staged and the played set when it is armed anew."""
+    await bench.arm()
+    await bench.play(1.0)
+    staged = bench.tones(0.5)
+    if bench.has(Feature.STAGING):
+        await bench.amplifier.stage(staged)
+    await bench.amplifier.disarm(0.0)
+    await bench.until(
+        lambda status: status.state is AmplifierState.SWITCH_ON_DISABLED,
+        what="disarming",
+        feed=False,
+    )
+    status = await bench.arm()
+    expect(status.token == 0, "active_token after Arm", expected=0, seen=status.token)
+    await bench.expect_levels(why="after Arm")
+    commit = bench.amplifier.commit(staged.token)
+    await bench.refused(commit, what="a Commit of a set staged before Arm")
+    await bench.expect_levels(why="after a refused Commit")
+
+
+@driving(_SETS)
 async def achieved(bench: Bench) -> None:
     """It reports what it really plays: the nearest steps; token and levels read back."""
     await bench.arm()
     requested = DriveCommand(0, bench.frequency + 0.0249, bench.level * 0.987654, 12.3456)
     token = bench.amplifier.next_token()
-    achieved = await bench.amplifier.apply(
+    reply = await bench.amplifier.apply(
         bench.guard.check(CommandSet(token, (requested,), ramp=0.0, valid_for=0.0))
     )
-    expect(
-        [one.channel for one in achieved.commands] == [0],
-        "achieved channels differ from the requested ones",
-    )
-    (played,) = achieved.commands
+    channels = [one.channel for one in reply.commands]
+    expect(channels == [0], "achieved channels", expected=[0], seen=channels)
+    (played,) = reply.commands
     can = bench.can
     for what, error, step in (
         ("frequency", played.frequency - requested.frequency, can.frequency_step),
@@ -40,107 +73,201 @@ async def achieved(bench: Bench) -> None:
     ):
         expect(
             abs(error) <= step / 2 + 1e-9,
-            f"{what} must be within half a step of {step:g}, got an error of {error:g}",
+            f"achieved {what}",
+            expected=f"within half a step of {step:g}",
+            seen=f"an error of {error:g}",
         )
     status = await bench.amplifier.status()
-    expect(status.token == token, f"token must be {token}, got {status.token}")
+    expect(status.token == token, "active_token", expected=token, seen=status.token)
     await bench.expect_levels(played.level / bench.level, why="achieved level")
 
 
+@driving("wire-protocol.md#getcaps")
+async def steps_as_stated(bench: Bench) -> None:
+    """It rounds to the steps that it states, and reports what is rounded."""
+    can = bench.can
+    stated = {
+        "frequency": (can.frequency_step, _Q.frequency.step, bench.frequency),
+        "level": (can.level_step, _Q.level.step, bench.level / 2),
+        "phase": (can.phase_step, _Q.phase.step, 10.0),
+    }
+    coarse = {name: one for name, one in stated.items() if one[0] > 3 * one[1]}
+    if not coarse:
+        raise NotApplicable("its steps are those of the wire")
+    await bench.arm()
+    for name, (step, finest, begin) in coarse.items():
+        count = min(_SCANNED, math.floor(step / finest))
+        found = set()
+        for number in range(count):
+            command = DriveCommand(0, bench.frequency, bench.level / 2)
+            value: dict[str, Any] = {name: begin + number * step / count}
+            command = replace(command, **value)
+            token = bench.amplifier.next_token()
+            wanted = CommandSet(token, (command,), ramp=0.0, valid_for=0.0)
+            reply = await bench.amplifier.apply(bench.guard.check(wanted))
+            found.add(getattr(reply.commands[0], name))
+        expect(
+            len(found) <= 2,
+            f"values achieved of {count} requested within one step of {name}",
+            expected="at most 2",
+            seen=len(found),
+        )
+
+
+_SCANNED = 8
+
+
+@driving(_SETS)
+async def every_channel(bench: Bench) -> None:
+    """It plays every channel: each alone, and all together at levels of their own."""
+    await bench.arm()
+    count = bench.can.channels
+    for channel in range(count):
+        await bench.apply(bench.tones(1.0, first=channel))
+        await bench.expect_levels(*(0.0,) * channel, 1.0, why=f"channel {channel} alone")
+    fractions = [1.0 - 0.05 * channel for channel in range(count)]
+    await bench.play(*fractions)
+    await bench.expect_levels(*fractions, why="all channels")
+    await bench.play(*reversed(fractions))
+    await bench.expect_levels(*reversed(fractions), why="all channels, in the opposite order")
+
+
+@driving(_SETS)
+async def achieved_of_every_channel(bench: Bench) -> None:
+    """It reports the frequency and phase of each channel as its own."""
+    await bench.arm()
+    can = bench.can
+    room = (can.frequency_max - bench.frequency) / (2 * can.channels)
+    commands = tuple(
+        DriveCommand(
+            channel,
+            bench.frequency + min(10.0, room) * channel,
+            bench.level * (1.0 - 0.05 * channel),
+            phase=20.0 * channel - 160.0,
+        )
+        for channel in range(can.channels)
+    )
+    token = bench.amplifier.next_token()
+    wanted = bench.guard.check(CommandSet(token, commands, ramp=0.0, valid_for=0.0))
+    if bench.has(Feature.STAGING):
+        _expect_achieved(bench, commands, await bench.amplifier.stage(wanted), "Stage")
+        _expect_achieved(bench, commands, await bench.amplifier.commit(token), "Commit")
+    _expect_achieved(bench, commands, await bench.amplifier.apply(wanted), "Apply")
+
+
+def _expect_achieved(
+    bench: Bench, commands: tuple[DriveCommand, ...], reply: Achieved, name: str
+) -> None:
+    can = bench.can
+    got = {command.channel: command for command in reply.commands}
+    expect(
+        sorted(got) == list(range(can.channels)),
+        f"channels in the reply to {name}",
+        expected=list(range(can.channels)),
+        seen=sorted(got),
+    )
+    for command in commands:
+        played = got[command.channel]
+        turn = (played.phase - command.phase + 180) % 360 - 180
+        is_right = (
+            abs(played.frequency - command.frequency) <= can.frequency_step / 2 + 0.026
+            and abs(played.level - command.level) <= can.level_step / 2 + 1e-4
+            and abs(turn) <= can.phase_step / 2 + 0.01
+        )
+        expect(
+            is_right,
+            f"achieved of channel {command.channel} by {name}",
+            expected=command,
+            seen=played,
+        )
+
+
+@driving(_SETS)
 async def unnamed_channels(bench: Bench) -> None:
     """It silences the channels that a set does not contain."""
     await bench.arm()
-    await bench.amplifier.apply(bench.tones(1.0))
-    await bench.expect_levels(1.0, why="applied set")
-    await bench.amplifier.apply(bench.tones())
+    full = (1.0,) * bench.can.channels
+    await bench.play(*full)
+    await bench.expect_levels(*full, why="applied set")
+    await bench.play(1.0)
+    await bench.expect_levels(1.0, why="set of the first channel")
+    await bench.play()
     await bench.expect_levels(why="set without channels")
 
 
+@driving(_SETS)
 async def all_or_nothing(bench: Bench) -> None:
     """It accepts a set whole or not at all; the playing and the staged set stay."""
     await bench.arm()
     before = bench.tones(1.0)
-    await bench.amplifier.apply(before)
+    await bench.apply(before)
     staged = bench.tones(0.25)
-    await bench.amplifier.stage(staged)
-    larger = bench.guard_as(replace(bench.can, channels=16))
-    if bench.can.channels < 16:
-        beyond = bench.tones(0.5, guard=larger, first=bench.can.channels)
-        await bench.refused(bench.amplifier.apply(beyond), what="a channel that does not exist")
+    if bench.has(Feature.STAGING):
+        await bench.amplifier.stage(staged)
+    other = bench.tones(0.5, token=before.token)
+    for what, wanted in [*_impossible(bench), ("the token of another", other)]:
+        await bench.refused(bench.amplifier.apply(wanted), what=f"a set with {what}")
         status = await bench.amplifier.status()
-        expect(status.token == before.token, "token must not change by a refused set")
-        await bench.expect_levels(1.0, why="after a refused set")
-    await bench.amplifier.commit(staged.token)
-    await bench.expect_levels(0.25, why="commit of a set staged before a refused one")
+        expect(
+            status.token == before.token,
+            f"active_token after a set with {what}",
+            expected=before.token,
+            seen=status.token,
+        )
+        await bench.expect_levels(1.0, why=f"after a set with {what}")
+    if bench.has(Feature.STAGING):
+        await bench.amplifier.commit(staged.token)
+        await bench.expect_levels(0.25, why="commit of a set staged before refused ones")
 
 
-async def stage_and_commit(bench: Bench) -> None:
-    """It changes nothing on Stage, and plays the staged set on Commit of its token only."""
-    await bench.arm()
-    staged = bench.tones(1.0)
-    await bench.amplifier.stage(staged)
-    await bench.expect_levels(why="after Stage")
-    other = bench.amplifier.next_token()
-    await bench.refused(bench.amplifier.commit(other), what="a token that is not staged")
-    await bench.expect_levels(why="after a refused Commit")
-    await bench.amplifier.commit(staged.token)
-    await bench.expect_levels(1.0, why="after Commit")
+def _impossible(bench: Bench) -> list[tuple[str, SafeCommandSet]]:
+    """Make sets of which one value is beyond the capabilities, as far as the wire can say it."""
+    can, sets = bench.can, list[tuple[str, SafeCommandSet]]()
+
+    def add(what: str, guard: Guard, *commands: DriveCommand, ramp: float = 0.0) -> None:
+        token = bench.amplifier.next_token()
+        sets.append((what, guard.check(CommandSet(token, commands, ramp=ramp, valid_for=0.0))))
+
+    good = DriveCommand(0, bench.frequency, bench.level / 2)
+    if can.channels < _Q.channel_count.maximum:
+        beyond = replace(good, channel=can.channels)
+        add("a channel that does not exist", bench.wider(channels=can.channels + 1), good, beyond)
+    high = can.frequency_max + can.frequency_step + 0.1
+    if high <= _Q.frequency.high:
+        wide = bench.wider(frequency_max=_Q.frequency.high)
+        add("a frequency above the highest", wide, replace(good, frequency=high))
+    low = can.frequency_min - can.frequency_step - 0.1
+    if low >= 10.0:
+        wide = bench.wider(frequency_min=0.0)
+        add("a frequency below the lowest", wide, replace(good, frequency=low))
+    if can.level_max + can.level_step < 1.0:
+        loud = replace(good, level=can.level_max + can.level_step)
+        add("a level above the highest", bench.wider(level_max=1.0), loud)
+    if can.ramp_max < _Q.ramp.high:
+        slow = can.ramp_max + 0.001
+        add("a ramp above the longest", bench.wider(ramp_max=_Q.ramp.high), good, ramp=slow)
+    return sets
 
 
-async def tokens(bench: Bench) -> None:
-    """It plays a token once: the same set is confirmed; another, or a late copy, is refused."""
-    await bench.arm()
-    skipped, first = bench.tones(0.5), bench.tones(1.0)
-    achieved = await bench.amplifier.apply(first)
-    expect(
-        (await bench.amplifier.apply(first)).commands == achieved.commands,
-        "reply to a repeated set must equal the first one",
-    )
-    await bench.amplifier.commit(first.token)
-    other = bench.tones(0.5, token=first.token)
-    await bench.refused(bench.amplifier.apply(other), what="another set with the active token")
-    await bench.expect_levels(1.0, why="after a repeated token")
-    await bench.amplifier.apply(bench.tones(0.25))
-    staged = bench.tones(0.5)
-    await bench.amplifier.stage(staged)
-    await bench.refused(bench.amplifier.apply(first), what="a late copy of an earlier set")
-    await bench.refused(bench.amplifier.stage(skipped), what="a token older than the active one")
-    await bench.expect_levels(0.25, why="after a late copy")
-    await bench.amplifier.commit(staged.token)
-    await bench.expect_levels(0.5, why="commit of a set staged before a late copy")
-
-
-async def staged_sets_expire(bench: Bench) -> None:
-    """It forgets a staged set that is not committed within a second."""
-    await bench.arm()
-    staged = bench.tones(1.0)
-    await bench.amplifier.stage(staged)
-    await bench.wait(1.25 * PROTOCOL.staged_life)
-    await bench.refused(bench.amplifier.commit(staged.token), what="the commit of an old set")
-    await bench.expect_levels(why="after a refused Commit")
-
-
-async def ramps(bench: Bench) -> None:
-    """It follows the ramp of a set."""
-    await bench.arm()
-    ramp = min(0.5, bench.can.ramp_max)
-    await bench.amplifier.apply(bench.tones(1.0, ramp=ramp))
-    level = (await bench.levels())[0]
-    expect(level < bench.level * 0.9, f"level must rise along the ramp, got {level:g} at its start")
-    await bench.until(
-        lambda status: abs(status.levels[0] - bench.level) <= LEVEL_TOLERANCE,
-        what="end of a ramp",
-        feed=True,
-    )
-
-
-async def cancelled_requests(bench: Bench) -> None:
-    """It gives a request its own reply after one that was cancelled."""
-    for _ in range(3):
-        requesting = asyncio.create_task(bench.amplifier.faults())
-        await asyncio.sleep(0)
-        requesting.cancel()
-        await asyncio.gather(requesting, return_exceptions=True)
-        status = await bench.arm()
-        bench.expect_state(status, AmplifierState.OPERATION_ENABLED, after="Arm")
+@driving("wire-protocol.md#getcaps")
+async def stated_ranges(bench: Bench) -> None:
+    """It accepts what is just within its ranges."""
+    can = bench.can
+    for watchdog in (can.watchdog_min, can.watchdog_max):
+        status = await bench.arm(watchdog)
+        bench.expect_state(
+            status, AmplifierState.OPERATION_ENABLED, after=f"Arm with {watchdog:g} s"
+        )
         await bench.amplifier.disarm(0.0)
+    await bench.arm()
+    await bench.amplifier.identify()
+    again = bench.amplifier.capabilities
+    expect(again == can, "capabilities once armed", expected=can, seen=again)
+    if not bench.has(Feature.STAGING):  # nothing is played that loud
+        return
+    for frequency in (bench.guard.limits.frequency_min, bench.guard.limits.frequency_max):
+        command = DriveCommand(can.channels - 1, frequency, bench.guard.limits.level)
+        token = bench.amplifier.next_token()
+        wanted = CommandSet(token, (command,), ramp=can.ramp_max, valid_for=0.0)
+        reply = await bench.amplifier.stage(bench.guard.check(wanted))
+        expect(bool(reply.commands), "staged commands", expected="one", seen="none")

@@ -38,8 +38,7 @@ class Amplifier:
         self.state, self.fault = DISARMED, NO_FAULT
         self.session = self.latch = 0
         self._faults = deque(maxlen=16)
-        self._before = self._after = [0] * CHANNELS
-        self._ramp, self._begin = 0, clock()
+        self._fades = [(0, 0, 0, clock())] * CHANNELS  # level before, after, ramp, begin
         self._forget()
 
     def update(self):
@@ -77,22 +76,24 @@ class Amplifier:
         return max(0, round(self._expires_at - self._clock())) if self.state == ARMED else 0
 
     def _levels_at(self, moment):
-        share = 1.0
-        if self._ramp > 0:
-            share = min(max((moment - self._begin) / self._ramp, 0.0), 1.0)
-        rising = (1 - math.cos(math.pi * share)) / 2
-        return [
-            round(before * (1 - rising) + after * rising)
-            for before, after in zip(self._before, self._after, strict=True)
-        ]
+        levels = []
+        for before, after, ramp, begin in self._fades:
+            share = min(max((moment - begin) / ramp, 0.0), 1.0) if ramp > 0 else 1.0
+            rising = (1 - math.cos(math.pi * share)) / 2
+            levels.append(round(before * (1 - rising) + after * rising))
+        return levels
 
     def _fade_to(self, levels, *, ramp, begin=None):
         begin = self._clock() if begin is None else begin
-        self._before = self._levels_at(begin)
-        self._after, self._ramp, self._begin = levels, ramp, begin
+        before = self._levels_at(begin)
+        for channel, (_, after, its_ramp, since) in enumerate(self._fades):
+            is_silent = not after and not levels[channel]
+            if not (is_silent and since + its_ramp <= begin + ramp):  # silence never comes later
+                self._fades[channel] = (before[channel], levels[channel], ramp, begin)
 
     def _is_silent(self):
-        return not any(self._after) and self._clock() >= self._begin + self._ramp
+        now = self._clock()
+        return all(not after and now >= begin + ramp for _, after, ramp, begin in self._fades)
 
     def _forget(self):
         self.token, self._staged, self._ends_at = 0, None, None
@@ -183,9 +184,7 @@ class Amplifier:
         self._end_ramp = ramp
 
     def _silence(self, ramp):
-        ramp = min(max(ramp, 0), MAX_RAMP)
-        if any(self._after) or self._clock() + ramp < self._begin + self._ramp:  # not later
-            self._fade_to([0] * CHANNELS, ramp=ramp)
+        self._fade_to([0] * CHANNELS, ramp=min(max(ramp, 0), MAX_RAMP))
         self._staged, self._ends_at = None, None
 
     def _check_token(self, session, token):

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from drivers.amplifier import Amplifier
-from drivers.conformance import CHECKS, run_check
+from drivers.conformance import CHECKS, raw_line, run_check
 from drivers.registry import open_backend
 from firmware_programs import UARTS, running_firmware, running_machine
 
@@ -18,7 +18,8 @@ async def problems(url: str) -> list[tuple[str, str]]:
     """The checks that fail, with what happened."""
     amplifier = Amplifier(open_backend(url), reply_timeout=REPLY_TIMEOUT)
     await amplifier.open()
-    results = [await run_check(check, amplifier) for check in CHECKS]
+    raw = raw_line(url)
+    results = [await run_check(check, amplifier, raw, url=url) for check in CHECKS]
     await amplifier.close()
     return [(one.check.name, one.problem) for one in results if one.problem is not None]
 

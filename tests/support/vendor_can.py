@@ -61,7 +61,9 @@ class Channel:
         return round(self.now + (self.goal - self.now) * gain)
 
     def go(self, goal: int, ramp: float, time: float) -> None:
-        self.now, self.goal, self.begin, self.ramp = self.level(time), goal, time, ramp
+        is_silent_sooner = not self.goal and not goal and self.begin + self.ramp <= time + ramp
+        if not is_silent_sooner:
+            self.now, self.goal, self.begin, self.ramp = self.level(time), goal, time, ramp
 
 
 class VendorAmplifier:
@@ -256,7 +258,11 @@ class VendorAmplifier:
             if bits(data, 52, 4) != place:
                 return BAD_CHANNEL, bits(data, 52, 4)
             frequency, level = bits(data, 0, 16), bits(data, 16, 16)
-            if level > 10000 or (level and not LOWEST <= frequency <= HIGHEST):
+            phase = bits(data, 32, 16)
+            is_phase = phase < 18000 or phase >= 0x10000 - 18000
+            if level > 10000 or not is_phase or bits(data, 51, 1):
+                return BAD_VALUE, place
+            if level and not LOWEST <= frequency <= HIGHEST:
                 return BAD_VALUE, place
             if bits(data, 50, 1):
                 return NO_ENVELOPE, place  # no envelope is ever loaded here
@@ -315,8 +321,7 @@ class VendorAmplifier:
     def _silence(self, ramp: float, now: float) -> None:
         self.ends_at = math.inf
         for channel in self.channels:
-            if channel.goal or now + ramp < channel.begin + channel.ramp:
-                channel.go(0, ramp, now)
+            channel.go(0, ramp, now)
 
     def _is_silent(self, now: float) -> bool:
         return not any(channel.level(now) for channel in self.channels)

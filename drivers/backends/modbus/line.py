@@ -119,6 +119,13 @@ class ModbusLine(SharedLine[Port]):
         on_sent(self._last_sent_at)
         self._free_from = self._last_sent_at + self._time_of(len(request.frame)) + self._gap
 
+    async def send_raw(self, data: bytes) -> None:
+        """Send bytes as they are, after the silence of a serial line."""
+        await self._await_silence()
+        self._ready().write(data)
+        self._last_sent_at = clock.now()
+        self._free_from = self._last_sent_at + self._time_of(len(data)) + self._gap
+
     def _make(self, read: Read | None, write: Write | None, *, unit: int) -> RequestAdu:
         self._transaction = (self._transaction + 1) % _TRANSACTIONS
         number = 0 if self.url.is_rtu else self._transaction
@@ -152,6 +159,8 @@ class ModbusLine(SharedLine[Port]):
         return self._times.of(size) if self._times else 0.0
 
     def _received(self, data: bytes) -> None:
+        if self.tap is not None:
+            self.tap(data)
         replies = self._reader.feed(data, self._request)
         trace.frame(Direction.IN, data, self.name, lambda: ", ".join(map(repr, replies)))
         for response in replies:

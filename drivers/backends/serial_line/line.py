@@ -55,6 +55,8 @@ class SerialLine(SharedLine[Port]):
         )
 
     def _received(self, data: bytes) -> None:
+        if self.tap is not None:
+            self.tap(data)
         for frame in self._reader.feed(data):
             # A frame without a listener goes to one that counts it as unexpected.
             listener = self._listeners.get(frame.address) or next(

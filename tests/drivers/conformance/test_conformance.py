@@ -1,268 +1,123 @@
-"""Conformance checks against amplifiers with one mistake each."""
+"""Attempts and results of conformance checks: delays of this program do not count."""
 
-import math
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+import asyncio
+from collections.abc import Callable, Coroutine
 
 import pytest
 
+from conformance_bench import opened
 from drivers import clock
-from drivers.amplifier import Amplifier
-from drivers.backend import Backend
-from drivers.command import CommandSet
-from drivers.conformance import CHECKS, run_check
-from drivers.protocol.messages import (
-    Achieved,
-    AmplifierState,
-    Apply,
-    Arm,
-    Capabilities,
-    Clear,
-    Commit,
-    Disarm,
-    Identity,
-    LoadEnvelope,
-    Nak,
-    Ping,
-    Reply,
-    Request,
-    Stage,
-    Status,
-    Stop,
-)
-from sim.amplifier.amplifier import SimulatedAmplifier
-from sim.waveform import FadingTone
-from vendor_pages import plain
-from virtual_loop import in_virtual_time
+from drivers.conformance import CheckResult, Result, run_check
+from drivers.conformance.bench import Bench
+from drivers.conformance.check import MAX_ATTEMPTS, Check
+from drivers.conformance.findings import Inconclusive, NotApplicable, expect
+from drivers.conformance.report import ConformanceReport
+from drivers.guard.channel_state import Interval
+from model.rig.rig import Rig
+from virtual_loop import VirtualLoop, run_virtual
 
-Answer = Callable[[SimulatedAmplifier, Request, float], Reply]
-Deed = Callable[[SimulatedAmplifier, float], None]
+Steps = Callable[[Bench], Coroutine[None, None, None]]
 
 
-class Flawed(Backend):
-    """A simulated amplifier in this process with altered replies."""
-
-    def __init__(self, answer: Answer) -> None:
-        self._amplifier = SimulatedAmplifier("main", channels=4)
-        self._answer = answer
-
-    async def open(self) -> None:
-        """Nothing to open."""
-
-    async def close(self) -> None:
-        """Nothing to close."""
-
-    @property
-    def last_sent_at(self) -> float:
-        return 0.0
-
-    async def exchange(self, request: Request, *, timeout: float) -> Reply:
-        return self._answer(self._amplifier, request, clock.now())
+def stall(duration: float) -> None:
+    """Let this program not run for a time [s]."""
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualLoop)
+    loop.now += duration
 
 
-def altered_reply(kind: type[Any], **changes: object) -> Answer:
-    """Alter every reply of a kind."""
+def result_of(steps: Steps, rig: Rig) -> CheckResult:
+    """The result of a check with these steps, on a sound amplifier."""
+    check = Check("named", "does as told", ("wire-protocol.md#watchdog",), drives=True, run=steps)
 
-    def answer(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-        reply = amplifier.handle(request, now)
-        return replace(reply, **changes) if isinstance(reply, kind) else reply
+    async def run() -> CheckResult:
+        async with opened("serial", rig) as (amplifier, raw):
+            return await run_check(check, amplifier, raw)
 
-    return answer
-
-
-def altered_request(kind: type[Any], alter: Callable[[Any], Request]) -> Answer:
-    """Carry out another request instead of one of a kind."""
-
-    def answer(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-        return amplifier.handle(alter(request) if isinstance(request, kind) else request, now)
-
-    return answer
+    return run_virtual(run())
 
 
-def altered_set(alter: Callable[[CommandSet], dict[str, Any]]) -> Answer:
-    """Apply another set."""
-    return altered_request(
-        Apply,
-        lambda asked: Apply(
-            replace(plain(asked).command_set, **alter(asked.command_set)), asked.session
-        ),
+def test_violation_fails_at_once(coarse_rig: Rig) -> None:
+    """With what was seen and expected, and the place on the page."""
+
+    async def steps(bench: Bench) -> None:
+        expect(False, "level", expected="0.2", seen="0.1")
+
+    found = result_of(steps, coarse_rig)
+    assert found.result is Result.FAILED
+    assert found.attempts == 1
+    row = found.to_json()
+    assert (row["expected"], row["seen"]) == ("0.2", "level: 0.1")
+    assert row["place"] == "wire-protocol.md#watchdog"
+
+
+def test_violation_amid_a_stall_is_looked_at_again(coarse_rig: Rig) -> None:
+    """The second attempt, undisturbed, passes."""
+    tries = []
+
+    async def steps(bench: Bench) -> None:
+        tries.append(clock.now())
+        if len(tries) == 1:
+            stall(0.05)
+            await bench.sample()
+            expect(False, "level", expected="0.2", seen="0.1")
+
+    found = result_of(steps, coarse_rig)
+    assert found.result is Result.PASSED
+    assert found.attempts == 2
+
+
+@pytest.mark.parametrize("is_violation", [True, False])
+def test_check_that_is_always_disturbed_is_inconclusive(
+    is_violation: bool, coarse_rig: Rig
+) -> None:
+    """After a bounded number of attempts, and never passed."""
+
+    async def steps(bench: Bench) -> None:
+        stall(0.05)
+        await bench.sample()
+        expect(not is_violation, "level", expected="0.2", seen="0.1")
+        raise Inconclusive("nothing was seen")
+
+    found = result_of(steps, coarse_rig)
+    assert found.result is Result.INCONCLUSIVE
+    assert found.attempts == MAX_ATTEMPTS
+    assert found.problem
+
+
+def test_check_without_object_is_skipped(coarse_rig: Rig) -> None:
+    """It is no problem, and has a reason."""
+
+    async def steps(bench: Bench) -> None:
+        raise NotApplicable("it has no envelopes")
+
+    found = result_of(steps, coarse_rig)
+    assert (found.result, found.problem, found.reason) == (
+        Result.SKIPPED,
+        None,
+        "it has no envelopes",
     )
+    report = ConformanceReport("serial:///dev/null", (found,), left_out=2).to_json()
+    assert report["overall"] == "incomplete"
+    assert (report["passed"], report["skipped"], report["left_out"]) == (0, 1, 2)
 
 
-def void(amplifier: SimulatedAmplifier, now: float) -> None:
-    """Do nothing."""
+@pytest.mark.parametrize(
+    ("earliest", "latest", "result"),
+    [
+        (0.100, 0.104, Result.PASSED),
+        (0.090, 0.097, Result.FAILED),  # certainly before 100 ms
+        (0.109, 0.112, Result.FAILED),  # certainly after 105 ms
+        (0.060, 0.103, Result.INCONCLUSIVE),  # perhaps long before
+        (0.101, 0.150, Result.INCONCLUSIVE),
+    ],
+)
+def test_times_are_judged_by_what_is_certain(
+    earliest: float, latest: float, result: Result, coarse_rig: Rig
+) -> None:
+    """An event between two looks is early or late only if it is for certain."""
 
+    async def steps(bench: Bench) -> None:
+        bench.expect_time("trip", Interval(earliest, latest), low=0.1, high=0.105)
 
-def clear(amplifier: SimulatedAmplifier, now: float) -> None:
-    """Acknowledge a stop or fault."""
-    amplifier.handle(Clear(amplifier.latch), now)
-
-
-def beside(kind: type[Any], *, before: Deed = void, after: Deed = void) -> Answer:
-    """Do something before or after a request of a kind."""
-
-    def answer(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-        is_wanted = isinstance(request, kind)
-        (before if is_wanted else void)(amplifier, now)
-        reply = amplifier.handle(request, now)
-        (after if is_wanted else void)(amplifier, now)
-        return reply
-
-    return answer
-
-
-def forget_tokens(amplifier: SimulatedAmplifier, now: float) -> None:
-    """Forget which set has been played."""
-    amplifier._sets.active = None
-
-
-def ignore_contents(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Confirm any set with the active token."""
-    active = amplifier._sets.active
-    if isinstance(request, Apply) and active and request.command_set.token == active.token:
-        return active.achieved
-    return amplifier.handle(request, now)
-
-
-def extend_ramp(amplifier: SimulatedAmplifier, now: float) -> None:
-    """Begin the ramp to silence anew."""
-    channels = amplifier._channels
-    channels._outputs = [
-        tuple(replace(tone, start=now, ramp=1.0, gain_to=1.0) for tone in output)
-        for output in channels._outputs
-        if all(isinstance(tone, FadingTone) for tone in output)
-    ]
-
-
-def keep_staged(amplifier: SimulatedAmplifier, now: float) -> None:
-    """Let no staged set grow old."""
-    amplifier._sets._staged_at = now
-
-
-def promises_more(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Report a higher level than is played."""
-    reply = amplifier.handle(request, now)
-    if isinstance(request, Apply) and isinstance(reply, Achieved):
-        louder = tuple(replace(one, level=one.level + 0.01) for one in reply.commands)
-        return replace(reply, commands=louder)
-    return reply
-
-
-def keeps_empty_slots(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Keep an envelope when its slot is emptied."""
-    kept = dict(amplifier._sets.slots)
-    reply = amplifier.handle(request, now)
-    if isinstance(request, LoadEnvelope):
-        amplifier._sets.slots = kept | amplifier._sets.slots
-    return reply
-
-
-def commits_anything(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Play the staged set whatever the token."""
-    if isinstance(request, Commit) and amplifier._sets.staged is not None:
-        reply = amplifier.handle(Commit(amplifier._sets.staged.token, request.session), now)
-        return Achieved(request.token, ()) if isinstance(reply, Achieved) else reply
-    return amplifier.handle(request, now)
-
-
-def is_never_silent(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Ignore a set without channels."""
-    if isinstance(request, Apply) and not request.command_set.commands:
-        return Achieved(request.command_set.token, ())
-    return amplifier.handle(request, now)
-
-
-def ignores_disarm(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Confirm a disarm and play on."""
-    return amplifier.status(now) if isinstance(request, Disarm) else amplifier.handle(request, now)
-
-
-def does_not_beat(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """Feed the watchdog by arming only."""
-    fed = amplifier._last_fed
-    reply = amplifier.handle(request, now)
-    if not isinstance(request, Arm) and not isinstance(reply, Nak):
-        amplifier._last_fed = fed
-    return amplifier.status(now) if isinstance(reply, Status) else reply
-
-
-def obeys_any_session(kind: type[Any]) -> Answer:
-    """Carry out requests of a kind whatever their session."""
-
-    def answer(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-        if isinstance(request, kind):
-            request = replace(request, session=amplifier.session)
-        return amplifier.handle(request, now)
-
-    return answer
-
-
-def forget_session(amplifier: SimulatedAmplifier, now: float) -> None:
-    """Forget which session has ended."""
-    if amplifier.state is not AmplifierState.OPERATION_ENABLED:
-        amplifier.session = 0
-
-
-def silences(amplifier: SimulatedAmplifier, now: float) -> None:
-    """Begin anew at level zero."""
-    amplifier._silence(now, ramp=0.0)
-
-
-MISTAKES: list[tuple[str, Answer]] = [
-    ("identity", altered_reply(Identity, serial_number="")),
-    ("capabilities", altered_reply(Capabilities, level_max=0.0)),
-    ("starts_disarmed", altered_reply(Status, high_voltage=True)),
-    ("achieved", promises_more),
-    ("unnamed_channels", is_never_silent),
-    (
-        "all_or_nothing",
-        altered_set(lambda asked: {"commands": tuple(c for c in asked.commands if c.channel < 4)}),
-    ),
-    (
-        "stage_and_commit",
-        altered_request(Stage, lambda stage: Apply(stage.command_set, stage.session)),
-    ),
-    ("stage_and_commit", commits_anything),
-    ("tokens", beside(Apply, before=forget_tokens)),
-    ("tokens", ignore_contents),
-    ("staged_sets_expire", beside(Commit, before=keep_staged)),
-    ("ramps", altered_set(lambda asked: {"ramp": 0.0})),
-    *(("sessions", obeys_any_session(kind)) for kind in (Apply, Stage, Ping, Arm)),
-    ("sessions", beside(Arm, before=forget_session)),
-    ("sessions", beside(Arm, before=silences)),
-    ("quick_stop", beside(Stop, after=clear)),
-    ("clear_names_the_stop", altered_reply(Status, latch=1)),
-    ("clear_names_the_stop", beside(Clear, before=lambda one, now: setattr(one, "latch", 1))),
-    ("silence_never_later", beside(Stop, before=extend_ramp)),
-    ("quick_stop", beside(Arm, before=clear)),
-    ("disarm", ignores_disarm),
-    ("heartbeats", does_not_beat),
-    ("valid_for", beside(object, after=lambda one, now: setattr(one, "_vibration_end", math.inf))),
-    ("watchdog", beside(object, after=lambda one, now: setattr(one, "_last_fed", now))),
-    ("envelopes", beside(Apply, before=lambda one, now: setattr(one._channels, "_endings", {}))),
-    ("missing_envelopes", keeps_empty_slots),
-]
-
-
-@pytest.mark.parametrize(("name", "answer"), MISTAKES)
-@in_virtual_time
-async def test_check_fails_for_its_mistake_only(name: str, answer: Answer) -> None:
-    """An amplifier without the mistake passes."""
-    (check,) = [check for check in CHECKS if check.name == name]
-    outcomes = []
-    for behaviour in (answer, SimulatedAmplifier.handle):
-        amplifier = Amplifier(Flawed(behaviour))
-        await amplifier.open()
-        outcomes.append(await run_check(check, amplifier))
-    assert outcomes[0].problem
-    assert outcomes[1].problem is None
-
-
-def test_reading_checks_come_first() -> None:
-    """Each check has its mistake above, except those that others cannot pass without."""
-    drives = [check.drives for check in CHECKS]
-    assert drives == sorted(drives)
-    assert drives.count(False) >= 4
-    untested = {check.name for check in CHECKS} - {name for name, _ in MISTAKES}
-    assert untested == {"reading_changes_nothing", "plays_nothing_disarmed", "cancelled_requests"}
+    assert result_of(steps, coarse_rig).result is result

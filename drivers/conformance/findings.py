@@ -1,0 +1,24 @@
+"""What a check can find: a violation, too little evidence, or nothing to check."""
+
+
+class ContractViolation(Exception):
+    """The amplifier does not behave as its page says."""
+
+    def __init__(self, what: str, *, expected: object, seen: object) -> None:
+        super().__init__(f"{what} must be {expected}, got {seen}")
+        self.expected = str(expected)
+        self.seen = f"{what}: {seen}"
+
+
+class Inconclusive(Exception):
+    """What was seen does not suffice to pass or to fail, as where this host was delayed."""
+
+
+class NotApplicable(Exception):
+    """The amplifier, or its wire, does not have what is checked."""
+
+
+def expect(condition: bool, what: str, *, expected: object, seen: object) -> None:
+    """Raise ContractViolation unless the condition holds."""
+    if not condition:
+        raise ContractViolation(what, expected=expected, seen=seen)

@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware firmware-test test lint format docs fuzz kill-test fault-test stop-test estimate-test soak bench bench-latency \
+.PHONY: demo firmware firmware-test test lint format docs fuzz conformance-faults kill-test fault-test stop-test estimate-test soak bench bench-latency \
 	bench-localization bench-plant bench-promise bench-wires dist smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -42,6 +42,11 @@ lint: .venv/installed-test
 # A million damaged frames for every codec; `make test` takes a few thousand.
 fuzz: .venv/installed-test
 	$(BIN)/python tests/support/mutation.py
+
+# Every fault planted into simulated amplifiers, on every wire, under the conformance check that must
+# find it; `make test` takes each on one wire.
+conformance-faults: .venv/installed-test
+	$(BIN)/python tests/support/conformance_faults.py
 
 # Two hundred daemons killed at random moments, over every wire, and when all was silent;
 # `make test` takes eight. Others: make kill-test KILLS='--kills 20 --seed 7'

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import shlex
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import asdict
 from typing import Any
@@ -12,6 +12,7 @@ from drivers import clock
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.conformance import Check, CheckResult, raw_line, run_check
+from drivers.conformance.report import ConformanceReport
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, Guard, GuardLimits
 from drivers.operation.checked_amplifier import CheckedAmplifier
@@ -146,12 +147,18 @@ async def drive(
     return {"url": url, "achieved": played, "duration_s": duration, **_status_rows(after)}
 
 
-async def conform(url: str, checks: tuple[Check, ...]) -> AsyncIterator[CheckResult]:
-    """Run checks in turn on one open amplifier."""
+async def conform(
+    url: str, checks: tuple[Check, ...], on_result: Callable[[CheckResult], None]
+) -> ConformanceReport:
+    """Run checks in turn on one open amplifier; on_result: called with each result."""
+    results = []
     async with _opened(url) as amplifier:
         raw = raw_line(url)
         for check in checks:
-            yield await run_check(check, amplifier, raw, url=url)
+            results.append(await run_check(check, amplifier, raw, url=url))
+            on_result(results[-1])
+        stated = amplifier_class(amplifier.capabilities)
+    return ConformanceReport(url, stated.value, tuple(results))
 
 
 @asynccontextmanager

@@ -13,7 +13,7 @@ import typer
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
 
 if TYPE_CHECKING:
-    from drivers.conformance import Check, CheckResult
+    from drivers.conformance import CheckResult
 
 _T = TypeVar("_T")
 
@@ -220,43 +220,39 @@ def conformance(
     json_: Json = False,
 ) -> None:
     """Check that an amplifier fulfils the contract. Reads only, unless --write is given."""
+    from drivers.amp_actions import conform
     from drivers.conformance import CHECKS, LEVEL
-    from drivers.conformance.report import ConformanceReport
 
     reading = tuple(check for check in CHECKS if not check.drives)
     driving = tuple(check for check in CHECKS if check.drives)
-    outcomes = _run(_conform(url, reading, quiet=json_), trace)
+    show = _no_result if json_ else _show_result
+    report = _run(conform(url, reading, show), trace)
     if not write and not json_ and sys.stdin.isatty():
         write = typer.confirm(
             f"{len(driving)} more checks arm the amplifier and drive its channels at {LEVEL:.0%} "
             "of full stroke. Continue?"
         )
-    if write and all(outcome.problem is None for outcome in outcomes):
-        outcomes += _run(_conform(url, driving, quiet=json_), trace)
-    report = ConformanceReport(url, tuple(outcomes), len(CHECKS) - len(outcomes))
+    if write and report.problems == 0:
+        report = report.followed_by(_run(conform(url, driving, show), trace))
     if json_:
         print(json.dumps(report.to_json()))
     else:
         print(report.summary)
         if report.left_out:
             print(f"Next: era amp conformance {shlex.quote(url)} --write")
-    if any(outcome.problem is not None for outcome in outcomes):
+    if report.problems:
         raise typer.Exit(1)
 
 
-async def _conform(url: str, checks: "tuple[Check, ...]", *, quiet: bool) -> "list[CheckResult]":
-    from drivers.amp_actions import conform
+def _no_result(result: "CheckResult") -> None:
+    """Show nothing."""
 
-    outcomes = []
-    async for outcome in conform(url, checks):
-        outcomes.append(outcome)
-        if not quiet:
-            mark = outcome.result.value
-            mark = mark if outcome.problem is None else mark.upper()
-            print(f"{mark:<7}  It {outcome.check.requirement}.")
-            if outcome.reason:
-                print(f"         {outcome.reason} ({outcome.place})")
-    return outcomes
+
+def _show_result(result: "CheckResult") -> None:
+    mark = result.result.value
+    print(f"{mark if result.problem is None else mark.upper():<7}  It {result.check.requirement}.")
+    if result.reason:
+        print(f"         {result.reason} ({result.place})")
 
 
 def _run(work: Coroutine[Any, Any, _T], trace: Path | None, *, needs_trace: bool = True) -> _T:

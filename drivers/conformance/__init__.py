@@ -76,6 +76,7 @@ CHECKS: tuple[Check, ...] = (
     frames.invalid_frames,
     frames.invalid_frames_do_not_feed,
     frames.tolerated_frames,
+    frames.frames_in_any_order,
     frames.broadcasts,
     envelopes.onsets,
     envelopes.endings,

@@ -7,10 +7,10 @@ from drivers import clock
 from drivers.amplifier import WATCHDOG
 from drivers.conformance.bench import Bench
 from drivers.conformance.check import driving
-from drivers.conformance.findings import expect
+from drivers.conformance.findings import NotApplicable, expect
 from drivers.conformance.raw.line import RawRequest
 from drivers.conformance.watchdog import expect_trip
-from drivers.protocol.messages import AmplifierState, Apply, Commit, Feature, Ping, Stop
+from drivers.protocol.messages import AmplifierState, Apply, Commit, Feature, Ping, Stage, Stop
 
 _FRAME = (
     "wire-protocol.md#the-frame",
@@ -80,6 +80,23 @@ async def tolerated_frames(bench: Bench) -> None:
         expected = " or ".join(sorted(request.allowed))
         expect(outcome in request.allowed, request.name, expected=expected, seen=outcome)
     await bench.expect_levels(1.0, why="after unusual frames")
+
+
+@driving("wire-can.md#orders-and-answers")
+async def frames_in_any_order(bench: Bench) -> None:
+    """It takes the frames of a set in any order, and nothing of it applies before the last."""
+    bench.require(Feature.STAGING)
+    staged = bench.tones(*(0.5,) * bench.can.channels)
+    requests = bench.raw.in_any_order(Stage(staged))
+    if not requests:
+        raise NotApplicable("a set is one frame on this wire")
+    await bench.arm()
+    for request in requests:
+        outcome = await bench.raw.send(request)
+        expect(outcome in request.allowed, request.name, expected="a reply", seen=outcome)
+        await bench.expect_levels(why=f"after {request.name}, staged")
+    await bench.amplifier.commit(staged.token)
+    await bench.expect_levels(*(0.5,) * bench.can.channels, why="after its Commit")
 
 
 @driving(*_BROADCAST)

@@ -1,20 +1,37 @@
 """The report of a run of checks."""
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+from drivers.conformance import CHECKS
 from drivers.conformance.check import CheckResult, Result
 
 
 @dataclass(frozen=True)
 class ConformanceReport:
-    """Results of checks on the amplifier at a URL; left_out: number of checks that were not run."""
+    """Results of checks on the amplifier at a URL.
+
+    amplifier_class: A, B or C, by the capabilities that it states.
+    """
 
     url: str
-    results: Sequence[CheckResult]
-    left_out: int
+    amplifier_class: str
+    results: tuple[CheckResult, ...]
+
+    @property
+    def left_out(self) -> int:
+        """Number of checks that were not run."""
+        return len(CHECKS) - len(self.results)
+
+    @property
+    def problems(self) -> int:
+        """Number of checks that must not count as fulfilled."""
+        return sum(one.problem is not None for one in self.results)
+
+    def followed_by(self, other: "ConformanceReport") -> "ConformanceReport":
+        """Return the report of both."""
+        return replace(self, results=(*self.results, *other.results))
 
     @property
     def overall(self) -> str:
@@ -33,13 +50,14 @@ class ConformanceReport:
         parts = [f"{count} {name}" for name, count in counts.items()]
         if self.left_out:
             parts.append(f"{self.left_out} not run")
-        return ", ".join(parts)
+        return f"class {self.amplifier_class}: {', '.join(parts)}"
 
     def to_json(self) -> dict[str, Any]:
         """Make an object with stable keys."""
         return {
             "url": self.url,
             "overall": self.overall,
+            "class": self.amplifier_class,
             **self._counts(),
             "left_out": self.left_out,
             "seconds": round(sum(one.seconds for one in self.results), 3),

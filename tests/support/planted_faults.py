@@ -174,7 +174,9 @@ def due(change: Callable[[Any, float], float]) -> Plant:
 
     return both(
         replaced(SimulatedAmplifier, "_watchdog_end", property(moved_end)),
-        status_of(lambda one, _: {"watchdog_left": max(0.0, one.watchdog_left)}),
+        status_of(
+            lambda one, self: {"watchdog_left": min(max(0.0, one.watchdog_left), self._watchdog)}
+        ),
     )
 
 
@@ -1157,9 +1159,37 @@ FAULTS: dict[str, PlantedFault] = {
     "any host arms an armed amplifier": PlantedFault(
         "invalid_frames", wrapped(RequestHandler, "_plain_request", _any_host), wires=CAN
     ),
-    "a broadcast Commit is ignored": PlantedFault(
+    "broadcast orders are ignored": PlantedFault(
+        "broadcasts", replaced(RequestHandler, "_broadcast", lambda *_: None), wires=CAN
+    ),
+    "any order may be broadcast": PlantedFault(
         "broadcasts",
-        replaced(can_requests, "TO_ALL", (can_sets.Action.STOP,)),
+        replaced(
+            RequestHandler,
+            "_broadcast",
+            lambda self, data: self._request(data[:7] + b"\x01", fd=False),
+        ),
+        wires=CAN,
+    ),
+    "incomplete sets play": PlantedFault(
+        "invalid_frames",
+        replaced(SetBuffer, "is_complete", property(lambda self: self.request is not None)),
+        wires=CAN,
+    ),
+    "incomplete sets wait for ever": PlantedFault(
+        "invalid_frames", replaced(can_requests, "_INCOMPLETE_LIFE", 3.0), wires=CAN
+    ),
+    "the order of a set must come last": PlantedFault(
+        "frames_in_any_order",
+        wrapped(
+            RequestHandler,
+            "_request",
+            lambda take, self, data, **how: (
+                self._buffer.is_complete,
+                take(self, data, **how),
+                self._buffer.is_complete or self._buffer.clear(),
+            ),
+        ),
         wires=CAN,
     ),
 }

@@ -139,7 +139,8 @@ class VendorAmplifier:
             if data[7] == 0 and bits(data, 48, 3) == STOP:
                 self._stop(bits(data, 16, 16), now)
             elif data[7] == 0 and bits(data, 48, 3) == COMMIT:
-                self._set(data, now)
+                is_done = self._set(data, now) == (DONE, NO_CHANNEL)
+                self.fed = now if is_done else self.fed
 
     def _manage(self, command: int, now: float) -> None:
         if command == 129:

@@ -20,6 +20,7 @@ _SEQUENCE = 0xA5
 _OTHER_NODE = 62
 _OTHER_HOST = 3
 _INCOMPLETE = 15
+_COLLECTING = 1.1 * float(CANOPEN["incomplete_life"])  # s; then an incomplete set is forgotten
 _Q = PROTOCOL.quantities
 
 
@@ -48,7 +49,7 @@ class CanRaw(RawLine):
                 replies.get_nowait()
             await self._write(request)
             try:
-                async with asyncio.timeout(self._time_of(request) + _PATIENCE):
+                async with asyncio.timeout(self._time_of(request) + request.lasts + _PATIENCE):
                     while True:
                         outcome = _outcome(await replies.get())
                         if outcome is not None:
@@ -61,7 +62,7 @@ class CanRaw(RawLine):
     async def send_only(self, request: RawRequest) -> None:
         """See `RawLine`."""
         await self._write(request)
-        await asyncio.sleep(self._time_of(request) + 0.002)
+        await asyncio.sleep(self._time_of(request) + request.lasts + 0.002)
 
     def invalid(self, ping: Ping, apply: Apply) -> Sequence[RawRequest]:
         """See `RawLine`."""
@@ -83,6 +84,12 @@ class CanRaw(RawLine):
             _made("a set for another node", another_node, NO_REPLY),
             _made("an arm of another host", [replace(status, data=arm)], "WRONG_SESSION"),
             _made("a status order", [status], REPLY),
+        ]
+        *commands, order = encode_request(apply, node=node, sequence=_SEQUENCE)
+        alone = tuple(commands)
+        found += [
+            _incomplete("a set without its command", (order,), "incomplete set"),
+            _incomplete("a command without its order", alone, NO_REPLY),
         ]
         return [*found, *self._bad_sets(apply)]
 
@@ -123,6 +130,15 @@ class CanRaw(RawLine):
             _made("a command without its set, then a Ping", [self._command(), *whole], REPLY),
         ]
 
+    def in_any_order(self, stage: Stage) -> Sequence[RawRequest]:
+        """See `RawLine`."""
+        frames = encode_request(stage, node=self._url.node, sequence=_SEQUENCE)
+        return [
+            _made("a set whose order comes first", [frames[-1], *frames[:-1]], REPLY),
+            _made("a set in the opposite order", frames[::-1], REPLY),
+            _made("a set of which a command comes twice", [frames[0], *frames], REPLY),
+        ]
+
     def broadcasts(self, ping: Ping, apply: Apply) -> Sequence[RawRequest]:
         """See `RawLine`."""
         own, to_all = cob_id("order", self._url.node), cob_id("order")
@@ -130,7 +146,7 @@ class CanRaw(RawLine):
             "a broadcast set without channels": [
                 frame
                 for frame in self._with(apply, order={"sequence": 0, "count": 0})
-                if frame.id != cob_id("command", self._url.node)
+                if frame.id == own
             ],
             "a broadcast status": encode_request(
                 GetStatus(), node=self._url.node, sequence=_SEQUENCE
@@ -215,6 +231,10 @@ def _outcome(data: bytes) -> str | None:
     if result == _INCOMPLETE:
         return "incomplete set"
     return NakCode(result).name if result else REPLY
+
+
+def _incomplete(name: str, frames: tuple[CanFrame, ...], outcome: str) -> RawRequest:
+    return RawRequest(name, (frames,), frozenset({outcome}), lasts=_COLLECTING)
 
 
 def _made(name: str, frames: Sequence[CanFrame], outcome: str) -> RawRequest:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from drivers.protocol.messages import Apply, Broadcast, Ping
+from drivers.protocol.messages import Apply, Broadcast, Ping, Stage
 
 NO_REPLY = "no reply"
 REPLY = "a reply"
@@ -16,13 +16,14 @@ class RawRequest:
     """A request as bytes or frames, sent in pieces with a pause [s] in between.
 
     name: what is wrong with it; allowed: the outcomes that the page allows: NO_REPLY, REPLY, or
-    names of refusals.
+    names of refusals; lasts [s]: how long the amplifier may wait for more of it.
     """
 
     name: str
     pieces: Sequence[object]
     allowed: frozenset[str]
     pause: float = 0.0
+    lasts: float = 0.0
 
 
 class RawLine(ABC):
@@ -52,6 +53,10 @@ class RawLine(ABC):
     @abstractmethod
     def broadcasts(self, ping: Ping, apply: Apply) -> Sequence[RawRequest]:
         """Make broadcasts that must be discarded."""
+
+    def in_any_order(self, stage: Stage) -> Sequence[RawRequest]:
+        """Make a valid request of several frames in other orders; none if it is one frame."""
+        return ()
 
     @abstractmethod
     def longest_stop(self) -> RawRequest:

@@ -7,7 +7,7 @@ import pytest
 
 from conformance_bench import opened
 from drivers import clock
-from drivers.conformance import CheckResult, Result, run_check
+from drivers.conformance import CHECKS, CheckResult, Result, run_check
 from drivers.conformance.bench import Bench
 from drivers.conformance.check import MAX_ATTEMPTS, Check
 from drivers.conformance.findings import Inconclusive, NotApplicable, expect
@@ -97,9 +97,10 @@ def test_check_without_object_is_skipped(coarse_rig: Rig) -> None:
         None,
         "it has no envelopes",
     )
-    report = ConformanceReport("serial:///dev/null", (found,), left_out=2).to_json()
-    assert report["overall"] == "incomplete"
-    assert (report["passed"], report["skipped"], report["left_out"]) == (0, 1, 2)
+    report = ConformanceReport("serial:///dev/null", "A", (found,)).to_json()
+    assert (report["overall"], report["class"]) == ("incomplete", "A")
+    assert (report["passed"], report["skipped"]) == (0, 1)
+    assert report["left_out"] == len(CHECKS) - 1
 
 
 @pytest.mark.parametrize(

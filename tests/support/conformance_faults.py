@@ -18,19 +18,18 @@ def main() -> int:
     """Run all."""
     rig = make_paper_rig(12, 9)
     found: Counter[str] = Counter()
-    missed = 0
+    lines: list[str] = []
     for name, fault in FAULTS.items():
         for wire in fault.wires:
             result = result_of(fault, wire, rig)
             if result.result is Result.FAILED:
                 found[wire] += 1
             else:
-                missed += 1
-                print(f"not found on {wire}: {name} ({fault.check} {result.result.value})")
-    for wire, count in found.items():
-        print(f"{wire}: {count} faults found")
-    for name, fault in UNSEEN.items():
-        print(f"not to be seen: {name}; {fault.unseen}")
+                lines.append(f"not found on {wire}: {name} ({fault.check} {result.result.value})")
+    missed = len(lines)
+    lines += [f"{wire}: {count} faults found" for wire, count in found.items()]
+    lines += [f"not to be seen: {name}; {fault.unseen}" for name, fault in UNSEEN.items()]
+    sys.stdout.write("\n".join([*lines, ""]))
     return 1 if missed else 0
 
 

@@ -23,7 +23,11 @@ _REST = 0.003  # s; in which the rest of a response arrives
 _TRANSACTION, _TAG = 0xA55A, 0x5AA5
 _OTHER_UNIT = 231
 _NOWHERE = 9000
-_WRITE, _WRITE_ONE, _READ = 16, 6, 4
+_WRITE, _WRITE_ONE, _READ, _READ_WRITE = 16, 6, 4, 23
+# Places of registers in a set of one channel, and in the control block.
+_COMMIT, _SESSION, _TOKEN, _RAMP, _VALID_FOR = 1, 2, 3, 4, 5
+_LEVEL, _PHASE, _FLAGS = 7, 8, 9
+_STOP_RAMP = 3
 _EXCEPTION = 0x80
 _GATEWAY = ("exception 10", "exception 11")
 _CONTROL: int = _MAP["holding"]["control"]["address"]
@@ -70,27 +74,31 @@ class ModbusRaw(RawLine):
         """See `RawLine`."""
         beat, played = self._registers(ping), self._registers(apply)
         body = _write(_HEARTBEAT, beat)
-        miscounted = (
-            struct.pack(">BHHB", _WRITE, _HEARTBEAT, len(beat) + 1, 2 * len(beat)) + body[6:]
-        )
+        head = struct.pack(">BHHB", _WRITE, _HEARTBEAT, len(beat) + 1, 2 * len(beat))
+        nowhere = struct.pack(">BHH", _READ_WRITE, _NOWHERE, 4) + body[1:]
         found = [
             *self._damaged(body, "a heartbeat"),
             *self._damaged(_write(_SET, played), "a set"),
             self._made("a heartbeat for another unit", body, NO_REPLY, *_GATEWAY, unit=_OTHER_UNIT),
             self._made("an unknown function", b"\x63\0\0", "exception 1"),
-            self._made("a heartbeat without session", _write(_HEARTBEAT, beat[:2]), "exception 3"),
+            self._made("a heartbeat without session", _write(_HEARTBEAT, beat[:1]), "exception 3"),
             self._made(
                 "a heartbeat with a register too many",
-                _write(_HEARTBEAT, _checked([*beat, 0])),
+                _write(_HEARTBEAT, [*beat, 0]),
                 "exception 2",
                 "exception 3",
             ),
-            self._made("a heartbeat with a wrong count", miscounted, "exception 3", NO_REPLY),
+            self._made("a heartbeat with a wrong count", head + body[6:], "exception 3", NO_REPLY),
             self._made(
                 "a session by function 6",
-                struct.pack(">BHH", _WRITE_ONE, _HEARTBEAT + 2, beat[2]),
-                "exception 2",
+                struct.pack(">BHH", _WRITE_ONE, _HEARTBEAT + 1, beat[1]),
                 "exception 1",
+            ),
+            self._made(
+                "a heartbeat that reads registers that do not exist",
+                nowhere,
+                "exception 1",
+                "exception 2",
             ),
             self._made(
                 "registers that do not exist",
@@ -107,27 +115,23 @@ class ModbusRaw(RawLine):
 
     def _bad_sets(self, played: Sequence[int]) -> list[RawRequest]:
         """Make sets with one register out of range."""
-        *head, token, ramp, valid_for = played[:7]
-        *_, phase, flags = played[7:11]
-        changed = [
-            ("a register too few", played[:-1], 3),
-            ("flag bit 2", [*played[:10], flags | 4], 3),
-            ("flag bit 3", [*played[:10], flags | 8], 3),
-            ("a level out of range", [*played[:8], _Q.level.maximum + 1, phase, flags], 3),
-            ("a phase out of range", [*played[:9], _Q.phase.maximum + 1, flags], 3),
-            ("a ramp out of range", [*head, token, _Q.ramp.maximum + 1, *played[6:]], 3),
-            (
-                "a valid_for out of range",
-                [*head, token, ramp, _Q.valid_for.maximum + 1, *played[7:]],
-                3,
-            ),
-            ("token 0", [*head, 0, ramp, valid_for, *played[7:]], 3),
-            ("another commit_token", [*head[:2], token % 65535 + 1, *played[3:]], 3),
-            ("another session", [*head[:3], head[3] % 65535 + 1, *played[4:]], 4),
+        changes = [
+            ("flag bit 2", _FLAGS, played[_FLAGS] | 4, 3),
+            ("flag bit 3", _FLAGS, played[_FLAGS] | 8, 3),
+            ("a level out of range", _LEVEL, _Q.level.maximum + 1, 3),
+            ("a phase out of range", _PHASE, _Q.phase.maximum + 1, 3),
+            ("a ramp out of range", _RAMP, _Q.ramp.maximum + 1, 3),
+            ("a valid_for out of range", _VALID_FOR, _Q.valid_for.maximum + 1, 3),
+            ("token 0", _TOKEN, 0, 3),
+            ("another commit_token", _COMMIT, played[_TOKEN] % 65535 + 1, 3),
+            ("another session", _SESSION, played[_SESSION] % 65535 + 1, 4),
         ]
+        found = [("a register too few", played[:-1], 3)]
+        for name, place, value, code in changes:
+            found.append((name, [*played[:place], value, *played[place + 1 :]], code))
         return [
-            self._made(f"a set with {name}", _write(_SET, _checked(registers)), f"exception {code}")
-            for name, registers, code in changed
+            self._made(f"a set with {name}", _write(_SET, registers), f"exception {code}")
+            for name, registers, code in found
         ]
 
     def tolerated(self, ping: Ping) -> Sequence[RawRequest]:
@@ -155,7 +159,7 @@ class ModbusRaw(RawLine):
             )
         else:
             found.append(
-                RawRequest("a heartbeat in two pieces", (half, rest), frozenset({REPLY}), 0.01)
+                RawRequest("a heartbeat in two pieces", (half, rest), frozenset({REPLY}), 0.2)
             )
         return found
 
@@ -174,8 +178,8 @@ class ModbusRaw(RawLine):
     def longest_stop(self) -> RawRequest:
         """See `RawLine`."""
         stop = self._registers(Stop(0.0))
-        stop[4] = 0xFFFF
-        body = _write(_CONTROL, _checked(stop))
+        stop[_STOP_RAMP] = 0xFFFF
+        body = _write(_CONTROL, stop)
         return self._made("a Stop with a ramp out of range", body, REPLY)
 
     def carried_out(self, request: Broadcast) -> RawRequest:
@@ -256,9 +260,3 @@ def _write(address: int, registers: Sequence[int]) -> bytes:
     words = [word & 0xFFFF for word in registers]
     head = struct.pack(">BHHB", _WRITE, address, len(words), 2 * len(words))
     return head + struct.pack(f">{len(words)}H", *words)
-
-
-def _checked(registers: Sequence[int]) -> list[int]:
-    """Renew the check of a block."""
-    tag, _, *rest = registers
-    return [tag, exchanges.crc_of(rest), *rest]

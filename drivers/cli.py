@@ -238,7 +238,7 @@ def conformance(
         print(json.dumps(report.to_json()))
     else:
         print(report.summary)
-        if report.left_out:
+        if report.not_run:
             print(f"Next: era amp conformance {shlex.quote(url)} --write")
     if report.problems:
         raise typer.Exit(1)

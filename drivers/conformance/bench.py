@@ -28,7 +28,7 @@ LEVEL = 0.2
 LONG_WATCHDOG = 2.0  # s; does not trip during a check, on amplifiers that support it
 EVENT_TIMEOUT = 5.0  # s; for changes without a request
 _LEAST_POLLS = 100
-_PREPARATION = 5  # exchanges whose fastest is the usual one
+_PREPARATION = 5  # exchanges whose fastest is the typical one
 _POLL = 0.001  # s; pause between polls for an event
 _SLACK = 0.002  # s; of the amplifier's clock, and of times in milliseconds
 _DRIFT = 1e-3  # of a time; of the amplifier's clock
@@ -57,8 +57,8 @@ class Bench:
         limits = self.guard.limits
         self.frequency = min(max(110.0, limits.frequency_min), limits.frequency_max)
         self.level = min(LEVEL, limits.level)
-        self.exchange_time = 0.0  # s; the usual one of a status
-        self.longest_delay = 0.0  # s; of a reply, beyond the usual
+        self.exchange_time = 0.0  # s; the typical one of a status
+        self.max_delay = 0.0  # s; of a reply, beyond the typical
         self.fed = Interval(-math.inf, math.inf)  # when the watchdog was fed last
         self.watchdog = 0.0
 
@@ -84,7 +84,7 @@ class Bench:
         return self._raw
 
     async def prepare(self) -> None:
-        """Open the amplifier again if it was lost, and measure its usual exchange."""
+        """Open the amplifier again if it was lost, and measure its typical exchange."""
         if self.amplifier.is_lost:
             await self.amplifier.close()
             await self.amplifier.open()
@@ -93,7 +93,7 @@ class Bench:
             when = (await self.sample()).when
             durations.append(when.latest - when.earliest)
         self.exchange_time = min(durations)
-        self.longest_delay = 0.0
+        self.max_delay = 0.0
 
     def guard_as(self, capabilities: Capabilities) -> Guard:
         """Make a guard for an amplifier with these capabilities."""
@@ -145,8 +145,8 @@ class Bench:
         result = await call
         when = Interval(earliest, clock.now())
         if self.exchange_time:
-            usual = 3 * self.exchange_time
-            self.longest_delay = max(self.longest_delay, when.latest - when.earliest - usual)
+            typical = 3 * self.exchange_time
+            self.max_delay = max(self.max_delay, when.latest - when.earliest - typical)
         return result, when
 
     async def arm(self, watchdog: float = LONG_WATCHDOG) -> Status:
@@ -161,9 +161,9 @@ class Bench:
         self.fed = when
         return Sample(when, status)
 
-    async def apply(self, wanted: SafeCommandSet) -> Interval:
+    async def apply(self, requested: SafeCommandSet) -> Interval:
         """Apply a set; returns when."""
-        _, when = await self.timed(self.amplifier.apply(wanted))
+        _, when = await self.timed(self.amplifier.apply(requested))
         self.fed = when
         return when
 

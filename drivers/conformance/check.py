@@ -147,14 +147,14 @@ async def run_check(
     attempt failed and this program was not late in one. raw: access to the line, url: of the
     amplifier; checks that need them are skipped without.
     """
-    begin, place = clock.now(), check.place(raw)
+    start, place = clock.now(), check.place(raw)
     attempts: list[_Attempt] = []
     while len(attempts) < MAX_ATTEMPTS:
         attempt = await _attempt(check, Bench(amplifier, raw, url=url))
         attempts.append(attempt)
         if not attempt.is_doubtful:
             break
-    finding, reason, took = attempt.finding, attempt.reason, clock.now() - begin
+    finding, reason, took = attempt.finding, attempt.reason, clock.now() - start
     if finding is None:
         result = Result.PASSED
     elif isinstance(finding, NotApplicable):
@@ -189,7 +189,7 @@ async def _attempt(check: Check, bench: Bench) -> _Attempt:
     with Lateness() as lateness:
         finding = await _finding(check, bench)
     missed = bench.amplifier.statistics.timeouts - before
-    return _Attempt(finding, lateness.worst, bench.longest_delay, missed)
+    return _Attempt(finding, lateness.worst, bench.max_delay, missed)
 
 
 async def _finding(check: Check, bench: Bench) -> Exception | None:

@@ -20,12 +20,12 @@ _SHARP = 0.15  # of the largest level; span of the curve over the interval of a 
 _LATEST_PAUSE = 0.04  # s
 
 
-def raised_cosine(ramp: float, *, begin: float, end: float) -> Curve:
+def raised_cosine(ramp: float, *, start: float, end: float) -> Curve:
     """Make the curve of a ramp [s] from one level to another."""
 
     def level(time: float) -> float:
         share = min(max(time / ramp, 0.0), 1.0) if ramp else float(time >= 0)
-        return begin + (end - begin) * (1 - math.cos(math.pi * share)) / 2
+        return start + (end - start) * (1 - math.cos(math.pi * share)) / 2
 
     return level
 

@@ -55,7 +55,7 @@ async def stop_ramp(bench: Bench) -> None:
     status, when = await bench.timed(bench.amplifier.stop(ramp))
     bench.expect_state(status, AmplifierState.QUICK_STOP_ACTIVE, after="a Stop")
     samples = await samples_until(bench, when.latest + 1.1 * ramp, feed=False)
-    falling = raised_cosine(ramp, begin=bench.level, end=0.0)
+    falling = raised_cosine(ramp, start=bench.level, end=0.0)
     for channel in range(bench.can.channels):
         expect_curve(
             bench, samples, falling, commit=when, lasts=ramp, channel=channel, what="of a Stop"
@@ -69,17 +69,17 @@ async def stop_ramp_clipped(bench: Bench) -> None:
     """It clips the ramp of a Stop into its range."""
     await bench.arm()
     await bench.play(1.0)
-    longest = bench.can.ramp_max
+    max_ramp = bench.can.ramp_max
     if bench.has_raw:
-        request, earliest = bench.raw.longest_stop(), clock.now()
+        request, earliest = bench.raw.stop_out_of_range(), clock.now()
         outcome = await bench.raw.send(request)
         expect(outcome in request.allowed, request.name, expected="a reply", seen=outcome)
         when = Interval(earliest, earliest + 2 * bench.exchange_time)
     else:
-        _, when = await bench.timed(bench.amplifier.stop(longest))
-    samples = await samples_until(bench, when.latest + 1.1 * longest, feed=False)
-    falling = raised_cosine(longest, begin=bench.level, end=0.0)
-    expect_curve(bench, samples, falling, commit=when, lasts=longest, what="of the longest Stop")
+        _, when = await bench.timed(bench.amplifier.stop(max_ramp))
+    samples = await samples_until(bench, when.latest + 1.1 * max_ramp, feed=False)
+    falling = raised_cosine(max_ramp, start=bench.level, end=0.0)
+    expect_curve(bench, samples, falling, commit=when, lasts=max_ramp, what="of the longest Stop")
 
 
 @driving(_STATES)
@@ -94,7 +94,7 @@ async def clear_too_early(bench: Bench) -> None:
         cleared, sent = await bench.timed(bench.amplifier.clear(status.latch))
         if sent.latest < when.earliest + 0.9 * ramp:
             bench.expect_state(cleared, AmplifierState.QUICK_STOP_ACTIVE, after="Clear amid a ramp")
-    falling = raised_cosine(ramp, begin=bench.level, end=0.0)
+    falling = raised_cosine(ramp, start=bench.level, end=0.0)
     samples = await samples_until(bench, when.latest + 1.1 * ramp, feed=False)
     for sample in samples:
         highest = falling(sample.when.earliest - when.latest - 0.002) + bench.tolerance
@@ -113,7 +113,7 @@ async def silence_never_later(bench: Bench) -> None:
     """It lets a further Stop or Disarm shorten the ramp to silence, never extend it."""
     amplifier, full = bench.amplifier, bench.can.ramp_max
     stop, disarm = amplifier.stop, amplifier.disarm
-    for first, begin, then, after, share in (
+    for first, start, then, after, share in (
         (stop, full, stop, 0.0, 0.1),
         (stop, full / 4, stop, full, 0.1),
         (stop, full / 4, stop, full / 4, 0.15),
@@ -124,29 +124,29 @@ async def silence_never_later(bench: Bench) -> None:
     ):
         await bench.arm()
         await bench.play(1.0)
-        _, begun = await bench.timed(first(begin))
-        await bench.pause_until(begun.latest + share * begin)
+        _, started = await bench.timed(first(start))
+        await bench.pause_until(started.latest + share * start)
         _, second = await bench.timed(then(after))
-        due = min(begun.latest + begin, second.latest + after) - begun.latest
-        what = f"silence after {begin:g} s, then {after:g} s"
-        silent = await bench.time_of(is_silent, since=begun, due=due, what=what)
+        due = min(started.latest + start, second.latest + after) - started.latest
+        what = f"silence after {start:g} s, then {after:g} s"
+        silent = await bench.time_of(is_silent, since=started, due=due, what=what)
         bench.expect_time(what, silent, low=0.0, high=due + PROMPT)
         await bench.rest()
 
 
 @driving("wire-protocol.md#sets-tokens-and-ramps")
 async def stop_ends_fades(bench: Bench) -> None:
-    """It ends a fade that a set has begun along the ramp of a Stop, if that is sooner."""
+    """It ends a fade that a set began, along the ramp of a Stop, if that is sooner."""
     full = bench.can.ramp_max
     for set_ramp, stop_ramp_ in ((full, full / 8), (full / 4, full)):
         await bench.arm()
         await bench.play(1.0)
-        begun = await bench.play(ramp=set_ramp)
-        await bench.pause_until(begun.latest + 0.1 * set_ramp)
+        started = await bench.play(ramp=set_ramp)
+        await bench.pause_until(started.latest + 0.1 * set_ramp)
         _, stopped = await bench.timed(bench.amplifier.stop(stop_ramp_))
-        due = min(begun.latest + set_ramp, stopped.latest + stop_ramp_) - begun.latest
+        due = min(started.latest + set_ramp, stopped.latest + stop_ramp_) - started.latest
         what = "silence of a fading set after a Stop"
-        silent = await bench.time_of(is_silent, since=begun, due=due, what=what)
+        silent = await bench.time_of(is_silent, since=started, due=due, what=what)
         bench.expect_time(what, silent, low=0.0, high=due + PROMPT)
         await bench.rest()
 
@@ -160,7 +160,7 @@ async def disarm(bench: Bench) -> None:
     status, when = await bench.timed(bench.amplifier.disarm(ramp))
     bench.expect_state(status, AmplifierState.SWITCHED_ON, after="Disarm")
     samples = await samples_until(bench, when.latest + 0.8 * ramp, feed=False)
-    falling = raised_cosine(ramp, begin=bench.level, end=0.0)
+    falling = raised_cosine(ramp, start=bench.level, end=0.0)
     expect_curve(bench, samples, falling, commit=when, lasts=0.75 * ramp, what="of a Disarm")
 
     def is_disarmed(status: Status) -> bool:
@@ -235,8 +235,8 @@ async def arming_ends_fades(bench: Bench) -> None:
     await bench.arm()
     await bench.play(1.0)
     ramp = bench.can.ramp_max
-    _, begun = await bench.timed(bench.amplifier.disarm(ramp))
-    await bench.pause_until(begun.latest + 0.1 * ramp)
+    _, started = await bench.timed(bench.amplifier.disarm(ramp))
+    await bench.pause_until(started.latest + 0.1 * ramp)
     status = await bench.arm()
     bench.expect_state(status, AmplifierState.OPERATION_ENABLED, after="Arm amid a Disarm")
     what = "silence after Arm amid a Disarm"

@@ -27,8 +27,8 @@ def _step(bench: Bench) -> float:
     """Return a step [s] that is long against an exchange; NotApplicable without envelopes."""
     if not bench.can.envelope_knots:
         raise NotApplicable("it has no envelopes")
-    wanted = max(0.1, 20 * bench.exchange_time)
-    return min(max(wanted, bench.can.envelope_step_min), bench.can.envelope_step_max)
+    requested = max(0.1, 20 * bench.exchange_time)
+    return min(max(requested, bench.can.envelope_step_min), bench.can.envelope_step_max)
 
 
 async def _load(bench: Bench, slot: int, *amplitudes: complex) -> None:
@@ -92,7 +92,7 @@ async def skipped_endings(bench: Bench) -> None:
     _step(bench)
     await _load(bench, 2, 1.0)
     ramp = bench.ramp
-    falling = raised_cosine(ramp, begin=bench.level, end=0.0)
+    falling = raised_cosine(ramp, start=bench.level, end=0.0)
     for name in ("flag", "Disarm", "Stop"):
         await bench.arm()
         await bench.apply(bench.tones(1.0, ending=2))
@@ -139,12 +139,12 @@ async def kept_phase_onset(bench: Bench) -> None:
     """It begins an onset with keep phase at the present amplitude, and without at zero."""
     step, level = _step(bench), bench.level
     await _load(bench, 1, 0.5)
-    for keep_phase, begin in ((True, level), (False, 0.0)):
+    for keep_phase, start in ((True, level), (False, 0.0)):
         await bench.arm()
         await bench.play(1.0)
-        wanted = bench.tones(1.0, onset=1, keep_phase=keep_phase, ramp=0.0)
-        when = await bench.apply(wanted)
-        curve = _along(step, begin, 0.5 * level, level)
+        requested = bench.tones(1.0, onset=1, keep_phase=keep_phase, ramp=0.0)
+        when = await bench.apply(requested)
+        curve = _along(step, start, 0.5 * level, level)
         samples = await samples_until(bench, when.latest + 2.2 * step)
         after = [one for one in samples if one.when.earliest > when.latest + 0.002]
         expect_curve(bench, after, curve, commit=when, lasts=2 * step, what="of an onset")
@@ -175,7 +175,7 @@ async def missing_envelopes(bench: Bench) -> None:
     await bench.play(1.0)
     shaped = {"onset": bench.tones(1.0, onset=slot), "ending": bench.tones(1.0, ending=slot)}
     await _load(bench, slot)
-    for name, wanted in shaped.items():
-        await bench.refused(bench.amplifier.apply(wanted), what=f"an {name} from an empty slot")
-        await bench.refused(bench.amplifier.stage(wanted), what=f"an {name} from an empty slot")
+    for name, requested in shaped.items():
+        await bench.refused(bench.amplifier.apply(requested), what=f"an {name} from an empty slot")
+        await bench.refused(bench.amplifier.stage(requested), what=f"an {name} from an empty slot")
         await bench.expect_levels(1.0, why="after a refused set")

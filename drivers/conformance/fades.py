@@ -14,7 +14,7 @@ from drivers.protocol.messages import Feature
 
 _SETS = "wire-protocol.md#sets-tokens-and-ramps"
 _LOW = 10.0  # Hz; its period is long against the time of an exchange
-_TURN = 0.12  # error of a phase, in turns, that still tells cases apart
+_CYCLE_ERROR = 0.12  # error of a phase, in turns, that still tells cases apart
 
 
 async def _followed(
@@ -33,7 +33,7 @@ async def ramp_up(bench: Bench) -> None:
     when = await bench.play(*(1.0,) * count, ramp=ramp)
     samples = await samples_until(bench, when.latest + 1.1 * ramp)
     for channel in range(count):
-        rising = raised_cosine(ramp, begin=0.0, end=bench.level)
+        rising = raised_cosine(ramp, start=0.0, end=bench.level)
         expect_curve(
             bench,
             samples,
@@ -54,7 +54,7 @@ async def ramp_down(bench: Bench) -> None:
     for last in ((0.0,), ()):
         await bench.play(1.0)
         when = await bench.play(*last, ramp=ramp)
-        falling = raised_cosine(ramp, begin=bench.level, end=0.0)
+        falling = raised_cosine(ramp, start=bench.level, end=0.0)
         await _followed(bench, falling, when, ramp, "of a falling ramp")
         await bench.expect_levels(why="after a ramp to silence")
 
@@ -67,12 +67,12 @@ async def ramps_of_other_lengths(bench: Bench) -> None:
     await bench.expect_levels(1.0, why="after ramp 0")
     await bench.play()
     await bench.expect_levels(why="after ramp 0 to silence")
-    longest = bench.can.ramp_max
-    if not longest:
+    max_ramp = bench.can.ramp_max
+    if not max_ramp:
         raise NotApplicable("it plays without ramps")
-    when = await bench.play(1.0, ramp=longest)
-    rising = raised_cosine(longest, begin=0.0, end=bench.level)
-    await _followed(bench, rising, when, longest, "of the longest ramp")
+    when = await bench.play(1.0, ramp=max_ramp)
+    rising = raised_cosine(max_ramp, start=0.0, end=bench.level)
+    await _followed(bench, rising, when, max_ramp, "of the longest ramp")
 
 
 @driving(_SETS)
@@ -80,15 +80,15 @@ async def interrupted_ramps(bench: Bench) -> None:
     """It continues an interrupted fade from its present gain."""
     await bench.arm()
     ramp = bench.ramp
-    begun = await bench.play(1.0, ramp=ramp)
-    await bench.pause_until(begun.latest + ramp / 2)
+    started = await bench.play(1.0, ramp=ramp)
+    await bench.pause_until(started.latest + ramp / 2)
     when = await bench.play(ramp=ramp)
     # Its gain at the interruption is known as well as both times are.
     shares = [
         (1 - math.cos(math.pi * min(max(share / ramp, 0.0), 1.0))) / 2
-        for share in (when.earliest - begun.latest - 0.002, when.latest - begun.earliest)
+        for share in (when.earliest - started.latest - 0.002, when.latest - started.earliest)
     ]
-    low, high = (raised_cosine(ramp, begin=bench.level * share, end=0.0) for share in shares)
+    low, high = (raised_cosine(ramp, start=bench.level * share, end=0.0) for share in shares)
     for sample in await samples_until(bench, when.latest + 1.1 * ramp):
         level = sample.status.levels[0]
         least = low(sample.when.latest - when.earliest) - bench.tolerance
@@ -108,11 +108,11 @@ async def earlier_ends_stay(bench: Bench) -> None:
     await bench.arm()
     short, long = bench.ramp / 2, min(2 * bench.ramp, bench.can.ramp_max)
     await bench.play(1.0)
-    begun = await bench.play(ramp=short)
-    await bench.pause_until(begun.latest + short / 4)
+    started = await bench.play(ramp=short)
+    await bench.pause_until(started.latest + short / 4)
     reached = (await bench.levels())[0]
     await bench.play(ramp=long)
-    for sample in await samples_until(bench, begun.latest + 0.9 * short):
+    for sample in await samples_until(bench, started.latest + 0.9 * short):
         level = sample.status.levels[0]
         expect(
             level <= reached + bench.tolerance,
@@ -121,29 +121,29 @@ async def earlier_ends_stay(bench: Bench) -> None:
             seen=f"{level:.4f}",
         )
     what = "silence of a fade before a longer one"
-    silent = await bench.time_of(is_silent, since=begun, due=short, what=what)
+    silent = await bench.time_of(is_silent, since=started, due=short, what=what)
     bench.expect_time(what, silent, low=0.0, high=short + PROMPT)
 
 
 @dataclass(frozen=True)
-class _Phase:
+class _FollowingTone:
     """A tone that follows one of its frequency and phase 0 after a part of a turn.
 
     amid: the level amid the ramp between them, relative to that before.
     """
 
     name: str
-    turn: float
+    cycles: float
     phase: float
     keep_phase: bool
     amid: float
 
 
-_PHASES = (
-    _Phase("half a turn later", 0.5, 0.0, False, 0.0),
-    _Phase("half a turn later, its phase kept", 0.5, 0.0, True, 1.0),
-    _Phase("of the opposite phase, kept", 0.5, 180.0, True, 0.0),
-    _Phase("of 90 degrees, a quarter of a turn later", 0.25, 90.0, False, 1.0),
+_TONES = (
+    _FollowingTone("half a turn later", 0.5, 0.0, False, 0.0),
+    _FollowingTone("half a turn later, its phase kept", 0.5, 0.0, True, 1.0),
+    _FollowingTone("of the opposite phase, kept", 0.5, 180.0, True, 0.0),
+    _FollowingTone("of 90 degrees, a quarter of a turn later", 0.25, 90.0, False, 1.0),
 )
 
 
@@ -152,14 +152,14 @@ async def phases(bench: Bench) -> None:
     """It counts phases from the commit, or with keep phase from the tone that plays."""
     bench.require(Feature.PHASE)
     frequency = max(_LOW, bench.can.frequency_min)
-    if 2 * bench.exchange_time * frequency > _TURN:
+    if 2 * bench.exchange_time * frequency > _CYCLE_ERROR:
         raise NotApplicable("the wire is too slow to tell phases apart at its lowest frequency")
-    found = [await _level_after(bench, case, frequency) for case in _PHASES]
+    found = [await _level_after(bench, case, frequency) for case in _TONES]
     if all(level > 0.9 * bench.level for level, _ in found):
         raise NotApplicable("its levels do not show that tones of one frequency interfere")
-    for case, (level, error) in zip(_PHASES, found, strict=True):
+    for case, (level, error) in zip(_TONES, found, strict=True):
         allowed = bench.level * (math.pi * error + 0.05) + bench.tolerance
-        if error > 1.5 * _TURN:
+        if error > 1.5 * _CYCLE_ERROR:
             raise Inconclusive(f"a tone {case.name} was late by {error:.2f} turns")
         expect(
             abs(level - case.amid * bench.level) <= allowed,
@@ -169,13 +169,13 @@ async def phases(bench: Bench) -> None:
         )
 
 
-async def _level_after(bench: Bench, case: _Phase, frequency: float) -> tuple[float, float]:
+async def _level_after(bench: Bench, case: _FollowingTone, frequency: float) -> tuple[float, float]:
     """Return the level amid the ramp to a tone, and the error of its turns."""
     await bench.arm()
     first = await bench.apply(bench.tones(1.0, frequency=frequency))
     # Whole turns before, so that the pause is longer than an exchange.
-    wanted = first.earliest + (math.ceil(0.02 * frequency) + case.turn) / frequency
-    await bench.pause_until(wanted)
+    requested = first.earliest + (math.ceil(0.02 * frequency) + case.cycles) / frequency
+    await bench.pause_until(requested)
     second = await bench.apply(
         bench.tones(
             1.0,
@@ -188,8 +188,8 @@ async def _level_after(bench: Bench, case: _Phase, frequency: float) -> tuple[fl
     level = await _level_amid(bench, second, bench.ramp)
     await bench.amplifier.disarm(0.0)
     await asyncio.sleep(0.01)
-    spread = (second.earliest - first.latest, second.latest - first.earliest)
-    turns = [one * frequency - case.turn for one in spread]
+    delays = (second.earliest - first.latest, second.latest - first.earliest)
+    turns = [one * frequency - case.cycles for one in delays]
     error = max(abs(one - round(one)) for one in turns)
     return level, (0.0 if case.keep_phase else error)
 
@@ -213,8 +213,8 @@ async def ramps_of_valid_for(bench: Bench) -> None:
     await bench.arm()
     ramp, lasts = bench.ramp / 2, 1.5 * bench.ramp
     when = await bench.play(1.0, ramp=ramp, valid_for=lasts)
-    rising = raised_cosine(ramp, begin=0.0, end=bench.level)
-    falling = raised_cosine(ramp, begin=0.0, end=bench.level)
+    rising = raised_cosine(ramp, start=0.0, end=bench.level)
+    falling = raised_cosine(ramp, start=0.0, end=bench.level)
 
     def level(time: float) -> float:
         return min(rising(time), bench.level - falling(time - lasts))

@@ -95,16 +95,16 @@ async def steps_as_stated(bench: Bench) -> None:
     if not coarse:
         raise NotApplicable("its steps are those of the wire")
     await bench.arm()
-    for name, (step, finest, begin) in coarse.items():
+    for name, (step, finest, start) in coarse.items():
         count = min(_SCANNED, math.floor(step / finest))
         found = set()
         for number in range(count):
             command = DriveCommand(0, bench.frequency, bench.level / 2)
-            value: dict[str, Any] = {name: begin + number * step / count}
+            value: dict[str, Any] = {name: start + number * step / count}
             command = replace(command, **value)
             token = bench.amplifier.next_token()
-            wanted = CommandSet(token, (command,), ramp=0.0, valid_for=0.0)
-            reply = await bench.amplifier.apply(bench.guard.check(wanted))
+            requested = CommandSet(token, (command,), ramp=0.0, valid_for=0.0)
+            reply = await bench.amplifier.apply(bench.guard.check(requested))
             found.add(getattr(reply.commands[0], name))
         expect(
             len(found) <= 2,
@@ -148,11 +148,11 @@ async def achieved_of_every_channel(bench: Bench) -> None:
         for channel in range(can.channels)
     )
     token = bench.amplifier.next_token()
-    wanted = bench.guard.check(CommandSet(token, commands, ramp=0.0, valid_for=0.0))
+    requested = bench.guard.check(CommandSet(token, commands, ramp=0.0, valid_for=0.0))
     if bench.has(Feature.STAGING):
-        _expect_achieved(bench, commands, await bench.amplifier.stage(wanted), "Stage")
+        _expect_achieved(bench, commands, await bench.amplifier.stage(requested), "Stage")
         _expect_achieved(bench, commands, await bench.amplifier.commit(token), "Commit")
-    _expect_achieved(bench, commands, await bench.amplifier.apply(wanted), "Apply")
+    _expect_achieved(bench, commands, await bench.amplifier.apply(requested), "Apply")
 
 
 def _expect_achieved(
@@ -168,11 +168,11 @@ def _expect_achieved(
     )
     for command in commands:
         played = got[command.channel]
-        turn = (played.phase - command.phase + 180) % 360 - 180
+        difference = (played.phase - command.phase + 180) % 360 - 180
         is_right = (
             abs(played.frequency - command.frequency) <= can.frequency_step / 2 + 0.026
             and abs(played.level - command.level) <= can.level_step / 2 + 1e-4
-            and abs(turn) <= can.phase_step / 2 + 0.01
+            and abs(difference) <= can.phase_step / 2 + 0.01
         )
         expect(
             is_right,
@@ -205,8 +205,8 @@ async def all_or_nothing(bench: Bench) -> None:
     if bench.has(Feature.STAGING):
         await bench.amplifier.stage(staged)
     other = bench.tones(0.5, token=before.token)
-    for what, wanted in [*_impossible(bench), ("the token of another", other)]:
-        await bench.refused(bench.amplifier.apply(wanted), what=f"a set with {what}")
+    for what, requested in [*_impossible(bench), ("the token of another", other)]:
+        await bench.refused(bench.amplifier.apply(requested), what=f"a set with {what}")
         status = await bench.amplifier.status()
         expect(
             status.token == before.token,
@@ -268,6 +268,6 @@ async def stated_ranges(bench: Bench) -> None:
     for frequency in (bench.guard.limits.frequency_min, bench.guard.limits.frequency_max):
         command = DriveCommand(can.channels - 1, frequency, bench.guard.limits.level)
         token = bench.amplifier.next_token()
-        wanted = CommandSet(token, (command,), ramp=can.ramp_max, valid_for=0.0)
-        reply = await bench.amplifier.stage(bench.guard.check(wanted))
+        requested = CommandSet(token, (command,), ramp=can.ramp_max, valid_for=0.0)
+        reply = await bench.amplifier.stage(bench.guard.check(requested))
         expect(bool(reply.commands), "staged commands", expected="one", seen="none")

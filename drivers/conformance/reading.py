@@ -84,22 +84,22 @@ async def reading_changes_nothing(bench: Bench) -> None:
 async def replies_in_time(bench: Bench) -> None:
     """It begins every reply within 10 ms, beside the time on the wire."""
     on_wire = bench.amplifier.round_trip()
-    for name, ask in (
+    for name, call in (
         ("GetStatus", bench.amplifier.status),
         ("GetFaults", bench.amplifier.faults),
         ("Ping", bench.amplifier.heartbeat),
     ):
         durations = []
         for _ in range(_TRIES):
-            _, when = await bench.timed(ask())
+            _, when = await bench.timed(call())
             durations.append(when.latest - when.earliest)
-        longest = PROTOCOL.reaction + on_wire + _ADAPTERS
-        usual = sorted(durations)[_TRIES // 2]
+        limit = PROTOCOL.reaction + on_wire + _ADAPTERS
+        typical = sorted(durations)[_TRIES // 2]
         expect(
-            usual <= longest,
+            typical <= limit,
             f"reply to {name}",
-            expected=f"within {longest * 1e3:.1f} ms, {_ADAPTERS * 1e3:g} ms of which for adapters",
-            seen=f"{usual * 1e3:.1f} ms",
+            expected=f"within {limit * 1e3:.1f} ms, {_ADAPTERS * 1e3:g} ms of which for adapters",
+            seen=f"{typical * 1e3:.1f} ms",
         )
 
 

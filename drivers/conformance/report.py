@@ -20,7 +20,7 @@ class ConformanceReport:
     results: tuple[CheckResult, ...]
 
     @property
-    def left_out(self) -> int:
+    def not_run(self) -> int:
         """Number of checks that were not run."""
         return len(CHECKS) - len(self.results)
 
@@ -41,15 +41,15 @@ class ConformanceReport:
             return "failed"
         if Result.INCONCLUSIVE in found:
             return "inconclusive"
-        return "incomplete" if self.left_out else "passed"
+        return "incomplete" if self.not_run else "passed"
 
     @property
     def summary(self) -> str:
         """Return the number of checks with each result."""
         counts = self._counts()
         parts = [f"{count} {name}" for name, count in counts.items()]
-        if self.left_out:
-            parts.append(f"{self.left_out} not run")
+        if self.not_run:
+            parts.append(f"{self.not_run} not run")
         return f"class {self.amplifier_class}: {', '.join(parts)}"
 
     def to_json(self) -> dict[str, Any]:
@@ -59,7 +59,7 @@ class ConformanceReport:
             "overall": self.overall,
             "class": self.amplifier_class,
             **self._counts(),
-            "left_out": self.left_out,
+            "not_run": self.not_run,
             "seconds": round(sum(one.seconds for one in self.results), 3),
             "checks": [one.to_json() for one in self.results],
         }

@@ -71,8 +71,8 @@ async def watchdog(bench: Bench) -> None:
 async def watchdog_times(bench: Bench) -> None:
     """It takes the watchdog that Arm gives, from the shortest to the longest."""
     bench.require(Feature.WATCHDOG)
-    for wanted in (_ODD, WATCHDOG, bench.can.watchdog_max):
-        await bench.arm(wanted)
+    for requested in (_ODD, WATCHDOG, bench.can.watchdog_max):
+        await bench.arm(requested)
         await bench.play(1.0)
         await expect_trip(bench, why=f"of {bench.watchdog:g} s")
         await bench.rest()
@@ -97,20 +97,20 @@ async def watchdog_without_reading(bench: Bench) -> None:
     )
 
 
-Ask = Callable[[], Awaitable[object]]
+Call = Callable[[], Awaitable[object]]
 
 
-async def _ignoring(ask: Ask) -> None:
+async def _ignoring(call: Call) -> None:
     """Make a request that may be refused."""
     with contextlib.suppress(CommandRefused):
-        await ask()
+        await call()
 
 
-def _not_feeding(bench: Bench) -> list[tuple[str, Ask]]:
+def _not_feeding(bench: Bench) -> list[tuple[str, Call]]:
     """Make requests that look, or are refused."""
     amplifier = bench.amplifier
     late = bench.tones(0.5, token=amplifier.next_token())
-    asks: list[tuple[str, Ask]] = [
+    calls: list[tuple[str, Call]] = [
         ("GetStatus", amplifier.status),
         ("GetFaults", amplifier.faults),
         ("Hello and GetCaps", amplifier.identify),
@@ -120,11 +120,11 @@ def _not_feeding(bench: Bench) -> list[tuple[str, Ask]]:
     if bench.can.channels < 16:
         larger = bench.wider(channels=bench.can.channels + 1)
         beyond = bench.tones(0.5, guard=larger, first=bench.can.channels)
-        asks += [
+        calls += [
             ("a refused Apply", lambda: amplifier.apply(beyond)),
             ("a refused Stage", lambda: amplifier.stage(beyond)),
         ]
-    return asks
+    return calls
 
 
 @driving(_PLACE)
@@ -134,11 +134,11 @@ async def what_does_not_feed(bench: Bench) -> None:
     await bench.arm()
     old = bench.tones(1.0)
     await bench.play(1.0)
-    asks = [*_not_feeding(bench), ("an older token", lambda: bench.amplifier.apply(old))]
-    for name, ask in asks:
+    calls = [*_not_feeding(bench), ("an older token", lambda: bench.amplifier.apply(old))]
+    for name, call in calls:
         await bench.beat()
         await asyncio.sleep(_SEEN)
-        await _ignoring(ask)
+        await _ignoring(call)
         bench.expect_not_fed(await bench.sample(), by=name)
 
 
@@ -149,21 +149,23 @@ _SEEN = 0.02  # s; that the watchdog runs down before a request that must not fi
 async def trips_amid_other_requests(bench: Bench) -> None:
     """It trips its watchdog in time while requests look or are refused."""
     bench.require(Feature.WATCHDOG)
-    for asks in ([("GetStatus", bench.amplifier.status)], _not_feeding(bench)):
+    for calls in ([("GetStatus", bench.amplifier.status)], _not_feeding(bench)):
         await bench.arm(WATCHDOG)
         await bench.play(1.0)
-        await _ask_until(bench, [ask for _, ask in asks], bench.fed.latest + 0.8 * bench.watchdog)
+        await _call_until(
+            bench, [call for _, call in calls], bench.fed.latest + 0.8 * bench.watchdog
+        )
         await expect_trip(bench, why="amid requests that do not feed it")
         await bench.rest()
 
 
-async def _ask_until(bench: Bench, asks: Sequence[Ask], end: float) -> None:
+async def _call_until(bench: Bench, calls: Sequence[Call], end: float) -> None:
     while True:
-        for ask in asks:
+        for call in calls:
             if clock.now() > end:
                 return
             try:
-                await _ignoring(ask)
+                await _ignoring(call)
             except LinkTimeout:
                 continue
             await asyncio.sleep(0.002)
@@ -182,26 +184,26 @@ async def what_feeds(bench: Bench) -> None:
         await amplifier.stage(staged[-1])
 
     staged = [bench.tones(1.0)]
-    asks: list[tuple[str, Ask]] = [
+    calls: list[tuple[str, Call]] = [
         ("Apply", lambda: amplifier.apply(staged[0])),
         ("Ping", amplifier.heartbeat),
     ]
     if bench.has(Feature.STAGING):
-        asks += [
+        calls += [
             ("Stage", stage_and_note),
             ("Commit", lambda: amplifier.commit(staged[-1].token)),
             ("a repeated Commit", lambda: amplifier.commit(staged[-1].token)),
         ]
     if amplifier.carries_sessions:
-        asks.append(("the same Arm", lambda: amplifier.arm(bench.watchdog, session=session)))
-    for name, ask in asks:
+        calls.append(("the same Arm", lambda: amplifier.arm(bench.watchdog, session=session)))
+    for name, call in calls:
         await asyncio.sleep(0.6 * bench.watchdog)
-        _, bench.fed = await bench.timed(ask())
+        _, bench.fed = await bench.timed(call())
         bench.expect_fed(await bench.sample(), by=name)
     await asyncio.sleep(0.6 * bench.watchdog)
     status = (await bench.sample()).status
     bench.expect_state(status, AmplifierState.OPERATION_ENABLED, after="requests that feed it")
-    await expect_trip(bench, why=f"after {asks[-1][0]}")
+    await expect_trip(bench, why=f"after {calls[-1][0]}")
 
 
 @driving(_PLACE)

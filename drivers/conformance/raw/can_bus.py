@@ -13,8 +13,8 @@ from drivers.conformance.raw.line import NO_REPLY, REPLY, RawLine, RawRequest
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Apply, Broadcast, GetStatus, NakCode, Ping, Stage, Stop
 
-_PATIENCE = 0.03  # s, beyond the time on the bus; three times the longest reaction
-_TIMEOUT = 0.03  # s; for room in the transmit queue
+_TIMEOUT = 0.03  # s, beyond the time on the bus; three times the longest reaction
+_SEND_TIMEOUT = 0.03  # s; for room in the transmit queue
 _SETTLING = 0.002  # s
 _SEQUENCE = 0xA5
 _OTHER_NODE = 62
@@ -49,7 +49,7 @@ class CanRaw(RawLine):
                 replies.get_nowait()
             await self._write(request)
             try:
-                async with asyncio.timeout(self._time_of(request) + request.lasts + _PATIENCE):
+                async with asyncio.timeout(self._time_of(request) + request.lasts + _TIMEOUT):
                     while True:
                         outcome = _outcome(await replies.get())
                         if outcome is not None:
@@ -124,9 +124,11 @@ class CanRaw(RawLine):
     def tolerated(self, ping: Ping) -> Sequence[RawRequest]:
         """See `RawLine`."""
         whole = encode_request(ping, node=self._url.node, sequence=_SEQUENCE)
-        foreign = CanFrame(0x7A0, b"\x00" * 8)
+        other_device = CanFrame(0x7A0, b"\x00" * 8)
         return [
-            _made("frames of another device, then a Ping", [foreign, foreign, *whole], REPLY),
+            _made(
+                "frames of another device, then a Ping", [other_device, other_device, *whole], REPLY
+            ),
             _made("a command without its set, then a Ping", [self._command(), *whole], REPLY),
         ]
 
@@ -161,7 +163,7 @@ class CanRaw(RawLine):
             for name, frames in requests.items()
         ]
 
-    def longest_stop(self) -> RawRequest:
+    def stop_out_of_range(self) -> RawRequest:
         """See `RawLine`."""
         (stop,) = encode_request(Stop(0.0), node=self._url.node, sequence=_SEQUENCE)
         changed = _with_fields(stop, "order", {"ramp": 0xFFFF})
@@ -180,7 +182,7 @@ class CanRaw(RawLine):
             if number:
                 await asyncio.sleep(request.pause)
             assert isinstance(piece, tuple)  # noqa: S101  made here
-            await self._bus.send(piece, timeout=_TIMEOUT)
+            await self._bus.send(piece, timeout=_SEND_TIMEOUT)
 
     def _time_of(self, request: RawRequest) -> float:
         times = CanTimes(self._url.bus.bitrate, self._url.bus.fd)

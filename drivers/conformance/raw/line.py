@@ -59,7 +59,7 @@ class RawLine(ABC):
         return ()
 
     @abstractmethod
-    def longest_stop(self) -> RawRequest:
+    def stop_out_of_range(self) -> RawRequest:
         """Make a Stop with the largest ramp that its field holds."""
 
     @abstractmethod

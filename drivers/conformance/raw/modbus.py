@@ -17,7 +17,7 @@ from drivers.protocol.messages import Apply, Broadcast, Ping, Request, Stop
 
 _MAP = PROTOCOL.modbus
 _Q = PROTOCOL.quantities
-_PATIENCE = 0.03  # s, beyond the time on the line; three times the longest reaction
+_TIMEOUT = 0.03  # s, beyond the time on the line; three times the longest reaction
 _GAP = 0.06  # s; ends a frame over RTU, where more than 40 ms are a pause
 _REST = 0.003  # s; in which the rest of a response arrives
 _TRANSACTION, _TAG = 0xA55A, 0x5AA5
@@ -54,7 +54,7 @@ class ModbusRaw(RawLine):
         try:
             await self._write(request)
             try:
-                async with asyncio.timeout(self._time_of(request) + self._patience):
+                async with asyncio.timeout(self._time_of(request) + self._timeout):
                     while (outcome := self._outcome()) is None:
                         self._came.clear()
                         await self._came.wait()
@@ -175,7 +175,7 @@ class ModbusRaw(RawLine):
             ),
         ]
 
-    def longest_stop(self) -> RawRequest:
+    def stop_out_of_range(self) -> RawRequest:
         """See `RawLine`."""
         stop = self._registers(Stop(0.0))
         stop[_STOP_RAMP] = 0xFFFF
@@ -197,9 +197,9 @@ class ModbusRaw(RawLine):
         return modbus_line(self._url)
 
     @property
-    def _patience(self) -> float:
+    def _timeout(self) -> float:
         """Time [s] after which no response comes; over RTU a pause may end the request first."""
-        return _PATIENCE + (_GAP if self._url.is_rtu else 0.0)
+        return _TIMEOUT + (_GAP if self._url.is_rtu else 0.0)
 
     async def _write(self, request: RawRequest) -> None:
         for number, piece in enumerate(request.pieces):

@@ -27,7 +27,7 @@ from drivers.protocol.messages import (
 _NAK = REPLY_BIT | PROTOCOL.types["nak"]
 _OTHER_ADDRESS = PROTOCOL.serial.address_max - 1
 _UNKNOWN_TYPE = PROTOCOL.vendor_numbers - 1
-_PATIENCE = 0.03  # s, beyond the time on the line; three times the longest reaction
+_TIMEOUT = 0.03  # s, beyond the time on the line; three times the longest reaction
 _SEQUENCE = 0xA55A
 _Q = PROTOCOL.quantities
 _SESSION, _TOKEN, _RAMP, _VALID, _COUNT, _COMMANDS = 0, 2, 4, 6, 8, 9  # offsets of an Apply
@@ -54,7 +54,7 @@ class SerialRaw(RawLine):
         try:
             await self._write(request)
             size = sum(len(piece) for piece in request.pieces if isinstance(piece, bytes))
-            timeout = SerialTimes(self._url.baud).exchange(size) + _PATIENCE
+            timeout = SerialTimes(self._url.baud).exchange(size) + _TIMEOUT
             try:
                 async with asyncio.timeout(timeout):
                     await self._came.wait()
@@ -157,7 +157,7 @@ class SerialRaw(RawLine):
             for one in (ping, apply, GetStatus())
         ]
 
-    def longest_stop(self) -> RawRequest:
+    def stop_out_of_range(self) -> RawRequest:
         """See `RawLine`."""
         stop = replace(self._frame(Stop(0.0)), payload=b"\xff\xff")
         return self._made("a Stop with a ramp out of range", stop, REPLY)

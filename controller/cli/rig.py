@@ -110,7 +110,9 @@ def check(
     verdict = diagnose(rig, observation)
     elapsed = time.perf_counter() - started
     if as_json:
-        print(json.dumps({**diagnosis_report.as_json(verdict), "elapsed_s": elapsed}))
+        exactly_known = [*rig.uncertainty.exactly_known]
+        answer = {"exactly_known": exactly_known, "elapsed_s": elapsed}
+        print(json.dumps({**diagnosis_report.as_json(verdict), **answer}))
     else:
         low, high = verdict.frequencies.min(), verdict.frequencies.max()
         print(
@@ -118,6 +120,8 @@ def check(
             f"{counted(len(verdict.frequencies), 'frequency', plural='frequencies')} "
             f"from {low:g} to {high:g} Hz, {elapsed:.1f} s"
         )
+        if note := rig.uncertainty.note:
+            print(note)
         print()
         print(
             "\n".join(

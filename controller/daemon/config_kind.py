@@ -32,7 +32,8 @@ class DaemonKind:
             f"{', '.join(source.name for source in config.touch) or 'the API only'}; "
             f"socket {config.socket}{hint}"
         )
-        return CheckedFile(line, warnings)
+        note = rig.uncertainty.note
+        return CheckedFile(line, [*warnings, *([note] if note else [])])
 
     def example(self) -> str:
         """A commented example with every key."""

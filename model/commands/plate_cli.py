@@ -94,6 +94,7 @@ def plate_map(
     from model.config.points import parse_pair
     from model.files.replacing import check_picture
     from model.rig.file import load_rig
+    from model.structure.support import support_problem
     from model.vibration.maps import plate_map as solve
     from model.vibration.peak import G
 
@@ -104,12 +105,15 @@ def plate_map(
     started = time.perf_counter()
     solved = solve(rig, excitation, raster=parse_pair(points, what="--points") if points else None)
     elapsed = time.perf_counter() - started
-    if warning := beyond_limits(excitation, rig):
-        typer.echo(f"era: warning: {warning}", err=True)
+    unsupported = support_problem(rig.plate, rig.eras, loads=rig.masses)
+    for warning in (beyond_limits(excitation, rig), unsupported):
+        if warning:
+            typer.echo(f"era: warning: {warning}", err=True)
     if output is not None:
         from model.figures import map_figure, save_figure
 
-        figure = map_figure(rig, solved, active=excitation.keys(), title=", ".join(drive))
+        title = ", ".join([*drive, *(["not supported"] if unsupported else [])])
+        figure = map_figure(rig, solved, active=excitation.keys(), title=title)
         save_figure(figure, output)
     row, column = divmod(int(solved.peak.argmax()), len(solved.x))
     if as_json:
@@ -122,6 +126,7 @@ def plate_map(
                     "max_m_s2": float(solved.peak.max()),
                     "max_at_m": [float(solved.x[column]), float(solved.y[row])],
                     "nulls_m": solved.nulls.tolist(),
+                    "is_supported": unsupported is None,
                     "mesh": [rig.mesh.nx, rig.mesh.ny],
                     "solve_time_s": elapsed,
                     "files": [str(output)] if output else [],

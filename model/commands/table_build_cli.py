@@ -3,13 +3,16 @@
 import json
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from model.commands.next_line import next_line
 from model.commands.options import JsonOption, MeshOption, RigArgument
 from model.counting import counted
+
+if TYPE_CHECKING:
+    from model.fem.plate_mesh import PlateMesh
 
 
 def build(
@@ -80,6 +83,7 @@ def build(
     kept.clear()
     elapsed = time.perf_counter() - started
     error = 100 * float(table.discretisation_error.max())
+    warning = _coarse(error, table.mesh)
     if as_json:
         answer = {
             "patterns": table.pattern_count,
@@ -91,12 +95,14 @@ def build(
             "mode": table.drive_mode,
             "fingerprint": table.fingerprint,
             "code_version": table.code_version,
+            "exactly_known": [*rig.uncertainty.exactly_known],
             "parts": built.part_count,
             "parts_reused": built.reused_count,
             "build_time_s": elapsed,
             "files": [str(output)],
         }
         print(json.dumps(answer))
+        _warn(warning)
         return
     if built.reused_count:
         print(f"reused {built.reused_count} of {built.part_count} parts of an interrupted build")
@@ -109,5 +115,27 @@ def build(
         f"mesh {table.mesh}: error of the fields {error:.3g} %, estimated with "
         f"{table.reference_mesh}"
     )
+    if note := rig.uncertainty.note:
+        print(note)
     print(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
+    _warn(warning)
     print(next_line("era", "table", "show", output))
+
+
+NOTED_ERROR = 5.0
+"""Error of the fields [%] from which a mesh is called coarse, as large as that of a gain."""
+
+
+def _coarse(error: float, mesh: "PlateMesh") -> str | None:
+    """Warn of the error [%] of a mesh, None for a small one."""
+    if error < NOTED_ERROR:
+        return None
+    return (
+        f"mesh {mesh} is coarse: its fields are wrong by {error:.3g} %; what is promised takes "
+        "this error into account and is lower for it; `mesh: auto` keeps it at 1 %"
+    )
+
+
+def _warn(warning: str | None) -> None:
+    if warning:
+        typer.echo(f"era: warning: {warning}", err=True)

@@ -33,7 +33,8 @@ class RigKind:
         problems += [problem for problem in wrong if problem.key not in known]
         if rig is None or problems:
             raise ConfigError(document.source, problems)
-        return CheckedFile(_summary(rig), warnings)
+        note = rig.uncertainty.note
+        return CheckedFile(_summary(rig), [*warnings, *([note] if note else [])])
 
     def example(self) -> str:
         """The paper's plate."""

@@ -83,9 +83,9 @@ def limits_of(section: LimitsSection) -> GuardLimits:
     return GuardLimits(frequency_min=low, frequency_max=high, **given)
 
 
-def uncertainty_of(section: UncertaintySection | None) -> Uncertainty:
-    """The standard deviations of the rig's parameters; those not measured without a section."""
-    return Uncertainty() if section is None else Uncertainty(**section.model_dump())
+def uncertainty_of(section: UncertaintySection) -> Uncertainty:
+    """The standard deviations of the rig's parameters."""
+    return Uncertainty(**section.model_dump())
 
 
 def fingertip_of(section: FingertipSection | str) -> Fingertip | None:

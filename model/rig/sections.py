@@ -4,11 +4,13 @@ Bounds are wide: they catch values in the wrong unit.
 """
 
 import re
+from dataclasses import asdict
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
+    BeforeValidator,
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
@@ -32,6 +34,7 @@ from model.config.units import (
     TIME,
 )
 from model.finger.perception import DEFAULT_THRESHOLD, THRESHOLDS
+from model.rig.uncertainty import Uncertainty
 from model.structure.laminate import Bond
 from model.structure.materials import material, material_names
 from registry.suggestions import did_you_mean
@@ -184,12 +187,26 @@ class AmplifierSection(Section):
 class UncertaintySection(Section):
     """Standard deviations of a rig's parameters, see `Uncertainty`; a key left out means none."""
 
+    @classmethod
+    def not_measured(cls) -> "UncertaintySection":
+        """Return the section of a rig that was not measured."""
+        return cls(**asdict(Uncertainty()))
+
     gain: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
     phase_deg: Annotated[float, Quantity(RATIO, at_least=0, at_most=60)] = 0.0
     thickness: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.03)] = 0.0
     stiffness: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
     damping: Annotated[float, Quantity(RATIO, at_least=1, at_most=4)] = 1.0
     fingertip: Annotated[float, Quantity(RATIO, at_least=0, at_most=1)] = 0.0
+
+
+def _mapping(value: object) -> object:
+    if value is None:
+        raise ValueError(
+            "must be a mapping of `key: value` lines, got null; remove the key for a rig that was "
+            "not measured, or write {} for one that is known exactly"
+        )
+    return value
 
 
 class FingertipSection(Section):
@@ -233,6 +250,8 @@ class RigSection(Section):
     masses: Annotated[dict[Identifier, MassSection], Field(max_length=64, default_factory=dict)]
     amplifiers: Annotated[dict[Identifier, AmplifierSection], Field(min_length=1)]
     limits: LimitsSection = LimitsSection()
-    uncertainty: UncertaintySection | None = None
+    uncertainty: Annotated[UncertaintySection, BeforeValidator(_mapping)] = (
+        UncertaintySection.not_measured()
+    )
     fingertip: FingertipSection | Literal["none"] = FingertipSection()
     threshold: Annotated[str, AfterValidator(_threshold)] = DEFAULT_THRESHOLD

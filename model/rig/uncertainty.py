@@ -1,7 +1,7 @@
 """How well a rig knows its plate, its ERAs, its amplifiers and the fingers on it."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 
 from model.arguments import expect_at_least
 
@@ -33,6 +33,22 @@ class Uncertainty:
     def none(cls) -> "Uncertainty":
         """A rig whose every parameter is known exactly."""
         return cls(0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+    @property
+    def exactly_known(self) -> tuple[str, ...]:
+        """Keys of the parameters that are taken as none."""
+        none = asdict(Uncertainty.none())
+        return tuple(key for key, value in asdict(self).items() if value == none[key])
+
+    @property
+    def note(self) -> str | None:
+        """One line on what is taken as none; None where every parameter is uncertain."""
+        if not self.exactly_known:
+            return None
+        return (
+            f"uncertainty taken as none: {', '.join(self.exactly_known)}; what is promised holds "
+            f"for these known exactly, the rest: {self}"
+        )
 
     def __str__(self) -> str:
         """Its terms that are not none, as 'gain 5 %, phase 5°, damping x 1.5'."""

@@ -98,6 +98,20 @@ def test_map_warns_of_frequencies_outside_the_limits(era):
     assert era(*options, "--drive", "SW=500", "--drive", "NE=40")[2] == ""
 
 
+def test_map_marks_a_plate_that_is_not_supported(era, answer, tmp_path):
+    """On two ERAs it would tip over; the map is drawn, with a warning and a mark."""
+    others = ("NE:", "NW:")
+    lines = Path(RIG).read_text(encoding="utf-8").splitlines(keepends=True)
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("".join(line for line in lines if not line.strip().startswith(others)))
+    options = ("map", rig, "--mesh", "24x18", "--drive", "SW=110")
+    assert answer(*options)["is_supported"] is False
+    status, _, said = era("plate", *options)
+    assert status == 0
+    assert "not supported" in said
+    assert answer("map", RIG, *options[2:])["is_supported"] is True
+
+
 def test_convergence_lists_errors_of_finer_and_finer_meshes(era, answer, monkeypatch, tmp_path):
     """Errors fall from mesh to mesh, and the rig's own is marked; text and JSON agree."""
     studied = []

@@ -65,6 +65,22 @@ def test_build_writes_a_table_and_what_made_it(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_build_notes_a_coarse_mesh_and_what_is_taken_as_none(tmp_path: Path) -> None:
+    """A warning of the error on standard error, and the uncertainties that the rig leaves out."""
+    rig = tmp_path / "rig.yaml"
+    text = Path(RIG).read_text(encoding="utf-8")
+    rig.write_text(text + "\nuncertainty: {fingertip: 0.5}\n", encoding="utf-8")
+    path = tmp_path / "t.npz"
+    coarse = table("build", rig, "-o", path, *QUICK)
+    assert "warning: mesh 12x9" in coarse.stderr
+    assert any("thickness" in line and "none" in line for line in coarse.stdout.splitlines())
+    fine = ["--frequencies", "60", "--grid", "4x3"]
+    answer = json.loads(table("build", RIG, "-o", path, *fine, "--json").stdout)
+    assert answer["exactly_known"] == []
+    assert answer["discretisation_error_percent"] < 5
+    assert table("build", RIG, "-o", path, *fine).stderr == ""
+
+
 @pytest.mark.parametrize(
     ("ending", "status"), [(signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)]
 )

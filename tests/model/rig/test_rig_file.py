@@ -298,6 +298,29 @@ def test_load_rig_reads_uncertainty(tmp_path: Path) -> None:
             load_rig(write(tmp_path, GOOD + f"uncertainty: {{{wrong}}}\n"))
 
 
+def test_a_rig_says_which_uncertainties_are_taken_as_none(tmp_path: Path) -> None:
+    """The keys that a section leaves out, or gives as none; a rig without one has no such note."""
+    assert load_rig(write(tmp_path, GOOD)).uncertainty.note is None
+    partial = load_rig(write(tmp_path, GOOD + "uncertainty: {fingertip: 0.5, gain: 0}\n"))
+    known = ("gain", "phase_deg", "thickness", "stiffness", "damping")
+    assert partial.uncertainty.exactly_known == known
+    note = partial.uncertainty.note
+    assert note is not None
+    assert all(key in note for key in known)
+    assert "\n" not in note
+    every = load_rig(write(tmp_path, GOOD + "uncertainty: {}\n"))
+    assert every.uncertainty.exactly_known == (*known, "fingertip")
+
+
+def test_load_rig_refuses_an_empty_uncertainty(tmp_path: Path) -> None:
+    """Nothing after the key is neither the default nor none."""
+    with pytest.raises(ConfigError) as refused:
+        load_rig(write(tmp_path, GOOD + "uncertainty:\n"))
+    (problem,) = refused.value.problems
+    assert problem.key == "uncertainty"
+    assert "{}" in problem.message
+
+
 def test_load_rig_reads_fingertip_and_threshold(tmp_path: Path) -> None:
     """A finger that presses lightly by default, one by its values, or none; all are answers'."""
     light = load_rig(write(tmp_path, GOOD))

@@ -96,9 +96,14 @@ def _lines(each: "CheckedEffect") -> list[str]:
         tones = f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
         lines.append(f"  felt {_span(each.felt)} dB SL at {tones}")
     if each.contrasts:
-        lines.append(f"  {_span(each.contrasts)} dB above what a resting second finger feels")
+        lines.append(
+            f"  {_span(each.promised_contrasts)} dB above what a resting second finger feels, on "
+            "nine of ten plates"
+        )
+        lines.append(f"  {_span(each.contrasts)} dB on the plate as modelled")
     if each.held_back_db > _SHOWN_FROM:
-        lines.append(f"  up to {each.held_back_db:.1f} dB weaker so that it feels no more")
+        held = f"  up to {each.held_back_db:.1f} dB weaker"
+        lines.append(f"{held} so that it feels half of it at most")
     return [*lines, *(f"  PROBLEM {problem}" for problem in each.problems)]
 
 

@@ -32,14 +32,14 @@ def check_figure(
     """Draw three panels, with one mark for each touch; crosses where nothing is felt.
 
     Level: what is felt less what is promised, the worse of alone and beside a resting finger;
-    frequency; and how far a resting finger feels less.
+    frequency; and how far a resting finger feels less on nine of ten plates.
     """
     ratio = table.plate.width / table.plate.length
     figure = Figure(figsize=(18.0, 5.0 * ratio + 1.6), layout="constrained")
     panels: list[tuple[str, Callable[[CheckedEffect, SimulatedTouch], float | None]]] = [
         ("felt minus promised / dB", _off_level),
         ("frequency / Hz", _frequency),
-        ("above what a resting second finger feels / dB", _contrast),
+        ("above a resting second finger on nine of ten plates / dB", _contrast),
     ]
     low, high = float(table.frequencies[0]), float(table.frequencies[-1])
     scales: list[tuple[Normalize, str]] = [
@@ -70,9 +70,7 @@ def _frequency(each: CheckedEffect, touch: SimulatedTouch) -> float | None:
 
 
 def _contrast(each: CheckedEffect, touch: SimulatedTouch) -> float | None:
-    if touch.felt_db_sl is None or touch.resting_db_sl is None:
-        return None
-    return touch.felt_db_sl - touch.resting_db_sl
+    return touch.promised_contrast_db
 
 
 def _draw_layout(axes: Axes, layout: SurfaceLayout, table: LocalizationTable) -> None:

@@ -52,12 +52,18 @@ class CheckedEffect:
 
     @property
     def contrasts(self) -> list[float]:
-        """Level above that of the resting finger [dB]."""
+        """Level above that of the resting finger on the plate as modelled [dB]."""
         return [
             each.felt_db_sl - each.resting_db_sl
             for each in self.touches
             if each.felt_db_sl is not None and each.resting_db_sl is not None
         ]
+
+    @property
+    def promised_contrasts(self) -> list[float]:
+        """Level above that of the resting finger on nine of ten plates [dB]."""
+        found = [each.promised_contrast_db for each in self.touches]
+        return [each for each in found if each is not None]
 
     @property
     def held_back_db(self) -> float:
@@ -77,6 +83,7 @@ class CheckedEffect:
             "on": self.on,
             "promised_db_sl": self.promised_db_sl,
             "felt_db_sl": summary(self.felt),
+            "promised_contrast_db": summary(self.promised_contrasts),
             "felt_contrast_db": summary(self.contrasts),
             "held_back_db": self.held_back_db,
             "frequency_hz": self.frequencies,

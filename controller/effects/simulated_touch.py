@@ -19,6 +19,7 @@ from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import decibels, detection_threshold
 from model.structure.fingertip import fingertip_loads
 from model.table.effect_level import EffectLevels
+from model.table.pulse_gains import robust_over_effect_db
 from model.table.table import LocalizationTable
 from model.transients.envelope import Bases, ramped_pulse
 from model.transients.measures import SAMPLE_RATE, Transients
@@ -38,8 +39,9 @@ class SimulatedTouch:
     """A touch at a position [m], with a resting finger [m] or None.
 
     frequencies [Hz]; felt_db_sl: over the duration of the effect; resting_db_sl: the strongest that
-    the resting finger feels over as long, None without one; held_back_db: by how much it is weaker
-    for that finger; reason: why nothing plays.
+    the resting finger feels over as long, None without one; promised_contrast_db: over that finger
+    on nine of ten plates; held_back_db: by how much it is weaker for that finger; reason: why
+    nothing plays.
     """
 
     at: Position
@@ -47,6 +49,7 @@ class SimulatedTouch:
     frequencies: tuple[float, ...] = ()
     felt_db_sl: float | None = None
     resting_db_sl: float | None = None
+    promised_contrast_db: float | None = None
     reason: str | None = None
     held_back_db: float = 0.0
 
@@ -108,16 +111,18 @@ class TouchSimulator:
         end = since + duration
         felt = self._levels_at(transients, at, bases, length=duration, until=end)
         level = float(felt[round(since * SAMPLE_RATE)])
-        resting_level = None
+        resting_level = promised = None
         if resting is not None:
             over = self._levels_at(transients, resting, bases, length=duration, until=end + _AFTER)
             resting_level = float(over[round(since * SAMPLE_RATE) :].max())
+            promised = robust_over_effect_db(pattern, level - resting_level)
         return SimulatedTouch(
             at,
             resting,
             tuple(frequency for frequency, _ in bases),
             level,
             resting_level,
+            promised,
             held_back_db=answer.held_back_db,
         )
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -12,9 +13,10 @@ from controller.sources.contacts import Contact
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, decibels
-from model.table.effect_level import SHAPED_FROM, DriveLimits, EffectLevels, allowed_quiet_db_sl
+from model.table.effect_level import SHAPED_FROM, DriveLimits, EffectLevels
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, Pattern
 from model.table.pattern_choice import UnreachableLevel
+from model.table.pulse_gains import OverEffect
 from model.table.question import MAX_LEVEL_DB_SL, Question
 from model.table.table import LocalizationTable
 
@@ -28,7 +30,7 @@ _SHORT_OF = 0.1  # dB; a level closer to the wanted one is reached
 class TableAnswer:
     """The question that was finally answered, its pattern, and the level felt of it [dB SL].
 
-    held_back_db: by how much it is weaker so that quiet fingers feel no more than promised.
+    held_back_db: by how much it is weaker so that quiet fingers feel half of it at most.
 
     felt_db_sl: over the duration of a pulse whose level is felt, onset included, or the steady one
     in a band, both on the plate as modelled; else the steady level of nine of ten plates.
@@ -54,7 +56,8 @@ def query_table(
     question = _question(targets, quiet, capabilities, table.frequencies)
     duration = _felt_duration(targets)
     if all(target.level_db_sl is None for _, target in targets):
-        pattern = strongest(table.query(question), capabilities.max_amplitudes)
+        rated = _over_effect(levels, question, duration)
+        pattern = strongest(table.query(question, rated), capabilities.max_amplitudes)
         felt = pattern.level_db_sl
         if duration is not None and levels is not None:
             # Along the ramp of its duration, but no stronger: the neighbours feel it as long.
@@ -160,8 +163,8 @@ def _over_duration(
     """Return a pattern whose level is felt over a duration [s].
 
     Where the drive of the first answer cannot be raised enough, the table is asked for as much
-    more, which another frequency may reach. Quiet fingers feel no more of either than the first
-    one promises, or they stay unaware; the drive of the first is not lowered for them.
+    more, which another frequency may reach. Neither is raised beyond what the quiet fingers allow;
+    the drive of the first is not lowered for them.
     """
     limits = DriveLimits(capabilities.max_amplitudes, capabilities.max_power, capabilities.slew)
     level = question.level_db_sl
@@ -172,31 +175,49 @@ def _over_duration(
         )
         return TableAnswer(question, found.pattern, found.level_db_sl, found.held_back_db)
 
-    question, pattern = _query(table, question, allow_weaker=True)
+    rated = _over_effect(levels, question, duration)
+    question, pattern = _query(table, question, allow_weaker=True, over_effect=rated)
     first = raised(question, pattern, limits)
     missing = level - first.felt_db_sl
     if missing < _SHORT_OF:
         return first
     requested = min(first.pattern.level_db_sl + missing, MAX_LEVEL_DB_SL)
-    allowed = None if pattern.quiet_level_db_sl is None else allowed_quiet_db_sl(pattern)
     second = raised(
-        *_query(table, replace(question, level_db_sl=requested), allow_weaker=True),
-        replace(limits, quiet_db_sl=allowed),
+        *_query(
+            table, replace(question, level_db_sl=requested), allow_weaker=True, over_effect=rated
+        ),
+        replace(limits, lowers=True),
     )
     return max(first, second, key=lambda each: each.felt_db_sl)
 
 
+def _over_effect(
+    levels: EffectLevels | None, question: Question, duration: float | None
+) -> OverEffect | None:
+    """Return the gains over a duration [s] by which drives are chosen.
+
+    None for a vibration that lasts, or whose onset is shaped.
+    """
+    if levels is None or duration is None or question.envelopes:
+        return None
+    return OverEffect(duration, partial(levels.responses, question=question, duration=duration))
+
+
 def _query(
-    table: LocalizationTable, question: Question, *, allow_weaker: bool
+    table: LocalizationTable,
+    question: Question,
+    *,
+    allow_weaker: bool,
+    over_effect: OverEffect | None = None,
 ) -> tuple[Question, Pattern]:
     """Query a table; allow_weaker: for the highest level where the stroke allows no more."""
     try:
-        return question, table.query(question)
+        return question, table.query(question, over_effect)
     except UnreachableLevel as error:
         if not allow_weaker or error.reachable_db_sl >= question.level_db_sl:
             raise
         question = replace(question, level_db_sl=error.reachable_db_sl)
-        return question, table.query(question)
+        return question, table.query(question, over_effect)
 
 
 def _as_neighbours_allow(

@@ -38,6 +38,14 @@ def query(
     envelopes: Annotated[
         bool, typer.Option("--envelopes", help="Shape onset and ending by envelopes.")
     ] = False,
+    thorough: Annotated[
+        bool,
+        typer.Option(
+            "--thorough",
+            help="Try all drive modes within this one and all higher levels, so that no lower "
+            "level and no richer mode has less contrast; takes some tenths of a second.",
+        ),
+    ] = False,
     batch: Annotated[
         Path | None,
         typer.Option(
@@ -67,7 +75,7 @@ def query(
             "eras_at_most": eras,
             "envelopes": envelopes,
         }
-        _query_batch(table_file, batch, defaults)
+        _query_batch(table_file, batch, defaults, thorough=thorough)
         return
     if not target:
         raise InputError(
@@ -83,7 +91,7 @@ def query(
     )
     table = load_table(table_file)
     table.prepare(drive_mode)
-    answer = query_as_json(table, question, prepared_timing(table))
+    answer = query_as_json(table, question, prepared_timing(table), thorough=thorough)
     if as_json:
         print(json.dumps(answer))
     else:
@@ -136,7 +144,9 @@ def _usable(answer: dict[str, Any]) -> str:
     return "dB SL or more" if is_bound else "dB SL"
 
 
-def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> None:
+def _query_batch(
+    table_file: Path, batch: Path, defaults: dict[str, Any], *, thorough: bool
+) -> None:
     """Answer line by line; exit with 1 at the end if a line had no answer.
 
     defaults: of keys that lines leave out.
@@ -150,7 +160,7 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
     has_failed = False
     try:
         with open(batch, encoding="utf-8", opener=regular_file) as lines:
-            for answer in query_batch(table, lines, defaults):
+            for answer in query_batch(table, lines, defaults, thorough=thorough):
                 has_failed = has_failed or "error" in answer
                 print(json.dumps(answer))
     except OSError as error:

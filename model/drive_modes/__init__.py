@@ -5,8 +5,8 @@ all modes up to its own. All but `switched` drive all ERAs at one frequency. The
 mode's score at a frequency also bounds the restricted modes and prunes most of their frequencies.
 
 For a single target a coherent mode is at least as good as the more restricted ones, up to
-unconverged iterations, so that it skips their search. It searches them for several targets, and
-where no weights reach the wanted level.
+unconverged iterations, so that it skips their search: `model.table.thorough_query` does it. It
+searches them for several targets, and where no weights reach the wanted level; `graded` always.
 
 Symbols here and in `model.table`: f frequencies, p points under the fingers, q quiet fingertips, r
 reduced modal coordinates; h field of an ERA at a point, R Hermitian form of the expected power at
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.drive_modes.coherent import Coherent
+from model.drive_modes.coherent import PRUNE_MARGIN, Coherent
 from model.drive_modes.forms import Forms, Weights
 from model.drive_modes.graded import GRADED
 from model.drive_modes.phased import PHASED
@@ -72,7 +72,7 @@ DRIVE_MODES: dict[str, DriveMode] = {
 def find_drives(forms: Forms, drive_mode: str) -> list[tuple[float, Weights]]:
     """Find the drives of the best robust scores in a mode and its restricted ones.
 
-    Up to ALTERNATIVES with their scores, best first, one for each frequency or mixture of them;
+    Up to ALTERNATIVES at one frequency and as many of `switched`, with their scores, best first;
     empty where no drive reaches the wanted level.
     """
     mixed: list[tuple[float, Weights]] = []
@@ -83,7 +83,7 @@ def find_drives(forms: Forms, drive_mode: str) -> list[tuple[float, Weights]]:
     for name in (drive_mode, *DRIVE_MODES[drive_mode].restricted):
         coherent = DRIVE_MODES[name].coherent
         if coherent is None:
-            mixed = find_switched(forms, best)
+            mixed = find_switched(forms, PRUNE_MARGIN * best)
             continue
         if len(open_) == 0:
             continue
@@ -93,13 +93,14 @@ def find_drives(forms: Forms, drive_mode: str) -> list[tuple[float, Weights]]:
         at = open_[better]
         score[at], weights[at] = found.score[better], found.weights[better]
         best = max(best, float(score.max()))
-        is_done = name == "phased" or not found.is_level_limited
+        # Two tones may be worth more than amplitudes at one, and are soon searched.
+        is_done = name != "graded" and not found.is_level_limited
         if best > 0 and is_done and len(forms.targets) == 1:
             break
         open_ = open_[found.bound > best]
     top = np.argsort(-score)[:ALTERNATIVES].tolist()
     drives = [(float(score[f]), Weights.at(f, weights[f])) for f in top if score[f] > 0]
-    return sorted(drives + mixed, key=lambda each: -each[0])[:ALTERNATIVES]
+    return sorted(drives + mixed[:ALTERNATIVES], key=lambda each: -each[0])
 
 
 def max_sensation(forms: Forms, drive_mode: str) -> float:

@@ -264,10 +264,13 @@ def _saturated(weights: Complex64Array, gain: float) -> Complex64Array:
 
 
 def _moved(shares: Float32Array, expected: Float32Array) -> Float32Array:
-    """Shares of the quiet fingertips (f, q) after a step of Lawson's, by their expected powers."""
+    """Shares of the quiet fingertips (f, q) after a step of Lawson's, by their expected powers.
+
+    As they were at frequencies where no ERA is driven, as those of `graded` that only push away.
+    """
     moved = shares * np.sqrt(expected)
     total = np.add.reduce(moved, axis=-1, keepdims=True)
-    return np.asarray(moved / np.maximum(total, _LEAST))
+    return np.where(total > _LEAST, moved / np.maximum(total, _LEAST), shares)
 
 
 def _mean(forms: Forms, *, sigma: float = 0.0) -> Complex64Array:

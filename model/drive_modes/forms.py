@@ -65,6 +65,9 @@ class Forms:
     - quiet: (f, q, eras, eras) the same at each quiet fingertip, or without any one form for the
       rest of the plate
     - threshold: (f,) [m/s²]; wanted: amplitude to threshold for every target
+    - few, fine: (f, q, p, eras) fields of each ERA at few points of each quiet fingertip, by whose
+      mean the expected power counts the plate as modelled, each times the root of its weight; and
+      at many points, of which the loudest counts. None where the mean is good enough
     """
 
     targets: Complex64Array
@@ -73,6 +76,8 @@ class Forms:
     threshold: Float32Array
     wanted: float
     level_margin: float = LEVEL_MARGIN
+    few: Complex64Array | None = None
+    fine: Complex64Array | None = None
 
     @property
     def frequency_count(self) -> int:
@@ -93,6 +98,8 @@ class Forms:
             self.threshold.take(frequencies),
             self.wanted,
             self.level_margin,
+            None if self.few is None else self.few.take(frequencies, axis=0),
+            None if self.fine is None else self.fine.take(frequencies, axis=0),
         )
 
     def amplitude(self, weights: Complex64Array) -> Float32Array:
@@ -117,7 +124,12 @@ class Forms:
 
     def quiet_power(self, weights: Complex64Array) -> Float32Array:
         """Expected power [m²/s⁴] at each quiet fingertip of weights (f, eras), (f, q)."""
-        return expected_power(self.quiet.swapaxes(0, 1), weights).T
+        power = expected_power(self.quiet.swapaxes(0, 1), weights).T
+        if self.few is None or self.fine is None:
+            return power
+        mean = np.add.reduce(_powers(self.few, weights), axis=2)
+        loudest = np.maximum.reduce(_powers(self.fine, weights), axis=2)
+        return np.asarray(power + np.maximum(loudest - mean, 0))
 
     def _amplitudes(self, weights: Complex64Array) -> Float32Array:
         """Amplitudes at the targets of weights (..., f, eras), (..., t, f)."""
@@ -131,6 +143,12 @@ class Forms:
         variance = expected_power(self.target_power, weights) - amplitudes * amplitudes
         deviation = np.sqrt(np.maximum(variance, 0))
         return np.asarray(amplitudes - np.float32(self.level_margin) * deviation)
+
+
+def _powers(fields: Complex64Array, weights: Complex64Array) -> Float32Array:
+    """Squared magnitudes (f, q, p) of fields (f, q, p, eras) for weights (f, eras)."""
+    found = np.matvec(fields, weights[:, None])
+    return np.asarray(found.real * found.real + found.imag * found.imag)
 
 
 def expected_power(forms: Complex64Array, weights: Complex64Array) -> Float32Array:

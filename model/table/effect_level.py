@@ -11,18 +11,29 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from model.arrays import Float32Array, FloatArray, IntArray
 from model.finger.perception import decibels, detection_threshold
-from model.structure.fingertip import fingertip_loads
+from model.structure.fingertip import Fingertip, fingertip_loads
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, ONSET_RAMP, Pattern
+from model.table.pulse_gains import PulseGains, PulseResponses, pulse_gains
 from model.table.question import Question
 from model.table.table import LocalizationTable
-from model.transients.loaded_ramps import ramped_accelerations
+from model.transients.loaded_ramps import (
+    ramped_accelerations,
+    ramped_responses,
+    response_count,
+    time_count,
+)
+from model.transients.onset import ringing_time
 from model.transients.shaping import RISE
 from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes
 
 SHAPED_FROM = 0.2
 """Shortest duration [s] with a shaped onset, which settles in half of it."""
+
+MIN_CONTRAST_DB = 6.0
+"""Contrast over an effect down to which its drive is raised: quiet fingers feel half of it."""
 
 
 def pulse_ramp(duration: float) -> float:
@@ -48,26 +59,13 @@ class DriveLimits:
     """Limits of a drive.
 
     amplitudes: largest ones [m], by ERA; power: sum of squared levels; slew: rise of one [1/s];
-    quiet_db_sl: level of quiet fingers over the duration up to which it may be raised, None for
-    those of the pattern's promise, or -10 dB SL; without it no drive is lowered for them.
+    lowers: whether a drive is also lowered for the quiet fingers, not only kept from a raise.
     """
 
     amplitudes: Mapping[str, float]
     power: float = math.inf
     slew: float = math.inf
-    quiet_db_sl: float | None = None
-
-
-@dataclass(frozen=True)
-class PulseGains:
-    """A vibration of limited duration compared with the steady one.
-
-    targets: level over the duration relative to the steady one [dB], of each; quiet_db_sl: level
-    over the duration at the loudest quiet point on the plate as modelled, None without one.
-    """
-
-    targets: list[float]
-    quiet_db_sl: float | None
+    lowers: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,38 +91,67 @@ class EffectLevels:
         self, excitation: Excitation, question: Question, *, ramp: float, duration: float
     ) -> PulseGains:
         """Levels over the duration [s] along a plain ramp [s], relative to steady ones."""
-        table, contacts, t = self._table, question.contacts, len(question.targets)
-        tips = table.read_fingertips(contacts)
+        table, part = self._table, _Part.of(duration)
+        tips = table.read_fingertips(question.contacts)
         k, p, r = tips.fine.shape
-        loads = fingertip_loads(table.fingertip, contacts, question.loads)
-        centres = tips.fine[: len(loads), 0].astype(float)
-        fingers = [(c, load.fingertip) for c, load in zip(centres, loads, strict=True)]
-        length = min(duration, SHAPED_FROM)  # the rest is steady
-        power, steady = np.zeros(k * p), np.zeros(k * p)
-        frequencies, bases = base_amplitudes(excitation, table.eras)
-        thresholds = detection_threshold(frequencies, table.threshold)
-        for frequency, base, threshold in zip(
-            frequencies.tolist(), bases, thresholds.tolist(), strict=True
-        ):
+        squares = np.zeros(())
+        for frequency, bases in zip(*base_amplitudes(excitation, table.eras), strict=True):
             found = ramped_accelerations(
                 self._plate,
-                base,
-                frequency,
+                bases,
+                float(frequency),
                 points=tips.fine.reshape(-1, r).astype(float),
-                fingers=fingers,
+                fingers=self._fingers(tips.fine, question),
                 ramp=ramp,
-                duration=length,
+                duration=part.duration,
+                after=part.after,
             )
-            squares = np.abs(found / threshold) ** 2
-            share = length / duration
-            power += share * squares[:-1].mean(axis=0) + (1 - share) * squares[-1]
-            steady += squares[-1]
-        levels = np.sqrt(power).reshape(k, p)
-        weights = tips.fine_weights[:t].astype(float)
-        felt = (levels[:t] * weights).sum(axis=1)
-        gains = decibels(felt / (np.sqrt(steady).reshape(k, p)[:t] * weights).sum(axis=1))
-        loudest = float(decibels(levels[t:].max())) if k > t else None
-        return PulseGains(gains.tolist(), loudest)
+            threshold = detection_threshold(frequency, table.threshold)
+            squares = squares + (found.real**2 + found.imag**2) / threshold**2
+        return pulse_gains(
+            squares.reshape(-1, k, p),
+            tips.fine_weights[: len(question.targets)].astype(float),
+            count=time_count(part.duration),
+            share=part.share,
+        )
+
+    def responses(self, rows: IntArray, *, question: Question, duration: float) -> PulseResponses:
+        """Responses over a duration [s] along the ramp of it, at rows of the table's frequencies.
+
+        At the few points of each fingertip by which drives are searched.
+        """
+        table, part = self._table, _Part.of(duration)
+        tips = table.read_fingertips(question.contacts)
+        k, p, r = tips.few.shape
+        frequencies = table.frequencies[rows]
+        values = [
+            ramped_responses(
+                self._plate,
+                frequency,
+                points=tips.few.reshape(-1, r).astype(float),
+                fingers=self._fingers(tips.few, question),
+                ramp=pulse_ramp(duration),
+                duration=part.duration,
+                after=part.after,
+            )
+            for frequency in frequencies.tolist()
+        ]
+        return PulseResponses(
+            rows,
+            np.array(values).reshape(len(rows), len(table.eras), -1, k, p),
+            detection_threshold(frequencies, table.threshold),
+            tips.few_weights[: len(question.targets)].astype(float),
+            response_count(part.duration),
+            part.share,
+        )
+
+    def _fingers(
+        self, tips: Float32Array, question: Question
+    ) -> list[tuple[FloatArray, Fingertip]]:
+        """Shapes (r,) of the plate under the fingers on it, from (k, p, r), and their loads."""
+        loads = fingertip_loads(self._table.fingertip, question.contacts, question.loads)
+        centres = tips[: len(loads), 0].astype(float)
+        return [(centre, load.fingertip) for centre, load in zip(centres, loads, strict=True)]
 
     def raised(
         self,
@@ -147,7 +174,10 @@ class EffectLevels:
                 gain, allowed = shaped_gain_db(duration), math.inf
             else:
                 gains = self.gains_db(pattern.excitation, question, ramp=ramp, duration=duration)
-                gain, allowed = min(gains.targets), _allowed_db(pattern, gains, limits)
+                gain = min(gains.targets)
+                allowed = _allowed_db(pattern, gains, level_db_sl)
+                if not limits.lowers:
+                    allowed = max(allowed, 0.0)
             wanted = min(level_db_sl - pattern.level_db_sl - gain, room)
             raise_db = min(wanted, allowed)
             min_ramp = self._largest(pattern.excitation) * 10 ** (raise_db / 20) / limits.slew
@@ -178,23 +208,29 @@ class EffectLevels:
         return float(decibels(min([*room, math.sqrt(limits.power / power)]))) - 1e-3
 
 
-def allowed_quiet_db_sl(pattern: Pattern) -> float:
-    """Level that quiet fingers may feel of a pattern as promised: its robust one, or unaware."""
-    promised = pattern.highest_quiet_level_db_sl
-    return IMPERCEPTIBLE_DB_SL if promised is None else max(promised, IMPERCEPTIBLE_DB_SL)
-
-
-def _allowed_db(pattern: Pattern, gains: PulseGains, limits: DriveLimits) -> float:
-    """By how much [dB] the quiet fingers allow to raise a pattern.
-
-    What they feel over the duration is the ringing of the modelled plate, and what other plates
-    add to the steady vibration, which lags as at the targets.
-    """
-    promised = pattern.highest_quiet_level_db_sl
-    if promised is None or gains.quiet_db_sl is None:
+def _allowed_db(pattern: Pattern, gains: PulseGains, level_db_sl: float) -> float:
+    """By how much [dB] quiet fingers allow to raise a pattern towards a level."""
+    contrast = gains.contrast_db(pattern)
+    if contrast is None:
         return math.inf
-    steady = promised + min(gains.targets)
-    felt = 10 * math.log10(10 ** (gains.quiet_db_sl / 10) + 10 ** (steady / 10))
-    if limits.quiet_db_sl is None:
-        return max(0.0, allowed_quiet_db_sl(pattern) - felt)
-    return limits.quiet_db_sl - felt
+    felt = pattern.level_db_sl + min(gains.targets) - contrast
+    return max(level_db_sl - MIN_CONTRAST_DB, IMPERCEPTIBLE_DB_SL) - felt
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Part of an effect that is followed: its duration and what is followed after it [s].
+
+    after: None where the effect goes on; share: of the part in the duration.
+    """
+
+    duration: float
+    after: float | None
+    share: float
+
+    @classmethod
+    def of(cls, duration: float) -> "_Part":
+        """Short ones to beyond their end, where a quiet finger may feel most."""
+        length = min(duration, SHAPED_FROM)  # the rest is steady
+        after = ringing_time(duration) if duration <= SHAPED_FROM else None
+        return cls(length, after, length / duration)

@@ -1,5 +1,6 @@
 """A table's plate with the fingers of a question on it."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
@@ -14,7 +15,15 @@ from model.ensemble.draws import draw
 from model.ensemble.measures import Felt, Fingertips, felt
 from model.ensemble.tone_responses import Tones, tone_responses
 from model.table.fingertip_shapes import FingertipShapes
+from model.table.pulse_gains import PulseResponses
 from model.table.question import Question
+from model.transients.onset import RINGING_TIMES, RampedRinging
+
+MAX_FINGERS_BY_POINT = 4
+"""Quiet fingers up to which the points of each are looked at one by one in a search."""
+
+MAX_VARIANCE_FINE = 0.005
+"""Variance of an ERA's gain up to which nulls are so deep that few points do not show them."""
 
 
 class FingersOnPlate:
@@ -54,12 +63,74 @@ class FingersOnPlate:
         power = contacts.power[:, :t].swapaxes(0, 1) * (gains**2)[:, None, None, None]
         quiet = contacts.power[:, t:] if background is None else self._expected(background)[:, None]
         wanted = 10 ** (self._question.level_db_sl / 20)
-        return Forms(by_target, power, np.ascontiguousarray(quiet), self._threshold, wanted)
+        found = Forms(by_target, power, np.ascontiguousarray(quiet), self._threshold, wanted)
+        is_deep = self._plate.gain_variance < MAX_VARIANCE_FINE
+        if background is not None or not is_deep or len(self._tips.few) - t > MAX_FINGERS_BY_POINT:
+            return found
+        few = contacts.fields[:, t:] * np.sqrt(self._tips.few_weights[t:, :, None])
+        return replace(found, few=few, fine=self._fine_fields(t))
+
+    def _fine_fields(self, first: int) -> Complex64Array:
+        """Fields of each ERA at the fine points of the fingers from the first on, (f, q, p, n)."""
+        contacts, plate, fine = self._contacts, self._plate, self._tips.fine[first:]
+        f, a, n = contacts.forces.shape
+        by_attachment = np.ascontiguousarray(contacts.forces.transpose(1, 0, 2)).reshape(a, -1)
+        modal = (contacts.shapes.T @ by_attachment.view(np.float32)).view(np.complex64)
+        modal = (
+            modal.reshape(-1, f, n) * (plate.receptance * plate.minus_omega2[:, None]).T[..., None]
+        )
+        rows = np.ascontiguousarray(modal).reshape(len(modal), -1).view(np.float32)
+        found = (fine.reshape(-1, fine.shape[2]) @ rows).view(np.complex64).reshape(-1, f, n)
+        return np.ascontiguousarray(found.swapaxes(0, 1)).reshape(f, *fine.shape[:2], n)
+
+    def forms_over(self, ringing: RampedRinging) -> Forms:
+        """Forms to search for a short effect, by quiet fingertip; its level is that as modelled.
+
+        A target counts by the mean of its demodulated acceleration over the duration, a quiet
+        fingertip by its power, that after the end included. Ringing is that of the plate without
+        fingers.
+        """
+        contacts, points = self._contacts, self._tips.few.reshape(-1, self._tips.few.shape[2])
+        f, k, p, n = contacts.fields.shape
+        real, imaginary = ringing.parts.reshape(2, -1, points.shape[1]) @ points.T
+        parts = (real + 1j * imaginary).reshape(f, n, -1, k, p).transpose(0, 3, 2, 4, 1)
+        over = parts + ringing.envelope[:, None, None] * contacts.fields[:, :, None]
+        return self._over(self.forms(None), contacts.fields, over, RINGING_TIMES)
+
+    def forms_during(self, responses: PulseResponses) -> Forms:
+        """Forms as `forms_over` at the rows of responses, of the plate with the fingers on it."""
+        over = responses.values[:, :, :-1].transpose(0, 3, 2, 4, 1).astype(np.complex64)
+        fields = self._contacts.fields.take(responses.rows, axis=0)
+        return self._over(self.forms(None).at(responses.rows), fields, over, responses.count)
+
+    def _over(
+        self, steady: Forms, fields: Complex64Array, over: Complex64Array, count: int
+    ) -> Forms:
+        """Forms from steady fields (f, k, p, n), and fields over an effect (f, k, times, p, n).
+
+        count: times until its end.
+        """
+        t, (f, k, _, _, n) = len(self._question.targets), over.shape
+        weights = self._tips.few_weights
+        mean = (over[:, :t, :count].mean(axis=2) * weights[:t, :, None]).sum(axis=2)
+        scale = np.sqrt(weights[t:])[:, None, :, None]
+        lasting, during = (
+            (each[:, t:] * scale / np.float32(math.sqrt(length))).reshape(f, k - t, -1, n)
+            for each, length in ((fields[:, :, None], 1), (over, count))
+        )
+        return replace(
+            steady,
+            targets=np.asarray(mean.swapaxes(0, 1) * self._gains[:, None, None]),
+            quiet=np.ascontiguousarray(steady.quiet + _gram(during) - _gram(lasting)),
+            level_margin=0.0,
+            few=None,
+            fine=None,
+        )
 
     def by_point(self, forms: Forms, frequencies: IntArray) -> Forms:
         """Forms, at rows (n,) of the plate's frequencies, with every quiet point as a fingertip."""
         quiet = self._contacts.point_power(frequencies, first=len(self._question.targets))
-        return replace(forms, quiet=quiet)
+        return replace(forms, quiet=quiet, few=None, fine=None)
 
     def respond(self, drives: Sequence[Weights]) -> "DriveResponses":
         """Responses of the fingertips to drives."""
@@ -88,6 +159,11 @@ class FingersOnPlate:
         diagonal = expected.reshape(len(expected), -1)[:, :: expected.shape[1] + 1]
         diagonal *= 1 + np.float32(self._plate.gain_variance)
         return expected
+
+
+def _gram(rows: Complex64Array) -> Complex64Array:
+    """Forms of the sum over rows (..., rows, n): (..., n, n)."""
+    return np.asarray(rows.conj().swapaxes(-1, -2) @ rows)
 
 
 @dataclass(frozen=True, eq=False)

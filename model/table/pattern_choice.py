@@ -15,20 +15,23 @@ import numpy as np
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.counting import counted
 from model.drive_modes import DRIVE_MODES, find_drives, max_sensation
+from model.drive_modes.coherent import CoherentResult
 from model.drive_modes.exact_search import search_exactly, sensation_found
 from model.drive_modes.forms import Forms, Weights
 from model.drive_modes.tones import excitation_of
-from model.ensemble.measures import percentile, percentile_of_sorted
+from model.ensemble.measures import Felt, percentile, percentile_of_sorted
 from model.errors import InputError
 from model.finger.perception import decibels
 from model.structure.actuator import Era
-from model.table.fingers_on_plate import DriveResponses, FingersOnPlate
+from model.table.fingers_on_plate import MAX_FINGERS_BY_POINT, DriveResponses, FingersOnPlate
 from model.table.pattern import ONSET_RAMP, Pattern
+from model.table.pulse_gains import OverEffect, contrast_over_effect
 from model.table.question import Question
+from model.transients.onset import RampedRinging
 
 JUDGING_DRAWS, JUDGING_SEED = 64, 1
-MAX_FINGERS_BY_POINT = 4
-"""Quiet fingers up to which drives that minimise over their points are candidates, too."""
+MAX_DURING_EFFECT = 3
+"""Drives that are rated by what is felt over a short effect, and as many at their frequencies."""
 
 PROMISED_DRAWS, PROMISED_SEED = 200, 8
 
@@ -46,6 +49,7 @@ ONSET_WEIGHT = 1 / 3
 ONSET_MARGIN_DB = 0.3
 
 _ROUNDING = 1 - 1e-5
+_NEARLY = 10 ** (-1 / 20)  # within a decibel
 
 OnsetContrast: TypeAlias = Callable[[IntArray, Complex64Array], FloatArray | None]
 """Contrast of ramped onsets (n,) for indices of frequencies (n,) and weights of ERAs (n, eras).
@@ -78,7 +82,8 @@ class Candidates:
     """What to choose from: rows (f,) of the table's frequencies [Hz] that may be played.
 
     background (rows, eras, eras): mean power of the rest of the plate, for no quiet finger;
-    threshold (rows,) [m/s²], and its name.
+    threshold (rows,) [m/s²], and its name; over_effect: gains over the duration of a short effect,
+    None for a steady vibration; ringing: of the plate over it, None where it cannot be solved.
     """
 
     eras: tuple[Era, ...]
@@ -89,6 +94,8 @@ class Candidates:
     threshold: Float32Array
     threshold_name: str
     onset_contrast: OnsetContrast
+    over_effect: OverEffect | None
+    ringing: RampedRinging | None
 
 
 def choose_pattern(question: Question, drive_mode: str, candidates: Candidates) -> Pattern:
@@ -99,13 +106,19 @@ def choose_pattern(question: Question, drive_mode: str, candidates: Candidates) 
     """
     playable = candidates.playable
     forms = candidates.fingers.forms(candidates.background)
+    is_short = candidates.over_effect is not None and bool(question.quiet)
+    if is_short and candidates.ringing is not None:
+        forms = candidates.fingers.forms_over(candidates.ringing)
     if len(playable) < forms.frequency_count:
         forms = forms.at(playable)
     if drive_mode == "switched" and question.eras_at_most != 2:
         found, gap = _search_exactly(question, forms)
     else:
         forms, found = _search(question, drive_mode, forms)
-        found, gap = found + _by_point(question, drive_mode, candidates, forms, found), None
+        if is_short:
+            found = found[:MAX_DURING_EFFECT]
+        further = _during_effect if is_short else _by_point
+        found, gap = found + further(question, drive_mode, candidates, forms, found), None
     scores = np.array([score for score, _ in found])
     drives = [each for _, each in found]
     if len(playable) < len(candidates.frequencies):
@@ -145,16 +158,44 @@ def _by_point(
         return []
     if not 1 <= len(question.quiet) <= MAX_FINGERS_BY_POINT:
         return []
-    tones = [drive.tones() for _, drive in drives]
-    rows = sorted({each[0][0] for each in tones if len(each) == 1})
-    if not rows:
+    at = _rows_of([drive for _, drive in drives if len(drive.tones()) == 1])
+    if len(at) == 0:
         return []
-    at = np.array(rows)
     by_point = candidates.fingers.by_point(forms.at(at), candidates.playable[at])
-    found = coherent.search_all(by_point)
+    return _drives_of(coherent.search_all(by_point), at)
+
+
+def _during_effect(
+    question: Question,
+    drive_mode: str,
+    candidates: Candidates,
+    forms: Forms,
+    drives: Sequence[tuple[float, Weights]],
+) -> list[tuple[float, Weights]]:
+    """Drives at the same frequencies that minimise what is felt over a short effect.
+
+    On the plate with the fingers on it, whose ringing takes too long to solve at every frequency.
+    """
+    coherent = DRIVE_MODES[drive_mode].coherent
+    if coherent is None or candidates.over_effect is None:
+        return []
+    at = _rows_of([drive for _, drive in drives])
+    responses = candidates.over_effect.responses(candidates.playable[at])
+    return _drives_of(coherent.search_all(candidates.fingers.forms_during(responses)), at)
+
+
+def _rows_of(drives: Sequence[Weights]) -> IntArray:
+    """Frequencies of drives, by index, ascending."""
+    return np.array(sorted({row for drive in drives for row, _ in drive.tones()}), dtype=int)
+
+
+def _drives_of(found: CoherentResult, rows: IntArray) -> list[tuple[float, Weights]]:
+    """The drives at rows (n,) of frequencies that reach the level, with their scores."""
     return [
         (score, Weights.at(row, weights))
-        for row, score, weights in zip(rows, found.score.tolist(), found.weights, strict=True)
+        for row, score, weights in zip(
+            rows.tolist(), found.score.tolist(), found.weights, strict=True
+        )
         if score > 0
     ]
 
@@ -198,6 +239,8 @@ def _judged(
     if len(drives) == 1:
         return 0
     judged = responses.drawn(count=JUDGING_DRAWS, seed=JUDGING_SEED)
+    if candidates.over_effect is not None:
+        return _judged_over_effect(question, drives, scores, judged, candidates.over_effect)
     least = percentile(judged.level[:, 1:])
     reaches = least >= 10 ** (question.level_db_sl / 20) * _ROUNDING
     if not reaches.any():
@@ -219,6 +262,30 @@ def _judged(
         if contrast is not None:
             best = near[int((robust[near] * contrast**ONSET_WEIGHT).argmax())]
     return best
+
+
+def _judged_over_effect(
+    question: Question,
+    drives: Sequence[Weights],
+    scores: FloatArray,
+    judged: Felt,
+    over_effect: OverEffect,
+) -> int:
+    """Index of the drive of the best contrast over the duration of an effect.
+
+    Of those that reach the level over it on the plate as modelled, or come near the strongest.
+    """
+    responses = over_effect.responses(_rows_of(drives))
+    gains = [responses.gains(drive) for drive in drives]
+    lag = 10 ** (np.array([min(each.targets) for each in gains]) / 20)
+    level = judged.level[:, 0] * lag
+    near = min(10 ** (question.level_db_sl / 20) * _ROUNDING, level.max() * _NEARLY)
+    if judged.contrast is None:
+        return int(((level >= near) * scores * lag).argmax())
+    quiet = 10 ** (np.array([each.quiet_db_sl for each in gains]) / 20)
+    felt = judged.contrast.felt
+    contrast = contrast_over_effect(level / quiet, felt[:, 0], percentile(felt[:, 1:]))
+    return int(((level >= near) * contrast).argmax())
 
 
 def _level_error(question: Question, drive_mode: str, reachable: float) -> UnreachableLevel:

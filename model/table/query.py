@@ -15,6 +15,7 @@ from model.table.concentration import with_concentration
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.table import LocalizationTable
+from model.table.thorough_query import query_thoroughly
 from model.table.timing import Timing
 from model.transients.envelope import Envelopes
 
@@ -69,15 +70,20 @@ def question_from_json(line: str, defaults: Mapping[str, Any] = MappingProxyType
 
 
 def query_table(
-    table: LocalizationTable, question: Question, timing: Timing, *, measures: bool = True
+    table: LocalizationTable,
+    question: Question,
+    timing: Timing,
+    *,
+    measures: bool = True,
+    thorough: bool = False,
 ) -> tuple[Pattern, float]:
     """Query a table; also return the time [s] that the pattern took without its measures.
 
     The pattern has envelopes if the question wants them; measures: compute those in time and over
-    the whole plate.
+    the whole plate; thorough: as `query_thoroughly`.
     """
     started = time.perf_counter()
-    pattern = table.query(question)
+    pattern = query_thoroughly(table, question) if thorough else table.query(question)
     if question.envelopes:
         pattern = timing.with_envelopes(question, pattern)
     elapsed = time.perf_counter() - started
@@ -87,9 +93,11 @@ def query_table(
     return with_concentration(table, question, pattern), elapsed
 
 
-def query_as_json(table: LocalizationTable, question: Question, timing: Timing) -> dict[str, Any]:
+def query_as_json(
+    table: LocalizationTable, question: Question, timing: Timing, *, thorough: bool = False
+) -> dict[str, Any]:
     """Query a table with all measures and return the JSON object of `era table query`."""
-    pattern, elapsed = query_table(table, question, timing)
+    pattern, elapsed = query_table(table, question, timing, thorough=thorough)
     concentration = pattern.concentration
     return {
         "drive": table.drive_of(pattern.excitation),
@@ -153,6 +161,8 @@ def query_batch(
     table: LocalizationTable,
     lines: Iterable[str],
     defaults: Mapping[str, Any] = MappingProxyType({}),
+    *,
+    thorough: bool = False,
 ) -> Iterator[dict[str, Any]]:
     """Answer every line that is not empty; `{"error": ..., "line": n}` for one without answer.
 
@@ -164,6 +174,7 @@ def query_batch(
         if not line.strip():
             continue
         try:
-            yield query_as_json(table, question_from_json(line, defaults), timing)
+            question = question_from_json(line, defaults)
+            yield query_as_json(table, question, timing, thorough=thorough)
         except InputError as error:
             yield {"error": str(error), "line": number}

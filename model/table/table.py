@@ -38,9 +38,10 @@ from model.table.fingers_on_plate import FingersOnPlate
 from model.table.fingertip_shapes import FingertipReader, FingertipShapes
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.pattern_choice import Candidates, OnsetContrast, choose_pattern
+from model.table.pulse_gains import OverEffect
 from model.table.question import MIN_LEVEL_DB_SL, Point, Question
 from model.table.raster import Raster, ReducedOnRaster
-from model.transients.onset import RampedOnsets
+from model.transients.onset import RampedOnsets, RampedRinging, ramped_ringing
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes
@@ -51,6 +52,9 @@ DEFAULT_FREQUENCIES = np.arange(40.0, 501.0, 10.0)
 
 Steps of 2 Hz would promise 0.1 to 0.2 dB more and take twice as long (docs/decisions, 0037).
 """
+
+EFFECT_DURATIONS = (0.02, 0.04, 0.08, 0.16)
+"""Durations [s] of short effects for which the plate's ringing is kept; the nearest is taken."""
 
 PAPER_GRID = Grid(12, 9)
 
@@ -115,14 +119,15 @@ class LocalizationTable:
         """Number of `switched` patterns of one or two ERAs."""
         return pattern_count(len(self.eras), len(self.frequencies), eras_at_most=2)
 
-    def query(self, question: Question) -> Pattern:
+    def query(self, question: Question, over_effect: OverEffect | None = None) -> Pattern:
         """Find the best pattern in a drive mode among those that reach a level at the targets.
 
         Of the highest felt contrast that nine of ten plates within the rig's uncertainty give, the
         fingers' load on the plate; with no quiet finger contrast is to the plate beyond 50 mm, root
         mean square. The pattern is turned down to the level, which nine of ten plates reach where
-        possible. Raises InputError for contacts off the plate and for a level that cannot be
-        reached.
+        possible. over_effect: gains of drives over the duration of a short effect, which then
+        decide with the steady measures; None where the steady vibration counts. Raises InputError
+        for contacts off the plate and for a level that cannot be reached.
         """
         question.check_on(self.plate)
         drive_mode = question.drive_mode_on(self.drive_mode, era_count=len(self.eras))
@@ -144,6 +149,8 @@ class LocalizationTable:
             threshold=self._threshold,
             threshold_name=self.threshold,
             onset_contrast=self._onset_contrast(question, tips),
+            over_effect=over_effect,
+            ringing=self._ringing(over_effect.duration) if over_effect else None,
         )
         return choose_pattern(question, drive_mode, candidates)
 
@@ -156,6 +163,8 @@ class LocalizationTable:
             )
         if (drive_mode or self.drive_mode) != "switched":
             _ = self.onsets  # used only where several patterns are near the best
+            for duration in EFFECT_DURATIONS:
+                self._ringing(duration)
 
     def forms(self, question: Question) -> Forms:
         """Expected powers at the fingertips of a question, at all frequencies of the table."""
@@ -274,6 +283,22 @@ class LocalizationTable:
             return RampedOnsets(self.in_time, self.frequencies, ramp=ONSET_RAMP)
         except InputError:
             return None
+
+    def _ringing(self, duration: float) -> RampedRinging | None:
+        """Ringing over an effect of about a duration [s]; None where too few ERAs support it."""
+        nearest = min(EFFECT_DURATIONS, key=lambda each: abs(math.log(each / duration)))
+        if nearest not in self._ringings:
+            try:
+                self._ringings[nearest] = ramped_ringing(
+                    self.in_time, self.frequencies, ramp=nearest / 4, duration=nearest
+                )
+            except InputError:
+                self._ringings[nearest] = None
+        return self._ringings[nearest]
+
+    @cached_property
+    def _ringings(self) -> dict[float, RampedRinging | None]:
+        return {}
 
     @cached_property
     def _threshold(self) -> NDArray[np.float32]:

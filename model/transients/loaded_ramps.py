@@ -23,7 +23,7 @@ from model.structure.fingertip import Fingertip
 from model.transients.time_response import PlateInTime
 
 _STEP = 0.001  # s; between the times of a response, which is demodulated
-_MAX_TIMES = 64
+_MAX_TIMES = 48
 _DAMPING = 5.0  # of sigma by the period; what is left after it comes back as exp(-5)
 _PERIODS = 2.0  # period of the transform, in durations
 _LINES = 8.0  # the band of the transform to each side, by the reciprocal of the ramp
@@ -32,15 +32,27 @@ _MIN_BAND = 200.0  # Hz
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """Line of the transform and what it needs of a ramp, for times (n,).
+    """Line of the transform and what it needs of a drive, for times (n,).
 
-    p: (m,) [1/s]; ramp: (m,) its transform [s]; inverse: (n, m); rise: (n,) the ramp itself.
+    p: (m,) [1/s]; transform: (m,) [s] of its envelope; inverse: (n, m); envelope: (n,).
     """
 
     p: ComplexArray
-    ramp: ComplexArray
+    transform: ComplexArray
     inverse: ComplexArray
-    rise: FloatArray
+    envelope: FloatArray
+
+    def in_time(self, accelerations: ComplexArray) -> ComplexArray:
+        """Accelerations (d, n + 1, p) in time from those on the line, (d, m + 1, p).
+
+        The last is the steady one, of both.
+        """
+        steady = accelerations[:, -1:]
+        transient = (accelerations[:, :-1] - steady) * self.transform[:, None]
+        d, m, p = transient.shape
+        found = (self.inverse @ transient.swapaxes(0, 1).reshape(m, d * p)).reshape(-1, d, p)
+        lasting = self.envelope[:, None] * steady
+        return np.concatenate([found.swapaxes(0, 1) + lasting, steady], axis=1)
 
 
 def ramped_accelerations(
@@ -52,66 +64,121 @@ def ramped_accelerations(
     fingers: Sequence[tuple[FloatArray, Fingertip]],
     ramp: float,
     duration: float,
+    after: float | None,
 ) -> ComplexArray:
     """Demodulated accelerations (n + 1, p) [m/s²] along a raised cosine [s]; the last is steady.
 
-    plate: without fingers; bases (eras,): motions [m] at a frequency [Hz]; points (p, r): shapes;
-    fingers: shape (r,) under each and its load. At n times evenly over the duration [s].
+    After the duration [s] the drive fades in the same way, and is followed for a time [s]; not with
+    None. plate: without fingers; bases (eras,): motions [m] at a frequency [Hz]; points (p, r):
+    shapes; fingers: shape (r,) under each and its load. At n times at even distances, of which
+    `time_count` are within the duration.
     """
-    line = _line(ramp, duration)
-    omega = 2 * math.pi * frequency
-    s = 1j * omega + np.append(line.p, 0.0)
-    stiffness, damping, gains = (
-        np.array(each)
-        for each in zip(
-            *((era.stiffness, era.damping, era.gain(np.array(frequency))) for era in plate.eras),
-            strict=True,
-        )
-    )
-    driven = plate.participation @ np.column_stack(
-        [stiffness * gains * bases, damping * gains * bases]
-    )
-    modal = 1 / (s[:, None] - plate.eigenvalues)
-    states = modal * (driven[:, 0] + s[:, None] * driven[:, 1])  # (m, 2 r)
-    if fingers:
-        states -= modal * _held(plate, modal, states, fingers, s)
-    accelerations = states @ (points @ plate.displacement).T * (s**2)[:, None]
-    transient = (accelerations[:-1] - accelerations[-1]) * line.ramp[:, None]
-    found = line.inverse @ transient + line.rise[:, None] * accelerations[-1]
-    return np.asarray(np.vstack([found, accelerations[-1:]]))
+    line = _line(ramp, duration, after, _LINES, time_count(duration))
+    s = 2j * math.pi * frequency + np.append(line.p, 0.0)
+    springs, dampers = (each * bases for each in _by_motion(plate, frequency))
+    driven = np.array([springs, dampers]) @ plate.participation.T
+    factors = np.stack([np.ones_like(s), s], axis=1)
+    found = _held_by(plate, s, driven, factors, np.ones((2, 1)), points, fingers)
+    return np.asarray(line.in_time(found)[0])
 
 
-def _held(
+def ramped_responses(
     plate: PlateInTime,
-    modal: ComplexArray,
-    states: ComplexArray,
+    frequency: float,
+    *,
+    points: FloatArray,
     fingers: Sequence[tuple[FloatArray, Fingertip]],
-    s: ComplexArray,
+    ramp: float,
+    duration: float,
+    after: float | None,
 ) -> ComplexArray:
-    """Forces of fingers on the modes (m, 2 r), of states (m, 2 r) without them."""
-    shapes = np.array([shape for shape, _ in fingers])
-    at_fingers = shapes @ plate.displacement  # (k, 2 r)
-    forces = plate.forced @ shapes.T  # (2 r, k)
-    k = len(fingers)
-    products = (at_fingers[:, None] * forces.T).reshape(k * k, -1)
-    receptance = (modal @ products.T).reshape(len(s), k, k)
-    stiffness = np.column_stack([tip.dynamic_stiffness(-1j * s) for _, tip in fingers])
-    system = receptance * stiffness[:, None] + np.eye(k)
-    moved = np.linalg.solve(system, (states @ at_fingers.T)[:, :, None])[:, :, 0]
-    return np.asarray((stiffness * moved) @ forces.T)
+    """As `ramped_accelerations` of each ERA alone at full stroke: (eras, n + 1, p).
+
+    With half of the lines and of the times, and in single precision: to choose by.
+    """
+    line = _line(ramp, duration, after, _LINES / 2, response_count(duration))
+    s = 2j * math.pi * frequency + np.append(line.p, 0.0)
+    springs, dampers = _by_motion(plate, frequency)
+    strokes = np.array([era.stroke for era in plate.eras])
+    factors = (springs + s[:, None] * dampers) * strokes
+    driven = plate.participation.T
+    found = _held_by(plate, s, driven, factors, np.eye(len(strokes)), points, fingers)
+    return line.in_time(found)
+
+
+def _by_motion(plate: PlateInTime, frequency: float) -> tuple[ComplexArray, ComplexArray]:
+    """Force of each ERA by its motion [N/m] and by its velocity [N s/m], (eras,) each."""
+    gains = np.array([era.gain(np.array(frequency)) for era in plate.eras])
+    springs, dampers = (
+        gains * [getattr(era, key) for era in plate.eras] for key in ("stiffness", "damping")
+    )
+    return springs, dampers
+
+
+def _held_by(
+    plate: PlateInTime,
+    s: ComplexArray,
+    driven: ComplexArray,
+    factors: ComplexArray,
+    sums: FloatArray,
+    points: FloatArray,
+    fingers: Sequence[tuple[FloatArray, Fingertip]],
+) -> ComplexArray:
+    """Accelerations (d, m, p) at complex frequencies s (m,), held by fingers.
+
+    driven (c, 2 r), factors (m, c): what drives the modes, and how strongly at each; sums (c, d):
+    of it in each drive.
+    """
+    single, p, c, k = np.complex64, len(points), len(driven), len(fingers)
+    shapes = np.vstack([points, *(shape for shape, _ in fingers)])
+    at = (shapes @ plate.displacement).astype(single)  # (p + k, 2 r)
+    forced = (shapes[p:] @ plate.forced.T).astype(single)  # (k, 2 r)
+    modal = (1 / (s[:, None] - plate.eigenvalues)).astype(single)
+    sources = np.concatenate([driven.astype(single), forced])
+    moved = modal @ (sources[:, None] * at).reshape(-1, at.shape[1]).T
+    moved = moved.reshape(len(s), c + k, p + k).astype(complex)
+    by_drive = sums.T @ (moved[:, :c] * factors[:, :, None])  # (m, d, p + k)
+    found = by_drive[:, :, :p]
+    if fingers:
+        stiffness = np.column_stack([tip.dynamic_stiffness(-1j * s) for _, tip in fingers])
+        receptance = moved[:, c:, p:].swapaxes(1, 2)
+        system = receptance * stiffness[:, None] + np.eye(k)
+        free = np.linalg.solve(system, by_drive[:, :, p:].swapaxes(1, 2))
+        forces = (stiffness[:, :, None] * free).swapaxes(1, 2)  # (m, d, k)
+        found = found - forces @ moved[:, c:, :p]
+    return np.asarray((found * (s**2)[:, None, None]).swapaxes(0, 1))
+
+
+def time_count(duration: float) -> int:
+    """Number of times within a duration [s]."""
+    return min(_MAX_TIMES, max(1, math.ceil(duration / _STEP)))
+
+
+def response_count(duration: float) -> int:
+    """Number of times of `ramped_responses` within a duration [s]."""
+    return (time_count(duration) + 1) // 2
 
 
 @lru_cache(maxsize=32)
-def _line(ramp: float, duration: float) -> _Line:
-    count = min(_MAX_TIMES, max(1, math.ceil(duration / _STEP)))
-    times = duration * (np.arange(count) + 0.5) / count
-    period = _PERIODS * duration
-    half = math.ceil(period * max(_LINES / ramp, _MIN_BAND))
+def _line(ramp: float, duration: float, after: float | None, lines: float, within: int) -> _Line:
+    spacing = duration / within
+    count = within + math.ceil((after or 0.0) / spacing)
+    times = np.asarray(spacing * (np.arange(count) + 0.5), dtype=float)
+    period = _PERIODS * count * spacing
+    half = math.ceil(period * max(lines / ramp, _MIN_BAND))
     step = 2 * math.pi / period
     p = _DAMPING / period + 1j * step * (np.arange(2 * half) - half + 0.5)
     side = math.pi / ramp
     late = np.exp(-p * ramp)
-    rise = np.where(times < ramp, (1 - np.cos(side * times)) / 2, 1.0)
     transform = ((1 + late) / p - p * (1 + late) / (p**2 + side**2)) / 2
+    drive = _rise(times, ramp)
+    if after is not None:
+        transform *= 1 - np.exp(-p * duration)
+        drive -= _rise(np.asarray(times - duration), ramp)
     inverse = np.exp(np.outer(times, p)) * (step / (2 * math.pi))
-    return _Line(p.astype(complex), transform.astype(complex), inverse, rise)
+    return _Line(p.astype(complex), transform.astype(complex), inverse.astype(complex), drive)
+
+
+def _rise(times: FloatArray, ramp: float) -> FloatArray:
+    """A raised cosine from 0 to 1 over a ramp [s] at times [s]."""
+    return (1 - np.cos(math.pi * np.clip(times / ramp, 0.0, 1.0))) / 2

@@ -7,18 +7,25 @@ milliseconds apart: within some tenths of a decibel of `model.transients.measure
 sample, at a hundredth of the work.
 """
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import ComplexArray, FloatArray, IntArray
+from model.arrays import ComplexArray, Float32Array, FloatArray, IntArray
 from model.finger.contrast import contrast_ratio
 from model.transients.measures import ONSET_WINDOW
 from model.transients.time_response import PlateInTime
 
 TIME_COUNT = 12
 """Times at which an onset is evaluated; uneven, so that they do not all miss a beat."""
+
+RINGING_TIMES = 6
+"""Times at which a short effect is evaluated; those of the ringing after it are as close."""
+
+MIN_RINGING_TIME = 0.02  # s
 
 BATCH = 32  # frequencies solved together: some ten megabytes
 
@@ -32,7 +39,7 @@ class RampedOnsets:
         times = ONSET_WINDOW - (ONSET_WINDOW - ramp / 2) * np.linspace(1, 0, TIME_COUNT) ** 1.2
         self._eras = len(plate.eras)
         batches = np.split(2 * np.pi * frequencies, range(BATCH, len(frequencies), BATCH))
-        parts = [ramp_responses(plate, omega, times, ramp) for omega in batches]
+        parts = [ramp_responses(plate, omega, times, ramp)[0] for omega in batches]
         self._parts = np.concatenate(parts, dtype=np.complex64, casting="same_kind")
 
     def contrast(
@@ -59,13 +66,51 @@ class RampedOnsets:
         return contrast_ratio(at_targets, at_quiet).astype(float)
 
 
+@dataclass(frozen=True, eq=False)
+class RampedRinging:
+    """What a plate adds to a short drive at full stroke, at n times during and after it.
+
+    envelope: (n,) of the drive; parts: (2, f, eras, n, r) real and imaginary part of the
+    acceleration of the reduced coordinates beyond that of a slow drive.
+    """
+
+    envelope: Float32Array
+    parts: Float32Array
+
+
+def ringing_time(duration: float) -> float:
+    """Time [s] after a short effect over which what quiet fingers feel is followed."""
+    return max(duration / 2, MIN_RINGING_TIME)
+
+
+def ramped_ringing(
+    plate: PlateInTime, frequencies: FloatArray, *, ramp: float, duration: float
+) -> RampedRinging:
+    """Solve ringing at each of the frequencies (f,) [Hz]; ramp, duration [s]."""
+    spacing = duration / RINGING_TIMES
+    n, end = RINGING_TIMES + math.ceil(ringing_time(duration) / spacing), RINGING_TIMES
+    times = spacing * (np.arange(n) + 0.5)
+    every = np.append(times, times[end:] - duration)
+    rise = np.where(every < ramp, (1 - np.cos(np.pi / ramp * every)) / 2, 1.0)
+    envelope = rise[:n].copy()
+    envelope[end:] -= rise[n:]
+    found = []
+    for omega in np.split(2 * np.pi * frequencies, range(BATCH, len(frequencies), BATCH)):
+        responses, steady = ramp_responses(plate, omega, every, ramp)
+        ringing = responses[:, :, :n] - envelope[:, None] * steady[:, :, None]
+        ringing[:, :, end:] -= responses[:, :, n:]
+        found.append(np.array([ringing.real, ringing.imag], dtype=np.float32))
+    return RampedRinging(envelope.astype(np.float32), np.concatenate(found, axis=1))
+
+
 def ramp_responses(
     plate: PlateInTime, omega: FloatArray, times: FloatArray, ramp: float
-) -> ComplexArray:
+) -> tuple[ComplexArray, ComplexArray]:
     """Acceleration of the reduced coordinates to each ERA's ramp alone, (f, eras, n, r).
 
-    Demodulated: without the factor exp(i omega t). Before the ramp is over the base moves as the
-    sum of three exponentials, see `model.transients.base_motion.fade`.
+    And the steady one, (f, eras, r). Demodulated: without the factor exp(i omega t). Before the
+    ramp is over the base moves as the sum of three exponentials, see
+    `model.transients.base_motion.fade`.
     """
     f, eras = len(omega), len(plate.eras)
     side = np.pi / ramp
@@ -90,4 +135,4 @@ def ramp_responses(
     later = np.exp((times[~rising, None] - ramp) * rates[:, None, :])[:, None]
     free = start[:, :, None] * decay
     free[:, :, ~rising] += end[:, :, None] * later
-    return np.asarray(forced + free @ plate.acceleration.T)
+    return np.asarray(forced + free @ plate.acceleration.T), accelerations[:, :, 0]

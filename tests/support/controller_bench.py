@@ -145,7 +145,7 @@ class Table:
         """Remember it."""
         self.prepared.append(drive_mode)
 
-    def query(self, question: Question) -> Pattern:
+    def query(self, question: Question, over_effect: object = None) -> Pattern:
         """The same for every target."""
         self.asked.append(question)
         if isinstance(self.excitation, Exception):

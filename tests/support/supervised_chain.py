@@ -41,7 +41,7 @@ class Changing(OneTable):
     weak = 0.005
     asked = 0
 
-    def query(self, question: Question) -> Pattern:
+    def query(self, question: Question, over_effect: object = None) -> Pattern:
         """Answer at 110, 111 or 112 Hz."""
         frequency = 110.0 + self.asked % 3
         self.asked += 1

@@ -66,7 +66,7 @@ class OneTable:
     def prepare(self, drive_mode: str) -> None:
         """Nothing to prepare."""
 
-    def query(self, question: Question) -> Pattern:
+    def query(self, question: Question, over_effect: object = None) -> Pattern:
         """Select the pattern by the number of fingers."""
         excitation = self.shared if question.quiet else self.alone
         contrast = 12.0 if question.quiet else None

@@ -44,7 +44,7 @@ class Table:
     def prepare(self, mode: str) -> None:
         """Do nothing."""
 
-    def query(self, question: Question) -> Pattern:
+    def query(self, question: Question, over_effect: object = None) -> Pattern:
         """A pattern that names its question."""
         self.asked.append(question)
         if self.error is not None:

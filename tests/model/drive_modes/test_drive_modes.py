@@ -12,6 +12,8 @@ from drives import by_hand
 from model.drive_modes import DRIVE_MODES, find_drives, max_sensation, playable_drive_modes
 from model.drive_modes import switched as switched_mode
 from model.drive_modes.forms import SILENT, Forms, Weights
+from model.finger.fingertip import fingertip_points
+from model.rig.uncertainty import Uncertainty
 from model.table.question import Question
 from paper_table import contact_sets, smooth_table
 from random_forms import random_forms
@@ -24,6 +26,24 @@ def forms_on_plate(places, *, targets=1, level=12.0):
     return smooth_table().forms(
         Question(tuple(places[:targets]), tuple(places[targets:]), level_db_sl=level)
     )
+
+
+def test_the_loudest_point_of_a_quiet_fingertip_counts_as_modelled():
+    """Of a rig that is known exactly, in place of the mean of a few points."""
+    (places,) = contact_sets(1, fingers=3, seed=8)
+    known = replace(smooth_table(), uncertainty=Uncertainty.none())
+    given = known.forms(Question((places[0],), tuple(places[1:])))
+    rng = np.random.default_rng(0)
+    weights = (rng.standard_normal((27, 4)) + 1j * rng.standard_normal((27, 4))).astype("c8")
+    power = given.quiet_power(weights)
+    for frequency, finger in ((3, 0), (20, 1)):
+        w = weights[frequency]
+        expected = (w.conj() @ given.quiet[frequency, finger] @ w).real
+        points = fingertip_points(*places[1 + finger], smooth_table().plate)
+        fields = smooth_table().unit_fields(points, contacts=places)[frequency]
+        loudest = (np.abs(w @ fields) ** 2).max()
+        few = (np.abs(given.few[frequency, finger] @ w) ** 2).sum()
+        assert power[frequency, finger] == pytest.approx(expected + loudest - few, rel=2e-3)
 
 
 def found_alone(mode, given):
@@ -169,7 +189,7 @@ def test_find_drives_returns_the_best_first(mode):
     for places in contact_sets(4, fingers=3, seed=11):
         given = forms_on_plate(places)
         found = find_drives(given, mode)
-        assert len(found) == 4
+        assert len(found) >= 4
         scores = [score for score, _ in found]
         assert scores == sorted(scores, reverse=True)
         for score, drive in found:

@@ -208,7 +208,12 @@ def _relay(
             await ended.wait()
 
     asyncio.run(run())
-    return checker.finish(time.monotonic())
+    found = checker.finish(time.monotonic())
+    if not checker.frames:
+        raise InputError(
+            "no frame passed, nothing was checked; use the relay URLs in place of the amplifiers'"
+        )
+    return found
 
 
 def _print(found: list["Violation"], checker: "Witness", *, as_json: bool) -> None:

@@ -21,6 +21,7 @@ from sim.witness.endpoint import WireEndpoint
 from sim.witness.witness import Witness
 
 _READ_MAX = 4096
+_WAKE_INTERVAL = 0.005  # s; a longer delay of this program is told to the witness
 
 _logger = logging.getLogger(__name__)
 
@@ -36,18 +37,51 @@ async def relays(
     Endpoints of one wire share a relay. Raises LinkError where a wire cannot be opened.
     """
     relayed: dict[str, str] = {}
+    observer = _Observer(witness)
     async with contextlib.AsyncExitStack() as stack:
         for endpoint, name in zip(endpoints, names, strict=True):
             if endpoint.location not in relayed:
                 relay = _serial_relay if endpoint.is_device else _tcp_relay
                 relayed[endpoint.location] = await stack.enter_async_context(
-                    relay(endpoint, name, witness)
+                    relay(endpoint, name, observer)
                 )
-        yield [endpoint.url_via(relayed[endpoint.location]) for endpoint in endpoints]
+        watching = asyncio.create_task(observer.watch())
+        try:
+            yield [endpoint.url_via(relayed[endpoint.location]) for endpoint in endpoints]
+        finally:
+            watching.cancel()
+
+
+class _Observer:
+    """Passes what is on the wires to a witness, and the delays of this program before it."""
+
+    def __init__(self, witness: Witness) -> None:
+        self.witness = witness
+        self._due = time.monotonic()
+
+    def record(self, wire: str, direction: Direction, at: float, data: bytes) -> None:
+        """Pass on bytes that were read or written at a time [s]."""
+        self._check()
+        self.witness.record_bytes(wire, direction, at, data)
+
+    async def watch(self) -> None:
+        """Measure how late this program wakes up, until cancelled."""
+        while True:
+            self._due = time.monotonic() + _WAKE_INTERVAL
+            await asyncio.sleep(_WAKE_INTERVAL)
+            self._check()
+
+    def _check(self) -> None:
+        now = time.monotonic()
+        if (late := now - self._due) > _WAKE_INTERVAL:
+            self.witness.delayed(now, late)
+            self._due = now
 
 
 @asynccontextmanager
-async def _serial_relay(endpoint: WireEndpoint, name: str, witness: Witness) -> AsyncIterator[str]:
+async def _serial_relay(
+    endpoint: WireEndpoint, name: str, observer: _Observer
+) -> AsyncIterator[str]:
     """Relay a serial port through a pseudo-terminal."""
     try:
         port = serial.Serial(endpoint.location, baudrate=endpoint.baud, timeout=0, exclusive=True)
@@ -61,9 +95,10 @@ async def _serial_relay(endpoint: WireEndpoint, name: str, witness: Witness) -> 
     loop = asyncio.get_running_loop()
 
     def to_amplifier(data: bytes) -> None:
+        before = time.monotonic()  # it arrives afterwards, however long this program is delayed
         with contextlib.suppress(OSError):
             port.write(data)
-        witness.record_bytes(name, "amplifier", time.monotonic(), data)
+        observer.record(name, "amplifier", before, data)
 
     terminal = PseudoTerminal(to_amplifier)
 
@@ -76,10 +111,11 @@ async def _serial_relay(endpoint: WireEndpoint, name: str, witness: Witness) -> 
             data = b""
         if not data:
             loop.remove_reader(port.fileno())
-            witness.closed(name, time.monotonic())
+            observer.witness.closed(name, time.monotonic())
             return
+        at = time.monotonic()
         terminal.write(data)
-        witness.record_bytes(name, "host", time.monotonic(), data)
+        observer.record(name, "host", at, data)
 
     with contextlib.closing(port), contextlib.closing(terminal):
         loop.add_reader(port.fileno(), to_host)
@@ -91,7 +127,7 @@ async def _serial_relay(endpoint: WireEndpoint, name: str, witness: Witness) -> 
 
 
 @asynccontextmanager
-async def _tcp_relay(endpoint: WireEndpoint, name: str, witness: Witness) -> AsyncIterator[str]:
+async def _tcp_relay(endpoint: WireEndpoint, name: str, observer: _Observer) -> AsyncIterator[str]:
     """Relay a server through a port of the loopback interface."""
     loop = asyncio.get_running_loop()
     host, _, number = endpoint.location.rpartition(":")
@@ -100,15 +136,15 @@ async def _tcp_relay(endpoint: WireEndpoint, name: str, witness: Witness) -> Asy
 
     def opened(connection: "_RelayedConnection") -> None:
         open_now.add(connection)
-        witness.opened(name, time.monotonic())
+        observer.witness.opened(name, time.monotonic())
 
     def closed(connection: "_RelayedConnection") -> None:
         open_now.discard(connection)
         if not open_now:
-            witness.closed(name, time.monotonic())
+            observer.witness.closed(name, time.monotonic())
 
-    def on_data(direction: Direction, data: bytes) -> None:
-        witness.record_bytes(name, direction, time.monotonic(), data)
+    def on_data(direction: Direction, at: float, data: bytes) -> None:
+        observer.record(name, direction, at, data)
 
     async def open_back(front: "_RelayedConnection") -> None:
         try:
@@ -152,7 +188,7 @@ class _RelayedConnection(asyncio.Protocol):
     def __init__(
         self,
         direction: Direction,
-        on_data: Callable[[Direction, bytes], None],
+        on_data: Callable[[Direction, float, bytes], None],
         opened: Callable[["_RelayedConnection"], None],
         closed: Callable[["_RelayedConnection"], None],
     ) -> None:
@@ -184,8 +220,9 @@ class _RelayedConnection(asyncio.Protocol):
         if self._other is None or self._other._transport is None:
             self._early += data
             return
+        before = time.monotonic()
         self._other._transport.write(data)
-        self._on_data(self._direction, data)
+        self._on_data(self._direction, before, data)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Close the other one, too."""

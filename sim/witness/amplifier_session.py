@@ -37,6 +37,7 @@ class AmplifierSession:
     last_silenced: float = -math.inf  # when a silencing request was sent
     staged: dict[int, Request] = field(default_factory=dict)
     last_set: Request | None = None  # since Arm
+    active_set: Request | None = None  # applied or committed last, since Arm
     committed_tokens: deque[int] = field(default_factory=lambda: deque(maxlen=_TOKENS_KEPT))
     levels: dict[int, ChannelCommand] = field(default_factory=dict)
     is_identified: bool | None = None

@@ -7,6 +7,7 @@ from functools import partial
 
 from sim.witness.amplifier_session import AmplifierSession
 from sim.witness.config import TimeLimits
+from sim.witness.delays import Delays
 
 
 @dataclass
@@ -62,23 +63,33 @@ class Deadlines:
     """Pending deadlines of a host; those that end while a wire is disturbed are not checked."""
 
     def __init__(
-        self, sessions: Mapping[str, AmplifierSession], inputs: KnownInputs, *, times: TimeLimits
+        self,
+        sessions: Mapping[str, AmplifierSession],
+        inputs: KnownInputs,
+        *,
+        times: TimeLimits,
+        delays: Delays,
     ) -> None:
         self._sessions = sessions
+        self._delays = delays
         self._inputs = inputs
         self._times = times
         self._pending: list[_Deadline] = []
 
     def advance(self, time: float) -> None:
         """Check the deadlines that have passed."""
-        passed = [deadline for deadline in self._pending if deadline.due < time]
+        passed = [deadline for deadline in self._pending if self._due(deadline) < time]
         if not passed:
             return
-        self._pending = [deadline for deadline in self._pending if deadline.due >= time]
+        self._pending = [one for one in self._pending if self._due(one) >= time]
         for deadline in passed:
             session = deadline.session
             if not (session.is_disturbed(deadline.due) or deadline.is_met()):
                 session.report(deadline.invariant, deadline.due, deadline.sentence)
+
+    def _due(self, deadline: _Deadline) -> float:
+        """When a condition must hold [s], later by the witness's own delays until then."""
+        return deadline.due + self._delays.since(deadline.due - self._times.touch)
 
     def expect_silence(self, last_lift: float) -> None:
         """After the last lift every amplifier must be silenced."""

@@ -17,6 +17,7 @@ from sim.witness.decoded import (
     RequestKind,
     StateEvent,
 )
+from sim.witness.delays import Delays
 from sim.witness.host_rules import HostRules
 from sim.witness.violation import Report
 from sim.witness.watched_wire import WatchedWire
@@ -28,15 +29,18 @@ _ANY_UNIT = 255  # of Modbus TCP: the only one
 class Exchanges:
     """The frames of all wires in order; host: the rules for requests."""
 
-    def __init__(self, host: HostRules, *, times: TimeLimits, report: Report) -> None:
+    def __init__(
+        self, host: HostRules, *, times: TimeLimits, delays: Delays, report: Report
+    ) -> None:
         self._host = host
+        self._delays = delays
         self._times = times
         self._report = report
 
     def check_overdue(self, session: AmplifierSession, now: float) -> None:
         """Report replies that are overdue."""
         for key, (at, request) in list(session.pending.items()):
-            due = at + self._times.reply + self._times.slack
+            due = at + self._times.reply + self._times.slack + self._delays.since(at)
             if now > due and key not in session.overdue:
                 session.overdue.add(key)
                 if request.kind in STATE_CHANGING:

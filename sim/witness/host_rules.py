@@ -9,6 +9,7 @@ from sim.witness.amplifier_session import AmplifierSession
 from sim.witness.config import TimeLimits
 from sim.witness.deadlines import Deadlines, KnownInputs
 from sim.witness.decoded import WATCHDOG_FEEDING, ChannelCommand, Request, RequestKind
+from sim.witness.delays import Delays
 from sim.witness.set_rules import ExpectedSets, check_envelope, check_set
 
 _IN_FLIGHT = 0.001  # s; from the host's write until a frame is seen
@@ -20,11 +21,14 @@ _UNORDERED = (RequestKind.READ, RequestKind.HELLO, RequestKind.CAPABILITIES)
 class HostRules:
     """The rules for hosts, over all amplifiers by name."""
 
-    def __init__(self, sessions: Mapping[str, AmplifierSession], *, times: TimeLimits) -> None:
+    def __init__(
+        self, sessions: Mapping[str, AmplifierSession], *, times: TimeLimits, delays: Delays
+    ) -> None:
         self._sessions = sessions
+        self._delays = delays
         self._times = times
         self._inputs = KnownInputs()
-        self._deadlines = Deadlines(sessions, self._inputs, times=times)
+        self._deadlines = Deadlines(sessions, self._inputs, times=times, delays=delays)
         self._expected: ExpectedSets | None = None
 
     # inputs beside the wires
@@ -93,7 +97,7 @@ class HostRules:
                     session.report(
                         "stop", time, f"{session.name} armed before its stop was cleared"
                     )
-                session.last_set = None
+                session.last_set = session.active_set = None
                 session.armed_at = time
                 session.last_feed = time
             case RequestKind.CLEAR:
@@ -181,7 +185,7 @@ class HostRules:
         is_running = self._inputs.stalled_since is None and not is_ending
         if last is None or not (session.is_open and session.amplifier.is_enabled and is_running):
             return
-        if time > last + self._times.heartbeat + self._times.slack:
+        if time > last + self._times.heartbeat + self._times.slack + self._delays.since(last):
             session.last_feed = time
             session.report("heartbeat", time, f"{session.name}: no heartbeat since {last:.4f} s")
 
@@ -224,6 +228,9 @@ class HostRules:
             case RequestKind.STAGE:
                 session.staged = {request.token: request}
             case RequestKind.APPLY | RequestKind.COMMIT:
+                is_commit = request.kind is RequestKind.COMMIT
+                staged = session.staged.get(request.token) if is_commit else request
+                session.active_set = staged or session.active_set
                 is_new = request.token != session.last_token
                 session.committed_tokens.append(request.token)
                 commands = self._channel_commands(session, request)

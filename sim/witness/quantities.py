@@ -76,7 +76,12 @@ def request_of(
     commands: Mapping[int, ChannelCommand] | None = None,
     problem: str = "",
 ) -> Request:
-    """A request from the integers of a frame; raises OutOfRange."""
+    """A request from the integers of a frame; raises OutOfRange.
+
+    The ramp of what silences is clipped into range.
+    """
+    if kind in (RequestKind.STOP, RequestKind.DISARM):
+        ramp = min(ramp, RAMP.high)
     return Request(
         kind,
         address,

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 
 from sim.witness.amplifier_session import AmplifierSession
-from sim.witness.decoded import ChannelCommand, Request
+from sim.witness.decoded import ChannelCommand, Request, RequestKind
 from sim.witness.quantities import is_newer
 
 _STEP = 0.6  # of a step of the wire; tolerance of rounding
@@ -37,6 +37,13 @@ def check_envelope(session: AmplifierSession, time: float, level: float) -> None
 
 
 def _check_token(session: AmplifierSession, time: float, request: Request) -> None:
+    active = session.active_set
+    is_repeated = active is not None and (request.token, request.commands) == (
+        active.token,
+        active.commands,
+    )
+    if is_repeated and request.kind is RequestKind.APPLY:
+        return  # its reply may have been lost, also if another set is staged meanwhile
     last, session.last_set = session.last_set, request
     if last is None or is_newer(request.token, last.token):
         return

@@ -7,6 +7,7 @@ from typing import Any, Literal
 from sim.witness.amplifier_session import AmplifierSession
 from sim.witness.config import WitnessConfig, parse_config
 from sim.witness.decoded import STATE_CHANGING, Damaged, Data, Direction, Request
+from sim.witness.delays import Delays
 from sim.witness.exchanges import Exchanges
 from sim.witness.host_rules import HostRules
 from sim.witness.reference_amplifier import ReferenceAmplifier
@@ -44,8 +45,11 @@ class Witness:
                     sessions[one.address] = self._sessions[name] = self._session(name)
             self._wires[wire] = WatchedWire(wire, kind, sessions)
         times = self._config.times_s
-        self._host = HostRules(self._sessions, times=times)
-        self._exchanges = Exchanges(self._host, times=times, report=self._report)
+        self._delays = Delays()
+        self._host = HostRules(self._sessions, times=times, delays=self._delays)
+        self._exchanges = Exchanges(
+            self._host, times=times, delays=self._delays, report=self._report
+        )
 
     def _session(self, name: str) -> AmplifierSession:
         config = self._config.amplifiers[name]
@@ -92,6 +96,13 @@ class Witness:
                 self._exchanges.sent(wire, time, raw, message)
             else:
                 self._exchanges.received(wire, time, message)
+
+    def delayed(self, until: float, duration: float) -> None:
+        """Note that this program did not run for a duration [s] until a time [s].
+
+        Deadlines of hosts and amplifiers are extended by it: what came in time was seen late.
+        """
+        self._delays.note(until, duration)
 
     def opened(self, link: str, time: float) -> None:
         """Note that a host has opened a wire: its amplifiers are not identified yet."""

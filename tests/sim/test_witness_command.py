@@ -3,8 +3,11 @@
 import asyncio
 import json
 import math
+import os
 import signal
 import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 from resource import RLIM_INFINITY, RLIMIT_FSIZE, prlimit
 
@@ -162,3 +165,17 @@ async def test_witness_relays_a_wire_until_interrupted(
         assert process.returncode == 2
         (error,) = err.decode().splitlines()
         assert "capture.txt" in error
+
+
+def test_witness_without_frames_has_checked_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A relay that nothing passed is an error, not "no rule was broken"."""
+
+    @asynccontextmanager
+    async def ended_at_once(*_: object) -> AsyncIterator[list[str]]:
+        os.kill(os.getpid(), signal.SIGTERM)
+        yield ["serial:///dev/pts/9"]
+
+    monkeypatch.setattr("sim.witness_relay.relays", ended_at_once)
+    result = CliRunner().invoke(app, ["witness", URL])
+    assert isinstance(result.exception, InputError)
+    assert "nothing was checked" in str(result.exception)

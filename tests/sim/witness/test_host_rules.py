@@ -5,6 +5,7 @@ import pytest
 from sim.witness.amplifier_session import AmplifierSession
 from sim.witness.config import AmplifierConfig, ChannelLimits, TimeLimits
 from sim.witness.decoded import ChannelCommand, Reply, Request, RequestKind, Status
+from sim.witness.delays import Delays
 from sim.witness.host_rules import HostRules
 from sim.witness.reference_amplifier import ReferenceAmplifier
 
@@ -29,7 +30,7 @@ class Watched:
     def __init__(self) -> None:
         self.broken: list[str] = []
         self.sessions = {name: self._session(name) for name in ("west", "east")}
-        self.host = HostRules(self.sessions, times=TimeLimits())
+        self.host = HostRules(self.sessions, times=TimeLimits(), delays=Delays())
         for session in self.sessions.values():
             session.amplifier.request_granted(ARM, Reply(1, ARM.key, status=ENABLED), 1.0, 1.001)
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 
 from sim.witness.config import AmplifierConfig
-from sim.witness.decoded import ChannelCommand, ReportViolation, Request
+from sim.witness.decoded import ChannelCommand, ReportViolation, Request, RequestKind
 from sim.witness.reference_amplifier import ReferenceAmplifier
 
 _TOKENS_KEPT = 16  # of commits
@@ -48,6 +48,14 @@ class AmplifierSession:
     last_feed: float | None = None
     last_token: int = 0
     preempted_at: float = -math.inf  # when a silencing request overtook pending ones
+    constants: dict[tuple[RequestKind, int], bytes] = field(default_factory=dict)
+
+    def check_constant(self, kind: RequestKind, reported: bytes, time: float) -> None:
+        """Compare an identity or capabilities with those reported before in the same length."""
+        before = self.constants.setdefault((kind, len(reported)), reported)
+        if reported != before and not self.is_disturbed(time):
+            self.report("constant", time, f"{self.name}: reply to {kind.value} has changed")
+        self.constants[kind, len(reported)] = reported
 
     def forget_pending(self) -> None:
         """Abandon the pending requests; their replies may still arrive."""

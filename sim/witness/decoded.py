@@ -129,7 +129,9 @@ class Status:
 class Reply:
     """A reply. key: of its request, None where it matches none; refusal: 0 if granted.
 
-    achieved: the set as played, by channel, and its token; is_exact: whether it plays as commanded.
+    achieved: the set as played, by channel, and its token; is_exact: whether it plays as commanded;
+    constant: what must be the same in every reply to such a request; faults: newest first, each
+    with its age [s].
     """
 
     address: int
@@ -139,6 +141,8 @@ class Reply:
     token: int = 0
     achieved: Mapping[int, ChannelCommand] | None = None
     is_exact: bool | None = None
+    constant: bytes | None = None
+    faults: tuple[tuple[int, float], ...] | None = None
     problem: str = ""
 
 

@@ -103,6 +103,7 @@ class Exchanges:
             if session.amplifier.is_enabled and not session.is_disturbed(time):
                 session.report("state", time, f"{session.name} restarted while enabled")
             session.amplifier.restarted(time)
+            session.constants.clear()
             session.vibrates = False
         elif isinstance(message, StateEvent):
             if not any(request.kind in STATE_CHANGING for _, request in session.pending.values()):
@@ -162,6 +163,10 @@ class Exchanges:
             session.report(rule, time, what)
         if request.kind is RequestKind.HELLO:
             self._host.request_granted(session, time, request)
+        if reply.constant is not None:
+            session.check_constant(request.kind, reply.constant, time)
+        if reply.faults is not None and not was_lost:
+            session.amplifier.faults_reported(reply.faults, at, time)
         if was_lost or request.problem:
             return
         if reply.refusal:

@@ -20,9 +20,11 @@ from sim.witness.decoded import (
 )
 from sim.witness.modbus_frames import Adu, RtuSplitter, Splitter, TcpSplitter
 from sim.witness.quantities import INVALID, OutOfRange, signed
+from sim.witness.reports import check_text, faults_of_words
 
 _CONTROL, _HEARTBEAT, _LOOK, _SET, _ENVELOPE = 1, 9, 12, 15, 101
 _STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS = 1001, 1033, 1351, 1065, 1141, 1221
+_TEXT_WORDS = 16
 _WORDS = {15: RequestKind.ARM, 0: RequestKind.DISARM, 2: RequestKind.STOP, 128: RequestKind.CLEAR}
 _READ_KINDS = {
     _IDENTITY: RequestKind.HELLO,
@@ -260,7 +262,24 @@ def _of_read(unit: int, pdu: bytes, request: _Open) -> Reply:
         token = q.ACTIVE_TOKEN.whole(body[2])
         commands = _channel_commands(body[4:])
         return Reply(unit, request.key, status=status, token=token, achieved=commands)
+    if request.read_from == _FAULTS:
+        return Reply(unit, request.key, faults=faults_of_words(body))
+    if constant:
+        problem = _text_problem(body) if request.read_from == _IDENTITY else ""
+        raw = struct.pack(f">{len(body)}H", *body)
+        return Reply(unit, request.key, constant=raw, problem=problem)
     return Reply(unit, request.key)
+
+
+def _text_problem(body: Sequence[int]) -> str:
+    """Describe what is wrong with the texts behind the versions of an identity; "" if nothing."""
+    for start in range(1, len(body), _TEXT_WORDS):
+        words = body[start : start + _TEXT_WORDS]
+        try:
+            check_text(struct.pack(f">{len(words)}H", *words).rstrip(b"\0"))
+        except OutOfRange as found:
+            return f"identity: {found}"
+    return ""
 
 
 def _decode_status(body: Sequence[int]) -> Status:

@@ -20,6 +20,7 @@ from sim.witness.decoded import (
 )
 from sim.witness.quantities import is_newer
 from sim.witness.reference_outputs import ReferenceOutputs
+from sim.witness.reports import Faults, Interval, fault_list_problem
 from sim.witness.watchdog import Watchdog
 
 SILENCING_RAMP = 0.005  # s; along which the watchdog and faults silence
@@ -69,6 +70,7 @@ class ReferenceAmplifier:
         self._is_reported = True  # the amplifier has reported this state
         self.is_answered = True  # in a reply
         self.last_fault = -math.inf  # when it was seen to enter a fault
+        self._fault_since: Interval | None = None  # when the present one came, if known
         self.watchdog = Watchdog(name, slack=times.slack, report=report)
         self._last_status = -math.inf  # time of its last status
         self._token: int | None = None
@@ -125,7 +127,7 @@ class ReferenceAmplifier:
             self._silence(self.watchdog.expiry, SILENCING_RAMP, "the watchdog")
             self.state, self._fault, self._is_reported = _REACTING, 1, False
             self.is_answered = False
-            self.last_fault = time
+            self.last_fault, self._fault_since = time, self.watchdog.expiry
 
     # requests
 
@@ -306,6 +308,19 @@ class ReferenceAmplifier:
         self.status_reported(status, begin, end)
         self.is_answered = was_answered
 
+    def faults_reported(self, faults: Faults, start: float, end: float) -> None:
+        """Compare a list of faults that was true at some time between two [s]."""
+        self.advance(start)
+        is_known = self.is_in_fault and self._is_reported
+        problem = fault_list_problem(
+            faults,
+            (start - self._slack, end + self._slack),
+            present=self._fault if is_known else 0,
+            since=self._fault_since,
+        )
+        if problem is not None:
+            self._report("faults", end, f"{self._name} {problem}")
+
     def _check_condition(self, reported: Status, begin: float, end: float) -> None:
         if self.state is None:
             self._adopt(reported, end)
@@ -339,6 +354,7 @@ class ReferenceAmplifier:
     def _adopt(self, reported: Status, time: float) -> None:
         """Adopt a reported status where the state is unknown."""
         self.state, self._fault, self._is_reported = reported.state, reported.fault, True
+        self._fault_since = None
         if reported.state in _SILENT:
             self._outputs.settle(NAMES[reported.state])
         else:
@@ -378,6 +394,7 @@ class ReferenceAmplifier:
             self._report(
                 "state", end, f"{self._name} is in {NAMES[reported.state]} without a fault"
             )
+        self._fault_since = since
         self._silence(since, SILENCING_RAMP, "a fault")
 
     def _rule_against(self, now: int) -> str:

@@ -22,6 +22,7 @@ from sim.witness.decoded import (
     Status,
 )
 from sim.witness.quantities import INVALID, OutOfRange
+from sim.witness.reports import check_identity, unpack_faults
 
 _KINDS = {
     1: RequestKind.HELLO,
@@ -222,7 +223,21 @@ def _decode_reply(number: int, address: int, sequence: int, payload: bytes) -> M
         )
     if kind is None:
         raise OutOfRange(f"unknown message type {number}")
-    return Reply(address, (sequence, kind))
+    if kind in (RequestKind.HELLO, RequestKind.CAPABILITIES):
+        return _decode_constant(address, (sequence, kind), payload)
+    faults = unpack_faults(payload) if kind is RequestKind.FAULTS else None
+    return Reply(address, (sequence, kind), faults=faults)
+
+
+def _decode_constant(address: int, key: tuple[int, RequestKind], payload: bytes) -> Reply:
+    """Decode an identity or capabilities."""
+    problem = ""
+    if key[1] is RequestKind.HELLO:
+        try:
+            check_identity(payload)
+        except OutOfRange as found:
+            problem = f"identity: {found}"
+    return Reply(address, key, constant=payload, problem=problem)
 
 
 def _decode_status(payload: bytes) -> Status:

@@ -111,6 +111,7 @@ class Witness:
         for session in self._wires[link].sessions.values():
             session.is_open, session.is_identified, session.vibrates = True, False, False
             session.forget_pending()
+            session.constants.clear()  # it may be another one
             session.amplifier.forget_state()
 
     def closed(self, link: str, time: float) -> None:

@@ -8,8 +8,9 @@ import functools
 import math
 import struct
 import zlib
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import count
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -32,6 +33,7 @@ from drivers.codec import payload
 from drivers.codec.can_bus import requests
 from drivers.codec.modbus import exchanges
 from drivers.codec.serial_line import frame as serial_frame
+from drivers.codec.serial_line import reports as serial_reports
 from drivers.codec.serial_line import sets as serial_sets
 from drivers.command import CommandSet, DriveCommand
 from drivers.guard import rules
@@ -43,6 +45,7 @@ from drivers.protocol.messages import (
     AmplifierState,
     Apply,
     Disarm,
+    FaultList,
     GetStatus,
     Hello,
     Identity,
@@ -399,6 +402,35 @@ def _reports(change: Callable[[Status], Status]) -> Plant:
     )
 
 
+def _lists(change: Callable[[Any], Any]) -> Plant:
+    def around(carry_out: Any, amplifier: Any, request: Any, *rest: Any) -> Any:
+        reply = carry_out(amplifier, request, *rest)
+        if isinstance(reply, FaultList):
+            return replace(reply, faults=change(reply.faults))
+        return reply
+
+    return wrapped(SimulatedAmplifier, "_carry_out", around)
+
+
+def _identifies(change: Callable[[Identity], Identity]) -> Plant:
+    def around(carry_out: Any, amplifier: Any, request: Any, *rest: Any) -> Any:
+        reply = carry_out(amplifier, request, *rest)
+        return change(reply) if isinstance(reply, Identity) else reply
+
+    return wrapped(SimulatedAmplifier, "_carry_out", around)
+
+
+def _as_another_each_time(identity: Identity, numbers: Iterator[int] = count()) -> Identity:  # noqa: B008
+    return replace(identity, firmware=f"1.{next(numbers)}")
+
+
+def _shrinks(carry_out: Any, amplifier: Any, request: Any, *rest: Any) -> Any:
+    if isinstance(request, Disarm):
+        less = replace(amplifier.capabilities, ramp_max=0.5)
+        amplifier.capabilities = less
+    return carry_out(amplifier, request, *rest)
+
+
 def _enters(wrong: AmplifierState, *, instead_of: AmplifierState) -> Plant:
     def around(
         enter: Any, amplifier: Any, state: AmplifierState, moment: float, **how: Any
@@ -569,6 +601,27 @@ FAR_ENDS: dict[str, Bug] = {
         "session",
         replaced(SimulatedAmplifier, "_is_foreign", lambda *_: False),
         scenarios.strangers_heartbeat,
+    ),
+    "its list of faults is empty": Bug(
+        "faults", _lists(lambda faults: ()), scenarios.asked, wire="serial"
+    ),
+    "it lists faults older than they are": Bug(
+        "faults",
+        _lists(lambda faults: tuple(replace(one, age=one.age + 5) for one in faults)),
+        scenarios.asked,
+        wire="modbus-tcp",
+    ),
+    "it lists faults oldest first": Bug(
+        "faults", _lists(lambda faults: faults[::-1]), scenarios.asked
+    ),
+    "its identity changes": Bug("constant", _identifies(_as_another_each_time), scenarios.asked),
+    "its capabilities change": Bug(
+        "constant", wrapped(SimulatedAmplifier, "_carry_out", _shrinks), scenarios.asked
+    ),
+    "its name is no UTF-8": Bug(
+        "answer",
+        replaced(serial_reports, "pack_text", lambda text: b"\x02\xff\xfe"),
+        scenarios.asked,
     ),
     "it forgets which set plays": Bug("token", _reports(lambda one: replace(one, token=0))),
 }

@@ -120,6 +120,21 @@ async def arc(chain: Chain) -> None:
     await chain.operate("clear", rest=0.05)
 
 
+async def asked(chain: Chain) -> None:
+    """An amplifier trips, is asked for its faults, and identifies itself again."""
+    await chain.operate("arm")
+    await chain.touch(1, rest=0.06)
+    chain.trip()
+    await chain.rest(0.02)
+    await chain.amplifier.status()
+    await chain.amplifier.faults()
+    await chain.touch()
+    await chain.operate("clear", rest=0.05)
+    await chain.amplifier.identify()
+    chain.trip()
+    await chain.amplifier.faults()
+
+
 async def noise(chain: Chain) -> None:
     """Damaged frames come to the amplifier (a stop and a ping), which must not mind them."""
     await chain.operate("arm")

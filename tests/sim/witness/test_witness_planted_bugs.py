@@ -24,7 +24,7 @@ RULES = {
     *("limits", "garbage", "enabled", "justified", "pattern", "lift", "touch", "commit", "token"),
     "session",
     *("stop", "heartbeat", "armed", "identified", "credit", "answer", "damage", "watchdog"),
-    *("latched", "state", "ramp", "plays", "silent", "high_voltage"),
+    *("latched", "state", "ramp", "plays", "silent", "high_voltage", "constant", "faults"),
 }
 """As docs/reference/witness.md lists them."""
 

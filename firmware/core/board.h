@@ -16,8 +16,8 @@ enum line { LINE_SERIAL, LINE_MODBUS, LINE_CAN };
 uint32_t board_samples_due(void);
 // Hand the next sample of every channel to the converter; 32767 is full stroke.
 void board_output(const int16_t samples[CHANNELS]);
-// Go on sending; then, unless samples are late, sleep until one is due or a byte has arrived.
-void board_wait(bool may_sleep);
+// Go on sending; then sleep until a sample is due or a byte has arrived.
+void board_wait(void);
 
 // Lines.
 

@@ -15,12 +15,10 @@ static struct modbus modbus;
 static struct rtu rtu;
 static struct can_node node;
 static struct slcan slcan;
-static uint32_t samples_due, samples_to_measuring;
+static uint32_t samples_to_measuring;
 
-// Lines are looked at after each millisecond of samples, even while some are late. Of a longer time
-// in which the processor could not make them (a program or an emulator may stand still) only this
-// passes: the watchdog watches the host, not what held up the processor.
-#define SAMPLES_AT_ONCE SAMPLES_PER_MS
+// Of a longer time in which the processor could not make samples (a program or an emulator may stand
+// still) only this passes: the watchdog watches the host, not what held up the processor.
 #define SAMPLES_LATE_MAX (50 * SAMPLES_PER_MS)
 
 static void send_can(const struct can_frame *frame)
@@ -53,10 +51,8 @@ static void measure(void)
 static void make_samples(void)
 {
     int16_t samples[CHANNELS];
-    samples_due += board_samples_due();
-    if (samples_due > SAMPLES_LATE_MAX)
-        samples_due = SAMPLES_LATE_MAX;
-    for (int i = 0; i < SAMPLES_AT_ONCE && samples_due > 0; i++, samples_due--) {
+    uint32_t due = board_samples_due();
+    for (due = due > SAMPLES_LATE_MAX ? SAMPLES_LATE_MAX : due; due > 0; due--) {
         if (samples_to_measuring-- == 0) { // every millisecond
             samples_to_measuring = SAMPLES_PER_MS - 1;
             measure();
@@ -101,11 +97,6 @@ static void serve_can(void)
 struct modbus *loop_modbus(void)
 {
     return &modbus;
-}
-
-bool loop_is_late(void)
-{
-    return samples_due > 0;
 }
 
 void loop_once(void)

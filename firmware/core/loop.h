@@ -5,16 +5,11 @@
 #ifndef LOOP_H
 #define LOOP_H
 
-#include <stdbool.h>
-
 void loop_init(void);
 
 // Make samples that are due, then carry out what has arrived. Call it for ever, and `board_wait`
 // between two calls.
 void loop_once(void);
-
-// Whether samples are due already.
-bool loop_is_late(void);
 
 // For a board with Modbus on other lines than LINE_MODBUS.
 struct modbus *loop_modbus(void);

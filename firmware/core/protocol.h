@@ -65,6 +65,9 @@ enum nak {
 #define SAFETY_RAMP 5       // ms; of the watchdog, of faults, and of what an Arm still finds playing
 #define ENVELOPE_SLOT_MAX 63
 
+// Features.
+#define FEATURE_EVENTS 0x0001
+
 // Flags of Status.
 #define HIGH_VOLTAGE_ON 0x01
 #define INTERLOCK_OPEN 0x02

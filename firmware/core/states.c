@@ -200,7 +200,8 @@ uint8_t amplifier_flags(const struct amplifier *amplifier)
 
 uint16_t amplifier_watchdog_left(const struct amplifier *amplifier)
 {
-    return (uint16_t)((amplifier->watchdog_left + SAMPLES_PER_MS - 1) / SAMPLES_PER_MS);
+    uint16_t left = (uint16_t)(amplifier->watchdog_left / SAMPLES_PER_MS);
+    return left == 0 && amplifier->watchdog_left > 0 ? 1 : left;
 }
 
 uint32_t amplifier_fault_age(const struct amplifier *amplifier, uint8_t number)

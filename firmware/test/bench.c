@@ -37,7 +37,7 @@ static void report(const char *what, uint32_t instructions)
     print(at);
     print("\n");
     for (int i = 0; i < 100; i++)
-        board_wait(true); // until it is sent
+        board_wait(); // until it is sent
 }
 
 static void measure_samples(const char *what)
@@ -108,5 +108,5 @@ int main(void)
     measure_frame("Apply of 2 channels and its reply", APPLY, sizeof APPLY);
     print("end\n");
     for (;;)
-        board_wait(true);
+        board_wait();
 }

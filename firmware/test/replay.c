@@ -21,7 +21,7 @@ static char next_character(void)
 {
     int byte = board_read(LINE_SERIAL);
     while (byte < 0) {
-        board_wait(true);
+        board_wait();
         byte = board_read(LINE_SERIAL);
     }
     return (char)byte;

@@ -1,8 +1,8 @@
 """Prove the firmware: `python firmware/test/run.py [--long]`, by `make firmware-test`.
 
-Runs the tests, mutated frames under the sanitizers (20 000 for each codec; a million with --long),
-and prints code size, memory, and instructions per frame and per sample. Says what was left out
-where a program is not installed.
+Runs the tests of its samples, mutated frames under the sanitizers (20 000 for each codec; a million
+with --long), and conformance on every wire. Prints code size, memory, and instructions per frame
+and per sample, and says what was left out where a program is not installed.
 """
 
 import os
@@ -13,7 +13,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 OUT = ROOT / "out" / "firmware"
-TESTS = ("tests/firmware",)
+TESTS = ("tests/firmware/test_firmware_samples.py", "tests/firmware/test_firmware_on_the_plate.py")
 
 
 def main() -> None:
@@ -23,6 +23,7 @@ def main() -> None:
     run("make", "-s", "-C", ROOT / "firmware", "all", OUT / "era-fuzz")
     run(sys.executable, "-m", "pytest", "-q", *TESTS, cwd=ROOT)
     run(OUT / "era-fuzz", str(frames))
+    run(sys.executable, ROOT / "firmware" / "test" / "conformance.py")
     if not is_bare_metal:
         print("left out: bare metal; it needs gcc-arm-none-eabi and qemu-system-arm")
         return

@@ -69,10 +69,11 @@ static void read_identity(struct writer *writer, const struct amplifier *amplifi
 static void read_capability(struct writer *writer, uint8_t sub)
 {
     const struct capability *capability = &CAPABILITIES[sub - 1];
+    uint16_t events = sub == CAPABILITY_COUNT ? FEATURE_EVENTS : 0; // CAN always sends them
     if (capability->size == 1)
         write_u8(writer, (uint8_t)capability->value);
     else
-        write_u16(writer, capability->value);
+        write_u16(writer, capability->value | events);
 }
 
 static void read_status(struct writer *writer, const struct amplifier *amplifier, uint8_t sub)

@@ -98,7 +98,7 @@ static int write_block(struct modbus *modbus, uint16_t address, const uint8_t *b
     uint16_t tag = 0;
     for (unsigned i = 0; i < sizeof BLOCKS / sizeof BLOCKS[0]; i++) {
         uint16_t skipped = address == BLOCKS[i] ? 0 : TAG_BEFORE;
-        if (address + skipped != BLOCKS[i] || count <= skipped)
+        if (address + skipped != BLOCKS[i] || count < skipped)
             continue;
         if (skipped > 0)
             modbus->tag = tag = values[0];

@@ -166,7 +166,7 @@ uint16_t modbus_read(const struct modbus *modbus, uint16_t address)
 static struct verdict write_control(struct modbus *modbus, const uint16_t *written, uint16_t count)
 {
     uint16_t fields[CONTROL_FIELDS];
-    if (count > CONTROL_FIELDS)
+    if (count < 1 || count > CONTROL_FIELDS)
         return refused(NAK_BAD_LENGTH);
     memcpy(fields, modbus->control, sizeof fields);
     memcpy(fields, written, count * sizeof fields[0]);

@@ -42,6 +42,8 @@ static uint16_t expected_length(const uint8_t *frame, uint16_t length)
 
 static bool has_good_crc(const uint8_t *frame, uint16_t length)
 {
+    if (length < 2 + CRC_SIZE)
+        return false;
     uint16_t crc = crc16_of(frame, (uint16_t)(length - CRC_SIZE));
     return frame[length - 2] == (uint8_t)crc && frame[length - 1] == (uint8_t)(crc >> 8);
 }
@@ -64,17 +66,19 @@ uint16_t rtu_silence(struct rtu *rtu, uint32_t microseconds)
 {
     if (rtu->length == 0 || microseconds < RTU_SILENCE)
         return 0;
-    uint16_t length = expected_length(rtu->received, rtu->length);
-    bool is_whole = length > 0 && length <= rtu->length;
-    if (!is_whole && microseconds < RTU_LONGEST_PAUSE && length <= RTU_FRAME_MAX)
-        return 0;
-    if (!is_whole || !has_good_crc(rtu->received, length)) {
-        rtu->discarded++;
-        rtu->length = 0;
-        return 0;
+    uint16_t length = rtu->length;
+    if (!has_good_crc(rtu->received, length)) {
+        length = expected_length(rtu->received, rtu->length);
+        bool is_whole = length > 0 && length <= rtu->length;
+        if (!is_whole && microseconds < RTU_LONGEST_PAUSE && length <= RTU_FRAME_MAX)
+            return 0;
+        if (!is_whole || !has_good_crc(rtu->received, length)) {
+            rtu->discarded++;
+            rtu->length = 0;
+            return 0;
+        }
     }
     uint16_t reply = request_received(rtu, length);
-    // A request that came while this program did not look follows without silence.
     rtu->length = (uint16_t)(rtu->length - length);
     memmove(rtu->received, rtu->received + length, rtu->length);
     return reply;

@@ -3,8 +3,9 @@
 // Modbus RTU: frames that end with silence, guarded by a CRC-16.
 //
 // Give every byte to `rtu_byte`, and call `rtu_silence` again and again with the time since the last
-// one. A request counts when its length, which its function tells, has arrived and 3.5 characters
-// of silence have passed; so pauses inside it do no harm until they are longer than 40 ms.
+// one. What has a good checksum when 3.5 characters of silence have passed is a request. Else its
+// function tells how long it is: the rest may follow after a pause of up to 40 ms, and several that
+// came while nobody looked are told apart.
 
 #ifndef MODBUS_RTU_H
 #define MODBUS_RTU_H

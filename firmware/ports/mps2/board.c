@@ -4,8 +4,8 @@
 //
 //     UART0 serial protocol, UART1 Modbus RTU, UART2 samples, UART3 CAN as slcan
 //
-// Interrupts stay masked: a byte and the SysTick only wake the main loop from its sleep. On the real
-// board, which has one byte of buffer in each UART, samples must leave the main loop enough time.
+// Bytes that arrive are taken by interrupt into a ring; those to send wait in another for the main
+// loop. The SysTick only wakes it from its sleep.
 //
 // It has no converter: UART2 stands in for one, 16-bit little-endian integers, the channels one after
 // another. It has no high voltage either; that of this file is 1800 V by definition.
@@ -21,8 +21,8 @@ struct uart { // CMSDK APB UART
 #define TX_FULL 1
 #define RX_FULL 2
 #define TX_AND_RX_ENABLED 3
-#define RX_WAKES 8
-#define WOKEN_BY_RX 2
+#define RX_INTERRUPTS 8
+#define INTERRUPTED_BY_RX 2
 
 struct timer { // CMSDK APB timer; counts down
     volatile uint32_t control, value, reload, interrupt;
@@ -32,13 +32,10 @@ struct timer { // CMSDK APB timer; counts down
 struct systick {
     volatile uint32_t control, reload, value;
 };
-#define SYSTICK_WAKES 7 // enabled, interrupt, clock of the processor
+#define SYSTICK_INTERRUPTS 7 // enabled, interrupt, clock of the processor
 
 #define SYSTICK ((struct systick *)0xE000E010)
 #define INTERRUPTS_ENABLE (*(volatile uint32_t *)0xE000E100)
-#define INTERRUPTS_CLEAR (*(volatile uint32_t *)0xE000E280)
-#define SYSTEM_CLEAR (*(volatile uint32_t *)0xE000ED04)
-#define SYSTICK_PENDING (UINT32_C(1) << 25)
 
 #define TIMER0 ((struct timer *)0x40000000)
 #define UART0 ((struct uart *)0x40004000)
@@ -46,19 +43,23 @@ struct systick {
 #define UART2 ((struct uart *)0x40006000)
 #define UART3 ((struct uart *)0x40007000)
 
-#define SENDING_SIZE 1024 // a power of 2
+#define RING_SIZE 1024 // a power of 2
+
+struct ring {
+    volatile uint32_t put, taken; // bytes, ever
+    uint8_t bytes[RING_SIZE];
+};
 
 static struct line_state {
     struct uart *uart;
     uint32_t receive_interrupt; // its number
-    uint32_t heard_at;
-    uint32_t put, taken;        // bytes, ever
+    volatile uint32_t heard_at;
 } lines[] = {[LINE_SERIAL] = {.uart = UART0, .receive_interrupt = 0},
              [LINE_MODBUS] = {.uart = UART1, .receive_interrupt = 2},
              [LINE_CAN] = {.uart = UART3, .receive_interrupt = 18}};
 #define LINES (sizeof lines / sizeof lines[0])
 
-static uint8_t sending[LINES][SENDING_SIZE];
+static struct ring received[LINES], sending[LINES];
 
 static bool is_high_voltage;
 static uint32_t ticks_seen;
@@ -72,12 +73,11 @@ static uint32_t ticks(void)
 static void open_uart(struct uart *uart, uint32_t baud)
 {
     uart->divider = CLOCK / baud;
-    uart->control = TX_AND_RX_ENABLED | RX_WAKES;
+    uart->control = TX_AND_RX_ENABLED | RX_INTERRUPTS;
 }
 
 void board_open(void)
 {
-    __asm__ volatile("cpsid i");
     open_uart(UART0, 921600);
     open_uart(UART1, 115200);
     open_uart(UART2, 1562500);
@@ -88,7 +88,7 @@ void board_open(void)
     ticks_seen = ticks();
     SYSTICK->reload = CLOCK / 1000 - 1;
     SYSTICK->value = 0;
-    SYSTICK->control = SYSTICK_WAKES;
+    SYSTICK->control = SYSTICK_INTERRUPTS;
     for (unsigned i = 0; i < LINES; i++)
         INTERRUPTS_ENABLE = UINT32_C(1) << lines[i].receive_interrupt;
 }
@@ -118,47 +118,74 @@ void board_output(const int16_t samples[CHANNELS])
     }
 }
 
+static void put(struct ring *ring, uint8_t byte)
+{
+    if (ring->put - ring->taken == RING_SIZE)
+        return; // nobody takes them: lost
+    ring->bytes[ring->put % RING_SIZE] = byte;
+    ring->put++;
+}
+
+static int take(struct ring *ring)
+{
+    if (ring->put == ring->taken)
+        return -1;
+    uint8_t byte = ring->bytes[ring->taken % RING_SIZE];
+    ring->taken++;
+    return byte;
+}
+
+// The interrupt of every line, see startup.c.
+void board_received(void)
+{
+    for (unsigned i = 0; i < LINES; i++) {
+        while (lines[i].uart->state & RX_FULL) {
+            lines[i].uart->interrupt = INTERRUPTED_BY_RX;
+            lines[i].heard_at = ticks();
+            put(&received[i], (uint8_t)lines[i].uart->data);
+        }
+    }
+}
+
 static bool send_some(void)
 {
     bool is_sending = false;
     for (unsigned i = 0; i < LINES; i++) {
-        if (lines[i].taken == lines[i].put)
-            continue;
-        is_sending = true;
-        while (lines[i].taken != lines[i].put && !(lines[i].uart->state & TX_FULL))
-            lines[i].uart->data = sending[i][lines[i].taken++ % SENDING_SIZE];
+        while (sending[i].put != sending[i].taken && !(lines[i].uart->state & TX_FULL))
+            lines[i].uart->data = (uint32_t)take(&sending[i]);
+        is_sending = is_sending || sending[i].put != sending[i].taken;
     }
     return is_sending;
 }
 
-void board_wait(bool may_sleep)
+static bool has_received(void)
 {
-    if (send_some() || !may_sleep)
+    for (unsigned i = 0; i < LINES; i++)
+        if (received[i].put != received[i].taken)
+            return true;
+    return false;
+}
+
+void board_wait(void)
+{
+    if (send_some())
         return;
-    __asm__ volatile("wfi");
-    SYSTEM_CLEAR = SYSTICK_PENDING;
-    for (unsigned i = 0; i < LINES; i++) {
-        lines[i].uart->interrupt = WOKEN_BY_RX;
-        INTERRUPTS_CLEAR = UINT32_C(1) << lines[i].receive_interrupt;
-    }
+    // Masked, so that no byte comes between the look and the sleep; a masked interrupt ends it, too.
+    __asm__ volatile("cpsid i");
+    if (!has_received())
+        __asm__ volatile("wfi");
+    __asm__ volatile("cpsie i");
 }
 
 int board_read(enum line line)
 {
-    struct line_state *state = &lines[line];
-    if (!(state->uart->state & RX_FULL))
-        return -1;
-    state->heard_at = ticks();
-    return (uint8_t)state->uart->data;
+    return take(&received[line]);
 }
 
 void board_write(enum line line, const uint8_t *bytes, uint16_t length)
 {
-    struct line_state *state = &lines[line];
-    if (state->put - state->taken + length > SENDING_SIZE)
-        return; // nobody reads: the reply is lost
     while (length-- > 0)
-        sending[line][state->put++ % SENDING_SIZE] = *bytes++;
+        put(&sending[line], *bytes++);
 }
 
 uint32_t board_silence(enum line line)

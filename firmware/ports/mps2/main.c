@@ -12,6 +12,6 @@ int main(void)
     loop_init();
     for (;;) {
         loop_once();
-        board_wait(!loop_is_late());
+        board_wait();
     }
 }

@@ -6,4 +6,7 @@
 // Start clock and lines.
 void board_open(void);
 
+// Interrupt of the lines.
+void board_received(void);
+
 #endif

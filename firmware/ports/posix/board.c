@@ -45,7 +45,7 @@ void board_output(const int16_t samples[CHANNELS])
         fwrite(samples, sizeof samples[0], CHANNELS, samples_file);
 }
 
-void board_wait(bool may_sleep)
+void board_wait(void)
 {
     struct pollfd watched[LINES + 1 + TCP_WATCHED];
     for (int i = 0; i < LINES; i++) {
@@ -56,9 +56,9 @@ void board_wait(bool may_sleep)
     watched[LINES].events = POLLIN;
     tcp_watch(&watched[LINES + 1]);
     char ignored[64];
-    if (samples_file != NULL && may_sleep)
+    if (samples_file != NULL)
         fflush(samples_file);
-    if (poll(watched, LINES + 1 + TCP_WATCHED, may_sleep ? 1 : 0) > 0 && watched[LINES].revents != 0 &&
+    if (poll(watched, LINES + 1 + TCP_WATCHED, 1) > 0 && watched[LINES].revents != 0 &&
         read(STDIN_FILENO, ignored, sizeof ignored) <= 0)
         exit(0);
 }

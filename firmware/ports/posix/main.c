@@ -14,6 +14,6 @@ int main(int count, char **arguments)
     for (;;) {
         loop_once();
         tcp_serve(loop_modbus());
-        board_wait(!loop_is_late());
+        board_wait();
     }
 }

@@ -7,6 +7,8 @@
 
 #include <errno.h>
 #include <fcntl.h>
+#include <netinet/in.h>
+#include <netinet/tcp.h>
 #include <string.h>
 #include <sys/socket.h>
 #include <unistd.h>
@@ -94,11 +96,13 @@ static void take(struct modbus *modbus, struct host *host)
 
 static void accept_host(void)
 {
-    int connection = accept(listening, NULL, NULL);
+    int yes = 1, connection = accept(listening, NULL, NULL);
     for (int i = 0; i < TCP_HOSTS && connection > 0; i++) {
         if (hosts[i].connection > 0)
             continue;
         fcntl(connection, F_SETFL, O_NONBLOCK);
+        // A reply must not wait for the acknowledgement of the one before.
+        setsockopt(connection, IPPROTO_TCP, TCP_NODELAY, &yes, sizeof yes);
         hosts[i].connection = connection;
         hosts[i].length = 0;
         return;

@@ -103,6 +103,8 @@ class _Attempt:
         """Whether it must be made again."""
         if self.finding is None or isinstance(self.finding, NotApplicable):
             return False
+        if isinstance(self.finding, ContractViolation) and self.finding.is_certain:
+            return False
         return isinstance(self.finding, Inconclusive) or self._is_disturbed
 
     @property

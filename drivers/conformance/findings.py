@@ -2,9 +2,15 @@
 
 
 class ContractViolation(Exception):
-    """The amplifier does not behave as its page says."""
+    """The amplifier does not behave as its page says.
 
-    def __init__(self, what: str, *, expected: object, seen: object) -> None:
+    is_certain: whether no delay of this program or the wire can have made it appear so.
+    """
+
+    def __init__(
+        self, what: str, *, expected: object, seen: object, is_certain: bool = False
+    ) -> None:
+        self.is_certain = is_certain
         super().__init__(f"{what} must be {expected}, got {seen}")
         self.expected = str(expected)
         self.seen = f"{what}: {seen}"

@@ -62,24 +62,52 @@ static uint16_t request_received(struct rtu *rtu, uint16_t length)
     return (uint16_t)(size + 1 + CRC_SIZE);
 }
 
+// Forget the first bytes.
+static void drop(struct rtu *rtu, uint16_t count)
+{
+    rtu->length = (uint16_t)(rtu->length - count);
+    memmove(rtu->received, rtu->received + count, rtu->length);
+    rtu->paused_at = 0;
+}
+
+// Length of the request at the beginning of what has arrived; 0: none, or not yet.
+static uint16_t first_request(struct rtu *rtu)
+{
+    if (has_good_crc(rtu->received, rtu->length))
+        return rtu->length;
+    if (has_good_crc(rtu->received + rtu->paused_at, (uint16_t)(rtu->length - rtu->paused_at))) {
+        rtu->discarded++; // half a frame before it
+        drop(rtu, rtu->paused_at);
+        return rtu->length;
+    }
+    uint16_t length = expected_length(rtu->received, rtu->length);
+    bool is_whole = length > 0 && length <= rtu->length;
+    return is_whole && has_good_crc(rtu->received, length) ? length : 0;
+}
+
+// Whether the rest of a frame may follow.
+static bool may_go_on(const struct rtu *rtu)
+{
+    uint16_t length = expected_length(rtu->received, rtu->length);
+    return rtu->length < RTU_FRAME_MAX && length <= RTU_FRAME_MAX &&
+           (length == 0 || length > rtu->length);
+}
+
 uint16_t rtu_silence(struct rtu *rtu, uint32_t microseconds)
 {
     if (rtu->length == 0 || microseconds < RTU_SILENCE)
         return 0;
-    uint16_t length = rtu->length;
-    if (!has_good_crc(rtu->received, length)) {
-        length = expected_length(rtu->received, rtu->length);
-        bool is_whole = length > 0 && length <= rtu->length;
-        if (!is_whole && microseconds < RTU_LONGEST_PAUSE && length <= RTU_FRAME_MAX)
-            return 0;
-        if (!is_whole || !has_good_crc(rtu->received, length)) {
-            rtu->discarded++;
-            rtu->length = 0;
-            return 0;
-        }
+    uint16_t length = first_request(rtu);
+    if (length > 0) {
+        uint16_t reply = request_received(rtu, length);
+        drop(rtu, length);
+        return reply;
     }
-    uint16_t reply = request_received(rtu, length);
-    rtu->length = (uint16_t)(rtu->length - length);
-    memmove(rtu->received, rtu->received + length, rtu->length);
-    return reply;
+    if (may_go_on(rtu) && microseconds < RTU_LONGEST_PAUSE) {
+        rtu->paused_at = rtu->length;
+    } else {
+        rtu->discarded++;
+        drop(rtu, rtu->length);
+    }
+    return 0;
 }

@@ -5,7 +5,7 @@
 // Give every byte to `rtu_byte`, and call `rtu_silence` again and again with the time since the last
 // one. What has a good checksum when 3.5 characters of silence have passed is a request. Else its
 // function tells how long it is: the rest may follow after a pause of up to 40 ms, and several that
-// came while nobody looked are told apart.
+// came while nobody looked are told apart. A request that follows half of another is understood.
 
 #ifndef MODBUS_RTU_H
 #define MODBUS_RTU_H
@@ -20,6 +20,7 @@ struct rtu {
     struct modbus *modbus;
     uint8_t received[RTU_FRAME_MAX];
     uint16_t length;
+    uint16_t paused_at; // bytes before the last pause that may be one inside a frame
     uint32_t discarded; // frames
     uint8_t reply[RTU_FRAME_MAX];
 };

@@ -74,7 +74,7 @@ async def run_simulation(
     if simulation.until_eof:
         # In a thread, since not every kind of standard input can be polled.
         threading.Thread(target=_await_eof, args=(loop, ended), daemon=True).start()
-    bench = await asyncio.to_thread(_make_bench, simulation)
+    bench = await asyncio.to_thread(_make_bench, simulation, now=clock.now())
     if ended.is_set():
         return None
     bench.place_fingers(simulation.fingers, now=clock.now())
@@ -89,12 +89,12 @@ async def run_simulation(
     return message
 
 
-def _make_bench(simulation: Simulation) -> Bench:
+def _make_bench(simulation: Simulation, *, now: float) -> Bench:
     rig, imperfections = simulation.rig, simulation.imperfections
     if simulation.firmware is not None:
-        return FirmwareBench(rig, now=clock.now(), imperfections=imperfections)
+        return FirmwareBench(rig, now=now, imperfections=imperfections)
     rate = simulation.sample_rate
-    return Bench(rig, now=clock.now(), sample_rate=rate, imperfections=imperfections)
+    return Bench(rig, now=now, sample_rate=rate, imperfections=imperfections)
 
 
 async def _serve(

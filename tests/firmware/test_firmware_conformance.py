@@ -18,7 +18,7 @@ REPLY_TIMEOUT = 2.0  # s; a busy machine delays replies
 @pytest.mark.real_time
 async def test_firmware_conforms(firmware: Path) -> None:
     """It fails no check, and passes most."""
-    with running_firmware(firmware, "--serial") as url:
+    with running_firmware(firmware, "--serial") as (url, _):
         amplifier = Amplifier(open_backend(url), reply_timeout=REPLY_TIMEOUT)
         await amplifier.open()
         results = [await run_check(check, amplifier) for check in CHECKS]

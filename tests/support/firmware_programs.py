@@ -15,8 +15,11 @@ def build_firmware(folder: Path) -> Path:
 
 
 @contextmanager
-def running_firmware(folder: Path, *options: str) -> Iterator[str]:
-    """Run the amplifier with an option for its line; yield the URL of that line."""
+def running_firmware(folder: Path, *options: str) -> Iterator[tuple[str, int]]:
+    """Run the amplifier with an option for its line; yield the URL of that line, and its process.
+
+    The process is given by its number.
+    """
     with subprocess.Popen(
         [folder / "era-firmware", "--until-eof", *options],
         stdin=subprocess.PIPE,
@@ -25,7 +28,7 @@ def running_firmware(folder: Path, *options: str) -> Iterator[str]:
     ) as process:
         assert process.stdin is not None
         assert process.stdout is not None
-        yield process.stdout.readline().strip()
+        yield process.stdout.readline().strip(), process.pid
         process.stdin.close()
 
 

@@ -184,6 +184,7 @@ void board_open(int count, char **arguments)
     if (count == 1)
         open_line(LINE_SERIAL, "serial://");
     fflush(stdout);
-    signal(SIGUSR1, move_interlock);
+    struct sigaction moves = {.sa_handler = move_interlock, .sa_flags = SA_RESTART};
+    sigaction(SIGUSR1, &moves, NULL);
     started_at = microseconds();
 }

@@ -10,6 +10,7 @@ from typing import Any
 
 from drivers import clock
 from drivers.amplifier import WATCHDOG, Amplifier
+from drivers.backends.urls.address import with_address
 from drivers.command import CommandSet, DriveCommand
 from drivers.conformance import Check, CheckResult, raw_line, run_check
 from drivers.conformance.report import ConformanceReport
@@ -24,6 +25,7 @@ from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import AmplifierState, Feature, Status
 from drivers.registry import open_backend
 
+_TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address
 _STOP_TIMEOUT = 2.0  # s; for boards that restart when their port is opened
 _RAMP = 0.05  # s; neither start nor end of a drive clicks
 _UNITS = {
@@ -60,9 +62,11 @@ async def status(url: str) -> dict[str, Any]:
     async with _opened(url) as amplifier:
         now = await amplifier.status()
         faults = await amplifier.faults()
+        measured = await amplifier.measured()
         return {
             "url": url,
             **_status_rows(now),
+            "measured": [{"voltage_v": one.voltage, "current_a": one.current} for one in measured],
             "faults": [
                 {"fault": record.fault.name, "channel": record.channel, "age_s": record.age}
                 for record in faults
@@ -91,6 +95,33 @@ async def stop(url: str) -> dict[str, Any]:
     finally:
         await amplifier.close()
     return {"url": url, **outcome.to_json(clock.now()), **rows}
+
+
+async def set_address(url: str, address: int, serial_number: str | None) -> dict[str, Any]:
+    """Give the amplifier at a URL, or that of a serial number, another address on its line."""
+    moved = with_address(url, address)
+    if serial_number is None:
+        async with _opened(url) as amplifier:
+            serial_number = amplifier.identity.serial_number
+            if Feature.ADDRESS not in amplifier.capabilities.features:
+                raise CommandError("the address of this amplifier cannot be set over its wire")
+            if (await amplifier.status()).state is not AmplifierState.SWITCH_ON_DISABLED:
+                raise CommandRefused("an address is set while disarmed; disarm the amplifier first")
+            await amplifier.set_address(address, serial_number)
+    else:
+        amplifier = Amplifier(open_backend(url))
+        try:
+            await amplifier.connect()
+            await amplifier.set_address(address, serial_number)
+        finally:
+            await amplifier.close()
+    await asyncio.sleep(_TAKING_ADDRESS)
+    amplifier = Amplifier(open_backend(moved), serial_number=serial_number)
+    try:
+        await amplifier.open(take_over=False)
+    finally:
+        await amplifier.close()
+    return {"url": moved, "serial_number": serial_number}
 
 
 async def clear(url: str) -> dict[str, Any]:

@@ -37,13 +37,17 @@ from drivers.protocol.messages import (
     Feature,
     GetCaps,
     GetFaults,
+    GetMeasured,
     GetStatus,
     Hello,
     Identity,
     Loaded,
     LoadEnvelope,
+    Measured,
+    Measurement,
     Ping,
     Request,
+    SetAddress,
     Stage,
     Status,
     Stop,
@@ -61,7 +65,10 @@ WATCHDOG_REACTION = 0.005 + PROTOCOL.reaction
 _logger = logging.getLogger(__name__)
 
 # Requests that do not feed the watchdog, or silence the amplifier where they arrive.
-_NOT_FEEDING = (Hello, GetCaps, GetStatus, GetFaults, LoadEnvelope, Clear, Stop, Disarm)
+_NOT_FEEDING = (
+    *(Hello, GetCaps, GetStatus, GetFaults, GetMeasured, LoadEnvelope),
+    *(Clear, Stop, Disarm),
+)
 
 
 @final
@@ -312,6 +319,12 @@ class Amplifier:
         """Read latched and past faults, newest first."""
         return (await self._request(GetFaults(), expect=FaultList)).faults
 
+    async def measured(self) -> tuple[Measurement, ...]:
+        """Read voltage and current of each channel; empty if it does not measure them."""
+        if Feature.ELECTRICAL not in self.capabilities.features:
+            return ()
+        return (await self._request(GetMeasured(), expect=Measured)).channels
+
     async def clear(self, latch: int | None = None) -> Status:
         """Acknowledge a stop, or faults whose cause is gone; the amplifier stays disarmed.
 
@@ -363,6 +376,13 @@ class Amplifier:
         with _errors_logged_for_stop(request):
             self._recorder.sending(request)
         await self._link.broadcast(request)
+
+    async def set_address(self, address: int, serial_number: str) -> None:
+        """Give the amplifier of this serial number another address, disarmed; there is no reply.
+
+        Enough for it that the wire is connected, so that two of one address can be told apart.
+        """
+        await self._link.broadcast(SetAddress(address, serial_number))
 
     async def _disarm_inherited(self) -> None:
         """Disarm an amplifier that an earlier host may have left playing."""

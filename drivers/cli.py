@@ -203,6 +203,25 @@ def stop(url: Url, trace: Trace = None, json_: Json = False) -> None:
 
 
 @amp.command()
+def address(
+    url: Url,
+    new: Annotated[int, typer.Argument(metavar="NEW", min=1, max=247, help="Address to take.")],
+    serial_number: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TEXT", help="Of the amplifier to change, if several reply at the address."
+        ),
+    ] = None,
+    trace: Trace = None,
+    json_: Json = False,
+) -> None:
+    """Give an amplifier another address, unit or node on its line; disarmed only."""
+    from drivers import amp_actions
+
+    _show(_run(amp_actions.set_address(url, new, serial_number), trace), as_json=json_)
+
+
+@amp.command()
 def clear(url: Url, trace: Trace = None, json_: Json = False) -> None:
     """Acknowledge a stop or fault. Leaves the amplifier disarmed."""
     from drivers import amp_actions

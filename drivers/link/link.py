@@ -29,6 +29,7 @@ from drivers.protocol.messages import (
     Hello,
     Identity,
     Loaded,
+    Measured,
     Nak,
     Reply,
     Request,
@@ -53,7 +54,7 @@ DEGRADED = (
 
 BUSY_PAUSE = 0.005  # s; before a retry to a busy amplifier; short against the latency of touch
 
-ReplyT = TypeVar("ReplyT", Identity, Capabilities, Status, Achieved, FaultList, Loaded)
+ReplyT = TypeVar("ReplyT", Identity, Capabilities, Status, Achieved, FaultList, Loaded, Measured)
 
 
 def retries_on(round_trip: float, *, reply_timeout: float = REPLY_TIMEOUT) -> int:

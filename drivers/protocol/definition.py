@@ -100,6 +100,7 @@ class Quantities:
     watchdog_left: WireQuantity
     token: WireQuantity
     active_token: WireQuantity
+    address: WireQuantity
     channel: WireQuantity
     channel_count: WireQuantity
     fault_count: WireQuantity
@@ -109,6 +110,8 @@ class Quantities:
     envelope_step: WireQuantity
     temperature: WireQuantity
     voltage: WireQuantity
+    channel_voltage: WireQuantity
+    channel_current: WireQuantity
     age: WireQuantity
     versions: WireQuantity
     features: WireQuantity

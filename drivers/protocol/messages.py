@@ -17,8 +17,10 @@ these into bytes and back.
     Clear       Status              acknowledge faults whose cause is gone
     Ping        Status              heartbeat: feeds the watchdog
     LoadEnvelope  Loaded            store an envelope in its slot, for sets that refer to it
+    GetMeasured Measured            read voltage and current of each channel
+    SetAddress  AddressSet          take another address on the line, if it has this serial number
 
-A Commit or a Stop may be broadcast to all amplifiers of a bus; there are no replies then.
+A Commit, Stop or SetAddress may be broadcast to all amplifiers of a bus; there are no replies then.
 """
 
 from dataclasses import dataclass, field
@@ -184,6 +186,22 @@ class LoadEnvelope:
 
 
 @dataclass(frozen=True, slots=True)
+class GetMeasured:
+    """Report voltage and current of each channel; of amplifiers that measure them."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetAddress:
+    """Take another address on the line, for the amplifier of this serial number; others ignore it.
+
+    It keeps the address without supply; disarmed only.
+    """
+
+    address: int
+    serial_number: str
+
+
+@dataclass(frozen=True, slots=True)
 class Identity:
     """Identity of an amplifier; the serial number is unique; versions: of the protocol."""
 
@@ -290,6 +308,28 @@ class Loaded:
 
 
 @dataclass(frozen=True, slots=True)
+class Measurement:
+    """Voltage [V] and current [A] of a channel, both rms."""
+
+    voltage: float
+    current: float
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Measurements of each channel."""
+
+    channels: tuple[Measurement, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class AddressSet:
+    """Confirmation of an address, still sent from the one before."""
+
+    address: int
+
+
+@dataclass(frozen=True, slots=True)
 class AmplifierEvent:
     """A change of state, or a fault; channel: the one at fault, if any."""
 
@@ -320,6 +360,10 @@ Request: TypeAlias = (
     | Clear
     | Ping
     | LoadEnvelope
+    | GetMeasured
+    | SetAddress
 )
-Reply: TypeAlias = Identity | Capabilities | Status | Achieved | FaultList | Loaded | Nak
-Broadcast: TypeAlias = Commit | Stop
+Reply: TypeAlias = (
+    Identity | Capabilities | Status | Achieved | FaultList | Loaded | Measured | AddressSet | Nak
+)
+Broadcast: TypeAlias = Commit | Stop | SetAddress

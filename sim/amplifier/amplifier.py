@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
+    AddressSet,
     AmplifierEvent,
     AmplifierState,
     Apply,
@@ -27,14 +28,18 @@ from drivers.protocol.messages import (
     Feature,
     GetCaps,
     GetFaults,
+    GetMeasured,
     Hello,
     Identity,
     LoadEnvelope,
+    Measured,
+    Measurement,
     Nak,
     NakCode,
     Ping,
     Reply,
     Request,
+    SetAddress,
     Stage,
     Status,
     Stop,
@@ -49,9 +54,17 @@ SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expi
 _Q = PROTOCOL.quantities
 _FAULTS_KEPT = 16
 _HIGH_VOLTAGE = 1800.0  # V
+_CAPACITANCE = 1e-9  # F; of an actuator
 _DISCHARGE = 0.02  # s; time constant of the supply once it is off
 _SLOTS = 63
-FEATURES = Feature.WHOLE | Feature.EVENTS | Feature.BROADCAST | Feature.INTERLOCK
+FEATURES = (
+    Feature.WHOLE
+    | Feature.EVENTS
+    | Feature.BROADCAST
+    | Feature.INTERLOCK
+    | Feature.ELECTRICAL
+    | Feature.ADDRESS
+)
 _LATCHED = (AmplifierState.QUICK_STOP_ACTIVE, AmplifierState.FAULT)
 _FEEDING_REQUESTS = (Arm, Ping, Stage, Commit, Apply)  # with the session that is held
 
@@ -249,6 +262,10 @@ class SimulatedAmplifier:
                 if self._silent_from <= now and self._is_cause_gone(now):
                     self.fault = Fault.NONE
                     self._enter(following, now)
+            case SetAddress(address=address):
+                return AddressSet(address)
+            case GetMeasured():
+                return self._measured(now)
             case LoadEnvelope(envelope=envelope):
                 return self._sets.load(envelope)
             case Stage(command_set=wanted):
@@ -262,6 +279,18 @@ class SimulatedAmplifier:
             case _:  # GetStatus, Ping
                 pass
         return None
+
+    def _measured(self, now: float) -> Reply:
+        """What a capacitor of a typical actuator draws at the present levels."""
+        if Feature.ELECTRICAL not in self._features:
+            return Nak(NakCode.UNKNOWN_TYPE)
+        channels = []
+        for level, output in zip(self._channels.levels(now), self.outputs, strict=True):
+            # Force goes with the voltage squared, at half the frequency.
+            voltage = _HIGH_VOLTAGE * math.sqrt(level / 2)
+            frequency = max((tone.frequency for tone in output), default=0.0) / 2
+            channels.append(Measurement(voltage, 2 * math.pi * frequency * _CAPACITANCE * voltage))
+        return Measured(tuple(channels))
 
     def _is_foreign(self, session: int, request: Request) -> bool:
         """Whether a session is not the one that is held, or to arm, has ended."""

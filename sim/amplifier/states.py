@@ -17,11 +17,13 @@ from drivers.protocol.messages import (
     Disarm,
     GetCaps,
     GetFaults,
+    GetMeasured,
     GetStatus,
     Hello,
     LoadEnvelope,
     Ping,
     Request,
+    SetAddress,
     Stage,
     Stop,
 )
@@ -31,7 +33,9 @@ ENABLED = frozenset({AmplifierState.OPERATION_ENABLED})
 
 Table: TypeAlias = Mapping[tuple[AmplifierState, type[Request]], AmplifierState]
 
-_ASKING: tuple[type[Request], ...] = (Hello, GetCaps, GetStatus, GetFaults, Ping, LoadEnvelope)
+_ASKING: tuple[type[Request], ...] = (
+    *(Hello, GetCaps, GetStatus, GetFaults, GetMeasured, Ping, LoadEnvelope),
+)
 _PLAYING: tuple[type[Request], ...] = (Stage, Commit, Apply)
 _OFF = (AmplifierState.SWITCH_ON_DISABLED, AmplifierState.READY_TO_SWITCH_ON)
 _STOPPED = (
@@ -55,6 +59,7 @@ TRANSITIONS: Table = {
             AmplifierState.FAULT,
         )
     },
+    **{(state, SetAddress): state for state in _OFF},
     **{(state, Clear): state for state in AmplifierState},
     (AmplifierState.QUICK_STOP_ACTIVE, Clear): AmplifierState.SWITCH_ON_DISABLED,
     (AmplifierState.FAULT, Clear): AmplifierState.SWITCH_ON_DISABLED,

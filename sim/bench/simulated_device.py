@@ -18,6 +18,7 @@ from drivers.protocol.messages import (
     NakCode,
     Reply,
     Request,
+    SetAddress,
     Status,
 )
 from sim.amplifier.thermal_model import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
@@ -88,12 +89,18 @@ class SimulatedDevice:
             return None
         if self.faults.now("nak_storm", now):
             return Nak(NakCode.BUSY)
+        if isinstance(request, SetAddress):
+            if Feature.ADDRESS not in self.capabilities.features:
+                return Nak(NakCode.UNKNOWN_TYPE)
+            if request.serial_number != self.identity.serial_number:
+                return None  # it is for another amplifier of this address
         return self._bench.exchange(self.name, request, now=now)
 
-    def broadcast(self, request: Broadcast) -> None:
-        """Execute a broadcast, which has no reply."""
+    def broadcast(self, request: Broadcast) -> Reply | None:
+        """Execute a broadcast; what it would reply."""
         if Feature.BROADCAST in self.capabilities.features:
-            self.exchange(request)
+            return self.exchange(request)
+        return None
 
     def restart(self) -> None:
         """Power-cycle it."""

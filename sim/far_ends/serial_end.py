@@ -12,7 +12,15 @@ from drivers.codec.payload import Malformed
 from drivers.codec.serial_line.exchanges import decode_request, encode_event, encode_reply
 from drivers.codec.serial_line.frame import Frame, FrameCounters, FrameReader, encode_frame
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import AmplifierEvent, Commit, Nak, Reply, Stop
+from drivers.protocol.messages import (
+    AddressSet,
+    AmplifierEvent,
+    Commit,
+    Nak,
+    Reply,
+    SetAddress,
+    Stop,
+)
 from sim.bench.simulated_device import SimulatedDevice
 from sim.transport.line import TwoWayLine
 from sim.transport.pseudo_terminal import make_terminal
@@ -32,8 +40,9 @@ class SerialEnd:
         unpluggable: bool = False,
     ) -> None:
         alone = len(devices) == 1
-        self._devices = {
-            PROTOCOL.serial.address if alone else device.address: device for device in devices
+        self._devices = list(devices)
+        self._addresses = {
+            device.name: PROTOCOL.serial.address if alone else device.address for device in devices
         }
         self._first = devices[0]
         self._baud = baud or PROTOCOL.serial.baud
@@ -64,8 +73,8 @@ class SerialEnd:
         first = PROTOCOL.serial.address
         return {
             device.name: f"serial://{self.port}?baud={self._baud}"
-            + (f"&address={number}" if number != first else "")
-            for number, device in self._devices.items()
+            + (f"&address={address}" if (address := self._addresses[device.name]) != first else "")
+            for device in self._devices
         }
 
     @property
@@ -97,10 +106,14 @@ class SerialEnd:
                 continue
             if frame.address == PROTOCOL.serial.broadcast:
                 self._broadcast(frame)
-            elif frame.address in self._devices:
-                reply = self._answer(frame, self._devices[frame.address])
+                continue
+            for device in self._devices:
+                if self._addresses[device.name] != frame.address:
+                    continue
+                reply = self._answer(frame, device)
                 if reply is not None:
                     self._line.outward.send(encode_frame(encode_reply(reply, frame)))
+                self._note_address(device, reply)
 
     def _answer(self, frame: Frame, device: SimulatedDevice) -> Reply | None:
         try:
@@ -112,14 +125,20 @@ class SerialEnd:
     def _broadcast(self, frame: Frame) -> None:
         with contextlib.suppress(Malformed):
             request = decode_request(frame)
-            if isinstance(request, Commit | Stop):
-                for device in self._devices.values():
-                    device.broadcast(request)
+            if isinstance(request, Commit | Stop | SetAddress):
+                for device in self._devices:
+                    self._note_address(device, device.broadcast(request))
+
+    def _note_address(self, device: SimulatedDevice, reply: Reply | None) -> None:
+        """Note the address that an amplifier has taken."""
+        if isinstance(reply, AddressSet):
+            self._addresses[device.name] = reply.address
 
     def _send_event(self, event: AmplifierEvent) -> None:
         if self._first.is_answering:
             self._events = (self._events + 1) & 0xFFFF
-            frame = encode_event(event, address=PROTOCOL.serial.address, sequence=self._events)
+            address = self._addresses[self._first.name]
+            frame = encode_event(event, address=address, sequence=self._events)
             self._line.outward.send(encode_frame(frame))
 
     def _to_host(self, data: bytes) -> None:

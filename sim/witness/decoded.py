@@ -30,6 +30,7 @@ class RequestKind(Enum):
     CLEAR = "Clear"
     PING = "Ping"
     ENVELOPE = "LoadEnvelope"
+    ADDRESS = "SetAddress"
     READ = "a read"
 
 

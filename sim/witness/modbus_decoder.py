@@ -22,16 +22,17 @@ from sim.witness.modbus_frames import Adu, RtuSplitter, Splitter, TcpSplitter
 from sim.witness.quantities import INVALID, OutOfRange, signed
 from sim.witness.reports import check_text, faults_of_words
 
-_CONTROL, _HEARTBEAT, _LOOK, _SET, _ENVELOPE = 1, 9, 12, 15, 101
+_CONTROL, _HEARTBEAT, _LOOK, _SET, _ENVELOPE, _ADDRESS = 1, 9, 12, 15, 101, 181
 _STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS = 1001, 1033, 1351, 1065, 1141, 1221
 _TEXT_WORDS = 16
 _WORDS = {15: RequestKind.ARM, 0: RequestKind.DISARM, 2: RequestKind.STOP, 128: RequestKind.CLEAR}
+_MEASURED = 1421
 _READ_KINDS = {
     _IDENTITY: RequestKind.HELLO,
     _CAPABILITIES: RequestKind.CAPABILITIES,
     _FAULTS: RequestKind.FAULTS,
 }
-_TAGGED = (_CONTROL, _HEARTBEAT, _SET, _ENVELOPE)
+_TAGGED = (_CONTROL, _HEARTBEAT, _SET, _ENVELOPE, _ADDRESS)
 _READ_TAGS = (*_TAGGED, _STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS)
 
 
@@ -167,7 +168,8 @@ def _of_write(
 ) -> Request:
     """Decode a write."""
     if at == _LOOK:
-        kind = RequestKind.FAULTS if read_from == _FAULTS else RequestKind.STATUS
+        kinds = {_FAULTS: RequestKind.FAULTS, _MEASURED: RequestKind.READ}
+        kind = kinds.get(read_from or 0, RequestKind.STATUS)
         return Request(kind, unit, key)
     head = 1 if at in _TAGGED else 0
     block, body = at + head, words[head:]
@@ -178,6 +180,8 @@ def _of_write(
             return q.request_of(RequestKind.PING, unit, key, session=body[0])
         case 16:
             return _set(unit, key, body)
+        case 182:
+            return Request(RequestKind.ADDRESS, unit, key)
         case 102:
             return Request(RequestKind.ENVELOPE, unit, key, envelope=_envelope(body))
         case _:

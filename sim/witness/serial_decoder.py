@@ -38,6 +38,8 @@ _KINDS = {
     11: RequestKind.CLEAR,
     12: RequestKind.PING,
     13: RequestKind.ENVELOPE,
+    14: RequestKind.READ,
+    15: RequestKind.ADDRESS,
 }
 _EVENT, _NAK = 30, 31
 _MAX_LENGTH = 249  # bytes of a frame
@@ -159,7 +161,7 @@ def _decode_request(number: int, address: int, sequence: int, payload: bytes) ->
         )
     if kind is RequestKind.ENVELOPE:
         return Request(kind, address, key, envelope=_envelope(payload))
-    if kind is RequestKind.HELLO:
+    if kind in (RequestKind.HELLO, RequestKind.ADDRESS):
         return Request(kind, address, key)
     size = _SIZES.get(kind, 0)
     if len(payload) != size:

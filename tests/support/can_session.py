@@ -122,6 +122,7 @@ class Session:
         yield self._ordered("The same again, after a lost answer", Apply(safe), 3)
         self.device.pass_time(0.05)
         yield self._ordered("Ping: the host's heartbeat, and a status order", Ping(), 4)
+        yield self._asked("Read the voltage of channel 0, 200Csub1", _read(0x200C, 1))
         staged = self.guard.check(CommandSet(514, _COMMANDS[:1], ramp=0.0, valid_for=0.0))
         yield self._ordered("Stage token 514", Stage(staged), 5)
         yield self._ordered("Commit token 514", Commit(514), 6)
@@ -159,6 +160,8 @@ class Session:
         yield self._ordered("Clear of latch 2", Clear(2), 15)
         yield self._ordered("Disarm, ramp 50 ms", Disarm(0.05), 16)
         yield self._asked("NMT: reset node", CanFrame(0x000, bytes([129, NODE])))
+        yield self._asked("Give the amplifier A-17 the node number 5, 200E", *_NUMBER)
+        yield self._asked("NMT: reset communication", CanFrame(0x000, bytes([130, NODE])))
 
     def _next(self, token: int) -> SafeCommandSet:
         return self.guard.check(CommandSet(token, _COMMANDS, ramp=0.0, valid_for=0.0))
@@ -200,6 +203,10 @@ _COMMANDS = (
     DriveCommand(channel=3, frequency=250.5, level=1.0, phase=-90.0, keep_phase=True),
 )
 _SHAPED = (DriveCommand(0, 110.0, 0.2, onset=5),)
+_NUMBER = (  # five bytes, the node and the serial number
+    CanFrame(0x601, bytes.fromhex("21 0E 20 00 05 00 00 00")),
+    CanFrame(0x601, bytes.fromhex("05 05 41 2D 31 37 00 00")),
+)
 _ENVELOPE = [
     CanFrame(0x600 + NODE, bytes.fromhex(text))
     for text in ("21 00 21 05 0B 00 00 00", "00 32 00 02 E8 03 28 23", "17 10 27 FF FF 00 00 00")

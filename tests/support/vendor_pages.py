@@ -7,6 +7,7 @@ from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.guard import Guard, GuardLimits
 from drivers.protocol.messages import (
     Achieved,
+    AddressSet,
     AmplifierEvent,
     AmplifierState,
     Apply,
@@ -23,16 +24,20 @@ from drivers.protocol.messages import (
     Feature,
     GetCaps,
     GetFaults,
+    GetMeasured,
     GetStatus,
     Hello,
     Identity,
     Loaded,
     LoadEnvelope,
+    Measured,
+    Measurement,
     Nak,
     NakCode,
     Ping,
     Reply,
     Request,
+    SetAddress,
     Stage,
     Status,
     Stop,
@@ -42,7 +47,11 @@ from sim.faults.fault_window import Faults
 CAPABILITIES = Capabilities(
     *(4, 20.0, 600.0, 0.05, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 16, 0.001, 0.1),
     channel_limits=(ChannelLimits(20.0, 600.0, 1.0),) * 3 + (ChannelLimits(20.0, 500.0, 1.0),),
-    features=Feature.WHOLE | Feature.BROADCAST | Feature.INTERLOCK,
+    features=Feature.WHOLE
+    | Feature.BROADCAST
+    | Feature.INTERLOCK
+    | Feature.ELECTRICAL
+    | Feature.ADDRESS,
 )
 IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", (2,))
 SESSION = 9
@@ -56,6 +65,13 @@ SHAPE = GUARD.check_envelope(Envelope(slot=5, step=0.005, knots=(Knot(0.1, 90), 
 GUARD.check_envelope(Envelope(slot=6, step=0.005, knots=(Knot(0.1, 0),)))
 SHAPED_COMMANDS = (DriveCommand(0, 110.0, 0.2, onset=5, ending=6),)
 SHAPED = GUARD.check(CommandSet(514, SHAPED_COMMANDS, ramp=0.0, valid_for=0.0))
+MEASURED = Measured(
+    (
+        Measurement(402.5, 139e-6),
+        *(Measurement(0.0, 0.0),) * 2,
+        Measurement(1272.8, 0.001002),
+    )
+)
 S = AmplifierState
 OFF = Status(S.SWITCH_ON_DISABLED, Fault.NONE, 0, False, 25.0, 0.0, (0.0,) * 4)
 ARMED = Status(S.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4, 1800.0)
@@ -97,6 +113,8 @@ EXAMPLES: dict[str, Example] = {
         FaultList((FaultRecord(Fault.WATCHDOG, None, 1.5), FaultRecord(Fault.ARC, 2, 65.536))),
         TRIPPED,
     ),
+    "GetMeasured": Example(GetMeasured(), MEASURED),
+    "SetAddress": Example(SetAddress(5, "A-17"), AddressSet(5), OFF),
     "Clear": Example(Clear(latch=2), CLEARED, CLEARED),
 }
 
@@ -122,6 +140,10 @@ def usual_reply(request: Request) -> Reply:
             return CAPABILITIES
         case GetFaults():
             return FaultList(())
+        case GetMeasured():
+            return MEASURED
+        case SetAddress(address=address):
+            return AddressSet(address)
         case Stage(command_set=wanted) | Apply(command_set=wanted):
             return Achieved(wanted.token, wanted.commands)
         case Commit(token=token):
@@ -160,8 +182,9 @@ class ScriptedDevice:
         self.asked.append(request)
         return self.answer(request)
 
-    def broadcast(self, request: Broadcast) -> None:
+    def broadcast(self, request: Broadcast) -> Reply | None:
         self.heard.append(request)
+        return None
 
     def on_plug(self, on_plug: Callable[[bool], None]) -> None:
         """Stay plugged in."""

@@ -28,7 +28,7 @@ from drivers.codec.can_bus.requests import (
     requested_commands,
 )
 from drivers.codec.can_bus.timing import CanTimes
-from drivers.errors import LinkError, LinkTimeout
+from drivers.errors import CommandError, LinkError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
@@ -39,6 +39,7 @@ from drivers.protocol.messages import (
     Commit,
     GetCaps,
     GetFaults,
+    GetMeasured,
     Hello,
     LoadEnvelope,
     Nak,
@@ -46,6 +47,7 @@ from drivers.protocol.messages import (
     Ping,
     Reply,
     Request,
+    SetAddress,
     Stage,
     Stop,
 )
@@ -55,6 +57,7 @@ _BROADCAST_TIMEOUT = 0.03  # s; for room in the transmit queue
 _MAX_SDO_RESPONSES = 40  # of one job
 _FRAMES_APART = 8  # from a heartbeat to its order: that long the bus may be busy
 _START = CANOPEN["nmt"]["start"]
+_RESET_COMMUNICATION = CANOPEN["nmt"]["reset_communication"]
 _T = TypeVar("_T")
 
 
@@ -138,6 +141,11 @@ class CanBackend(WireBackend):
                 return capabilities
             case GetFaults():
                 return await self._objects_job(ObjectClient.faults, request, timeout)
+            case SetAddress():
+                raise CommandError("on CAN an address is set by a broadcast")
+            case GetMeasured():
+                measure = partial(ObjectClient.measured, channels=self._channels)
+                return await self._objects_job(measure, request, timeout)
             case LoadEnvelope():
                 load = partial(ObjectClient.load_envelope, request=request)
                 return await self._objects_job(load, request, timeout)
@@ -145,7 +153,16 @@ class CanBackend(WireBackend):
                 return await self._exchange_pdo(request, timeout)
 
     async def broadcast(self, request: Broadcast) -> None:
-        """Send a commit or a stop to every amplifier of the bus; raises LinkError."""
+        """Send a commit or a stop to every amplifier of the bus; raises LinkError.
+
+        SetAddress is for its own node alone: two of one number cannot be told apart.
+        """
+        if isinstance(request, SetAddress):
+            give = partial(ObjectClient.set_address, request=request)
+            await self._objects_job(give, request, _BROADCAST_TIMEOUT)
+            reset = CanFrame(cob_id("nmt"), bytes([_RESET_COMMUNICATION, self._url.node]))
+            await self._send([reset], request, _BROADCAST_TIMEOUT)
+            return
         await self._send(encode_broadcast(request), request, _BROADCAST_TIMEOUT)
 
     async def _hello(self, request: Hello, timeout: float) -> Reply:

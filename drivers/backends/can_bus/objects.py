@@ -23,6 +23,7 @@ from drivers.codec.can_bus.objects import (
     Entry,
     index_of,
     limit_entries,
+    measured_entries,
     nak_of_abort,
     pack_envelope,
     read_integer,
@@ -30,6 +31,7 @@ from drivers.codec.can_bus.objects import (
     unpack_capabilities,
     unpack_faults,
     unpack_identity,
+    unpack_measured,
 )
 from drivers.errors import FrameError, LinkError, LinkTimeout
 from drivers.protocol.messages import (
@@ -39,7 +41,10 @@ from drivers.protocol.messages import (
     Identity,
     Loaded,
     LoadEnvelope,
+    Measured,
     Nak,
+    NakCode,
+    SetAddress,
 )
 from drivers.statistics import WireCounters
 
@@ -48,6 +53,7 @@ _WAITING_MAX = 256  # replies; bounds the memory on a flooded bus
 _RESYNCHRONISE = 5  # tries
 _BLOCK_FROM = 15  # bytes; segments are faster below
 _ABORTED_COMMAND = 0x0504_0001  # block transfers not supported
+_NO_OBJECT = 0x0602_0000
 _TIMED_OUT = 0x0504_0000  # SDO protocol timed out
 _DISTURBED = (_TIMED_OUT, 0x0503_0000, 0x0504_0003, 0x0504_0004)  # or toggle, sequence, CRC wrong
 _ABANDON = struct.pack("<BHBL", 0x80, 0, 0, _TIMED_OUT)
@@ -166,6 +172,20 @@ class ObjectClient:
             lambda: unpack_faults(self._client.upload(index_of("faults"), 0)), timeout
         )
 
+    def measured(self, channels: int, *, timeout: float) -> Measured | Nak:
+        """Read voltage and current of so many channels; a Nak from a node that measures neither."""
+
+        def read() -> Measured | Nak:
+            try:
+                each = [self._integers(measured_entries(channel)) for channel in range(channels)]
+            except SdoAbortedError as abort:
+                if abort.code != _NO_OBJECT:
+                    raise
+                return Nak(NakCode.UNKNOWN_TYPE)
+            return unpack_measured(each)
+
+        return self._transfer(read, timeout)
+
     def achieved(self, *, timeout: float) -> Achieved:
         """Read what the last set plays."""
         return self._transfer(
@@ -189,6 +209,14 @@ class ObjectClient:
             return Loaded(slot=envelope.slot, knots=len(envelope.knots))
 
         return self._transfer(write, timeout)
+
+    def set_address(self, request: SetAddress, *, timeout: float) -> None:
+        """Give the node another number, which it takes at the next reset of communication."""
+        data = bytes([request.address]) + request.serial_number.encode()
+        self._transfer(
+            lambda: self._client.download(index_of("set_address"), 0, data, force_segment=True),
+            timeout,
+        )
 
     def _download(self, index: int, subindex: int, data: bytes) -> None:
         if len(data) >= _BLOCK_FROM and self._takes_blocks:

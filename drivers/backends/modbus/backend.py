@@ -127,7 +127,7 @@ class ModbusBackend(WireBackend):
         if line.has_duplicate_responder:
             raise LinkError(
                 f"several amplifiers respond as unit {self._url.unit} on {self._url.endpoint}; "
-                "give each its own unit"
+                "give each its own: era amp address --serial-number"
             )
 
     def _next_tag(self) -> int:

@@ -132,7 +132,7 @@ class SerialBackend(WireBackend):
         if self._has_duplicate_responder:
             raise LinkError(
                 f"several amplifiers reply at address {self._url.address} on {self._url.port}; "
-                "give each its own address"
+                "give each its own: era amp address --serial-number"
             )
 
     def _send(self, line: SerialLine, data: bytes, request: Request) -> None:

@@ -20,6 +20,8 @@ from drivers.protocol.messages import (
     Feature,
     Identity,
     LoadEnvelope,
+    Measured,
+    Measurement,
     NakCode,
 )
 
@@ -31,6 +33,10 @@ _LIMITS: Mapping[str, WireQuantity] = {  # of a channel
     "frequency_min": _Q.frequency,
     "frequency_max": _Q.frequency,
     "level_max": _Q.level,
+}
+_MEASURED: Mapping[str, WireQuantity] = {  # of a channel
+    "voltage": _Q.channel_voltage,
+    "current": _Q.channel_current,
 }
 _WIDTHS = {"u8": 1, "u16": 2, "u32": 4, "i16": 2}
 TEXTS = ("vendor", "product", "serial_number", "firmware")
@@ -66,9 +72,18 @@ CAPABILITY_ENTRIES = tuple(_capability_entries())
 
 def limit_entries(channel: int) -> tuple[Entry, ...]:
     """Return the entries of the limits of a channel, named as their fields."""
+    return _channel_entries(channel, _LIMITS)
+
+
+def measured_entries(channel: int) -> tuple[Entry, ...]:
+    """Return the entries of the measurements of a channel, named as their fields."""
+    return _channel_entries(channel, _MEASURED)
+
+
+def _channel_entries(channel: int, quantities: Mapping[str, WireQuantity]) -> tuple[Entry, ...]:
     return tuple(
         Entry(index_of(f"channel_{name}"), channel + 1, name, quantity.wire, quantity)
-        for name, quantity in _LIMITS.items()
+        for name, quantity in quantities.items()
     )
 
 
@@ -109,6 +124,18 @@ def unpack_capabilities(
         for one in limits
     )
     return Capabilities(**fields)
+
+
+def unpack_measured(channels: Sequence[Mapping[str, int]]) -> Measured:
+    """Decode measurements from the integers of their entries by name, channel by channel."""
+    return Measured(
+        tuple(
+            Measurement(
+                **{name: quantity.from_wire(one[name]) for name, quantity in _MEASURED.items()}
+            )
+            for one in channels
+        )
+    )
 
 
 def unpack_faults(data: bytes) -> FaultList:

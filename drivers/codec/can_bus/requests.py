@@ -11,6 +11,7 @@ from dataclasses import replace
 
 from drivers.codec.can_bus.frame import CANOPEN, LAYOUTS, CanFrame, cob_id, command_id
 from drivers.command import CommandSet, DriveCommand
+from drivers.errors import CommandError
 from drivers.guard import require_safe
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
@@ -22,6 +23,7 @@ from drivers.protocol.messages import (
     Disarm,
     GetStatus,
     Ping,
+    SetAddress,
     Stage,
     Stop,
 )
@@ -70,7 +72,12 @@ def encode_request(
 
 
 def encode_broadcast(request: Broadcast) -> tuple[CanFrame, ...]:
-    """Encode a request to every amplifier of the bus; there are no replies."""
+    """Encode a request to every amplifier of the bus; there are no replies.
+
+    CommandError for SetAddress: an address is set by an object.
+    """
+    if isinstance(request, SetAddress):
+        raise CommandError("on CAN an address is set by an object")
     return (_order(request, 0, 0),)
 
 

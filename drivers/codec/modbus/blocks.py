@@ -23,6 +23,8 @@ from drivers.protocol.messages import (
     Feature,
     Identity,
     Loaded,
+    Measured,
+    Measurement,
     Nak,
     NakCode,
     Status,
@@ -33,6 +35,7 @@ _Q = PROTOCOL.quantities
 HEAD = len(_MAP["head"])  # registers at the start of every block
 CHANNEL_SIZE: int = _MAP["channel_registers"]
 LIMIT_SIZE: int = _MAP["limit_registers"]
+MEASURED_SIZE: int = _MAP["measured_registers"]
 FAULT_SIZE: int = _MAP["fault_registers"]
 TEXT_SIZE: int = _MAP["text_registers"]
 _NO_CHANNEL = 255
@@ -187,6 +190,19 @@ def unpack_faults(registers: Sequence[int]) -> FaultList:
                 age=_Q.age.from_wire(high << 16 | low),
             )
             for fault, channel, high, low in records
+        )
+    )
+
+
+def unpack_measured(registers: Sequence[int]) -> Measured:
+    """Decode measurements."""
+    found, rest = _fields(_MAP["input"]["measured"]["registers"], registers)
+    channels = _channel_count(found["channel_count"], read=len(rest) // MEASURED_SIZE)
+    volts, amperes = _Q.channel_voltage, _Q.channel_current
+    return Measured(
+        tuple(
+            Measurement(volts.from_wire(voltage), amperes.from_wire(current))
+            for voltage, current in list(_groups(rest, MEASURED_SIZE))[:channels]
         )
     )
 

@@ -5,12 +5,21 @@ two. Its tag, written and read back, matches responses to requests, since RTU fr
 number. Identity and capabilities are only read, so that nothing is written to an unknown device.
 """
 
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from drivers.codec.modbus import blocks
-from drivers.codec.modbus.blocks import CHANNEL_SIZE, FAULT_SIZE, HEAD, LIMIT_SIZE, TEXT_SIZE
+from drivers.codec.modbus.blocks import (
+    CHANNEL_SIZE,
+    FAULT_SIZE,
+    HEAD,
+    LIMIT_SIZE,
+    MEASURED_SIZE,
+    TEXT_SIZE,
+)
 from drivers.command import CommandSet, DriveCommand, Envelope
+from drivers.errors import CommandError
 from drivers.guard import require_safe
 from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import (
@@ -24,6 +33,7 @@ from drivers.protocol.messages import (
     Fault,
     GetCaps,
     GetFaults,
+    GetMeasured,
     GetStatus,
     Hello,
     LoadEnvelope,
@@ -32,6 +42,7 @@ from drivers.protocol.messages import (
     Ping,
     Reply,
     Request,
+    SetAddress,
     Stage,
     Stop,
 )
@@ -86,6 +97,11 @@ def encode_request(
         case GetFaults():
             beyond = min(records, _MAP["fault_count"]) * FAULT_SIZE
             return Exchange(_read("faults", beyond=beyond), Write(_MAP["look"], (tag,)))
+        case GetMeasured():
+            beyond = channels * MEASURED_SIZE
+            return Exchange(_read("measured", beyond=beyond), Write(_MAP["look"], (tag,)))
+        case SetAddress():
+            raise CommandError("on Modbus an address is set by a broadcast")
         case Ping(session=session):
             held = _Q.held_session.to_wire(session)
             return Exchange(_read("status", beyond=channels), _block("heartbeat", tag, [held]))
@@ -113,7 +129,15 @@ def encode_broadcast(request: Broadcast) -> Write:
     """Encode a write to all units."""
     if isinstance(request, Commit):
         return _block("set", 0, _pack_commit(request))
+    if isinstance(request, SetAddress):
+        return _block("address", 0, [_Q.address.to_wire(request.address), *_text(request)])
     return _block("control", 0, _control(request))
+
+
+def _text(request: SetAddress) -> tuple[int, ...]:
+    """The serial number as registers."""
+    raw = request.serial_number.encode()[: 2 * TEXT_SIZE].ljust(2 * TEXT_SIZE, b"\0")
+    return struct.unpack(f">{TEXT_SIZE}H", raw)
 
 
 def decode_refusal(registers: Sequence[int], *, tag: int) -> Nak | None:
@@ -145,6 +169,8 @@ def decode_reply(request: Request, registers: Sequence[int]) -> Reply:
             return blocks.unpack_achieved(registers)
         case LoadEnvelope():
             return blocks.unpack_loaded(registers)
+        case GetMeasured():
+            return blocks.unpack_measured(registers)
         case _:
             return blocks.unpack_status(registers)
 
@@ -153,7 +179,7 @@ def reported_state(
     request: Request, registers: Sequence[int]
 ) -> tuple[AmplifierState, Fault] | None:
     """Decode state and fault if the block has them; raises FrameError."""
-    if isinstance(request, Hello | GetCaps | GetFaults | LoadEnvelope):
+    if isinstance(request, Hello | GetCaps | GetFaults | GetMeasured | LoadEnvelope):
         return None
     return blocks.unpack_state(registers)
 

@@ -9,16 +9,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.codec.payload import Cursor, Malformed, pack, pack_optional_channel
+from drivers.codec.payload import Cursor, Malformed, pack, pack_optional_channel, pack_text
 from drivers.codec.serial_line.frame import NEUTRAL, REPLY, Frame
 from drivers.codec.serial_line.reports import (
     pack_capabilities,
     pack_faults,
     pack_identity,
+    pack_measured,
     pack_status,
     unpack_capabilities,
     unpack_faults,
     unpack_identity,
+    unpack_measured,
     unpack_status,
 )
 from drivers.codec.serial_line.sets import (
@@ -33,6 +35,7 @@ from drivers.guard import require_safe
 from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import (
     Achieved,
+    AddressSet,
     AmplifierEvent,
     AmplifierState,
     Apply,
@@ -45,16 +48,19 @@ from drivers.protocol.messages import (
     FaultList,
     GetCaps,
     GetFaults,
+    GetMeasured,
     GetStatus,
     Hello,
     Identity,
     Loaded,
     LoadEnvelope,
+    Measured,
     Nak,
     NakCode,
     Ping,
     Reply,
     Request,
+    SetAddress,
     Stage,
     Status,
     Stop,
@@ -101,6 +107,7 @@ _CAPABILITIES = _Layout(Capabilities, pack_capabilities, unpack_capabilities)
 _STATUS = _Layout(Status, pack_status, unpack_status)
 _ACHIEVED = _Layout(Achieved, pack_achieved, unpack_achieved)
 _FAULTS = _Layout(FaultList, pack_faults, unpack_faults)
+_MEASURED = _Layout(Measured, pack_measured, unpack_measured)
 
 
 def _set(message: type[Stage] | type[Apply]) -> _Layout:
@@ -120,6 +127,11 @@ _LOAD_ENVELOPE = _Layout(
     LoadEnvelope,
     lambda load: pack_envelope(load.envelope),
     lambda cursor: LoadEnvelope(unpack_envelope(cursor)),
+)
+_SET_ADDRESS = _Layout(
+    SetAddress,
+    lambda wanted: pack((_Q.address, wanted.address)) + pack_text(wanted.serial_number),
+    lambda cursor: SetAddress(cursor.integer(_Q.address), cursor.text()),
 )
 _EVENT_LAYOUT = _Layout(
     AmplifierEvent,
@@ -158,6 +170,8 @@ _EXCHANGES: dict[int, tuple[_Layout, _Layout]] = {
         _LOAD_ENVELOPE,
         _numbers(Loaded, slot=_Q.envelope_slot, knots=_Q.envelope_knots),
     ),
+    PROTOCOL.types["get_measured"]: (_empty(GetMeasured), _MEASURED),
+    PROTOCOL.types["set_address"]: (_SET_ADDRESS, _numbers(AddressSet, address=_Q.address)),
 }
 _TYPE_OF = {request.message: code for code, (request, _) in _EXCHANGES.items()}
 

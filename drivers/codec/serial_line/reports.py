@@ -26,6 +26,8 @@ from drivers.protocol.messages import (
     FaultRecord,
     Feature,
     Identity,
+    Measured,
+    Measurement,
     Status,
 )
 
@@ -132,6 +134,27 @@ def unpack_status(cursor: Cursor) -> Status:
         latch=latch,
         levels=tuple(cursor.number(_Q.level) for _ in range(channels)),
         **flags,
+    )
+
+
+def pack_measured(measured: Measured) -> bytes:
+    """Pack measurements; what is beyond the range is its end."""
+    packed = pack((_Q.channel_count, len(measured.channels)))
+    for one in measured.channels:
+        packed += pack(
+            (_Q.channel_voltage, min(one.voltage, _Q.channel_voltage.high)),
+            (_Q.channel_current, min(one.current, _Q.channel_current.high)),
+        )
+    return packed
+
+
+def unpack_measured(cursor: Cursor) -> Measured:
+    """Unpack measurements."""
+    return Measured(
+        tuple(
+            Measurement(cursor.number(_Q.channel_voltage), cursor.number(_Q.channel_current))
+            for _ in range(cursor.integer(_Q.channel_count))
+        )
     )
 
 

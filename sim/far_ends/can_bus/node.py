@@ -31,26 +31,30 @@ class CanNode:
         self, device: SimulatedDevice, node: int, *, send: Callable[[CanFrame], None]
     ) -> None:
         self._device = device
-        self._node = node
         self._send = send
         self._state = _PRE_OPERATIONAL
-        self._objects = ObjectDictionary(device, node, pdo_written=self._pdo)
-        self._sdo = SdoServer(
-            read=self._objects.read,
-            write=self._objects.write,
-            send=lambda data: send(CanFrame(IDS["sdo_answer"] + node, data)),
-        )
-        self._requests = RequestHandler(
-            device,
-            node,
-            objects=self._objects,
-            send=send,
-            call_later=lambda delay, callback: self._call_later(delay, callback),
-        )
+        self._take_number(node)
         self._fault = Fault.NONE
         self._was_off = False
         self._poll_timer: asyncio.TimerHandle | None = None
         self._heartbeat_timer: asyncio.TimerHandle | None = None
+
+    def _take_number(self, node: int) -> None:
+        """Take a node number, with the objects and identifiers that follow from it."""
+        self._node = node
+        self._objects = ObjectDictionary(self._device, node, pdo_written=self._pdo)
+        self._sdo = SdoServer(
+            read=self._objects.read,
+            write=self._objects.write,
+            send=lambda data: self._send(CanFrame(IDS["sdo_answer"] + node, data)),
+        )
+        self._requests = RequestHandler(
+            self._device,
+            node,
+            objects=self._objects,
+            send=self._send,
+            call_later=lambda delay, callback: self._call_later(delay, callback),
+        )
 
     def start(self, call_later: CallLater | None = None) -> None:
         """Boot; call_later: the running event loop's by default."""
@@ -92,6 +96,8 @@ class CanNode:
             self._leave_operation(_PRE_OPERATIONAL)
         elif data[0] == _NMT["reset_communication"]:
             self._leave_operation(_PRE_OPERATIONAL)
+            if self._objects.next_node != self._node:
+                self._take_number(self._objects.next_node)
             self._boot()
         elif data[0] == _NMT["reset_node"]:
             self._device.restart()

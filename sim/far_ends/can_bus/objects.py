@@ -12,7 +12,19 @@ from typing import Any
 
 from drivers.command import Envelope, Knot
 from drivers.protocol.definition import PROTOCOL, WireQuantity
-from drivers.protocol.messages import FaultList, GetFaults, LoadEnvelope, Nak, NakCode, Status
+from drivers.protocol.messages import (
+    AddressSet,
+    FaultList,
+    Feature,
+    GetFaults,
+    GetMeasured,
+    LoadEnvelope,
+    Measured,
+    Nak,
+    NakCode,
+    SetAddress,
+    Status,
+)
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.sdo import (
     BAD_LENGTH,
@@ -70,6 +82,7 @@ class ObjectDictionary:
         self._channels = device.capabilities.channels
         self.achieved = b""
         self.blocks: dict[int, bytes] = {}  # last data by PDO identifier
+        self.next_node = node  # from the next reset of communication on
         self.reset()
         self._reads: dict[tuple[int, int], Callable[[], bytes]] = {}
         self._writes: dict[tuple[int, int], Callable[[bytes], None]] = {}
@@ -78,6 +91,8 @@ class ObjectDictionary:
         self._status()
         self._pdos()
         self._reads[_INDEX["envelope"], 0] = lambda: bytes([_SLOTS])
+        if Feature.ADDRESS in device.capabilities.features:
+            self._writes[_INDEX["set_address"], 0] = self._set_address
         for slot in range(1, _SLOTS + 1):
             self._writes[_INDEX["envelope"], slot] = partial(self._load, slot)
 
@@ -161,8 +176,22 @@ class ObjectDictionary:
             self._reads[levels, channel + 1] = partial(
                 lambda channel: _scaled(_Q.level, status().levels[channel]), channel
             )
+        if Feature.ELECTRICAL in self._device.capabilities.features:
+            self._measurements()
         self._reads[_INDEX["achieved"], 0] = lambda: self.achieved
         self._reads[_INDEX["faults"], 0] = self._faults
+
+    def _measurements(self) -> None:
+        for name, quantity in (("voltage", _Q.channel_voltage), ("current", _Q.channel_current)):
+            index = _INDEX[f"channel_{name}"]
+            self._count(index, self._channels)
+            for channel in range(self._channels):
+                self._reads[index, channel + 1] = partial(self._measured, channel, name, quantity)
+
+    def _measured(self, channel: int, name: str, quantity: WireQuantity) -> bytes:
+        reply = self._device.exchange(GetMeasured())
+        channels = reply.channels if isinstance(reply, Measured) else ()
+        return _scaled(quantity, getattr(channels[channel], name) if channels else 0.0)
 
     def _pdos(self) -> None:
         """The fixed PDOs, and the objects that they map."""
@@ -219,6 +248,18 @@ class ObjectDictionary:
         reply = self._device.exchange(LoadEnvelope(_envelope_of(slot, data)))
         if isinstance(reply, Nak):
             raise SdoAbort(_ABORTS[reply.code])
+
+    def _set_address(self, data: bytes) -> None:
+        if len(data) < 2:
+            raise SdoAbort(BAD_LENGTH)
+        if not 1 <= data[0] <= CANOPEN["node_max"]:
+            raise SdoAbort(_ABORTS[NakCode.BAD_VALUE])
+        wanted = SetAddress(data[0], data[1:].decode(errors="replace"))
+        reply = self._device.exchange(wanted)
+        if not isinstance(reply, AddressSet):
+            code = reply.code if isinstance(reply, Nak) else NakCode.BAD_VALUE
+            raise SdoAbort(_ABORTS[code])
+        self.next_node = reply.address
 
     def _record(self, index: int, values: list[bytes]) -> None:
         self._count(index, len(values))

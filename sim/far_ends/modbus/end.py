@@ -46,8 +46,11 @@ class _Units:
     def reply(self, request: RequestAdu, *, over_tcp: bool) -> bytes | None:
         """The reply PDU to a request, or None."""
         if request.unit == _MAP["broadcast"]:
-            for unit in self.units.values():
-                unit.handle_broadcast(request.pdu)
+            for number, unit in list(self.units.items()):
+                taken = unit.handle_broadcast(request.pdu)
+                if taken is not None:
+                    del self.units[number]
+                    self.units[taken] = unit
             return None
         number = request.unit
         if over_tcp and number == _ANY_UNIT and len(self.units) == 1:

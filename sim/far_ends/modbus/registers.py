@@ -17,7 +17,9 @@ from drivers.protocol.messages import (
     FaultList,
     Identity,
     LoadEnvelope,
+    Measured,
     NakCode,
+    SetAddress,
     Stage,
     Status,
 )
@@ -154,6 +156,17 @@ def capability_words(capabilities: Capabilities) -> list[int]:
     return words
 
 
+def measured_words(measured: Measured) -> list[int]:
+    """The number of channels, then voltage and current of each; none where nothing is measured."""
+    words = [len(measured.channels)]
+    for one in measured.channels:
+        words += [
+            word_of(_Q.channel_voltage, one.voltage),
+            word_of(_Q.channel_current, one.current),
+        ]
+    return words
+
+
 def identity_words(identity: Identity) -> list[int]:
     """The versions that are spoken, then the texts."""
     words = [sum(2**version for version in identity.versions)]
@@ -195,6 +208,14 @@ def decode_set(words: Sequence[int]) -> Stage | Apply | Commit:
     if commit not in (0, token):
         raise RefusedWrite(NakCode.BAD_TOKEN)
     return Apply(wanted, session) if commit else Stage(wanted, session)
+
+
+def decode_address(words: Sequence[int]) -> SetAddress:
+    """Decode the address block; raises RefusedWrite."""
+    if len(words) != 1 + MAP["text_registers"]:
+        raise RefusedWrite(NakCode.BAD_LENGTH)
+    raw = struct.pack(f">{len(words) - 1}H", *words[1:]).rstrip(b"\0")
+    return SetAddress(int(value_of(_Q.address, words[0])), raw.decode(errors="replace"))
 
 
 def decode_envelope(words: Sequence[int]) -> LoadEnvelope:

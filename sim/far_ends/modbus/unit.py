@@ -10,6 +10,7 @@ from typing import Protocol, TypeVar
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
+    AddressSet,
     Arm,
     Broadcast,
     Capabilities,
@@ -19,15 +20,18 @@ from drivers.protocol.messages import (
     FaultList,
     GetCaps,
     GetFaults,
+    GetMeasured,
     GetStatus,
     Hello,
     Identity,
     Loaded,
+    Measured,
     Nak,
     NakCode,
     Ping,
     Reply,
     Request,
+    SetAddress,
     Status,
     Stop,
 )
@@ -52,10 +56,12 @@ from sim.far_ends.modbus.registers import (
     RefusedWrite,
     achieved_words,
     capability_words,
+    decode_address,
     decode_envelope,
     decode_set,
     fault_words,
     identity_words,
+    measured_words,
     status_words,
     value_of,
 )
@@ -70,6 +76,7 @@ _WORD = _CONTROL + _HEAD  # of the control block
 _HEARTBEAT: int = MAP["holding"]["heartbeat"]["address"]
 _SET: int = MAP["holding"]["set"]["address"]
 _ENVELOPE: int = MAP["holding"]["envelope"]["address"]
+_ADDRESS: int = MAP["holding"]["address"]["address"]
 _CHANNELS, _KNOTS = 16, 32
 # How many registers follow those of a block that have names of their own.
 _FOLLOWING = {
@@ -77,9 +84,11 @@ _FOLLOWING = {
     "heartbeat": 0,
     "set": _CHANNELS * _GROUP,
     "envelope": 2 * _KNOTS,
+    "address": MAP["text_registers"],
     "status": _CHANNELS,
     "refusal": 0,
     "capabilities": _CHANNELS * MAP["limit_registers"],
+    "measured": _CHANNELS * MAP["measured_registers"],
     "identity": len(MAP["input"]["identity"]["texts"]) * MAP["text_registers"],
     "achieved": _CHANNELS * _GROUP,
     "faults": MAP["fault_count"] * MAP["fault_registers"],
@@ -107,8 +116,8 @@ class Amplifier(Protocol):
     def exchange(self, request: Request) -> Reply | None:
         """Its reply to a request; None for no reply."""
 
-    def broadcast(self, request: Broadcast) -> None:
-        """Execute a broadcast."""
+    def broadcast(self, request: Broadcast) -> Reply | None:
+        """Execute a broadcast; what it would reply."""
 
 
 class _NoReply(Exception):
@@ -138,17 +147,19 @@ class ModbusUnit:
         except _NoReply:
             return None
 
-    def handle_broadcast(self, pdu: bytes) -> None:
-        """Execute a broadcast commit or stop; anything else is ignored."""
+    def handle_broadcast(self, pdu: bytes) -> int | None:
+        """Execute a broadcast commit, stop or address; the unit's number if it has changed."""
         try:
             if pdu[0] != WRITE:
-                return
+                return None
             address, words = to_write(WRITE, pdu[1:])
             request = self._request(address, self._without_head(address, words))
         except (ModbusException, _NoReply, RefusedWrite):
-            return
-        if isinstance(request, Commit | Stop):
-            self._amplifier.broadcast(request)
+            return None
+        if not isinstance(request, Commit | Stop | SetAddress):
+            return None
+        reply = self._amplifier.broadcast(request)
+        return reply.address if isinstance(reply, AddressSet) else None
 
     def _carry_out(self, function: int, body: bytes) -> bytes:
         if function in (READ_HOLDING, READ_INPUT):
@@ -208,6 +219,9 @@ class ModbusUnit:
                 return capability_words(self._query(GetCaps(), Capabilities))
             case "identity":
                 return identity_words(self._query(Hello(), Identity))
+            case "measured":
+                reply = self._amplifier.exchange(GetMeasured())
+                return measured_words(reply if isinstance(reply, Measured) else Measured(()))
             case "faults":
                 return fault_words(self._query(GetFaults(), FaultList))
             case "achieved":
@@ -226,6 +240,8 @@ class ModbusUnit:
             if tag:
                 self._tag = tag
             request = self._request(address, fields)
+            if isinstance(request, SetAddress):  # by broadcast only
+                raise ModbusException(ILLEGAL_ADDRESS)
             reply = None if request is None else self._exchange(request)
         except RefusedWrite as refused:
             channel = NO_CHANNEL if refused.channel is None else refused.channel & 0xFFFF
@@ -265,6 +281,8 @@ class ModbusUnit:
             return self._control_request(words)
         if begin == _HEARTBEAT:
             return Ping(words[0])
+        if begin == _ADDRESS:
+            return decode_address(words)
         return decode_set(words) if begin == _SET else decode_envelope(words)
 
     def _control_request(self, words: Sequence[int]) -> Request:

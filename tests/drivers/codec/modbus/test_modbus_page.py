@@ -9,12 +9,13 @@ from drivers.codec.modbus.adu import RequestAdu, ResponseReader, build_adu
 from drivers.codec.modbus.exchanges import Exchange, Read, Write
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import Apply, Commit, Disarm, Nak, Request, Stop
+from drivers.protocol.messages import Apply, Commit, Disarm, Nak, Request, SetAddress, Stop
 from drivers.statistics import WireCounters
 from sim.far_ends.modbus.frames import RequestAdu as Asked
 from sim.far_ends.modbus.frames import rtu_frame, tcp_frame
 from sim.far_ends.modbus.unit import ModbusUnit
-from vendor_pages import EXAMPLES, GUARD, ScriptedDevice, plain
+from vendor_pages import EXAMPLES as ALL
+from vendor_pages import GUARD, ScriptedDevice, plain
 
 PAGE = (Path(drivers.__file__).parent.parent / "docs" / "reference" / "wire-modbus.md").read_text(
     "utf-8"
@@ -26,9 +27,14 @@ FRAMES = {
     )
 }
 MAP = PROTOCOL.modbus
+EXAMPLES = {name: one for name, one in ALL.items() if not isinstance(one.request, SetAddress)}
 NUMBERED = [(name, number) for number, name in enumerate(EXAMPLES, start=1)]
 BESIDE = ("Refusal", "FC16 Apply", "FC4 Apply", "FC43 Identification", "FC16 Disarm")
-BROADCASTS = {"Broadcast Commit": (22, Commit(513, 9)), "Broadcast Stop": (23, Stop(0.005))}
+BROADCASTS = {
+    "Broadcast Commit": (22, Commit(513, 9)),
+    "Broadcast Stop": (23, Stop(0.005)),
+    "Broadcast SetAddress": (26, SetAddress(5, "A-17")),
+}
 every_wire = pytest.mark.parametrize("wire", ["RTU", "TCP"])
 every_example = pytest.mark.parametrize(("name", "number"), NUMBERED, ids=EXAMPLES)
 
@@ -70,7 +76,9 @@ def test_page_shows_every_message() -> None:
     assert set(FRAMES) == {
         f"{name}, {wire}" for name in pairs + broadcasts for wire in ("RTU", "TCP")
     }
-    assert {type(example.request) for example in EXAMPLES.values()} == set(Request.__args__)
+    assert {type(example.request) for example in EXAMPLES.values()} == {*Request.__args__} - {
+        SetAddress
+    }
 
 
 @every_wire
@@ -190,7 +198,7 @@ def addresses() -> dict[int, str]:
     """Return the registers of the definition by address."""
     named = {MAP["look"]: "look"}
     behind = {"set": "channels", "envelope": "knots", "status": "levels", "achieved": "channels"}
-    behind["capabilities"] = "limits"
+    behind |= {"capabilities": "limits", "measured": "measurements", "address": "serial_number"}
     for name, block in [*MAP["holding"].items(), *MAP["input"].items()]:
         registers = [*MAP["head"], *block["registers"]]
         if name in behind:

@@ -192,7 +192,7 @@ def test_any_payload_is_a_valid_reply_or_malformed(
 @pytest.mark.parametrize(
     ("code", "payload", "nak"),
     [
-        (14, "", NakCode.UNKNOWN_TYPE),
+        (29, "", NakCode.UNKNOWN_TYPE),
         (13, "05 32 00 02 e803 0000", NakCode.BAD_LENGTH),
         (13, "40 32 00 00", NakCode.BAD_VALUE),
         (13, "05 32 00 01 1127 0000", NakCode.BAD_VALUE),

@@ -83,9 +83,9 @@ def test_check_links_warns_of_eras_on_several_links() -> None:
 @pytest.mark.parametrize(
     ("urls", "times"),
     [
-        # 57 + 49 bytes of 11 bits there and back, twice 3.5 characters of silence (Modbus over
-        # serial line), 10 ms for the amplifier's answer to begin: 74.7 ms, asked twice.
-        (["modbus+rtu:///dev/ttyS1?baud=19200#1"], ["202 ms"]),
+        # 57 + 47 bytes of 11 bits there and back, twice 3.5 characters of silence (Modbus over
+        # serial line), 10 ms for the amplifier's answer to begin: 73.6 ms, asked twice.
+        (["modbus+rtu:///dev/ttyS1?baud=19200#1"], ["197 ms"]),
         (["modbus+rtu:///dev/ttyS1?baud=115200#1"], []),
         (["serial:///dev/ttyUSB0"], []),
         # Three times 30 ms each, after a heartbeat of 50 ms.

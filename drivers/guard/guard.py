@@ -103,6 +103,11 @@ class Guard:
     ) -> None:
         self._made_for = (limits, capabilities)
         self._limits = limits_in_force(limits, capabilities)
+        if Feature.VOLTAGE in capabilities.features:
+            raise CommandError(
+                "levels must be of the full stroke, got an amplifier whose levels are of a "
+                "voltage; use a backend that converts them"
+            )
         is_bounded = self._limits.on_time < math.inf or self._limits.duty < 1
         if is_bounded and Feature.VALID_FOR not in capabilities.features:
             raise CommandError(

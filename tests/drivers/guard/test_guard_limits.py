@@ -286,6 +286,13 @@ def test_bounded_on_time_needs_an_amplifier_that_ends_vibrations() -> None:
         unlimited.check(CommandSet(2, commands, ramp=0.0, valid_for=0.1))
 
 
+def test_amplifier_of_voltages_is_refused() -> None:
+    """Limits of stroke would mean something else there."""
+    volts = replace(CAPABILITIES, features=Feature.WHOLE | Feature.VOLTAGE)
+    with pytest.raises(CommandError, match="full stroke"):
+        Guard(GuardLimits(40.0, 500.0, 0.8), volts)
+
+
 def test_channels_bound_the_limits_of_all() -> None:
     """The highest of the lowest frequencies, the lowest of the rest: a pattern needs them all."""
     limits = (ChannelLimits(50.0, 600.0, 0.9), ChannelLimits(20.0, 300.0, 0.6)) * 2

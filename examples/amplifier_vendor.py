@@ -23,7 +23,7 @@ import era_haptics as era
 from drivers.amplifier import Amplifier
 from drivers.codec.serial_line.exchanges import decode_reply, encode_request
 from drivers.codec.serial_line.frame import FrameReader, encode_frame
-from drivers.conformance import CHECKS, run_check
+from drivers.conformance import CHECKS, Result, raw_line, run_check
 from drivers.protocol.messages import Hello, Ping
 from drivers.registry import open_backend
 
@@ -99,18 +99,19 @@ async def conform(url):
     amplifier = Amplifier(open_backend(url))
     await amplifier.open()
     try:
-        return [await run_check(check, amplifier) for check in CHECKS]
+        raw = raw_line(url)
+        return [await run_check(check, amplifier, raw, url=url) for check in CHECKS]
     finally:
         await amplifier.close()
 
 
 outcomes = asyncio.run(conform(url))
 for outcome in outcomes:
-    print("passed" if outcome.problem is None else "FAILED", outcome.check.requirement)
-    if outcome.problem:
-        print("       ", outcome.problem)
+    print(outcome.result.value, outcome.check.requirement)
+    if outcome.reason:
+        print("       ", outcome.reason, outcome.place)
 
 # %%
 far_end.terminate()
 far_end.communicate(timeout=10)
-print(sum(outcome.problem is None for outcome in outcomes), "of", len(outcomes), "passed")
+print(sum(outcome.result is Result.FAILED for outcome in outcomes), "of", len(outcomes), "failed")

@@ -86,6 +86,7 @@ def test_hmi_engineer_example_feels_what_was_predicted() -> None:
     assert "daemon ended with status 0" in said
 
 
+@pytest.mark.real_time
 def test_amplifier_vendor_example_passes_conformance() -> None:
     """Its frame is that of the wire page, it gets a reply, and all checks pass."""
     said = run("amplifier_vendor.py")
@@ -93,9 +94,9 @@ def test_amplifier_vendor_example_passes_conformance() -> None:
     assert f"by hand  {ping}" in said
     assert f"by codec {ping}" in said
     assert re.search(r"^reply    00 .* 00 -> Status SWITCH_ON_DISABLED$", said, re.MULTILINE)
-    passed, total = re.findall(r"^(\d+) of (\d+) ", said, re.MULTILINE)[-1]
-    assert passed == total
-    assert int(total) == said.count("\npassed ") > 15
+    failed, total = re.findall(r"^(\d+) of (\d+) ", said, re.MULTILINE)[-1]
+    assert failed == "0"
+    assert int(total) > said.count("\npassed ") > 40
 
 
 @pytest.mark.usefixtures("cache")

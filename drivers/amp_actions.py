@@ -16,6 +16,7 @@ from drivers.conformance import Check, CheckResult, raw_line, run_check
 from drivers.conformance.report import ConformanceReport
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, Guard, GuardLimits
+from drivers.link.link import REPLY_TIMEOUT
 from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.operation.keep_alive import keep_alive
 from drivers.operation.silence import stop_and_confirm, stop_outcome
@@ -27,6 +28,7 @@ from drivers.registry import open_backend
 
 _TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address
 _STOP_TIMEOUT = 2.0  # s; for boards that restart when their port is opened
+_PATIENT_TIMEOUT = 0.2  # s; of replies under test, whose time is measured
 _RAMP = 0.05  # s; neither start nor end of a drive clicks
 _UNITS = {
     **dict.fromkeys(("frequency_min", "frequency_max", "frequency_step"), "_hz"),
@@ -183,7 +185,7 @@ async def conform(
 ) -> ConformanceReport:
     """Run checks in turn on one open amplifier; on_result: called with each result."""
     results = []
-    async with _opened(url) as amplifier:
+    async with _opened(url, reply_timeout=_PATIENT_TIMEOUT) as amplifier:
         raw = raw_line(url)
         for check in checks:
             results.append(await run_check(check, amplifier, raw, url=url))
@@ -193,8 +195,10 @@ async def conform(
 
 
 @asynccontextmanager
-async def _opened(url: str, *, take_over: bool = False) -> AsyncIterator[Amplifier]:
-    amplifier = Amplifier(open_backend(url))
+async def _opened(
+    url: str, *, take_over: bool = False, reply_timeout: float = REPLY_TIMEOUT
+) -> AsyncIterator[Amplifier]:
+    amplifier = Amplifier(open_backend(url), reply_timeout=reply_timeout)
     await amplifier.open(take_over=take_over)
     try:
         yield amplifier

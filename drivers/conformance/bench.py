@@ -83,11 +83,17 @@ class Bench:
             raise NotApplicable("there is no raw access to this wire")
         return self._raw
 
-    async def prepare(self) -> None:
-        """Open the amplifier again if it was lost, and measure its typical exchange."""
+    async def prepare(self, *, drives: bool) -> None:
+        """Open the amplifier again if it was lost, and measure its typical exchange.
+
+        drives: whether it must be disarmed first, as after an attempt that was cut short.
+        """
         if self.amplifier.is_lost:
             await self.amplifier.close()
             await self.amplifier.open()
+        off = AmplifierState.SWITCH_ON_DISABLED
+        if drives and (await self.amplifier.status()).state is not off:
+            await self.rest()
         durations = []
         for _ in range(_PREPARATION):
             when = (await self.sample()).when

@@ -11,7 +11,7 @@ from drivers.conformance.bench import Bench
 from drivers.conformance.findings import ContractViolation, Inconclusive, NotApplicable
 from drivers.conformance.lateness import STALL, Lateness
 from drivers.conformance.raw.line import RawLine
-from drivers.errors import DriverError
+from drivers.errors import DriverError, LinkError
 
 MAX_ATTEMPTS = 4
 """Attempts of a check of which this host, or the wire, disturbed all before."""
@@ -179,10 +179,10 @@ async def run_check(
 
 
 def _all_failed(attempts: Sequence[_Attempt]) -> bool:
-    """Whether every attempt failed, and one without a delay of this program."""
-    return not any(isinstance(one.finding, Inconclusive) for one in attempts) and any(
-        one.lateness <= STALL for one in attempts
-    )
+    """Whether every attempt failed, and several not for want of a reply, one without a delay."""
+    failed = [one for one in attempts if not isinstance(one.finding, Inconclusive | LinkError)]
+    is_unclear = any(isinstance(one.finding, Inconclusive) for one in attempts)
+    return not is_unclear and len(failed) > 1 and any(one.lateness <= STALL for one in failed)
 
 
 async def _attempt(check: Check, bench: Bench) -> _Attempt:
@@ -198,7 +198,7 @@ async def _finding(check: Check, bench: Bench) -> Exception | None:
     """Return what the steps found, None if all is as required."""
     finding: Exception | None = None
     try:
-        await bench.prepare()
+        await bench.prepare(drives=check.drives)
         await check.run(bench)
     except _FINDINGS as found:
         finding = found

@@ -57,7 +57,6 @@ from sim.far_ends.serial_end import SerialEnd
 from sim.transport.line import Line
 from sim.waveform import FadingTone
 
-WIRES = ("serial", "modbus+tcp", "can+slcan")
 ALL = ("serial", "modbus+tcp", "modbus+rtu", "can+slcan")
 SERIAL, MODBUS, CAN = ("serial",), ("modbus+tcp", "modbus+rtu"), ("can+slcan",)
 SESSIONS = ("serial", "modbus+tcp", "modbus+rtu")
@@ -906,7 +905,7 @@ FAULTS: dict[str, PlantedFault] = {
     ),
     "Clear forgets the faults": PlantedFault("fault_list", after(Clear, _forgets_faults)),
     "replies are 25 ms late": PlantedFault(
-        "replies_in_time", wrapped(Line, "send", _late), wires=WIRES
+        "replies_in_time", wrapped(Line, "send", _late), wires=("serial", "modbus+tcp")
     ),
     "events come although none are stated": PlantedFault(
         "events",

@@ -20,6 +20,7 @@ from drivers.guard import SafeCommandSet, SafeEnvelope, require_safe
 from drivers.guard.recorder import PlayRecorder
 from drivers.line.sender import SUPERSEDED
 from drivers.link.link import REPLY_TIMEOUT, Link, ReplyT
+from drivers.link.pacing import Pacing
 from drivers.link.refusals import PROTOCOL_VIOLATION
 from drivers.protocol.definition import PROTOCOL, random_session, random_token, token_after
 from drivers.protocol.messages import (
@@ -56,6 +57,7 @@ from drivers.protocol.wire_times import WireTimes
 from drivers.statistics import LinkStatistics
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms
+_FEEDS_PER_WATCHDOG = 5  # while a set waits
 OPEN_TIMEOUT = 0.5  # s; for boards that restart when their port is opened
 DISARM_RAMP = 0.05  # s; long enough to avoid a click
 STOP_RAMP = 0.005  # s; the shortest without a step
@@ -96,6 +98,7 @@ class Amplifier:
             silent_from=self._silent_from,
         )
         self._recorder = PlayRecorder()
+        self._pacing = Pacing()
         self._serial_number = serial_number
         self._listeners: list[Callable[[AmplifierEvent], None]] = []
         self._token = 0
@@ -234,6 +237,7 @@ class Amplifier:
 
     async def close(self) -> None:
         """Close the wire; disarm before, or the vibration lasts until the watchdog trips."""
+        self._pacing.supersede()
         await self._link.close()
 
     async def arm(self, watchdog: float = WATCHDOG, *, session: int | None = None) -> Status:
@@ -261,6 +265,7 @@ class Amplifier:
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> Status:
         """Ramp [s] to silence, then switch the high voltage off; overtakes the queue."""
+        self._pacing.supersede()
         return await self._request(Disarm(ramp=self._ramp(ramp)), expect=Status)
 
     async def stop(self, ramp: float = STOP_RAMP) -> Status:
@@ -272,6 +277,7 @@ class Amplifier:
         on the wire yet is preempted at once.
         """
         self._stop_count += 1
+        self._pacing.supersede()
         return await self._request(Stop(ramp=self._ramp(ramp)), expect=Status)
 
     async def load_envelope(self, safe: SafeEnvelope) -> None:
@@ -286,11 +292,22 @@ class Amplifier:
                 f"{loaded.knots} in slot {loaded.slot}; {PROTOCOL_VIOLATION}"
             )
 
+    async def wait_for_room(self, safe: SafeCommandSet) -> None:
+        """Wait until no channel that a set drives fades between two others, feeding the watchdog.
+
+        Of several sets the newest goes on; the others raise Preempted, as a set does if silence, a
+        stop or a disarm comes.
+        """
+        require_safe(Apply(safe, self.session))
+        interval = (self._watchdog or WATCHDOG) / _FEEDS_PER_WATCHDOG
+        await self._pacing.wait_for_room(safe, self.heartbeat, interval=interval)
+
     async def stage(self, safe: SafeCommandSet) -> Achieved:
         """Keep a set ready under its token; returns what its commit would achieve.
 
-        Raises CommandRefused if a newer set, a stop or a disarm came first.
+        Waits for room. Raises CommandRefused if a newer set, a stop or a disarm came first.
         """
+        await self.wait_for_room(safe)
         achieved = await self._request(Stage(safe, self.session), expect=Achieved)
         return _of_token(achieved, safe.token)
 
@@ -305,9 +322,10 @@ class Amplifier:
     async def apply(self, safe: SafeCommandSet) -> Achieved:
         """Play a set now; returns the achieved set.
 
-        A silent set overtakes the queue as a stop does. Raises CommandRefused if a newer set or a
-        stop superseded it.
+        Waits for room. A silent set does not wait, and overtakes the queue as a stop does. Raises
+        CommandRefused if a newer set or a stop superseded it.
         """
+        await self.wait_for_room(safe)
         achieved = await self._request(Apply(safe, self.session), expect=Achieved)
         return _of_token(achieved, safe.token)
 
@@ -351,6 +369,7 @@ class Amplifier:
 
         Stop-class requests are exempt.
         """
+        self._pacing.supersede()
         self._link.abort_unsent()
 
     def expect_stop(self) -> None:
@@ -366,12 +385,16 @@ class Amplifier:
         """
         commit = Commit(token, self.session)
         self._recorder.sending(commit)
-        with self._feeding():
-            await self._link.broadcast(commit)
+        try:
+            with self._feeding():
+                await self._link.broadcast(commit)
+        finally:
+            self._recorder.left(commit)
 
     async def stop_on_bus(self, ramp: float = STOP_RAMP) -> None:
         """Stop every amplifier of the bus, before all queued requests; there are no replies."""
         self._stop_count += 1
+        self._pacing.supersede()
         request = Stop(ramp=self._ramp(ramp))
         with _errors_logged_for_stop(request):
             self._recorder.sending(request)
@@ -415,6 +438,8 @@ class Amplifier:
             outcome = error
             raise
         finally:
+            self._recorder.left(request)
+            self._pacing.notice()
             with _errors_logged_for_stop(request):
                 trace.request(request, outcome, clock.now() - started_at)
         with _errors_logged_for_stop(request):

@@ -114,6 +114,7 @@ class Decider:
         self._tracker = ContactTracker(rig.plate)
         self._intent_source = intent_source
         self._intent_due: float | None = None  # when the intent may change without a touch
+        self._held_until: float | None = None  # when there is room for a pattern
         self._selector = Selector(table, None if timing is None else timing.levels)
         self._builder = SetBuilder(rig, guards, timing=timing)
         self._selected: Selection | None = None
@@ -160,11 +161,11 @@ class Decider:
     def due(self) -> float | None:
         """When [s] to decide next even if nothing arrives.
 
-        A source times out then, an intent expires, endings can be added, or a guard would pass what
-        it refused.
+        A source times out then, an intent expires, endings can be added, a guard would pass what it
+        refused, or the amplifiers have room for what is held back.
         """
         moments = (
-            *(self._tracker.next_expiry, self._intent_due),
+            *(self._tracker.next_expiry, self._intent_due, self._held_until),
             *(self._playing.endings_due, self._playing.retry_at),
         )
         return min((moment for moment in moments if moment is not None), default=None)
@@ -227,9 +228,9 @@ class Decider:
         confirmed_until = self._confirmed_until(decision.selection)
         if not self._playing.validity.is_renewal_due(now, confirmed_until=confirmed_until):
             return None
-        return self._builder.build_renewal(
-            decision.sets, valid_for=self._valid_for(decision.selection, now)
-        )
+        valid_for = self._valid_for(decision.selection, now)
+        sets = self._builder.build_renewal(decision.sets, valid_for=valid_for)
+        return sets if sets is not None and sets.room_from <= now else None
 
     def confirm_renewal(self, sets: SafeSets, *, now: float) -> None:
         """Note that the amplifiers have accepted the sets of a renewal."""
@@ -264,7 +265,11 @@ class Decider:
         return self._loading_times.ramp_only_reason(now)
 
     def decide(self, now: float) -> Decision | None:
-        """Decide at a time [s]; None if nothing changes."""
+        """Decide at a time [s]; None if nothing changes.
+
+        A pattern that the amplifiers have no room for yet is decided again once they have, unless
+        something else is then.
+        """
         self.expire(now)
         contacts, playing = self._tracker.contacts, self._playing
         triggered_at = now if self._triggered_at is None else min(self._triggered_at, now)
@@ -285,6 +290,10 @@ class Decider:
             draft = Decision(contacts, selection, from_rest, triggered_at)
             if is_new:
                 _logger.exception("loop: decision failed, silencing all channels")
+        self._held_until = None
+        if decision is not None and decision.sets is not None and decision.sets.room_from > now:
+            self._hold(decision.sets.room_from, now, triggered_at)
+            return None
         if decision is None and is_new:
             decision = draft
             if not playing.is_silent:
@@ -301,6 +310,16 @@ class Decider:
             )
         self._selected = selection
         return decision
+
+    def _hold(self, until: float, now: float, triggered_at: float) -> None:
+        """Decide again at a time [s], as if nothing had been decided at `now` [s]."""
+        self._held_until, self._triggered_at = until, triggered_at
+        playing = self._playing
+        self._playing = replace(
+            playing,
+            retry_at=until if _is_due(playing.retry_at, now) else playing.retry_at,
+            endings_due=until if _is_due(playing.endings_due, now) else playing.endings_due,
+        )
 
     def silence(self, *, ramp: float, before: SafeSets | None = None) -> SafeSets:
         """Build the sets that ramp [s] every wired channel to zero; see `SetBuilder`."""

@@ -57,6 +57,11 @@ class SafeSets:
         return min((time for time in times if time > 0), default=math.inf)
 
     @property
+    def room_from(self) -> float:
+        """When [s] no channel fades between two other sets any more; see `PlayRecord`."""
+        return max(safe.record.room_from(safe) for safe in self.sets.values())
+
+    @property
     def settled_after(self) -> float:
         """Time [s] after the commit when the last fade or envelope has ended."""
         return max((safe.settled_after for safe in self.sets.values()), default=0.0)

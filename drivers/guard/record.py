@@ -18,10 +18,12 @@ from drivers.guard.channel_state import (
     state_after,
     union_of,
 )
+from drivers.guard.voices import Voices, latest_of
 from drivers.protocol.messages import Achieved, AmplifierState, Status
 from registry.limits import GuardLimits
 
 _ROUNDING = 1 + 1e-9  # sums of floats
+_ARRIVAL = 0.03  # s; in which a request arrives that has no reply, as the host's timeout
 _SILENT = ChannelState()
 
 States = tuple[ChannelState, ...]
@@ -29,10 +31,15 @@ States = tuple[ChannelState, ...]
 
 @dataclass
 class _Sent:
-    """A set that may play; since [s]: when it was sent."""
+    """A set that may play; sent_at [s]: when it was sent.
+
+    latest [s]: when it has been carried out if it ever is; infinite while a request for it is
+    pending, None while it is only staged.
+    """
 
     command_set: CommandSet
     sent_at: float
+    latest: float | None = math.inf
     achieved: tuple[DriveCommand, ...] = field(default=())
 
 
@@ -49,6 +56,7 @@ class PlayRecord:
         self._clock = clock
         self._budget = Budget(limits)
         self._confirmed: States = (_SILENT,) * channels
+        self._voices: tuple[Voices, ...] = (Voices(),) * channels  # of the confirmed sets
         self._confirmed_token = 0
         self._pending: list[_Sent] = []
         self._staged: _Sent | None = None
@@ -69,6 +77,28 @@ class PlayRecord:
                 raise CommandRefused("on-time or duty limit reached; end along a ramp")
         self._check_transition(command_set, now)
         return max_valid_for
+
+    def room_from(self, command_set: CommandSet) -> float:
+        """Return the time [s] from which a set is no third voice on any channel.
+
+        Later while sets that were sent are unconfirmed. Minus infinity for a set that needs no
+        room: silence, one that ends the others at once, or one that was sent before.
+        """
+        token = command_set.token
+        is_sent = token == self._confirmed_token or any(
+            sent.command_set.token == token for sent in self._pending
+        )
+        if is_sent or command_set.ramp == 0:
+            return -math.inf
+        voices = self._voices_after(self._pending, self._clock())
+        return max(
+            (
+                voices[command.channel].room_from
+                for command in command_set.commands
+                if command.level > 0 or command.onset
+            ),
+            default=-math.inf,
+        )
 
     def fade_left(self) -> float:
         """Return the longest time [s] in which a silent set sent now may fade."""
@@ -98,15 +128,25 @@ class PlayRecord:
 
     def stage(self, command_set: CommandSet) -> None:
         """Record a set that is about to be staged: from then on it may be committed."""
+        is_new = command_set.token not in [sent.command_set.token for sent in self._pending]
         self.send(command_set)
         self._staged = next(
             (sent for sent in self._pending if sent.command_set.token == command_set.token), None
         )
+        if is_new and self._staged is not None:
+            self._staged.latest = None
 
     def commit(self, token: int) -> None:
         """Record that the staged set is about to be committed."""
         if self._staged is not None and self._staged.command_set.token == token:
             self.send(self._staged.command_set)
+            self._staged.latest = math.inf
+
+    def left(self, token: int) -> None:
+        """Record that no request to play the set of this token is pending any more."""
+        for sent in self._pending:
+            if sent.command_set.token == token and sent.latest == math.inf:
+                sent.latest = self._clock() + _ARRIVAL
 
     def achieve(self, achieved: Achieved) -> None:
         """Record what a sent set plays once it is committed."""
@@ -125,6 +165,7 @@ class PlayRecord:
         when = Interval(sent.sent_at, now)
         before = self._states(self._pending[:number], when)
         played = _played(sent)
+        self._voices = self._with(sent, self._voices_after(self._pending[:number], now), now)
         if self._limits.slew == math.inf and not self._is_shaped(sent.command_set):
             self._confirmed = _upper_bounds_after(before, played, when)
         else:
@@ -149,6 +190,8 @@ class PlayRecord:
         )
         silence = CommandSet(0, commands, ramp=ramp, valid_for=0.0)
         self._confirmed = states_after(self._states(self._pending, when), silence, when, {})[0]
+        silent = _Sent(silence, now)
+        self._voices = self._with(silent, self._voices_after(self._pending, now), now)
         self._confirmed_token = 0
         self._pending.clear()
         self._staged = None
@@ -247,6 +290,36 @@ class PlayRecord:
         if self._may_be_silent:
             states = tuple(union_of((state, _SILENT), when) for state in states)
         return states
+
+    def _voices_after(self, pending: Sequence[_Sent], now: float) -> tuple[Voices, ...]:
+        """Return upper bounds of the voices once the sets before have been sent."""
+        voices = self._voices
+        for sent in pending:
+            if sent.latest is not None:
+                after = self._with(sent, voices, min(now, sent.latest))
+                voices = tuple(map(latest_of, zip(voices, after, strict=True)))
+        return voices
+
+    def _with(self, sent: _Sent, voices: tuple[Voices, ...], latest: float) -> tuple[Voices, ...]:
+        """Return the voices once a set plays, since a time [s] at the latest."""
+        requested = sent.command_set
+        commands = {command.channel: command for command in requested.commands}
+        each = (commands.get(n, DriveCommand(n, 0.0, 0.0)) for n in range(len(voices)))
+        return tuple(
+            before.after(
+                command,
+                Interval(min(sent.sent_at, latest), latest),
+                ramp=requested.ramp,
+                valid_for=requested.valid_for,
+                onset=self._longest(command.onset),
+                ending=self._longest(command.ending),
+            )
+            for before, command in zip(voices, each, strict=True)
+        )
+
+    def _longest(self, slot: int) -> float:
+        """Return the longest duration [s] of an envelope that a slot may hold."""
+        return max(map(duration, self.slots.get(slot, ())), default=0.0)
 
     def _fade(self, command_set: CommandSet, ramp: float) -> float:
         """Return the longest time [s] from the end of a set until silence."""

@@ -47,6 +47,17 @@ class PlayRecorder:
                 for record in self._records:
                     record.silence_sent()
 
+    def left(self, request: Request) -> None:
+        """Record that a request is not pending any more, with or without its reply."""
+        match request:
+            case Apply(command_set=SafeCommandSet() as safe):
+                safe.record.left(safe.token)
+            case Commit(token=token):
+                for record in self._records:
+                    record.left(token)
+            case _:
+                pass
+
     def replied(self, request: Request, reply: Reply) -> None:
         """Record what a reply confirms."""
         if isinstance(request, LoadEnvelope) and isinstance(reply, Loaded):

@@ -40,7 +40,8 @@ class CheckedAmplifier:
         return status
 
     async def apply(self, safe: SafeCommandSet) -> Achieved:
-        """Play a set now; returns the achieved set."""
+        """Play a set once there is room for it; returns the achieved set."""
+        await self.amplifier.wait_for_room(safe)
         check, started_at = self._check, clock.now()
         check.forget(safe)
         achieved = await self.amplifier.apply(safe)

@@ -90,6 +90,7 @@ class NakCode(ExtensibleEnum):
     NO_ENVELOPE = 9
     WRONG_SESSION = 10
     WRONG_LATCH = 11
+    FADING = 12
 
 
 @dataclass(frozen=True, slots=True)

@@ -270,8 +270,8 @@ def test_reply_may_have_more_than_is_known() -> None:
     assert status == Status(
         AmplifierState.FAULT, Fault(66), 1, True, 25.0, 0.0, (0.0,), 1800.0, 3, other_flags=0x84
     )
-    assert reply(REPLY | 31, "09 0C FF 00") == Nak(NakCode(12))
-    assert [Fault(66).name, NakCode(12).name] == ["VENDOR_66", "NUMBER_12"]
+    assert reply(REPLY | 31, "09 0D FF 00") == Nak(NakCode(13))
+    assert [Fault(66).name, NakCode(13).name] == ["VENDOR_66", "NUMBER_13"]
 
 
 def test_reply_to_another_type_is_malformed() -> None:

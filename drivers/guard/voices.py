@@ -1,0 +1,87 @@
+"""When the voices of a channel have ended: an amplifier plays two at most (`FADING`).
+
+A voice is what one set plays on a channel, until it has faded. Its end is known as an upper bound:
+commits are as late as they can be.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+from typing import NamedTuple
+
+from drivers.command import DriveCommand
+from drivers.guard.channel_state import Interval
+
+LAG = 0.002
+"""Longest time [s] by which playback lags behind a commit, by the protocol."""
+
+
+class Voice(NamedTuple):
+    """A voice without further sets: latest ends [s], each minus infinity if it is not so.
+
+    lasts_until: of its full amplitude, and lasting: of the fade after that; fading: of the fade
+    that it may be in already.
+    """
+
+    lasts_until: float = -math.inf
+    lasting: float = -math.inf
+    fading: float = -math.inf
+
+    @property
+    def end(self) -> float:
+        """Its latest end [s]."""
+        return max(self.lasting, self.fading)
+
+
+@dataclass(frozen=True, slots=True)
+class Voices:
+    """The voices of a channel, that with the last end first.
+
+    ending [s]: longest envelope that the newest command may end along, 0 for none.
+    """
+
+    voices: tuple[Voice, ...] = ()
+    ending: float = 0.0
+
+    @property
+    def room_from(self) -> float:
+        """When [s] at most one is left."""
+        return self.voices[1].end + LAG if len(self.voices) > 1 else -math.inf
+
+    def after(
+        self,
+        command: DriveCommand,
+        commit: Interval,
+        *,
+        ramp: float,
+        valid_for: float,
+        onset: float,
+        ending: float,
+    ) -> "Voices":
+        """The voices after a command.
+
+        ramp, valid_for: of its set, onset, ending: duration of its envelopes, 0 for none [s].
+        """
+        is_driven = command.level > 0 or command.onset > 0
+        has_ending = self.ending > 0 and not (is_driven or command.skip_ending)
+        faded = commit.latest + (max(ramp, self.ending) if has_ending else ramp)
+        voices = []
+        for lasts_until, lasting, fading in self.voices:
+            begun = max(fading, lasting) if lasts_until <= commit.latest else fading
+            ends = [begun if has_ending else min(begun, faded)]  # no ending cuts a fade short
+            ends += [faded] if lasts_until > commit.earliest else []
+            voices.append(Voice(fading=max(ends)))
+        if is_driven:
+            lasts_until = commit.latest + (valid_for or math.inf)
+            onset_end = commit.latest + onset if command.level == 0 else -math.inf
+            voices.append(Voice(lasts_until, lasts_until + max(ramp, ending), onset_end))
+        left = [voice for voice in voices if voice.end > commit.latest]
+        return Voices(tuple(sorted(left, key=lambda voice: voice.end, reverse=True)), ending)
+
+
+def latest_of(several: Sequence[Voices]) -> Voices:
+    """Upper bounds of the voices that sound in any one of several cases."""
+    ranks = zip_longest(*(one.voices for one in several), fillvalue=Voice())
+    voices = tuple(Voice(*map(max, zip(*rank, strict=True))) for rank in ranks)
+    return Voices(voices, max(one.ending for one in several))

@@ -67,7 +67,13 @@ LONG = {
     *("staged_sets_expire", "ramp_down", "ramps_of_other_lengths", "interrupted_ramps", "phases"),
     *("earlier_ends_stay", "ramps_of_valid_for", "valid_for_is_of_its_set", "stop_ramp_clipped"),
     *("silence_never_later", "stop_ends_fades", "watchdog_times", "watchdog_left", "what_feeds"),
-    *("trips_amid_other_requests", "endings", "invalid_frames", "invalid_frames_do_not_feed"),
+    *(
+        "two_voices",
+        "trips_amid_other_requests",
+        "endings",
+        "invalid_frames",
+        "invalid_frames_do_not_feed",
+    ),
 }
 """Checks that last long; over all wires they are run in virtual time."""
 

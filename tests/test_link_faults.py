@@ -28,6 +28,7 @@ from drivers.registry import open_backend
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from reconnection import reconnect
+from sim.amplifier.channels import PlayableSet
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultKind, FaultWindow
 from virtual_loop import run_virtual
@@ -369,16 +370,14 @@ def test_slow_wire_is_not_lost(name: str, coarse_rig: Rig) -> None:
 async def test_token_is_applied_once_under_frame_loss(far: FarSide) -> None:
     """With 20 % of all frames lost each way, confirmed sets play exactly once."""
     played: list[int] = []  # in the order of their commits
-    commit = far.amplifier._commit
+    play = far.amplifier._play
 
-    def noted(token: int, now: float) -> object:
-        active = far.amplifier._sets.active
-        reply = commit(token, now)
-        if far.amplifier._sets.active is not active:
-            played.append(token)
+    def noted(playable: PlayableSet, now: float) -> object:
+        reply = play(playable, now)
+        played.append(playable.token)
         return reply
 
-    far.amplifier._commit = noted
+    far.amplifier._play = noted
     confirmed = []
     async with Link(far, reply_timeout=0.03) as link:
         await link.amplifier.arm(2.0)

@@ -125,6 +125,26 @@ async def earlier_ends_stay(bench: Bench) -> None:
     bench.expect_time(what, silent, low=0.0, high=short + PROMPT)
 
 
+@driving(_SETS)
+async def two_voices(bench: Bench) -> None:
+    """It refuses a third voice on a channel while two fade, and takes the set afterwards."""
+    await bench.arm()
+    await bench.play(1.0)
+    second = bench.tones(0.5, ramp=bench.ramp)
+    await bench.amplifier.apply(second)
+    # A guard of its own does not know of the fade, and holds nothing back.
+    third = bench.tones(0.25, ramp=bench.ramp, guard=bench.guard_as(bench.can))
+    await bench.refused(bench.amplifier.apply(third), what="a third voice")
+    status = await bench.amplifier.status()
+    what = "active_token after a refused set"
+    expect(status.token == second.token, what, expected=second.token, seen=status.token)
+    await bench.wait(1.25 * bench.ramp)
+    await bench.expect_levels(0.5, why="fade that went on after a refused set")
+    await bench.amplifier.apply(bench.tones(0.25, ramp=bench.ramp))
+    await bench.wait(1.25 * bench.ramp)
+    await bench.expect_levels(0.25, why="set after the end of a fade")
+
+
 @dataclass(frozen=True)
 class _FollowingTone:
     """A tone that follows one of its frequency and phase 0 after a part of a turn.

@@ -13,7 +13,7 @@ from collections import deque
 DISARMED, SWITCHED_ON, ARMED, STOPPED, REACTING, FAULT = 1, 3, 4, 5, 6, 7
 NO_FAULT, WATCHDOG = 0, 1
 BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN, NO_ENVELOPE = 3, 4, 5, 6, 9
-WRONG_SESSION, WRONG_LATCH = 10, 11
+WRONG_SESSION, WRONG_LATCH, FADING = 10, 11, 12
 
 CHANNELS = 4
 FREQUENCY = (400, 12000)  # range
@@ -39,6 +39,7 @@ class Amplifier:
         self.session = self.latch = 0
         self._faults = deque(maxlen=16)
         self._fades = [(0, 0, 0, clock())] * CHANNELS  # level before, after, ramp, begin
+        self._voices = [[] for _ in range(CHANNELS)]  # when each has ended
         self._forget()
 
     def update(self):
@@ -90,6 +91,13 @@ class Amplifier:
             is_silent = not after and not levels[channel]
             if not (is_silent and since + its_ramp <= begin + ramp):  # silence never comes later
                 self._fades[channel] = (before[channel], levels[channel], ramp, begin)
+        for channel, level in enumerate(levels):
+            self._voices[channel] = self._fading(channel, ramp, begin) + [math.inf] * (level > 0)
+
+    def _fading(self, channel, ramp, begin):
+        """When the voices of a channel end that a set leaves to fade."""
+        ends = [min(end, begin + ramp) for end in self._voices[channel]]
+        return [end for end in ends if end > begin]
 
     def _is_silent(self):
         now = self._clock()
@@ -147,8 +155,6 @@ class Amplifier:
     def stage(self, session, token, ramp, valid_for, commands):
         """Hold a set of (channel, frequency, level, phase) until its commit; return it."""
         self._check(session, token, ramp, valid_for, commands)
-        if self.token and not 1 <= (token - self.token) % 65536 <= 32767:
-            raise Refused(BAD_TOKEN)  # a late copy
         self._staged, self._staged_at = (token, ramp, valid_for, commands), self._clock()
         self.ping(session)
         return token, commands
@@ -165,17 +171,22 @@ class Amplifier:
         return token, self._playing[3]
 
     def apply(self, session, token, ramp, valid_for, commands):
-        """Stage and commit at once; repeat the reply for the same set again."""
+        """Play a set; repeat the reply for the same set again."""
         if token != self.token:
-            self.stage(session, token, ramp, valid_for, commands)
+            self._check(session, token, ramp, valid_for, commands)
+            self._play((token, ramp, valid_for, commands))
         elif self._playing != (token, ramp, valid_for, commands):
             self._check_token(session, token)
             raise Refused(BAD_TOKEN)
         return self.commit(session, token)
 
     def _play(self, wanted):
-        self._playing, self._staged = wanted, None
-        self.token, ramp, valid_for, commands = wanted
+        """Play a checked set, if its channels have room for it."""
+        token, ramp, valid_for, commands = wanted
+        for channel, _, level, _ in commands:
+            if level > 0 and len(self._fading(channel, ramp, self._clock())) > 1:
+                raise Refused(FADING, channel)  # two voices a channel
+        self._playing, self._staged, self.token = wanted, None, token
         levels = [0] * CHANNELS  # channels without a command fall silent
         for channel, _, level, _ in commands:
             levels[channel] = level
@@ -198,6 +209,8 @@ class Amplifier:
     def _check(self, session, token, ramp, valid_for, commands):
         """Check a whole set; raise Refused."""
         self._check_token(session, token)
+        if self.token and not 1 <= (token - self.token) % 65536 <= 32767:
+            raise Refused(BAD_TOKEN)  # a late copy
         if not (0 <= ramp <= MAX_RAMP and 0 <= valid_for <= 60000):
             raise Refused(BAD_VALUE)
         seen = set()

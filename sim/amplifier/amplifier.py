@@ -10,6 +10,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 
+from drivers.command import CommandSet
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
@@ -44,7 +45,7 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
-from sim.amplifier.channels import Channels
+from sim.amplifier.channels import Channels, PlayableSet
 from sim.amplifier.set_store import RefusedSet, SetStore
 from sim.amplifier.states import ENABLED, next_state
 from sim.amplifier.thermal_model import DERATE_ABOVE, DERATED, FAULT_ABOVE, GOOD_BELOW, ThermalState
@@ -269,13 +270,17 @@ class SimulatedAmplifier:
             case LoadEnvelope(envelope=envelope):
                 return self._sets.load(envelope)
             case Stage(command_set=wanted):
-                return self._sets.stage(wanted, now, derating_factor=self._derating_factor)
+                return self._sets.stage(self._prepared(wanted), now)
             case Commit(token=token):
-                return self._commit(token, now)
+                active = self._sets.active
+                if active is not None and active.token == token:
+                    return active.achieved
+                return self._play(self._sets.staged_as(token, now), now)
             case Apply(command_set=wanted):
-                if not self._sets.is_repeated(wanted):
-                    self._sets.stage(wanted, now, derating_factor=self._derating_factor)
-                return self._commit(wanted.token, now)
+                active = self._sets.active
+                if active is not None and self._sets.is_repeated(wanted):
+                    return active.achieved
+                return self._play(self._prepared(wanted), now)
             case _:  # GetStatus, Ping
                 pass
         return None
@@ -317,16 +322,21 @@ class SimulatedAmplifier:
         self._enter(AmplifierState.OPERATION_ENABLED, now)
         return None
 
-    def _commit(self, token: int, now: float) -> Achieved:
-        active = self._sets.active
-        if active is None or active.token != token:
-            active = self._sets.commit(token, now)
-            wanted = active.command_set
-            self._channels.play(active, now)
-            self._warm(now)
-            ends = wanted.valid_for > 0 and not wanted.is_silent
-            self._vibration_end = now + wanted.valid_for if ends else math.inf
-        return active.achieved
+    def _prepared(self, wanted: CommandSet) -> PlayableSet:
+        return self._sets.prepare(wanted, derating_factor=self._derating_factor)
+
+    def _play(self, playable: PlayableSet, now: float) -> Achieved:
+        """Play a set now, unless a channel has no room for it."""
+        channel = self._channels.without_room(playable, now)
+        if channel is not None:
+            raise RefusedSet(NakCode.FADING, channel)
+        self._sets.activate(playable)
+        self._channels.play(playable, now)
+        self._warm(now)
+        wanted = playable.command_set
+        ends = wanted.valid_for > 0 and not wanted.is_silent
+        self._vibration_end = now + wanted.valid_for if ends else math.inf
+        return playable.achieved
 
     @property
     def _features(self) -> Feature:

@@ -1,13 +1,14 @@
 """Outputs of the channels of a simulated amplifier, and the transition between sets."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.protocol.messages import Achieved
-from sim.waveform import Output, end_along, fade_to, level_of, shape_to
+from sim.waveform import Output, ShapedTone, end_along, fade_to, level_of, shape_to
 
 _DERATING_RAMP = 0.02  # s; no click
+_VOICES = 2  # at most, of one channel
 
 
 @dataclass(frozen=True)
@@ -80,8 +81,19 @@ class Channels:
         """Time from which all are silent, not before `time`."""
         return max([time, *(tone.silent_from for output in self._outputs for tone in output)])
 
+    def without_room(self, playable: PlayableSet, time: float) -> int | None:
+        """The first channel on which a set would be a third voice; None to play it."""
+        after = self._outputs_after(playable, time)
+        return next((channel for channel, output in after if len(output) > _VOICES), None)
+
     def play(self, playable: PlayableSet, time: float) -> None:
         """Play a set; channels that it does not name are silenced."""
+        self._outputs = [output for _, output in self._outputs_after(playable, time)]
+        self._endings = playable.endings
+        self._ramp = playable.command_set.ramp
+
+    def _outputs_after(self, playable: PlayableSet, time: float) -> Iterator[tuple[int, Output]]:
+        """Each channel and its output once a set plays."""
         commands = {command.channel: command for command in playable.commands}
         ramp = playable.command_set.ramp
         for channel, playing in enumerate(self._outputs):
@@ -100,9 +112,7 @@ class Channels:
                     amplitude=command.phasor,
                     keep_phase=command.keep_phase,
                 )
-            self._outputs[channel] = output
-        self._endings = playable.endings
-        self._ramp = ramp
+            yield channel, output
 
     def end(self, time: float) -> None:
         """End the vibration along its endings, or the ramp of its set."""
@@ -124,14 +134,10 @@ class Channels:
         for channel, playing in enumerate(self._outputs):
             tone = next((tone for tone in playing if tone.is_lasting), None)
             if tone is not None:
-                self._outputs[channel] = fade_to(
-                    playing,
-                    time,
-                    ramp=_DERATING_RAMP,
-                    frequency=tone.frequency,
-                    amplitude=factor * tone.settled_amplitude,
-                    keep_phase=True,
-                )
+                levels = (tone.amplitude(time), factor * tone.settled_amplitude)
+                derated = ShapedTone(tone.frequency, tone.origin, time, _DERATING_RAMP, levels)
+                fading = (one for one in playing if one is not tone and one.silent_from > time)
+                self._outputs[channel] = (*fading, derated)
         self._endings = _derated(self._endings, factor)
 
 

@@ -53,22 +53,28 @@ class SetStore:
             self.slots.pop(kept.slot, None)
         return Loaded(slot=kept.slot, knots=len(kept.knots))
 
-    def stage(self, wanted: CommandSet, now: float, *, derating_factor: float) -> Achieved:
-        """Stage a set at a time [s] with the present envelopes, its levels times the factor."""
+    def prepare(self, wanted: CommandSet, *, derating_factor: float) -> PlayableSet:
+        """Check a set, with the present envelopes, its levels times the factor."""
         if not is_newer_token(wanted.token, self.token):  # a late copy
             raise RefusedSet(NakCode.BAD_TOKEN)
-        staged = self._with_envelopes(wanted)
-        self.staged = staged if derating_factor == 1 else staged.derated(derating_factor)
-        self._staged_at = now
-        return self.staged.achieved
+        playable = self._with_envelopes(wanted)
+        return playable if derating_factor == 1 else playable.derated(derating_factor)
 
-    def commit(self, token: int, now: float) -> PlayableSet:
-        """Make the staged set active at a time [s]."""
+    def stage(self, playable: PlayableSet, now: float) -> Achieved:
+        """Stage a set at a time [s]."""
+        self.staged, self._staged_at = playable, now
+        return playable.achieved
+
+    def staged_as(self, token: int, now: float) -> PlayableSet:
+        """The set that is staged under a token at a time [s]."""
         is_old = now - self._staged_at > PROTOCOL.staged_life
         if is_old or self.staged is None or self.staged.token != token:
             raise RefusedSet(NakCode.BAD_TOKEN)
-        self.active, self.staged = self.staged, None
-        return self.active
+        return self.staged
+
+    def activate(self, playable: PlayableSet) -> None:
+        """Make a set the active one."""
+        self.active, self.staged = playable, None
 
     def forget(self) -> None:
         """Discard the sets; envelopes stay."""

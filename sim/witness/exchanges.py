@@ -23,6 +23,7 @@ from sim.witness.violation import Report
 from sim.witness.watched_wire import WatchedWire
 
 _PENDING_TIMEOUT = 1.0  # s; then a reply matches nothing any more
+_FADING = 12
 _ANY_UNIT = 255  # of Modbus TCP: the only one
 
 
@@ -170,6 +171,9 @@ class Exchanges:
         if was_lost or request.problem:
             return
         if reply.refusal:
+            if reply.refusal == _FADING and not session.is_disturbed(time):
+                what = f"host sent set {request.token} to {session.name} while two voices sound"
+                session.report("voices", time, what)
             if reply.status is not None and not is_overtaken:
                 session.amplifier.refusal_received(reply.status, at, time)
             return

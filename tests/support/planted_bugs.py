@@ -37,6 +37,7 @@ from drivers.codec.serial_line import reports as serial_reports
 from drivers.codec.serial_line import sets as serial_sets
 from drivers.command import CommandSet, DriveCommand
 from drivers.guard import rules
+from drivers.guard.record import PlayRecord
 from drivers.line import priority
 from drivers.line.sender import Sender
 from drivers.link.link import Link
@@ -362,6 +363,9 @@ DRIVERS: dict[str, Bug] = {
         ),
         scenarios.slow_lift,
     ),
+    "sets are not held back": Bug(
+        "voices", replaced(PlayRecord, "room_from", lambda *_: -math.inf), scenarios.hasty
+    ),
     "a stop is sent as a disarm": Bug("stop", replaced(Amplifier, "stop", Amplifier.disarm)),
     "no amplifier is identified": Bug("identified", wrapped(Link, "request", _knows_already)),
     "sets are sent without their order": Bug(
@@ -548,7 +552,7 @@ FAR_ENDS: dict[str, Bug] = {
         "silent", wrapped(Channels, "silence", _on_first_channel), scenarios.arc
     ),
     "a stale set is played": Bug(
-        "token", wrapped(SetStore, "stage", _forgetful), scenarios.late_copy
+        "token", wrapped(SetStore, "prepare", _forgetful), scenarios.late_copy
     ),
     "a damaged frame is carried out": Bug("damage", _unchecked, scenarios.noise),
     "the high voltage stays on": Bug(

@@ -282,17 +282,18 @@ def _leaves_fades(silence: Any, channels: Any, time: float, *, ramp: float) -> N
         silence(channels, time, ramp=ramp)
 
 
-def _ends_earlier_sets(commit: Any, amplifier: Any, token: int, now: float) -> Any:
+def _ends_earlier_sets(play: Any, amplifier: Any, playable: Any, now: float) -> Any:
     end = amplifier._vibration_end
-    reply = commit(amplifier, token, now)
+    reply = play(amplifier, playable, now)
     amplifier._vibration_end = min(end, amplifier._vibration_end)
     return reply
 
 
-def _extends_valid_for(commit: Any, amplifier: Any, token: int, now: float) -> Any:
-    reply = commit(amplifier, token, now)
-    lasts = amplifier._sets.active.command_set.valid_for
-    amplifier._vibration_end = now + lasts if lasts else amplifier._vibration_end
+def _extends_valid_for(handle: Any, amplifier: Any, request: Any, now: float) -> Any:
+    reply = handle(amplifier, request, now)
+    if isinstance(request, Apply | Commit) and isinstance(reply, Achieved):
+        lasts = amplifier._sets.active.command_set.valid_for
+        amplifier._vibration_end = now + lasts if lasts else amplifier._vibration_end
     return reply
 
 
@@ -700,6 +701,9 @@ FAULTS: dict[str, PlantedFault] = {
     "a set prolongs an earlier fade": PlantedFault(
         "earlier_ends_stay", wrapped(FadingTone, "fade_out", _extends)
     ),
+    "a third voice is played": PlantedFault(
+        "two_voices", replaced(Channels, "without_room", lambda *_: None)
+    ),
     "keep phase is ignored": PlantedFault(
         "phases", played(each(lambda one: replace(one, keep_phase=False)))
     ),
@@ -745,10 +749,10 @@ FAULTS: dict[str, PlantedFault] = {
         wrapped(Channels, "end", lambda end, self, time: self.silence(time, ramp=0.0)),
     ),
     "valid_for begins anew with the same set": PlantedFault(
-        "valid_for_is_of_its_set", wrapped(SimulatedAmplifier, "_commit", _extends_valid_for)
+        "valid_for_is_of_its_set", handled(_extends_valid_for)
     ),
     "valid_for of an earlier set ends the next": PlantedFault(
-        "valid_for_is_of_its_set", wrapped(SimulatedAmplifier, "_commit", _ends_earlier_sets)
+        "valid_for_is_of_its_set", wrapped(SimulatedAmplifier, "_play", _ends_earlier_sets)
     ),
     # Tokens
     "older tokens play": PlantedFault(
@@ -770,7 +774,7 @@ FAULTS: dict[str, PlantedFault] = {
         "tokens_wrap", replaced(set_store, "is_newer_token", _without_wrap)
     ),
     "a Commit plays what is staged, whatever its token": PlantedFault(
-        "stage_and_commit", wrapped(SetStore, "commit", _commits_any)
+        "stage_and_commit", wrapped(SetStore, "staged_as", _commits_any)
     ),
     "Stage plays": PlantedFault(
         "stage_and_commit",

@@ -185,6 +185,8 @@ class Checks:
     def _check_limits(self, name: str) -> None:
         limits = self._bench.rig.limits
         for output in self._bench.amplifiers[name].outputs:
+            if len(output) > 2:
+                self.violate(f"{name} plays {len(output)} voices on a channel")
             for tone in output:
                 if not limits.frequency_min <= tone.frequency <= limits.frequency_max:
                     self.violate(f"{name} plays {tone.frequency} Hz")

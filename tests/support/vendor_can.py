@@ -17,7 +17,7 @@ BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
 STATUS, APPLY, STAGE, COMMIT, ARM, DISARM, STOP, CLEAR = range(8)
 DISARMED, SWITCHED_ON, ARMED, STOPPED_QUICKLY, REACTING, FAULTY = 1, 3, 4, 5, 6, 7
 DONE, BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN, NO_ENVELOPE = 0, 3, 4, 5, 6, 9
-WRONG_SESSION, WRONG_LATCH = 10, 11
+WRONG_SESSION, WRONG_LATCH, FADING = 10, 11, 12
 INCOMPLETE_SET = 15
 NO_CHANNEL = 255
 CHANNELS = 4
@@ -54,6 +54,7 @@ class Channel:
 
     def __init__(self) -> None:
         self.now, self.goal, self.begin, self.ramp = 0, 0, 0.0, 0.0
+        self.voices: list[float] = []  # when each has ended
 
     def level(self, time: float) -> int:
         s = min((time - self.begin) / self.ramp, 1.0) if self.ramp > 0 else 1.0
@@ -64,6 +65,11 @@ class Channel:
         is_silent_sooner = not self.goal and not goal and self.begin + self.ramp <= time + ramp
         if not is_silent_sooner:
             self.now, self.goal, self.begin, self.ramp = self.level(time), goal, time, ramp
+        self.voices = [*self.fading(ramp, time), *([math.inf] if goal else [])]
+
+    def fading(self, ramp: float, time: float) -> list[float]:
+        """When the voices end that a set leaves to fade."""
+        return [min(end, time + ramp) for end in self.voices if min(end, time + ramp) > time]
 
 
 class VendorAmplifier:
@@ -252,6 +258,9 @@ class VendorAmplifier:
         if action == COMMIT:
             if self.staged is None or self.staged[0] != token or now > self.staged_until:
                 return BAD_TOKEN, NO_CHANNEL
+            full = self._without_room(self.staged[1], self.staged[2], now)
+            if full is not None:
+                return FADING, full
             self.achieved, self.exact = _achieved(token, self.staged[1]), True
             self._play(now)
             return DONE, NO_CHANNEL
@@ -269,11 +278,21 @@ class VendorAmplifier:
                 return NO_ENVELOPE, place  # no envelope is ever loaded here
         if ramp > 1000 or span > 60000:
             return BAD_VALUE, NO_CHANNEL
+        full = self._without_room(mine, ramp, now) if action == APPLY else None
+        if full is not None:
+            return FADING, full
         self.staged, self.staged_until = (token, mine, ramp, span), now + 1.0
         self.achieved, self.exact = _achieved(token, mine), True
         if action == APPLY:
             self._play(now)
         return DONE, NO_CHANNEL
+
+    def _without_room(self, commands: dict[int, bytes], ramp: int, now: float) -> int | None:
+        """A channel on which a set would be a third voice."""
+        for number, data in commands.items():
+            if bits(data, 16, 16) and len(self.channels[number].fading(ramp / 1000, now)) > 1:
+                return number
+        return None
 
     def _play(self, now: float) -> None:
         assert self.staged is not None

@@ -28,6 +28,16 @@ async def day(chain: Chain) -> None:
     await chain.operate("disarm", rest=0.1)
 
 
+async def hasty(chain: Chain) -> None:
+    """Other fingers touch every 4 ms, within the ramp of a pattern."""
+    await chain.operate("arm", rest=0.12)
+    for _ in range(5):
+        await chain.touch(1, rest=0.004)
+        await chain.touch(1, 2, rest=0.004)
+    await chain.rest(0.1)
+    await chain.touch(rest=0.06)
+
+
 async def hung(chain: Chain) -> None:
     """The control loop stalls during a touch; a client polls the status, clears and rearms."""
     await chain.operate("arm")

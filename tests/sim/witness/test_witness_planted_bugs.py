@@ -22,7 +22,7 @@ SCENARIOS: dict[str, Callable[[Chain], Awaitable[None]]] = {
 }
 RULES = {
     *("limits", "garbage", "enabled", "justified", "pattern", "lift", "touch", "commit", "token"),
-    "session",
+    *("session", "voices"),
     *("stop", "heartbeat", "armed", "identified", "credit", "answer", "damage", "watchdog"),
     *("latched", "state", "ramp", "plays", "silent", "high_voltage", "constant", "faults"),
 }

@@ -375,7 +375,7 @@ class Amplifier:
     def expect_stop(self) -> None:
         """Discard what is unsent, and a clear in progress, since a stop is about to be sent."""
         self._stop_count += 1
-        self._link.abort_unsent()
+        self.abort_unsent()
 
     async def commit_on_bus(self, token: int) -> None:
         """Let every amplifier of the bus play its staged set of this token at the same time.

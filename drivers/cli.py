@@ -215,7 +215,7 @@ def address(
     trace: Trace = None,
     json_: Json = False,
 ) -> None:
-    """Give an amplifier another address, unit or node on its line; disarmed only."""
+    """Change the address, unit or node of an amplifier."""
     from drivers import amp_actions
 
     _show(_run(amp_actions.set_address(url, new, serial_number), trace), as_json=json_)

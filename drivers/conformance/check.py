@@ -13,7 +13,7 @@ from drivers.conformance.lateness import STALL, Lateness
 from drivers.conformance.raw.line import RawLine
 from drivers.errors import DriverError, LinkError
 
-MAX_ATTEMPTS = 4
+MAX_ATTEMPTS = 10
 """Attempts of a check of which this host, or the wire, disturbed all before."""
 
 _FINDINGS = (ContractViolation, Inconclusive, NotApplicable, DriverError)

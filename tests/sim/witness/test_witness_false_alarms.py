@@ -21,7 +21,14 @@ KINDS: Mapping[str, str] = {
     "can+slcan": "slcan",
 }
 RAW = {"invalid_frames", "invalid_frames_do_not_feed", "tolerated_frames", "broadcasts"}
-BY_HOST = {"enabled", "limits", "token", "credit", "stop"}  # conformance breaks them on purpose
+BY_HOST = {
+    "enabled",
+    "limits",
+    "token",
+    "credit",
+    "stop",
+    "voices",
+}  # conformance breaks them on purpose
 LIMITS = {channel: {"frequency_hz": [0, 4000], "level": 1.0} for channel in range(4)}
 
 

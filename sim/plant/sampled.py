@@ -30,7 +30,7 @@ class SampledPlant:
 
     def follow(self) -> None:
         """Go on under the plant's present contacts."""
-        if self._plant.loaded is self._current:
+        if self._plant.loaded is self._current and self._plant.contacts == self._contacts:
             return
         before = self._current, self._contacts
         state = (self._current.plate.free_state @ (self._free + self._forced)).real
@@ -43,7 +43,8 @@ class SampledPlant:
         """Advance by the next samples, the bases' motion (n, eras) [m].
 
         shapes (p, r): of the plant's `reduced` at points. Return their accelerations (n, p)
-        [m/s²] at the samples.
+        [m/s²] half a sample before each: at the samples themselves the velocity of a base, and
+        with it the force of its damper, jumps.
         """
         plate = self._current.plate
         slopes = np.diff(bases, axis=0, prepend=self._bases[None]) * self.rate
@@ -56,7 +57,8 @@ class SampledPlant:
         if len(bases):
             self._free, self._bases, self._slopes = free[-1], bases[-1], slopes[-1]
         points = plate.with_phalanges(shapes) @ plate.free_acceleration
-        return np.asarray((free @ points.T).real)
+        halfway = free * np.exp(-plate.decay / (2 * self.rate))
+        return np.asarray((halfway @ points.T).real)
 
     def _use(self, plate: LoadedPlate) -> None:
         """Go on with a plate; find its forced vibration for bases of 1 m and of 1 m/s."""

@@ -87,16 +87,16 @@ def played(firmware: Path) -> Played:
     resting = fingertip_loads(rig.fingertip, QUESTION.contacts, QUESTION.loads)
     contacts = {str(number): each for number, each in enumerate(resting)}
     points = np.concatenate([fingertip_points(*at, rig.plate) for at in QUESTION.contacts])
-    plant = Plant(reduced, rig.eras, loads=rig.masses, time=-1 / RATE)
+    plant = Plant(reduced, rig.eras, loads=rig.masses, time=0.0)
     sampled = SampledPlant(plant, rate=RATE)
     plant.set_contacts(contacts)
     sampled.follow()
     felt = sampled.advance(bases, shapes=plant.reduced.at(points))
     for number, terms in enumerate(motion(pattern, rig)):
         plant.set_input(number, terms)
-    until = (len(bases) - 0.5) / RATE
-    _, exact = plant.advance(until, sample_rate=RATE, shapes=plant.reduced.at(points))
-    return Played(pattern, felt, exact)
+    until = (len(bases) - 1) / RATE
+    _, exact = plant.advance(until, sample_rate=2 * RATE, shapes=plant.reduced.at(points))
+    return Played(pattern, felt[1:], exact[::2])  # halfway between two samples
 
 
 def on_the_wire(term: Term) -> float:

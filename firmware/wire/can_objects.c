@@ -223,6 +223,7 @@ static uint32_t abort_code(enum nak nak)
         [NAK_NO_ENVELOPE] = 0x08000024,
         [NAK_WRONG_SESSION] = 0x08000025,
         [NAK_WRONG_LATCH] = 0x08000026,
+        [NAK_FADING] = 0x08000027,
     };
     return CODES[nak];
 }

@@ -58,9 +58,9 @@ static enum exception exception_of(enum nak nak)
     case NAK_WRONG_STATE:
     case NAK_WRONG_SESSION:
     case NAK_WRONG_LATCH:
+    case NAK_FADING:
         return FAILURE;
     case NAK_BUSY:
-    case NAK_FADING:
         return BUSY;
     default:
         return ILLEGAL_VALUE;

@@ -81,7 +81,7 @@ class FirmwareBench(Bench):
         last = self._count + len(levels)
         if self._start is None or abs(now - self._start - last / RATE) > _MAX_LAG:
             self._start = now - last / RATE
-        times = self._start + (np.arange(self._count, last) + 0.5) / RATE
+        times: FloatArray = self._start + np.arange(self._count + 0.5, last) / RATE
         self._count, self._time = last, float(times[-1])
         bases = levels * self._gains * [era.stroke for era in self.rig.eras]
         shapes = [self.fingers.layout.shapes, *(probe.shapes for probe in self.probes)]

@@ -311,13 +311,13 @@ class PlayRecord:
                 Interval(min(sent.sent_at, latest), latest),
                 ramp=requested.ramp,
                 valid_for=requested.valid_for,
-                onset=self._longest(command.onset),
-                ending=self._longest(command.ending),
+                onset=self._maximum(command.onset),
+                ending=self._maximum(command.ending),
             )
             for before, command in zip(voices, each, strict=True)
         )
 
-    def _longest(self, slot: int) -> float:
+    def _maximum(self, slot: int) -> float:
         """Return the longest duration [s] of an envelope that a slot may hold."""
         return max(map(duration, self.slots.get(slot, ())), default=0.0)
 

@@ -68,8 +68,9 @@ class Voices:
         faded = commit.latest + (max(ramp, self.ending) if has_ending else ramp)
         voices = []
         for lasts_until, lasting, fading in self.voices:
-            begun = max(fading, lasting) if lasts_until <= commit.latest else fading
-            ends = [begun if has_ending else min(begun, faded)]  # no ending cuts a fade short
+            under_way = max(fading, lasting) if lasts_until <= commit.latest else fading
+            # No ending cuts a fade short.
+            ends = [under_way if has_ending else min(under_way, faded)]
             ends += [faded] if lasts_until > commit.earliest else []
             voices.append(Voice(fading=max(ends)))
         if is_driven:

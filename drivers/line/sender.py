@@ -119,7 +119,7 @@ class Sender:
             if queued.backend is backend and priority.supersedes(queued.priority):
                 self._queue.remove(queued)
                 queued.fail(Preempted(SUPERSEDED))
-        if self._task is None and not self._queue:
+        if not self._is_serving and not self._queue:
             await self._send_first(entry)
             if entry.result.done():
                 return cast(_T, entry.result.result())
@@ -152,11 +152,16 @@ class Sender:
 
     def _enqueue(self, entry: _Entry) -> None:
         self._queue.append(entry)
-        if self._task is None:
-            self._start()
-        else:
+        if self._is_serving:
             self._wake()
+        else:
+            self._start()
         self._update_preemption()
+
+    @property
+    def _is_serving(self) -> bool:
+        """Whether a task sends what is queued; not one that an exception has ended."""
+        return self._task is not None and not self._task.done()
 
     def _start(self) -> None:
         """Send what is queued in a task of its own."""

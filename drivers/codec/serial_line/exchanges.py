@@ -130,7 +130,7 @@ _LOAD_ENVELOPE = _Layout(
 )
 _SET_ADDRESS = _Layout(
     SetAddress,
-    lambda wanted: pack((_Q.address, wanted.address)) + pack_text(wanted.serial_number),
+    lambda change: pack((_Q.address, change.address)) + pack_text(change.serial_number),
     lambda cursor: SetAddress(cursor.integer(_Q.address), cursor.text()),
 )
 _EVENT_LAYOUT = _Layout(

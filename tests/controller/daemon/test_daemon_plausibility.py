@@ -69,9 +69,9 @@ def test_lie_ends_in_fault_and_silence(name: str, names: tuple[str, ...], moves:
             chain.move()  # another set, for a lie about sets
             await chain.play(6 * HEARTBEAT, interval=TOUCHES, moves=moves)
             assert chain.state in (DaemonState.FAULT_REACTION_ACTIVE, DaemonState.FAULT)
+            await chain.rest(SILENCE)
             assert f"amplifier {names[0]}" in chain.causes[0]
             assert reason in chain.causes[0]
-            await chain.rest(SILENCE)
             assert not any(level for levels in chain.levels().values() for level in levels)
 
     run_virtual(main(), rng=random.Random(1))

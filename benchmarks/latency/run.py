@@ -218,7 +218,7 @@ def _matched(
     return match(vibrating, sent, *(each.error for each in expected), first=expected[0].first)
 
 
-LAST = 0.03  # s; fingers expire after the last touch, and silence has no touch
+LAST = 0.1  # s; a set may wait for a fade; fingers expire later, and silence has no touch
 
 
 def _capabilities(rig: Rig, touch_wait: float) -> PlaybackCapabilities:

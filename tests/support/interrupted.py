@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
@@ -58,7 +59,8 @@ def _waiting(command: str, inside: str, writing: int) -> int:
 
     def wait(*args: object, **kwargs: object) -> None:
         os.write(writing, b".")
-        signal.pause()
+        while True:  # a signal just before signal.pause() would not end that
+            time.sleep(0.1)
 
     sys.argv = ["era", *shlex.split(command)]
     with patch(inside, wait):

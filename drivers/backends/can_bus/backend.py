@@ -232,7 +232,7 @@ class CanBackend(WireBackend):
             achieved = await self._objects_job(ObjectClient.achieved, request, timeout)
             if requested is not None:
                 achieved = _in_order_of(requested, achieved)
-        if isinstance(request, Apply | Stage):
+        if isinstance(request, Stage):
             self._staged = achieved
         return achieved
 

@@ -126,7 +126,8 @@ class VendorAmplifier:
         if identifier == 0x000 and len(data) == 2 and data[1] in (0, NODE):
             self._manage(data[0], now)
         elif identifier == 0x600 + NODE and len(data) == 8:
-            self._send(0x580 + NODE, self._sdo(data, now))
+            if data[0] >> 5 != 4:  # an abort has no answer
+                self._send(0x580 + NODE, self._sdo(data, now))
         elif self.host and identifier == 0x700 + self.host and len(data) == 1:
             self.fed = now
         elif self.nmt != OPERATIONAL:

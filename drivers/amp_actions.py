@@ -118,12 +118,8 @@ async def set_address(url: str, address: int, serial_number: str | None) -> dict
         finally:
             await amplifier.close()
     await asyncio.sleep(_TAKING_ADDRESS)
-    amplifier = Amplifier(open_backend(moved), serial_number=serial_number)
-    try:
-        await amplifier.open(take_over=False)
-    finally:
-        await amplifier.close()
-    return {"url": moved, "serial_number": serial_number}
+    async with _opened(moved, serial_number=serial_number):
+        return {"url": moved, "serial_number": serial_number}
 
 
 async def clear(url: str) -> dict[str, Any]:
@@ -196,9 +192,15 @@ async def conform(
 
 @asynccontextmanager
 async def _opened(
-    url: str, *, take_over: bool = False, reply_timeout: float = REPLY_TIMEOUT
+    url: str,
+    *,
+    take_over: bool = False,
+    reply_timeout: float = REPLY_TIMEOUT,
+    serial_number: str | None = None,
 ) -> AsyncIterator[Amplifier]:
-    amplifier = Amplifier(open_backend(url), reply_timeout=reply_timeout)
+    amplifier = Amplifier(
+        open_backend(url), reply_timeout=reply_timeout, serial_number=serial_number
+    )
     await amplifier.open(take_over=take_over)
     try:
         yield amplifier

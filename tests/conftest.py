@@ -29,11 +29,11 @@ from model.table.table_cache import cached_table  # noqa: E402
 from paper_plate import make_paper_rig  # noqa: E402
 
 SLOWEST = (
+    "test_how_to_pages.py",
     "test_tutorials.py",
     "test_dashboard.py",
     "test_touch_to_finger_processes.py",
     "test_demo.py",
-    "test_how_to_pages.py",
     "test_daemon_faults_process.py",
     "test_examples.py",
     "test_latency_measured.py",

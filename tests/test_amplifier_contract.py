@@ -64,16 +64,13 @@ async def amplifier(backend: Backend) -> AsyncIterator[Amplifier]:
 
 
 LONG = {
-    *("staged_sets_expire", "ramp_down", "ramps_of_other_lengths", "interrupted_ramps", "phases"),
-    *("earlier_ends_stay", "ramps_of_valid_for", "valid_for_is_of_its_set", "stop_ramp_clipped"),
-    *("silence_never_later", "stop_ends_fades", "watchdog_times", "watchdog_left", "what_feeds"),
-    *(
-        "two_voices",
-        "trips_amid_other_requests",
-        "endings",
-        "invalid_frames",
-        "invalid_frames_do_not_feed",
-    ),
+    *("staged_sets_expire", "ramp_up", "ramp_down", "ramps_of_other_lengths", "interrupted_ramps"),
+    *("phases", "earlier_ends_stay", "valid_for", "ramps_of_valid_for", "valid_for_is_of_its_set"),
+    *("stop_ramp", "stop_ramp_clipped", "stop_ends_fades", "silence_never_later", "disarm"),
+    *("watchdog_times", "watchdog_left", "watchdog_without_reading", "trips_amid_other_requests"),
+    *("what_feeds", "what_does_not_feed", "two_voices", "onsets", "endings", "skipped_endings"),
+    *("kept_phase_onset", "loaded_while_playing", "clear_too_early", "arms_again", "fault_list"),
+    *("invalid_frames", "invalid_frames_do_not_feed"),
 }
 """Checks that last long; over all wires they are run in virtual time."""
 

@@ -23,7 +23,7 @@ async def test_amplifier_takes_another_address(wire: str, coarse_rig: Rig) -> No
         assert (await identify(moved["url"]))["serial_number"] == "SIM-east"
         assert (await identify(west))["serial_number"] == "SIM-west"
         with pytest.raises(LinkTimeout):
-            await identify(east)
+            await identify(far.urls["east"])
 
 
 @pytest.mark.parametrize("wire", ["serial", "modbus+tcp", "modbus+rtu"])

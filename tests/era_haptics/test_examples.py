@@ -86,9 +86,8 @@ def test_hmi_engineer_example_feels_what_was_predicted() -> None:
     assert "daemon ended with status 0" in said
 
 
-@pytest.mark.real_time
-def test_amplifier_vendor_example_passes_conformance() -> None:
-    """Its frame is that of the wire page, it gets a reply, and all checks pass."""
+def test_amplifier_vendor_example_passes_reading_checks() -> None:
+    """Its frame is that of the wire page, it gets a reply, and no check fails."""
     said = run("amplifier_vendor.py")
     (ping,) = re.findall(r"^Ping request: `([0-9A-F ]+)`$", WIRE_PAGE, re.MULTILINE)
     assert f"by hand  {ping}" in said
@@ -96,7 +95,7 @@ def test_amplifier_vendor_example_passes_conformance() -> None:
     assert re.search(r"^reply    00 .* 00 -> Status SWITCH_ON_DISABLED$", said, re.MULTILINE)
     failed, total = re.findall(r"^(\d+) of (\d+) ", said, re.MULTILINE)[-1]
     assert failed == "0"
-    assert int(total) > said.count("\npassed ") > 40
+    assert int(total) == said.count("\npassed ") > 3
 
 
 @pytest.mark.usefixtures("cache")

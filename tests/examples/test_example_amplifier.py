@@ -1,5 +1,6 @@
-"""The example amplifier on a virtual clock: watchdog, validity, and damaged bytes."""
+"""The example amplifier on a virtual clock: watchdog, validity, damaged bytes, conformance."""
 
+import asyncio
 import math
 import re
 import sys
@@ -9,6 +10,12 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+
+from drivers.amplifier import Amplifier
+from drivers.conformance import CHECKS, CheckResult, Result, raw_line, run_check
+from drivers.registry import open_backend
+from memory_machine import live_in_memory
+from virtual_loop import run_virtual
 
 ROOT = Path(__file__).parents[2]
 WIRE_PAGE = (ROOT / "docs" / "reference" / "wire-protocol.md").read_text("utf-8")
@@ -110,3 +117,26 @@ def test_serial_end_obeys_only_stop_and_commit_as_broadcasts(
     assert end.amplifier.state == 1
     assert end.take(serial.framed(serial.STOP, 2, 0, 1, bytes(2))) == b""
     assert end.amplifier.state == 5
+
+
+def test_serial_end_passes_conformance(serial: ModuleType) -> None:
+    """Every check on a line in memory; skipped are those of what it has not."""
+
+    async def run() -> list[CheckResult]:
+        clock = asyncio.get_running_loop().time
+        end = serial.SerialEnd()
+        end.amplifier = type(end.amplifier)(clock=lambda: 1000 * clock())
+        terminal = live_in_memory().make_terminal(
+            lambda data: terminal.write(end.take(data)), unpluggable=False
+        )
+        url = f"serial://{terminal.port}"
+        amplifier = Amplifier(open_backend(url))
+        await amplifier.open()
+        try:
+            return [await run_check(check, amplifier, raw_line(url)) for check in CHECKS]
+        finally:
+            await amplifier.close()
+
+    results = run_virtual(run())
+    assert {one.check.name: one.problem for one in results if one.problem} == {}
+    assert sum(one.result is Result.PASSED for one in results) > 40

@@ -18,13 +18,14 @@ PAGES = ROOT / "docs" / "how-to"
 PIP = ROOT / "tests" / "support" / "built_pip.py"
 NAMES = [
     "add-a-material",
-    "add-a-backend",
     "add-an-element",
     "add-a-touch-source",
     "add-an-effect",
     "design-a-layout",
-    "write-an-amplifier",
 ]
+WITH_CONFORMANCE = ["add-a-backend", "write-an-amplifier"]
+"""They run the whole of it."""
+IN_REAL_TIME = [pytest.param(name, marks=pytest.mark.real_time) for name in WITH_CONFORMANCE]
 
 
 @pytest.fixture
@@ -45,7 +46,10 @@ def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
     shutil.rmtree(home)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name",
+    [*NAMES, *(pytest.param(name, marks=pytest.mark.real_time) for name in WITH_CONFORMANCE)],
+)
 def test_page_commands_print_what_is_shown(name: str, reader: Reader) -> None:
     """Commands, run in order, print the output on the page."""
     steps = read_steps(PAGES / f"{name}.md")
@@ -54,7 +58,7 @@ def test_page_commands_print_what_is_shown(name: str, reader: Reader) -> None:
         reader.follow(step)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *WITH_CONFORMANCE])
 def test_page_includes_code_from_files(name: str) -> None:
     """Page and file cannot differ."""
     text = (PAGES / f"{name}.md").read_text("utf-8")

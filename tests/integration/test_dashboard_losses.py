@@ -51,7 +51,9 @@ async def test_lost_link_is_one_event_with_its_attempts(tab: Page, tmp_path: Pat
             await open_dashboard(tab, gateway, DESKTOP)
             # Disarmed: no watchdog can make it another fault on a busy machine.
             assert "%" in await tab.until(TILE)
-            before = await tab.evaluate(EVENTS)
+            before = (await tab.evaluate(EVENTS))[
+                -1:
+            ]  # a short loss on a busy machine joins this one
             bench.far.device.inject_fault(FaultWindow("hang"))
             await tab.until(f"{STATE} === 'COMM_LOST'")
             assert await tab.evaluate(REASON) == "link-lost"

@@ -28,8 +28,11 @@ def test_page_and_daemon(tmp_path: Path) -> None:
             assert process.stdout is not None
             assert process.stdout.readline().startswith("dashboard: http://127.0.0.1:")
             with Client.connect(socket, timeout=20) as daemon:
+                daemon.subscribe("state")
+                while (state := daemon.status().state) != "READY_TO_SWITCH_ON":
+                    assert state != "OPERATION_ENABLED"
+                    next(daemon.events(timeout=20))
                 assert daemon.hello("test").rig.simulated
-                assert daemon.status().state != "OPERATION_ENABLED"
             process.send_signal(signal.SIGINT)
             assert process.wait(20) == 0
         finally:

@@ -12,7 +12,7 @@ from drivers.registry import open_backend
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from planted_faults import PlantedFault
-from virtual_loop import run_virtual
+from virtual_loop import Seen, run_virtual
 from wires import WIRES, far_side, patient
 
 
@@ -30,14 +30,16 @@ async def opened(wire: str, rig: Rig) -> AsyncIterator[tuple[Amplifier, RawLine 
             await amplifier.close()
 
 
-def results_on(wire: str, rig: Rig, checks: Sequence[Check] = CHECKS) -> list[CheckResult]:
-    """Results of checks on one amplifier."""
+def results_on(
+    wire: str, rig: Rig, checks: Sequence[Check] = CHECKS, *, seen: Seen | None = None
+) -> list[CheckResult]:
+    """Results of checks on one amplifier; seen: observer of the bytes."""
 
     async def run() -> list[CheckResult]:
         async with opened(wire, rig) as (amplifier, raw):
             return [await run_check(check, amplifier, raw) for check in checks]
 
-    return run_virtual(run())
+    return run_virtual(run(), seen=seen)
 
 
 def result_of(fault: PlantedFault, wire: str, rig: Rig) -> CheckResult:

@@ -1,16 +1,12 @@
 """A CAN amplifier built independently, from docs/reference/wire-can.md, the sections of
 docs/reference/wire-protocol.md that it names, and from nothing else of this project.
 
-Four channels, classic frames, no envelopes, no faults but the watchdog's. It talks through
-python-can and runs in a thread of its own.
+Four channels, classic frames, no envelopes, no faults but the watchdog's.
 """
 
 import math
 import struct
-import threading
-import time
-
-import can
+from collections.abc import Callable
 
 NODE = 1
 BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
@@ -73,12 +69,10 @@ class Channel:
 
 
 class VendorAmplifier:
-    """The amplifier, on the bus while the context lasts."""
+    """The amplifier, between frames that arrive and those that it sends."""
 
-    def __init__(self, channel: str) -> None:
-        self._thread = threading.Thread(target=self._run, name="an amplifier from elsewhere")
-        self._bus = can.Bus(interface="virtual", channel=channel)
-        self._ending = threading.Event()
+    def __init__(self, send: Callable[[int, bytes], None], clock: Callable[[], float]) -> None:
+        self._send, self._clock = send, clock
         self._beat_due = 0.0
         self.nmt = PRE_OPERATIONAL
         self.state, self.fault, self.latch = DISARMED, 0, 0
@@ -93,25 +87,9 @@ class VendorAmplifier:
         self.exact = True
         self.period = HEARTBEAT
 
-    def __enter__(self) -> "VendorAmplifier":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._ending.set()
-        self._thread.join()
-        self._bus.shutdown()
-
-    def _run(self) -> None:
+    def boot(self) -> None:
+        """Say that it is there."""
         self._send(0x700 + NODE, bytes([BOOT_UP]))
-        while not self._ending.is_set():
-            message = self._bus.recv(timeout=0.001)
-            if message is not None and not message.is_extended_id:
-                self._take(message.arbitration_id, bytes(message.data))
-            self._tick(time.monotonic())
-
-    def _send(self, identifier: int, data: bytes) -> None:
-        self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
 
     def _forget(self) -> None:
         self.staged: tuple[int, dict[int, bytes], int, int] | None = None
@@ -121,8 +99,9 @@ class VendorAmplifier:
 
     # Frames received
 
-    def _take(self, identifier: int, data: bytes) -> None:
-        now = time.monotonic()
+    def take(self, identifier: int, data: bytes) -> None:
+        """Take a frame."""
+        now = self._clock()
         if identifier == 0x000 and len(data) == 2 and data[1] in (0, NODE):
             self._manage(data[0], now)
         elif identifier == 0x600 + NODE and len(data) == 8:
@@ -152,7 +131,7 @@ class VendorAmplifier:
     def _manage(self, command: int, now: float) -> None:
         if command == 129:
             self._reset()
-            self._send(0x700 + NODE, bytes([BOOT_UP]))
+            self.boot()
             return
         self.nmt = {1: OPERATIONAL, 2: STOPPED}.get(command, PRE_OPERATIONAL)
         if self.nmt != OPERATIONAL and self.state == ARMED:
@@ -308,7 +287,9 @@ class VendorAmplifier:
 
     # Changes by itself
 
-    def _tick(self, now: float) -> None:
+    def tick(self) -> None:
+        """Do what is due."""
+        now = self._clock()
         if self.period and now >= self._beat_due:
             self._beat_due = now + self.period
             self._send(0x700 + NODE, bytes([self.nmt]))
@@ -417,6 +398,8 @@ class VendorAmplifier:
 
     def _object(self, index: int, subindex: int, now: float) -> bytes | None:
         match index, subindex:
+            case 0x1001, 0:
+                return bytes([0x11 if self.fault else 0])
             case 0x1017, 0:
                 return struct.pack("<H", round(self.period * 1000))
             case 0x1018, 4:

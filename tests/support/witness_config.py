@@ -29,6 +29,18 @@ def witness_config(
     }
 
 
+def witness_of_one(kind: str = "serial") -> Witness:
+    """A witness of the amplifier m on the wire a, whose host sends no heartbeats."""
+    limits = {n: {"frequency_hz": [0, 4000], "level": 1.0} for n in range(4)}
+    return Witness(
+        {
+            "wires": {"a": kind},
+            "amplifiers": {"m": {"wire": "a", "channels": limits}},
+            "times_s": {"slack": 0.002, "heartbeat": 3.0},
+        }
+    )
+
+
 def sense(witness: Witness, now: float, name: str, amplifier: SimulatedAmplifier) -> None:
     """Show the levels and frequencies of an amplifier's channels at a time [s]."""
     levels = [min(level_of(output, now), 1.0) for output in amplifier.outputs]

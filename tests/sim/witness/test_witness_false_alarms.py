@@ -1,69 +1,13 @@
 """Correct traffic, of which the witness must report nothing: not for its own delays either."""
 
-import asyncio
 import struct
 import zlib
-from collections.abc import Mapping
 
 import pytest
 from cobs import cobs
 
-from conformance_bench import opened
-from drivers.conformance import CHECKS, Result, run_check
-from model.rig.rig import Rig
 from sim.witness.witness import Witness
-from virtual_loop import run_virtual
-
-KINDS: Mapping[str, str] = {
-    "serial": "serial",
-    "modbus+tcp": "modbus-tcp",
-    "modbus+rtu": "modbus-rtu",
-    "can+slcan": "slcan",
-}
-RAW = {"invalid_frames", "invalid_frames_do_not_feed", "tolerated_frames", "broadcasts"}
-BY_HOST = {
-    "enabled",
-    "limits",
-    "token",
-    "credit",
-    "stop",
-    "voices",
-}  # conformance breaks them on purpose
-LIMITS = {channel: {"frequency_hz": [0, 4000], "level": 1.0} for channel in range(4)}
-
-
-def make_witness(kind: str = "serial", *, slack: float = 0.002) -> Witness:
-    """A witness of one amplifier whose host sends no heartbeats."""
-    return Witness(
-        {
-            "wires": {"a": kind},
-            "amplifiers": {"m": {"wire": "a", "channels": LIMITS}},
-            "times_s": {"slack": slack, "heartbeat": 3.0},
-        }
-    )
-
-
-@pytest.mark.parametrize("wire", KINDS)
-def test_conformance_of_a_sound_amplifier_breaks_no_rule_of_amplifiers(
-    wire: str, coarse_rig: Rig
-) -> None:
-    """Watchdogs, repeated tokens, fades and stops of all kinds, in half a minute of traffic."""
-    witness = make_witness(KINDS[wire])
-
-    async def run() -> None:
-        async with opened(wire, coarse_rig) as (amplifier, _):
-            for check in CHECKS:
-                if check.name not in RAW:
-                    result = await run_check(check, amplifier)
-                    assert result.result in (Result.PASSED, Result.SKIPPED)
-
-    def seen(link: str, toward: str, data: bytes) -> None:
-        now = asyncio.get_running_loop().time()
-        witness.record_bytes("a", "amplifier" if toward == "amplifier" else "host", now, data)
-
-    run_virtual(run(), seen=seen)
-    assert [one for one in witness.finish() if one.invariant not in BY_HOST] == []
-    assert witness.frames > 4000
+from witness_config import witness_of_one
 
 
 def frame(kind: int, payload: str, *, sequence: int, version: int = 2) -> bytes:
@@ -82,7 +26,7 @@ def left(milliseconds: int) -> str:
 
 def armed_witness() -> Witness:
     """A witness that has seen an Arm with 250 ms at 0.01 s."""
-    witness = make_witness()
+    witness = witness_of_one()
     witness.record_bytes("a", "amplifier", 0.010, frame(3, "FA00 0900", sequence=1))
     witness.record_bytes("a", "host", 0.011, frame(0x83, left(250), sequence=1))
     return witness

@@ -49,7 +49,7 @@ CHECKS: tuple[Check, ...] = (
     fades.ramps_of_other_lengths,
     fades.interrupted_ramps,
     fades.earlier_ends_stay,
-    fades.two_voices,
+    fades.voices,
     fades.phases,
     fades.ramps_of_valid_for,
     ending.valid_for,

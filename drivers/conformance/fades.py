@@ -8,11 +8,19 @@ from drivers.conformance.bench import Bench
 from drivers.conformance.check import driving
 from drivers.conformance.curve import Curve, expect_curve, raised_cosine, samples_until
 from drivers.conformance.ending import PROMPT, is_silent
-from drivers.conformance.findings import Inconclusive, NotApplicable, expect
+from drivers.conformance.findings import (
+    ContractViolation,
+    Inconclusive,
+    NotApplicable,
+    expect,
+)
+from drivers.errors import CommandRefused
+from drivers.guard import SafeCommandSet
 from drivers.guard.channel_state import Interval
 from drivers.protocol.messages import Feature
 
 _SETS = "wire-protocol.md#sets-tokens-and-ramps"
+_COUNTED = 8  # voices that fit into a ramp, even where an exchange takes long
 _LOW = 10.0  # Hz; its period is long against the time of an exchange
 _CYCLE_ERROR = 0.12  # error of a phase, in turns, that still tells cases apart
 
@@ -126,23 +134,58 @@ async def earlier_ends_stay(bench: Bench) -> None:
 
 
 @driving(_SETS)
-async def two_voices(bench: Bench) -> None:
-    """It refuses a third voice on a channel while two fade, and takes the set afterwards."""
+async def voices(bench: Bench) -> None:
+    """It sounds as many voices of a channel as it states, and refuses one more until one ends.
+
+    Of many only the first are counted.
+    """
+    if not bench.ramp:
+        raise NotApplicable("it plays without ramps")
     await bench.arm()
-    await bench.play(1.0)
-    second = bench.tones(0.5, ramp=bench.ramp)
-    await bench.amplifier.apply(second)
-    # A guard of its own does not know of the fade, and holds nothing back.
-    third = bench.tones(0.25, ramp=bench.ramp, guard=bench.guard_as(bench.can))
-    await bench.refused(bench.amplifier.apply(third), what="a third voice")
+    count = min(bench.can.voices, _COUNTED)
+    token, fading_from = await _fill(bench, count)
+    if bench.can.voices == count:
+        one_more = bench.amplifier.apply(_tone(bench, 0.25))
+        try:
+            _, when = await bench.timed(one_more)
+        except CommandRefused:
+            pass
+        else:
+            if when.latest > fading_from.earliest + bench.ramp:
+                raise Inconclusive(f"{count} sets took as long as a ramp")
+            what = f"a voice beyond the {count} that it states"
+            raise ContractViolation(what, expected="refused", seen="a reply")
     status = await bench.amplifier.status()
-    what = "active_token after a refused set"
-    expect(status.token == second.token, what, expected=second.token, seen=status.token)
+    what = "active_token of the last voice that it has room for"
+    expect(status.token == token, what, expected=token, seen=status.token)
     await bench.wait(1.25 * bench.ramp)
-    await bench.expect_levels(0.5, why="fade that went on after a refused set")
-    await bench.amplifier.apply(bench.tones(0.25, ramp=bench.ramp))
+    await bench.expect_levels(0.5, why="fade that went on after others")
+    await bench.amplifier.apply(_tone(bench, 0.25))
     await bench.wait(1.25 * bench.ramp)
     await bench.expect_levels(0.25, why="set after the end of a fade")
+
+
+async def _fill(bench: Bench, count: int) -> tuple[int, Interval]:
+    """Begin so many voices; returns the token of the last, and when the first began to fade."""
+    await bench.play(1.0)
+    fades = []
+    for number in range(2, count + 1):
+        wanted = _tone(bench, 0.5)
+        try:
+            _, when = await bench.timed(bench.amplifier.apply(wanted))
+        except CommandRefused as refused:
+            raise ContractViolation(
+                f"voice {number} of the {bench.can.voices} that it states",
+                expected="a reply",
+                seen=str(refused),
+            ) from None
+        fades.append(when)
+    return wanted.token, fades[0]
+
+
+def _tone(bench: Bench, fraction: float) -> SafeCommandSet:
+    """Make a set by a guard of its own, which knows of no fade and so holds nothing back."""
+    return bench.tones(fraction, ramp=bench.ramp, guard=bench.guard_as(bench.can))
 
 
 @dataclass(frozen=True)

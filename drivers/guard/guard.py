@@ -115,7 +115,7 @@ class Guard:
                 "(valid_for), got one that does not; remove them from the rig file, or use another"
             )
         self._capabilities = capabilities_in_force(capabilities)
-        self._record = PlayRecord(self._limits, self._capabilities.channels, clock)
+        self._record = PlayRecord(self._limits, self._capabilities, clock)
 
     @property
     def limits(self) -> GuardLimits:

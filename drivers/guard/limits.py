@@ -77,10 +77,11 @@ def _whole_steps(value: float, quantity: WireQuantity) -> float:
 
 
 def capabilities_in_force(capabilities: Capabilities) -> Capabilities:
-    """Limit an amplifier's ramps and channels to the range of the protocol."""
+    """Limit an amplifier's ramps, channels and voices to the range of the protocol."""
     quantities = PROTOCOL.quantities
     return replace(
         capabilities,
         ramp_max=max(0.0, min(capabilities.ramp_max, quantities.ramp.high)),
         channels=min(capabilities.channels, quantities.channel_count.maximum),
+        voices=max(capabilities.voices, quantities.voices.minimum),
     )

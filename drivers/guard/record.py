@@ -19,7 +19,7 @@ from drivers.guard.channel_state import (
     union_of,
 )
 from drivers.guard.voices import Voices, latest_of
-from drivers.protocol.messages import Achieved, AmplifierState, Status
+from drivers.protocol.messages import Achieved, AmplifierState, Capabilities, Status
 from registry.limits import GuardLimits
 
 _ROUNDING = 1 + 1e-9  # sums of floats
@@ -44,15 +44,19 @@ class _Sent:
 
 
 class PlayRecord:
-    """The record of one amplifier, at first silent; clock [s].
+    """The record of an amplifier with these capabilities in force, at first silent; clock [s].
 
     slots: the envelopes that each slot may hold; last_token: of the set that was sent last.
     """
 
-    def __init__(self, limits: GuardLimits, channels: int, clock: Callable[[], float]) -> None:
+    def __init__(
+        self, limits: GuardLimits, capabilities: Capabilities, clock: Callable[[], float]
+    ) -> None:
         self.slots: dict[int, tuple[Envelope, ...]] = {}
         self.last_token = 0
+        channels = capabilities.channels
         self._limits = limits
+        self._most = capabilities.voices
         self._clock = clock
         self._budget = Budget(limits)
         self._confirmed: States = (_SILENT,) * channels
@@ -79,7 +83,7 @@ class PlayRecord:
         return max_valid_for
 
     def room_from(self, command_set: CommandSet) -> float:
-        """Return the time [s] from which a set is no third voice on any channel.
+        """Return the time [s] from which a set is no voice too many on any channel.
 
         Later while sets that were sent are unconfirmed. Minus infinity for a set that needs no
         room: silence, one that ends the others at once, or one that was sent before.
@@ -93,7 +97,7 @@ class PlayRecord:
         voices = self._voices_after(self._pending, self._clock())
         return max(
             (
-                voices[command.channel].room_from
+                voices[command.channel].room_from(self._most)
                 for command in command_set.commands
                 if command.level > 0 or command.onset
             ),

@@ -1,4 +1,4 @@
-"""When the voices of a channel have ended: an amplifier plays two at most (`FADING`).
+"""When the voices of a channel have ended: an amplifier plays only so many (`FADING`).
 
 A voice is what one set plays on a channel, until it has faded. Its end is known as an upper bound:
 commits are as late as they can be.
@@ -44,10 +44,9 @@ class Voices:
     voices: tuple[Voice, ...] = ()
     ending: float = 0.0
 
-    @property
-    def room_from(self) -> float:
-        """When [s] at most one is left."""
-        return self.voices[1].end + LAG if len(self.voices) > 1 else -math.inf
+    def room_from(self, most: int) -> float:
+        """When [s] another has room among so many at most."""
+        return self.voices[most - 1].end + LAG if len(self.voices) >= most else -math.inf
 
     def after(
         self,

@@ -3,6 +3,7 @@
 A has everything, B lacks what class A needs but has a watchdog, C has no watchdog.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -17,15 +18,19 @@ class AmplifierClass(StrEnum):
     C = "C"
 
 
+AMPLE_VOICES = 8
+"""So many that no set every 10 ms waits, along ramps of 50 ms."""
+
+
 @dataclass(frozen=True)
 class Lack:
     """What an amplifier may lack, its class then, and what controller, daemon and promise do.
 
-    feature: None for envelopes, which have no bit.
+    lacked: a feature, or whether an amplifier lacks what has no bit.
     """
 
     name: str
-    feature: Feature | None
+    lacked: Feature | Callable[[Capabilities], bool]
     highest_class: AmplifierClass
     controller: str
     daemon: str
@@ -33,9 +38,9 @@ class Lack:
 
     def is_in(self, capabilities: Capabilities) -> bool:
         """Whether an amplifier lacks it."""
-        if self.feature is None:
-            return not capabilities.envelope_knots
-        return self.feature not in capabilities.features
+        if isinstance(self.lacked, Feature):
+            return self.lacked not in capabilities.features
+        return self.lacked(capabilities)
 
 
 LACKS = (
@@ -58,7 +63,7 @@ LACKS = (
     ),
     Lack(
         "envelopes",
-        None,
+        lambda capabilities: not capabilities.envelope_knots,
         AmplifierClass.B,
         "plays ramps",
         "shows the class",
@@ -87,6 +92,14 @@ LACKS = (
         "commits and stops each amplifier of a line by itself",
         "nothing",
         "unchanged; several amplifiers of a line start one after the other",
+    ),
+    Lack(
+        f"{AMPLE_VOICES} voices",
+        lambda capabilities: capabilities.voices < AMPLE_VOICES,
+        AmplifierClass.A,
+        "holds the newest pattern back until a channel has a voice for it",
+        "nothing",
+        "unchanged; with two voices a pattern begins up to a ramp later",
     ),
 )
 """What amplifiers may lack, the gravest first."""

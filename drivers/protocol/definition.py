@@ -115,6 +115,7 @@ class Quantities:
     age: WireQuantity
     versions: WireQuantity
     features: WireQuantity
+    voices: WireQuantity
     session: WireQuantity
     held_session: WireQuantity
     latch: WireQuantity

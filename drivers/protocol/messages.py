@@ -228,6 +228,7 @@ class Capabilities:
 
     envelope_knots: most knots of an envelope; envelope_slots: number of slots; envelope steps [s];
     all 0 without envelopes. channel_limits: of each channel; empty: those of the amplifier.
+    voices: how many sets a channel can sound at once, while they fade.
     """
 
     channels: int
@@ -246,6 +247,7 @@ class Capabilities:
     envelope_step_max: float = 0.0
     channel_limits: tuple[ChannelLimits, ...] = ()
     features: Feature = field(kw_only=True)
+    voices: int = 2
 
     @property
     def limits_of_channels(self) -> tuple[ChannelLimits, ...]:

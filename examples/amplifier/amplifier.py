@@ -18,6 +18,7 @@ WRONG_SESSION, WRONG_LATCH, FADING = 10, 11, 12
 CHANNELS = 4
 FREQUENCY = (400, 12000)  # range
 MAX_RAMP = 1000
+VOICES = 2  # of a channel at once
 WATCHDOG_RANGE = (100, 2000)
 SHORT_FADE = 5
 STAGED_LIFE = 1000  # ms until a staged set is forgotten
@@ -184,8 +185,8 @@ class Amplifier:
         """Play a checked set, if its channels have room for it."""
         token, ramp, valid_for, commands = wanted
         for channel, _, level, _ in commands:
-            if level > 0 and len(self._fading(channel, ramp, self._clock())) > 1:
-                raise Refused(FADING, channel)  # two voices a channel
+            if level > 0 and len(self._fading(channel, ramp, self._clock())) > VOICES - 1:
+                raise Refused(FADING, channel)
         self._playing, self._staged, self.token = wanted, None, token
         levels = [0] * CHANNELS  # channels without a command fall silent
         for channel, _, level, _ in commands:

@@ -117,9 +117,9 @@ class SerialEnd:
         if kind == GET_CAPS:
             steps = (1, 10000, 1, 1, parts.MAX_RAMP, *parts.WATCHDOG_RANGE)
             numbers = struct.pack("<B9H", parts.CHANNELS, *parts.FREQUENCY, *steps)
-            no_envelopes, features = bytes(6), struct.pack("<H", FEATURES)
+            no_envelopes, rest = bytes(6), struct.pack("<HB", FEATURES, parts.VOICES)
             each = struct.pack("<3H", *parts.FREQUENCY, 10000)
-            return numbers + no_envelopes + features + parts.CHANNELS * each
+            return numbers + no_envelopes + rest + parts.CHANNELS * each
         if kind == GET_FAULTS:
             records = [struct.pack("<BBI", fault, 255, age) for fault, age in a.faults]
             return bytes([len(records)]) + b"".join(records)

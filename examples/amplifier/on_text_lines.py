@@ -20,6 +20,7 @@ CAPABILITIES = {
     "channels": parts.CHANNELS,
     "frequency": parts.FREQUENCY,
     "longest_ramp": parts.MAX_RAMP,
+    "voices": parts.VOICES,
     "watchdog": parts.WATCHDOG_RANGE,
 }
 

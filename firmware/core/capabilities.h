@@ -12,7 +12,8 @@ struct capability {
     uint8_t size; // bytes on the serial line and on CAN; always one Modbus register
 };
 
-#define CAPABILITY_COUNT 15
+#define CAPABILITY_COUNT 16
+#define FEATURES_SUB 15 // where FEATURES is in this list, from 1
 extern const struct capability CAPABILITIES[CAPABILITY_COUNT];
 
 // Of each channel, here the same for all: lowest and highest frequency, highest level.

@@ -10,25 +10,40 @@ static bool is_silent(const struct command *command)
     return command->level == 0 && command->onset == 0;
 }
 
-// Keep phase applies to what the channel plays last, as long as it sounds, at exactly this frequency.
+// Keep phase applies to what the channel plays, unless that falls silent, at exactly this frequency.
 static bool keeps_phase(const struct channel *channel, const struct command *command)
 {
     const struct voice *voice = &channel->voices[channel->newest];
-    return (command->flags & KEEP_PHASE) != 0 && voice->is_sounding &&
+    return (command->flags & KEEP_PHASE) != 0 && voice_lasts(voice) &&
            voice->frequency == command->frequency;
+}
+
+// The first voice that does not sound; VOICES if all do.
+static uint8_t free_voice(const struct channel *channel)
+{
+    uint8_t number = 0;
+    while (number < VOICES && channel->voices[number].is_sounding)
+        number++;
+    return number;
 }
 
 bool channel_has_room(const struct channel *channel, const struct command *command, uint16_t ramp)
 {
     bool needs_no_voice = is_silent(command) || (keeps_phase(channel, command) && command->onset);
-    bool has_free_voice = !channel->voices[0].is_sounding || !channel->voices[1].is_sounding;
-    return needs_no_voice || has_free_voice || ramp == 0;
+    return needs_no_voice || free_voice(channel) < VOICES || ramp == 0;
 }
 
 static void fall_all(struct channel *channel, uint16_t ramp)
 {
-    voice_fall(&channel->voices[0], ramp);
-    voice_fall(&channel->voices[1], ramp);
+    for (uint8_t i = 0; i < VOICES; i++)
+        voice_fall(&channel->voices[i], ramp);
+}
+
+static void fall_others(struct channel *channel, uint16_t ramp)
+{
+    for (uint8_t i = 0; i < VOICES; i++)
+        if (i != channel->newest)
+            voice_fall(&channel->voices[i], ramp);
 }
 
 static struct voice *begin_voice(struct channel *channel, const struct command *command,
@@ -37,7 +52,7 @@ static struct voice *begin_voice(struct channel *channel, const struct command *
     bool is_kept = keeps_phase(channel, command);
     uint32_t angle = channel->voices[channel->newest].angle;
     fall_all(channel, ramp);
-    channel->newest = channel->voices[0].is_sounding ? 1 : 0;
+    channel->newest = free_voice(channel);
     struct voice *voice = &channel->voices[channel->newest];
     voice_begin(voice, command->frequency, amplitude, command->onset ? 0 : ramp);
     if (is_kept)
@@ -51,7 +66,7 @@ static void play_onset(struct channel *channel, const struct command *command, u
     static const struct complex silence = {0, 0};
     struct voice *voice = &channel->voices[channel->newest];
     if (keeps_phase(channel, command))
-        voice_fall(&channel->voices[1 - channel->newest], ramp);
+        fall_others(channel, ramp);
     else
         voice = begin_voice(channel, command, silence, ramp);
     voice_walk(voice, onset, amplitude_of(command->level, command->phase));
@@ -83,7 +98,7 @@ void channel_end(struct channel *channel, uint16_t ramp)
     static const struct complex silence = {0, 0};
     struct voice *voice = &channel->voices[channel->newest];
     if (channel->has_command && channel->ending.knots > 0 && voice->is_sounding) {
-        voice_fall(&channel->voices[1 - channel->newest], ramp);
+        fall_others(channel, ramp);
         voice_walk(voice, &channel->ending, silence);
     } else {
         fall_all(channel, ramp);
@@ -99,14 +114,19 @@ void channel_quiet(struct channel *channel, uint16_t ramp)
 
 bool channel_is_sounding(const struct channel *channel)
 {
-    return channel->voices[0].is_sounding || channel->voices[1].is_sounding;
+    for (uint8_t i = 0; i < VOICES; i++)
+        if (channel->voices[i].is_sounding)
+            return true;
+    return false;
 }
 
 uint16_t channel_level(const struct channel *channel)
 {
     if (!channel_is_sounding(channel))
         return 0;
-    int64_t size = (int64_t)voice_size(&channel->voices[0]) + voice_size(&channel->voices[1]);
+    int64_t size = 0;
+    for (uint8_t i = 0; i < VOICES; i++)
+        size += voice_size(&channel->voices[i]);
     int64_t level = (size * FULL_STROKE + ONE / 2) / ONE;
     if (level < 1)
         return 1;
@@ -115,7 +135,9 @@ uint16_t channel_level(const struct channel *channel)
 
 int16_t channel_sample(struct channel *channel)
 {
-    int64_t sum = (int64_t)voice_sample(&channel->voices[0]) + voice_sample(&channel->voices[1]);
+    int64_t sum = 0;
+    for (uint8_t i = 0; i < VOICES; i++)
+        sum += voice_sample(&channel->voices[i]);
     int32_t value = (int32_t)((sum + (1 << 14)) >> 15);
     if (value > INT16_MAX)
         return INT16_MAX;

@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: MIT
 //
-// A channel: two voices, and the command that it plays.
+// A channel: its voices, and the command that it plays.
 
 #ifndef CHANNEL_H
 #define CHANNEL_H
 
+#include "config.h"
 #include "voice.h"
 
 struct command {
@@ -15,14 +16,14 @@ struct command {
 };
 
 struct channel {
-    struct voice voices[2];
+    struct voice voices[VOICES];
     uint8_t newest;         // the voice that began last
     bool has_command;       // plays one, as against falling silent
     uint16_t ramp;          // of its set
     struct envelope ending; // of its command; without knots: none
 };
 
-// Whether a command can be played now: a third voice would have no place.
+// Whether a command can be played now: a voice must be free for it.
 bool channel_has_room(const struct channel *channel, const struct command *command, uint16_t ramp);
 
 // Play a command for which there is room; onset and ending: its envelopes, or null.
@@ -37,7 +38,7 @@ void channel_quiet(struct channel *channel, uint16_t ramp);
 
 bool channel_is_sounding(const struct channel *channel);
 
-// Present level: the sum of both voices, at least one step while anything sounds.
+// Present level: the sum of its voices, at least one step while anything sounds.
 uint16_t channel_level(const struct channel *channel);
 
 // Value at this sample, 32767 being full stroke; then move on by one sample.

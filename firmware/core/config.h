@@ -21,6 +21,7 @@
 #define FREQUENCY_MIN (20 * FREQUENCY_PER_HZ)
 #define FREQUENCY_MAX (2000 * FREQUENCY_PER_HZ) // at most a quarter of the sample rate
 #define LEVEL_MAX FULL_STROKE
+#define VOICES 2 // oscillators of a channel, 2 to 255
 #define WATCHDOG_MIN 100
 #define WATCHDOG_MAX 2000
 

@@ -83,6 +83,11 @@ void voice_fall(struct voice *voice, uint16_t ramp)
     voice->stride = stride_within(samples);
 }
 
+bool voice_lasts(const struct voice *voice)
+{
+    return voice->is_sounding && voice->gain != GAIN_FALLING && !walks_to_silence(voice);
+}
+
 static void move_gain(struct voice *voice)
 {
     voice->along += voice->stride;

@@ -3,8 +3,8 @@
 // A voice: one oscillator with a complex amplitude and a gain.
 //
 // The amplitude stands still or walks along an envelope; the gain stands still, rises or falls
-// along a raised cosine. A channel has two voices, so that one can fade out while the other fades
-// in. The work for a sample is the same however many requests have arrived.
+// along a raised cosine. A channel has at least two voices, so that one can fade out while another
+// fades in. The work for a sample is the same however many requests have arrived.
 
 #ifndef VOICE_H
 #define VOICE_H
@@ -32,6 +32,9 @@ void voice_walk(struct voice *voice, const struct envelope *path, struct complex
 
 // Fall silent along a ramp [ms] from the present amplitude; sooner than before, or not at all.
 void voice_fall(struct voice *voice, uint16_t ramp);
+
+// Whether it sounds and does not fall silent.
+bool voice_lasts(const struct voice *voice);
 
 // Value at this sample in units of 2^-30 of full stroke; then move on by one sample.
 int32_t voice_sample(struct voice *voice);

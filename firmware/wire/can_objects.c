@@ -69,7 +69,7 @@ static void read_identity(struct writer *writer, const struct amplifier *amplifi
 static void read_capability(struct writer *writer, uint8_t sub)
 {
     const struct capability *capability = &CAPABILITIES[sub - 1];
-    uint16_t events = sub == CAPABILITY_COUNT ? FEATURE_EVENTS : 0; // CAN always sends them
+    uint16_t events = sub == FEATURES_SUB ? FEATURE_EVENTS : 0; // CAN always sends them
     if (capability->size == 1)
         write_u8(writer, (uint8_t)capability->value);
     else

@@ -58,6 +58,9 @@ _HIGH_VOLTAGE = 1800.0  # V
 _CAPACITANCE = 1e-9  # F; of an actuator
 _DISCHARGE = 0.02  # s; time constant of the supply once it is off
 _SLOTS = 63
+VOICES = 8
+"""Voices of a channel: enough for a set every 10 ms that fades along 50 ms."""
+
 FEATURES = (
     Feature.WHOLE
     | Feature.EVENTS
@@ -70,8 +73,8 @@ _LATCHED = (AmplifierState.QUICK_STOP_ACTIVE, AmplifierState.FAULT)
 _FEEDING_REQUESTS = (Arm, Ping, Stage, Commit, Apply)  # with the session that is held
 
 
-def capabilities(channels: int) -> Capabilities:
-    """Capabilities of a simulated amplifier with the given number of channels."""
+def capabilities(channels: int, voices: int = VOICES) -> Capabilities:
+    """Capabilities of a simulated amplifier with these numbers of channels and voices."""
     return Capabilities(
         channels=channels,
         frequency_min=10.0,  # the guard's floor: below it a plate only rocks
@@ -88,17 +91,18 @@ def capabilities(channels: int) -> Capabilities:
         envelope_step_min=0.001,
         envelope_step_max=_Q.envelope_step.high,
         features=FEATURES,
+        voices=voices,
     )
 
 
 class SimulatedAmplifier:
-    """An amplifier with a name and a number of channels; times [s] are of any one clock.
+    """An amplifier with a name, and numbers of channels and voices; times [s] of any one clock.
 
     listeners: called with every change of state or fault, and its time [s]. capabilities: others
     hold from the next restart.
     """
 
-    def __init__(self, name: str, *, channels: int) -> None:
+    def __init__(self, name: str, *, channels: int, voices: int = VOICES) -> None:
         self.identity = Identity(
             vendor="era-haptics",
             product="simulated amplifier",
@@ -106,7 +110,7 @@ class SimulatedAmplifier:
             firmware="1",
             versions=(PROTOCOL.version,),
         )
-        self.capabilities = capabilities(channels)
+        self.capabilities = capabilities(channels, voices)
         self.state = AmplifierState.SWITCH_ON_DISABLED
         self.fault = Fault.NONE
         self.listeners: list[Callable[[AmplifierEvent, float], None]] = []
@@ -119,7 +123,7 @@ class SimulatedAmplifier:
 
     def _start(self) -> None:
         """Reset all but the temperature and the fault history."""
-        self._channels = Channels(self.capabilities.channels)
+        self._channels = Channels(self.capabilities.channels, self.capabilities.voices)
         self._sets = SetStore(self.capabilities)
         self._watchdog = 0.0
         self._last_fed = 0.0

@@ -8,7 +8,6 @@ from drivers.protocol.messages import Achieved
 from sim.waveform import Output, ShapedTone, end_along, fade_to, level_of, shape_to
 
 _DERATING_RAMP = 0.02  # s; no click
-_VOICES = 2  # at most, of one channel
 
 
 @dataclass(frozen=True)
@@ -51,9 +50,10 @@ class PlayableSet:
 
 
 class Channels:
-    """Outputs of the channels, at first silent; times [s] of any one clock."""
+    """Outputs of the channels, at first silent, of so many voices; times [s] of any one clock."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, voices: int) -> None:
+        self._voices = voices
         self._outputs: list[Output] = [()] * count
         self._endings: Mapping[int, Envelope] = {}
         self._ramp = 0.0  # of the active set
@@ -82,9 +82,9 @@ class Channels:
         return max([time, *(tone.silent_from for output in self._outputs for tone in output)])
 
     def without_room(self, playable: PlayableSet, time: float) -> int | None:
-        """The first channel on which a set would be a third voice; None to play it."""
+        """The first channel on which a set would be a voice too many; None to play it."""
         after = self._outputs_after(playable, time)
-        return next((channel for channel, output in after if len(output) > _VOICES), None)
+        return next((channel for channel, output in after if len(output) > self._voices), None)
 
     def play(self, playable: PlayableSet, time: float) -> None:
         """Play a set; channels that it does not name are silenced."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from sim.witness.config import AmplifierConfig
 from sim.witness.decoded import ChannelCommand, ReportViolation, Request, RequestKind
 from sim.witness.reference_amplifier import ReferenceAmplifier
+from sim.witness.voices import Voices
 
 _TOKENS_KEPT = 16  # of commits
 
@@ -49,6 +50,7 @@ class AmplifierSession:
     last_token: int = 0
     preempted_at: float = -math.inf  # when a silencing request overtook pending ones
     constants: dict[tuple[RequestKind, int], bytes] = field(default_factory=dict)
+    voices: Voices = field(default_factory=Voices)
 
     def check_constant(self, kind: RequestKind, reported: bytes, time: float) -> None:
         """Compare an identity or capabilities with those reported before in the same length."""

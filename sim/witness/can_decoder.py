@@ -23,6 +23,8 @@ from sim.witness.decoded import (
 )
 from sim.witness.quantities import INVALID, OutOfRange
 
+_VOICES = bytes.fromhex("4F012010")  # an answer with one byte, of object 2001sub16
+
 
 class CanDecoder:
     """Decodes the text of an adapter; nodes: number of channels by node."""
@@ -89,7 +91,8 @@ class CanDecoder:
             return [StateEvent(number, state, frame.data[3] >> 4)]
         if function == 0x580 and number in self._nodes:
             # The transfer may have fed the watchdog at any time.
-            return [Reply(number, "objects")]
+            is_voices = frame.data[:4] == _VOICES
+            return [Reply(number, "objects", voices=frame.data[4] if is_voices else 0)]
         for node in self._nodes.values():
             if frame.identifier == 0x180 + node.number:
                 return [*node.requests.end_set(frame.data[0]), node.reply(frame)]

@@ -131,8 +131,8 @@ class Reply:
     """A reply. key: of its request, None where it matches none; refusal: 0 if granted.
 
     achieved: the set as played, by channel, and its token; is_exact: whether it plays as commanded;
-    constant: what must be the same in every reply to such a request; faults: newest first, each
-    with its age [s].
+    constant: what must be the same in every reply to such a request; voices: of a channel, as it
+    states, or 0; faults: newest first, each with its age [s].
     """
 
     address: int
@@ -143,6 +143,7 @@ class Reply:
     achieved: Mapping[int, ChannelCommand] | None = None
     is_exact: bool | None = None
     constant: bytes | None = None
+    voices: int = 0
     faults: tuple[tuple[int, float], ...] | None = None
     problem: str = ""
 

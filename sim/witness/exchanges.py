@@ -6,6 +6,7 @@ from sim.witness.amplifier_session import AmplifierSession
 from sim.witness.config import TimeLimits
 from sim.witness.decoded import (
     REPLY_TO_DAMAGED_FRAME,
+    SETS,
     STATE_CHANGING,
     BootUp,
     Damaged,
@@ -65,6 +66,8 @@ class Exchanges:
         for session in self._addressed(wire, message.address):
             if not is_copy:
                 self._host.check_request(session, time, message)
+            if message.kind in SETS:
+                session.voices.sent(message)
             if message.key is None:
                 self._process_unconfirmed(session, time, message)
             else:
@@ -138,6 +141,7 @@ class Exchanges:
             self._host.request_granted(session, time, request)
 
     def _process_reply(self, session: AmplifierSession, time: float, reply: Reply) -> None:
+        session.voices.stated = reply.voices or session.voices.stated
         if reply.key == "objects":
             session.amplifier.may_feed(time)
             return
@@ -171,12 +175,14 @@ class Exchanges:
         if was_lost or request.problem:
             return
         if reply.refusal:
+            session.voices.refused(request.token)
             if reply.refusal == _FADING and not session.is_disturbed(time):
-                what = f"host sent set {request.token} to {session.name} while two voices sound"
-                session.report("voices", time, what)
+                self._report_fading(session, time, request.token)
             if reply.status is not None and not is_overtaken:
                 session.amplifier.refusal_received(reply.status, at, time)
             return
+        if request.kind in SETS:
+            session.voices.granted(request, time)
         if request.kind in STATE_CHANGING:
             # The first attempt may have been executed and its reply lost.
             same = {
@@ -193,6 +199,15 @@ class Exchanges:
         if session.is_disturbed(time) and request.kind is RequestKind.ARM:
             session.amplifier.forget_state()
         session.amplifier.request_granted(request, reply, at, time)
+
+    def _report_fading(self, session: AmplifierSession, time: float, token: int) -> None:
+        """Report a set that had no room, or was refused although it had."""
+        stated, possible = session.voices.stated, session.voices.at(time)
+        if possible < stated:
+            what = f"{session.name} refused set {token} as voice {possible + 1} of {stated}"
+        else:
+            what = f"host sent set {token} to {session.name}, whose voices all sound"
+        session.report("voices", time, what)
 
     def _check_unexpected(self, session: AmplifierSession, time: float, reply: Reply) -> None:
         was_abandoned = reply.key in session.abandoned

@@ -42,6 +42,7 @@ _KINDS = {
     15: RequestKind.ADDRESS,
 }
 _EVENT, _NAK = 30, 31
+_VOICES_AT = 27  # in capabilities
 _MAX_LENGTH = 249  # bytes of a frame
 _DAMAGED = 16  # damaged requests kept, to recognise replies to them
 _SIZES = {  # of the payload
@@ -239,7 +240,8 @@ def _decode_constant(address: int, key: tuple[int, RequestKind], payload: bytes)
             check_identity(payload)
         except OutOfRange as found:
             problem = f"identity: {found}"
-    return Reply(address, key, constant=payload, problem=problem)
+    voices = payload[_VOICES_AT] if key[1] is RequestKind.CAPABILITIES else 0
+    return Reply(address, key, constant=payload, voices=voices, problem=problem)
 
 
 def _decode_status(payload: bytes) -> Status:

@@ -20,11 +20,11 @@ RAMP, LAG = 0.2, 0.002  # s
 
 
 class Bench:
-    """An armed amplifier over a backend that remembers refusals for a third voice."""
+    """An armed amplifier over a backend that remembers refusals for a voice too many."""
 
-    def __init__(self) -> None:
+    def __init__(self, voices: int = 2) -> None:
         self.refused = 0
-        simulated = SimulatedAmplifier("main", channels=3)
+        simulated = SimulatedAmplifier("main", channels=3, voices=voices)
         handle = simulated.handle
 
         def remember(request: object, now: float) -> Reply:
@@ -63,6 +63,20 @@ async def test_third_set_is_sent_when_the_older_voice_must_have_ended() -> None:
     achieved = await bench.amplifier.apply(third := bench.tone(190.0))
     assert isinstance(achieved, Achieved)
     assert achieved.token == third.token
+    assert clock.now() - DELAY - replied_at == pytest.approx(RAMP + LAG)
+    assert bench.refused == 0
+
+
+@in_virtual_time
+async def test_amplifier_of_five_voices_takes_five_at_once() -> None:
+    """The sixth waits for the first of the four that fade."""
+    bench = Bench(voices=5)
+    await bench.start()
+    replied_at = await bench.fade()
+    for frequency in (170.0, 190.0, 210.0):
+        await bench.amplifier.apply(bench.tone(frequency))
+    assert clock.now() - replied_at == pytest.approx(3 * DELAY)
+    await bench.amplifier.apply(bench.tone(230.0))
     assert clock.now() - DELAY - replied_at == pytest.approx(RAMP + LAG)
     assert bench.refused == 0
 
@@ -152,10 +166,10 @@ async def test_unconfirmed_set_is_assumed_to_fade_as_late_as_it_can() -> None:
 
 @pytest.mark.parametrize("seed", range(60))
 @in_virtual_time
-async def test_host_never_sends_a_third_voice(seed: int) -> None:
-    """Random sets, envelopes, pauses and lost frames."""
+async def test_host_never_sends_a_voice_too_many(seed: int) -> None:
+    """Random sets, envelopes, pauses and lost frames; two voices and more."""
     rng = random.Random(seed)
-    bench = Bench()
+    bench = Bench(voices=2 + seed % 3)
     await bench.start()
     for slot in (1, 2):
         knots = tuple(Knot(0.2, 0.0) for _ in range(rng.randint(1, 4)))

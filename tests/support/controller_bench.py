@@ -33,7 +33,7 @@ from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone
 from registry.limits import GuardLimits
-from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.amplifier.amplifier import VOICES, SimulatedAmplifier
 from stub_wire_times import StubWireTimes
 
 FINGER = (1, 0.5, 0.5)
@@ -46,10 +46,10 @@ class FarEnd(Backend):
     The last byte leaves at once, the reply takes `delay` [s]. `answer` may override any reply.
     """
 
-    def __init__(self, channels: int = 2) -> None:
+    def __init__(self, channels: int = 2, voices: int = VOICES) -> None:
         self.asked: list[tuple[float, Request]] = []
         self.delay = self.commit_takes = 0.0
-        self.amplifier = SimulatedAmplifier("any", channels=channels)
+        self.amplifier = SimulatedAmplifier("any", channels=channels, voices=voices)
         self.amplifier.capabilities = replace(
             self.amplifier.capabilities, frequency_max=600.0, envelope_knots=0, envelope_slots=0
         )
@@ -253,6 +253,7 @@ def make_bench(
     sources: Sequence[TouchSource] = (),
     observer: Observer | None = None,
     channels: int = 2,
+    voices: int = VOICES,
     far_ends: list[Any] | None = None,
     rate: float = math.inf,
     on_time: float = math.inf,
@@ -263,7 +264,7 @@ def make_bench(
     rate [1/s], on_time [s]: limits of the rig; options: as a `Controller` takes them.
     """
     names = amplifiers or ("main",)
-    far_ends = far_ends or [FarEnd(channels) for _ in names]
+    far_ends = far_ends or [FarEnd(channels, voices) for _ in names]
     reports = Reports()
     rig = _rig(*names)
     rig = replace(rig, limits=replace(rig.limits, rate=rate, on_time=on_time))

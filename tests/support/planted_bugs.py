@@ -106,6 +106,17 @@ def both(first: Plant, second: Plant) -> Plant:
     return plant
 
 
+def with_voices(in_force: int, *, stated: int = 0) -> Plant:
+    """Have this number of voices, and state another."""
+
+    def around(init: Any, amplifier: Any, *args: Any, **kwargs: Any) -> None:
+        init(amplifier, *args, **{**kwargs, "voices": in_force})
+        can = amplifier.capabilities
+        amplifier.capabilities = replace(can, voices=stated or in_force)
+
+    return wrapped(SimulatedAmplifier, "__init__", around)
+
+
 def _swapped(channel: int) -> int:
     return (1, 0, 2)[channel]
 
@@ -364,8 +375,11 @@ DRIVERS: dict[str, Bug] = {
         scenarios.slow_lift,
     ),
     "sets are not held back": Bug(
-        "voices", replaced(PlayRecord, "room_from", lambda *_: -math.inf), scenarios.hasty
+        "voices",
+        both(with_voices(2), replaced(PlayRecord, "room_from", lambda *_: -math.inf)),
+        scenarios.hasty,
     ),
+    "it has fewer voices than it states": Bug("voices", with_voices(2, stated=4), scenarios.hasty),
     "a stop is sent as a disarm": Bug("stop", replaced(Amplifier, "stop", Amplifier.disarm)),
     "no amplifier is identified": Bug("identified", wrapped(Link, "request", _knows_already)),
     "sets are sent without their order": Bug(

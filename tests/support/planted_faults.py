@@ -35,7 +35,7 @@ from drivers.protocol.messages import (
     Stage,
     Status,
 )
-from planted_bugs import Plant, both, replaced, wrapped
+from planted_bugs import Plant, both, replaced, with_voices, wrapped
 from sim.amplifier import amplifier as simulated
 from sim.amplifier import channels as channel_outputs
 from sim.amplifier import set_store
@@ -701,8 +701,17 @@ FAULTS: dict[str, PlantedFault] = {
     "a set prolongs an earlier fade": PlantedFault(
         "earlier_ends_stay", wrapped(FadingTone, "fade_out", _extends)
     ),
-    "a third voice is played": PlantedFault(
-        "two_voices", replaced(Channels, "without_room", lambda *_: None)
+    "a voice beyond those stated is played": PlantedFault(
+        "voices", replaced(Channels, "without_room", lambda *_: None)
+    ),
+    "two voices are stated, and a third is played": PlantedFault(
+        "voices", with_voices(3, stated=2)
+    ),
+    "four voices are stated, and a third is refused": PlantedFault(
+        "voices", with_voices(2, stated=4)
+    ),
+    "many voices are stated, and a third is refused": PlantedFault(
+        "voices", with_voices(2, stated=255)
     ),
     "keep phase is ignored": PlantedFault(
         "phases", played(each(lambda one: replace(one, keep_phase=False)))

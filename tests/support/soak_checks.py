@@ -184,8 +184,9 @@ class Checks:
 
     def _check_limits(self, name: str) -> None:
         limits = self._bench.rig.limits
-        for output in self._bench.amplifiers[name].outputs:
-            if len(output) > 2:
+        amplifier = self._bench.amplifiers[name]
+        for output in amplifier.outputs:
+            if len(output) > amplifier.capabilities.voices:
                 self.violate(f"{name} plays {len(output)} voices on a channel")
             for tone in output:
                 if not limits.frequency_min <= tone.frequency <= limits.frequency_max:

@@ -23,8 +23,8 @@ HEARTBEAT, WATCHDOG_FADE, COLLECTING = 0.05, 0.005, 0.1  # s
 VERSIONS = 1 << 2
 TEXTS = {1: "Elsewhere Ltd", 2: "From the page", 3: "EL-0042", 4: "0.1"}
 FEATURES = 0b111111  # events, watchdog, staging, valid_for, phase, broadcast
-CAPABILITIES = "BHHHHHHHHHBBHHH"
-LIMITS = (CHANNELS, LOWEST, HIGHEST, 1, 10000, 1, 1, 1000, 100, 2000, 0, 0, 0, 0, FEATURES)
+CAPABILITIES = "BHHHHHHHHHBBHHHB"
+LIMITS = (CHANNELS, LOWEST, HIGHEST, 1, 10000, 1, 1, 1000, 100, 2000, 0, 0, 0, 0, FEATURES, 2)
 CHANNEL_LIMITS = {0x2009: LOWEST, 0x200A: HIGHEST, 0x200B: 10000}
 
 
@@ -408,7 +408,7 @@ class VendorAmplifier:
                 return TEXTS[number].encode()
             case 0x2000, 5:
                 return struct.pack("<H", VERSIONS)
-            case 0x2001, number if 1 <= number <= 15:
+            case 0x2001, number if 1 <= number <= 16:
                 return struct.pack("<" + CAPABILITIES[number - 1], LIMITS[number - 1])
             case limit, channel if limit in CHANNEL_LIMITS and 1 <= channel <= CHANNELS:
                 return struct.pack("<H", CHANNEL_LIMITS[limit])

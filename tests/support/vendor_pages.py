@@ -52,6 +52,7 @@ CAPABILITIES = Capabilities(
     | Feature.INTERLOCK
     | Feature.ELECTRICAL
     | Feature.ADDRESS,
+    voices=4,
 )
 IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", (2,))
 SESSION = 9

@@ -108,7 +108,8 @@ def unpack_capabilities(registers: Sequence[int]) -> Capabilities:
     """Decode capabilities."""
     found, rest = _fields(_MAP["input"]["capabilities"]["registers"], registers)
     whole: dict[str, Any] = {
-        name: _integer(name, found.pop(name)) for name in ("envelope_knots", "envelope_slots")
+        name: _integer(name, found.pop(name))
+        for name in ("envelope_knots", "envelope_slots", "voices")
     }
     channels = _channel_count(found.pop("channel_count"), read=len(rest) // LIMIT_SIZE)
     features = Feature(found.pop("features"))

@@ -48,6 +48,7 @@ _CAPABILITIES: Mapping[str, WireQuantity] = {  # in the order of the payload; th
     "envelope_step_min": _Q.envelope_step,
     "envelope_step_max": _Q.envelope_step,
     "features": _Q.features,
+    "voices": _Q.voices,
 }
 _LIMITS: Mapping[str, WireQuantity] = {  # of a channel, in the order of the payload
     "frequency_min": _Q.frequency,

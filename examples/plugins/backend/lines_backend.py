@@ -208,6 +208,7 @@ def read(request: Request, reply: dict[str, Any]) -> Reply:
                 watchdog_max=longest * SECONDS,
                 envelope_knots=0,
                 features=Feature.WHOLE,
+                voices=reply["voices"],
             )
         case GetFaults():
             return FaultList(

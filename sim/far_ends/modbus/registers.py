@@ -145,6 +145,7 @@ def capability_words(capabilities: Capabilities) -> list[int]:
         "envelope_step_min": word_of(_Q.envelope_step, capabilities.envelope_step_min),
         "envelope_step_max": word_of(_Q.envelope_step, capabilities.envelope_step_max),
         "features": int(capabilities.features),
+        "voices": capabilities.voices,
     }
     words = [fields[name] for name in MAP["input"]["capabilities"]["registers"]]
     for each in capabilities.limits_of_channels:

@@ -46,7 +46,7 @@ async def test_pattern_waits_for_the_end_of_a_fade_and_the_newest_is_played(
     names: tuple[str, ...],
 ) -> None:
     """On all amplifiers at one moment; at most one ramp after its touch."""
-    async with running(*names) as bench:
+    async with running(*names, voices=2) as bench:
         await touch(bench, 1, rest=0.05)
         second = await touch(bench, 2, rest=0.005)
         third = await touch(bench, 3, rest=0.005)
@@ -83,10 +83,11 @@ async def test_lift_is_not_held_back() -> None:
         assert bench.far_end.sets()[-1].is_silent
 
 
+@pytest.mark.parametrize(("voices", "least"), [(2, 41), (8, 100)])
 @in_virtual_time
-async def test_hundred_changes_in_a_second_are_never_refused() -> None:
-    """Ten milliseconds apart, ramps of fifteen; heartbeats go on."""
-    async with running() as bench:
+async def test_hundred_changes_in_a_second_are_never_refused(voices: int, least: int) -> None:
+    """Ten milliseconds apart, ramps of fifteen; heartbeats go on. With eight voices all play."""
+    async with running(voices=voices) as bench:
         replies = []
         obey = bench.far_end.obey
         bench.far_end.answer = lambda request: replies.append(obey(request)) or replies[-1]
@@ -96,4 +97,4 @@ async def test_hundred_changes_in_a_second_are_never_refused() -> None:
         assert not any(isinstance(reply, Nak) for reply in replies)
         beats = bench.far_end.times(Ping)
         assert max(b - a for a, b in pairwise(beats)) < 0.075
-        assert len(bench.far_end.times(Apply)) > 40
+        assert len(bench.far_end.times(Apply)) >= least

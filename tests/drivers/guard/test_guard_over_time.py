@@ -15,7 +15,7 @@ from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import DriverError
 from drivers.guard import Guard, GuardLimits, SafeCommandSet
-from drivers.protocol.messages import Apply, Commit, Nak, Reply, Request
+from drivers.protocol.messages import Apply, Commit, Nak, NakCode, Reply, Request
 from lossy_backend import Fate, LossyBackend
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.waveform import level_of
@@ -98,6 +98,8 @@ class MeteredBackend(LossyBackend):
         self._meter.measure(clock.now())
         super()._deliver(request, arriving)
         reply = arriving.result()
+        if isinstance(reply, Nak) and reply.code is NakCode.FADING:
+            self._meter.violations.append(f"{clock.now():.3f}: a voice too many")
         plays = isinstance(request, Apply | Commit) and not isinstance(reply, Nak)
         is_new = plays and self.amplifier.status(clock.now()).token != before
         if is_new and any(tone.is_lasting for tones in self.amplifier.outputs for tone in tones):
@@ -156,8 +158,8 @@ LIMITS = [
 class Driver:
     """Carries out actions on an amplifier."""
 
-    def __init__(self, limits: GuardLimits) -> None:
-        simulated = SimulatedAmplifier("main", channels=2)
+    def __init__(self, limits: GuardLimits, voices: int) -> None:
+        simulated = SimulatedAmplifier("main", channels=2, voices=voices)
         self.meter = Meter(simulated, limits)
         self.backend = MeteredBackend(simulated, self.meter)
         self.amplifier = Amplifier(self.backend)
@@ -244,7 +246,7 @@ class Driver:
 
 
 @pytest.mark.parametrize("limits", LIMITS, ids=["slew", "power", "on", "duty", "rate", "all"])
-@given(script=st.lists(actions, min_size=12, max_size=40))
+@given(voices=st.sampled_from([2, 3, 8]), script=st.lists(actions, min_size=12, max_size=40))
 @settings(
     max_examples=15,
     deadline=None,
@@ -252,7 +254,7 @@ class Driver:
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 def test_no_limit_is_exceeded_on_the_amplifier(
-    limits: GuardLimits, script: list[tuple[str, object]]
+    limits: GuardLimits, voices: int, script: list[tuple[str, object]]
 ) -> None:
-    """Random sets, envelopes, pauses, losses, stops and re-arms."""
-    assert run_virtual(Driver(limits).run(script)) == []
+    """Random sets, envelopes, pauses, losses, stops and re-arms; two voices a channel, and more."""
+    assert run_virtual(Driver(limits, voices).run(script)) == []

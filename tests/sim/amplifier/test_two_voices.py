@@ -40,7 +40,7 @@ def tone(token: int, frequency: float = 110.0, *, level: float = 0.5, ramp: floa
 @pytest.fixture
 def amplifier() -> SimulatedAmplifier:
     """Armed at 0 s; token 1 plays at 110 Hz, token 2 at 150 Hz since 0.1 s along 200 ms."""
-    amplifier = SimulatedAmplifier("main", channels=2)
+    amplifier = SimulatedAmplifier("main", channels=2, voices=2)
     amplifier.handle(Arm(2.0, SESSION), 0.0)
     assert isinstance(amplifier.handle(Apply(tone(1, ramp=0.0), SESSION), 0.0), Achieved)
     assert isinstance(amplifier.handle(Apply(tone(2, 150.0), SESSION), 0.1), Achieved)
@@ -68,7 +68,7 @@ def test_third_voice_is_refused_and_the_fade_goes_on(amplifier: SimulatedAmplifi
 
 def test_level_of_two_voices_of_one_frequency_is_that_of_their_sum() -> None:
     """Opposite phases cancel halfway."""
-    amplifier = SimulatedAmplifier("main", channels=1)
+    amplifier = SimulatedAmplifier("main", channels=1, voices=2)
     amplifier.handle(Arm(2.0, SESSION), 0.0)
     amplifier.handle(Apply(tone(1, 100.0, ramp=0.0), SESSION), 0.0)
     amplifier.handle(Apply(tone(2, 100.0, phase=-180.0), SESSION), 0.1)  # ten periods later
@@ -179,7 +179,7 @@ SETS = st.tuples(
 def test_output_is_that_of_two_oscillators(sets) -> None:
     """Whatever sets come how soon: the same are refused, and what is played has no jump."""
     small, now = Channel(), 0.0
-    amplifier = SimulatedAmplifier("main", channels=1)
+    amplifier = SimulatedAmplifier("main", channels=1, voices=2)
     amplifier.handle(Arm(2.0, SESSION), now)
 
     def played(time: float) -> float:

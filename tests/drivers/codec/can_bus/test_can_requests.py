@@ -257,12 +257,13 @@ def test_objects_are_decoded() -> None:
         **{"ramp_max": 1000, "watchdog_min": 100, "watchdog_max": 2000, "envelope_knots": 32},
         **{"envelope_slots": 63, "envelope_step_min": 10, "envelope_step_max": 1000},
         "features": 0b1_0000_0001_1110,  # bit 12 is not defined yet
+        "voices": 4,
     }
     limits = [{"frequency_min": 400, "frequency_max": 6000, "level_max": 5000}] * 4
     known = Feature.WHOLE | Feature(1 << 12)
     each = (ChannelLimits(20.0, 300.0, 0.5),) * 4
     assert unpack_capabilities(numbers, limits) == replace(
-        WIDE, channels=4, features=known, channel_limits=each
+        WIDE, channels=4, features=known, channel_limits=each, voices=4
     )
 
 

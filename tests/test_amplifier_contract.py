@@ -68,7 +68,15 @@ LONG = {
     *("phases", "earlier_ends_stay", "valid_for", "ramps_of_valid_for", "valid_for_is_of_its_set"),
     *("stop_ramp", "stop_ramp_clipped", "stop_ends_fades", "silence_never_later", "disarm"),
     *("watchdog_times", "watchdog_left", "watchdog_without_reading", "trips_amid_other_requests"),
-    *("what_feeds", "what_does_not_feed", "voices", "onsets", "endings", "skipped_endings"),
+    *(
+        "what_feeds",
+        "what_does_not_feed",
+        "voices",
+        "onsets",
+        "endings",
+        "skipped_endings",
+        "interrupted_endings",
+    ),
     *("kept_phase_onset", "loaded_while_playing", "clear_too_early", "arms_again", "fault_list"),
     *("invalid_frames", "invalid_frames_do_not_feed"),
 }

@@ -82,6 +82,7 @@ CHECKS: tuple[Check, ...] = (
     envelopes.onsets,
     envelopes.endings,
     envelopes.skipped_endings,
+    envelopes.interrupted_endings,
     envelopes.loaded_while_playing,
     envelopes.kept_phase_onset,
     envelopes.watchdog_skips_endings,

@@ -4,7 +4,7 @@ from drivers.command import Envelope, Knot
 from drivers.conformance.bench import Bench
 from drivers.conformance.check import driving
 from drivers.conformance.curve import Curve, expect_curve, raised_cosine, samples_until
-from drivers.conformance.ending import is_silent
+from drivers.conformance.ending import PROMPT, is_silent
 from drivers.conformance.findings import NotApplicable, expect
 from drivers.protocol.messages import Feature
 
@@ -106,6 +106,21 @@ async def skipped_endings(bench: Bench) -> None:
             bench, samples, falling, commit=when, lasts=ramp, what=f"of an ending skipped by {name}"
         )
         await bench.rest()
+
+
+@driving(_PLACE)
+async def interrupted_endings(bench: Bench) -> None:
+    """It ends an ending amid which a longer ramp begins when it would have ended."""
+    step = _step(bench)
+    await _load(bench, 2, 1.0)
+    await bench.arm()
+    await bench.apply(bench.tones(1.0, ending=2))
+    ended = await bench.play()
+    await bench.pause_until(ended.latest + step)
+    await bench.play(ramp=min(4 * step, bench.can.ramp_max))
+    what = "silence of an ending before a longer ramp"
+    silent = await bench.time_of(is_silent, since=ended, due=2 * step, what=what)
+    bench.expect_time(what, silent, low=0.0, high=2 * step + PROMPT)
 
 
 @driving(_PLACE)

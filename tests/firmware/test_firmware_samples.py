@@ -23,7 +23,7 @@ from firmware_script import (
 from model.arrays import FloatArray
 
 TOLERANCE = 6e-5  # of full stroke: two steps of a 16-bit sample, and phases over seconds
-STOP, FADING = 8, 12
+BAD_TOKEN, STOP, FADING = 6, 8, 12
 
 
 def seconds(count: int) -> FloatArray:
@@ -99,6 +99,46 @@ def test_keep_phase_changes_the_level_alone(firmware: Path) -> None:
     level = 0.25 + 0.25 * falling(t - 0.1, 0.02)
     expected = np.where(t >= 0.007, level * tone(t - 0.007, 123.45, 1), 0)
     assert np.abs(samples[:, 0] - expected).max() < TOLERANCE
+
+
+def test_channel_that_falls_silent_keeps_no_phase(firmware: Path) -> None:
+    """Its next voice counts t from its own commit, while the one before still fades."""
+    script: Script = [
+        (0, arm()),
+        (7, apply(1, command(0, 123.45, 0.5))),
+        (100, apply(2, ramp_ms=40)),
+        (110, apply(3, command(0, 123.45, 0.25, flags=KEEP_PHASE), ramp_ms=40)),
+    ]
+    samples, _ = replay(firmware, script, 200)
+    t = seconds(len(samples))
+    first = np.where(t >= 0.007, tone(t - 0.007, 123.45, 0.5) * falling(t - 0.1, 0.04), 0)
+    second = np.where(t >= 0.11, tone(t - 0.11, 123.45, 0.25) * (1 - falling(t - 0.11, 0.04)), 0)
+    assert np.abs(samples[:, 0] - first - second).max() < TOLERANCE
+
+
+def test_interrupted_ending_ends_when_it_would(firmware: Path) -> None:
+    """By a set with a longer ramp, silent or not; a silent one plays no ending again."""
+    for others in ((), (command(1, 110, 0.2),)):
+        script: Script = [
+            (0, load(6, 10, (0.4, 0.0))),
+            (0, arm()),
+            (0, apply(1, command(0, 90, 0.4, ending=6))),
+            (50, apply(2)),
+            (60, apply(3, *others, ramp_ms=100)),
+        ]
+        samples, _ = replay(firmware, script, 100)
+        t = seconds(len(samples))
+        expected = tone(t, 90, 0.4) * falling(t - 0.06, 0.01)
+        assert np.abs(samples[:, 0] - expected).max() < TOLERANCE
+
+
+def test_same_commands_in_another_order_are_another_set(firmware: Path) -> None:
+    """An Apply with active_token is refused with BAD_TOKEN then, and confirmed otherwise."""
+    commands = command(0, 100, 0.5), command(1, 130, 0.4)
+    again = [(10, apply(1, *commands)), (20, apply(1, *commands[::-1]))]
+    _, replies = replay(firmware, [(0, arm()), (0, apply(1, *commands)), *again], 30)
+    assert replies[-2][0] == 0x87
+    assert replies[-1] == (NAK, bytes([7, BAD_TOKEN, 255]))
 
 
 def test_envelopes_move_along_straight_lines(firmware: Path) -> None:

@@ -55,7 +55,7 @@ from sim.far_ends.modbus import unit as modbus_unit
 from sim.far_ends.modbus.unit import ModbusUnit
 from sim.far_ends.serial_end import SerialEnd
 from sim.transport.line import Line
-from sim.waveform import FadingTone
+from sim.waveform import FadingTone, ShapedTone
 
 ALL = ("serial", "modbus+tcp", "modbus+rtu", "can+slcan")
 SERIAL, MODBUS, CAN = ("serial",), ("modbus+tcp", "modbus+rtu"), ("can+slcan",)
@@ -244,6 +244,10 @@ def _linear(tone: FadingTone, time: float) -> float:
 
 def _extends(fade_out: Any, tone: Any, time: float, *, ramp: float) -> Any:
     return replace(tone, start=time, ramp=ramp, gain_from=tone.gain(time), gain_to=0.0)
+
+
+def _prolongs(fade_out: Any, tone: Any, time: float, *, ramp: float) -> Any:
+    return replace(fade_out(tone, time, ramp=ramp), ramp=ramp)
 
 
 def _never_shortens(fade_out: Any, tone: Any, time: float, *, ramp: float) -> Any:
@@ -974,6 +978,9 @@ FAULTS: dict[str, PlantedFault] = {
     ),
     "the flag skip ending is ignored": PlantedFault(
         "skipped_endings", played(each(lambda one: replace(one, skip_ending=False)))
+    ),
+    "a set prolongs an ending": PlantedFault(
+        "interrupted_endings", wrapped(ShapedTone, "fade_out", _prolongs)
     ),
     "a Stop plays the ending": PlantedFault(
         "skipped_endings",

@@ -113,6 +113,38 @@ def test_onset_that_continues_a_voice_takes_its_place(amplifier: SimulatedAmplif
     assert [len(output) for output in amplifier.outputs] == [2, 0]
 
 
+def test_channel_that_falls_silent_keeps_no_phase(amplifier: SimulatedAmplifier) -> None:
+    """Its next voice counts t from its own commit, while the one before still fades."""
+    amplifier.handle(Apply(CommandSet(3, (), ramp=0.5, valid_for=0.0), SESSION), 0.31)
+    amplifier.handle(Apply(tone(4, 150.0, keep_phase=True), SESSION), 0.4)
+    assert [one.origin for one in amplifier.outputs[0]] == [0.1, 0.4]
+
+
+@pytest.mark.parametrize("others", [(), (DriveCommand(1, 90.0, 0.5),)], ids=["silent", "driving"])
+def test_interrupted_ending_ends_when_it_would(others: tuple[DriveCommand, ...]) -> None:
+    """By a set with a longer ramp, halfway; a silent one plays no ending again."""
+    amplifier = SimulatedAmplifier("main", channels=2)
+    amplifier.handle(Arm(2.0, SESSION), 0.0)
+    amplifier.handle(LoadEnvelope(Envelope(1, 0.05, (Knot(0.5, 0.0),))), 0.0)
+    amplifier.handle(Apply(tone(1, ramp=0.0, ending=1), SESSION), 0.0)
+    amplifier.handle(Apply(CommandSet(2, (), ramp=0.0, valid_for=0.0), SESSION), 0.1)
+    amplifier.handle(Apply(CommandSet(3, others, ramp=0.2, valid_for=0.0), SESSION), 0.15)
+    assert status(amplifier, 0.175).levels[0] == pytest.approx(0.25)  # 0.5 (1 + cos(pi / 2)) / 2
+    assert status(amplifier, 0.201).levels[0] == 0.0
+
+
+def test_same_commands_in_another_order_are_another_set() -> None:
+    """An Apply with active_token is refused then, and confirmed otherwise."""
+    amplifier = SimulatedAmplifier("main", channels=2)
+    amplifier.handle(Arm(2.0, SESSION), 0.0)
+    commands = (DriveCommand(0, 110.0, 0.5), DriveCommand(1, 150.0, 0.4))
+    first = CommandSet(1, commands, ramp=0.0, valid_for=0.0)
+    other = CommandSet(1, commands[::-1], ramp=0.0, valid_for=0.0)
+    assert isinstance(amplifier.handle(Apply(first, SESSION), 0.0), Achieved)
+    assert isinstance(amplifier.handle(Apply(first, SESSION), 0.1), Achieved)
+    assert amplifier.handle(Apply(other, SESSION), 0.2) == Nak(NakCode.BAD_TOKEN)
+
+
 @dataclass
 class Oscillator:
     """A tone whose complex amplitude moves along a raised cosine; silent if it ends at zero."""

@@ -19,6 +19,8 @@ FREQUENCY_CEILING = PROTOCOL.quantities.frequency.high
 LEVEL_CEILING = 1.0
 # No bus carries more sets per second, so a higher rate can only be a runaway loop.
 RATE_CEILING = 2000.0
+# A set every 10 ms along ramps of 150 ms; the guard follows each voice.
+VOICES_CEILING = 16
 _SLACK = 1e-6  # of a step; sums of floats
 
 
@@ -77,11 +79,11 @@ def _whole_steps(value: float, quantity: WireQuantity) -> float:
 
 
 def capabilities_in_force(capabilities: Capabilities) -> Capabilities:
-    """Limit an amplifier's ramps, channels and voices to the range of the protocol."""
+    """Limit an amplifier's ramps and channels to the range of the protocol, voices to a ceiling."""
     quantities = PROTOCOL.quantities
     return replace(
         capabilities,
         ramp_max=max(0.0, min(capabilities.ramp_max, quantities.ramp.high)),
         channels=min(capabilities.channels, quantities.channel_count.maximum),
-        voices=max(capabilities.voices, quantities.voices.minimum),
+        voices=min(max(capabilities.voices, quantities.voices.minimum), VOICES_CEILING),
     )

@@ -82,6 +82,19 @@ async def test_amplifier_of_five_voices_takes_five_at_once() -> None:
 
 
 @in_virtual_time
+async def test_amplifier_of_many_voices_is_sent_sixteen_at_once() -> None:
+    """The seventeenth waits, so that the guard follows no more."""
+    bench = Bench(voices=255)
+    await bench.start()
+    replied_at = await bench.fade()
+    for number in range(14):
+        await bench.amplifier.apply(bench.tone(170.0 + number))
+    assert clock.now() - replied_at == pytest.approx(14 * DELAY)
+    await bench.amplifier.apply(bench.tone(230.0))
+    assert clock.now() - DELAY - replied_at == pytest.approx(RAMP + LAG)
+
+
+@in_virtual_time
 async def test_newer_set_takes_the_place_of_the_one_that_waits() -> None:
     """The older one is never sent."""
     bench = Bench()

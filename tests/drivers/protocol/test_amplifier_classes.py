@@ -39,6 +39,14 @@ def test_class_a_has_envelopes() -> None:
     assert [lack.name for lack in missing(plain)] == ["envelopes"]
 
 
+def test_two_voices_are_named_and_leave_the_class() -> None:
+    """An amplifier of two oscillators a channel may be of class A."""
+    small = replace(WHOLE, voices=2)
+    assert amplifier_class(small) == "A"
+    assert [lack.name for lack in missing(small)] == ["8 voices"]
+    assert missing(WHOLE) == ()
+
+
 def test_page_has_the_table_of_the_code() -> None:
     """Written anew by the program that the page names."""
     page = PAGE.read_text("utf-8")

@@ -15,6 +15,7 @@ from model.rig.file import load_rig
 from model.vibration.parametric_plate import parametric_plate
 from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.plant.imperfections import draw_imperfections
+from wires import patient
 
 FREQUENCY = 170.0
 # What no quantisation step divides, so that rounding shows.
@@ -29,7 +30,7 @@ async def steady(far_end: FarEndProcess, wiring: Mapping[str, tuple[str, int]]) 
     amplifiers = {}
     try:
         for name, url in far_end.urls.items():
-            amplifiers[name] = amplifier = Amplifier(open_backend(url), reply_timeout=5.0)
+            amplifiers[name] = amplifier = Amplifier(open_backend(patient(url)), reply_timeout=5.0)
             await amplifier.open()
             await amplifier.arm(2.0)
             commands = tuple(

@@ -16,7 +16,7 @@ from model.rig.rig import Rig
 from sim.witness.endpoint import parse_endpoint
 from sim.witness.witness import Witness
 from sim.witness_relay import relays
-from wires import WIRES, far_side
+from wires import WIRES, far_side, patient
 from witness_config import witness_config
 
 
@@ -26,7 +26,7 @@ def _witness(url: str, *, level: float) -> Witness:
 
 
 async def _drive(url: str) -> None:
-    amplifier = Amplifier(open_backend(url), reply_timeout=2.0)
+    amplifier = Amplifier(open_backend(patient(url)), reply_timeout=2.0)
     await amplifier.open()
     try:
         guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifier.capabilities)

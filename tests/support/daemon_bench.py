@@ -163,7 +163,7 @@ async def until_state(client: AsyncClient, *states: str) -> str:
     """Wait until the daemon is in one of these states; return it."""
     end = time.monotonic() + PATIENCE
     while (state := (await client.status()).state) not in states:
-        assert time.monotonic() < end, f"daemon stays in {state}"
+        assert time.monotonic() < end, f"daemon stays in {state}: {(await client.status()).cause}"
         await asyncio.sleep(0.01)
     return state
 

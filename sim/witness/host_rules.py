@@ -118,12 +118,14 @@ class HostRules:
     # rules
 
     def _check_credit(self, session: AmplifierSession, time: float, request: Request) -> None:
-        """Only a silencing request may be sent while another reply is pending."""
+        """Only a silencing request, to any amplifier of a wire, may precede a pending reply."""
         is_silent_set = request.kind is RequestKind.APPLY and not request.vibrates
         if is_silent_set or request.kind in (RequestKind.STOP, RequestKind.DISARM):
-            session.preempted_at = time
+            for other in self._sessions.values():
+                if other.config.wire == session.config.wire:
+                    other.preempted_at = time
             return
-        for at, other in session.pending.values():
+        for at, awaited in session.pending.values():
             # A last lift preempts too, even if a finger has come since.
             is_awaited = at > max(session.preempted_at, self._inputs.last_lift)
             if is_awaited and time - at < self._times.reply - self._times.slack:
@@ -131,7 +133,7 @@ class HostRules:
                     "credit",
                     time,
                     f"host sent {request.kind.value} to {session.name} {(time - at) * 1e3:.1f} ms "
-                    f"after {other.kind.value}, whose reply is pending",
+                    f"after {awaited.kind.value}, whose reply is pending",
                 )
 
     def _check_stop(self, session: AmplifierSession, time: float, request: Request) -> None:

@@ -39,8 +39,7 @@ class _Entry:
     """A request from its queueing to its result.
 
     number: order among requests of one amplifier; attempt_number: order among amplifiers, and
-    sent_before: time [s] of the frame before it: of the current attempt; not_before [s]: of the
-    next one.
+    started_at [s]: of the current attempt; not_before [s]: of the next one.
     """
 
     __slots__ = (
@@ -53,7 +52,7 @@ class _Entry:
         "priority",
         "queued_at",
         "result",
-        "sent_before",
+        "started_at",
     )
 
     def __init__(
@@ -71,12 +70,12 @@ class _Entry:
         self.queued_at = clock.now()
         self.result: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         self.is_withdrawn = False
-        self.sent_before = 0.0
+        self.started_at = 0.0
 
     @property
     def is_unsent(self) -> bool:
         """Whether nothing of the current attempt was sent."""
-        return self.backend.last_sent_at == self.sent_before
+        return self.backend.last_sent_at < self.started_at
 
     def rank(self, now: float) -> int:
         """Place in the queue at a time [s]; one that has waited long is a heartbeat's equal."""
@@ -237,7 +236,7 @@ class Sender:
 
     async def _carry_out(self, entry: _Entry) -> None:
         """Make one attempt."""
-        entry.sent_before = entry.backend.last_sent_at
+        entry.started_at = clock.now()
         self._current, self._is_preempted = entry, False
         task = cast("asyncio.Task[Any]", self._task)
         cancellations = task.cancelling()

@@ -38,7 +38,7 @@ class ModbusLine(SharedLine[Port]):
         self.url = url
         self.counters = WireCounters()
         self._last_sent_at = 0.0
-        self._is_transacting = False
+        self._is_in_use = False
         self._reader = ResponseReader(is_rtu=url.is_rtu, counters=self.counters)
         self.has_duplicate_responder = False  # the last response was followed by a different one
         self._last_response: ModbusResponse | None = None
@@ -77,7 +77,7 @@ class ModbusLine(SharedLine[Port]):
         response matches; on_sent: called with the time when the request was sent; is_stop: send it
         for an amplifier not reopened since a loss, too. Raises LinkTimeout, LinkError.
         """
-        self._is_transacting = True
+        self._is_in_use = True
         try:
             await self._await_silence()
             if not is_stop:
@@ -102,22 +102,30 @@ class ModbusLine(SharedLine[Port]):
             ) from None
         finally:
             self._response = None
-            self._is_transacting = False
+            self._is_in_use = False
 
     async def broadcast(self, write: Write, on_sent: Callable[[float], None]) -> None:
-        """Write to all units; there are no responses.
+        """Write to all units; there are no responses. Over RTU it ends when the line is free again.
 
-        Raises LinkError during a transaction over RTU, with whose response it would collide.
+        Raises LinkError during another request over RTU, with which it would collide.
         """
-        if self.url.is_rtu and self._is_transacting:
+        if not self.url.is_rtu:
+            self._send(self._make(None, write, unit=_BROADCAST))
+            on_sent(self._last_sent_at)
+            return
+        if self._is_in_use:
             raise LinkError(f"{self.name} is in use; broadcast after the transaction")
-        await self._await_silence()
-        request = self._make(None, write, unit=_BROADCAST)
-        if self.url.is_rtu:
+        self._is_in_use = True
+        try:
+            await self._await_silence()
+            request = self._make(None, write, unit=_BROADCAST)
             self._request = None
-        self._send(request)
-        on_sent(self._last_sent_at)
-        self._free_from = self._last_sent_at + self._time_of(len(request.frame)) + self._gap
+            self._send(request)
+            on_sent(self._last_sent_at)
+            self._free_from = self._last_sent_at + self._time_of(len(request.frame)) + self._gap
+            await self._await_silence()
+        finally:
+            self._is_in_use = False
 
     async def send_raw(self, data: bytes) -> None:
         """Send bytes as they are, after the silence of a serial line."""

@@ -176,8 +176,6 @@ async def test_stop_waits_for_the_grace_and_not_for_an_unsent_request(is_own: bo
     for gap, latest in ((0.0, PREEMPTION_GRACE), (0.1, 0.0)):
         line = Line()
         east, west = Amplifier(line), Amplifier(line)
-        if gap:
-            east._last_sent_at = clock.now()  # by a broadcast at the same moment
         east.gap = gap
         first = east.ask("first", Priority.APPLY)
         await asyncio.sleep(0.002)

@@ -199,6 +199,6 @@ async def test_stop_precedes_what_waits_for_the_end_of_a_broadcast(two_amplifier
             return await east.status()
 
         committing = asyncio.create_task(commit())
-        await asyncio.sleep(0.0005)
+        await asyncio.sleep(0.0025)  # silence, and a part of the frame
         await west.stop_on_bus(0.0)
         assert (await committing).state is AmplifierState.QUICK_STOP_ACTIVE

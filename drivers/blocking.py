@@ -9,8 +9,8 @@ Only `play`, while it waits, and `heartbeat` feed the watchdog: a script that ha
 
 import asyncio
 import threading
-from collections.abc import Coroutine, Sequence
-from types import TracebackType
+from collections.abc import Coroutine, Mapping, Sequence
+from types import MappingProxyType, TracebackType
 from typing import Any, TypeVar
 
 from drivers.amplifier import WATCHDOG, Amplifier
@@ -22,6 +22,7 @@ from drivers.operation.keep_alive import keep_alive
 from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import Achieved, Capabilities, FaultRecord, Identity, Status
 from drivers.registry import open_backend
+from registry.voltage import VoltageDrive
 
 _RAMP = 0.02  # s; long enough that neither start nor end of a vibration clicks
 
@@ -31,11 +32,19 @@ _T = TypeVar("_T")
 class BlockingAmplifier:
     """The amplifier at a URL within limits, open while the context lasts.
 
-    Leaving the context disarms it. Raises what `Amplifier` raises.
+    voltage: by channel, for an amplifier of voltage. Leaving the context disarms it. Raises what
+    `Amplifier` raises.
     """
 
-    def __init__(self, url: str, *, limits: GuardLimits) -> None:
+    def __init__(
+        self,
+        url: str,
+        *,
+        limits: GuardLimits,
+        voltage: Mapping[int, VoltageDrive] = MappingProxyType({}),
+    ) -> None:
         self._url = url
+        self._voltage = voltage
         self._limits = limits
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name=f"amplifier {url}")
@@ -43,7 +52,7 @@ class BlockingAmplifier:
     def __enter__(self) -> "BlockingAmplifier":
         self._thread.start()
         try:
-            self._amplifier = Amplifier(open_backend(self._url))
+            self._amplifier = Amplifier(open_backend(self._url, self._voltage))
             self._wait(self._amplifier.open())
             self._checked = CheckedAmplifier(self._amplifier)
             self._guard = Guard(self._limits, self._amplifier.capabilities)

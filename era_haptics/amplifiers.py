@@ -27,7 +27,10 @@ def open_amplifier(
         raise InputError(f"name must be an amplifier of the rig, {', '.join(known)}, got {name!r}")
     if url is not None and not isinstance(url, str):
         raise InputError(f"url must be text such as 'sim://', got {shown(url)}")
-    return BlockingAmplifier(url or rig.amplifiers[chosen[0]], limits=rig.limits)
+    (found,) = chosen
+    return BlockingAmplifier(
+        url or rig.amplifiers[found], limits=rig.limits, voltage=rig.voltage_of(found)
+    )
 
 
 def commands_for(rig: Rig, drive: Pattern | Drives) -> dict[str, tuple[DriveCommand, ...]]:

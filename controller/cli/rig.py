@@ -207,7 +207,9 @@ def _live(
     async def measure() -> "Observation":
         async with simulated_sensors(control, points, noise=noise) as sensors:
             amplifiers = {
-                name: Amplifier(open_backend(at[name]), reply_timeout=_REPLY_TIMEOUT)
+                name: Amplifier(
+                    open_backend(at[name], rig.voltage_of(name)), reply_timeout=_REPLY_TIMEOUT
+                )
                 for name in rig.amplifiers
             }
             sweep = ChannelSweep(

@@ -233,7 +233,9 @@ class Daemon:
 
     def _make_backends(self, config: DaemonConfig) -> dict[str, RecordedBackend]:
         return {
-            name: RecordedBackend(open_backend(url), name, self._recorder)
+            name: RecordedBackend(
+                open_backend(url, config.rig.voltage_of(name)), name, self._recorder
+            )
             for name, url in config.urls.items()
         }
 

@@ -95,7 +95,7 @@ async def run_demo(
             table,
             amplifiers={
                 name: Amplifier(
-                    open_backend(url),
+                    open_backend(url, rig.voltage_of(name)),
                     reply_timeout=EMULATOR_TIMEOUT if wire == "firmware" else REPLY_TIMEOUT,
                 )
                 for name, url in plate.urls.items()

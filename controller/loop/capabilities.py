@@ -25,7 +25,8 @@ class PlaybackCapabilities:
     play; frequencies: the lowest and highest [Hz]; max_amplitudes [m] by ERA;
     envelope_support: which envelopes every amplifier plays; max_power: sum of squared levels of
     all ERAs; slew [1/s]: highest rise of a level. eras_at_most: how many ERAs may play together;
-    ends_itself: whether every amplifier ends a vibration after its time.
+    ends_itself: whether every amplifier ends a vibration after its time; has_cross_fades: whether
+    each changes from one tone to another without silence between.
     """
 
     drive_mode: str
@@ -37,6 +38,7 @@ class PlaybackCapabilities:
     slew: float = math.inf
     eras_at_most: int = 2
     ends_itself: bool = True
+    has_cross_fades: bool = True
 
 
 def playback_capabilities(
@@ -82,6 +84,7 @@ def playback_capabilities(
         slew=min(one.slew for one in limits.values()),
         eras_at_most=2 if is_coherent else 1,
         ends_itself=all(Feature.VALID_FOR in caps.features for caps in capabilities.values()),
+        has_cross_fades=all(caps.has_cross_fades for caps in capabilities.values()),
     )
 
 

@@ -49,7 +49,8 @@ class Decision:
     None for silence; adds_endings_only: whether the sets only add endings to the playback; refusal:
     why a guard refused the pattern, which makes it silence; retry_at [s]: when the guard would pass
     it, None for never. ends_due [s]: when the vibration that it ends was to end, if the amplifiers
-    do not end it themselves.
+    do not end it themselves. held_until [s]: when to decide instead, once amplifiers that cannot
+    cross-fade have faded out.
     """
 
     contacts: tuple[Contact, ...]
@@ -62,6 +63,7 @@ class Decision:
     refusal: str | None = None
     retry_at: float | None = None
     ends_due: float | None = None
+    held_until: float | None = None
 
 
 @dataclass(frozen=True)
@@ -291,8 +293,9 @@ class Decider:
             if is_new:
                 _logger.exception("loop: decision failed, silencing all channels")
         self._held_until = None
-        if decision is not None and decision.sets is not None and decision.sets.room_from > now:
-            self._hold(decision.sets.room_from, now, triggered_at)
+        until = _room_from(decision)
+        if until > now:
+            self._hold(until, now, triggered_at)
             return None
         if decision is None and is_new:
             decision = draft
@@ -355,6 +358,11 @@ class Decider:
             )
         except CommandRefused as error:
             silence = self.silence(ramp=FADE_RAMP)
+            if not self._capabilities.has_cross_fades:  # out, then in
+                if not self._playing.is_silent:
+                    return replace(draft, sets=silence, retry_at=now)
+                if error.until is not None:
+                    return replace(draft, held_until=error.until)
             return replace(draft, sets=silence, refusal=str(error), retry_at=error.until)
         return replace(draft, sets=sets, pattern=played)
 
@@ -411,6 +419,15 @@ class Decider:
         """Note when the first change since the last decision arrived."""
         if change and self._triggered_at is None:
             self._triggered_at = time
+
+
+def _room_from(decision: Decision | None) -> float:
+    """Return when [s] the amplifiers have room for a decision."""
+    if decision is None:
+        return -math.inf
+    if decision.held_until is not None:
+        return decision.held_until
+    return -math.inf if decision.sets is None else decision.sets.room_from
 
 
 def _is_due(moment: float | None, now: float) -> bool:

@@ -106,7 +106,7 @@ class Guard:
         if Feature.VOLTAGE in capabilities.features:
             raise CommandError(
                 "levels must be of the full stroke, got an amplifier whose levels are of a "
-                "voltage; use a backend that converts them"
+                "voltage; give each of its ERAs a `voltage` section in the rig file"
             )
         is_bounded = self._limits.on_time < math.inf or self._limits.duty < 1
         if is_bounded and Feature.VALID_FOR not in capabilities.features:

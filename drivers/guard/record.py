@@ -25,6 +25,7 @@ from registry.limits import GuardLimits
 _ROUNDING = 1 + 1e-9  # sums of floats
 _ARRIVAL = 0.03  # s; in which a request arrives that has no reply, as the host's timeout
 _SILENT = ChannelState()
+_NO_FREQUENCY = _SILENT.frequency
 
 States = tuple[ChannelState, ...]
 
@@ -46,7 +47,8 @@ class _Sent:
 class PlayRecord:
     """The record of an amplifier with these capabilities in force, at first silent; clock [s].
 
-    slots: the envelopes that each slot may hold; last_token: of the set that was sent last.
+    has_cross_fades: see `Capabilities`; slots: the envelopes that each slot may hold; last_token:
+    of the set that was sent last.
     """
 
     def __init__(
@@ -57,6 +59,7 @@ class PlayRecord:
         channels = capabilities.channels
         self._limits = limits
         self._most = capabilities.voices
+        self._has_cross_fades = capabilities.has_cross_fades
         self._clock = clock
         self._budget = Budget(limits)
         self._confirmed: States = (_SILENT,) * channels
@@ -170,7 +173,7 @@ class PlayRecord:
         before = self._states(self._pending[:number], when)
         played = _played(sent)
         self._voices = self._with(sent, self._voices_after(self._pending[:number], now), now)
-        if self._limits.slew == math.inf and not self._is_shaped(sent.command_set):
+        if not self._needs_states(sent.command_set):
             self._confirmed = _upper_bounds_after(before, played, when)
         else:
             self._confirmed = states_after(before, played, when, self.slots)[0]
@@ -221,7 +224,7 @@ class PlayRecord:
             self.slots[envelope.slot] = (envelope,)
 
     def _check_transition(self, command_set: CommandSet, now: float) -> None:
-        if self._limits.slew == math.inf and not self._is_shaped(command_set):
+        if not self._needs_states(command_set):
             return  # along one ramp no level exceeds both the old and the new one
         try:
             self._check_from(self._states(self._pending, Interval(now, now)), command_set, now)
@@ -247,6 +250,8 @@ class PlayRecord:
         when = Interval(now, now + COMMIT_DELAY)
         after, slopes = states_after(before, command_set, when, self.slots)
         limits = self._limits
+        if not self._has_cross_fades:
+            _check_alone(before, command_set, when)
         for channel, slope in enumerate(slopes):
             if slope > limits.slew * _ROUNDING:
                 raise CommandRefused(
@@ -270,6 +275,14 @@ class PlayRecord:
                 f"sum of squared levels must be at most {limits.power:g} while the previous tones "
                 f"fade, got {power:g}; use a ramp instead of an envelope"
             )
+
+    def _needs_states(self, command_set: CommandSet) -> bool:
+        """Whether levels along a ramp, or frequencies that sound together, decide on a set."""
+        return (
+            self._limits.slew < math.inf
+            or not self._has_cross_fades
+            or self._is_shaped(command_set)
+        )
 
     def _is_shaped(self, command_set: CommandSet) -> bool:
         """Whether a channel may follow an envelope during this set or at its end."""
@@ -350,6 +363,20 @@ def vibrates(command_set: CommandSet) -> bool:
 def skips_endings(command_set: CommandSet) -> bool:
     """Whether a silent set skips earlier endings on all channels."""
     return all(command.skip_ending for command in command_set.commands)
+
+
+def _check_alone(before: States, command_set: CommandSet, when: Interval) -> None:
+    """Raise CommandRefused if a channel would go over to a tone that does not continue."""
+    for command in command_set.commands:
+        continued = {command.frequency} if command.keep_phase else set()
+        others = before[command.channel].frequencies_at(when) - continued - {_NO_FREQUENCY}
+        if command.level > 0 and others:
+            raise CommandRefused(
+                f"channel {command.channel} must be silent before {command.frequency:g} Hz, since "
+                "its amplifier cannot cross-fade, got one that plays "
+                f"{', '.join(f'{one:g}' for one in sorted(others))} Hz; play silence first",
+                channel=command.channel,
+            )
 
 
 def states_after(

@@ -242,6 +242,8 @@ class PlausibilityCheck:
         is_measured = Feature.LEVELS_MEASURED in self._capabilities.features
         measuring_error = MEASURING_ERROR if is_measured else 0.0
         for channel, (state, level) in enumerate(zip(self._states, status.levels, strict=False)):
+            if not (self._capabilities.has_exact_fades or state.is_settled(when)):
+                continue
             low, high = state.low(when), state.high(when)
             # Fading tones may cancel the lasting one, but not to zero twice in a row.
             if level == 0 and state.lasting_low(when) > 0.75 * step:

@@ -70,6 +70,14 @@ LACKS = (
         "of ramps: less contrast while a vibration begins and ends",
     ),
     Lack(
+        "cross-fades",
+        lambda capabilities: not capabilities.has_cross_fades,
+        AmplifierClass.B,
+        "fades out before another frequency fades in",
+        "shows the class",
+        "of ramps, each change later by the fade of the one before",
+    ),
+    Lack(
         "valid_for",
         Feature.VALID_FOR,
         AmplifierClass.B,

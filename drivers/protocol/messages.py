@@ -229,6 +229,8 @@ class Capabilities:
     envelope_knots: most knots of an envelope; envelope_slots: number of slots; envelope steps [s];
     all 0 without envelopes. channel_limits: of each channel; empty: those of the amplifier.
     voices: how many sets a channel can sound at once, while they fade.
+    Not on the wire: has_cross_fades: whether a channel can change from one tone to another without
+    silence between; has_exact_fades: whether levels follow the protocol's curve while they change.
     """
 
     channels: int
@@ -248,6 +250,8 @@ class Capabilities:
     channel_limits: tuple[ChannelLimits, ...] = ()
     features: Feature = field(kw_only=True)
     voices: int = 2
+    has_cross_fades: bool = field(default=True, kw_only=True)
+    has_exact_fades: bool = field(default=True, kw_only=True)
 
     @property
     def limits_of_channels(self) -> tuple[ChannelLimits, ...]:

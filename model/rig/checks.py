@@ -1,6 +1,7 @@
 """Checks of a rig across its sections."""
 
 import math
+from collections.abc import Iterator
 
 from model.config.document import key_name
 from model.config.sections import Validation
@@ -8,9 +9,17 @@ from model.errors import InputError
 from model.rig.meshes import mesh_of
 from model.rig.parts import laminate_of, plate_of
 from model.rig.rig import SAME_POINT
-from model.rig.sections import EraSection, LimitsSection, MassSection, PlateSection, RigSection
+from model.rig.sections import (
+    EraSection,
+    LimitsSection,
+    MassSection,
+    PlateSection,
+    RigSection,
+    VoltageSection,
+)
 from model.structure.plate import Plate
 from registry.suggestions import did_you_mean
+from registry.voltage import Law
 
 
 def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> None:
@@ -26,6 +35,7 @@ def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> Non
         if place is not None:
             _check_on_plate(validation, ("masses", name, "at"), plate, place, what="mass")
     _check_wiring(validation, names)
+    _check_voltages(validation, names)
     for name in names:
         if {"damping", "damping_ratio"} <= validation.mapping(("eras", name)).keys():
             validation.add(
@@ -144,3 +154,46 @@ def _check_wiring(validation: Validation[RigSection], names: tuple[str, ...]) ->
                 f"must be unique, got {channel} of amplifier {amplifier} as ERA {other}; give each "
                 "ERA its own channel",
             )
+
+
+def _check_voltages(validation: Validation[RigSection], names: tuple[str, ...]) -> None:
+    """Check the `voltage` sections of ERAs: by themselves, and those of one amplifier."""
+    limits = validation.part(("limits",), LimitsSection) or LimitsSection()
+    driven: dict[str, list[str]] = {}
+    for name in names:
+        driven.setdefault(str(validation.mapping(("eras", name)).get("amplifier")), []).append(name)
+    for several in driven.values():
+        given = [name for name in several if "voltage" in validation.mapping(("eras", name))]
+        for name in several if given else ():
+            if name not in given:
+                validation.add(
+                    ("eras", name, "voltage"),
+                    f"missing; ERA {given[0]} of the same amplifier has it: levels of an amplifier "
+                    "are all of a voltage, or all of motion",
+                )
+                continue
+            section = validation.part(("eras", name, "voltage"), VoltageSection)
+            for key, problem in _voltage_problems(section, limits) if section else ():
+                validation.add(("eras", name, "voltage", key), problem)
+
+
+def _voltage_problems(section: VoltageSection, limits: LimitsSection) -> Iterator[tuple[str, str]]:
+    """Keys and problems of a `voltage` section."""
+    low, high = limits.frequency
+    first, last = section.response[0][0], section.response[-1][0]
+    if low < first or high > last:
+        yield (
+            "response",
+            f"must cover limits.frequency, {low:g} to {high:g} Hz, got {first:g} to {last:g} Hz; "
+            "narrow the limits, or measure the rest",
+        )
+    if section.bias and section.law is Law.LINEAR:
+        yield "bias", "is for `law: quadratic` only; remove it"
+    if section.bias >= section.maximum:
+        yield "bias", f"must be less than maximum, {section.maximum:g}, got {section.bias:g}"
+    if section.law is Law.QUADRATIC and not section.bias and limits.slew is not None:
+        yield (
+            "law",
+            "must have a bias under limits.slew, since without one the force rises up to 1.3 times "
+            "as steeply as the ramp; give a bias, or remove limits.slew",
+        )

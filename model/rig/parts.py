@@ -10,6 +10,7 @@ from model.rig.sections import (
     MaterialSection,
     PlateSection,
     UncertaintySection,
+    VoltageSection,
 )
 from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era, damping_from_ratio
@@ -18,6 +19,7 @@ from model.structure.laminate import Laminate, Layer, equivalent_plate
 from model.structure.plate import Material, Plate
 from model.structure.point_load import PointLoad
 from registry.limits import GuardLimits
+from registry.voltage import VoltageDrive
 
 
 def plate_of(section: PlateSection) -> Plate:
@@ -67,6 +69,17 @@ def era_of(name: str, section: EraSection, plate: Plate, *, era_count: int) -> E
         stroke=section.stroke,
         foot=section.foot,
         gains=tuple((f, size, math.radians(phase)) for f, size, phase in section.gains or ()),
+    )
+
+
+def voltage_of(section: VoltageSection, limits: LimitsSection) -> VoltageDrive:
+    """The way from a voltage to motion, over the frequencies that are played."""
+    return VoltageDrive(
+        response=tuple((f, size, math.radians(phase)) for f, size, phase in section.response),
+        law=section.law,
+        bias=section.bias,
+        maximum=section.maximum,
+        frequencies=limits.frequency,
     )
 
 

@@ -38,6 +38,7 @@ from model.rig.uncertainty import Uncertainty
 from model.structure.laminate import Bond
 from model.structure.materials import material, material_names
 from registry.suggestions import did_you_mean
+from registry.voltage import Law
 
 
 class _MaterialByName:
@@ -155,6 +156,15 @@ class PlateSection(Section):
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, below=1)] = 0.01
 
 
+class VoltageSection(Section):
+    """The way from the voltage of an amplifier to the motion of an ERA, see `VoltageDrive`."""
+
+    response: Annotated[list[GainRow], Field(min_length=1, max_length=2000), AfterValidator(_gains)]
+    law: Annotated[Law, Strict(strict=False)] = Law.LINEAR
+    bias: Annotated[float, Quantity(RATIO, at_least=0, below=1)] = 0.0
+    maximum: Annotated[float, Quantity(RATIO, above=0, at_most=1)] = 1.0
+
+
 class EraSection(Section):
     """One ERA. Defaults of damping and stroke are assumed, the paper prints neither."""
 
@@ -168,6 +178,7 @@ class EraSection(Section):
     gains: Annotated[list[GainRow], Field(max_length=2000), AfterValidator(_gains)] | None = None
     amplifier: Identifier
     channel: Annotated[int, Field(ge=0, le=255)]
+    voltage: VoltageSection | None = None
 
 
 class MassSection(Section):

@@ -9,6 +9,7 @@ Not modelled: the rise time of high voltage, and the voltage waveform of a tone.
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from drivers.command import CommandSet
 from drivers.protocol.definition import PROTOCOL
@@ -99,10 +100,12 @@ class SimulatedAmplifier:
     """An amplifier with a name, and numbers of channels and voices; times [s] of any one clock.
 
     listeners: called with every change of state or fault, and its time [s]. capabilities: others
-    hold from the next restart.
+    hold from the next restart. is_of_voltage: whether its levels and outputs are of a voltage.
     """
 
-    def __init__(self, name: str, *, channels: int, voices: int = VOICES) -> None:
+    def __init__(
+        self, name: str, *, channels: int, voices: int = VOICES, is_of_voltage: bool = False
+    ) -> None:
         self.identity = Identity(
             vendor="era-haptics",
             product="simulated amplifier",
@@ -111,6 +114,9 @@ class SimulatedAmplifier:
             versions=(PROTOCOL.version,),
         )
         self.capabilities = capabilities(channels, voices)
+        if is_of_voltage:
+            features = FEATURES | Feature.VOLTAGE
+            self.capabilities = replace(self.capabilities, features=features)
         self.state = AmplifierState.SWITCH_ON_DISABLED
         self.fault = Fault.NONE
         self.listeners: list[Callable[[AmplifierEvent, float], None]] = []

@@ -24,11 +24,13 @@ from model.structure.fingertip import FingertipLoad, check_loads
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import Term
+from registry.voltage import Law
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.plant.felt import Felt, measure_vibration
 from sim.plant.fingers import KEPT, Fingers, Position, Record
 from sim.plant.imperfections import Imperfections, delayed, draw_noise, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
+from sim.plant.voltage import moved_by_voltage
 from sim.waveform import Output, ToneSegment
 
 _TICK = 0.01  # s; of `keep_time`
@@ -80,7 +82,11 @@ class Bench:
         # Advanced only where its drive changes or its motion is sampled.
         self._plant = Plant(reduced, real.eras, loads=real.masses, time=now)
         self.amplifiers: Mapping[str, SimulatedAmplifier] = {
-            name: SimulatedAmplifier(name, channels=_channel_count(rig, name))
+            name: SimulatedAmplifier(
+                name,
+                channels=_channel_count(rig, name),
+                is_of_voltage=bool(rig.voltage_of(name)),
+            )
             for name in rig.amplifiers
         }
         # By ERA: the output of its channel, the output that moves the base, and the changes between
@@ -92,7 +98,8 @@ class Bench:
         self._shapes_at = lru_cache(_MAX_SHAPES)(
             lambda points: self._plant.reduced.at(np.frombuffer(points).reshape(-1, 2))
         )
-        self._played: deque[tuple[ToneSegment, float]] = deque()  # with the time of its end [s]
+        # Tones that were played, with the index of their ERA and the time of their end [s].
+        self._played: deque[tuple[int, ToneSegment, float]] = deque()
 
     @property
     def time(self) -> float:
@@ -214,15 +221,21 @@ class Bench:
                 before = self._applied_outputs[index]
                 self._plant.skip(self._time)
                 self._plant.set_input(index, self._motion(index, playing))
-                self._played.extend((tone, self.time) for tone in before if tone not in playing)
+                self._played.extend(
+                    (index, tone, self.time) for tone in before if tone not in playing
+                )
                 self._applied_outputs[index] = playing
-        while self._played and self._played[0][1] < self.time - KEPT:
+        while self._played and self._played[0][2] < self.time - KEPT:
             self._played.popleft()
 
     def _motion(self, index: int, playing: Output) -> list[Term]:
         """The base motion of an ERA by the output of its channel, imperfections included."""
         era = self.rig.eras[index]
-        terms = [term for tone in playing for term in tone.terms(stroke=era.stroke)]
+        drive = self.rig.voltage.get(era.name)
+        stroke = era.stroke if drive is None else 1.0
+        terms = [term for tone in playing for term in tone.terms(stroke=stroke)]
+        if drive is not None:
+            terms = moved_by_voltage(terms, drive, stroke=era.stroke)
         errors = self.imperfections.errors_of(era.name, self.rig)
         terms = realised(terms, errors)
         if errors.noise and playing:
@@ -232,12 +245,28 @@ class Bench:
         return terms
 
     def _frequencies(self, since: float, until: float) -> list[float]:
-        """The frequencies [Hz] that channels were commanded to play in a window."""
-        ended = [(tone, min(end, tone.silent_from)) for tone, end in self._played]
-        present = [(tone, tone.silent_from) for output in self._applied_outputs for tone in output]
+        """The frequencies [Hz] at which bases were moved by commands in a window."""
+        ended = [(index, tone, min(end, tone.silent_from)) for index, tone, end in self._played]
+        present = [
+            (index, tone, tone.silent_from)
+            for index, output in enumerate(self._applied_outputs)
+            for tone in output
+        ]
         return sorted(
-            {tone.frequency for tone, end in ended + present if tone.start < until and end > since}
+            {
+                frequency
+                for index, tone, end in ended + present
+                if tone.start < until and end > since
+                for frequency in self._moved_at(index, tone.frequency)
+            }
         )
+
+    def _moved_at(self, index: int, frequency: float) -> tuple[float, ...]:
+        """The frequencies [Hz] at which a tone of a channel moves its ERA."""
+        drive = self.rig.voltage.get(self.rig.eras[index].name)
+        if drive is None or drive.law is Law.LINEAR:
+            return (frequency,)
+        return (2 * frequency,) if drive.is_halved else (frequency, 2 * frequency)
 
 
 @lru_cache(maxsize=2)  # successive benches of one rig share it

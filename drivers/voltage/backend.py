@@ -1,0 +1,195 @@
+"""A backend over a backend: motion above, the voltage of the amplifier below.
+
+Everything above it, guard and records included, means motion; conversion is the last step before
+the codec, and replies are converted back. See docs/decisions/0044-level-of-what.md.
+"""
+
+import math
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import final
+
+from drivers.backend import Backend
+from drivers.command import DriveCommand
+from drivers.errors import CommandError, CommandRefused
+from drivers.guard import SafeCommandSet, require_safe
+from drivers.guard.voltage import safe_voltages
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import (
+    Achieved,
+    AmplifierEvent,
+    Apply,
+    Broadcast,
+    Capabilities,
+    ChannelLimits,
+    Feature,
+    GetCaps,
+    LoadEnvelope,
+    Nak,
+    NakCode,
+    Reply,
+    Request,
+    Stage,
+    Status,
+)
+from drivers.protocol.wire_times import WireTimes
+from drivers.statistics import WireCounters
+from drivers.voltage.conversion import (
+    capabilities_in_motion,
+    motion_level,
+    to_motion,
+    to_voltage,
+)
+from registry.voltage import VoltageDrive
+
+_SETS_KEPT = 8  # more than are ever staged, playing or repeated at once
+_SLACK = 1e-6  # of a step; sums of floats
+_LEVEL = PROTOCOL.quantities.level
+
+
+@final
+class VoltageBackend(Backend):
+    """An amplifier of voltage as one of motion; drives: by channel, of those that are wired."""
+
+    def __init__(self, backend: Backend, drives: Mapping[int, VoltageDrive]) -> None:
+        self._backend = backend
+        self._drives = dict(drives)
+        self._limits: tuple[ChannelLimits, ...] = ()
+        # By token: the set of motion and that of voltage.
+        self._sent: OrderedDict[int, tuple[SafeCommandSet, SafeCommandSet]] = OrderedDict()
+        self._motion_of: dict[int, float] = {}  # last driven frequency [Hz] by channel
+
+    async def open(self) -> None:
+        """Open the wire."""
+        self._sent.clear()
+        await self._backend.open()
+
+    async def close(self) -> None:
+        """Close the wire."""
+        await self._backend.close()
+
+    async def exchange(self, request: Request, *, timeout: float) -> Reply:
+        """Exchange a request in voltage, and return its reply in motion."""
+        require_safe(request)
+        if isinstance(request, LoadEnvelope):
+            return Nak(NakCode.UNKNOWN_TYPE)
+        if isinstance(request, Stage | Apply):
+            request = replace(request, command_set=self._converted(request.command_set))
+        reply = await self._backend.exchange(request, timeout=timeout)
+        match reply:
+            case Capabilities() if isinstance(request, GetCaps):
+                return self._capabilities(reply)
+            case Achieved():
+                return replace(reply, commands=tuple(map(self._in_motion, reply.commands)))
+            case Status():
+                return replace(reply, levels=self._levels(reply))
+            case _:
+                return reply
+
+    @property
+    def last_sent_at(self) -> float:
+        """Time [s] when the last byte of the last request went out."""
+        return self._backend.last_sent_at
+
+    @property
+    def counters(self) -> WireCounters:
+        """Frame counters of the wire."""
+        return self._backend.counters
+
+    def listen(
+        self, on_event: Callable[[AmplifierEvent], None], on_loss: Callable[[str], None]
+    ) -> None:
+        """Register callbacks."""
+        self._backend.listen(on_event, on_loss)
+
+    @property
+    def bus(self) -> str | None:
+        """Identifier of what one broadcast reaches."""
+        return self._backend.bus
+
+    async def broadcast(self, request: Broadcast) -> None:
+        """Broadcast; no broadcast has levels."""
+        await self._backend.broadcast(request)
+
+    @property
+    def carries_sessions(self) -> bool:
+        """Whether requests carry their session."""
+        return self._backend.carries_sessions
+
+    @property
+    def wire_times(self) -> WireTimes:
+        """Durations on its wire."""
+        return self._backend.wire_times
+
+    def _capabilities(self, reported: Capabilities) -> Capabilities:
+        if Feature.VOLTAGE not in reported.features:
+            raise CommandError(
+                "levels of the amplifier must be of a voltage, since the rig's ERAs have a "
+                "`voltage` section, got one that compensates its actuators itself; remove the "
+                "sections, or use another amplifier"
+            )
+        self._limits = tuple(
+            replace(limits, level_max=self._highest(channel, limits.level_max))
+            for channel, limits in enumerate(reported.limits_of_channels)
+        )
+        return capabilities_in_motion(reported, self._drives)
+
+    def _highest(self, channel: int, reported: float) -> float:
+        """Return the highest amplitude of a channel's voltage, in whole steps of the wire."""
+        drive = self._drives.get(channel)
+        highest = 0.0 if drive is None else min(reported, drive.swing)
+        return math.floor(highest * _LEVEL.per_unit + _SLACK) / _LEVEL.per_unit
+
+    def _converted(self, safe: object) -> SafeCommandSet:
+        """Return a set in voltage; the same again for one that is repeated."""
+        if not isinstance(safe, SafeCommandSet):
+            raise TypeError(f"set must have passed a guard, got {type(safe).__name__}")
+        known, converted = self._sent.get(safe.token, (None, None))
+        if converted is not None and known is safe:
+            return converted
+        last = next(reversed(self._sent.values()))[1].commands if self._sent else ()
+        before = {command.channel: command for command in last if command.level > 0}
+        commands = [self._in_voltage(command, before) for command in safe.commands]
+        converted = safe_voltages(safe, commands, self._limits)
+        self._sent[safe.token] = safe, converted
+        for command in safe.commands:
+            if command.level > 0:
+                self._motion_of[command.channel] = command.frequency
+        while len(self._sent) > _SETS_KEPT:
+            self._sent.popitem(last=False)
+        return converted
+
+    def _in_voltage(
+        self, command: DriveCommand, before: Mapping[int, DriveCommand]
+    ) -> DriveCommand:
+        drive = self._drives.get(command.channel)
+        if drive is None:
+            if command.level > 0:
+                raise CommandRefused(
+                    f"channel {command.channel} must have an ERA with a `voltage` section in the "
+                    "rig file, got none",
+                    channel=command.channel,
+                )
+            return command
+        return to_voltage(command, drive, before.get(command.channel))
+
+    def _in_motion(self, command: DriveCommand) -> DriveCommand:
+        drive = self._drives.get(command.channel)
+        return command if drive is None else to_motion(command, drive)
+
+    def _levels(self, status: Status) -> tuple[float, ...]:
+        """Return levels of motion, at the frequencies of the playing set or the last ones.
+
+        A channel whose frequency is unknown keeps its voltage: zero is zero.
+        """
+        frequencies = dict(self._motion_of)
+        if status.token in self._sent:
+            playing, _ = self._sent[status.token]
+            frequencies |= {one.channel: one.frequency for one in playing.commands if one.level > 0}
+        return tuple(
+            motion_level(level, self._drives[channel], frequencies[channel])
+            if channel in self._drives and channel in frequencies
+            else level
+            for channel, level in enumerate(status.levels)
+        )

@@ -1,6 +1,6 @@
 """The guard: only what it has checked can be encoded and played."""
 
-from drivers.guard.guard import Guard, SafeCommandSet, SafeEnvelope
+from drivers.guard.guard import Guard, SafeCommandSet, SafeEnvelope, safe_voltages
 from drivers.guard.limits import (
     FREQUENCY_CEILING,
     FREQUENCY_FLOOR,
@@ -20,4 +20,5 @@ __all__ = [
     "SafeEnvelope",
     "limits_in_force",
     "require_safe",
+    "safe_voltages",
 ]

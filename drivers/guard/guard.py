@@ -4,7 +4,7 @@ Its limits are fixed at construction, see `drivers.guard.limits`.
 """
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import final
 
@@ -22,8 +22,9 @@ from drivers.guard.rules import (
     is_finite,
     is_token,
 )
+from drivers.guard.voltage import checked_voltage
 from drivers.protocol.definition import PROTOCOL, token_after
-from drivers.protocol.messages import Capabilities, Feature
+from drivers.protocol.messages import Capabilities, ChannelLimits, Feature
 from registry.limits import GuardLimits
 
 _KEY = object()
@@ -59,6 +60,27 @@ class SafeCommandSet(CommandSet):
 
     def __init_subclass__(cls) -> None:
         raise TypeError("SafeCommandSet cannot be subclassed")
+
+
+def safe_voltages(
+    safe: SafeCommandSet, commands: Sequence[DriveCommand], limits: Sequence[ChannelLimits]
+) -> SafeCommandSet:
+    """Return a set that passed its guard with its commands converted to voltage, if within limits.
+
+    limits: by channel, see `checked_voltage`. Raises CommandRefused.
+    """
+    channels, wanted = ([one.channel for one in each] for each in (commands, safe.commands))
+    if channels != wanted:
+        raise CommandRefused(f"channels of the voltages must be {wanted}, got {channels}")
+    return SafeCommandSet(
+        safe.token,
+        tuple(checked_voltage(command, limits[command.channel]) for command in commands),
+        ramp=safe.ramp,
+        valid_for=safe.valid_for,
+        settled_after=safe.settled_after,
+        record=safe.record,
+        key=_KEY,
+    )
 
 
 @final

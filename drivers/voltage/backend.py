@@ -13,8 +13,7 @@ from typing import final
 from drivers.backend import Backend
 from drivers.command import DriveCommand
 from drivers.errors import CommandError, CommandRefused
-from drivers.guard import SafeCommandSet, require_safe
-from drivers.guard.voltage import safe_voltages
+from drivers.guard import SafeCommandSet, require_safe, safe_voltages
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,

@@ -1,0 +1,136 @@
+"""A pattern through an amplifier of voltage: its voltage, squared, moves the bases, and a finger
+feels what the table promised.
+
+The motion is found from samples of the amplifier's voltage and the differential equation of a
+resonator; neither the conversion nor the simulated law takes part in it.
+"""
+
+import asyncio
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import pytest
+
+from controller.loop.routing import route
+from drivers import clock
+from drivers.guard import Guard
+from drivers.operation.checked_amplifier import CheckedAmplifier
+from drivers.operation.keep_alive import keep_alive
+from model.arrays import ComplexArray, FloatArray
+from model.finger.contrast import mean_level_db_sl
+from model.finger.perception import sensation_level
+from model.table.build import build_table
+from model.table.pattern import Pattern
+from model.table.question import Question
+from paper_table import smooth_rig
+from sim.bench.bench import Bench
+from sim.plant.felt import Felt
+from sim.waveform import Output
+from virtual_loop import run_virtual
+from voltage_rigs import BAND, LAWS, RESONANCES, moved, resonator, voltage_amplifier, voltage_rig
+
+TARGET, QUIET = (0.10, 0.06), (0.22, 0.16)
+SETTLING, MEASURED = 1.0, 0.25  # s
+RATE = 20_000.0  # Hz
+
+
+def sampled(output: Output, times: FloatArray) -> FloatArray:
+    """A channel's voltage about its bias at times [s], by the definition of its tones."""
+    voltage = np.zeros(len(times))
+    for tone in output:
+        amplitude = np.array([tone.amplitude(t) if t >= tone.start else 0j for t in times])
+        phase = 2 * np.pi * tone.frequency * (times - tone.origin)
+        voltage += (amplitude * np.exp(1j * phase)).imag
+    return voltage
+
+
+def fitted(times: FloatArray, samples: FloatArray, frequencies: Sequence[float]) -> ComplexArray:
+    """Complex amplitudes of sines and cosines in samples, about a constant."""
+    angles = 2 * np.pi * np.outer(times, frequencies)
+    basis = np.hstack([np.sin(angles), np.cos(angles), np.ones((len(times), 1))])
+    found = np.linalg.lstsq(basis, samples, rcond=None)[0]
+    count = len(frequencies)
+    return np.asarray(found[:count] + 1j * found[count : 2 * count])
+
+
+@cache
+def a_pattern() -> Pattern:
+    """A phased pattern for one quiet finger, at a multiple of 10 Hz."""
+    question = Question(
+        (TARGET,), (QUIET,), level_db_sl=45.0, drive_mode="phased", frequencies=BAND
+    )
+    table = build_table(smooth_rig(), frequencies=np.arange(BAND[0], BAND[1] + 1, 10.0))
+    return table.query(question)
+
+
+def played(bench: Bench, pattern: Pattern) -> tuple[float, Sequence[Output], dict[str, Felt]]:
+    """Play a pattern through guard, conversion and amplifier.
+
+    Returns when it was committed, the voltages, and what fingers feel once it has settled.
+    """
+
+    async def play() -> tuple[float, Sequence[Output], dict[str, Felt]]:
+        amplifier = voltage_amplifier(bench)
+        await amplifier.open()
+        bench.place_fingers({"target": TARGET, "quiet": QUIET}, now=clock.now())
+        checked = CheckedAmplifier(amplifier)
+        await checked.arm()
+        guard = Guard(bench.rig.limits, amplifier.capabilities)
+        sets = route(pattern.excitation, bench.rig, token=amplifier.next_token(), ramp=0.02)
+        await checked.apply(guard.check(sets["main"]))
+        committed = clock.now()
+        outputs = bench.amplifiers["main"].outputs
+        await keep_alive(checked, SETTLING + MEASURED, interval=0.05)
+        bench.advance(clock.now())
+        felt = bench.felt(clock.now() - MEASURED, clock.now())
+        await amplifier.disarm()
+        return committed, outputs, felt
+
+    return run_virtual(play())
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_voltage_moves_bases_and_fingers_as_promised(law: str) -> None:
+    """Bases within 0.2 % of a full stroke, levels within 0.1 dB of the table's promise.
+
+    The harmonic of a bias is compared with its formula, and taken away before fingers are.
+    """
+    rig = voltage_rig(smooth_rig(), law)
+    pattern = a_pattern()
+    assert max(tone.amplitude for tone in pattern.excitation.values()) > 0.3e-4
+    bench = Bench(rig, now=1000.0)
+    committed, outputs, felt = played(bench, pattern)
+    _, bias, gain = LAWS[law]
+    times = committed + np.arange(0, SETTLING + MEASURED, 1 / RATE)
+    late = times > committed + SETTLING
+    assert len(pattern.excitation) >= 2
+    for name, tone in pattern.excitation.items():
+        output = outputs[rig.wiring[name].number]
+        voltage = bias + sampled(output, times)
+        force = voltage if law == "linear" else voltage**2 - bias**2
+        base = moved(force, times, RESONANCES[name], gain)
+        start = output[0].origin
+        reached = fitted(times[late] - start, base[late], [tone.frequency, 2 * tone.frequency])
+        wanted = tone.amplitude / rig.era(name).stroke * np.exp(1j * tone.phase)
+        assert abs(reached[0] - wanted) < 0.002
+        assert np.abs(voltage).max() <= 1.0
+        if bias:  # of the force, U / (4 bias); then through the actuator
+            strength = np.abs(sampled(output, times[late])).max() / (4 * bias)
+            harmonic, fundamental = np.abs(
+                resonator(np.array([2, 1]) * tone.frequency, RESONANCES[name], gain)
+            )
+            ratio = abs(reached[1] / reached[0])
+            assert ratio == pytest.approx(strength * harmonic / fundamental, rel=0.01)
+    driven = sorted({tone.frequency for tone in pattern.excitation.values()})
+    found = {name: _only(one, driven) for name, one in felt.items()}
+    level = mean_level_db_sl(*found["target"], felt["target"].weights, rig.threshold)
+    quiet = sensation_level(*found["quiet"], rig.threshold).max()
+    assert level == pytest.approx(pattern.level_db_sl, abs=0.1)
+    assert level - quiet == pytest.approx(pattern.felt_contrast_db, abs=0.5)  # steps of the wire
+
+
+def _only(felt: Felt, frequencies: Sequence[float]) -> tuple[FloatArray, FloatArray]:
+    """Frequencies and amplitudes without harmonics."""
+    rows = [felt.frequencies.index(frequency) for frequency in frequencies]
+    return np.array(frequencies), felt.amplitude[rows]

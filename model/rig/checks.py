@@ -135,9 +135,20 @@ def _check_on_plate(
 def _check_wiring(validation: Validation[RigSection], names: tuple[str, ...]) -> None:
     amplifiers = validation.mapping(("amplifiers",))
     wired: dict[tuple[str, int], str] = {}
+    if names and not any("amplifier" in validation.mapping(("eras", name)) for name in names):
+        validation.add(("eras",), "must have at least one ERA with an amplifier; add its amplifier")
     for name in names:
         amplifier = validation.field(("eras", name, "amplifier"), EraSection)
         channel = validation.field(("eras", name, "channel"), EraSection)
+        given = {
+            key for key, value in validation.mapping(("eras", name)).items() if value is not None
+        }
+        for key, other_key in (("amplifier", "channel"), ("channel", "amplifier")):
+            if other_key in given and key not in given:
+                validation.add(
+                    ("eras", name, key),
+                    f"missing; add it, or remove {other_key} too for an ERA that only supports",
+                )
         if amplifier is not None and amplifier not in amplifiers:
             known = ", ".join(key_name((key,)) for key in amplifiers) or "none"
             validation.add(
@@ -159,12 +170,18 @@ def _check_wiring(validation: Validation[RigSection], names: tuple[str, ...]) ->
 def _check_voltages(validation: Validation[RigSection], names: tuple[str, ...]) -> None:
     """Check the `voltage` sections of ERAs: by themselves, and those of one amplifier."""
     limits = validation.part(("limits",), LimitsSection) or LimitsSection()
-    driven: dict[str, list[str]] = {}
+    driven: dict[str | None, list[str]] = {}
     for name in names:
-        driven.setdefault(str(validation.mapping(("eras", name)).get("amplifier")), []).append(name)
-    for several in driven.values():
+        amplifier = validation.mapping(("eras", name)).get("amplifier")
+        driven.setdefault(None if amplifier is None else str(amplifier), []).append(name)
+    for amplifier, several in driven.items():
         given = [name for name in several if "voltage" in validation.mapping(("eras", name))]
         for name in several if given else ():
+            if amplifier is None:
+                validation.add(
+                    ("eras", name, "voltage"), "is for ERAs with an amplifier only; remove it"
+                )
+                continue
             if name not in given:
                 validation.add(
                     ("eras", name, "voltage"),

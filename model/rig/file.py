@@ -21,6 +21,7 @@ from model.rig.parts import (
 )
 from model.rig.rig import Channel, Rig
 from model.rig.sections import RigSection
+from model.structure.point_load import PointLoad
 
 
 def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
@@ -46,23 +47,34 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
     section = validation.finish()
     plate = plate_of(section.plate)
     wanted = section.mesh if mesh is None else mesh
-    eras = tuple(
-        era_of(name, era, plate, era_count=len(section.eras)) for name, era in section.eras.items()
-    )
+    everything = {
+        name: era_of(name, era, plate, era_count=len(section.eras))
+        for name, era in section.eras.items()
+    }
+    wiring = {
+        name: Channel(era.amplifier, era.channel)
+        for name, era in section.eras.items()
+        if era.amplifier is not None and era.channel is not None
+    }
+    supports = {name: era for name, era in everything.items() if name not in wiring}
     return Rig(
         plate=plate,
         mesh=mesh_of(
             wanted,
             plate,
             frequency_max=section.limits.frequency[1],
-            stiffness=max(era.stiffness for era in eras),
-            foot=min(era.foot for era in eras),
+            stiffness=max(era.stiffness for era in everything.values()),
+            foot=min(era.foot for era in everything.values()),
         ),
-        eras=eras,
-        wiring={name: Channel(era.amplifier, era.channel) for name, era in section.eras.items()},
+        eras=tuple(era for name, era in everything.items() if name in wiring),
+        wiring=wiring,
         amplifiers={name: amplifier.url for name, amplifier in section.amplifiers.items()},
         limits=limits_of(section.limits),
-        masses=tuple(mass_of(mass, plate) for mass in section.masses.values()),
+        masses=(
+            *(mass_of(mass, plate) for mass in section.masses.values()),
+            *map(PointLoad.of_era, supports.values()),
+        ),
+        supports=tuple(supports),
         laminate=laminate_of(section.plate),
         uncertainty=uncertainty_of(section.uncertainty),
         fingertip=fingertip_of(section.fingertip),

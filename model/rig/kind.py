@@ -60,6 +60,8 @@ def _summary(rig: Rig) -> str:
         f"mesh {rig.mesh}",
         f"ERAs {', '.join(era.name for era in rig.eras)}",
     ]
-    if rig.masses:
-        parts.append(f"carries {1e3 * sum(mass.mass for mass in rig.masses):g} g")
+    if rig.supports:
+        parts.append(f"supported without being driven by {', '.join(rig.supports)}")
+    if carried := sum(mass.mass for mass in rig.masses):
+        parts.append(f"carries {1e3 * carried:g} g")
     return f"good: {', '.join(parts)}"

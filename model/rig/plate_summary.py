@@ -32,7 +32,9 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
             f"{frequency:g}_hz": plate.bending_wavelength(frequency)
             for frequency in (limits.frequency_min, limits.frequency_max)
         },
-        "point_masses": [{"at_m": [mass.x, mass.y], "mass_kg": mass.mass} for mass in rig.masses],
+        "point_masses": [
+            {"at_m": [mass.x, mass.y], "mass_kg": mass.mass} for mass in rig.masses if mass.mass
+        ],
         "laminate": None if rig.laminate is None else _laminate(rig.laminate, limits),
     }
 

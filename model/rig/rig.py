@@ -37,7 +37,8 @@ class Channel:
 class Rig:
     """A plate on its ERAs, with wiring and limits.
 
-    wiring: channel by the name of the ERA; amplifiers: URL by name; masses: on the plate; laminate:
+    eras: those that are driven. wiring: channel by the name of the ERA; amplifiers: URL by name;
+    masses: on the plate, ERAs without an amplifier among them, whose names are supports; laminate:
     of which the plate is the equivalent, for display; uncertainty: of its parameters; fingertip:
     load of each finger on the plate, None for weightless ones; threshold: name of the set of
     detection thresholds (`model.finger.perception`); voltage: of ERAs behind amplifiers of voltage,
@@ -56,6 +57,7 @@ class Rig:
     fingertip: Fingertip | None = field(default_factory=Fingertip)
     threshold: str = DEFAULT_THRESHOLD
     voltage: Mapping[str, VoltageDrive] = field(default_factory=dict)
+    supports: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check that ERAs and masses are on the plate, and places and names of ERAs unique."""

@@ -166,7 +166,20 @@ class VoltageSection(Section):
 
 
 class EraSection(Section):
-    """One ERA. Defaults of damping and stroke are assumed, the paper prints neither."""
+    """One ERA; without an amplifier it only supports the plate.
+
+    Defaults of damping and stroke are assumed, the paper prints neither.
+    """
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "dependentRequired": {
+                "amplifier": ["channel"],
+                "channel": ["amplifier"],
+                "voltage": ["amplifier"],
+            }
+        }
+    )
 
     at: Place
     stiffness: Annotated[float, Quantity(STIFFNESS, above=0, at_most=1e12)]
@@ -176,8 +189,8 @@ class EraSection(Section):
     stroke: Annotated[float, Quantity(LENGTH, above=0, at_most=0.01)] = 100e-6
     foot: Foot = 0.0
     gains: Annotated[list[GainRow], Field(max_length=2000), AfterValidator(_gains)] | None = None
-    amplifier: Identifier
-    channel: Annotated[int, Field(ge=0, le=255)]
+    amplifier: Identifier | None = None
+    channel: Annotated[int, Field(ge=0, le=255)] | None = None
     voltage: VoltageSection | None = None
 
 

@@ -5,7 +5,6 @@ The motion is found from samples of the amplifier's voltage and the differential
 resonator; neither the conversion nor the simulated law takes part in it.
 """
 
-import asyncio
 from collections.abc import Sequence
 from functools import cache
 

@@ -22,6 +22,7 @@ from model.rig.sections import (
     PlateSection,
     RigSection,
     UncertaintySection,
+    VoltageSection,
 )
 from model.structure.materials import KNOWN_MATERIALS
 
@@ -33,6 +34,7 @@ SECTIONS = {
     "layers": LayerSection,
     "material": MaterialSection,
     "eras": EraSection,
+    "voltage": VoltageSection,
     "masses": MassSection,
     "amplifiers": AmplifierSection,
     "limits": LimitsSection,

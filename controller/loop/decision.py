@@ -117,7 +117,7 @@ class Decider:
         self._intent_source = intent_source
         self._intent_due: float | None = None  # when the intent may change without a touch
         self._held_until: float | None = None  # when there is room for a pattern
-        self._selector = Selector(table, None if timing is None else timing.levels)
+        self._selector = Selector(table, None if timing is None else timing.levels, rig.voltage)
         self._builder = SetBuilder(rig, guards, timing=timing)
         self._selected: Selection | None = None
         self._playing = self._playing_before = _Playback()

@@ -3,8 +3,9 @@
 import contextlib
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -18,9 +19,11 @@ from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.table.effect_level import EffectLevels
 from model.table.pattern import Pattern
 from model.table.question import Question
+from model.table.second_harmonic import with_second_harmonic
 from model.table.table import LocalizationTable
 from model.vibration.peak import peak_acceleration
 from registry.plugins import failure_text
+from registry.voltage import VoltageDrive
 
 # Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own
 # radius is still within the disc that the pattern was chosen for.
@@ -68,11 +71,18 @@ class Selector:
     A pattern stays as long as its targets and their levels do, no contact has moved more than 8 mm,
     and none has another load, which changes by a factor of 1.5 or more. A quiet contact that lifts
     leaves it as it is: a change would be felt. So does any move, any load and any new quiet contact
-    while a short pulse plays. levels: None for steady levels only.
+    while a short pulse plays. levels: None for steady levels only. voltage: of the rig, whose
+    harmonics are in the measures of patterns.
     """
 
-    def __init__(self, table: LocalizationTable, levels: EffectLevels | None = None) -> None:
+    def __init__(
+        self,
+        table: LocalizationTable,
+        levels: EffectLevels | None = None,
+        voltage: Mapping[str, VoltageDrive] = MappingProxyType({}),
+    ) -> None:
         self._table = table
+        self._voltage = voltage
         self._levels = levels
         self._current = Selection((), (), None, None)
 
@@ -124,7 +134,7 @@ class Selector:
         if not targets:
             return Selection((), quiet, None, intent.reason)
         try:
-            answer = self._query(targets, quiet, capabilities)
+            answer = self._with_harmonic(self._query(targets, quiet, capabilities))
             predictions = self._predict(targets, quiet, answer)
         except InputError as error:
             return Selection(targets, quiet, None, str(error))
@@ -149,6 +159,14 @@ class Selector:
                 if answer.felt_db_sl >= max(levels) - _STEP_SHORT_OF:
                     return answer
         return query_table(self._table, targets, quiet, capabilities, self._levels)
+
+    def _with_harmonic(self, answer: TableAnswer) -> TableAnswer:
+        """Return an answer that includes what a bias adds at twice its frequencies."""
+        if not any(drive.bias for drive in self._voltage.values()):
+            return answer
+        found = with_second_harmonic(answer.pattern, answer.question, self._table, self._voltage)
+        louder = found.level_db_sl - answer.pattern.level_db_sl
+        return replace(answer, pattern=found, felt_db_sl=answer.felt_db_sl + louder)
 
     def _continued(self, targets: tuple[tuple[Contact, Target], ...]) -> float | None:
         """Return the frequency [Hz] that plays if only levels of its targets change; else None."""

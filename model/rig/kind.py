@@ -7,6 +7,7 @@ from model.config.kinds import CheckedFile
 from model.rig.amplifiers import check_amplifiers
 from model.rig.file import example_rig_path, rig_of, rig_schema
 from model.rig.rig import Rig
+from model.rig.voltage_costs import voltage_costs
 from model.structure.support import support_problem
 
 
@@ -34,7 +35,8 @@ class RigKind:
         if rig is None or problems:
             raise ConfigError(document.source, problems)
         note = rig.uncertainty.note
-        return CheckedFile(_summary(rig), [*warnings, *([note] if note else [])])
+        costs = voltage_costs(rig)
+        return CheckedFile(_summary(rig), [*warnings, *costs, *([note] if note else [])])
 
     def example(self) -> str:
         """The paper's plate."""

@@ -6,6 +6,7 @@ resonator; neither the conversion nor the simulated law takes part in it.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -22,6 +23,8 @@ from model.finger.perception import sensation_level
 from model.table.build import build_table
 from model.table.pattern import Pattern
 from model.table.question import Question
+from model.table.second_harmonic import with_second_harmonic
+from model.table.table import LocalizationTable
 from paper_table import smooth_rig
 from sim.bench.bench import Bench
 from sim.plant.felt import Felt
@@ -54,13 +57,13 @@ def fitted(times: FloatArray, samples: FloatArray, frequencies: Sequence[float])
 
 
 @cache
-def a_pattern() -> Pattern:
+def an_answer() -> tuple[LocalizationTable, Question, Pattern]:
     """A phased pattern for one quiet finger, at a multiple of 10 Hz."""
     question = Question(
         (TARGET,), (QUIET,), level_db_sl=45.0, drive_mode="phased", frequencies=BAND
     )
     table = build_table(smooth_rig(), frequencies=np.arange(BAND[0], BAND[1] + 1, 10.0))
-    return table.query(question)
+    return table, question, table.query(question)
 
 
 def played(bench: Bench, pattern: Pattern) -> tuple[float, Sequence[Output], dict[str, Felt]]:
@@ -96,7 +99,7 @@ def test_voltage_moves_bases_and_fingers_as_promised(law: str) -> None:
     The harmonic of a bias is compared with its formula, and taken away before fingers are.
     """
     rig = voltage_rig(smooth_rig(), law)
-    pattern = a_pattern()
+    _, _, pattern = an_answer()
     assert max(tone.amplitude for tone in pattern.excitation.values()) > 0.3e-4
     bench = Bench(rig, now=1000.0)
     committed, outputs, felt = played(bench, pattern)
@@ -127,6 +130,31 @@ def test_voltage_moves_bases_and_fingers_as_promised(law: str) -> None:
     quiet = sensation_level(*found["quiet"], rig.threshold).max()
     assert level == pytest.approx(pattern.level_db_sl, abs=0.1)
     assert level - quiet == pytest.approx(pattern.felt_contrast_db, abs=0.5)  # steps of the wire
+
+
+def test_harmonic_is_in_the_promise() -> None:
+    """With a bias, levels and contrast with harmonics are what fingers feel, within 0.3 dB.
+
+    Actuators that respond at the harmonic as at the tone leave little of 30 dB.
+    """
+    rig = voltage_rig(smooth_rig(), "quadratic with bias")
+    flat = ((20.0, 2.0, 0.0), (1000.0, 2.0, 0.0))
+    drives = {name: replace(drive, response=flat) for name, drive in rig.voltage.items()}
+    rig = replace(rig, voltage=drives)
+    table, question, pattern = an_answer()
+    promised = with_second_harmonic(pattern, question, table, rig.voltage)
+    _, _, felt = played(Bench(rig, now=1000.0), pattern)
+    found = {name: (np.array(one.frequencies), one.amplitude) for name, one in felt.items()}
+    assert set(found["quiet"][0]) == {
+        factor * tone.frequency for tone in pattern.excitation.values() for factor in (1, 2)
+    }
+    level = mean_level_db_sl(*found["target"], felt["target"].weights, rig.threshold)
+    quiet = sensation_level(*found["quiet"], rig.threshold).max()
+    assert promised.level_db_sl == pytest.approx(level, abs=0.1)
+    assert promised.quiet_level_db_sl == pytest.approx(quiet, abs=0.3)
+    assert promised.felt_contrast_db == pytest.approx(level - quiet, abs=0.3)
+    lost = pattern.felt_contrast_db - promised.felt_contrast_db
+    assert lost > 10
 
 
 def _only(felt: Felt, frequencies: Sequence[float]) -> tuple[FloatArray, FloatArray]:

@@ -23,7 +23,7 @@ BAND = (60.0, 240.0)  # Hz
 LAWS = {
     "linear": (Law.LINEAR, 0.0, 3.0),
     "quadratic": (Law.QUADRATIC, 0.0, 8.0),
-    "quadratic with bias": (Law.QUADRATIC, 0.4, 8.0),
+    "quadratic with bias": (Law.QUADRATIC, 0.25, 5.0),
 }
 """Law, bias, and full strokes by a slow drive term of 1."""
 

@@ -135,7 +135,7 @@ def test_voltage_moves_bases_and_fingers_as_promised(law: str) -> None:
 def test_harmonic_is_in_the_promise() -> None:
     """With a bias, levels and contrast with harmonics are what fingers feel, within 0.3 dB.
 
-    Actuators that respond at the harmonic as at the tone leave little of 30 dB.
+    With actuators that respond at the harmonic as at the tone it costs 7 of 30 dB.
     """
     rig = voltage_rig(smooth_rig(), "quadratic with bias")
     flat = ((20.0, 2.0, 0.0), (1000.0, 2.0, 0.0))
@@ -154,7 +154,7 @@ def test_harmonic_is_in_the_promise() -> None:
     assert promised.quiet_level_db_sl == pytest.approx(quiet, abs=0.3)
     assert promised.felt_contrast_db == pytest.approx(level - quiet, abs=0.3)
     lost = pattern.felt_contrast_db - promised.felt_contrast_db
-    assert lost > 10
+    assert 6 < lost < 8
 
 
 def _only(felt: Felt, frequencies: Sequence[float]) -> tuple[FloatArray, FloatArray]:

@@ -77,6 +77,8 @@ class SetBuilder:
         self._rig = rig
         self._guards = guards
         self._timing = timing
+        self._ramp_max = min((guard.ramp_max for guard in guards.values()), default=math.inf)
+        self._fade_ramp = min(FADE_RAMP, self._ramp_max)
         self._token = random_token()
 
     def build_pattern(
@@ -148,7 +150,7 @@ class SetBuilder:
                 playing,
                 self._rig,
                 token=self._next_token(),
-                ramp=FADE_RAMP,
+                ramp=self._fade_ramp,
                 ending=shaped.ending,
             )
             checked = self._checked(_with_valid_for(sets, valid_for))
@@ -167,7 +169,7 @@ class SetBuilder:
                     replace(command, keep_phase=command.level > 0, onset=0)
                     for command in safe.commands
                 ),
-                ramp=FADE_RAMP,
+                ramp=self._fade_ramp,
                 valid_for=valid_for,
             )
             for name, safe in played.sets.items()
@@ -180,7 +182,7 @@ class SetBuilder:
 
     def build_end(self) -> SafeSets:
         """Build the sets that end every ERA along its ending; plain silence if refused."""
-        sets = route_to_silence(self._rig, token=self._next_token(), ramp=FADE_RAMP)
+        sets = route_to_silence(self._rig, token=self._next_token(), ramp=self._fade_ramp)
         try:
             return SafeSets(self._checked(sets))
         except Exception as error:  # silence is right for every kind of failure
@@ -214,7 +216,7 @@ class SetBuilder:
             pattern.excitation,
             self._rig,
             token=self._next_token(),
-            ramp=pattern.ramp,
+            ramp=min(pattern.ramp, self._ramp_max),
             playing=playing,
             onset=pattern.onset,
         )

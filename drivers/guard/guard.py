@@ -144,6 +144,11 @@ class Guard:
         """The limits in force: the least of configuration, amplifier and ceilings."""
         return self._limits
 
+    @property
+    def ramp_max(self) -> float:
+        """Longest ramp [s] of the amplifier."""
+        return self._capabilities.ramp_max
+
     def is_for(self, limits: GuardLimits, capabilities: Capabilities) -> bool:
         """Whether it was made for these limits and capabilities."""
         return self._made_for == (limits, capabilities)

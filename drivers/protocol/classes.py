@@ -70,6 +70,14 @@ LACKS = (
         "of ramps: less contrast while a vibration begins and ends",
     ),
     Lack(
+        "ramps",
+        lambda capabilities: not capabilities.ramp_max,
+        AmplifierClass.B,
+        "starts and ends at once",
+        "shows the class",
+        "of abrupt starts: nearly no contrast while a vibration begins and ends",
+    ),
+    Lack(
         "cross-fades",
         lambda capabilities: not capabilities.has_cross_fades,
         AmplifierClass.B,

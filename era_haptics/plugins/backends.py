@@ -1,10 +1,12 @@
 """Interfaces for amplifiers with their own protocol: entry points `era_haptics.backends`."""
 
 from drivers.backend import Backend
+from drivers.backends.foreign_amplifier import ForeignAmplifier
+from drivers.backends.text_line import TextLine
 from drivers.backends.wire_backend import WireBackend
 from drivers.clock import now
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
-from drivers.errors import CommandError, LinkError, LinkTimeout
+from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout
 from drivers.guard import require_safe
 from drivers.protocol.messages import (
     Achieved,
@@ -57,6 +59,7 @@ __all__ = [
     "Capabilities",
     "Clear",
     "CommandError",
+    "CommandRefused",
     "CommandSet",
     "Commit",
     "Disarm",
@@ -66,6 +69,7 @@ __all__ = [
     "FaultList",
     "FaultRecord",
     "Feature",
+    "ForeignAmplifier",
     "GetCaps",
     "GetFaults",
     "GetMeasured",
@@ -88,6 +92,7 @@ __all__ = [
     "Stage",
     "Status",
     "Stop",
+    "TextLine",
     "WireBackend",
     "WireCounters",
     "WireTimes",

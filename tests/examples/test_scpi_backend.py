@@ -114,7 +114,16 @@ async def test_generator_is_of_class_c_and_says_what_it_lacks(example: ModuleTyp
         can = amplifier.capabilities
         assert amplifier_class(can) is AmplifierClass.C
         assert [lack.name for lack in missing(can)] == [
-            *("watchdog", "staging", "envelopes", "ramps", "cross-fades", "valid_for", "broadcast")
+            *(
+                "watchdog",
+                "staging",
+                "envelopes",
+                "ramps",
+                "cross-fades",
+                "valid_for",
+                "broadcast",
+                "8 voices",
+            )
         ]
         assert can.level_max == 1.0
         with pytest.raises(CommandError, match="watchdog"):

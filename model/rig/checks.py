@@ -176,12 +176,13 @@ def _check_voltages(validation: Validation[RigSection], names: tuple[str, ...]) 
         driven.setdefault(None if amplifier is None else str(amplifier), []).append(name)
     for amplifier, several in driven.items():
         given = [name for name in several if "voltage" in validation.mapping(("eras", name))]
-        for name in several if given else ():
-            if amplifier is None:
+        if amplifier is None:
+            for name in given:
                 validation.add(
                     ("eras", name, "voltage"), "is for ERAs with an amplifier only; remove it"
                 )
-                continue
+            continue
+        for name in several if given else ():
             if name not in given:
                 validation.add(
                     ("eras", name, "voltage"),

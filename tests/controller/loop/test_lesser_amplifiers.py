@@ -1,5 +1,6 @@
 """A controller over amplifiers that lack something."""
 
+import asyncio
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -7,7 +8,8 @@ import pytest
 
 from controller.loop.intent import HapticIntent, Pulse, Target
 from controller.sources.contacts import Contact
-from controller_bench import FINGER, FarEnd, armed, make_bench, running
+from controller_bench import FINGER, OTHER, FarEnd, armed, make_bench, running
+from drivers import clock
 from drivers.errors import CommandError
 from drivers.operation.silence import SilenceStatus
 from drivers.protocol.messages import (
@@ -20,6 +22,7 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
+from model.vibration.excitation import Tone
 from virtual_loop import in_virtual_time
 
 LASTS = 0.1  # s
@@ -121,3 +124,31 @@ def _playing_on(request: object, stopped: Status) -> Status | None:
     """The status of an amplifier that does not obey stops."""
     is_asked = isinstance(request, Stop | GetStatus)
     return replace(stopped, levels=(0.5, 0.0)) if is_asked else None
+
+
+@in_virtual_time
+async def test_amplifier_without_cross_fades_goes_out_then_in() -> None:
+    """Another frequency comes after a silent set and its fade; nobody is told of a refusal."""
+    far_end = FarEnd()
+    far_end.amplifier.capabilities = replace(far_end.amplifier.capabilities, has_cross_fades=False)
+    async with running(far_ends=[far_end]) as bench:
+        bench.table.excitation = {"SW": Tone(110.0, 2e-5), "NE": Tone(110.0, 2e-5)}
+        await bench.hold(FINGER, seconds=0.2)
+        bench.table.excitation = {"SW": Tone(250.0, 2e-5), "NE": Tone(250.0, 2e-5)}
+        bench.touch(FINGER, OTHER)
+        sounding = []
+        for _ in range(40):
+            await asyncio.sleep(0.002)
+            bench.far_end.status()
+            sounding += [
+                {tone.frequency for tone in output if tone.silent_from > clock.now()}
+                for output in bench.far_end.amplifier.outputs
+            ]
+        assert {110.0} in sounding
+        assert {250.0} in sounding
+        assert max(map(len, sounding)) == 1
+        assert [each.is_silent for each in bench.far_end.sets()[-3:]] == [False, True, False]
+        assert bench.reports.refused == []
+        assert bench.reports.applied[-1].pattern.excitation["SW"].frequency == 250.0
+        begun = bench.far_end.times(Apply)
+        assert begun[-1] - begun[-2] == pytest.approx(0.020, abs=0.005)

@@ -110,3 +110,10 @@ def test_only_backends_use_encoders() -> None:
     assert users
     above = [file for file in users if not {"backends", "codec"} & set(file.parts)]
     assert {file.parent for file in above} == {CONFORMANCE / "raw"}
+
+
+def test_only_the_conversion_changes_checked_sets() -> None:
+    """`safe_voltages` is called in one place: just before the codec."""
+    users = {file for file in FILES for name, _ in calls(file, "safe_voltages")}
+    users = {file for file in users if any(name == "safe_voltages" for name, _ in calls(file, ""))}
+    assert users == {ROOT / "drivers" / "voltage" / "backend.py"}

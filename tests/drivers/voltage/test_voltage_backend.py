@@ -1,0 +1,147 @@
+"""An amplifier of voltage behind its conversion: limits, refusals, statuses."""
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import replace
+
+import pytest
+
+from drivers.amplifier import Amplifier
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot
+from drivers.errors import CommandError, CommandRefused
+from drivers.guard import Guard, safe_voltages
+from drivers.protocol.messages import AmplifierState, ChannelLimits
+from paper_table import smooth_rig
+from registry.voltage import Law, VoltageDrive
+from sim.bench.bench import Bench
+from virtual_loop import in_virtual_time
+from voltage_rigs import voltage_amplifier, voltage_rig
+
+TONES = (DriveCommand(0, 120.0, 0.5, 30.0), DriveCommand(2, 120.0, 0.25, -110.0))
+
+
+@asynccontextmanager
+async def opened(law: str) -> AsyncIterator[tuple[Bench, Amplifier, Guard]]:
+    """A bench, its amplifier armed, and a guard."""
+    bench = Bench(voltage_rig(smooth_rig(), law), now=1000.0)
+    amplifier = voltage_amplifier(bench)
+    await amplifier.open()
+    await amplifier.arm()
+    yield bench, amplifier, Guard(bench.rig.limits, amplifier.capabilities)
+    await amplifier.close()
+
+
+def a_set(amplifier: Amplifier, *commands: DriveCommand, ramp: float = 0.0) -> CommandSet:
+    """A set of these commands."""
+    return CommandSet(amplifier.next_token(), commands, ramp=ramp, valid_for=0.0)
+
+
+@pytest.mark.parametrize("law", ["linear", "quadratic", "quadratic with bias"])
+@in_virtual_time
+async def test_replies_are_of_motion(law: str) -> None:
+    """Achieved set and status have the levels, frequencies and phases that were asked for."""
+    async with opened(law) as (bench, amplifier, guard):
+        achieved = await amplifier.apply(guard.check(a_set(amplifier, *TONES)))
+        for wanted, found in zip(TONES, achieved.commands, strict=True):
+            assert found.frequency == wanted.frequency
+            assert found.phasor == pytest.approx(wanted.phasor, abs=2e-3)
+        status = await amplifier.status()
+        assert status.levels == pytest.approx((0.5, 0.0, 0.25, 0.0), abs=2e-3)
+        outputs = bench.amplifiers["main"].outputs
+        assert outputs[0][-1].frequency == (60.0 if law == "quadratic" else 120.0)
+        again = await amplifier.stop()
+        assert again.state is AmplifierState.QUICK_STOP_ACTIVE
+
+
+@in_virtual_time
+async def test_set_that_is_repeated_has_the_same_voltages() -> None:
+    """A retry carries what was sent before, or the amplifier would refuse its token."""
+    async with opened("quadratic") as (_, amplifier, guard):
+        safe = guard.check(a_set(amplifier, *TONES))
+        assert await amplifier.apply(safe) == await amplifier.apply(safe)
+
+
+@in_virtual_time
+async def test_tone_goes_out_before_another_comes_in() -> None:
+    """Without bias the guard refuses another frequency, or a restart, until there is silence."""
+    async with opened("quadratic") as (_, amplifier, guard):
+        await amplifier.apply(guard.check(a_set(amplifier, *TONES)))
+        for other in (replace(TONES[0], frequency=180.0), TONES[0]):
+            with pytest.raises(CommandRefused, match="cross-fade") as refused:
+                guard.check(a_set(amplifier, other))
+            assert refused.value.until is None
+        await amplifier.apply(
+            guard.check(a_set(amplifier, replace(TONES[0], level=0.6, keep_phase=True)))
+        )
+        await amplifier.apply(guard.silence(amplifier.next_token(), range(4), ramp=0.02))
+        with pytest.raises(CommandRefused, match="cross-fade") as refused:
+            guard.check(a_set(amplifier, TONES[0]))
+        assert refused.value.until is not None
+        guard.check(a_set(amplifier, DriveCommand(1, 90.0, 0.5)))  # a channel that was silent
+
+
+@in_virtual_time
+async def test_linear_voltage_fades_across() -> None:
+    """With a linear law nothing beats."""
+    async with opened("linear") as (_, amplifier, guard):
+        await amplifier.apply(guard.check(a_set(amplifier, *TONES)))
+        guard.check(a_set(amplifier, replace(TONES[0], frequency=180.0), ramp=0.02))
+
+
+@in_virtual_time
+async def test_envelopes_are_refused() -> None:
+    """Their voltage would depend on a frequency that they do not have."""
+    async with opened("linear") as (_, _, guard):
+        with pytest.raises(CommandRefused):
+            guard.check_envelope(Envelope(1, 0.005, (Knot(0.1, 0.0),)))
+
+
+@in_virtual_time
+async def test_amplifier_and_rig_must_agree_on_what_levels_are() -> None:
+    """Motion with a voltage section, and voltage without one, are refused."""
+    rig = voltage_rig(smooth_rig(), "linear")
+    of_motion = Bench(replace(rig, voltage={}), now=1000.0)
+    amplifier = voltage_amplifier(of_motion)
+    amplifier._link.backend._drives = rig.voltage_of("main")  # type: ignore[attr-defined]
+    with pytest.raises(CommandError, match="voltage"):
+        await amplifier.open()
+    bare = voltage_amplifier(Bench(rig, now=1000.0))
+    bare = Amplifier(bare._link.backend._backend)  # type: ignore[attr-defined]
+    await bare.open()
+    with pytest.raises(CommandError, match="voltage"):
+        Guard(rig.limits, bare.capabilities)
+
+
+LIMITS = (ChannelLimits(20.0, 300.0, 0.6),)
+
+
+@in_virtual_time
+async def test_voltage_limits_hold_after_the_conversion() -> None:
+    """A set that passed the guard is refused for its voltage, its frequency, or no number."""
+    async with opened("linear") as (_, amplifier, guard):
+        safe = guard.check(a_set(amplifier, TONES[0]))
+        held = safe_voltages(safe, [replace(TONES[0], level=0.6)], LIMITS)
+        assert held.commands[0].level == 0.6
+        for changed in ({"level": 0.61}, {"level": float("nan")}, {"frequency": 301.0}):
+            with pytest.raises(CommandRefused) as refused:
+                safe_voltages(safe, [replace(TONES[0], **changed)], LIMITS)
+            assert refused.value.channel == 0
+        with pytest.raises(CommandRefused, match="channels"):
+            safe_voltages(safe, [], LIMITS)
+
+
+@in_virtual_time
+async def test_level_beyond_the_voltage_is_refused_by_the_guard() -> None:
+    """The highest level is what the voltage reaches at every frequency of the rig."""
+    bench = Bench(voltage_rig(smooth_rig(), "quadratic"), now=1000.0)
+    weak = {
+        name: VoltageDrive(((50.0, 1.0, 0.0), (300.0, 1.0, 0.0)), law=Law.QUADRATIC)
+        for name in bench.rig.voltage
+    }
+    bench = Bench(replace(bench.rig, voltage=weak), now=1000.0)
+    amplifier = voltage_amplifier(bench)
+    await amplifier.open()
+    guard = Guard(bench.rig.limits, amplifier.capabilities)
+    assert guard.limits.level == pytest.approx(0.5)
+    with pytest.raises(CommandRefused):
+        guard.check(a_set(amplifier, DriveCommand(0, 100.0, 0.51)))

@@ -21,6 +21,7 @@ NAMES = [
     "add-an-element",
     "add-a-touch-source",
     "add-an-effect",
+    "drive-a-signal-generator",
     "design-a-layout",
 ]
 WITH_CONFORMANCE = ["add-a-backend", "write-an-amplifier"]

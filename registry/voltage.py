@@ -59,12 +59,12 @@ class VoltageDrive:
         At negative frequencies, as in the lower sideband of a fast ramp, the conjugate.
         """
         rows = self.response
-        wanted = abs(frequency)
-        after = bisect_right(rows, wanted, key=lambda row: row[0])
+        requested = abs(frequency)
+        after = bisect_right(rows, requested, key=lambda row: row[0])
         low, high = rows[max(after - 1, 0)], rows[min(after, len(rows) - 1)]
         found = cmath.rect(*low[1:])
-        if low[0] < wanted < high[0]:
-            part = (wanted - low[0]) / (high[0] - low[0])
+        if low[0] < requested < high[0]:
+            part = (requested - low[0]) / (high[0] - low[0])
             found += part * (cmath.rect(*high[1:]) - found)
         return found.conjugate() if frequency < 0 else found
 

@@ -109,8 +109,8 @@ class ForeignAmplifier(WireBackend):
                 return self.capabilities()
             case GetFaults():
                 return FaultList(())
-            case Apply(command_set=wanted):
-                return await self._apply(wanted) if is_enabled else Nak(NakCode.WRONG_STATE)
+            case Apply(command_set=requested):
+                return await self._apply(requested) if is_enabled else Nak(NakCode.WRONG_STATE)
             case Arm():
                 if is_latched:
                     return Nak(NakCode.WRONG_STATE)
@@ -137,14 +137,14 @@ class ForeignAmplifier(WireBackend):
                 return Nak(NakCode.UNKNOWN_TYPE)
         return await self._status()
 
-    async def _apply(self, wanted: CommandSet) -> Achieved:
+    async def _apply(self, requested: CommandSet) -> Achieved:
         """Play a set, unless it is the one that plays."""
         playing, achieved = self._playing
-        if playing is not None and playing == wanted:
+        if playing is not None and playing == requested:
             return achieved
         self._playing = None, Achieved(0, ())
-        achieved = Achieved(wanted.token, tuple(await self.play(wanted.commands)))
-        self._playing = wanted, achieved
+        achieved = Achieved(requested.token, tuple(await self.play(requested.commands)))
+        self._playing = requested, achieved
         return achieved
 
     async def _status(self) -> Status:

@@ -69,9 +69,9 @@ def safe_voltages(
 
     limits: by channel, see `checked_voltage`. Raises CommandRefused.
     """
-    channels, wanted = ([one.channel for one in each] for each in (commands, safe.commands))
-    if channels != wanted:
-        raise CommandRefused(f"channels of the voltages must be {wanted}, got {channels}")
+    channels, requested = ([one.channel for one in each] for each in (commands, safe.commands))
+    if channels != requested:
+        raise CommandRefused(f"channels of the voltages must be {requested}, got {channels}")
     return SafeCommandSet(
         safe.token,
         tuple(checked_voltage(command, limits[command.channel]) for command in commands),

@@ -20,7 +20,7 @@ def moved_by_voltage(voltage: Sequence[Term], drive: VoltageDrive, *, stroke: fl
     """Return the motion [m] of a base; voltage: about its bias, as shares of the full one."""
     terms: Iterable[Term] = voltage
     if drive.law is Law.QUADRATIC:
-        terms = [*_scaled(voltage, 2 * drive.bias), *_squared(voltage)]
+        terms = [*_scaled(voltage, 2 * drive.bias), *_square_of(voltage)]
     return [
         replace(term, c0=gain * term.c0, c1=gain * term.c1)
         for term in terms
@@ -33,7 +33,7 @@ def _scaled(terms: Iterable[Term], factor: float) -> Iterator[Term]:
     return (replace(term, c0=factor * term.c0, c1=factor * term.c1) for term in terms)
 
 
-def _squared(terms: Sequence[Term]) -> Iterator[Term]:
+def _square_of(terms: Sequence[Term]) -> Iterator[Term]:
     """Terms of the square of a sum: Im A Im B = Im[i/2 A conj(B)] - Im[i/2 A B]."""
     for one, other in combinations_with_replacement(terms, 2):
         twice = 1.0 if one is other else 2.0

@@ -1,6 +1,12 @@
 """The guard: only what it has checked can be encoded and played."""
 
-from drivers.guard.guard import Guard, SafeCommandSet, SafeEnvelope, safe_voltages
+from drivers.guard.guard import (
+    Guard,
+    SafeCommandSet,
+    SafeEnvelope,
+    safe_voltage_envelope,
+    safe_voltages,
+)
 from drivers.guard.limits import (
     FREQUENCY_CEILING,
     FREQUENCY_FLOOR,
@@ -20,5 +26,6 @@ __all__ = [
     "SafeEnvelope",
     "limits_in_force",
     "require_safe",
+    "safe_voltage_envelope",
     "safe_voltages",
 ]

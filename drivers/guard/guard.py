@@ -22,7 +22,7 @@ from drivers.guard.rules import (
     is_finite,
     is_token,
 )
-from drivers.guard.voltage import checked_voltage
+from drivers.guard.voltage import checked_knot, checked_voltage
 from drivers.protocol.definition import PROTOCOL, token_after
 from drivers.protocol.messages import Capabilities, ChannelLimits, Feature
 from registry.limits import GuardLimits
@@ -105,6 +105,24 @@ class SafeEnvelope(Envelope):
 
     def __init_subclass__(cls) -> None:
         raise TypeError("SafeEnvelope cannot be subclassed")
+
+
+def safe_voltage_envelope(
+    safe: SafeEnvelope, knots: Sequence[Knot], limits: ChannelLimits
+) -> SafeEnvelope:
+    """Return an envelope that passed its guard with its knots converted to voltage, if within.
+
+    limits: of its channel. Raises CommandRefused.
+    """
+    if len(knots) != len(safe.knots):
+        raise CommandRefused(f"knots of the voltage must be {len(safe.knots)}, got {len(knots)}")
+    return SafeEnvelope(
+        safe.slot,
+        safe.step,
+        tuple(checked_knot(knot, limits, slot=safe.slot) for knot in knots),
+        record=safe.record,
+        key=_KEY,
+    )
 
 
 @final

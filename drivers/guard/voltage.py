@@ -3,7 +3,7 @@
 import math
 from dataclasses import replace
 
-from drivers.command import DriveCommand
+from drivers.command import DriveCommand, Knot
 from drivers.errors import CommandRefused
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import ChannelLimits
@@ -18,7 +18,7 @@ def checked_voltage(command: DriveCommand, limits: ChannelLimits) -> DriveComman
     limits: of its amplitude as a share of the full voltage, and of its frequency [Hz].
     """
     channel = command.channel
-    if not (math.isfinite(command.level) and 0 <= command.level <= limits.level_max * _ROUNDING):
+    if not _is_within(command.level, limits):
         raise CommandRefused(
             f"voltage of channel {channel} must be 0 to {limits.level_max:g} of the full one, got "
             f"{command.level:g}; lower the level, or its limit in the rig file",
@@ -37,3 +37,18 @@ def checked_voltage(command: DriveCommand, limits: ChannelLimits) -> DriveComman
         level=_Q.level.quantise(min(command.level, limits.level_max)),
         phase=_Q.phase.quantise(command.phase),
     )
+
+
+def checked_knot(knot: Knot, limits: ChannelLimits, *, slot: int) -> Knot:
+    """Return a knot of voltage as the wire rounds it; raises CommandRefused beyond its limits."""
+    if not _is_within(knot.level, limits):
+        raise CommandRefused(
+            f"voltage of the envelope in slot {slot} must be 0 to {limits.level_max:g} of the full "
+            f"one, got {knot.level:g}; lower the level, or its limit in the rig file"
+        )
+    level = min(knot.level, limits.level_max)
+    return Knot(_Q.level.quantise(level), _Q.phase.quantise(knot.phase))
+
+
+def _is_within(level: float, limits: ChannelLimits) -> bool:
+    return math.isfinite(level) and 0 <= level <= limits.level_max * _ROUNDING

@@ -11,9 +11,15 @@ from dataclasses import replace
 from typing import final
 
 from drivers.backend import Backend
-from drivers.command import DriveCommand
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError, CommandRefused
-from drivers.guard import SafeCommandSet, require_safe, safe_voltages
+from drivers.guard import (
+    SafeCommandSet,
+    SafeEnvelope,
+    require_safe,
+    safe_voltage_envelope,
+    safe_voltages,
+)
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
@@ -24,6 +30,7 @@ from drivers.protocol.messages import (
     ChannelLimits,
     Feature,
     GetCaps,
+    Loaded,
     LoadEnvelope,
     Nak,
     NakCode,
@@ -36,6 +43,7 @@ from drivers.protocol.wire_times import WireTimes
 from drivers.statistics import WireCounters
 from drivers.voltage.conversion import (
     capabilities_in_motion,
+    knot_in_voltage,
     motion_level,
     to_motion,
     to_voltage,
@@ -58,10 +66,14 @@ class VoltageBackend(Backend):
         # By token: the set of motion and that of voltage.
         self._sent: OrderedDict[int, tuple[SafeCommandSet, SafeCommandSet]] = OrderedDict()
         self._motion_of: dict[int, float] = {}  # last driven frequency [Hz] by channel
+        # By slot: envelopes of motion, and those of voltage that the amplifier has.
+        self._envelopes: dict[int, SafeEnvelope] = {}
+        self._loaded: dict[int, tuple[float, tuple[Knot, ...]]] = {}
 
     async def open(self) -> None:
         """Open the wire."""
         self._sent.clear()
+        self._loaded.clear()
         await self._backend.open()
 
     async def close(self) -> None:
@@ -72,10 +84,15 @@ class VoltageBackend(Backend):
         """Exchange a request in voltage, and return its reply in motion."""
         require_safe(request)
         if isinstance(request, LoadEnvelope):
-            return Nak(NakCode.UNKNOWN_TYPE)
+            return self._keep(request.envelope)
         if isinstance(request, Stage | Apply):
+            refusal = await self._load(request.command_set, timeout=timeout)
+            if refusal is not None:
+                return refusal
             request = replace(request, command_set=self._converted(request.command_set))
         reply = await self._backend.exchange(request, timeout=timeout)
+        if isinstance(reply, Nak) and reply.code == NakCode.NO_ENVELOPE:
+            self._loaded.clear()
         match reply:
             case Capabilities() if isinstance(request, GetCaps):
                 return self._capabilities(reply)
@@ -139,6 +156,34 @@ class VoltageBackend(Backend):
         drive = self._drives.get(channel)
         highest = 0.0 if drive is None else min(reported, drive.swing)
         return math.floor(highest * _LEVEL.per_unit + _SLACK) / _LEVEL.per_unit
+
+    def _keep(self, envelope: Envelope) -> Reply:
+        """Keep an envelope until a set says at which frequency it is played."""
+        if not isinstance(envelope, SafeEnvelope):
+            raise TypeError(f"envelope must have passed a guard, got {type(envelope).__name__}")
+        self._envelopes[envelope.slot] = envelope
+        return Loaded(envelope.slot, len(envelope.knots))
+
+    async def _load(self, requested: CommandSet, *, timeout: float) -> Nak | None:
+        """Load the envelopes of a set at its frequencies; returns a refusal of the amplifier."""
+        for command in requested.commands:
+            drive = self._drives.get(command.channel)
+            for slot in (command.onset, command.ending):
+                kept = self._envelopes.get(slot)
+                if drive is None or kept is None:
+                    continue
+                knots = [knot_in_voltage(knot, drive, command.frequency) for knot in kept.knots]
+                limits = self._limits[command.channel]
+                safe = safe_voltage_envelope(kept, knots, limits)
+                content = (safe.step, safe.knots)
+                if self._loaded.get(slot) == content:
+                    continue
+                self._loaded.pop(slot, None)
+                reply = await self._backend.exchange(LoadEnvelope(safe), timeout=timeout)
+                if isinstance(reply, Nak):
+                    return reply
+                self._loaded[slot] = content
+        return None
 
     def _converted(self, safe: object) -> SafeCommandSet:
         """Return a set in voltage; the same again for one that is repeated."""

@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from drivers.command import DriveCommand
+from drivers.command import DriveCommand, Knot
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Capabilities, Feature
 from registry.voltage import VoltageDrive
@@ -47,6 +47,12 @@ def to_voltage(
     )
 
 
+def knot_in_voltage(knot: Knot, drive: VoltageDrive, frequency: float) -> Knot:
+    """Convert a knot of motion at a frequency [Hz], where voltage and motion are proportional."""
+    command = to_voltage(DriveCommand(0, frequency, knot.level, knot.phase), drive)
+    return Knot(command.level, command.phase)
+
+
 def to_motion(command: DriveCommand, drive: VoltageDrive) -> DriveCommand:
     """Convert a command of voltage."""
     frequency = 2 * command.frequency if drive.is_halved else command.frequency
@@ -70,8 +76,8 @@ def capabilities_in_motion(
 ) -> Capabilities:
     """Convert the capabilities of an amplifier of voltage; drives: by channel.
 
-    Its highest level is that which the voltage reaches at every frequency that is played. Knots
-    of envelopes belong to no frequency when they are loaded, so that there are none.
+    Its highest level is that which the voltage reaches at every frequency that is played. Without a
+    bias there are neither cross-fades nor envelopes.
     """
     limits = capabilities.limits_of_channels
     reached, steps = [1.0], [capabilities.level_step]
@@ -90,6 +96,15 @@ def capabilities_in_motion(
         step = max(capabilities.level_step, _Q.level.step)
         steps.append((2 if drive.is_halved else 1) * high / swing * step if swing else step)
     is_halved = any(drive.is_halved for drive in drives.values())
+    if is_halved:
+        capabilities = replace(
+            capabilities,
+            envelope_knots=0,
+            envelope_slots=0,
+            envelope_step_min=0.0,
+            envelope_step_max=0.0,
+            has_cross_fades=False,
+        )
     return replace(
         capabilities,
         frequency_min=max(low for low, _ in frequencies),
@@ -98,13 +113,8 @@ def capabilities_in_motion(
         level_max=min(reached),
         level_step=max(steps),
         phase_step=capabilities.phase_step * (2 if is_halved else 1),
-        envelope_knots=0,
-        envelope_slots=0,
-        envelope_step_min=0.0,
-        envelope_step_max=0.0,
         channel_limits=(),
         features=capabilities.features & ~Feature.VOLTAGE,
-        has_cross_fades=capabilities.has_cross_fades and not is_halved,
         has_exact_fades=False,
     )
 

@@ -35,7 +35,6 @@ def voltage_costs(rig: Rig) -> list[str]:
         }
         if drives:
             parts = [
-                "ramps in place of shaped onsets and endings",
                 _reach_text([*drives.values()], rig.limits.level),
                 *_fades_text([*drives.values()]),
                 *_harmonic_text(drives, rig),
@@ -83,7 +82,10 @@ def _reach_text(drives: Sequence[VoltageDrive], limit: float) -> str:
 def _fades_text(drives: Sequence[VoltageDrive]) -> list[str]:
     if not any(drive.is_halved for drive in drives):
         return []
-    return ["no cross-fades: without a bias one frequency fades out before the next fades in"]
+    return [
+        "no cross-fades: without a bias one frequency fades out before the next fades in",
+        "no envelopes: ramps in place of shaped onsets and endings",
+    ]
 
 
 def _harmonic_text(drives: dict[str, VoltageDrive], rig: Rig) -> list[str]:

@@ -20,6 +20,10 @@ CONFIG_READER = ROOT / "controller" / "daemon" / "config_reader.py"
 # Makes members of enumerations.
 EXTENSIBLE_ENUM = ROOT / "drivers" / "protocol" / "extensible_enum.py"
 
+# Makes requests of sets and envelopes, and of envelopes of voltage.
+AMPLIFIER = ROOT / "drivers" / "amplifier.py"
+CONVERSION = ROOT / "drivers" / "voltage" / "backend.py"
+
 # Sends what the guard has made past the queue of an amplifier, and frames damaged on purpose.
 CONFORMANCE = ROOT / "drivers" / "conformance"
 
@@ -79,8 +83,9 @@ def test_only_the_guard_makes_safe_sets() -> None:
 def test_only_the_amplifier_sends_sets() -> None:
     """Requests that carry a set or an envelope are made of checked ones, or by a decoder.
 
-    In `Amplifier` they are made of what its own check let through; in the codecs only by what
-    takes bytes apart. An encoder takes no other than these requests.
+    In `Amplifier` they are made of what its own check let through, in the conversion to voltage of
+    what the guard's package made; in the codecs only by what takes bytes apart. An encoder takes no
+    other than these requests.
     """
     senders = set()
     for file in ON_THE_WAY:
@@ -94,7 +99,7 @@ def test_only_the_amplifier_sends_sets() -> None:
                 is_checked = "unpack" in function or "decode" in function
             else:
                 is_checked = function == "_safe" or ast.unparse(argument) == "safe"
-                is_checked = is_checked and file.name == "amplifier.py"
+                is_checked = is_checked and file in (AMPLIFIER, CONVERSION)
             assert is_checked, f"{file}:{call.lineno} makes a {name}"
     assert "amplifier.py" in senders
 
@@ -113,7 +118,7 @@ def test_only_backends_use_encoders() -> None:
 
 
 def test_only_the_conversion_changes_checked_sets() -> None:
-    """`safe_voltages` is called in one place: just before the codec."""
-    users = {file for file in FILES for name, _ in calls(file, "safe_voltages")}
-    users = {file for file in users if any(name == "safe_voltages" for name, _ in calls(file, ""))}
-    assert users == {ROOT / "drivers" / "voltage" / "backend.py"}
+    """The makers of sets and envelopes of voltage are called in one place: before the codec."""
+    makers = ("safe_voltages", "safe_voltage_envelope")
+    users = {file for file in FILES for name, _ in calls(file, *makers) if name in makers}
+    assert users == {CONVERSION}

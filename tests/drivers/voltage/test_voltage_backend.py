@@ -4,6 +4,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from drivers.amplifier import Amplifier
@@ -14,8 +15,9 @@ from drivers.protocol.messages import AmplifierState, ChannelLimits
 from paper_table import smooth_rig
 from registry.voltage import Law, VoltageDrive
 from sim.bench.bench import Bench
+from sim.waveform import ShapedTone
 from virtual_loop import in_virtual_time
-from voltage_rigs import voltage_amplifier, voltage_rig
+from voltage_rigs import LAWS, RESONANCES, resonator, voltage_amplifier, voltage_rig
 
 TONES = (DriveCommand(0, 120.0, 0.5, 30.0), DriveCommand(2, 120.0, 0.25, -110.0))
 
@@ -88,12 +90,41 @@ async def test_linear_voltage_fades_across() -> None:
         guard.check(a_set(amplifier, replace(TONES[0], frequency=180.0), ramp=0.02))
 
 
+KNOTS = (Knot(0.2, 10.0), Knot(0.4, 100.0), Knot(0.1, -50.0))
+
+
 @in_virtual_time
-async def test_envelopes_are_refused() -> None:
-    """Their voltage would depend on a frequency that they do not have."""
-    async with opened("linear") as (_, _, guard):
+async def test_envelopes_without_bias_are_refused() -> None:
+    """The square of a straight line is none."""
+    async with opened("quadratic") as (_, _, guard):
         with pytest.raises(CommandRefused):
-            guard.check_envelope(Envelope(1, 0.005, (Knot(0.1, 0.0),)))
+            guard.check_envelope(Envelope(1, 0.005, KNOTS))
+
+
+@pytest.mark.parametrize("law", ["linear", "quadratic with bias"])
+@in_virtual_time
+async def test_envelope_is_converted_at_the_frequency_of_its_set(law: str) -> None:
+    """Each knot of the voltage, by the resonator's formula, is the knot of the motion.
+
+    The same envelope at another frequency is loaded again, at the same one it is not.
+    """
+    _, bias, gain = LAWS[law]
+    async with opened(law) as (bench, amplifier, guard):
+        onset = guard.check_envelope(Envelope(1, 0.005, KNOTS))
+        await amplifier.load_envelope(onset)
+        loads = []
+        for frequency in (120.0, 120.0, 180.0):
+            asked = replace(TONES[0], frequency=frequency, onset=1)
+            await amplifier.apply(guard.check(a_set(amplifier, asked)))
+            tone = bench.amplifiers["main"].outputs[0][-1]
+            assert isinstance(tone, ShapedTone)
+            response = resonator(np.array([frequency]), RESONANCES["SW"], gain)[0]
+            motion = np.array(tone.values[1:]) * response * (2 * bias if bias else 1)
+            wanted = [knot.phasor for knot in (*KNOTS, Knot(asked.level, asked.phase))]
+            np.testing.assert_allclose(motion, wanted, atol=2e-3)
+            loads.append(dict(amplifier._link.backend._loaded))  # type: ignore[attr-defined]
+            await amplifier.apply(guard.silence(amplifier.next_token(), range(4), ramp=0.0))
+        assert loads[0] == loads[1] != loads[2]
 
 
 @in_virtual_time

@@ -9,6 +9,7 @@ from controller.daemon.config_sections import DaemonSection
 from drivers.rig_check import check_links
 from model.config.document import Document
 from model.config.kinds import CheckedFile
+from model.rig.voltage_costs import voltage_costs
 
 
 class DaemonKind:
@@ -33,7 +34,7 @@ class DaemonKind:
             f"socket {config.socket}{hint}"
         )
         note = rig.uncertainty.note
-        return CheckedFile(line, [*warnings, *([note] if note else [])])
+        return CheckedFile(line, [*warnings, *voltage_costs(rig), *([note] if note else [])])
 
     def example(self) -> str:
         """A commented example with every key."""

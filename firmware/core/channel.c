@@ -133,6 +133,13 @@ uint16_t channel_level(const struct channel *channel)
     return level > FULL_STROKE ? FULL_STROKE : (uint16_t)level;
 }
 
+// The voltage u = sqrt((1 + force) / 2): its square is half the full one, the bias, and half the
+// force, so that nothing beats and there is no harmonic, whatever the voices play together.
+static int16_t voltage_of(int32_t force)
+{
+    return (int16_t)square_root((uint64_t)(force + INT16_MAX) * INT16_MAX / 2);
+}
+
 int16_t channel_sample(struct channel *channel)
 {
     int64_t sum = 0;
@@ -140,6 +147,8 @@ int16_t channel_sample(struct channel *channel)
         sum += voice_sample(&channel->voices[i]);
     int32_t value = (int32_t)((sum + (1 << 14)) >> 15);
     if (value > INT16_MAX)
-        return INT16_MAX;
-    return value < -INT16_MAX ? -INT16_MAX : (int16_t)value;
+        value = INT16_MAX;
+    if (value < -INT16_MAX)
+        value = -INT16_MAX;
+    return SQUARE_LAW ? voltage_of(value) : (int16_t)value;
 }

@@ -41,7 +41,8 @@ bool channel_is_sounding(const struct channel *channel);
 // Present level: the sum of its voices, at least one step while anything sounds.
 uint16_t channel_level(const struct channel *channel);
 
-// Value at this sample, 32767 being full stroke; then move on by one sample.
+// Value at this sample, 32767 being full stroke, or full voltage with SQUARE_LAW; then move on by one
+// sample.
 int16_t channel_sample(struct channel *channel);
 
 #endif

@@ -22,6 +22,11 @@
 #define FREQUENCY_MAX (2000 * FREQUENCY_PER_HZ) // at most a quarter of the sample rate
 #define LEVEL_MAX FULL_STROKE
 #define VOICES 2 // oscillators of a channel, 2 to 255
+// 1: samples are voltages of an electrostatic actuator, whose force goes with their square: the
+// root of a bias plus the summed force of the voices. 0: samples are forces.
+#ifndef SQUARE_LAW
+#define SQUARE_LAW 0
+#endif
 #define WATCHDOG_MIN 100
 #define WATCHDOG_MAX 2000
 

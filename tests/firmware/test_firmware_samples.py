@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from firmware_programs import build_firmware
 from firmware_script import (
     KEEP_PHASE,
     NAK,
@@ -70,6 +71,24 @@ def test_sets_cross_fade_along_raised_cosines(firmware: Path) -> None:
     second = np.where(t >= 0.1, tone(t - 0.1, 130, 0.4, 90) * rising, 0)
     assert np.abs(samples[:, 0] - first - second).max() < TOLERANCE
     assert not samples[220 * PER_MS :].any()
+
+
+def test_square_of_voltages_is_the_summed_force(firmware: Path, tmp_path: Path) -> None:
+    """With the square law two tones that cross-fade have neither harmonics nor beats.
+
+    The square of a sample is half the full force plus half of what the same script plays as forces.
+    """
+    script: Script = [
+        (0, arm()),
+        (0, apply(1, command(0, 100, 0.9), command(1, 180, 0.5))),
+        (60, apply(2, command(0, 130, 0.9, 90), command(1, 180, 0.1), ramp_ms=40)),
+    ]
+    forces, _ = replay(firmware, script, 150)
+    folder = build_firmware(tmp_path, "CFLAGS=-O2 -DSQUARE_LAW=1", goal="posix")
+    voltages, _ = replay(folder, script, 150)
+    assert voltages.min() >= 0
+    np.testing.assert_allclose(2 * voltages**2 - 1, forces, atol=2 * TOLERANCE)
+    assert voltages[0, 3] == pytest.approx(np.sqrt(0.5), abs=TOLERANCE)  # a silent channel
 
 
 def test_third_voice_is_refused_and_changes_nothing(firmware: Path) -> None:

@@ -8,9 +8,9 @@ from pathlib import Path
 FIRMWARE = Path(__file__).parents[2] / "firmware"
 
 
-def build_firmware(folder: Path) -> Path:
-    """Build the programs for this machine into a folder; return it."""
-    subprocess.run(["make", "-s", "-C", FIRMWARE, f"OUT={folder}"], check=True)
+def build_firmware(folder: Path, *options: str, goal: str = "all") -> Path:
+    """Build programs for this machine into a folder, with options of make; return it."""
+    subprocess.run(["make", "-s", "-C", FIRMWARE, f"OUT={folder}", *options, goal], check=True)
     return folder
 
 

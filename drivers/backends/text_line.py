@@ -7,7 +7,6 @@ from typing import final
 
 from drivers import trace
 from drivers.backends.hardware import Port
-from drivers.backends.ports.opening import open_port
 from drivers.errors import LinkError
 from drivers.trace import Direction
 
@@ -34,6 +33,9 @@ class TextLine:
 
     async def open(self) -> None:
         """Open the port; raises LinkError."""
+        # Here, since plug-ins import the names of this module without pyserial.
+        from drivers.backends.ports.opening import open_port
+
         if self._port is None:
             self._rest, self._loss = b"", None
             self._lines.clear()

@@ -24,6 +24,7 @@ from model.vibration.excitation import Excitation, Tone
 
 RAMP = 0.05  # s; long enough not to excite the plate at onset or end
 _PAIR_FREQUENCIES = 3  # at which channels are driven in pairs
+_FADED = 0.01  # s; more than commits and replies are late
 _LEVEL_TOLERANCE = 0.02  # relative; more than any amplifier rounds
 
 
@@ -124,6 +125,9 @@ class ChannelSweep:
         eras = [self._rig.eras[number] for number in numbers]
         stroke = min(era.stroke for era in eras)
         excitation = {era.name: Tone(frequency, self._level * stroke) for era in eras}
+        if not all(each.capabilities.has_cross_fades for each in self._amplifiers.values()):
+            await self._play({})  # out, then in
+            await self._wait(self._ramp + _FADED)
         frequency = await self._play(excitation) or frequency
         await self._wait(self._ramp + self._settle + self._listen)
         now = await self._sensors.time()
@@ -133,7 +137,8 @@ class ChannelSweep:
     async def _play(self, excitation: Excitation) -> float | None:
         """Play on all amplifiers; return the achieved frequency [Hz], None for silence."""
         self._token = token_after(self._token)
-        routed = route(excitation, self._rig, token=self._token, ramp=RAMP)
+        ramp = min([RAMP, *(guard.ramp_max for guard in self._guards.values())])
+        routed = route(excitation, self._rig, token=self._token, ramp=ramp)
         self._ramp = max(commands.ramp for commands in routed.values())
         safe = {name: self._guards[name].check(commands) for name, commands in routed.items()}
         played = await self._group.play(safe)

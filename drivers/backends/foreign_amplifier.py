@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from drivers.backends.wire_backend import WireBackend
 from drivers.command import CommandSet, DriveCommand
-from drivers.errors import LinkTimeout
+from drivers.errors import CommandError, LinkTimeout
 from drivers.guard import require_safe
 from drivers.protocol.messages import (
     Achieved,
@@ -85,18 +85,25 @@ class ForeignAmplifier(WireBackend):
         return False
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
-        """Carry out a request by the methods of the subclass."""
+        """Carry out a request by the methods of the subclass.
+
+        ValueError or LookupError, which words that are no numbers raise, mean a damaged reply: the
+        request is repeated.
+        """
         require_safe(request)
         try:
             async with asyncio.timeout(max(timeout, REPLY_TIME)):
                 return await self._carry_out(request)
-        except LinkTimeout:
+        except (LinkTimeout, CommandError):
             raise
         except TimeoutError:
             raise LinkTimeout(
                 f"no reply within {max(timeout, REPLY_TIME):g} s; check that the amplifier is "
                 "switched on, and its address"
             ) from None
+        except (ValueError, LookupError) as error:  # of what was read
+            self._counters.invalid_frames += 1
+            raise LinkTimeout(f"damaged reply ({error}); check the line") from error
 
     async def _carry_out(self, request: Request) -> Reply:
         """Return the reply to a request."""

@@ -223,6 +223,32 @@ async def test_late_reply_is_not_taken_for_another(
         assert backend.counters.unexpected_frames == before + 1
 
 
+@pytest.mark.parametrize("damaged", ["7;x;1;0;1", "\xff\xfe", ";;;;", "1;1;1"])
+async def test_damaged_reply_is_counted_and_asked_for_again(
+    example: ModuleType, monkeypatch: pytest.MonkeyPatch, damaged: str
+) -> None:
+    """Letters for numbers, no text, too few or empty answers; the next reply is understood."""
+    generator = Generator()
+    answer, broken = generator.message, []
+
+    def once(text: str) -> str | None:
+        reply = answer(text)
+        if broken:
+            return reply
+        broken.append(text)
+        number = str(reply).partition(";")[0]
+        return damaged.replace("7;", f"{number};").encode("ascii", "replace").decode()
+
+    async with opened(example, generator) as amplifier:
+        monkeypatch.setattr("drivers.backends.foreign_amplifier.REPLY_TIME", 0.05)
+        before = amplifier.statistics
+        generator.message = once  # type: ignore[method-assign]
+        assert (await amplifier.status()).levels == (0.0, 0.0)
+        after = amplifier.statistics
+        wrong = after.invalid_frames + after.unexpected_frames
+        assert wrong == before.invalid_frames + before.unexpected_frames + 1
+
+
 @pytest.mark.parametrize(
     "url",
     [

@@ -26,7 +26,7 @@ CHANNELS = (1, 2)
 LEAST = 0.002  # Vpp, into an open circuit
 MOST = 10.0  # V, peak with bias, into an open circuit
 OPTIONS = {"full_voltage": 5.0, "bias": 0.0, "baud": 115_200.0}
-ON = ("1", "ON")
+IS_ON = {"1": True, "ON": True, "0": False, "OFF": False}
 
 
 class ScpiBackend(ForeignAmplifier):
@@ -117,7 +117,7 @@ class ScpiBackend(ForeignAmplifier):
         """Read the outputs and their voltages."""
         found = await self._ask(*(f"{of}{n}{at}?" for n in CHANNELS for of, at in _STATE))
         pairs = zip(found[::2], found[1::2], strict=True)
-        return [float(vpp) / (2 * self._full) if is_on in ON else 0.0 for is_on, vpp in pairs]
+        return [IS_ON[on] * float(vpp) / (2 * self._full) for on, vpp in pairs]
 
     def _vpp(self, command: DriveCommand) -> float:
         """Peak to peak, 0 below half of the least."""

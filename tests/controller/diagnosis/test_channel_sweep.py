@@ -1,6 +1,7 @@
 """A sweep over channels when an amplifier does not play what was commanded."""
 
 import asyncio
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -57,3 +58,22 @@ async def test_channel_sweep_ends_when_a_level_is_not_played() -> None:
         await sweep.run([110.0])
     assert far_end.state is not AmplifierState.OPERATION_ENABLED
     assert not far_end.is_open
+
+
+@in_virtual_time
+async def test_channel_sweep_of_an_amplifier_without_ramps_and_cross_fades() -> None:
+    """Every tone comes after silence; nothing is refused."""
+    bench = make_bench()
+    far_end = bench.far_end
+    far_end.amplifier.capabilities = replace(
+        far_end.amplifier.capabilities, has_cross_fades=False, ramp_max=0.0
+    )
+    far_end.amplifier.restart(0.0)
+    sweep = ChannelSweep(
+        bench.rig, {"main": Amplifier(far_end)}, Deaf(), level=0.1, settle=0.1, listen=0.1
+    )
+    await sweep.run([110.0, 130.0])
+    silences = [each.is_silent for each in far_end.sets()]
+    assert silences[::2] == [True] * len(silences[::2])
+    assert not any(silences[1:-1:2])
+    assert {each.ramp for each in far_end.sets()} == {0.0}

@@ -207,7 +207,15 @@ def _thickness(rig: Rig, factor: float) -> Rig:
         )
         for era in rig.eras
     )
-    masses = tuple(replace(mass, mass=mass.mass / factor) for mass in rig.masses)
+    masses = tuple(
+        replace(
+            load,
+            stiffness=load.stiffness / factor,
+            damping=load.damping / factor,
+            mass=load.mass / factor,
+        )
+        for load in rig.masses
+    )
     return replace(_modulus(rig, factor**2), eras=eras, masses=masses)
 
 

@@ -39,13 +39,14 @@ def rig_yaml(data: Mapping[str, Value], rig: Rig, ranking: Ranking, case: int) -
     """The text of the studied rig file (its data) with the ERAs of one case.
 
     ERAs keep the wiring of the rig's; further ones get the next channels of its first amplifier.
+    ERAs without an amplifier stay.
     """
     wiring = list(rig.wiring.values())
     first = wiring[0].amplifier
     free = 1 + max(channel.number for channel in wiring if channel.amplifier == first)
     before = data["eras"]
     assert isinstance(before, dict)  # noqa: S101 - the rig was read from this data
-    eras: dict[str, Value] = {}
+    eras: dict[str, Value] = {name: before[name] for name in rig.supports}
     for number, era in enumerate(ranking.cases.eras_of(case, rig.eras)):
         # A renamed ERA has the other keys of the first. Copied, since aliases are not allowed.
         section = deepcopy(before.get(era.name, next(iter(before.values()))))

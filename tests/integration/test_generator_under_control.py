@@ -22,6 +22,7 @@ from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.timing import Timing
 from scpi_generator import Generator, on_tcp
 
 FOLDER = Path(__file__).parents[2] / "examples" / "plugins" / "scpi"
@@ -75,6 +76,7 @@ async def controlled(
                 amplifiers={"generator": amplifier},
                 intent_source=source,
                 observer=Observer(pattern_applied=applied.append, refused=refused.append),
+                timing=Timing(table),
                 is_supervised=is_supervised,
             ),
             source,
@@ -123,6 +125,7 @@ async def test_touches_play_two_channels_in_phase(rig: Rig, table: LocalizationT
         await running
     assert refused == []
     assert not generator.errors
+    assert applied[-1].timing is None  # transients of a squared ramp are not predicted
     pattern = applied[-1].pattern
     assert pattern.ramp == 0.0
     assert set(pattern.excitation) == {"SW", "NE"}

@@ -41,27 +41,30 @@ def example() -> ModuleType:
     return module
 
 
-def drives() -> dict[int, VoltageDrive]:
-    """Two resonant actuators of quadratic law, without bias."""
+def drives(bias: float = 0.0) -> dict[int, VoltageDrive]:
+    """Two resonant actuators of quadratic law."""
     frequencies = np.arange(20.0, 1001.0, 1.0)
     made = {}
     for channel, resonance in enumerate(RESONANCES):
         found = resonator(frequencies, resonance, GAIN)
         rows = zip(frequencies, np.abs(found), np.angle(found), strict=True)
         response = tuple((float(f), float(size), float(phase)) for f, size, phase in rows)
-        made[channel] = VoltageDrive(response, law=Law.QUADRATIC, frequencies=(60.0, 240.0))
+        made[channel] = VoltageDrive(
+            response, law=Law.QUADRATIC, bias=bias, frequencies=(60.0, 240.0)
+        )
     return made
 
 
 @asynccontextmanager
 async def opened(
-    example: ModuleType, generator: Generator, wire: str = "tcp"
+    example: ModuleType, generator: Generator, wire: str = "tcp", *, bias: float = 0.0
 ) -> AsyncIterator[Amplifier]:
     """An amplifier over a wire to a generator, converted, armed."""
     serve = on_tcp(generator) if wire == "tcp" else on_terminal(generator)
     async with serve as at:
         url = f"scpi://127.0.0.1:{at}" if wire == "tcp" else f"scpi+serial://{at}"
-        amplifier = Amplifier(VoltageBackend(example.ScpiBackend(url), drives()))
+        backend = example.ScpiBackend(f"{url}?bias={bias}")
+        amplifier = Amplifier(VoltageBackend(backend, drives(bias)))
         await amplifier.open()
         try:
             yield amplifier
@@ -77,11 +80,15 @@ def a_set(amplifier: Amplifier, *commands: DriveCommand) -> CommandSet:
 TONES = (DriveCommand(0, 120.0, 0.5, 30.0), DriveCommand(1, 120.0, 0.25, -110.0))
 
 
-@pytest.mark.parametrize("wire", ["tcp", "serial"])
-async def test_generator_moves_two_actuators_in_phase(example: ModuleType, wire: str) -> None:
+@pytest.mark.parametrize(
+    ("wire", "bias"), [("tcp", 0.0), ("serial", 0.0), ("tcp", 0.3), ("serial", 0.3)]
+)
+async def test_generator_moves_two_actuators_in_phase(
+    example: ModuleType, wire: str, bias: float
+) -> None:
     """Samples of its two voltages, squared, move two resonators as commanded, over each wire."""
     generator = Generator()
-    async with opened(example, generator, wire) as amplifier:
+    async with opened(example, generator, wire, bias=bias) as amplifier:
         checked = CheckedAmplifier(amplifier)
         await checked.arm()
         guard = Guard(LIMITS, amplifier.capabilities)
@@ -97,8 +104,9 @@ async def test_generator_moves_two_actuators_in_phase(example: ModuleType, wire:
             base = moved(share**2, times, resonance, GAIN)
             late = times > start + 0.5
             angle = 2 * np.pi * 120.0 * (times[late] - start)
-            basis = np.stack([np.sin(angle), np.cos(angle), np.ones_like(angle)], axis=1)
-            sine, cosine, _ = np.linalg.lstsq(basis, base[late], rcond=None)[0]
+            parts = [np.sin(angle), np.cos(angle), np.sin(2 * angle), np.cos(2 * angle)]
+            basis = np.stack([*parts, np.ones_like(angle)], axis=1)
+            sine, cosine, *_ = np.linalg.lstsq(basis, base[late], rcond=None)[0]
             wanted = command.level * np.exp(1j * math.radians(command.phase))
             assert abs(sine + 1j * cosine - wanted) < 2e-3
         await amplifier.disarm()

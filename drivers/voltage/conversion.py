@@ -19,6 +19,7 @@ from drivers.protocol.messages import Capabilities, Feature
 from registry.voltage import VoltageDrive
 
 _Q = PROTOCOL.quantities
+_DIGITS = 9  # of degrees; beyond them there are sums of floats
 
 
 def to_voltage(
@@ -62,7 +63,7 @@ def to_motion(command: DriveCommand, drive: VoltageDrive) -> DriveCommand:
         command,
         frequency=frequency,
         level=motion_level(command.level, drive, frequency),
-        phase=_wrapped(phase + math.degrees(cmath.phase(response))),
+        phase=_wrapped(round(phase + math.degrees(cmath.phase(response)), _DIGITS)),
     )
 
 

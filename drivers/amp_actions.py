@@ -177,14 +177,21 @@ async def drive(
 
 
 async def conform(
-    url: str, checks: tuple[Check, ...], on_result: Callable[[CheckResult], None]
+    url: str,
+    checks: tuple[Check, ...],
+    on_result: Callable[[CheckResult], None],
+    *,
+    process: int | None = None,
 ) -> ConformanceReport:
-    """Run checks in turn on one open amplifier; on_result: called with each result."""
+    """Run checks in turn on one open amplifier; on_result: called with each result.
+
+    process: see `run_check`.
+    """
     results = []
     async with _opened(url, reply_timeout=_PATIENT_TIMEOUT) as amplifier:
         raw = raw_line(url)
         for check in checks:
-            results.append(await run_check(check, amplifier, raw, url=url))
+            results.append(await run_check(check, amplifier, raw, url=url, process=process))
             on_result(results[-1])
         stated = amplifier_class(amplifier.capabilities)
     return ConformanceReport(url, stated.value, tuple(results))

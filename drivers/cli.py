@@ -235,6 +235,14 @@ def conformance(
     write: Annotated[
         bool, typer.Option("--write", help="Drive the outputs too, without confirmation.")
     ] = False,
+    process: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PID",
+            min=1,
+            help="Process of an emulated amplifier: its delays are not the amplifier's.",
+        ),
+    ] = None,
     trace: Trace = None,
     json_: Json = False,
 ) -> None:
@@ -245,14 +253,14 @@ def conformance(
     reading = tuple(check for check in CHECKS if not check.drives)
     driving = tuple(check for check in CHECKS if check.drives)
     show = _no_result if json_ else _show_result
-    report = _run(conform(url, reading, show), trace)
+    report = _run(conform(url, reading, show, process=process), trace)
     if not write and not json_ and sys.stdin.isatty():
         write = typer.confirm(
             f"{len(driving)} more checks arm the amplifier and drive its channels at {LEVEL:.0%} "
             "of full stroke. Continue?"
         )
     if write and report.problems == 0:
-        report = report.followed_by(_run(conform(url, driving, show), trace))
+        report = report.followed_by(_run(conform(url, driving, show, process=process), trace))
     if json_:
         print(json.dumps(report.to_json()))
     else:

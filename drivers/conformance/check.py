@@ -140,19 +140,25 @@ def _check(steps: Steps, places: tuple[str, ...], *, drives: bool) -> Check:
 
 
 async def run_check(
-    check: Check, amplifier: Amplifier, raw: RawLine | None = None, *, url: str = ""
+    check: Check,
+    amplifier: Amplifier,
+    raw: RawLine | None = None,
+    *,
+    url: str = "",
+    process: int | None = None,
 ) -> CheckResult:
     """Run a check on an open, disarmed amplifier, and leave it disarmed.
 
     A violation while this program or the wire was delayed does not count, nor does too little
     evidence: the check is repeated, and inconclusive if that does not end. It has failed if every
     attempt failed and this program was not late in one. raw: access to the line, url: of the
-    amplifier; checks that need them are skipped without.
+    amplifier; checks that need them are skipped without. process: number of the process that is the
+    amplifier, whose delays count as this program's.
     """
     start, place = clock.now(), check.place(raw)
     attempts: list[_Attempt] = []
     while len(attempts) < MAX_ATTEMPTS:
-        attempt = await _attempt(check, Bench(amplifier, raw, url=url))
+        attempt = await _attempt(check, Bench(amplifier, raw, url=url), process)
         attempts.append(attempt)
         if not attempt.is_doubtful:
             break
@@ -185,10 +191,10 @@ def _all_failed(attempts: Sequence[_Attempt]) -> bool:
     return not is_unclear and len(failed) > 1 and any(one.lateness <= STALL for one in failed)
 
 
-async def _attempt(check: Check, bench: Bench) -> _Attempt:
+async def _attempt(check: Check, bench: Bench, process: int | None) -> _Attempt:
     """Run the steps once."""
     before = bench.amplifier.statistics.timeouts
-    with Lateness() as lateness:
+    with Lateness(process) as lateness:
         finding = await _finding(check, bench)
     missed = bench.amplifier.statistics.timeouts - before
     return _Attempt(finding, lateness.worst, bench.max_delay, missed)

@@ -1,6 +1,7 @@
-"""Delays of this program: how late its event loop was, and how long replies took."""
+"""Delays of this program, and of an emulated amplifier that shares its processors."""
 
 import asyncio
+from pathlib import Path
 
 from drivers import clock
 
@@ -14,9 +15,13 @@ class Lateness:
     """Measures the lateness of the running event loop while its context lasts.
 
     worst [s]: the largest delay of a timer; total [s]: the sum of those that count as stalls.
+    process: number of a process on this machine that is the amplifier; its threads are late while
+    they wait for a processor.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, process: int | None = None) -> None:
+        self._process = process
+        self._waited = waited_for_processor(process)
         self.worst = 0.0
         self.total = 0.0
         self._timer: asyncio.TimerHandle | None = None
@@ -40,7 +45,26 @@ class Lateness:
         self._schedule()
 
     def _note(self) -> None:
-        late = clock.now() - self._due
+        before, self._waited = self._waited, waited_for_processor(self._process)
+        late = max(clock.now() - self._due, self._waited - before)
         self.worst = max(self.worst, late)
         if late > STALL:
             self.total += late
+
+
+def waited_for_processor(process: int | None) -> float:
+    """Return how long [s] the threads of a process were ready to run and did not.
+
+    By Linux's statistics of its scheduler; 0 for no process, or one that has ended.
+    """
+    tasks = Path(f"/proc/{process}/task")
+    if process is None or not tasks.is_dir():
+        return 0.0
+    total = 0
+    for task in tasks.iterdir():
+        try:
+            _, waited, _ = (task / "schedstat").read_text("ascii").split()
+        except OSError:  # a thread that has just ended
+            continue
+        total += int(waited)
+    return total * 1e-9

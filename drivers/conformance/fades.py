@@ -170,9 +170,9 @@ async def _fill(bench: Bench, count: int) -> tuple[int, Interval]:
     await bench.play(1.0)
     fades = []
     for number in range(2, count + 1):
-        wanted = _tone(bench, 0.5)
+        requested = _tone(bench, 0.5)
         try:
-            _, when = await bench.timed(bench.amplifier.apply(wanted))
+            _, when = await bench.timed(bench.amplifier.apply(requested))
         except CommandRefused as refused:
             raise ContractViolation(
                 f"voice {number} of the {bench.can.voices} that it states",
@@ -180,7 +180,7 @@ async def _fill(bench: Bench, count: int) -> tuple[int, Interval]:
                 seen=str(refused),
             ) from None
         fades.append(when)
-    return wanted.token, fades[0]
+    return requested.token, fades[0]
 
 
 def _tone(bench: Bench, fraction: float) -> SafeCommandSet:

@@ -58,7 +58,7 @@ class PlayRecord:
         self.last_token = 0
         channels = capabilities.channels
         self._limits = limits
-        self._most = capabilities.voices
+        self._max_voices = capabilities.voices
         self._has_cross_fades = capabilities.has_cross_fades
         self._clock = clock
         self._budget = Budget(limits)
@@ -100,7 +100,7 @@ class PlayRecord:
         voices = self._voices_after(self._pending, self._clock())
         return max(
             (
-                voices[command.channel].room_from(self._most)
+                voices[command.channel].room_from(self._max_voices)
                 for command in command_set.commands
                 if command.level > 0 or command.onset
             ),

@@ -44,9 +44,10 @@ class Voices:
     voices: tuple[Voice, ...] = ()
     ending: float = 0.0
 
-    def room_from(self, most: int) -> float:
-        """When [s] another has room among so many at most."""
-        return self.voices[most - 1].end + LAG if len(self.voices) >= most else -math.inf
+    def room_from(self, max_voices: int) -> float:
+        """When [s] another has room, of so many at most."""
+        has_room = len(self.voices) < max_voices
+        return -math.inf if has_room else self.voices[max_voices - 1].end + LAG
 
     def after(
         self,

@@ -4,7 +4,7 @@ import math
 
 from sim.witness.decoded import Request, RequestKind
 
-_LONGEST_ENVELOPE = 3.3  # s; 32 knots, 0.1 s apart
+_MAX_ENVELOPE = 3.3  # s; 32 knots, 0.1 s apart
 _LAG = 0.002  # s; of playback behind a commit
 
 
@@ -15,7 +15,7 @@ class Voices:
         self.stated = 0
         self._fades: dict[int, float] = {}  # along which a set ends others, by token [s]
         self._ends: dict[int, float] = {}  # of its own voices, by token [s]
-        self._longest = 0.0  # of the envelopes in use [s]
+        self._max_envelope = 0.0  # of the envelopes in use [s]
 
     def sent(self, request: Request) -> None:
         """Note a set that may play from now on, or is staged."""
@@ -25,7 +25,7 @@ class Voices:
         if request.kind is not RequestKind.COMMIT:
             self._fades[token] = request.ramp
         if any(command.onset or command.ending for command in request.commands.values()):
-            self._longest = _LONGEST_ENVELOPE
+            self._max_envelope = _MAX_ENVELOPE
 
     def refused(self, token: int) -> None:
         """Note that a set does not play."""
@@ -36,7 +36,7 @@ class Voices:
         if request.kind is RequestKind.STAGE:
             return
         playing = request.token
-        faded = time + _LAG + max(self._fades.get(playing, math.inf), self._longest)
+        faded = time + _LAG + max(self._fades.get(playing, math.inf), self._max_envelope)
         self._ends = {
             token: end if token == playing else min(end, faded)
             for token, end in self._ends.items()

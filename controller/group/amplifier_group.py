@@ -228,7 +228,12 @@ class AmplifierGroup:
             return await run_to_completion(self._quick_stops.stop())
 
     async def clear(self) -> None:
-        """Acknowledge stops, and faults whose cause has gone."""
+        """Acknowledge stops, and faults whose cause has gone.
+
+        Raises CommandRefused while amplifiers are being stopped: nothing is sent before a stop.
+        """
+        if self._silencing_count:
+            raise CommandRefused("amplifiers are being stopped or disarmed; clear again afterwards")
         count = self._stop_count
         try:
             await self._gather(amplifier.clear() for amplifier in self._all)

@@ -44,8 +44,9 @@ _ON_THE_WIRE = 0.002  # s; through driver, adapter and back
 # Bytes of a silent set for four channels and what may precede it on the line, there and back.
 _BYTES = 200
 # Bytes between two feeds of one of two amplifiers on a line, there and back: another request, a
-# status and a heartbeat of both, and a silent set of both.
-_BYTES_BETWEEN_FEEDS = 350
+# status and a heartbeat of both, a silent set of both, and, as what has waited is a heartbeat's
+# equal, an operator's clear of both.
+_BYTES_BETWEEN_FEEDS = 540
 _PATTERN = 0.25  # s; from a touch to its pattern
 _NOTICED = 0.3  # s; from an unplugged wire to the controller's reaction
 _TIMERS_MAX = 2_000

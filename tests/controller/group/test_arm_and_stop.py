@@ -231,6 +231,22 @@ async def test_silencing_wins_over_arming(silencing: str) -> None:
         assert ENABLED not in bench.states()
 
 
+@in_virtual_time
+async def test_clear_is_refused_while_stopping() -> None:
+    """Nothing is sent before the stop; afterwards clearing works."""
+    bench = make_bench("a")
+    await bench.controller.open()
+    bench.far_end.delay = 0.02
+    stopping = asyncio.create_task(bench.controller.stop())
+    await asyncio.sleep(0)
+    with pytest.raises(CommandRefused):
+        await bench.controller.clear()
+    await stopping
+    assert bench.far_end.requests(Clear) == []
+    await bench.controller.clear()
+    assert len(bench.far_end.requests(Clear)) == 1
+
+
 @pytest.mark.parametrize("order", ["stop", "disarm"])
 @in_virtual_time
 async def test_arm_is_refused_while_silencing(order: str) -> None:

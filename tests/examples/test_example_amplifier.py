@@ -11,9 +11,8 @@ from typing import Any
 
 import pytest
 
-from drivers.amplifier import Amplifier
-from drivers.conformance import CHECKS, CheckResult, Result, raw_line, run_check
-from drivers.registry import open_backend
+from conformance_bench import results_at
+from drivers.conformance import CheckResult, Result
 from memory_machine import live_in_memory
 from virtual_loop import run_virtual
 
@@ -129,13 +128,7 @@ def test_serial_end_passes_conformance(serial: ModuleType) -> None:
         terminal = live_in_memory().make_terminal(
             lambda data: terminal.write(end.take(data)), unpluggable=False
         )
-        url = f"serial://{terminal.port}"
-        amplifier = Amplifier(open_backend(url))
-        await amplifier.open()
-        try:
-            return [await run_check(check, amplifier, raw_line(url)) for check in CHECKS]
-        finally:
-            await amplifier.close()
+        return await results_at(f"serial://{terminal.port}")
 
     results = run_virtual(run())
     assert {one.check.name: one.problem for one in results if one.problem} == {}

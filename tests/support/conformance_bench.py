@@ -1,13 +1,11 @@
 """Conformance checks over a wire in memory, in virtual time."""
 
-from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import Sequence
 
 import pytest
 
 from drivers.amplifier import Amplifier
 from drivers.conformance import CHECKS, Check, CheckResult, raw_line, run_check
-from drivers.conformance.raw.line import RawLine
 from drivers.registry import open_backend
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
@@ -16,28 +14,25 @@ from virtual_loop import Seen, run_virtual
 from wires import WIRES, far_side, patient
 
 
-@asynccontextmanager
-async def opened(wire: str, rig: Rig) -> AsyncIterator[tuple[Amplifier, RawLine | None]]:
-    """The simulated amplifier of a rig behind a wire in memory, and raw access."""
-    live_in_memory()
-    async with far_side(WIRES[wire], rig) as far:
-        url = patient(far.url)
-        amplifier = Amplifier(open_backend(url))
-        await amplifier.open()
-        try:
-            yield amplifier, raw_line(url)
-        finally:
-            await amplifier.close()
+async def results_at(url: str, checks: Sequence[Check] = CHECKS) -> list[CheckResult]:
+    """Results of checks on the amplifier at a URL."""
+    amplifier, raw = Amplifier(open_backend(url)), raw_line(url)
+    await amplifier.open()
+    try:
+        return [await run_check(check, amplifier, raw) for check in checks]
+    finally:
+        await amplifier.close()
 
 
 def results_on(
     wire: str, rig: Rig, checks: Sequence[Check] = CHECKS, *, seen: Seen | None = None
 ) -> list[CheckResult]:
-    """Results of checks on one amplifier; seen: observer of the bytes."""
+    """Results of checks on the simulated amplifier of a rig; seen: observer of the bytes."""
 
     async def run() -> list[CheckResult]:
-        async with opened(wire, rig) as (amplifier, raw):
-            return [await run_check(check, amplifier, raw) for check in checks]
+        live_in_memory()
+        async with far_side(WIRES[wire], rig) as far:
+            return await results_at(patient(far.url), checks)
 
     return run_virtual(run(), seen=seen)
 

@@ -5,16 +5,16 @@ from collections.abc import Callable, Coroutine
 
 import pytest
 
-from conformance_bench import opened
+from conformance_bench import results_on
 from drivers import clock
-from drivers.conformance import CHECKS, CheckResult, Result, run_check
+from drivers.conformance import CHECKS, CheckResult, Result
 from drivers.conformance.bench import Bench
 from drivers.conformance.check import MAX_ATTEMPTS, Check
 from drivers.conformance.findings import Inconclusive, NotApplicable, expect
 from drivers.conformance.report import ConformanceReport
 from drivers.guard.channel_state import Interval
 from model.rig.rig import Rig
-from virtual_loop import VirtualLoop, run_virtual
+from virtual_loop import VirtualLoop
 
 Steps = Callable[[Bench], Coroutine[None, None, None]]
 
@@ -29,12 +29,8 @@ def stall(duration: float) -> None:
 def result_of(steps: Steps, rig: Rig) -> CheckResult:
     """The result of a check with these steps, on a sound amplifier."""
     check = Check("named", "does as told", ("wire-protocol.md#watchdog",), drives=True, run=steps)
-
-    async def run() -> CheckResult:
-        async with opened("serial", rig) as (amplifier, raw):
-            return await run_check(check, amplifier, raw)
-
-    return run_virtual(run())
+    (result,) = results_on("serial", rig, [check])
+    return result
 
 
 def test_violation_fails_at_once(coarse_rig: Rig) -> None:

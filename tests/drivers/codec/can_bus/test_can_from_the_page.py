@@ -6,9 +6,10 @@ from collections.abc import AsyncIterator, Iterator
 
 import pytest
 
+from conformance_bench import results_at
 from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
-from drivers.conformance import CHECKS, CheckResult, Result, raw_line, run_check
+from drivers.conformance import CheckResult, Result
 from drivers.guard import Guard, GuardLimits
 from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault
 from drivers.registry import open_backend
@@ -68,12 +69,7 @@ def test_vendor_amplifier_passes_conformance() -> None:
 
     async def run() -> list[CheckResult]:
         async with in_virtual_time() as url:
-            amplifier = Amplifier(open_backend(url))
-            await amplifier.open()
-            try:
-                return [await run_check(check, amplifier, raw_line(url)) for check in CHECKS]
-            finally:
-                await amplifier.close()
+            return await results_at(url)
 
     results = run_virtual(run())
     failed = {one.check.name: one.reason for one in results if one.result is Result.FAILED}

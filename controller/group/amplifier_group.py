@@ -230,10 +230,10 @@ class AmplifierGroup:
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone.
 
-        Raises CommandRefused while amplifiers are being stopped: nothing is sent before a stop.
+        Raises Preempted while amplifiers are being stopped or disarmed: nothing precedes that.
         """
         if self._silencing_count:
-            raise CommandRefused("amplifiers are being stopped or disarmed; clear again afterwards")
+            raise Preempted("amplifiers are being stopped or disarmed; clear again afterwards")
         count = self._stop_count
         try:
             await self._gather(amplifier.clear() for amplifier in self._all)

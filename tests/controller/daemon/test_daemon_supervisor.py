@@ -371,6 +371,25 @@ async def test_clear_does_not_acknowledge_later_stop(delay: float) -> None:
         assert daemon.state is DaemonState.READY_TO_SWITCH_ON
 
 
+@in_virtual_time
+async def test_clear_while_stopping_is_refused_and_no_fault() -> None:
+    """Nothing of it is sent before the stop is confirmed; afterwards it works."""
+    async with watched() as daemon:
+        await daemon.handle(ARM)
+        daemon.far_end.delay = 0.010
+        stopping = asyncio.create_task(daemon.handle(STOP))
+        await asyncio.sleep(0.001)
+        sent = len(daemon.far_end.requests(Stop, Clear, GetStatus))
+        with pytest.raises(CommandRefused):
+            await daemon.handle(CLEAR)
+        assert len(daemon.far_end.requests(Stop, Clear, GetStatus)) == sent
+        await stopping
+        assert daemon.state is DaemonState.QUICK_STOP_ACTIVE
+        await daemon.handle(CLEAR)
+        assert daemon.state is DaemonState.READY_TO_SWITCH_ON
+        assert DaemonState.FAULT not in daemon.states
+
+
 @pytest.mark.parametrize("delay", [0.001, 0.005, 0.009, 0.013])
 @in_virtual_time
 async def test_stop_while_disarming_is_no_fault(delay: float) -> None:

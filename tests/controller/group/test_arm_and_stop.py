@@ -9,7 +9,7 @@ from controller.group.amplifier_group import GroupState
 from controller.loop.loop import Controller
 from controller_bench import FINGER, OTHER, make_bench, running
 from drivers.amplifier import Amplifier
-from drivers.errors import CommandError, CommandRefused, LinkError
+from drivers.errors import CommandError, CommandRefused, LinkError, Preempted
 from drivers.protocol.messages import (
     AmplifierState,
     Apply,
@@ -239,7 +239,7 @@ async def test_clear_is_refused_while_stopping() -> None:
     bench.far_end.delay = 0.02
     stopping = asyncio.create_task(bench.controller.stop())
     await asyncio.sleep(0)
-    with pytest.raises(CommandRefused):
+    with pytest.raises(Preempted):
         await bench.controller.clear()
     await stopping
     assert bench.far_end.requests(Clear) == []

@@ -40,6 +40,12 @@ from drivers.protocol.messages import (
 REPLY_TIME = 0.5
 """Time [s] that an instrument may take for an exchange, relays included."""
 
+STOP_TIME = 0.09
+"""Time [s] that it may take for a Stop or Disarm, reading back included; then it is repeated.
+
+Three fit into the time within which a stop is confirmed.
+"""
+
 _LATCHES = 255
 
 
@@ -91,15 +97,16 @@ class ForeignAmplifier(WireBackend):
         request is repeated.
         """
         require_safe(request)
+        limit = max(timeout, STOP_TIME if isinstance(request, Stop | Disarm) else REPLY_TIME)
         try:
-            async with asyncio.timeout(max(timeout, REPLY_TIME)):
+            async with asyncio.timeout(limit):
                 return await self._carry_out(request)
         except (LinkTimeout, CommandError):
             raise
         except TimeoutError:
             raise LinkTimeout(
-                f"no reply within {max(timeout, REPLY_TIME):g} s; check that the amplifier is "
-                "switched on, and its address"
+                f"no reply within {limit:g} s; check that the amplifier is switched on, and its "
+                "address"
             ) from None
         except (ValueError, LookupError) as error:  # of what was read
             self._counters.invalid_frames += 1

@@ -10,6 +10,7 @@ from model.rig.rig import Rig
 from registry.voltage import VoltageDrive
 
 _STEP = 1.0  # Hz
+_HIGHEST = 500.0  # Hz; half of the range in which thresholds are known
 
 
 @dataclass(frozen=True)
@@ -51,11 +52,12 @@ def highest_level(drives: Sequence[VoltageDrive], limit: float) -> float:
 def second_harmonic(drive: VoltageDrive, *, level: float, threshold: str) -> Harmonic:
     """Second harmonic of an ERA with a bias, at a level; threshold: name of the set.
 
+    Of frequencies up to 500 Hz, of which there must be one: above, it is not felt.
     Its force is U / 4 b of the fundamental's, and its acceleration four times its share of motion.
     """
     low, high = drive.frequencies
-    # Half the range in which thresholds are known.
-    frequencies = np.arange(max(low, 10.0), min(high, 500.0) + _STEP / 2, _STEP)
+    frequencies = np.arange(max(low, 10.0), min(high, _HIGHEST) + _STEP / 2, _STEP)
+    frequencies = frequencies[frequencies <= _HIGHEST]
     response, doubled = (
         np.array([abs(drive.at(factor * f)) for f in frequencies]) for factor in (1, 2)
     )
@@ -96,7 +98,7 @@ def _harmonic_text(drives: dict[str, VoltageDrive], rig: Rig) -> list[str]:
             threshold=rig.threshold,
         )
         for name, drive in drives.items()
-        if drive.bias
+        if drive.bias and drive.frequencies[0] <= _HIGHEST
     }
     if not found:
         return []

@@ -14,7 +14,7 @@ from model.finger.perception import detection_threshold
 from model.rig.file import parse_rig
 from model.rig.kind import RIG
 from model.rig.rig import Rig
-from model.rig.voltage_costs import second_harmonic
+from model.rig.voltage_costs import second_harmonic, voltage_costs
 from model.table.build import build_table
 from model.table.question import Question
 from registry.voltage import Law, VoltageDrive
@@ -148,3 +148,11 @@ def test_second_harmonic_by_hand() -> None:
     assert full.worst_db - half.worst_db == pytest.approx(20 * math.log10(2))
     at_60, at_120 = detection_threshold(np.array([60.0, 120.0]), "vibrotactile-probe")
     assert full.worst_db == pytest.approx(20 * math.log10(4 * at_60 / at_120))
+
+
+def test_harmonic_that_is_not_felt_is_left_out() -> None:
+    """Above 500 Hz it is beyond the thresholds: the check says nothing of it, and goes on."""
+    rows = "response: [[40, 6, 0], [1000, 2, -90]], law: quadratic, bias: 0.4"
+    high = text(f"{{{rows}}}", f"{{{rows}}}").replace("[60, 260]", "[510, 600]")
+    (cost,) = voltage_costs(parse_rig("rig.yaml", high))
+    assert "harmonic of" not in cost

@@ -65,7 +65,8 @@ class VoltageBackend(Backend):
         self._limits: tuple[ChannelLimits, ...] = ()
         # By token: the set of motion and that of voltage.
         self._sent: OrderedDict[int, tuple[SafeCommandSet, SafeCommandSet]] = OrderedDict()
-        self._motion_of: dict[int, float] = {}  # last driven frequency [Hz] by channel
+        # By channel: motion and voltage of the last tone that is known to have played.
+        self._played: dict[int, tuple[DriveCommand, DriveCommand]] = {}
         # By slot: envelopes of motion, and those of voltage that the amplifier has.
         self._envelopes: dict[int, SafeEnvelope] = {}
         self._loaded: dict[int, tuple[float, tuple[Knot, ...]]] = {}
@@ -73,6 +74,7 @@ class VoltageBackend(Backend):
     async def open(self) -> None:
         """Open the wire."""
         self._sent.clear()
+        self._played.clear()
         self._loaded.clear()
         await self._backend.open()
 
@@ -97,8 +99,11 @@ class VoltageBackend(Backend):
             case Capabilities() if isinstance(request, GetCaps):
                 return self._capabilities(reply)
             case Achieved():
-                return replace(reply, commands=tuple(map(self._in_motion, reply.commands)))
+                if not isinstance(request, Stage):
+                    self._note_played(reply.token)
+                return self._achieved(reply)
             case Status():
+                self._note_played(reply.token)
                 return replace(reply, levels=self._levels(reply))
             case _:
                 return reply
@@ -192,21 +197,14 @@ class VoltageBackend(Backend):
         known, converted = self._sent.get(safe.token, (None, None))
         if converted is not None and known is safe:
             return converted
-        last = next(reversed(self._sent.values()))[1].commands if self._sent else ()
-        before = {command.channel: command for command in last if command.level > 0}
-        commands = [self._in_voltage(command, before) for command in safe.commands]
+        commands = [self._in_voltage(command) for command in safe.commands]
         converted = safe_voltages(safe, commands, self._limits)
         self._sent[safe.token] = safe, converted
-        for command in safe.commands:
-            if command.level > 0:
-                self._motion_of[command.channel] = command.frequency
         while len(self._sent) > _SETS_KEPT:
             self._sent.popitem(last=False)
         return converted
 
-    def _in_voltage(
-        self, command: DriveCommand, before: Mapping[int, DriveCommand]
-    ) -> DriveCommand:
+    def _in_voltage(self, command: DriveCommand) -> DriveCommand:
         drive = self._drives.get(command.channel)
         if drive is None:
             if command.level > 0:
@@ -216,24 +214,39 @@ class VoltageBackend(Backend):
                     channel=command.channel,
                 )
             return command
-        return to_voltage(command, drive, before.get(command.channel))
+        _, before = self._played.get(command.channel, (None, None))
+        return to_voltage(command, drive, before)
 
-    def _in_motion(self, command: DriveCommand) -> DriveCommand:
-        drive = self._drives.get(command.channel)
-        return command if drive is None else to_motion(command, drive)
+    def _note_played(self, token: int) -> None:
+        """Note the tones of a set that plays, if it was sent."""
+        if token in self._sent:
+            for motion, voltage in zip(*(one.commands for one in self._sent[token]), strict=True):
+                if motion.level > 0:
+                    self._played[motion.channel] = motion, voltage
+
+    def _achieved(self, reply: Achieved) -> Achieved:
+        """Return an achieved set of motion, by the responses that were used for its request."""
+        requested, _ = self._sent.get(reply.token, (None, None))
+        commands = () if requested is None else requested.commands
+        frequencies = {one.channel: one.frequency for one in commands}
+        return replace(
+            reply,
+            commands=tuple(
+                to_motion(one, self._drives[one.channel], frequencies.get(one.channel))
+                if one.channel in self._drives
+                else one
+                for one in reply.commands
+            ),
+        )
 
     def _levels(self, status: Status) -> tuple[float, ...]:
-        """Return levels of motion, at the frequencies of the playing set or the last ones.
+        """Return levels of motion, at the frequencies that played last.
 
         A channel whose frequency is unknown keeps its voltage: zero is zero.
         """
-        frequencies = dict(self._motion_of)
-        if status.token in self._sent:
-            playing, _ = self._sent[status.token]
-            frequencies |= {one.channel: one.frequency for one in playing.commands if one.level > 0}
         return tuple(
-            motion_level(level, self._drives[channel], frequencies[channel])
-            if channel in self._drives and channel in frequencies
+            motion_level(level, self._drives[channel], self._played[channel][0].frequency)
+            if channel in self._played
             else level
             for channel, level in enumerate(status.levels)
         )

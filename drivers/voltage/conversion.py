@@ -27,16 +27,16 @@ def to_voltage(
 ) -> DriveCommand:
     """Convert a command of motion; its limits are not checked.
 
-    before: what the channel was given last, in voltage. Two phases of a halved frequency give the
+    before: what the channel played last, in voltage. Two phases of a halved frequency give the
     same motion; a tone that continues takes that next to the one before, so that it does not pass
     through zero.
     """
-    response = drive.at(command.frequency)
+    response = _response(drive, command.frequency)
     force = command.level / abs(response)
     phase = command.phase - math.degrees(cmath.phase(response))
     frequency = command.frequency
     if drive.is_halved:
-        frequency, phase = frequency / 2, _wrapped(phase + 90.0) / 2
+        frequency, phase = _Q.frequency.quantise(frequency / 2), _wrapped(phase + 90.0) / 2
         if before is not None and command.keep_phase:
             turns = round((before.phase - phase) / 180.0)
             phase += 180.0 * turns
@@ -54,22 +54,29 @@ def knot_in_voltage(knot: Knot, drive: VoltageDrive, frequency: float) -> Knot:
     return Knot(command.level, command.phase)
 
 
-def to_motion(command: DriveCommand, drive: VoltageDrive) -> DriveCommand:
-    """Convert a command of voltage."""
+def to_motion(
+    command: DriveCommand, drive: VoltageDrive, requested: float | None = None
+) -> DriveCommand:
+    """Convert a command of voltage.
+
+    requested [Hz]: of the motion that it was converted from, for what an amplifier achieved of it.
+    At another frequency level and phase would differ by the response, beyond the amplifier's steps.
+    """
     frequency = 2 * command.frequency if drive.is_halved else command.frequency
     phase = 2 * command.phase - 90.0 if drive.is_halved else command.phase
-    response = drive.at(frequency)
+    at = frequency if requested is None else requested
+    response = _response(drive, at)
     return replace(
         command,
         frequency=frequency,
-        level=motion_level(command.level, drive, frequency),
+        level=motion_level(command.level, drive, at),
         phase=_wrapped(round(phase + math.degrees(cmath.phase(response)), _DIGITS)),
     )
 
 
 def motion_level(voltage: float, drive: VoltageDrive, frequency: float) -> float:
     """Level by the amplitude of the voltage, at a frequency [Hz] of motion."""
-    return abs(drive.at(frequency)) * drive.drive_amplitude(voltage)
+    return abs(_response(drive, frequency)) * drive.drive_amplitude(voltage)
 
 
 def capabilities_in_motion(
@@ -118,6 +125,11 @@ def capabilities_in_motion(
         features=capabilities.features & ~Feature.VOLTAGE,
         has_exact_fades=False,
     )
+
+
+def _response(drive: VoltageDrive, frequency: float) -> complex:
+    """Response at a frequency [Hz] of motion; at twice the half that the wire carries."""
+    return drive.at(2 * _Q.frequency.quantise(frequency / 2) if drive.is_halved else frequency)
 
 
 def _wrapped(degrees: float) -> float:

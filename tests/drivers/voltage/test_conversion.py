@@ -1,5 +1,6 @@
 """Commands of motion as voltages: by hand, and by spectra of sampled voltages."""
 
+import cmath
 import math
 from dataclasses import replace
 
@@ -77,6 +78,28 @@ def test_halved_phase_continues_on_the_near_side() -> None:
     assert first.phase == pytest.approx(85.0)
     assert to_voltage(there, drive).phase == pytest.approx(-85.0)
     assert to_voltage(there, drive, first).phase == pytest.approx(95.0)
+
+
+@pytest.mark.parametrize("law", [Law.LINEAR, Law.QUADRATIC])
+def test_reply_is_read_at_the_requested_frequency(law: Law) -> None:
+    """An amplifier that rounds 149.95 to 150.5 Hz is compared with what it was sent, by its steps.
+
+    Half of 149.95 Hz goes as 75 Hz, for which level and phase are meant.
+    """
+    rows = ((140.0, 4.0, 0.0), (160.0, 2.0, math.radians(-80.0)))
+    drive = VoltageDrive(rows, law=law, frequencies=(140.0, 160.0))
+    asked = DriveCommand(0, 149.95, 0.5, 30.0)
+    sent = to_voltage(asked, drive)
+    assert sent.frequency == (149.95 if law is Law.LINEAR else 75.0)
+    meant = 149.95 if law is Law.LINEAR else 150.0
+    part = (meant - 140.0) / 20.0
+    response = 4.0 + part * (2.0 * cmath.exp(-1j * math.radians(80.0)) - 4.0)
+    force = sent.level if law is Law.LINEAR else sent.level**2 / 2
+    assert force * abs(response) == pytest.approx(0.5)
+    played = replace(sent, frequency=150.5 if law is Law.LINEAR else 75.25)
+    found = to_motion(played, drive, requested=149.95)
+    assert found.frequency == 150.5
+    assert found.phasor == pytest.approx(asked.phasor)
 
 
 def test_level_is_what_voltage_reaches_at_every_frequency() -> None:

@@ -1,5 +1,7 @@
 """An amplifier of voltage behind its conversion: limits, refusals, statuses."""
 
+import cmath
+import math
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -11,6 +13,7 @@ from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError, CommandRefused
 from drivers.guard import Guard, safe_voltages
+from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.protocol.messages import AmplifierState, ChannelLimits
 from paper_table import smooth_rig
 from registry.voltage import Law, VoltageDrive
@@ -53,6 +56,46 @@ async def test_replies_are_of_motion(law: str) -> None:
         assert outputs[0][-1].frequency == (60.0 if law == "quadratic" else 120.0)
         again = await amplifier.stop()
         assert again.state is AmplifierState.QUICK_STOP_ACTIVE
+
+
+@pytest.mark.parametrize("law", LAWS)
+@in_virtual_time
+async def test_half_a_frequency_that_no_wire_carries_is_no_contradiction(law: str) -> None:
+    """Half of 149.95 Hz goes as 75 Hz; near its resonance the response turns by 4 degrees per Hz.
+
+    A step of the phase is 0.02 degrees.
+    """
+    async with opened(law) as (_, amplifier, guard):
+        await amplifier.disarm()
+        checked = CheckedAmplifier(amplifier)
+        await checked.arm()
+        asked = replace(TONES[0], frequency=149.95)
+        achieved = await checked.apply(guard.check(a_set(amplifier, asked)))
+        await checked.heartbeat()
+        await checked.heartbeat()
+        assert achieved.commands[0].frequency == pytest.approx(150.0, abs=0.051)
+        assert achieved.commands[0].phase == pytest.approx(asked.phase, abs=0.011)
+
+
+@in_virtual_time
+async def test_halved_phase_is_near_that_which_plays() -> None:
+    """Not near one that was staged since and never played.
+
+    The voltage turns by half of 160 degrees from 80 to -120: by 80 degrees, not by 100.
+    """
+    async with opened("quadratic") as (bench, amplifier, guard):
+        phases = []
+        for phase, is_played in ((80.0, True), (-60.0, False), (-120.0, True)):
+            tone = replace(TONES[0], phase=phase, keep_phase=True)
+            safe = guard.check(a_set(amplifier, tone))
+            if is_played:
+                await amplifier.apply(safe)
+                last = bench.amplifiers["main"].outputs[0][-1]
+                phases.append(math.degrees(cmath.phase(last.settled_amplitude)))
+            else:
+                await amplifier.stage(safe)
+        turned = math.remainder(phases[1] - phases[0], 360.0)
+        assert turned == pytest.approx(80.0, abs=0.1)
 
 
 @in_virtual_time

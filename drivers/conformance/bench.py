@@ -19,8 +19,14 @@ from drivers.conformance.raw.line import RawLine
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.guard.channel_state import Interval
-from drivers.operation.plausibility import CYCLE, MEASURING_ERROR
-from drivers.protocol.messages import AmplifierState, Capabilities, Feature, Status
+from drivers.operation.plausibility import CYCLE
+from drivers.protocol.messages import (
+    MEASURING_ERROR,
+    AmplifierState,
+    Capabilities,
+    Feature,
+    Status,
+)
 
 LEVEL = 0.2
 """Level of driven channels: perceptible, and far from any limit."""

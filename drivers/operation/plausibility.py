@@ -14,13 +14,17 @@ from drivers.guard import SafeCommandSet
 from drivers.guard.channel_state import ChannelState, Interval
 from drivers.guard.record import states_after
 from drivers.protocol.definition import PROTOCOL, WireQuantity
-from drivers.protocol.messages import Achieved, AmplifierState, Capabilities, Feature, Status
+from drivers.protocol.messages import (
+    MEASURING_ERROR,
+    Achieved,
+    AmplifierState,
+    Capabilities,
+    Feature,
+    Status,
+)
 
 MAX_CONTRADICTIONS = 2
 """Contradictions in a row that are a fault; a single one may be a moment between two sets."""
-
-MEASURING_ERROR = 0.002
-"""Of full stroke, of amplifiers that measure their levels."""
 
 CYCLE = 0.002
 """Longest lag [s] of playback and reports behind a commit."""

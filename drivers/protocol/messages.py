@@ -30,6 +30,9 @@ from typing import TypeAlias
 from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.protocol.extensible_enum import ExtensibleEnum
 
+MEASURING_ERROR = 0.002
+"""Of level 1, of amplifiers that measure their levels."""
+
 
 class AmplifierState(IntEnum):
     """Amplifier states by their CiA 402 names; the numbers are those on the wire."""

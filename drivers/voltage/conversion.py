@@ -15,7 +15,7 @@ from dataclasses import replace
 
 from drivers.command import DriveCommand, Knot
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import Capabilities, Feature
+from drivers.protocol.messages import MEASURING_ERROR, Capabilities, Feature
 from registry.voltage import VoltageDrive
 
 _Q = PROTOCOL.quantities
@@ -102,6 +102,8 @@ def capabilities_in_motion(
         reached.append(low)
         # Steepest at the highest voltage; that of the square is twice its share.
         step = max(capabilities.level_step, _Q.level.step)
+        if Feature.LEVELS_MEASURED in capabilities.features:
+            step += MEASURING_ERROR / 2  # levels are compared within two steps
         steps.append((2 if drive.is_halved else 1) * high / swing * step if swing else step)
     is_halved = any(drive.is_halved for drive in drives.values())
     if is_halved:

@@ -147,6 +147,10 @@ def test_capabilities_are_of_motion() -> None:
     assert not found.has_cross_fades
     assert not found.envelope_knots
     assert found.features == Feature.WHOLE
+    measured = replace(CAPABILITIES, features=Feature.WHOLE | Feature.LEVELS_MEASURED)
+    found = capabilities_in_motion(measured, {0: halved, 1: halved})
+    # Steepest at full voltage, 4 * 0.8; an error of 0.002, half of it in each of two steps.
+    assert found.level_step == pytest.approx(4 * 0.8 * (1e-4 + 0.001))
     linear = flat(0.5, 0.0, Law.LINEAR)
     found = capabilities_in_motion(CAPABILITIES, {0: linear, 1: halved})
     assert (found.frequency_min, found.frequency_max) == (20.0, 400.0)

@@ -9,6 +9,7 @@ import asyncio
 from abc import abstractmethod
 from collections.abc import Sequence
 
+from drivers.backends.host_lock import HostLock
 from drivers.backends.wire_backend import WireBackend
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandError, LinkTimeout
@@ -50,13 +51,24 @@ _LATCHES = 255
 
 
 class ForeignAmplifier(WireBackend):
-    """A backend by six methods of what is different: see their docstrings."""
+    """A backend by six methods of what is different: see their docstrings.
 
-    def __init__(self) -> None:
+    address: of the instrument, the same for every program on this machine: one of them arms it,
+    until it closes.
+    """
+
+    def __init__(self, address: str) -> None:
         super().__init__()
+        self._host_lock = HostLock(address)
         self._state = AmplifierState.SWITCH_ON_DISABLED
         self._playing: tuple[CommandSet | None, Achieved] = None, Achieved(0, ())
         self._latch = 0
+
+    async def close(self) -> None:
+        """End the arming: other programs may arm it now. Subclasses also close their wire."""
+        if self._state is AmplifierState.OPERATION_ENABLED:
+            self._state = AmplifierState.SWITCH_ON_DISABLED
+        self._host_lock.release()
 
     @abstractmethod
     async def identify(self) -> Identity:
@@ -92,6 +104,9 @@ class ForeignAmplifier(WireBackend):
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Carry out a request by the methods of the subclass.
+
+        A Stop or Disarm silences whatever plays, then raises LinkError if another program on this
+        machine may play again.
 
         ValueError or LookupError, which words that are no numbers raise, mean a damaged reply: the
         request is repeated.
@@ -129,6 +144,7 @@ class ForeignAmplifier(WireBackend):
                 if is_latched:
                     return Nak(NakCode.WRONG_STATE)
                 if not is_enabled:
+                    self._host_lock.acquire()
                     await self.prepare()
                     self._playing = None, Achieved(0, ())
                     self._state = AmplifierState.OPERATION_ENABLED
@@ -136,10 +152,12 @@ class ForeignAmplifier(WireBackend):
                 if is_enabled:
                     self._state = AmplifierState.SWITCH_ON_DISABLED
                 await self.silence()
+                self._host_lock.require_free()
             case Stop():
                 self._latch = self._latch % _LATCHES + 1
                 self._state = AmplifierState.QUICK_STOP_ACTIVE
                 await self.silence()
+                self._host_lock.require_free()
             case Clear(latch=latch):
                 if is_latched and latch != self._latch:
                     return Nak(NakCode.WRONG_LATCH)
@@ -162,13 +180,15 @@ class ForeignAmplifier(WireBackend):
         return achieved
 
     async def _status(self) -> Status:
-        """Return the status: levels read from the amplifier."""
+        """Return the status: levels read from the amplifier; armed if another program may play."""
         levels = tuple(await self.levels())
+        is_armed_elsewhere = self._host_lock.is_held_elsewhere
+        state = AmplifierState.OPERATION_ENABLED if is_armed_elsewhere else self._state
         return Status(
-            state=self._state,
+            state=state,
             fault=Fault.NONE,
             token=self._playing[1].token,
-            high_voltage=self._state is AmplifierState.OPERATION_ENABLED or any(levels),
+            high_voltage=state is AmplifierState.OPERATION_ENABLED or any(levels),
             temperature=25.0,
             watchdog_left=0.0,
             levels=levels,

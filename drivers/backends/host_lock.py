@@ -1,4 +1,4 @@
-"""Lock with which one program on this machine arms an amplifier over TCP.
+"""Lock with which one program on this machine arms an amplifier that cannot tell hosts apart.
 
 Serial ports are exclusive, and CAN nodes reveal another host. Reading the status and stopping need
 no lock.
@@ -20,22 +20,33 @@ class HostLock:
 
     def __init__(self, name: str) -> None:
         self._name = name
+        self._address = f"\0era-haptics host of {name}"[:100]
         self._held: socket.socket | None = None
 
     def acquire(self) -> None:
         """Acquire it; LinkError if another program on this machine holds it."""
-        if self._held is not None or sys.platform != "linux" or HARDWARE_PROVIDER.get() is not None:
+        if self._held is not None or not _has_effect():
             return
         held = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
-            held.bind(f"\0era-haptics host of {self._name}"[:100])
+            held.bind(self._address)
         except OSError as error:
             held.close()
-            raise LinkError(
-                f"another program on this machine drives the amplifier at {self._name}; end it, or "
-                "stop it with era stop"
-            ) from error
+            raise self._error() from error
         self._held = held
+
+    @property
+    def is_held_elsewhere(self) -> bool:
+        """Whether another program on this machine holds it."""
+        if self._held is not None or not _has_effect():
+            return False
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
+            return probe.connect_ex(self._address) == 0
+
+    def require_free(self) -> None:
+        """Raise LinkError if another program on this machine holds it."""
+        if self.is_held_elsewhere:
+            raise self._error()
 
     def release(self) -> None:
         """Release it, if held."""
@@ -43,3 +54,14 @@ class HostLock:
         if held is not None:
             with contextlib.suppress(OSError):
                 held.close()
+
+    def _error(self) -> LinkError:
+        return LinkError(
+            f"another program on this machine drives the amplifier at {self._name}; end it, or "
+            "stop it with era stop"
+        )
+
+
+def _has_effect() -> bool:
+    """Whether names are shared with other programs: not on simulated hardware."""
+    return sys.platform == "linux" and HARDWARE_PROVIDER.get() is None

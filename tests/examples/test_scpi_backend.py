@@ -1,5 +1,6 @@
 """The example backend of a signal generator, against an instrument by its standard and manual."""
 
+import asyncio
 import math
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -274,3 +275,11 @@ async def test_generator_that_hangs_up_is_lost(example: ModuleType) -> None:
     """A closed connection is a loss; a port without a generator cannot be opened."""
     with pytest.raises(LinkError):
         await Amplifier(example.ScpiBackend("scpi://127.0.0.1:9")).open()
+    server = await asyncio.start_server(lambda _, writer: writer.close(), "127.0.0.1", 0)
+    async with server:
+        backend = example.ScpiBackend(f"scpi://127.0.0.1:{server.sockets[0].getsockname()[1]}")
+        causes: asyncio.Queue[str] = asyncio.Queue()
+        backend.listen(lambda _: None, causes.put_nowait)
+        await backend.open()
+        assert await asyncio.wait_for(causes.get(), 5.0)
+        await backend.close()

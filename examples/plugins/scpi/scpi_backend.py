@@ -23,8 +23,8 @@ from era_haptics.plugins.backends import (
 )
 
 CHANNELS = (1, 2)
-LEAST = 0.002  # Vpp, into an open circuit
-MOST = 10.0  # V, peak with bias, into an open circuit
+MIN_VPP = 0.002  # V, into an open circuit
+MAX_PEAK = 10.0  # V, peak with bias, into an open circuit
 OPTIONS = {"full_voltage": 5.0, "bias": 0.0, "baud": 115_200.0}
 IS_ON = {"1": True, "ON": True, "0": False, "OFF": False}
 
@@ -33,7 +33,6 @@ class ScpiBackend(ForeignAmplifier):
     """A generator at a URL."""
 
     def __init__(self, url: str) -> None:
-        super().__init__()
         options = dict(OPTIONS)
         try:
             parts = urlsplit(url)
@@ -49,19 +48,22 @@ class ScpiBackend(ForeignAmplifier):
                 f"URL must be scpi://HOST[:PORT] or scpi+serial:///dev/ttyUSB0, with "
                 f"{', '.join(OPTIONS)} at most as options, got {url!r}"
             )
+        super().__init__(port)
         self._full, self._bias = options["full_voltage"], options["bias"]
-        if not (LEAST < self._full <= MOST and 0 <= self._bias < 1):
-            raise CommandError(f"full_voltage must be up to {MOST:g} V, bias below 1: {url!r}")
-        self._line = TextLine(port, baud=int(options["baud"]), on_loss=self._lose)
+        if not (MIN_VPP < self._full <= MAX_PEAK and 0 <= self._bias < 1):
+            raise CommandError(f"full_voltage must be up to {MAX_PEAK:g} V, bias below 1: {url!r}")
+        self._line = TextLine(
+            port, baud=int(options["baud"]), on_loss=lambda cause: self._on_loss(cause)
+        )
         self._number = 0
 
     async def open(self) -> None:
         """Open the line."""
-        self._loss = None
         await self._line.open()
 
     async def close(self) -> None:
         """Close the line."""
+        await super().close()
         await self._line.close()
 
     async def identify(self) -> Identity:
@@ -78,7 +80,7 @@ class ScpiBackend(ForeignAmplifier):
             frequency_max=3000.0,
             frequency_step=0.05,
             level_max=1.0,
-            level_step=max(LEAST / (2 * self._full), 1e-4),
+            level_step=max(MIN_VPP / (2 * self._full), 1e-4),
             phase_step=0.01,
             ramp_max=0.0,
             watchdog_min=0.0,
@@ -120,9 +122,9 @@ class ScpiBackend(ForeignAmplifier):
         return [IS_ON[on] * float(vpp) / (2 * self._full) for on, vpp in pairs]
 
     def _vpp(self, command: DriveCommand) -> float:
-        """Peak to peak, 0 below half of the least."""
+        """Peak to peak, 0 below half of the minimum."""
         vpp = 2 * self._full * command.level
-        return max(vpp, LEAST) if vpp >= LEAST / 2 else 0.0
+        return max(vpp, MIN_VPP) if vpp >= MIN_VPP / 2 else 0.0
 
     async def _played(self, command: DriveCommand) -> DriveCommand:
         """Read back what a channel plays."""
@@ -159,10 +161,6 @@ class ScpiBackend(ForeignAmplifier):
             if number.lstrip("+") == str(self._number) and len(answers) == count:
                 return answers
             self._counters.unexpected_frames += 1
-
-    def _lose(self, cause: str) -> None:
-        self._loss = cause
-        self._on_loss(cause)
 
 
 _STATE = (("OUTP", ""), ("SOUR", ":VOLT"))

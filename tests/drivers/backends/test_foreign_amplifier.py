@@ -1,15 +1,19 @@
-"""The base of laboratory instruments: stops that are lost."""
+"""The base of laboratory instruments: stops that are lost, and other programs that arm it."""
 
 import asyncio
 from collections.abc import Sequence
 from dataclasses import replace
 
+import pytest
+
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.backends.foreign_amplifier import ForeignAmplifier
+from drivers.backends.host_lock import HostLock
 from drivers.command import DriveCommand
-from drivers.operation.silence import stop_and_confirm
-from drivers.protocol.messages import Capabilities, Feature, Identity
+from drivers.errors import LinkError
+from drivers.operation.silence import SilenceStatus, stop_and_confirm
+from drivers.protocol.messages import AmplifierState, Capabilities, Feature, Identity
 from vendor_pages import CAPABILITIES
 from virtual_loop import in_virtual_time
 
@@ -18,14 +22,11 @@ class Instrument(ForeignAmplifier):
     """An instrument of one channel; lost: how many of the next OFF lines do not arrive."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__("instrument of a test")
         self.level = 0.0
         self.off_lines = self.lost = 0
 
     async def open(self) -> None:
-        """There is no wire."""
-
-    async def close(self) -> None:
         """There is no wire."""
 
     async def identify(self) -> Identity:
@@ -63,3 +64,46 @@ async def test_lost_stop_is_repeated_within_one_confirmation() -> None:
     assert instrument.off_lines == 3
     assert instrument.level == 0.0
     assert outcome.is_confirmed
+
+
+@in_virtual_time
+async def test_stop_is_not_confirmed_while_another_program_may_play() -> None:
+    """Its outputs are off, but the program that has armed it may switch them on again."""
+    instrument, other = Instrument(), HostLock("instrument of a test")
+    amplifier = Amplifier(instrument)
+    await amplifier.connect()
+    other.acquire()
+    instrument.level = 0.5
+    outcome = await stop_and_confirm(amplifier)
+    assert instrument.level == 0.0
+    assert outcome.silence is SilenceStatus.MAY_PLAY
+    assert "instrument of a test" in outcome.cause
+    await amplifier.close()
+    await amplifier.open(take_over=False)
+    assert (await amplifier.status()).state is AmplifierState.OPERATION_ENABLED
+    other.release()
+    assert (await stop_and_confirm(amplifier)).is_confirmed
+
+
+@in_virtual_time
+async def test_one_program_arms_until_it_closes() -> None:
+    """Another one is refused by its Arm, and by its taking over; the first stops it, confirmed."""
+    first, second = Amplifier(Instrument()), Amplifier(Instrument())
+    await first.open()
+    await second.open()
+    await first.arm()
+    with pytest.raises(LinkError, match="instrument of a test"):
+        await second.arm()
+    await second.close()
+    with pytest.raises(LinkError, match="instrument of a test"):
+        await second.open()
+    assert (await stop_and_confirm(first)).is_confirmed
+    await first.clear()
+    await first.arm()
+    await first.close()
+    await first.open(take_over=False)
+    assert (await first.status()).state is AmplifierState.SWITCH_ON_DISABLED
+    await first.close()
+    await second.open()
+    assert (await second.arm()).state is AmplifierState.OPERATION_ENABLED
+    await second.close()

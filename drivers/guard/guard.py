@@ -1,4 +1,4 @@
-"""The guard: the only maker of command sets that encoders accept.
+"""The guard, and what encoders accept: sets and envelopes that passed it, or made of these.
 
 Its limits are fixed at construction, see `drivers.guard.limits`.
 """
@@ -14,6 +14,7 @@ from drivers.errors import CommandError, CommandRefused
 from drivers.guard.channel_state import duration
 from drivers.guard.limits import capabilities_in_force, limits_in_force
 from drivers.guard.record import PlayRecord, skips_endings, vibrates
+from drivers.guard.rounding import rounded_down, rounded_envelope, rounded_set
 from drivers.guard.rules import (
     GuardContext,
     check_envelope,
@@ -28,11 +29,14 @@ from drivers.protocol.messages import Capabilities, ChannelLimits, Feature
 from registry.limits import GuardLimits
 
 _KEY = object()
+_Q = PROTOCOL.quantities
 
 
 @final
 class SafeCommandSet(CommandSet):
-    """A command set that has passed a guard; only a `Guard` can make one.
+    """A command set that has passed a guard, of motion, or of voltage made of one that has.
+
+    Made only in this module: by a `Guard`, and by `safe_voltages`.
 
     settled_after [s]: time from its commit until all ramps and envelopes have ended; record: of the
     guard, for `Amplifier`.
@@ -53,7 +57,9 @@ class SafeCommandSet(CommandSet):
         key: object = None,
     ) -> None:
         if key is not _KEY or record is None:
-            raise TypeError("SafeCommandSet must be made by Guard.check or Guard.silence")
+            raise TypeError(
+                "SafeCommandSet must be made by Guard.check, Guard.silence or safe_voltages"
+            )
         super().__init__(token=token, commands=commands, ramp=ramp, valid_for=valid_for)
         object.__setattr__(self, "settled_after", settled_after)
         object.__setattr__(self, "record", record)
@@ -67,14 +73,18 @@ def safe_voltages(
 ) -> SafeCommandSet:
     """Return a set that passed its guard with its commands converted to voltage, if within limits.
 
-    limits: by channel, see `checked_voltage`. Raises CommandRefused.
+    Levels, frequencies and phases may differ; silence, envelopes and flags may not. limits: by
+    channel, see `checked_voltage`. Raises CommandRefused.
     """
     channels, requested = ([one.channel for one in each] for each in (commands, safe.commands))
     if channels != requested:
         raise CommandRefused(f"channels of the voltages must be {requested}, got {channels}")
     return SafeCommandSet(
         safe.token,
-        tuple(checked_voltage(command, limits[command.channel]) for command in commands),
+        tuple(
+            checked_voltage(command, passed, limits[passed.channel])
+            for command, passed in zip(commands, safe.commands, strict=True)
+        ),
         ramp=safe.ramp,
         valid_for=safe.valid_for,
         settled_after=safe.settled_after,
@@ -85,7 +95,10 @@ def safe_voltages(
 
 @final
 class SafeEnvelope(Envelope):
-    """An envelope that has passed a guard; only a `Guard` can make one. record: of the guard."""
+    """An envelope that has passed a guard, or one of voltage made of it by `safe_voltage_envelope`.
+
+    record: of the guard.
+    """
 
     record: PlayRecord
 
@@ -99,7 +112,9 @@ class SafeEnvelope(Envelope):
         key: object = None,
     ) -> None:
         if key is not _KEY or record is None:
-            raise TypeError("SafeEnvelope must be made by Guard.check_envelope")
+            raise TypeError(
+                "SafeEnvelope must be made by Guard.check_envelope or safe_voltage_envelope"
+            )
         super().__init__(slot=slot, step=step, knots=knots)
         object.__setattr__(self, "record", record)
 
@@ -119,7 +134,10 @@ def safe_voltage_envelope(
     return SafeEnvelope(
         safe.slot,
         safe.step,
-        tuple(checked_knot(knot, limits, slot=safe.slot) for knot in knots),
+        tuple(
+            checked_knot(knot, passed, limits, slot=safe.slot)
+            for knot, passed in zip(knots, safe.knots, strict=True)
+        ),
         record=safe.record,
         key=_KEY,
     )
@@ -178,14 +196,15 @@ class Guard:
         duty that are left; a set that is sent later is checked again then.
         """
         check_set(command_set, self._context)
-        rounded = self._rounded(command_set)
+        rounded = rounded_set(
+            command_set, idle_frequency=self._idle_frequency, ramp_max=self.ramp_max
+        )
         check_power(rounded, self._context)
         remaining = self._record.check(rounded, ramp=rounded.ramp)
         valid_for = rounded.valid_for
         if vibrates(rounded) and remaining != float("inf"):
-            valid_for = min(valid_for or remaining, remaining, _VALID_FOR.high)
-            # Rounded down; 0 on the wire means without end.
-            valid_for = math.floor(valid_for * _VALID_FOR.per_unit) / _VALID_FOR.per_unit
+            valid_for = min(valid_for or remaining, remaining, _Q.valid_for.high)
+            valid_for = rounded_down(valid_for, _Q.valid_for)  # 0 means without end
             if valid_for <= 0:
                 raise CommandRefused("on-time or duty limit reached; pause the vibration")
             rounded = replace(rounded, valid_for=valid_for)
@@ -199,16 +218,10 @@ class Guard:
         Sets that refer to its slot are checked with it too from now on: load it before them.
         """
         check_envelope(envelope, self._context)
-        quantities = PROTOCOL.quantities
-        knots = tuple(
-            Knot(
-                quantities.level.quantise(float(knot.level)),
-                quantities.phase.quantise(float(knot.phase)),
-            )
-            for knot in envelope.knots
+        rounded = rounded_envelope(envelope)
+        safe = SafeEnvelope(
+            rounded.slot, rounded.step, rounded.knots, record=self._record, key=_KEY
         )
-        step = quantities.envelope_step.quantise(float(envelope.step))
-        safe = SafeEnvelope(int(envelope.slot), step, knots, record=self._record, key=_KEY)
         check_envelope(safe, self._context)
         self._record.expect_load(safe)
         return safe
@@ -264,34 +277,7 @@ class Guard:
         left = self._record.fade_left()
         if ramp <= left:
             return ramp
-        return math.floor(left * _RAMP.per_unit) / _RAMP.per_unit
-
-    def _rounded(self, command_set: CommandSet) -> CommandSet:
-        """Return a set that passed the rules as the wire carries it; a silent channel gets a
-        frequency that the amplifier accepts."""
-        quantities = PROTOCOL.quantities
-        valid_for = float(command_set.valid_for)
-        return CommandSet(
-            token=int(command_set.token),
-            commands=tuple(
-                DriveCommand(
-                    channel=int(command.channel),
-                    frequency=quantities.frequency.quantise(float(command.frequency))
-                    if command.level > 0 or command.onset
-                    else self._idle_frequency,
-                    level=quantities.level.quantise(float(command.level)),
-                    phase=quantities.phase.quantise(float(command.phase)),
-                    keep_phase=bool(command.keep_phase),
-                    onset=int(command.onset),
-                    ending=int(command.ending),
-                    skip_ending=bool(command.skip_ending),
-                )
-                for command in command_set.commands
-            ),
-            ramp=min(_rounded_up(command_set.ramp), self._capabilities.ramp_max),
-            # Must not be rounded to 0, which means without end.
-            valid_for=max(_VALID_FOR.quantise(valid_for), _VALID_FOR.step) if valid_for else 0.0,
-        )
+        return rounded_down(left, _Q.ramp)
 
     def _make_safe(self, command_set: CommandSet) -> SafeCommandSet:
         fades = [command_set.ramp]
@@ -310,13 +296,3 @@ class Guard:
             record=self._record,
             key=_KEY,
         )
-
-
-def _rounded_up(ramp: float) -> float:
-    """Round a ramp [s] to the next step of the wire, so that no level rises faster."""
-    return math.ceil(float(ramp) * _RAMP.per_unit - _SLACK) / _RAMP.per_unit
-
-
-_SLACK = 1e-6  # of a step; sums of floats
-_VALID_FOR = PROTOCOL.quantities.valid_for
-_RAMP = PROTOCOL.quantities.ramp

@@ -12,12 +12,29 @@ _ROUNDING = 1 + 1e-9
 _Q = PROTOCOL.quantities
 
 
-def checked_voltage(command: DriveCommand, limits: ChannelLimits) -> DriveCommand:
+def checked_voltage(
+    command: DriveCommand, passed: DriveCommand, limits: ChannelLimits
+) -> DriveCommand:
     """Return a command of voltage as the wire rounds it; raises CommandRefused beyond its limits.
 
-    limits: of its amplitude as a share of the full voltage, and of its frequency [Hz].
+    passed: the command of motion; the voltage of a silent one is 0, and envelopes and flags are the
+    same. limits: of its amplitude as a share of the full voltage, and of its frequency [Hz].
     """
     channel = command.channel
+    if command.level > 0 and not passed.level > 0:
+        raise CommandRefused(
+            f"voltage of channel {channel} must be 0 where its motion is, got {command.level:g}",
+            channel=channel,
+        )
+    as_passed = replace(
+        passed, frequency=command.frequency, level=command.level, phase=command.phase
+    )
+    if command != as_passed:
+        raise CommandRefused(
+            f"envelopes and flags of the voltage of channel {channel} must be those of its motion, "
+            f"got {command} for {passed}",
+            channel=channel,
+        )
     if not _is_within(command.level, limits):
         raise CommandRefused(
             f"voltage of channel {channel} must be 0 to {limits.level_max:g} of the full one, got "
@@ -39,8 +56,16 @@ def checked_voltage(command: DriveCommand, limits: ChannelLimits) -> DriveComman
     )
 
 
-def checked_knot(knot: Knot, limits: ChannelLimits, *, slot: int) -> Knot:
-    """Return a knot of voltage as the wire rounds it; raises CommandRefused beyond its limits."""
+def checked_knot(knot: Knot, passed: Knot, limits: ChannelLimits, *, slot: int) -> Knot:
+    """Return a knot of voltage as the wire rounds it; raises CommandRefused beyond its limits.
+
+    passed: the knot of motion; the voltage of a silent one is 0.
+    """
+    if knot.level > 0 and not passed.level > 0:
+        raise CommandRefused(
+            f"voltage of the envelope in slot {slot} must be 0 where its motion is, got "
+            f"{knot.level:g}"
+        )
     if not _is_within(knot.level, limits):
         raise CommandRefused(
             f"voltage of the envelope in slot {slot} must be 0 to {limits.level_max:g} of the full "

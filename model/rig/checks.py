@@ -135,7 +135,7 @@ def _check_on_plate(
 def _check_wiring(validation: Validation[RigSection], names: tuple[str, ...]) -> None:
     amplifiers = validation.mapping(("amplifiers",))
     wired: dict[tuple[str, int], str] = {}
-    if names and not any("amplifier" in validation.mapping(("eras", name)) for name in names):
+    if names and not any(_has(validation, name, "amplifier") for name in names):
         validation.add(("eras",), "must have at least one ERA with an amplifier; add its amplifier")
     for name in names:
         amplifier = validation.field(("eras", name, "amplifier"), EraSection)
@@ -175,7 +175,7 @@ def _check_voltages(validation: Validation[RigSection], names: tuple[str, ...]) 
         amplifier = validation.mapping(("eras", name)).get("amplifier")
         driven.setdefault(None if amplifier is None else str(amplifier), []).append(name)
     for amplifier, several in driven.items():
-        given = [name for name in several if "voltage" in validation.mapping(("eras", name))]
+        given = [name for name in several if _has(validation, name, "voltage")]
         if amplifier is None:
             for name in given:
                 validation.add(
@@ -193,6 +193,11 @@ def _check_voltages(validation: Validation[RigSection], names: tuple[str, ...]) 
             section = validation.part(("eras", name, "voltage"), VoltageSection)
             for key, problem in _voltage_problems(section, limits) if section else ():
                 validation.add(("eras", name, "voltage", key), problem)
+
+
+def _has(validation: Validation[RigSection], name: str, key: str) -> bool:
+    """Whether an ERA has a key that is not empty."""
+    return validation.mapping(("eras", name)).get(key) is not None
 
 
 def _voltage_problems(section: VoltageSection, limits: LimitsSection) -> Iterator[tuple[str, str]]:

@@ -94,6 +94,15 @@ def test_era_without_amplifier_must_have_neither_channel_nor_voltage() -> None:
     assert list(problems(useless)) == ["eras.NW.voltage"]
 
 
+def test_empty_key_is_as_one_left_out() -> None:
+    """An empty `voltage:` beside an ERA that has one, and an empty `amplifier:` of every ERA."""
+    assert list(problems(text(sw=""))) == ["eras.SW.voltage"]
+    assert list(problems(text(se=""))) == ["eras.SE.voltage"]
+    undriven = text("", "").replace("amplifier: main, channel: 0", "amplifier: null")
+    undriven = undriven.replace("amplifier: main, channel: 1", "amplifier: null")
+    assert list(problems(undriven)) == ["eras"]
+
+
 def test_era_without_amplifier_supports_as_one_at_rest() -> None:
     """Fields of the others are those of the rig in which it is wired and not driven.
 

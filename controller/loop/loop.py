@@ -84,7 +84,6 @@ class Controller:
         self._observer = observer or Observer()
         self._intent_source = intent_source or BuzzNewestContact()
         self._timing = timing
-        self._squares_ramps = any(drive.is_halved for drive in rig.voltage.values())
         self._drive_mode = drive_mode
         self._max_loading_time = max_loading_time if timing is not None else 0.0
         self._rejects = RejectCounter(_logger)
@@ -322,8 +321,8 @@ class Controller:
                 decision.pattern,
                 commands=commands,
                 sent_at=sent_at,
-                # The square of a ramp is not the ramp that is predicted.
-                timing=None if self._squares_ramps else self._timing,
+                # Bases do not follow a ramp of the voltage as is predicted.
+                timing=None if self._rig.voltage else self._timing,
             )
             self._report(self._observer.pattern_applied, applied)
         else:

@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from importlib import util
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
+from registry.voltage import Law
 from scpi_generator import Generator, on_tcp
 
 FOLDER = Path(__file__).parents[2] / "examples" / "plugins" / "scpi"
@@ -129,3 +131,18 @@ async def test_touches_play_two_channels_in_phase(rig: Rig, table: LocalizationT
     pattern = applied[-1].pattern
     assert pattern.ramp == 0.0
     assert set(pattern.excitation) == {"SW", "NE"}
+
+
+async def test_onset_of_an_actuator_is_not_predicted(rig: Rig, table: LocalizationTable) -> None:
+    """A linear law follows a ramp only as fast as the actuator does."""
+    drives = {name: replace(drive, law=Law.LINEAR) for name, drive in rig.voltage.items()}
+    linear = replace(rig, voltage=drives)
+    async with controlled(linear, table, Generator(), is_supervised=True) as found:
+        controller, _, applied, _ = found
+        await controller.open()
+        await controller.arm()
+        running = asyncio.create_task(controller.run())
+        await held(controller, FINGER, until=lambda: len(applied) == 1)
+        await controller.close()
+        await running
+    assert applied[0].timing is None

@@ -20,6 +20,9 @@ from typing import TypeAlias
 Response: TypeAlias = tuple[tuple[float, float, float], ...]
 """Rows of frequency [Hz], magnitude, phase [rad]; by ascending frequency."""
 
+HIGHEST_FELT = 1000.0
+"""Hz; the end of the detection thresholds, beyond which no harmonic counts."""
+
 
 class Law(StrEnum):
     """How the force of an actuator follows its voltage."""
@@ -32,9 +35,11 @@ class Law(StrEnum):
 class VoltageDrive:
     """One ERA behind an amplifier of voltage.
 
-    response: full strokes of its base by a sinusoidal drive term of amplitude 1. bias, maximum: the
-    constant part of the voltage, and its highest peak with it, as shares of the full voltage;
-    bias only with the quadratic law. frequencies [Hz]: the lowest and highest that are played.
+    response: full strokes of its base by a sinusoidal drive term of amplitude 1; static: by a
+    constant one of 1, None where unknown. bias, maximum: the constant part of the voltage, and its
+    highest peak with it, as shares of the full voltage; minimum: its lowest with a bias; without
+    one the supply is bipolar. bias, static: only with the quadratic law. frequencies [Hz]: the
+    lowest and highest that are played.
     """
 
     response: Response
@@ -42,6 +47,8 @@ class VoltageDrive:
     bias: float = 0.0
     maximum: float = 1.0
     frequencies: tuple[float, float] = (40.0, 500.0)
+    minimum: float = 0.0
+    static: float | None = None
 
     @property
     def is_halved(self) -> bool:
@@ -51,7 +58,9 @@ class VoltageDrive:
     @property
     def swing(self) -> float:
         """Highest amplitude of the voltage about its bias."""
-        return self.maximum - self.bias
+        if not self.bias:
+            return self.maximum
+        return min(self.maximum - self.bias, self.bias - self.minimum)
 
     def at(self, frequency: float) -> complex:
         """Response at a frequency [Hz]; linear between rows, constant outside.
@@ -82,14 +91,41 @@ class VoltageDrive:
 
     def reach(self) -> tuple[float, float]:
         """Lowest and highest level, over the played frequencies, at the highest voltage."""
+        full = self.drive_amplitude(self.swing)
+        least, greatest = self._moduli()
+        return full * least, full * greatest
+
+    def level_max(self) -> float:
+        """Highest level at every played frequency, by the voltage, and by the stroke if known.
+
+        The square of the voltage has a constant part, which deflects the base; deflection and tone,
+        the harmonic of a bias left out, stay within a full stroke.
+        """
+        reached, _ = self.reach()
+        if self.static is None or self.law is Law.LINEAR or not reached:
+            return reached
+        least, _ = self._moduli()
+        if self.is_halved:
+            return min(reached, least / (least + self.static))
+        # level + static (bias^2 + U^2 / 2) = 1 with U = level / (2 bias least)
+        room = max(1 - self.static * self.bias**2, 0.0)
+        curvature = self.static / (8 * (self.bias * least) ** 2)
+        return min(reached, 2 * room / (1 + math.sqrt(1 + 4 * curvature * room)))
+
+    def constant_term(self, level: float) -> float:
+        """Mean of the squared voltage at a level, where the response is least."""
+        least, _ = self._moduli()
+        return self.bias**2 + self.voltage_amplitude(level / least) ** 2 / 2
+
+    def _moduli(self) -> tuple[float, float]:
+        """Least and greatest modulus of the response, over the played frequencies."""
         low, high = self.frequencies
         rows = [
             self.at(low),
             *(cmath.rect(size, phase) for f, size, phase in self.response if low < f < high),
             self.at(high),
         ]
-        full = self.drive_amplitude(self.swing)
-        return full * _least_modulus(rows), full * max(map(abs, rows))
+        return _least_modulus(rows), max(map(abs, rows))
 
 
 def _least_modulus(path: Iterable[complex]) -> float:

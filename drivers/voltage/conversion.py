@@ -84,8 +84,8 @@ def capabilities_in_motion(
 ) -> Capabilities:
     """Convert the capabilities of an amplifier of voltage; drives: by channel.
 
-    Its highest level is that which the voltage reaches at every frequency that is played. Without a
-    bias there are neither cross-fades nor envelopes.
+    Its highest level is that which voltage and stroke allow at every frequency that is played.
+    Without a bias there are neither cross-fades nor envelopes.
     """
     limits = capabilities.limits_of_channels
     reached, steps = [1.0], [capabilities.level_step]
@@ -98,8 +98,8 @@ def capabilities_in_motion(
         frequencies.append((factor * of.frequency_min, factor * of.frequency_max))
         swing = min(drive.swing, of.level_max)
         held = replace(drive, maximum=drive.bias + swing)
-        low, high = held.reach()
-        reached.append(low)
+        _, high = held.reach()
+        reached.append(held.level_max())
         # Steepest at the highest voltage; that of the square is twice its share.
         step = max(capabilities.level_step, _Q.level.step)
         if Feature.LEVELS_MEASURED in capabilities.features:

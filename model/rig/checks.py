@@ -19,7 +19,7 @@ from model.rig.sections import (
 )
 from model.structure.plate import Plate
 from registry.suggestions import did_you_mean
-from registry.voltage import Law
+from registry.voltage import HIGHEST_FELT, Law
 
 
 def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> None:
@@ -204,16 +204,31 @@ def _voltage_problems(section: VoltageSection, limits: LimitsSection) -> Iterato
     """Keys and problems of a `voltage` section."""
     low, high = limits.frequency
     first, last = section.response[0][0], section.response[-1][0]
-    if low < first or high > last:
+    has_harmonic = section.bias and section.law is Law.QUADRATIC
+    highest = max(high, min(2 * high, HIGHEST_FELT)) if has_harmonic else high
+    if low < first or highest > last:
+        harmonic = " and, with a bias, its second harmonic" if has_harmonic else ""
         yield (
             "response",
-            f"must cover limits.frequency, {low:g} to {high:g} Hz, got {first:g} to {last:g} Hz; "
-            "narrow the limits, or measure the rest",
+            f"must cover limits.frequency{harmonic}, {low:g} to {highest:g} Hz, got {first:g} to "
+            f"{last:g} Hz; narrow the limits, or measure the rest",
         )
     if section.bias and section.law is Law.LINEAR:
         yield "bias", "is for `law: quadratic` only; remove it"
     if section.bias >= section.maximum:
         yield "bias", f"must be less than maximum, {section.maximum:g}, got {section.bias:g}"
+    if section.minimum and not section.bias:
+        yield "minimum", "is for a bias only; remove it"
+    if section.bias and section.minimum >= section.bias:
+        yield "minimum", f"must be less than bias, {section.bias:g}, got {section.minimum:g}"
+    if section.static is not None and section.law is Law.LINEAR:
+        yield "static", "is for `law: quadratic` only; remove it"
+    elif section.static is not None and section.static * section.bias**2 >= 1:
+        yield (
+            "static",
+            f"must leave stroke beside the bias, below {1 / section.bias**2:.4g}, got "
+            f"{section.static:g}; lower bias, or give the ERA its greater stroke",
+        )
     if section.law is Law.QUADRATIC and not section.bias and limits.slew is not None:
         yield (
             "law",

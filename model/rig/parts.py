@@ -80,6 +80,8 @@ def voltage_of(section: VoltageSection, limits: LimitsSection) -> VoltageDrive:
         bias=section.bias,
         maximum=section.maximum,
         frequencies=limits.frequency,
+        minimum=section.minimum,
+        static=section.static,
     )
 
 

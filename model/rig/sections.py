@@ -163,6 +163,8 @@ class VoltageSection(Section):
     law: Annotated[Law, Strict(strict=False)] = Law.LINEAR
     bias: Annotated[float, Quantity(RATIO, at_least=0, below=1)] = 0.0
     maximum: Annotated[float, Quantity(RATIO, above=0, at_most=1)] = 1.0
+    minimum: Annotated[float, Quantity(RATIO, at_least=-1, below=1)] = 0.0
+    static: Annotated[float, Quantity(RATIO, above=0, at_most=1000)] | None = None
 
 
 class EraSection(Section):

@@ -1,16 +1,19 @@
 """What it costs that an amplifier plays voltage, for `era config check`."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from model.finger.perception import decibels, detection_threshold
 from model.rig.rig import Rig
-from registry.voltage import VoltageDrive
+from registry.voltage import HIGHEST_FELT, Law, VoltageDrive
 
 _STEP = 1.0  # Hz
-_HIGHEST = 500.0  # Hz; half of the range in which thresholds are known
+_MAX_ANGLE = math.radians(20.5)  # between two rows
+_MAX_FREQUENCY = HIGHEST_FELT / 2  # Hz; of tones whose harmonic is felt
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class Harmonic:
 
 
 def voltage_costs(rig: Rig) -> list[str]:
-    """One warning for each amplifier of voltage, by its laws."""
+    """One warning for each amplifier of voltage, by its laws; one for each coarse response."""
     warnings = []
     for amplifier in rig.amplifiers:
         drives = {
@@ -38,15 +41,20 @@ def voltage_costs(rig: Rig) -> list[str]:
             parts = [
                 _reach_text([*drives.values()], rig.limits.level),
                 *_fades_text([*drives.values()]),
+                *_deflection_text([*drives.values()], rig.limits.level),
                 *_harmonic_text(drives, rig),
+                "a base is taken as stiff: `response` must be measured under the mounted plate, "
+                "with the other ERAs silent",
+                "onsets and endings are those of the force: contrast over the first 100 ms is not "
+                "predicted",
             ]
             warnings.append(f"{amplifier} plays voltage: {'; '.join(parts)}")
-    return warnings
+    return [*warnings, *(text for each in rig.voltage.items() for text in _coarse_text(*each))]
 
 
 def highest_level(drives: Sequence[VoltageDrive], limit: float) -> float:
-    """Highest level that every ERA reaches at every played frequency; limit: of the rig."""
-    return min(limit, *(drive.reach()[0] for drive in drives))
+    """Highest level of every ERA at every played frequency; limit: of the rig."""
+    return min(limit, *(drive.level_max() for drive in drives))
 
 
 def second_harmonic(drive: VoltageDrive, *, level: float, threshold: str) -> Harmonic:
@@ -56,8 +64,8 @@ def second_harmonic(drive: VoltageDrive, *, level: float, threshold: str) -> Har
     Its force is U / 4 b of the fundamental's, and its acceleration four times its share of motion.
     """
     low, high = drive.frequencies
-    frequencies = np.arange(max(low, 10.0), min(high, _HIGHEST) + _STEP / 2, _STEP)
-    frequencies = frequencies[frequencies <= _HIGHEST]
+    frequencies = np.arange(max(low, 10.0), min(high, _MAX_FREQUENCY) + _STEP / 2, _STEP)
+    frequencies = frequencies[frequencies <= _MAX_FREQUENCY]
     response, doubled = (
         np.array([abs(drive.at(factor * f)) for f in frequencies]) for factor in (1, 2)
     )
@@ -90,6 +98,43 @@ def _fades_text(drives: Sequence[VoltageDrive]) -> list[str]:
     ]
 
 
+def _deflection_text(drives: Sequence[VoltageDrive], limit: float) -> list[str]:
+    level = highest_level(drives, limit)
+    square = [drive for drive in drives if drive.law is Law.QUADRATIC and drive.level_max()]
+    known = [drive.static * drive.constant_term(level) for drive in square if drive.static]
+    unknown = [drive.constant_term(level) for drive in square if not drive.static]
+    return [
+        *([f"the mean force deflects a base by up to {max(known):.2g} strokes"] if known else []),
+        *(
+            [
+                f"the mean of the squared voltage, up to {max(unknown):.2g}, deflects a base by an "
+                "unknown distance, which nothing limits; give `static`"
+            ]
+            if unknown
+            else []
+        ),
+    ]
+
+
+def _coarse_text(name: str, drive: VoltageDrive) -> list[str]:
+    """Text about the played rows between which a response turns most, if that is far."""
+    low, high = drive.frequencies
+    angle, first, last = max(
+        (
+            (abs(math.remainder(other[2] - one[2], math.tau)), one[0], other[0])
+            for one, other in pairwise(drive.response)
+            if one[0] < high and other[0] > low
+        ),
+        default=(0.0, 0.0, 0.0),
+    )
+    if angle <= _MAX_ANGLE:
+        return []
+    return [
+        f"{name}: response turns by {math.degrees(angle):.0f} degrees from {first:g} to {last:g} "
+        "Hz; measure rows between, at most 20 degrees apart"
+    ]
+
+
 def _harmonic_text(drives: dict[str, VoltageDrive], rig: Rig) -> list[str]:
     found = {
         name: second_harmonic(
@@ -98,7 +143,7 @@ def _harmonic_text(drives: dict[str, VoltageDrive], rig: Rig) -> list[str]:
             threshold=rig.threshold,
         )
         for name, drive in drives.items()
-        if drive.bias and drive.frequencies[0] <= _HIGHEST
+        if drive.bias and drive.frequencies[0] <= _MAX_FREQUENCY
     }
     if not found:
         return []

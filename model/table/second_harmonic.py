@@ -21,10 +21,7 @@ from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes, peak_acceleration
-from registry.voltage import VoltageDrive
-
-HIGHEST_FELT = 1000.0
-"""Hz; the end of the detection thresholds."""
+from registry.voltage import HIGHEST_FELT, VoltageDrive
 
 
 def with_second_harmonic(

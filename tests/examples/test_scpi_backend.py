@@ -21,6 +21,7 @@ from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.protocol.classes import AmplifierClass, amplifier_class, missing
 from drivers.protocol.messages import AmplifierState
 from drivers.voltage import VoltageBackend
+from model.rig.file import load_rig
 from registry.limits import GuardLimits
 from registry.voltage import Law, VoltageDrive
 from scpi_generator import Generator, on_tcp, on_terminal
@@ -51,7 +52,11 @@ def drives(bias: float = 0.0) -> dict[int, VoltageDrive]:
         rows = zip(frequencies, np.abs(found), np.angle(found), strict=True)
         response = tuple((float(f), float(size), float(phase)) for f, size, phase in rows)
         made[channel] = VoltageDrive(
-            response, law=Law.QUADRATIC, bias=bias, frequencies=(60.0, 240.0)
+            response,
+            law=Law.QUADRATIC,
+            bias=bias,
+            minimum=-1.0 if bias else 0.0,
+            frequencies=(60.0, 240.0),
         )
     return made
 
@@ -283,3 +288,14 @@ async def test_generator_that_hangs_up_is_lost(example: ModuleType) -> None:
         await backend.open()
         assert await asyncio.wait_for(causes.get(), 5.0)
         await backend.close()
+
+
+def test_rows_of_the_rig_are_close_enough() -> None:
+    """Between its rows the example's response is within 2.5 % of the resonator's."""
+    rig = load_rig(MODULE.with_name("rig.yaml"), mesh="16x12")
+    frequencies = np.arange(60.0, 240.5, 0.5)
+    for name, resonance in zip(("SW", "NE"), RESONANCES, strict=True):
+        found = np.array([rig.voltage[name].at(f) for f in frequencies])
+        wanted = resonator(frequencies, resonance, GAIN)
+        np.testing.assert_allclose(found / wanted, 1.0, atol=0.025)
+        assert rig.voltage[name].static == GAIN

@@ -51,7 +51,9 @@ def voltage_rig(rig: Rig, law: str) -> Rig:
         found = resonator(frequencies, resonance, gain)
         rows = zip(frequencies, np.abs(found), np.angle(found), strict=True)
         response = tuple((float(f), float(size), float(phase)) for f, size, phase in rows)
-        drives[name] = VoltageDrive(response, law=kind, bias=bias, frequencies=BAND)
+        drives[name] = VoltageDrive(
+            response, law=kind, bias=bias, minimum=-1.0 if bias else 0.0, frequencies=BAND
+        )
     limits = replace(rig.limits, frequency_min=BAND[0], frequency_max=BAND[1])
     return replace(rig, voltage=drives, limits=limits)
 

@@ -111,10 +111,31 @@ def test_level_is_what_voltage_reaches_at_every_frequency() -> None:
     linear = VoltageDrive(rows, maximum=0.4, frequencies=(60.0, 150.0))
     assert linear.reach() == pytest.approx((0.4 * 2.0, 0.4 * 4.0))
     biased = VoltageDrive(rows, law=Law.QUADRATIC, bias=0.3, maximum=0.8, frequencies=(75.0, 80.0))
-    # 2 * 0.3 * 0.5 = 0.3; responses 3 at 75 Hz and 2.8 at 80 Hz
-    assert biased.reach() == pytest.approx((0.3 * 2.8, 0.3 * 3.0))
+    # A supply of one sign: 2 * 0.3 * 0.3 = 0.18; responses 3 at 75 Hz and 2.8 at 80 Hz
+    assert biased.reach() == pytest.approx((0.18 * 2.8, 0.18 * 3.0))
+    both = replace(biased, minimum=-1.0)  # 2 * 0.3 * 0.5 = 0.3
+    assert both.reach() == pytest.approx((0.3 * 2.8, 0.3 * 3.0))
+    assert replace(biased, minimum=0.2).swing == pytest.approx(0.1)
     crossing = ((50.0, 1.0, 0.0), (150.0, 1.0, math.pi))
     assert VoltageDrive(crossing, frequencies=(50.0, 150.0)).reach()[0] == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(("bias", "minimum"), [(0.0, 0.0), (0.2, -1.0)])
+def test_base_stays_within_its_stroke(bias: float, minimum: float) -> None:
+    """Samples of the squared voltage at the highest level: its mean deflects, its line moves.
+
+    A response of 4 at the frequency, and 6 to a constant term.
+    """
+    drive = replace(flat(4.0, 0.0, Law.QUADRATIC, bias), minimum=minimum, static=6.0)
+    level = drive.level_max()
+    assert level < drive.reach()[0]
+    voltage = to_voltage(DriveCommand(0, 100.0, level), drive)
+    times = np.arange(0, 1, 1 / 4000)
+    term = (bias + voltage.level * np.sin(2 * np.pi * voltage.frequency * times)) ** 2
+    line = 2 * abs(np.mean(term * np.exp(-200j * np.pi * times)))
+    assert 4 * line + 6 * np.mean(term) == pytest.approx(1.0)
+    assert drive.constant_term(level) == pytest.approx(np.mean(term))
+    assert replace(drive, static=None).level_max() == drive.reach()[0]
 
 
 CAPABILITIES = Capabilities(
@@ -156,3 +177,5 @@ def test_capabilities_are_of_motion() -> None:
     assert (found.frequency_min, found.frequency_max) == (20.0, 400.0)
     assert found.level_max == pytest.approx(0.4)
     assert capabilities_in_motion(CAPABILITIES, {0: linear}).has_cross_fades
+    held = replace(halved, static=4.0)
+    assert capabilities_in_motion(CAPABILITIES, {0: held}).level_max == pytest.approx(0.5)

@@ -32,6 +32,7 @@ amplifiers:
 limits: {frequency: [60, 260]}
 """
 ROWS = "response: [[40, 6, 0], [300, 2, -90]]"
+WIDE = "response: [[40, 6, 0], [300, 2, -90], [520, 1, -170]]"
 PLAIN = f"{{{ROWS}}}"
 
 
@@ -50,7 +51,7 @@ def problems(source: str) -> dict[str, str]:
 def test_section_is_read() -> None:
     """Law, bias and response of each channel; the frequencies are the rig's limits."""
     rig = parse_rig(
-        "rig.yaml", text(f"{{{ROWS}, law: quadratic, bias: 0.4}}", f"{{{ROWS}, maximum: 0.5}}")
+        "rig.yaml", text(f"{{{WIDE}, law: quadratic, bias: 0.4}}", f"{{{ROWS}, maximum: 0.5}}")
     )
     drives = rig.voltage_of("main")
     assert (drives[0].law, drives[0].bias, drives[0].maximum) == (Law.QUADRATIC, 0.4, 1.0)
@@ -65,12 +66,21 @@ def test_section_is_read() -> None:
         ("{response: [[70, 1, 0], [300, 1, 0]]}", "eras.SW.voltage.response"),
         ("{response: [[50, 1, 0], [200, 1, 0]]}", "eras.SW.voltage.response"),
         (f"{{{ROWS}, bias: 0.2}}", "eras.SW.voltage.bias"),
-        (f"{{{ROWS}, law: quadratic, bias: 0.5, maximum: 0.4}}", "eras.SW.voltage.bias"),
+        (f"{{{WIDE}, law: quadratic, bias: 0.5, maximum: 0.4}}", "eras.SW.voltage.bias"),
+        (f"{{{ROWS}, law: quadratic, bias: 0.4}}", "eras.SW.voltage.response"),
         (f"{{{ROWS}, law: cubic}}", "eras.SW.voltage.law"),
+        (f"{{{ROWS}, minimum: -1}}", "eras.SW.voltage.minimum"),
+        (f"{{{WIDE}, law: quadratic, bias: 0.3, minimum: 0.3}}", "eras.SW.voltage.minimum"),
+        (f"{{{ROWS}, static: 3}}", "eras.SW.voltage.static"),
+        (f"{{{WIDE}, law: quadratic, bias: 0.5, static: 4}}", "eras.SW.voltage.static"),
     ],
 )
 def test_invalid_sections_are_refused(sw: str, key: str) -> None:
-    """A response that does not cover the limits, a bias of a linear law or beyond the maximum."""
+    """A response that does not cover the limits, a bias of a linear law or beyond the maximum.
+
+    With a bias it must cover the harmonic, too: up to 520 Hz. A lowest voltage without a bias or
+    from the bias on, a static response of a linear law, or one of which the bias takes the stroke.
+    """
     assert list(problems(text(sw))) == [key]
 
 
@@ -133,16 +143,35 @@ def test_era_without_amplifier_supports_as_one_at_rest() -> None:
 
 def test_check_says_what_voltage_costs(tmp_path: Path) -> None:
     """Ramps, reach and highest level, cross-fades and harmonic, for each amplifier."""
-    quadratic = text(f"{{{ROWS}, law: quadratic}}", f"{{{ROWS}, law: quadratic, bias: 0.4}}")
+    quadratic = text(f"{{{ROWS}, law: quadratic}}", f"{{{WIDE}, law: quadratic, bias: 0.4}}")
     checked = RIG.check(parse_document(str(tmp_path / "rig.yaml"), quadratic))
     (warning,) = [each for each in checked.warnings if each.startswith("main plays voltage")]
     assert "cross-fades" in warning
     assert "second harmonic" in warning
     assert "NE, NW" in checked.line
+    assert "`static`" in warning
     linear = RIG.check(parse_document(str(tmp_path / "rig.yaml"), text()))
     (warning,) = [each for each in linear.warnings if each.startswith("main plays voltage")]
     assert "cross-fades" not in warning
     assert "harmonic" not in warning
+    assert "`static`" not in warning
+    assert "mounted" in warning
+    assert "first 100 ms" in warning
+
+
+def test_check_says_how_far_the_mean_force_deflects() -> None:
+    """A response of 2 at least, and 6 to a constant term: 2 / 8 of a stroke, and 6 / 8 at rest."""
+    flat = "{response: [[40, 2, 0], [300, 2, 0]], law: quadratic, static: 6}"
+    (cost,) = voltage_costs(parse_rig("rig.yaml", text(flat, flat)))
+    assert "levels up to 0.25 " in cost
+    assert "up to 0.75 strokes" in cost
+
+
+def test_check_names_rows_that_are_too_far_apart() -> None:
+    """Halfway between rows 90 degrees apart the straight line has 0.7 of the response."""
+    near = "{response: [[40, 2, 170], [150, 2, -175], [300, 2, -170]]}"
+    _, coarse = voltage_costs(parse_rig("rig.yaml", text(near, PLAIN)))
+    assert coarse.startswith("SE: response turns by 90 degrees from 40 to 300 Hz")
 
 
 def test_second_harmonic_by_hand() -> None:
@@ -163,5 +192,5 @@ def test_harmonic_that_is_not_felt_is_left_out() -> None:
     """Above 500 Hz it is beyond the thresholds: the check says nothing of it, and goes on."""
     rows = "response: [[40, 6, 0], [1000, 2, -90]], law: quadratic, bias: 0.4"
     high = text(f"{{{rows}}}", f"{{{rows}}}").replace("[60, 260]", "[510, 600]")
-    (cost,) = voltage_costs(parse_rig("rig.yaml", high))
+    cost, *_ = voltage_costs(parse_rig("rig.yaml", high))
     assert "harmonic of" not in cost

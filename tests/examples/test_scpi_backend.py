@@ -213,6 +213,30 @@ async def test_tones_continue_or_start_from_silence(example: ModuleType) -> None
         assert not generator.outputs[1].is_on
 
 
+async def test_tone_that_continues_is_not_restarted_by_one_that_begins(
+    example: ModuleType,
+) -> None:
+    """Another channel begins beside it; Achieved says that its time is not of the commit."""
+    generator = Generator()
+    async with opened(example, generator) as amplifier:
+        await amplifier.arm()
+        guard = Guard(LIMITS, amplifier.capabilities)
+        first, second = TONES[0], replace(TONES[1], frequency=150.0)
+        kept = replace(first, keep_phase=True)
+        achieved = await amplifier.apply(guard.check(a_set(amplifier, first)))
+        assert [one.keep_phase for one in achieved.commands] == [False]
+        start = generator.outputs[0].origin
+        achieved = await amplifier.apply(guard.check(a_set(amplifier, kept, second)))
+        assert generator.outputs[0].origin == start
+        assert [output.is_on for output in generator.outputs] == [True, True]
+        assert generator.outputs[1].frequency == 75.0
+        assert [one.keep_phase for one in achieved.commands] == [True, True]
+        await amplifier.apply(guard.silence(amplifier.next_token(), (0, 1), ramp=0.0))
+        achieved = await amplifier.apply(guard.check(a_set(amplifier, kept)))  # nothing continues
+        assert generator.outputs[0].origin > start
+        assert [one.keep_phase for one in achieved.commands] == [False]
+
+
 async def test_late_reply_is_not_taken_for_another(
     example: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,6 +8,7 @@ the peak at level 1, into an open circuit; bias: constant part, as a share of it
 """
 
 from collections.abc import Sequence
+from itertools import chain
 from urllib.parse import parse_qsl, urlsplit
 
 from era_haptics.plugins.backends import (
@@ -25,6 +26,7 @@ from era_haptics.plugins.backends import (
 CHANNELS = (1, 2)
 MIN_VPP = 0.002  # V, into an open circuit
 MAX_PEAK = 10.0  # V, peak with bias, into an open circuit
+SAME_FREQUENCY = 1e-5  # Hz; below every step
 OPTIONS = {"full_voltage": 5.0, "bias": 0.0, "baud": 115_200.0}
 IS_ON = {"1": True, "ON": True, "0": False, "OFF": False}
 
@@ -99,17 +101,26 @@ class ScpiBackend(ForeignAmplifier):
         await self._set(words)
 
     async def play(self, commands: Sequence[DriveCommand]) -> Sequence[DriveCommand]:
-        """Set frequencies, voltages and phases; tones that do not continue start together."""
+        """Set frequencies, voltages and phases; all tones start together unless one continues.
+
+        PHAS:SYNC restarts both channels. Beside a tone that continues, one that begins has the time
+        of its phase generator, which is not that of the commit: both are reported with keep_phase.
+        """
         sounding = [one for one in commands if self._vpp(one) > 0]
+        before = await self._of_outputs("FREQ")
         words = [f"OUTP{n} OFF" for n in CHANNELS if n - 1 not in {one.channel for one in sounding}]
         for one in sounding:
             n = one.channel + 1
             words += [f"SOUR{n}:FREQ {one.frequency:.10g}", f"SOUR{n}:VOLT {self._vpp(one):.6g}"]
             words += [f"SOUR{n}:PHAS {one.phase:.6g}", f"OUTP{n} ON"]
-        if not all(one.keep_phase for one in sounding):
+        continues = any(
+            one.keep_phase and abs(before[one.channel] - one.frequency) < SAME_FREQUENCY
+            for one in sounding
+        )
+        if sounding and not continues:
             words += ["*WAI", "SOUR1:PHAS:SYNC"]  # after the relays; of both channels
         await self._set(words)
-        return [await self._played(one) for one in sounding]
+        return [await self._played(one, keep_phase=continues) for one in sounding]
 
     async def silence(self) -> None:
         """Switch both outputs off."""
@@ -117,23 +128,26 @@ class ScpiBackend(ForeignAmplifier):
 
     async def levels(self) -> Sequence[float]:
         """Read the outputs and their voltages."""
-        found = await self._ask(*(f"{of}{n}{at}?" for n in CHANNELS for of, at in _STATE))
+        return [vpp / (2 * self._full) for vpp in await self._of_outputs("VOLT")]
+
+    async def _of_outputs(self, what: str) -> list[float]:
+        """Read a number of each channel, 0 where its output is off."""
+        questions = ((f"OUTP{n}?", f"SOUR{n}:{what}?") for n in CHANNELS)
+        found = await self._ask(*chain.from_iterable(questions))
         pairs = zip(found[::2], found[1::2], strict=True)
-        return [IS_ON[on] * float(vpp) / (2 * self._full) for on, vpp in pairs]
+        return [IS_ON[on] * float(number) for on, number in pairs]
 
     def _vpp(self, command: DriveCommand) -> float:
         """Peak to peak, 0 below half of the minimum."""
         vpp = 2 * self._full * command.level
         return max(vpp, MIN_VPP) if vpp >= MIN_VPP / 2 else 0.0
 
-    async def _played(self, command: DriveCommand) -> DriveCommand:
+    async def _played(self, command: DriveCommand, *, keep_phase: bool) -> DriveCommand:
         """Read back what a channel plays."""
         source = f"SOUR{command.channel + 1}"
         found = await self._ask(f"{source}:FREQ?", f"{source}:VOLT?", f"{source}:PHAS?")
         frequency, vpp, phase = map(float, found)
-        return DriveCommand(
-            command.channel, frequency, vpp / (2 * self._full), phase, command.keep_phase
-        )
+        return DriveCommand(command.channel, frequency, vpp / (2 * self._full), phase, keep_phase)
 
     async def _set(self, words: Sequence[str]) -> None:
         """Send words, and read what the generator says of them; silent after an error."""
@@ -161,6 +175,3 @@ class ScpiBackend(ForeignAmplifier):
             if number.lstrip("+") == str(self._number) and len(answers) == count:
                 return answers
             self._counters.unexpected_frames += 1
-
-
-_STATE = (("OUTP", ""), ("SOUR", ":VOLT"))

@@ -19,7 +19,7 @@ from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.table.effect_level import EffectLevels
 from model.table.pattern import Pattern
 from model.table.question import Question
-from model.table.second_harmonic import with_second_harmonic
+from model.table.second_harmonic import add_second_harmonic, with_second_harmonic
 from model.table.table import LocalizationTable
 from model.vibration.peak import peak_acceleration
 from registry.plugins import failure_text
@@ -83,6 +83,7 @@ class Selector:
     ) -> None:
         self._table = table
         self._voltage = voltage
+        self._has_harmonics = any(drive.bias for drive in voltage.values())
         self._levels = levels
         self._current = Selection((), (), None, None)
 
@@ -162,7 +163,7 @@ class Selector:
 
     def _with_harmonic(self, answer: TableAnswer) -> TableAnswer:
         """Return an answer that includes what a bias adds at twice its frequencies."""
-        if not any(drive.bias for drive in self._voltage.values()):
+        if not self._has_harmonics:
             return answer
         found = with_second_harmonic(answer.pattern, answer.question, self._table, self._voltage)
         louder = found.level_db_sl - answer.pattern.level_db_sl
@@ -194,12 +195,19 @@ class Selector:
         onset_gain = answer.felt_db_sl - pattern.level_db_sl
         fingers = [*(contact for contact, _ in targets), *quiet]
         discs = [fingertip_points(each.x, each.y, self._table.plate) for each in fingers]
+        points, question = np.concatenate(discs), answer.question
         frequencies, all_fields = self._table.amplitudes(
-            pattern.excitation,
-            np.concatenate(discs),
-            contacts=answer.question.contacts,
-            loads=answer.question.loads,
+            pattern.excitation, points, contacts=question.contacts, loads=question.loads
         )
+        if self._has_harmonics:
+            frequencies, all_fields = add_second_harmonic(
+                pattern.excitation,
+                (frequencies, all_fields),
+                points,
+                question,
+                self._table,
+                self._voltage,
+            )
         ends = np.cumsum([len(disc) for disc in discs])[: len(targets)]
         *fields, at_quiet = np.split(all_fields, ends, axis=1)
         loudest = peak_acceleration(at_quiet)

@@ -34,16 +34,17 @@ def with_second_harmonic(
 
     voltage: by ERA. Robust measures are changed by the harmonics of the plate as modelled.
     """
-    frequencies, weights = _harmonics(pattern.excitation, table, voltage)
-    if not len(frequencies):
-        return pattern
     discs = [fingertip_points(*at, table.plate) for at in question.contacts]
     points = np.concatenate(discs)
     tones, before = table.amplitudes(
         pattern.excitation, points, contacts=question.contacts, loads=question.loads
     )
-    added = _amplitudes(frequencies, weights, points, question, table)
-    every, after = np.concatenate([tones, frequencies]), np.vstack([before, added])
+    every, after = add_second_harmonic(
+        pattern.excitation, (tones, before), points, question, table, voltage
+    )
+    frequencies, added = every[len(tones) :], after[len(tones) :]
+    if not len(frequencies):
+        return pattern
     ends = np.cumsum([len(disc) for disc in discs])
     count = len(question.targets)
 
@@ -80,6 +81,25 @@ def with_second_harmonic(
         robust_felt_contrast_db=_plus(pattern.robust_felt_contrast_db, louder - robust),
         median_felt_contrast_db=_plus(pattern.median_felt_contrast_db, louder - float(nominal)),
     )
+
+
+def add_second_harmonic(
+    excitation: Excitation,
+    tones: tuple[FloatArray, FloatArray],
+    points: FloatArray,
+    question: Question,
+    table: LocalizationTable,
+    voltage: Mapping[str, VoltageDrive],
+) -> tuple[FloatArray, FloatArray]:
+    """Return frequencies (f,) [Hz] and peak acceleration (f, p) [m/s²] with those of harmonics.
+
+    tones: both without them, of an excitation at points under the fingers of a question.
+    """
+    frequencies, weights = _harmonics(excitation, table, voltage)
+    if not len(frequencies):
+        return tones
+    added = _amplitudes(frequencies, weights, points, question, table)
+    return np.concatenate([tones[0], frequencies]), np.vstack([tones[1], added])
 
 
 def _harmonics(

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import math
 import shlex
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -259,7 +260,7 @@ def _status_rows(status: Status) -> dict[str, Any]:
         "token": status.token,
         "high_voltage": status.high_voltage,
         "high_voltage_v": status.voltage,
-        "temperature_c": status.temperature,
+        "temperature_c": None if math.isnan(status.temperature) else status.temperature,
         "watchdog_left_s": status.watchdog_left,
         "levels": list(status.levels),
         **({"other_flags": status.other_flags} if status.other_flags else {}),

@@ -6,6 +6,7 @@ class C: nothing here ends a vibration when the host has died.
 """
 
 import asyncio
+import math
 from abc import abstractmethod
 from collections.abc import Sequence
 
@@ -189,7 +190,7 @@ class ForeignAmplifier(WireBackend):
             fault=Fault.NONE,
             token=self._playing[1].token,
             high_voltage=state is AmplifierState.OPERATION_ENABLED or any(levels),
-            temperature=25.0,
+            temperature=math.nan,
             watchdog_left=0.0,
             levels=levels,
             latch=self._latch,

@@ -267,9 +267,9 @@ class Capabilities:
 class Status:
     """Status of an amplifier: state, fault, playing token and present level of each channel.
 
-    token 0: nothing played since arming; temperature [°C]; watchdog_left [s]; voltage [V] of the
-    high-voltage supply, 0 if not measured; latch: number of the last stop or fault, 0 before the
-    first; other_flags: those that are not defined here.
+    token 0: nothing played since arming; temperature [°C], NaN if not measured;
+    watchdog_left [s]; voltage [V] of the high-voltage supply, 0 if not measured; latch: number of
+    the last stop or fault, 0 before the first; other_flags: those that are not defined here.
     """
 
     state: AmplifierState

@@ -1,12 +1,13 @@
 """The base of laboratory instruments: stops that are lost, and other programs that arm it."""
 
 import asyncio
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
 
-from drivers import clock
+from drivers import amp_actions, clock
 from drivers.amplifier import Amplifier
 from drivers.backends.foreign_amplifier import ForeignAmplifier
 from drivers.backends.host_lock import HostLock
@@ -107,3 +108,26 @@ async def test_one_program_arms_until_it_closes() -> None:
     await second.open()
     assert (await second.arm()).state is AmplifierState.OPERATION_ENABLED
     await second.close()
+
+
+@in_virtual_time
+async def test_temperature_that_is_not_measured_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No number is invented: NaN in a status, null as JSON."""
+    monkeypatch.setattr(amp_actions, "open_backend", lambda url: Instrument())
+    rows = await amp_actions.status("instrument://")
+    assert rows["temperature_c"] is None
+    assert json.loads(json.dumps(rows, allow_nan=False))["state"] == "SWITCH_ON_DISABLED"
+
+
+@in_virtual_time
+async def test_stop_by_command_names_the_program_that_may_play(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """`era amp stop` beside another program: outputs off, not confirmed, with its cause."""
+    monkeypatch.setattr(amp_actions, "open_backend", lambda url: Instrument())
+    other = HostLock("instrument of a test")
+    other.acquire()
+    rows = await amp_actions.stop("instrument://")
+    other.release()
+    assert rows["silence"] == "may_play"
+    assert "instrument of a test" in rows["cause"]

@@ -47,6 +47,7 @@ class AmplifierSession:
     armed_at: float = -math.inf
     stop_requested_at: float | None = None
     last_feed: float | None = None
+    last_ping: float = -math.inf
     last_token: int = 0
     preempted_at: float = -math.inf  # when a silencing request overtook pending ones
     constants: dict[tuple[RequestKind, int], bytes] = field(default_factory=dict)

@@ -127,7 +127,11 @@ class HostRules:
             return
         for at, awaited in session.pending.values():
             # A last lift preempts too, even if a finger has come since.
-            is_awaited = at > max(session.preempted_at, self._inputs.last_lift)
+            preempted = max(session.preempted_at, self._inputs.last_lift)
+            is_awaited = at > preempted and not (
+                awaited.kind is RequestKind.STATUS
+                and _is_part_of_heartbeat(session, at, begun_before=preempted)
+            )
             if is_awaited and time - at < self._times.reply - self._times.slack:
                 session.report(
                     "credit",
@@ -147,13 +151,10 @@ class HostRules:
             and requested_at < self._inputs.last_disarm + _REORDER_WINDOW
         ):
             return  # silences as well
-        if (
-            request.kind is RequestKind.STATUS
-            and session.last_feed is not None
-            and session.last_feed <= requested_at
-            and time <= session.last_feed + _HEARTBEAT_STATUS
+        if request.kind is RequestKind.STATUS and _is_part_of_heartbeat(
+            session, time, begun_before=requested_at
         ):
-            return  # part of a heartbeat that was on the line
+            return
         session.report(
             "stop",
             time,
@@ -178,6 +179,8 @@ class HostRules:
                 f"watchdog of {session.name}",
             )
         session.last_feed = time
+        if request.kind is RequestKind.PING:
+            session.last_ping = time
 
     def _check_heartbeat(self, session: AmplifierSession, time: float) -> None:
         if session.is_disturbed(time):
@@ -288,3 +291,8 @@ class HostRules:
 
     def _vibrates(self, session: AmplifierSession, request: Request) -> bool:
         return any(one.vibrates for one in self._channel_commands(session, request).values())
+
+
+def _is_part_of_heartbeat(session: AmplifierSession, time: float, *, begun_before: float) -> bool:
+    """Whether a request for the status at a time [s] belongs to a heartbeat on the line before."""
+    return session.last_ping <= begun_before and time <= session.last_ping + _HEARTBEAT_STATUS

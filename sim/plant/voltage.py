@@ -1,8 +1,9 @@
 """Motion of an ERA's base by the voltage of its amplifier.
 
 The square of a sum of sinusoids is a sum of sinusoids at the sums and differences of their
-frequencies; each passes the actuator's response at its own frequency. Not modelled: the actuator's
-transients beyond that, the force of a bias at rest, and what it does to stiffness.
+frequencies; each passes the actuator's response at its own frequency, a constant one that at the
+lowest row. Not modelled: the actuator's transients beyond that, the force of a bias at rest, what
+it does to stiffness, and how a base yields to the plate.
 """
 
 import cmath

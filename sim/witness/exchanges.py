@@ -64,6 +64,8 @@ class Exchanges:
         if not isinstance(message, Request):
             return
         for session in self._addressed(wire, message.address):
+            if message.kind is RequestKind.PING:
+                session.last_ping = time
             if not is_copy:
                 self._host.check_request(session, time, message)
             if message.kind in SETS:

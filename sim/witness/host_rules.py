@@ -128,10 +128,11 @@ class HostRules:
         for at, awaited in session.pending.values():
             # A last lift preempts too, even if a finger has come since.
             preempted = max(session.preempted_at, self._inputs.last_lift)
-            is_awaited = at > preempted and not (
-                awaited.kind is RequestKind.STATUS
-                and _is_part_of_heartbeat(session, at, begun_before=preempted)
-            )
+            if awaited.kind is RequestKind.STATUS and _is_part_of_heartbeat(
+                session, at, begun_before=preempted
+            ):
+                session.preempted_at = preempted = at
+            is_awaited = at > preempted
             if is_awaited and time - at < self._times.reply - self._times.slack:
                 session.report(
                     "credit",
@@ -179,8 +180,6 @@ class HostRules:
                 f"watchdog of {session.name}",
             )
         session.last_feed = time
-        if request.kind is RequestKind.PING:
-            session.last_ping = time
 
     def _check_heartbeat(self, session: AmplifierSession, time: float) -> None:
         if session.is_disturbed(time):

@@ -182,6 +182,8 @@ void amplifier_sample(struct amplifier *amplifier, int16_t samples[CHANNELS])
 {
     for (unsigned i = 0; i < CHANNELS; i++)
         samples[i] = channel_sample(&amplifier->channels[i]);
+    if (SQUARE_LAW && !amplifier->high_voltage) // no bias either
+        memset(samples, 0, CHANNELS * sizeof samples[0]);
     amplifier->now++;
     settle(amplifier);
     if (amplifier->state != OPERATION_ENABLED)

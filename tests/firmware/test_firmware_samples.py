@@ -24,6 +24,7 @@ from firmware_script import (
 from model.arrays import FloatArray
 
 TOLERANCE = 6e-5  # of full stroke: two steps of a 16-bit sample, and phases over seconds
+DISARM, GET_STATUS = 4, 9
 BAD_TOKEN, STOP, FADING = 6, 8, 12
 
 
@@ -73,7 +74,14 @@ def test_sets_cross_fade_along_raised_cosines(firmware: Path) -> None:
     assert not samples[220 * PER_MS :].any()
 
 
-def test_square_of_voltages_is_the_summed_force(firmware: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def square_law(firmware: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The firmware of electrostatic actuators; skipped where `firmware` is."""
+    folder = tmp_path_factory.mktemp("square_law")
+    return build_firmware(folder, "CFLAGS=-O2 -DSQUARE_LAW=1", goal="posix")
+
+
+def test_square_of_voltages_is_the_summed_force(firmware: Path, square_law: Path) -> None:
     """With the square law two tones that cross-fade have neither harmonics nor beats.
 
     The square of a sample is half the full force plus half of what the same script plays as forces.
@@ -84,11 +92,31 @@ def test_square_of_voltages_is_the_summed_force(firmware: Path, tmp_path: Path) 
         (60, apply(2, command(0, 130, 0.9, 90), command(1, 180, 0.1), ramp_ms=40)),
     ]
     forces, _ = replay(firmware, script, 150)
-    folder = build_firmware(tmp_path, "CFLAGS=-O2 -DSQUARE_LAW=1", goal="posix")
-    voltages, _ = replay(folder, script, 150)
+    voltages, _ = replay(square_law, script, 150)
     assert voltages.min() >= 0
     np.testing.assert_allclose(2 * voltages**2 - 1, forces, atol=2 * TOLERANCE)
     assert voltages[0, 3] == pytest.approx(np.sqrt(0.5), abs=TOLERANCE)  # a silent channel
+
+
+@pytest.mark.parametrize(
+    ("watchdog_ms", "last"),
+    [
+        (2000, (60, request(DISARM, bytes([20, 0])))),
+        (2000, (60, request(STOP, bytes([20, 0])))),
+        (100, (60, request(GET_STATUS))),  # its watchdog expires: a fault
+    ],
+    ids=["disarmed", "stopped", "fault"],
+)
+def test_bias_is_there_only_under_high_voltage(
+    square_law: Path, watchdog_ms: int, last: tuple[int, bytes]
+) -> None:
+    """No voltage before Arm, nor once it has fallen silent; between them the bias."""
+    script: Script = [(10, arm(watchdog_ms)), (20, apply(1, command(0, 100, 0.9))), last]
+    voltages, _ = replay(square_law, script, 200)
+    assert not voltages[: 10 * PER_MS].any()
+    silent = voltages[10 * PER_MS + 1 : 80 * PER_MS, 3]
+    np.testing.assert_allclose(silent, np.sqrt(0.5), atol=TOLERANCE)
+    assert not voltages[130 * PER_MS :].any()
 
 
 def test_third_voice_is_refused_and_changes_nothing(firmware: Path) -> None:

@@ -48,8 +48,8 @@ def rig_yaml(data: Mapping[str, Value], rig: Rig, ranking: Ranking, case: int) -
     assert isinstance(before, dict)  # noqa: S101 - the rig was read from this data
     eras: dict[str, Value] = {name: before[name] for name in rig.supports}
     for number, era in enumerate(ranking.cases.eras_of(case, rig.eras)):
-        # A renamed ERA has the other keys of the first. Copied, since aliases are not allowed.
-        section = deepcopy(before.get(era.name, next(iter(before.values()))))
+        # A renamed ERA has the other keys of the first driven one, copied: no aliases in a file.
+        section = deepcopy(before.get(era.name, before[rig.eras[0].name]))
         assert isinstance(section, dict)  # noqa: S101
         channel = wiring[number] if number < len(wiring) else None
         eras[era.name] = {

@@ -98,6 +98,21 @@ def test_placement_study_keeps_what_it_does_not_vary(tmp_path: Path) -> None:
         assert (era.stiffness, era.damping) == (before.stiffness, before.damping)
 
 
+def test_count_study_copies_a_driven_era_not_a_support(tmp_path: Path) -> None:
+    """The rig's first ERA only supports: the recommended ones have the stroke of a driven one."""
+    data = read_document(Path(RIG)).data
+    support, *driven = data["eras"].values()
+    del support["amplifier"], support["channel"]
+    for era in driven:
+        era["stroke"] = "80 um"
+    path = tmp_path / "rig.yaml"
+    path.write_text(data_text(data), encoding="utf-8")
+    study("count", tmp_path / "out", "--layouts", "6", rig=str(path))
+    rig = load_rig(tmp_path / "out" / "recommended.yaml")
+    assert len(rig.supports) == 1
+    assert {era.stroke for era in rig.eras} == {80e-6}
+
+
 def test_stiffness_study_recommends_a_rig_that_loads(tmp_path: Path) -> None:
     """All ERAs of the recommended rig have the stiffness of the best case."""
     check_recommendation(study("stiffness", tmp_path, "--layouts", "2"))

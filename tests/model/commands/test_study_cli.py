@@ -103,6 +103,7 @@ def test_count_study_copies_a_driven_era_not_a_support(tmp_path: Path) -> None:
     data = read_document(Path(RIG)).data
     support, *driven = data["eras"].values()
     del support["amplifier"], support["channel"]
+    support["at"] = [0.013, 0.017]  # where no layout has an ERA
     for era in driven:
         era["stroke"] = "80 um"
     path = tmp_path / "rig.yaml"

@@ -293,7 +293,7 @@ class Amplifier:
             )
 
     async def wait_for_room(self, safe: SafeCommandSet) -> None:
-        """Wait until no channel that a set drives fades between two others, feeding the watchdog.
+        """Wait until every channel that a set drives has a voice for it, feeding the watchdog.
 
         Of several sets the newest goes on; the others raise Preempted, as a set does if silence, a
         stop or a disarm comes.

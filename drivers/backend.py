@@ -41,8 +41,10 @@ class Backend(ABC):
         the wire is open, even if the amplifier counts as lost.
 
         timeout [s]: of the whole exchange, extended if the wire is slower. Raises LinkTimeout,
-        LinkError; TypeError for a set or envelope that has not passed a guard (`require_safe`). A
-        Nak is returned, not raised. Cancelling leaves the wire usable.
+        LinkError; CommandRefused for a set that the amplifier cannot play, CommandError for an
+        amplifier that does not fit its configuration; TypeError for a set or envelope that has not
+        passed a guard (`require_safe`). A Nak is returned, not raised. Cancelling leaves the wire
+        usable.
         """
 
     @property

@@ -58,7 +58,7 @@ class SafeSets:
 
     @property
     def room_from(self) -> float:
-        """When [s] no channel fades between two other sets any more; see `PlayRecord`."""
+        """When [s] every channel that they drive has a voice for them; see `PlayRecord`."""
         return max(safe.record.room_from(safe) for safe in self.sets.values())
 
     @property

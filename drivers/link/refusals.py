@@ -17,7 +17,7 @@ _REASONS = {
     NakCode.WRONG_SESSION: "another host has armed it, or it has been armed anew; disarm it, then "
     "arm it again",
     NakCode.WRONG_LATCH: "a newer stop or fault has come; read its status, then clear that",
-    NakCode.FADING: "a channel fades between two sets already; wait for the end of the ramp",
+    NakCode.FADING: "as many voices sound on the channel as it has; wait for the end of the ramp",
 }
 
 PROTOCOL_VIOLATION = (

@@ -17,7 +17,7 @@ from model.rig.parts import (
     mass_of,
     plate_of,
     uncertainty_of,
-    voltage_of,
+    voltage_drive_of,
 )
 from model.rig.rig import Channel, Rig
 from model.rig.sections import RigSection
@@ -80,7 +80,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
         fingertip=fingertip_of(section.fingertip),
         threshold=section.threshold,
         voltage={
-            name: voltage_of(era.voltage, section.limits)
+            name: voltage_drive_of(era.voltage, section.limits)
             for name, era in section.eras.items()
             if era.voltage is not None
         },

@@ -72,7 +72,7 @@ def era_of(name: str, section: EraSection, plate: Plate, *, era_count: int) -> E
     )
 
 
-def voltage_of(section: VoltageSection, limits: LimitsSection) -> VoltageDrive:
+def voltage_drive_of(section: VoltageSection, limits: LimitsSection) -> VoltageDrive:
     """The way from a voltage to motion, over the frequencies that are played."""
     return VoltageDrive(
         response=tuple((f, size, math.radians(phase)) for f, size, phase in section.response),

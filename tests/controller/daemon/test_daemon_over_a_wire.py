@@ -289,7 +289,9 @@ async def test_reload_applies_what_is_safe(tmp_path: Path) -> None:
 
         level = "level_db_sl: "
         assert await reload((f"{level}20", f"{level}10"), ("60 s", "20 s")) == (10, 20)
+        await era.subscribe("pattern")
         async with holding(era, far=bench.far):
+            await next_event(era, "pattern")  # reported after it plays
             (contact,) = (await era.status()).contacts
         assert 10 <= contact.level_db_sl < 16
         assert (await era.renew(lease.lease)).lease_s == 30  # a current lease keeps its duration

@@ -76,9 +76,11 @@ class Scene:
             await self.until(READY, ENABLED, DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
             if (state := self.supervisor.machine.state) is ENABLED:
                 return
-            with suppress(DriverError):  # the state that was set may not be the amplifier's
-                trigger = Trigger.ARM if state is READY else Trigger.CLEAR
+            trigger = Trigger.ARM if state is READY else Trigger.CLEAR
+            try:
                 await self.supervisor.handle(DaemonEvent(trigger))
+            except DriverError:  # it is being stopped, or this is not the amplifier's state
+                await asyncio.sleep(0.5)
         pytest.fail("cannot be armed")
 
 

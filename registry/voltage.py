@@ -89,6 +89,14 @@ class VoltageDrive:
             return drive
         return math.sqrt(2 * drive) if self.is_halved else drive / (2 * self.bias)
 
+    def second_harmonic(self, level: complex, frequency: float) -> complex:
+        """Motion at twice the frequency [Hz] beside a tone of a complex level, with a bias.
+
+        (b + U sin wt)^2 has U^2 / 2 sin(2 wt - 90 degrees), with U = level / (2 b response).
+        """
+        voltage = level / (2 * self.bias * self.at(frequency))
+        return -0.5j * voltage**2 * self.at(2 * frequency)
+
     def reach(self) -> tuple[float, float]:
         """Lowest and highest level, over the played frequencies, at the highest voltage."""
         full = self.drive_amplitude(self.swing)

@@ -61,20 +61,16 @@ def second_harmonic(drive: VoltageDrive, *, level: float, threshold: str) -> Har
     """Second harmonic of an ERA with a bias, at a level; threshold: name of the set.
 
     Of frequencies up to 500 Hz, of which there must be one: above, it is not felt.
-    Its force is U / 4 b of the fundamental's, and its acceleration four times its share of motion.
     """
     low, high = drive.frequencies
     frequencies = np.arange(max(low, 10.0), min(high, _MAX_FREQUENCY) + _STEP / 2, _STEP)
     frequencies = frequencies[frequencies <= _MAX_FREQUENCY]
-    response, doubled = (
-        np.array([abs(drive.at(factor * f)) for f in frequencies]) for factor in (1, 2)
-    )
-    voltage = level / (2 * drive.bias * response)
-    acceleration = 4 * voltage / (4 * drive.bias) * doubled / response
+    # Motion grows with the square of the level; acceleration is four times its share of motion.
+    share = np.array([level * abs(drive.second_harmonic(1.0, f)) for f in frequencies])
     felt = detection_threshold(frequencies, threshold) / detection_threshold(
         2 * frequencies, threshold
     )
-    relative = decibels(acceleration * felt)
+    relative = decibels(4 * share * felt)
     worst = int(np.argmax(relative))
     return Harmonic(float(np.median(relative)), float(relative[worst]), float(frequencies[worst]))
 

@@ -111,10 +111,11 @@ def _harmonics(
     found = np.zeros_like(levels)
     for column, era in enumerate(table.eras):
         drive = voltage.get(era.name)
-        for row, frequency in enumerate(frequencies if drive is not None else ()):
-            if drive is not None and drive.bias:
-                share = levels[row, column] / (2 * drive.bias * drive.at(frequency))
-                found[row, column] = -0.5j * share**2 * drive.at(2 * frequency)
+        if drive is not None and drive.bias:
+            found[:, column] = [
+                drive.second_harmonic(level, frequency)
+                for level, frequency in zip(levels[:, column], frequencies, strict=True)
+            ]
     is_felt = (2 * frequencies <= HIGHEST_FELT) & found.any(axis=1)
     return 2 * frequencies[is_felt], found[is_felt]
 

@@ -14,7 +14,7 @@ STALL = 0.004
 class Lateness:
     """Measures the lateness of the running event loop while its context lasts.
 
-    worst [s]: the largest delay of a timer; total [s]: the sum of those that count as stalls.
+    worst [s]: the largest delay of a timer.
     process: number of a process on this machine that is the amplifier; its threads are late while
     they wait for a processor.
     """
@@ -23,7 +23,6 @@ class Lateness:
         self._process = process
         self._waited = waited_for_processor(process)
         self.worst = 0.0
-        self.total = 0.0
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
 
@@ -48,8 +47,6 @@ class Lateness:
         before, self._waited = self._waited, waited_for_processor(self._process)
         late = max(clock.now() - self._due, self._waited - before)
         self.worst = max(self.worst, late)
-        if late > STALL:
-            self.total += late
 
 
 def waited_for_processor(process: int | None) -> float:
@@ -57,8 +54,7 @@ def waited_for_processor(process: int | None) -> float:
 
     By Linux's statistics of its scheduler; 0 for no process, or one that has ended.
     """
-    tasks = Path(f"/proc/{process}/task")
-    if process is None or not tasks.is_dir():
+    if process is None or not (tasks := Path(f"/proc/{process}/task")).is_dir():
         return 0.0
     total = 0
     for task in tasks.iterdir():

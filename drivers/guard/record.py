@@ -18,11 +18,11 @@ from drivers.guard.channel_state import (
     state_after,
     union_of,
 )
+from drivers.guard.rounding import TOLERANCE
 from drivers.guard.voices import Voices, latest_of
 from drivers.protocol.messages import Achieved, AmplifierState, Capabilities, Status
 from registry.limits import GuardLimits
 
-_ROUNDING = 1 + 1e-9  # sums of floats
 _ARRIVAL = 0.03  # s; in which a request arrives that has no reply, as the host's timeout
 _SILENT = ChannelState()
 _NO_FREQUENCY = _SILENT.frequency
@@ -253,7 +253,7 @@ class PlayRecord:
         if not self._has_cross_fades:
             _check_alone(before, command_set, when)
         for channel, slope in enumerate(slopes):
-            if slope > limits.slew * _ROUNDING:
+            if slope > limits.slew * TOLERANCE:
                 raise CommandRefused(
                     f"channel {channel}: level must rise by at most {limits.slew:g} per second, "
                     f"got {slope:g} per second; use a longer ramp",
@@ -263,14 +263,14 @@ class PlayRecord:
             return
         levels = [state.max_level for state in after]
         for channel, level in enumerate(levels):
-            if level > limits.level * _ROUNDING:
+            if level > limits.level * TOLERANCE:
                 raise CommandRefused(
                     f"channel {channel}: level must be at most {limits.level:g} while the previous "
                     f"tone fades, got {level:g}; use a ramp instead of an envelope",
                     channel=channel,
                 )
         power = sum(level**2 for level in levels)
-        if power > limits.power * _ROUNDING:
+        if power > limits.power * TOLERANCE:
             raise CommandRefused(
                 f"sum of squared levels must be at most {limits.power:g} while the previous tones "
                 f"fade, got {power:g}; use a ramp instead of an envelope"

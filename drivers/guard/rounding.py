@@ -5,6 +5,9 @@ import math
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.protocol.definition import PROTOCOL, WireQuantity
 
+TOLERANCE = 1 + 1e-9
+"""Factor by which a sum of floats may exceed a limit."""
+
 _SLACK = 1e-6  # of a step; sums of floats
 _Q = PROTOCOL.quantities
 

@@ -13,11 +13,11 @@ from numbers import Integral, Real
 from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.errors import CommandRefused
 from drivers.guard.channel_state import steepest_rise
+from drivers.guard.rounding import TOLERANCE
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Capabilities, Feature
 from registry.limits import GuardLimits
 
-_ROUNDING = 1 + 1e-9  # sums of floats
 _VALID_FOR = PROTOCOL.quantities.valid_for
 
 
@@ -62,7 +62,7 @@ def check_envelope(envelope: Envelope, context: GuardContext) -> None:
                 f"{knot.level!r} and {knot.phase!r} degrees"
             )
     rise = steepest_rise([knot.phasor for knot in envelope.knots])
-    if rise > limits.slew * envelope.step * _ROUNDING:
+    if rise > limits.slew * envelope.step * TOLERANCE:
         raise CommandRefused(
             f"envelope in slot {envelope.slot}: level must rise by at most {limits.slew:g} per "
             f"second, got {rise:g} within {envelope.step:g} s; use a longer step"
@@ -164,7 +164,7 @@ def check_power(command_set: CommandSet, context: GuardContext) -> None:
         return max([command.level, *(knot.level for one in envelopes for knot in one.knots)])
 
     power = sum(peak_level(command) ** 2 for command in command_set.commands)
-    if power > context.limits.power * _ROUNDING:
+    if power > context.limits.power * TOLERANCE:
         raise CommandRefused(
             f"sum of squared levels must be at most {context.limits.power:g}, got {power:g}; lower "
             "the levels or drive fewer channels at once"

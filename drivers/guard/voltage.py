@@ -5,10 +5,10 @@ from dataclasses import replace
 
 from drivers.command import DriveCommand, Knot
 from drivers.errors import CommandRefused
+from drivers.guard.rounding import TOLERANCE
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import ChannelLimits
 
-_ROUNDING = 1 + 1e-9
 _Q = PROTOCOL.quantities
 
 
@@ -76,4 +76,4 @@ def checked_knot(knot: Knot, passed: Knot, limits: ChannelLimits, *, slot: int) 
 
 
 def _is_within(level: float, limits: ChannelLimits) -> bool:
-    return math.isfinite(level) and 0 <= level <= limits.level_max * _ROUNDING
+    return math.isfinite(level) and 0 <= level <= limits.level_max * TOLERANCE

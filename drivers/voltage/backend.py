@@ -4,14 +4,13 @@ Everything above it, guard and records included, means motion; conversion is the
 the codec, and replies are converted back. See docs/decisions/0044-level-of-what.md.
 """
 
-import math
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import final
+from typing import cast, final
 
 from drivers.backend import Backend
-from drivers.command import CommandSet, DriveCommand, Envelope, Knot
+from drivers.command import CommandSet, DriveCommand, Knot
 from drivers.errors import CommandError, CommandRefused
 from drivers.guard import (
     SafeCommandSet,
@@ -20,6 +19,7 @@ from drivers.guard import (
     safe_voltage_envelope,
     safe_voltages,
 )
+from drivers.guard.rounding import rounded_down
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
@@ -86,12 +86,13 @@ class VoltageBackend(Backend):
         """Exchange a request in voltage, and return its reply in motion."""
         require_safe(request)
         if isinstance(request, LoadEnvelope):
-            return self._keep(request.envelope)
+            return self._keep(cast("SafeEnvelope", request.envelope))
         if isinstance(request, Stage | Apply):
-            refusal = await self._load(request.command_set, timeout=timeout)
+            requested = cast("SafeCommandSet", request.command_set)
+            refusal = await self._load(requested, timeout=timeout)
             if refusal is not None:
                 return refusal
-            request = replace(request, command_set=self._converted(request.command_set))
+            request = replace(request, command_set=self._converted(requested))
         reply = await self._backend.exchange(request, timeout=timeout)
         if isinstance(reply, Nak) and reply.code == NakCode.NO_ENVELOPE:
             self._loaded.clear()
@@ -160,12 +161,10 @@ class VoltageBackend(Backend):
         """Return the highest amplitude of a channel's voltage, in whole steps of the wire."""
         drive = self._drives.get(channel)
         highest = 0.0 if drive is None else min(reported, drive.swing)
-        return math.floor(highest * _LEVEL.per_unit + _SLACK) / _LEVEL.per_unit
+        return rounded_down(highest + _SLACK * _LEVEL.step, _LEVEL)
 
-    def _keep(self, envelope: Envelope) -> Reply:
+    def _keep(self, envelope: SafeEnvelope) -> Reply:
         """Keep an envelope until a set says at which frequency it is played."""
-        if not isinstance(envelope, SafeEnvelope):
-            raise TypeError(f"envelope must have passed a guard, got {type(envelope).__name__}")
         self._envelopes[envelope.slot] = envelope
         return Loaded(envelope.slot, len(envelope.knots))
 
@@ -190,10 +189,8 @@ class VoltageBackend(Backend):
                 self._loaded[slot] = content
         return None
 
-    def _converted(self, safe: object) -> SafeCommandSet:
+    def _converted(self, safe: SafeCommandSet) -> SafeCommandSet:
         """Return a set in voltage; the same again for one that is repeated."""
-        if not isinstance(safe, SafeCommandSet):
-            raise TypeError(f"set must have passed a guard, got {type(safe).__name__}")
         known, converted = self._sent.get(safe.token, (None, None))
         if converted is not None and known is safe:
             return converted

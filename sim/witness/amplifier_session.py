@@ -6,7 +6,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 
 from sim.witness.config import AmplifierConfig
-from sim.witness.decoded import ChannelCommand, ReportViolation, Request, RequestKind
+from sim.witness.decoded import ChannelCommand, ReportViolation, Request
 from sim.witness.reference_amplifier import ReferenceAmplifier
 from sim.witness.voices import Voices
 
@@ -50,15 +50,15 @@ class AmplifierSession:
     last_ping: float = -math.inf
     last_token: int = 0
     preempted_at: float = -math.inf  # when a silencing request overtook pending ones
-    constants: dict[tuple[RequestKind, int], bytes] = field(default_factory=dict)
+    constants: dict[str, bytes] = field(default_factory=dict)
     voices: Voices = field(default_factory=Voices)
 
-    def check_constant(self, kind: RequestKind, reported: bytes, time: float) -> None:
-        """Compare an identity or capabilities with those reported before in the same length."""
-        before = self.constants.setdefault((kind, len(reported)), reported)
+    def check_constant(self, what: str, reported: bytes, time: float) -> None:
+        """Compare what must be the same for ever with what was reported before."""
+        before = self.constants.setdefault(what, reported)
         if reported != before and not self.is_disturbed(time):
-            self.report("constant", time, f"{self.name}: reply to {kind.value} has changed")
-        self.constants[kind, len(reported)] = reported
+            self.report("constant", time, f"{self.name}: {what} has changed")
+        self.constants[what] = reported
 
     def forget_pending(self) -> None:
         """Abandon the pending requests; their replies may still arrive."""

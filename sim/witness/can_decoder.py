@@ -1,6 +1,6 @@
 """Decoder for CAN, from docs/reference/wire-can.md: requests, replies, sets, heartbeats, EMCY.
 
-Of SDO and NMT only identification, envelope transfers and boot-up are decoded.
+Of NMT only boot-up is decoded, of SDO what `can_transfers` lists.
 """
 
 import struct
@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from sim.witness import quantities as q
 from sim.witness.can_requests import ACTIONS, FILLING, PER_NODE, WITH_COMMANDS, CanRequests
 from sim.witness.can_text import CanFrame, SlcanText, SocketcandText
+from sim.witness.can_transfers import CanTransfers
 from sim.witness.decoded import (
     SETS,
     BootUp,
@@ -22,8 +23,6 @@ from sim.witness.decoded import (
     StateEvent,
 )
 from sim.witness.quantities import INVALID, OutOfRange
-
-_VOICES = bytes.fromhex("4F012010")  # an answer with one byte, of object 2001sub16
 
 
 class CanDecoder:
@@ -75,6 +74,7 @@ class CanDecoder:
             if node.requests.owns(frame):
                 return node.requests.take(time, frame) or [None]
         if function == 0x600 and number in self._nodes:
+            self._nodes[number].transfers.requested(time, frame)
             index = int.from_bytes(frame.data[1:3], "little")
             identifies = frame.data[0] == 0x40 and index in (0x1018, 0x2000)
             if frame.data[0] & 0xE3 == 0xC1:  # the end of a block: only envelopes are written so
@@ -90,9 +90,7 @@ class CanDecoder:
             state = frame.data[3] & 0xF
             return [StateEvent(number, state, frame.data[3] >> 4)]
         if function == 0x580 and number in self._nodes:
-            # The transfer may have fed the watchdog at any time.
-            is_voices = frame.data[:4] == _VOICES
-            return [Reply(number, "objects", voices=frame.data[4] if is_voices else 0)]
+            return [self._nodes[number].transfers.answered(frame)]
         for node in self._nodes.values():
             if frame.identifier == 0x180 + node.number:
                 return [*node.requests.end_set(frame.data[0]), node.reply(frame)]
@@ -112,6 +110,7 @@ class _Node:
         self.number = number
         self.numbers = range(number, number + max(1, -(-channels // PER_NODE)))
         self.requests = CanRequests(number, self.numbers)
+        self.transfers = CanTransfers(number)
         self.status: bytes | None = None
         self.levels: dict[int, bytes] = {}
 

@@ -132,7 +132,8 @@ class Reply:
 
     achieved: the set as played, by channel, and its token; is_exact: whether it plays as commanded;
     constant: what must be the same in every reply to such a request; voices: of a channel, as it
-    states, or 0; faults: newest first, each with its age [s].
+    states, or 0; faults: newest first, each with its age [s]; item: index and subindex of an object
+    that was read, since the time begun [s].
     """
 
     address: int
@@ -145,6 +146,8 @@ class Reply:
     constant: bytes | None = None
     voices: int = 0
     faults: tuple[tuple[int, float], ...] | None = None
+    item: tuple[int, int] | None = None
+    begun: float = 0.0
     problem: str = ""
 
 

@@ -146,6 +146,7 @@ class Exchanges:
         session.voices.stated = reply.voices or session.voices.stated
         if reply.key == "objects":
             session.amplifier.may_feed(time)
+            self._process_object(session, time, reply)
             return
         if reply.problem == REPLY_TO_DAMAGED_FRAME:
             session.report("damage", time, f"{session.name} executed a damaged frame")
@@ -171,7 +172,8 @@ class Exchanges:
         if request.kind is RequestKind.HELLO:
             self._host.request_granted(session, time, request)
         if reply.constant is not None:
-            session.check_constant(request.kind, reply.constant, time)
+            what = f"reply to {request.kind.value} of {len(reply.constant)} bytes"
+            session.check_constant(what, reply.constant, time)
         if reply.faults is not None and not was_lost:
             session.amplifier.faults_reported(reply.faults, at, time)
         if was_lost or request.problem:
@@ -201,6 +203,18 @@ class Exchanges:
         if session.is_disturbed(time) and request.kind is RequestKind.ARM:
             session.amplifier.forget_state()
         session.amplifier.request_granted(request, reply, at, time)
+
+    def _process_object(self, session: AmplifierSession, time: float, reply: Reply) -> None:
+        """Process an object that was read over CAN."""
+        if reply.item is None or session.is_disturbed(time) or session.is_disturbed(reply.begun):
+            return
+        name = f"object {reply.item[0]:04X}sub{reply.item[1]}"
+        if reply.problem:
+            session.report("answer", time, f"{session.name}: {name}: {reply.problem}")
+        if reply.constant is not None:
+            session.check_constant(name, reply.constant, time)
+        if reply.faults is not None:
+            session.amplifier.faults_reported(reply.faults, reply.begun, time)
 
     def _report_fading(self, session: AmplifierSession, time: float, token: int) -> None:
         """Report a set that had no room, or was refused although it had."""

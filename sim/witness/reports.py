@@ -40,8 +40,14 @@ def unpack_faults(payload: bytes) -> Faults:
     """Decode a list of faults behind their number; raises OutOfRange."""
     if not payload or len(payload) < 1 + 6 * payload[0]:
         raise OutOfRange("fault list must have as many records as it says")
-    records = struct.iter_unpack("<BBL", payload[1 : 1 + 6 * payload[0]])
-    return tuple((fault, age / 1000) for fault, _, age in records)
+    return unpack_fault_records(payload[1 : 1 + 6 * payload[0]])
+
+
+def unpack_fault_records(records: bytes) -> Faults:
+    """Decode a list of faults of six bytes each; raises OutOfRange."""
+    if len(records) % 6:
+        raise OutOfRange(f"fault list must have six bytes for each fault, got {len(records)}")
+    return tuple((fault, age / 1000) for fault, _, age in struct.iter_unpack("<BBL", records))
 
 
 def faults_of_words(words: Sequence[int]) -> Faults:

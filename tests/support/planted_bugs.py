@@ -57,6 +57,7 @@ from sim.amplifier import amplifier as simulated
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.amplifier.channels import Channels, PlayableSet
 from sim.amplifier.set_store import SetStore
+from sim.far_ends.can_bus.objects import ObjectDictionary
 from sim.far_ends.can_bus.requests import RequestHandler
 from sim.far_ends.can_bus.set_buffer import SetBuffer
 from sim.far_ends.serial_end import SerialEnd
@@ -438,6 +439,16 @@ def _identifies(change: Callable[[Identity], Identity]) -> Plant:
     return wrapped(SimulatedAmplifier, "_carry_out", around)
 
 
+def _reads(index: int, subindex: int, value: Callable[[Iterator[int]], bytes]) -> Plant:
+    """Let an object over CAN read as another value; numbers count the reads."""
+    numbers = count()
+
+    def around(read: Any, objects: Any, *item: int) -> Any:
+        return value(numbers) if item == (index, subindex) else read(objects, *item)
+
+    return wrapped(ObjectDictionary, "read", around)
+
+
 def _as_another_each_time(identity: Identity, numbers: Iterator[int] = count()) -> Identity:  # noqa: B008
     return replace(identity, firmware=f"1.{next(numbers)}")
 
@@ -640,6 +651,36 @@ FAR_ENDS: dict[str, Bug] = {
         "answer",
         replaced(serial_reports, "pack_text", lambda text: b"\x02\xff\xfe"),
         scenarios.asked,
+    ),
+    "its name is no UTF-8 on CAN": Bug(
+        "answer",
+        _reads(0x2000, 2, lambda numbers: b"\xff\xfe"),
+        scenarios.asked,
+        wire="slcan",
+    ),
+    "its firmware changes on CAN": Bug(
+        "constant",
+        _reads(0x2000, 4, lambda numbers: b"1." + b"1" * next(numbers)),
+        scenarios.asked,
+        wire="slcan",
+    ),
+    "its longest ramp changes on CAN": Bug(
+        "constant",
+        _reads(0x2001, 8, lambda numbers: struct.pack("<H", 1000 - next(numbers))),
+        scenarios.asked,
+        wire="socketcand",
+    ),
+    "its list of faults is empty on CAN": Bug(
+        "faults", _lists(lambda faults: ()), scenarios.asked, wire="slcan"
+    ),
+    "it lists faults older than they are on CAN": Bug(
+        "faults",
+        _lists(lambda faults: tuple(replace(one, age=one.age + 5) for one in faults)),
+        scenarios.asked,
+        wire="slcan",
+    ),
+    "it lists half a fault on CAN": Bug(
+        "answer", _reads(0x2008, 0, lambda numbers: bytes(9)), scenarios.asked, wire="slcan"
     ),
     "it forgets which set plays": Bug("token", _reports(lambda one: replace(one, token=0))),
 }

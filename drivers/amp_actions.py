@@ -13,8 +13,9 @@ from drivers import clock
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.backends.urls.address import with_address
 from drivers.command import CommandSet, DriveCommand
-from drivers.conformance import Check, CheckResult, raw_line, run_check
+from drivers.conformance import Check, CheckResult, raw_line
 from drivers.conformance.report import ConformanceReport
+from drivers.conformance.series import not_begun, run_checks
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, Guard, GuardLimits
 from drivers.link.link import REPLY_TIMEOUT
@@ -183,19 +184,29 @@ async def conform(
     on_result: Callable[[CheckResult], None],
     *,
     process: int | None = None,
+    before: ConformanceReport | None = None,
 ) -> ConformanceReport:
-    """Run checks in turn on one open amplifier; on_result: called with each result.
+    """Run checks in turn on one amplifier; on_result: called with each result.
 
-    process: see `run_check`.
+    process: see `run_check`; before: report of earlier checks, which this one continues: then a
+    link that cannot be opened any more makes these checks inconclusive instead of a LinkError.
     """
-    results = []
-    async with _opened(url, reply_timeout=_PATIENT_TIMEOUT) as amplifier:
-        raw = raw_line(url)
-        for check in checks:
-            results.append(await run_check(check, amplifier, raw, url=url, process=process))
-            on_result(results[-1])
-        stated = amplifier_class(amplifier.capabilities)
-    return ConformanceReport(url, stated.value, tuple(results))
+    raw = raw_line(url)
+    try:
+        async with _opened(url, reply_timeout=_PATIENT_TIMEOUT) as amplifier:
+            results = await run_checks(
+                checks, amplifier, raw, url=url, process=process, on_result=on_result
+            )
+            stated = amplifier_class(amplifier.capabilities).value
+    except LinkError as loss:
+        if before is None:
+            raise
+        results = tuple(not_begun(check, raw, str(loss)) for check in checks)
+        for result in results:
+            on_result(result)
+        stated = before.amplifier_class
+    report = ConformanceReport(url, stated, results)
+    return before.followed_by(report) if before else report
 
 
 @asynccontextmanager

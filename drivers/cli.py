@@ -260,7 +260,7 @@ def conformance(
             "of full stroke. Continue?"
         )
     if write and report.problems == 0:
-        report = report.followed_by(_run(conform(url, driving, show, process=process), trace))
+        report = _run(conform(url, driving, show, process=process, before=report), trace)
     if json_:
         print(json.dumps(report.to_json()))
     else:

@@ -1,14 +1,64 @@
 """Delays of this program, and of an emulated amplifier that shares its processors."""
 
 import asyncio
+import contextlib
+import os
 from pathlib import Path
 
 from drivers import clock
 
 _PERIOD = 0.002  # s
+_LISTED = 25  # periods between two looks for new threads
 
 STALL = 0.004
 """Lateness [s] from which an attempt counts as disturbed."""
+
+
+class ProcessorWaits:
+    """How long the threads of a process were ready to run and did not, by Linux's scheduler.
+
+    process: its number on this machine; None: of no process. Used as a context, since it keeps the
+    statistics of its threads open: they are read so often that opening them each time would delay
+    what is measured.
+    """
+
+    def __init__(self, process: int | None) -> None:
+        self._tasks = Path(f"/proc/{process}/task") if process is not None else None
+        self._open: dict[str, int] = {}
+        self._waited: dict[str, int] = {}
+        self._reads = 0
+
+    def __enter__(self) -> "ProcessorWaits":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for task in list(self._open):
+            self._close(task)
+
+    def total(self) -> float:
+        """Return the time [s] so far, also of threads that have ended."""
+        if self._reads % _LISTED == 0:
+            self._list()
+        self._reads += 1
+        for task, descriptor in list(self._open.items()):
+            try:
+                self._waited[task] = int(os.pread(descriptor, 64, 0).split()[1])
+            except (OSError, IndexError):  # a thread that has just ended
+                self._close(task)
+        return sum(self._waited.values()) * 1e-9
+
+    def _list(self) -> None:
+        """Open the statistics of threads that are new."""
+        if self._tasks is None:
+            return
+        with contextlib.suppress(OSError):  # the process, or the thread, has ended
+            for task in self._tasks.iterdir():
+                if task.name not in self._waited:
+                    descriptor = os.open(task / "schedstat", os.O_RDONLY | os.O_CLOEXEC)
+                    self._open[task.name], self._waited[task.name] = descriptor, 0
+
+    def _close(self, task: str) -> None:
+        os.close(self._open.pop(task))
 
 
 class Lateness:
@@ -20,8 +70,8 @@ class Lateness:
     """
 
     def __init__(self, process: int | None = None) -> None:
-        self._process = process
-        self._waited = waited_for_processor(process)
+        self._waits = ProcessorWaits(process)
+        self._waited = self._waits.total()
         self.worst = 0.0
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
@@ -33,7 +83,8 @@ class Lateness:
     def __exit__(self, *_: object) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        self._note()
+        with self._waits:
+            self._note()
 
     def _schedule(self) -> None:
         self._due = clock.now() + _PERIOD
@@ -44,23 +95,6 @@ class Lateness:
         self._schedule()
 
     def _note(self) -> None:
-        before, self._waited = self._waited, waited_for_processor(self._process)
+        before, self._waited = self._waited, self._waits.total()
         late = max(clock.now() - self._due, self._waited - before)
         self.worst = max(self.worst, late)
-
-
-def waited_for_processor(process: int | None) -> float:
-    """Return how long [s] the threads of a process were ready to run and did not.
-
-    By Linux's statistics of its scheduler; 0 for no process, or one that has ended.
-    """
-    if process is None or not (tasks := Path(f"/proc/{process}/task")).is_dir():
-        return 0.0
-    total = 0
-    for task in tasks.iterdir():
-        try:
-            _, waited, _ = (task / "schedstat").read_text("ascii").split()
-        except OSError:  # a thread that has just ended
-            continue
-        total += int(waited)
-    return total * 1e-9

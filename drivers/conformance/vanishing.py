@@ -6,7 +6,7 @@ import sys
 from drivers import clock
 from drivers.conformance.bench import Bench
 from drivers.conformance.check import driving
-from drivers.conformance.findings import ContractViolation, NotApplicable, expect
+from drivers.conformance.findings import ContractViolation, Inconclusive, NotApplicable, expect
 from drivers.protocol.messages import AmplifierState, Fault, Feature
 
 _WATCHDOG = 0.5  # s; long enough to open the line again
@@ -68,8 +68,11 @@ async def _killed(url: str, watchdog: float) -> float:
     )
     try:
         assert process.stdout is not None  # noqa: S101  it is a pipe
-        async with asyncio.timeout(_START_TIMEOUT):
-            said = await process.stdout.readline()
+        try:
+            async with asyncio.timeout(_START_TIMEOUT):
+                said = await process.stdout.readline()
+        except TimeoutError:
+            raise Inconclusive(f"no second host within {_START_TIMEOUT:g} s") from None
         if said.strip() != b"armed":
             *_, last = (await process.communicate())[1].decode().splitlines() or [""]
             raise ContractViolation("second host", expected="armed", seen=last)

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import pytest
 
 from drivers.amplifier import Amplifier
-from drivers.conformance import CHECKS, Check, CheckResult, raw_line, run_check
+from drivers.conformance import CHECKS, Check, CheckResult, raw_line
+from drivers.conformance.series import run_checks
 from drivers.registry import open_backend
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
@@ -19,7 +20,7 @@ async def results_at(url: str, checks: Sequence[Check] = CHECKS) -> list[CheckRe
     amplifier, raw = Amplifier(open_backend(url)), raw_line(url)
     await amplifier.open()
     try:
-        return [await run_check(check, amplifier, raw) for check in checks]
+        return list(await run_checks(checks, amplifier, raw))
     finally:
         await amplifier.close()
 

@@ -1,0 +1,67 @@
+"""Checks in turn on one amplifier, whose link may be lost on the way."""
+
+import asyncio
+from collections.abc import Callable, Iterable
+
+from drivers import clock
+from drivers.amplifier import Amplifier
+from drivers.conformance.check import Check, CheckResult, Result, run_check
+from drivers.conformance.raw.line import RawLine
+from drivers.errors import DriverError
+
+_REOPENING = 2.0  # s; an adapter that was reset has its port again by then
+_PAUSE = 0.1  # s; between tries
+
+
+async def run_checks(
+    checks: Iterable[Check],
+    amplifier: Amplifier,
+    raw: RawLine | None = None,
+    *,
+    url: str = "",
+    process: int | None = None,
+    on_result: Callable[[CheckResult], None] = lambda result: None,
+) -> tuple[CheckResult, ...]:
+    """Run checks on an open, disarmed amplifier; on_result is called with each result.
+
+    A link that was lost is opened again before the next check. Once it cannot be, all that are left
+    are inconclusive. raw, url, process: see `run_check`.
+    """
+    results: list[CheckResult] = []
+    loss = ""
+    for check in checks:
+        loss = loss or await _reopened(amplifier)
+        if loss:
+            results.append(not_begun(check, raw, loss))
+        else:
+            results.append(await run_check(check, amplifier, raw, url=url, process=process))
+        on_result(results[-1])
+    return tuple(results)
+
+
+def not_begun(check: Check, raw: RawLine | None, loss: str) -> CheckResult:
+    """Make the result of a check before which the link was lost, and why."""
+    reason = f"the link was lost before it: {loss}"
+    return CheckResult(
+        check,
+        check.place(raw),
+        Result.INCONCLUSIVE,
+        reason,
+        seen=reason,
+        expected=check.requirement,
+        attempts=0,
+    )
+
+
+async def _reopened(amplifier: Amplifier) -> str:
+    """Open the amplifier again if it was lost; return why it cannot be opened, or nothing."""
+    end = clock.now() + _REOPENING
+    while amplifier.is_lost:
+        try:
+            await amplifier.close()
+            await amplifier.open()
+        except DriverError as error:
+            if clock.now() >= end:
+                return str(error)
+            await asyncio.sleep(_PAUSE)
+    return ""

@@ -2,8 +2,8 @@
 
 Runs the tests of its samples, mutated frames under the sanitizers (20 000 for each codec; a million
 with --long), and conformance on every wire. Prints code size, memory, and instructions per frame
-and per sample, and says what was left out where a program is not installed. --no-tests: after
-`make test`, which has run them.
+and per sample, and says what was left out where a program is not installed, which is a failure in
+CI. --no-tests: after `make test`, which has run them.
 """
 
 import os
@@ -28,7 +28,7 @@ def main() -> None:
     run(sys.executable, ROOT / "firmware" / "test" / "conformance.py")
     if not is_bare_metal:
         print("left out: bare metal; it needs gcc-arm-none-eabi and qemu-system-arm")
-        return
+        sys.exit(os.environ.get("CI") == "true")
     run("arm-none-eabi-size", OUT / "mps2-amplifier.elf")
     print(instructions(), end="")
 

@@ -6,6 +6,7 @@ ends disarmed.
 """
 
 from drivers.conformance import (
+    cross_fades,
     ending,
     envelopes,
     fades,
@@ -51,6 +52,8 @@ CHECKS: tuple[Check, ...] = (
     fades.earlier_ends_stay,
     fades.voices,
     fades.phases,
+    cross_fades.levels_of_two_frequencies,
+    cross_fades.levels_of_one_frequency,
     fades.ramps_of_valid_for,
     ending.valid_for,
     ending.valid_for_is_of_its_set,

@@ -5,7 +5,8 @@ changed, in a line or two. `UNSEEN` are those that the wire does not show, with 
 """
 
 import asyncio
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -235,6 +236,35 @@ def silenced(change: Callable[[float], float]) -> Plant:
         silence(channels, time, ramp=change(ramp))
 
     return wrapped(Channels, "silence", around)
+
+
+def levels_of(level: Callable[[Sequence[float]], float]) -> Plant:
+    """Make the level of a channel of the magnitudes of its voices that sound, oldest first."""
+
+    def levels(channels: Any, time: float) -> tuple[float, ...]:
+        return tuple(
+            min(level([one for one in _sizes(output, time) if one > 0] or [0.0]), 1.0)
+            for output in channels._outputs
+        )
+
+    return replaced(Channels, "levels", levels)
+
+
+def _sizes(output: Any, time: float) -> list[float]:
+    """The magnitudes of the voices of an output."""
+    return [abs(tone.amplitude(time)) for tone in output]
+
+
+def _half_cancelled(levels: Any, channels: Any, time: float) -> tuple[float, ...]:
+    added = (sum(_sizes(output, time)) for output in channels._outputs)
+    return tuple((one + both) / 2 for one, both in zip(levels(channels, time), added, strict=True))
+
+
+def _newest_of_one_frequency(levels: Any, channels: Any, time: float) -> tuple[float, ...]:
+    return tuple(
+        _sizes(output, time)[-1] if len({tone.frequency for tone in output}) == 1 else level
+        for output, level in zip(channels._outputs, levels(channels, time), strict=True)
+    )
 
 
 def _linear(tone: FadingTone, time: float) -> float:
@@ -727,6 +757,26 @@ FAULTS: dict[str, PlantedFault] = {
         "phases", played(each(lambda one: replace(one, phase=-one.phase)))
     ),
     "phases are ignored": PlantedFault("phases", played(each(lambda one: replace(one, phase=0.0)))),
+    # Levels of cross-fades
+    "a channel shows the level of its newest voice alone": PlantedFault(
+        "levels_of_two_frequencies", levels_of(lambda sizes: sizes[-1])
+    ),
+    "a channel shows the level of its loudest voice alone": PlantedFault(
+        "levels_of_two_frequencies", levels_of(max)
+    ),
+    "levels of voices are added as powers": PlantedFault(
+        "levels_of_two_frequencies", levels_of(lambda sizes: math.hypot(*sizes))
+    ),
+    "a cross-fade shows a tenth more than its voices": PlantedFault(
+        "levels_of_two_frequencies",
+        levels_of(lambda sizes: sum(sizes) * (1.1 if len(sizes) > 1 else 1.0)),
+    ),
+    "a cross-fade shows half of what one frequency cancels": PlantedFault(
+        "levels_of_one_frequency", wrapped(Channels, "levels", _half_cancelled)
+    ),
+    "voices of one frequency show the newest alone": PlantedFault(
+        "levels_of_one_frequency", wrapped(Channels, "levels", _newest_of_one_frequency)
+    ),
     # valid_for
     "valid_for is ignored": PlantedFault(
         "valid_for", before(object, lambda self, *_: setattr(self, "_vibration_end", float("inf")))

@@ -220,20 +220,17 @@ def shape_to(
 def end_along(
     playing: Output, time: float, *, ramp: float, step: float, knots: tuple[complex, ...]
 ) -> Output:
-    """The output after a command at a time [s] to end along an envelope; see `shape_to`."""
-    lasting = next((tone for tone in playing if tone.is_lasting), None)
-    if lasting is None:
-        return tuple(tone for tone in playing if tone.silent_from > time)
-    return shape_to(
-        playing,
-        time,
-        ramp=ramp,
-        step=step,
-        knots=knots,
-        frequency=lasting.frequency,
-        amplitude=0j,
-        keep_phase=True,
-    )
+    """The output after a command at a time [s] to end along an envelope; see `shape_to`.
+
+    The ending is that of the newest tone, from its present amplitude, also while an onset leads it
+    to silence; of one that is silent already there is none.
+    """
+    newest = playing[-1] if playing else None
+    if newest is None or newest.silent_from <= time:
+        return fade_to(playing, time, ramp=ramp)
+    fading = fade_to(playing[:-1], time, ramp=ramp)
+    values = (newest.amplitude(time), *knots, 0j)
+    return (*fading, ShapedTone(newest.frequency, newest.origin, time, step, values))
 
 
 def level_of(playing: Output, time: float) -> float:

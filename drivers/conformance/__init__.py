@@ -84,6 +84,7 @@ CHECKS: tuple[Check, ...] = (
     frames.broadcasts,
     envelopes.onsets,
     envelopes.endings,
+    envelopes.endings_amid_onsets,
     envelopes.skipped_endings,
     envelopes.interrupted_endings,
     envelopes.loaded_while_playing,

@@ -5,7 +5,7 @@ from drivers.conformance.bench import Bench
 from drivers.conformance.check import driving
 from drivers.conformance.curve import Curve, expect_curve, raised_cosine, samples_until
 from drivers.conformance.ending import PROMPT, is_silent
-from drivers.conformance.findings import NotApplicable, expect
+from drivers.conformance.findings import Inconclusive, NotApplicable, expect
 from drivers.protocol.messages import Feature
 
 _PLACE = "wire-protocol.md#envelopes"
@@ -84,6 +84,27 @@ async def endings(bench: Bench) -> None:
         lasts=lasts + 3 * step,
         what="of an ending by valid_for",
     )
+
+
+@driving(_PLACE)
+async def endings_amid_onsets(bench: Bench) -> None:
+    """It ends along the ending from the present amplitude amid an onset to level 0, too."""
+    step, level = _step(bench), bench.level
+    if bench.can.envelope_knots < 2:
+        raise NotApplicable("an onset of one knot has no level that stays")
+    await _load(bench, 1, 1.0, 1.0)
+    await _load(bench, 2, 0.5)
+    await bench.arm()
+    begun = await bench.apply(bench.tones(0.0, onset=1, ending=2))
+    await bench.pause_until(begun.latest + 1.3 * step)
+    when = await bench.play()
+    if when.latest > begun.earliest + 2 * step:
+        raise Inconclusive("the silent set came after the level that stays")
+    falling = _along(step, level, 0.5 * level, 0.0)
+    samples = await samples_until(bench, when.latest + 2.2 * step)
+    what = "of an ending amid an onset to level 0"
+    expect_curve(bench, samples, falling, commit=when, lasts=2 * step, what=what)
+    await bench.expect_levels(why="after such an ending")
 
 
 @driving(_PLACE)

@@ -179,6 +179,21 @@ def test_interrupted_ending_ends_when_it_would(firmware: Path) -> None:
         assert np.abs(samples[:, 0] - expected).max() < TOLERANCE
 
 
+def test_ending_plays_amid_an_onset_to_level_zero(firmware: Path) -> None:
+    """From the present amplitude along straight lines, whatever the ramp of the silent set."""
+    script: Script = [
+        (0, load(5, 10, (0.4, 0.0), (0.4, 0.0))),
+        (0, load(6, 10, (0.2, 0.0))),
+        (0, arm()),
+        (0, apply(1, command(0, 90, 0.0, onset=5, ending=6))),
+        (15, apply(2, ramp_ms=100)),
+    ]
+    samples, _ = replay(firmware, script, 60)
+    t = seconds(len(samples))
+    level = np.interp(t, [0, 0.01, 0.015, 0.025, 0.035], [0, 0.4, 0.4, 0.2, 0])
+    assert np.abs(samples[:, 0] - tone(t, 90, 1) * level).max() < TOLERANCE
+
+
 def test_same_commands_in_another_order_are_another_set(firmware: Path) -> None:
     """An Apply with active_token is refused with BAD_TOKEN then, and confirmed otherwise."""
     commands = command(0, 100, 0.5), command(1, 130, 0.4)

@@ -267,6 +267,10 @@ def _newest_of_one_frequency(levels: Any, channels: Any, time: float) -> tuple[f
     )
 
 
+def _onset_goes_on(ended: Any, playing: Any, time: float, *how: Any) -> Any:
+    return ended(playing, time, *how) if playing and playing[-1].is_lasting else playing
+
+
 def _linear(tone: FadingTone, time: float) -> float:
     share = min((time - tone.start) / tone.ramp, 1.0) if tone.ramp else 1.0
     return tone.gain_from + (tone.gain_to - tone.gain_from) * share
@@ -1011,6 +1015,9 @@ FAULTS: dict[str, PlantedFault] = {
             "play",
             lambda play, self, one, time: play(self, replace(one, endings={}), time),
         ),
+    ),
+    "an onset to level 0 goes on through a silent set": PlantedFault(
+        "endings_amid_onsets", wrapped(channel_outputs, "_ended", _onset_goes_on)
     ),
     "the steps of envelopes are doubled": PlantedFault(
         "onsets",

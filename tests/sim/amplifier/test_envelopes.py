@@ -90,6 +90,28 @@ def test_ending_plays_before_a_silent_set() -> None:
     assert tone.silent_from == pytest.approx(1.215)
 
 
+def test_ending_plays_amid_an_onset_to_level_zero() -> None:
+    """From the present amplitude, whatever the ramp and whatever the onset would have done."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.0, onset=1, ending=2)), 1.0)
+    amplifier.handle(Apply(CommandSet(2, (), ramp=0.5, valid_for=0.0)), 1.01)
+    expected = {1.01: 0.4, 1.0125: 0.05, 1.015: 0.5, 1.02: 0.1, 1.025: 0.0}
+    for moment, value in expected.items():  # 0.4, half way to -0.5, the knots, silence
+        assert level(amplifier, moment) == pytest.approx(value, abs=1e-9)
+
+
+def test_silent_set_after_an_onset_to_level_zero_fades_what_else_sounds() -> None:
+    """A voice that has ended has no ending; that of the set before fades along the new ramp."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.8)), 1.0)
+    amplifier.handle(Apply(playing(2, 0.0, ramp=0.8, onset=1, ending=2)), 1.0)
+    before = level(amplifier, 1.1)
+    assert before > 0.5
+    amplifier.handle(Apply(CommandSet(3, (), ramp=0.02, valid_for=0.0)), 1.1)
+    assert level(amplifier, 1.11) == pytest.approx(before / 2)
+    assert level(amplifier, 1.1201) == 0.0
+
+
 @pytest.mark.parametrize(
     "silencing",
     [Apply(playing(2, 0.0, ramp=0.005, skip_ending=True)), Stop(0.005), Disarm(0.005), None],

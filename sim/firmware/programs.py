@@ -9,6 +9,7 @@ import fcntl
 import os
 import re
 import shutil
+import socket
 from collections.abc import AsyncIterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +33,6 @@ _FULL_STROKE = 32767.0  # as a sample
 _PIPE_SIZE = 1 << 20  # bytes; eight seconds
 _STARTUP_TIMEOUT = 10.0  # s
 _QEMU = "qemu-system-arm"
-_QEMU_LOOKS = 1.1  # s; it looks once a second whether its pseudo-terminal has been opened
 
 
 @dataclass(frozen=True)
@@ -43,15 +43,16 @@ class Firmware:
     description: str
     is_emulated: bool
 
-    def arguments(self, samples: Path) -> list[str | Path]:
-        """The command with its serial line on a pseudo-terminal; samples: a file for them."""
-        if self.is_emulated:
-            return [
-                *self.command,
-                *("-serial", "pty", "-serial", "null", "-serial"),
-                f"file:{samples}",
-            ]
-        return [*self.command, "--serial", "--samples", samples]
+    def arguments(self, samples: Path, *, listening: int | None) -> list[str | Path]:
+        """The command; samples: a file for them; listening: descriptor of a socket for its line.
+
+        Without one the line is a pseudo-terminal.
+        """
+        if listening is None:
+            return [*self.command, "--serial", "--samples", samples]
+        line = f"socket,id=line,fd={listening},server=on,wait=off,nodelay=on"
+        uarts = ("-serial", "chardev:line", "-serial", "null", "-serial", f"file:{samples}")
+        return [*self.command, "-chardev", line, *uarts]
 
 
 def find_firmware() -> Firmware:
@@ -91,25 +92,32 @@ class RunningFirmware:
 
 @contextlib.asynccontextmanager
 async def running(firmware: Firmware, folder: Path, name: str) -> AsyncIterator[RunningFirmware]:
-    """Run the firmware for an amplifier; folder: for its pipe. Raises LinkError."""
+    """Run the firmware for an amplifier; folder: for its pipe. Raises LinkError.
+
+    The emulator has its line on TCP: beside other load, the kernel would keep bytes of a
+    pseudo-terminal for longer than a host waits.
+    """
     path = folder / f"{name}.samples"
     os.mkfifo(path)
     async with contextlib.AsyncExitStack() as stack:
         pipe = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         stack.callback(os.close, pipe)
         fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
+        listening = socket.create_server(("127.0.0.1", 0)) if firmware.is_emulated else None
+        line = listening.fileno() if listening is not None else None
         process = await asyncio.create_subprocess_exec(
-            *firmware.arguments(path),
+            *firmware.arguments(path, listening=line),
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.DEVNULL,  # the emulator tells how it was ended
+            pass_fds=() if line is None else (line,),
         )
         stack.push_async_callback(_terminate, process)
-        terminal = await _terminal_of(process, name)
-        # Held open, or the emulator would see it closed between two hosts, and look again later.
-        stack.callback(os.close, os.open(terminal, os.O_RDWR | os.O_NOCTTY))
-        if firmware.is_emulated:
-            await asyncio.sleep(_QEMU_LOOKS)
-        yield RunningFirmware(f"serial://{terminal}", pipe)
+        if listening is not None:
+            port = listening.getsockname()[1]
+            listening.close()
+            yield RunningFirmware(f"serial://127.0.0.1:{port}", pipe)
+        else:
+            yield RunningFirmware(f"serial://{await _terminal_of(process, name)}", pipe)
 
 
 async def _terminal_of(process: asyncio.subprocess.Process, name: str) -> str:

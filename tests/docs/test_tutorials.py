@@ -12,7 +12,8 @@ from typed_page import Typed, Written, read_steps
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "tutorials"
-IN_REAL_TIME = {"daemon-with-a-layout"}  # its amplifier has a watchdog
+SHORT = "own-plate"
+"""Followed by every run of the tests; the others by `make pages`."""
 
 
 @pytest.fixture
@@ -26,7 +27,7 @@ def home() -> Iterator[Path]:
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, marks=[pytest.mark.real_time] if page in IN_REAL_TIME else [])
+        pytest.param(page, marks=[] if page == SHORT else [pytest.mark.pages])
         for page in sorted(path.stem for path in PAGES.glob("*.md"))
     ],
 )

@@ -26,7 +26,8 @@ NAMES = [
 ]
 WITH_CONFORMANCE = ["add-a-backend", "write-an-amplifier"]
 """They run the whole of it."""
-IN_REAL_TIME = [pytest.param(name, marks=pytest.mark.real_time) for name in WITH_CONFORMANCE]
+SHORT = "add-a-material"
+"""Executed by every run of the tests; the others by `make pages`."""
 
 
 @pytest.fixture
@@ -49,7 +50,10 @@ def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
 
 @pytest.mark.parametrize(
     "name",
-    [*NAMES, *(pytest.param(name, marks=pytest.mark.real_time) for name in WITH_CONFORMANCE)],
+    [
+        pytest.param(name, marks=[] if name == SHORT else [pytest.mark.pages])
+        for name in [*NAMES, *WITH_CONFORMANCE]
+    ],
 )
 def test_page_commands_print_what_is_shown(name: str, reader: Reader) -> None:
     """Commands, run in order, print the output on the page."""

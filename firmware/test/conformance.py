@@ -23,6 +23,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from sim.firmware.programs import ending_with_parent
+
 OUT = Path(__file__).parents[2] / "out" / "firmware"
 ERA = Path(sys.executable).parent / "era"
 BOARD = ("qemu-system-arm", "-M", "mps2-an385", "-display", "none", "-monitor", "none", "-kernel")
@@ -74,7 +76,9 @@ def run_at(place: Place) -> Run:
     """Run the suite on an amplifier."""
     with place() as (url, process):
         command = [ERA, "amp", "conformance", url, "--write", "--json", "--process", str(process)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            ending_with_parent(command), capture_output=True, text=True, check=False
+        )
     return Run(done.returncode, done.stdout, done.stderr.strip())
 
 
@@ -138,7 +142,7 @@ def started(
     stack: contextlib.ExitStack, *options: str, keeps: tuple[int, ...] = ()
 ) -> "subprocess.Popen[str]":
     """Start an emulator until the stack ends; keeps: descriptors that it inherits."""
-    command = [*BOARD, OUT / "mps2-amplifier.elf", *options]
+    command = ending_with_parent([*BOARD, OUT / "mps2-amplifier.elf", *options])
     pipe, null = subprocess.PIPE, subprocess.DEVNULL
     process = subprocess.Popen(command, stdout=pipe, stderr=null, text=True, pass_fds=keeps)
     stack.enter_context(process)

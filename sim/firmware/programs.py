@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import socket
+import sys
 from collections.abc import AsyncIterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,11 @@ _FULL_STROKE = 32767.0  # as a sample
 _PIPE_SIZE = 1 << 20  # bytes; eight seconds
 _STARTUP_TIMEOUT = 10.0  # s
 _QEMU = "qemu-system-arm"
+_WITH_PARENT = (
+    "import ctypes, os, signal, sys; "
+    "ctypes.CDLL(None).prctl(1, signal.SIGTERM); "  # PR_SET_PDEATHSIG
+    "os.getppid() == int(sys.argv[1]) and os.execvp(sys.argv[2], sys.argv[2:])"
+)
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,16 @@ def find_firmware() -> Firmware:
     )
 
 
+def ending_with_parent(command: Sequence[str | Path]) -> list[str | Path]:
+    """A command whose process ends with the thread that starts it, also if that is killed.
+
+    An emulator does not notice by itself that nobody reads it, and computes on. On Linux only.
+    """
+    if sys.platform != "linux":
+        return [*command]
+    return [sys.executable, "-c", _WITH_PARENT, str(os.getpid()), *command]
+
+
 class RunningFirmware:
     """A running amplifier: its URL, and its samples as they come."""
 
@@ -106,7 +122,7 @@ async def running(firmware: Firmware, folder: Path, name: str) -> AsyncIterator[
         listening = socket.create_server(("127.0.0.1", 0)) if firmware.is_emulated else None
         line = listening.fileno() if listening is not None else None
         process = await asyncio.create_subprocess_exec(
-            *firmware.arguments(path, listening=line),
+            *ending_with_parent(firmware.arguments(path, listening=line)),
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.DEVNULL,  # the emulator tells how it was ended
             pass_fds=() if line is None else (line,),

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import math
 import shlex
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import asdict
 from typing import Any
@@ -25,13 +25,20 @@ from drivers.operation.silence import stop_and_confirm, stop_outcome
 from drivers.operation.watchdog import check_watchdog, shortest_watchdog
 from drivers.protocol.classes import amplifier_class
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import AmplifierState, Feature, Status
+from drivers.protocol.messages import AmplifierState, Feature, SensorUnit, Status
 from drivers.registry import open_backend
 
 _TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address
 _STOP_TIMEOUT = 2.0  # s; for boards that restart when their port is opened
 _PATIENT_TIMEOUT = 0.2  # s; of replies under test, whose time is measured
 _RAMP = 0.05  # s; neither start nor end of a drive clicks
+_SENSOR_UNITS = {
+    SensorUnit.ACCELERATION: "m/s²",
+    SensorUnit.VELOCITY: "m/s",
+    SensorUnit.DISPLACEMENT: "m",
+    SensorUnit.FORCE: "N",
+    SensorUnit.VOLTAGE: "V",
+}
 _UNITS = {
     **dict.fromkeys(("frequency_min", "frequency_max", "frequency_step"), "_hz"),
     **dict.fromkeys(("ramp_max", "watchdog_min", "watchdog_max"), "_s"),
@@ -78,6 +85,57 @@ async def status(url: str) -> dict[str, Any]:
             "last_round_trip_s": amplifier.statistics.last_round_trip,
             **_wire_rows(amplifier),
         }
+
+
+async def sensors(url: str) -> dict[str, Any]:
+    """Read what the sensors measure, and where."""
+    async with _opened(url) as amplifier:
+        found = await amplifier.sensors()
+    return {
+        "url": url,
+        "sensors": [
+            {
+                "sensor": number,
+                "measures": one.unit.name.lower(),
+                "unit": _SENSOR_UNITS.get(one.unit),
+                "channel": one.channel,
+                "x_m": one.x,
+                "y_m": one.y,
+                "range": one.range,
+                "frequency_max_hz": one.frequency_max,
+                "sample_rate_hz": one.sample_rate,
+                "count_step": one.count_step,
+            }
+            for number, one in enumerate(found)
+        ],
+    }
+
+
+async def measure(url: str, frequencies: Sequence[float], window: float) -> dict[str, Any]:
+    """Measure tones [Hz] at every sensor over a window [s]; what plays goes on."""
+    async with _opened(url) as amplifier:
+        if Feature.SENSORS not in amplifier.capabilities.features:
+            raise CommandError("the amplifier has no sensors")
+        described = await amplifier.sensors()
+        reading = await amplifier.measure(frequencies, window)
+    return {
+        "url": url,
+        "state": reading.state.name,
+        "token": reading.token,
+        "window_s": window,
+        "sensors": [
+            {
+                "sensor": number,
+                "unit": _SENSOR_UNITS.get(described[number].unit),
+                "overload": one.is_overloaded,
+                "tones": [
+                    {"frequency_hz": at, "amplitude": tone.amplitude, "phase_deg": tone.phase}
+                    for at, tone in zip(frequencies, one.tones, strict=True)
+                ],
+            }
+            for number, one in enumerate(reading.sensors)
+        ],
+    }
 
 
 async def stop(url: str) -> dict[str, Any]:

@@ -20,7 +20,16 @@ from drivers.guard import Guard, GuardLimits
 from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.operation.keep_alive import keep_alive
 from drivers.operation.watchdog import HEARTBEAT
-from drivers.protocol.messages import Achieved, Capabilities, FaultRecord, Identity, Status
+from drivers.protocol.messages import (
+    Achieved,
+    AmplifierState,
+    Capabilities,
+    FaultRecord,
+    Identity,
+    Reading,
+    Sensor,
+    Status,
+)
 from drivers.registry import open_backend
 from registry.voltage import VoltageDrive
 
@@ -109,6 +118,28 @@ class BlockingAmplifier:
     def faults(self) -> tuple[FaultRecord, ...]:
         """Read latched and past faults, newest first."""
         return self._wait(self._amplifier.faults())
+
+    def sensors(self) -> tuple[Sensor, ...]:
+        """Read what its sensors measure, and where; empty if it has none."""
+        return self._wait(self._amplifier.sensors())
+
+    def measure(self, frequencies: Sequence[float], window: float) -> Reading:
+        """Measure tones [Hz] at all sensors over a window [s], feeding the watchdog meanwhile.
+
+        What plays must have settled before. Raises CommandRefused if the amplifier stops by itself.
+        """
+        return self._wait(self._measured(frequencies, window))
+
+    async def _measured(self, frequencies: Sequence[float], window: float) -> Reading:
+        is_armed = (await self._amplifier.status()).state is AmplifierState.OPERATION_ENABLED
+        measuring = asyncio.ensure_future(self._amplifier.measure(frequencies, window))
+        try:
+            while is_armed and not measuring.done():
+                await asyncio.wait([measuring], timeout=HEARTBEAT)
+                await self._checked.heartbeat()
+            return await measuring
+        finally:
+            measuring.cancel()
 
     def heartbeat(self) -> Status:
         """Feed the watchdog."""

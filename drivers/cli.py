@@ -186,6 +186,31 @@ def drive(
 
 
 @amp.command()
+def sensors(url: Url, trace: Trace = None, json_: Json = False) -> None:
+    """Show what the sensors measure, and where."""
+    from drivers import amp_actions
+
+    _show(_run(amp_actions.sensors(url), trace), as_json=json_)
+
+
+@amp.command()
+def measure(
+    url: Url,
+    frequency: Annotated[
+        list[float],
+        typer.Option("--frequency", help="Frequency of a tone [Hz]; once for each, up to 16."),
+    ],
+    window: Annotated[float, typer.Option(help="Time over which to measure [s].")] = 0.5,
+    trace: Trace = None,
+    json_: Json = False,
+) -> None:
+    """Measure amplitude and phase of tones at every sensor. Changes nothing that plays."""
+    from drivers import amp_actions
+
+    _show(_run(amp_actions.measure(url, frequency, window), trace), as_json=json_)
+
+
+@amp.command()
 def stop(url: Url, trace: Trace = None, json_: Json = False) -> None:
     """Stop all channels at once. Latched until cleared.
 

@@ -56,7 +56,7 @@ def entries(channels: int) -> Iterator[Entry]:
 
 
 def _count(per: str | int, channels: int) -> int:
-    if per == "channel":
+    if per in ("channel", "sensor"):  # a sensor at each channel's actuator
         return channels
     return -(-channels // CANOPEN["channels_per_node"]) if per == "four_channels" else int(per)
 

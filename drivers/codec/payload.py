@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from enum import IntEnum
 from typing import Any, TypeVar
 
-from drivers.errors import FrameError
+from drivers.errors import CommandError, FrameError
 from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import NakCode, Status
 
@@ -17,7 +17,10 @@ _CHANNEL = PROTOCOL.quantities.channel
 _NO_CHANNEL = 255
 _STATUS_FLAGS = PROTOCOL.status_flags
 _TEXT_MAX = 32
+_BAD_VALUE = NakCode.BAD_VALUE
+_REAL_MAX = (2 - 2**-23) * 2.0**127  # of IEEE 754 binary32
 _LAYOUTS = {code: struct.Struct("<" + code) for code in "BHIh"}
+_REAL = struct.Struct("<f")
 
 EnumT = TypeVar("EnumT", bound=IntEnum)
 
@@ -95,6 +98,15 @@ class Cursor:
         """Read any byte."""
         return self._raw("B")
 
+    def signed(self) -> int:
+        """Read any signed integer of two bytes."""
+        return self._raw("h")
+
+    def real(self) -> float:
+        """Read a number of type f32, which must be finite and not negative."""
+        (value,) = _REAL.unpack(self._take(_REAL.size))
+        return checked_real(value)
+
     def end(self) -> None:
         """Require the end of the payload."""
         if self._at != len(self._payload):
@@ -148,6 +160,20 @@ def pack_text(text: str) -> bytes:
     """Pack a text, truncated to its longest length; see `Cursor.text`."""
     raw = text.encode()[:_TEXT_MAX].decode(errors="ignore").encode()
     return bytes([len(raw)]) + raw
+
+
+def pack_real(value: float) -> bytes:
+    """Pack a finite number as type f32; CommandError for one out of range."""
+    if not 0 <= value <= _REAL_MAX:
+        raise CommandError(f"a number must be 0 to {_REAL_MAX:.4g}, got {value:g}")
+    return _REAL.pack(value)
+
+
+def checked_real(value: float) -> float:
+    """Return a number of type f32 as it arrived; Malformed unless finite and not negative."""
+    if not 0 <= value <= _REAL_MAX:
+        raise Malformed(f"a number must be 0 to {_REAL_MAX:.4g}, got {value}", code=_BAD_VALUE)
+    return value
 
 
 def pack_optional_channel(channel: int | None) -> bytes:

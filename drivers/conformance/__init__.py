@@ -13,6 +13,7 @@ from drivers.conformance import (
     frames,
     playing,
     reading,
+    sensors,
     sessions,
     tokens,
     vanishing,
@@ -30,6 +31,8 @@ CHECKS: tuple[Check, ...] = (
     reading.starts_disarmed,
     reading.reading_changes_nothing,
     reading.replies_in_time,
+    sensors.sensor_descriptions,
+    sensors.readings,
     playing.plays_nothing_disarmed,
     playing.arming_forgets,
     playing.achieved,
@@ -91,6 +94,10 @@ CHECKS: tuple[Check, ...] = (
     envelopes.kept_phase_onset,
     envelopes.watchdog_skips_endings,
     envelopes.missing_envelopes,
+    sensors.readings_change_nothing,
+    sensors.disturbed_readings,
+    sensors.readings_of_tones,
+    sensors.raw_samples,
     vanishing.vanished_host,
 )
 """All checks, in their order of execution."""

@@ -31,8 +31,11 @@ from drivers.protocol.messages import (
     Loaded,
     Measured,
     Nak,
+    Reading,
     Reply,
     Request,
+    SampleBlock,
+    SensorList,
     Status,
     Stop,
 )
@@ -54,7 +57,19 @@ DEGRADED = (
 
 BUSY_PAUSE = 0.005  # s; before a retry to a busy amplifier; short against the latency of touch
 
-ReplyT = TypeVar("ReplyT", Identity, Capabilities, Status, Achieved, FaultList, Loaded, Measured)
+ReplyT = TypeVar(
+    "ReplyT",
+    Identity,
+    Capabilities,
+    Status,
+    Achieved,
+    FaultList,
+    Loaded,
+    Measured,
+    SensorList,
+    Reading,
+    SampleBlock,
+)
 
 
 def retries_on(round_trip: float, *, reply_timeout: float = REPLY_TIMEOUT) -> int:

@@ -119,6 +119,18 @@ class Quantities:
     session: WireQuantity
     held_session: WireQuantity
     latch: WireQuantity
+    sensor: WireQuantity
+    sensor_count: WireQuantity
+    place: WireQuantity
+    sample_rate: WireQuantity
+    reading: WireQuantity
+    held_reading: WireQuantity
+    window: WireQuantity
+    window_left: WireQuantity
+    window_start: WireQuantity
+    tone_count: WireQuantity
+    sample: WireQuantity
+    sample_count: WireQuantity
 
 
 @dataclass(frozen=True)
@@ -138,7 +150,8 @@ class Protocol:
 
     vendor_numbers: the first type, fault and refusal that are the vendor's; reaction [s]: longest
     time until a reply begins; staged_life [s]: of a set that is not committed; features,
-    status_flags: bits by name; modbus, canopen: the sections of these names in the file.
+    status_flags: bits by name; overload: bit of the flags of a sensor; modbus,
+    canopen: the sections of these names in the file.
     """
 
     version: int
@@ -151,6 +164,9 @@ class Protocol:
     faults: Mapping[str, int]
     features: Mapping[str, int]
     status_flags: Mapping[str, int]
+    sensor_units: Mapping[str, int]
+    reading_states: Mapping[str, int]
+    overload: int
     naks: Mapping[str, int]
     quantities: Quantities
     modbus: Mapping[str, Any]
@@ -172,6 +188,9 @@ def _load() -> Protocol:
         faults=raw["faults"],
         features=raw["features"],
         status_flags=raw["status_flags"],
+        sensor_units=raw["sensor_units"],
+        reading_states=raw["reading_states"],
+        overload=raw["overload"],
         naks=raw["naks"],
         quantities=Quantities(
             **{
@@ -205,6 +224,11 @@ def random_token() -> int:
 def random_session() -> int:
     """Return a random session, so that no other host has it, nor an earlier one."""
     return _random(PROTOCOL.quantities.session)
+
+
+def random_reading() -> int:
+    """Return a random number of a reading, so that it is not taken for another host's."""
+    return _random(PROTOCOL.quantities.reading)
 
 
 def _random(quantity: WireQuantity) -> int:

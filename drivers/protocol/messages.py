@@ -18,11 +18,17 @@ these into bytes and back.
     Ping        Status              heartbeat: feeds the watchdog
     LoadEnvelope  Loaded            store an envelope in its slot, for sets that refer to it
     GetMeasured Measured            read voltage and current of each channel
+    GetSensors  SensorList          read what its sensors measure, and where
+    Measure     Reading             begin to measure tones at all sensors
+    GetReading  Reading             read how the tones were measured
+    GetBlock    SampleBlock         read raw samples of a sensor
     SetAddress  AddressSet          take another address on the line, if it has this serial number
 
 A Commit, Stop or SetAddress may be broadcast to all amplifiers of a bus; there are no replies then.
 """
 
+import cmath
+import math
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 from typing import TypeAlias
@@ -77,6 +83,25 @@ class Feature(IntFlag):
     SENSORS = 1 << 10
     ADDRESS = 1 << 11
     WHOLE = WATCHDOG | STAGING | VALID_FOR | PHASE  # without envelopes, which have no bit
+
+
+class SensorUnit(ExtensibleEnum):
+    """Quantity and unit of a sensor: m/s², m/s, m, N, V."""
+
+    ACCELERATION = 1
+    VELOCITY = 2
+    DISPLACEMENT = 3
+    FORCE = 4
+    VOLTAGE = 5
+
+
+class ReadingState(IntEnum):
+    """State of a reading; DISTURBED: complete, but what played changed within its window."""
+
+    NONE = 0
+    RUNNING = 1
+    COMPLETE = 2
+    DISTURBED = 3
 
 
 class NakCode(ExtensibleEnum):
@@ -203,6 +228,40 @@ class SetAddress:
 
     address: int
     serial_number: str
+
+
+@dataclass(frozen=True, slots=True)
+class GetSensors:
+    """Describe the sensors from one on; of amplifiers that have any."""
+
+    first: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """Measure tones of these frequencies [Hz] over a window [s] that begins now.
+
+    number: of the reading, drawn by the host; the same request again changes nothing.
+    """
+
+    number: int
+    window: float
+    frequencies: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class GetReading:
+    """Report the reading, its sensors from one on."""
+
+    first: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class GetBlock:
+    """Report raw samples of a sensor within the window of the reading, from one on."""
+
+    sensor: int
+    sample: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,6 +392,84 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True)
+class Sensor:
+    """Sensor of an amplifier: its unit, and the channel whose actuator it sits at, if any.
+
+    x, y [m]: its place on the plate, None if the amplifier does not know it. range: its largest
+    reading; frequency_max [Hz]: of its tones; sample_rate [Hz]: of raw samples, 0 for none;
+    count_step: of one count of a raw sample. Ranges and steps are in its unit.
+    """
+
+    unit: SensorUnit
+    channel: int | None
+    x: float | None
+    y: float | None
+    range: float
+    frequency_max: float
+    sample_rate: int = 0
+    count_step: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class SensorList:
+    """Sensors from the one that was asked for on, as many as fit; count: of all."""
+
+    count: int
+    sensors: tuple[Sensor, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ToneReading:
+    """One tone at one sensor: amplitude × sin(2π f t + phase) [unit of the sensor, degrees]."""
+
+    amplitude: float
+    phase: float
+
+    @property
+    def phasor(self) -> complex:
+        """Complex amplitude, of which the signal is Im[phasor exp(i 2π f t)]."""
+        return cmath.rect(self.amplitude, math.radians(self.phase))
+
+
+@dataclass(frozen=True, slots=True)
+class SensorReading:
+    """The tones of a reading at one sensor; is_overloaded: it was beyond its range."""
+
+    tones: tuple[ToneReading, ...]
+    is_overloaded: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """The reading of a number, its sensors from the one that was asked for on, as many as fit.
+
+    left [s]: until it is complete, without sensors before; start [s]: t at the first sample, 0 if
+    nothing was played (token 0); saturates after 71 minutes.
+    """
+
+    number: int
+    state: ReadingState
+    left: float = 0.0
+    start: float = 0.0
+    token: int = 0
+    tone_count: int = 0
+    sensors: tuple[SensorReading, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SampleBlock:
+    """Raw samples [counts] of a sensor, numbered from 0 at the start of the reading's window.
+
+    first: number of the first one here; end: the number after the newest so far.
+    """
+
+    number: int
+    first: int
+    end: int
+    samples: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class AddressSet:
     """Confirmation of an address, still sent from the one before."""
 
@@ -371,9 +508,24 @@ Request: TypeAlias = (
     | Ping
     | LoadEnvelope
     | GetMeasured
+    | GetSensors
+    | Measure
+    | GetReading
+    | GetBlock
     | SetAddress
 )
 Reply: TypeAlias = (
-    Identity | Capabilities | Status | Achieved | FaultList | Loaded | Measured | AddressSet | Nak
+    Identity
+    | Capabilities
+    | Status
+    | Achieved
+    | FaultList
+    | Loaded
+    | Measured
+    | SensorList
+    | Reading
+    | SampleBlock
+    | AddressSet
+    | Nak
 )
 Broadcast: TypeAlias = Commit | Stop | SetAddress

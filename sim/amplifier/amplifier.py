@@ -10,6 +10,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Protocol, TypeAlias
 
 from drivers.command import CommandSet
 from drivers.protocol.definition import PROTOCOL
@@ -28,12 +29,16 @@ from drivers.protocol.messages import (
     FaultList,
     FaultRecord,
     Feature,
+    GetBlock,
     GetCaps,
     GetFaults,
     GetMeasured,
+    GetReading,
+    GetSensors,
     Hello,
     Identity,
     LoadEnvelope,
+    Measure,
     Measured,
     Measurement,
     Nak,
@@ -72,6 +77,21 @@ FEATURES = (
 )
 _LATCHED = (AmplifierState.QUICK_STOP_ACTIVE, AmplifierState.FAULT)
 _FEEDING_REQUESTS = (Arm, Ping, Stage, Commit, Apply)  # with the session that is held
+
+SensorRequest: TypeAlias = GetSensors | Measure | GetReading | GetBlock
+
+
+class SensorPort(Protocol):
+    """Sensors that an amplifier reports."""
+
+    def handle(self, request: SensorRequest, now: float) -> Reply:
+        """Reply to a request at a time [s]."""
+
+    def changed(self, moment: float) -> None:
+        """Note that what plays changes at a time [s]."""
+
+    def forget(self) -> None:
+        """Forget the reading, as without supply."""
 
 
 def capabilities(channels: int, voices: int = VOICES) -> Capabilities:
@@ -125,7 +145,20 @@ class SimulatedAmplifier:
         self.session = 0  # held while armed, or the one that ended last
         self.latch = 0
         self._is_interlock_open = False
+        self.committed_at = -math.inf  # [s]; of the set played last
+        self._sensing: SensorPort | None = None
         self._start()
+
+    def attach(self, sensing: SensorPort) -> None:
+        """Give it sensors."""
+        self._sensing = sensing
+        features = self.capabilities.features | Feature.SENSORS
+        self.capabilities = replace(self.capabilities, features=features)
+
+    @property
+    def token(self) -> int:
+        """Token of the set played last since arming; 0: none."""
+        return self._sets.token
 
     def _start(self) -> None:
         """Reset all but the temperature and the fault history."""
@@ -158,7 +191,7 @@ class SimulatedAmplifier:
             if moment == self._vibration_end:
                 self._channels.end(moment)
                 self._vibration_end = math.inf
-                self._warm(moment)
+                self._changed(moment)
             elif moment == self._watchdog_end:
                 self.trip(Fault.WATCHDOG, moment)
             elif moment == self._silence_reached:
@@ -244,6 +277,8 @@ class SimulatedAmplifier:
         self._heat = ThermalState(moment, self._heat.at(moment))
         self.fault = Fault.NONE
         self._start()
+        if self._sensing is not None:
+            self._sensing.forget()
         self._enter(AmplifierState.SWITCH_ON_DISABLED, moment)
 
     def _carry_out(self, request: Request, following: AmplifierState, now: float) -> Reply | None:
@@ -277,6 +312,10 @@ class SimulatedAmplifier:
                 return AddressSet(address)
             case GetMeasured():
                 return self._measured(now)
+            case GetSensors() | Measure() | GetReading() | GetBlock():
+                if self._sensing is None or Feature.SENSORS not in self._features:
+                    return Nak(NakCode.UNKNOWN_TYPE)
+                return self._sensing.handle(request, now)
             case LoadEnvelope(envelope=envelope):
                 return self._sets.load(envelope)
             case Stage(command_set=wanted):
@@ -342,7 +381,8 @@ class SimulatedAmplifier:
             raise RefusedSet(NakCode.FADING, channel)
         self._sets.activate(playable)
         self._channels.play(playable, now)
-        self._warm(now)
+        self.committed_at = now
+        self._changed(now)
         wanted = playable.command_set
         ends = wanted.valid_for > 0 and not wanted.is_silent
         self._vibration_end = now + wanted.valid_for if ends else math.inf
@@ -369,7 +409,7 @@ class SimulatedAmplifier:
         self._silent_from = self._channels.silent_from(moment)
         self._vibration_end = math.inf
         self._sets.staged = None
-        self._warm(moment)
+        self._changed(moment)
 
     def _enter(self, state: AmplifierState, moment: float, *, channel: int | None = None) -> None:
         """Enter a state, and notify the listeners of a change."""
@@ -396,7 +436,10 @@ class SimulatedAmplifier:
             return math.inf
         return self._heat.when(FAULT_ABOVE if self._is_derated else DERATE_ABOVE)
 
-    def _warm(self, moment: float) -> None:
+    def _changed(self, moment: float) -> None:
+        """Note that what plays changes."""
+        if self._sensing is not None:
+            self._sensing.changed(moment)
         self._heat = self._heat.driven(moment, load=self._channels.load)
 
     def _handle_overtemperature(self, moment: float) -> None:
@@ -406,7 +449,7 @@ class SimulatedAmplifier:
             return
         self._is_derated = True
         self._channels.derate(moment, DERATED)
-        self._warm(moment)
+        self._changed(moment)
 
     def _is_cause_gone(self, now: float) -> bool:
         """Whether the cause of the fault no longer persists."""

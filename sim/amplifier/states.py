@@ -15,12 +15,16 @@ from drivers.protocol.messages import (
     Clear,
     Commit,
     Disarm,
+    GetBlock,
     GetCaps,
     GetFaults,
     GetMeasured,
+    GetReading,
+    GetSensors,
     GetStatus,
     Hello,
     LoadEnvelope,
+    Measure,
     Ping,
     Request,
     SetAddress,
@@ -35,6 +39,7 @@ Table: TypeAlias = Mapping[tuple[AmplifierState, type[Request]], AmplifierState]
 
 _ASKING: tuple[type[Request], ...] = (
     *(Hello, GetCaps, GetStatus, GetFaults, GetMeasured, Ping, LoadEnvelope),
+    *(GetSensors, Measure, GetReading, GetBlock),
 )
 _PLAYING: tuple[type[Request], ...] = (Stage, Commit, Apply)
 _OFF = (AmplifierState.SWITCH_ON_DISABLED, AmplifierState.READY_TO_SWITCH_ON)

@@ -6,7 +6,7 @@ level 1 being the full stroke, with the imperfections given.
 
 import asyncio
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
 from types import MappingProxyType
 from typing import Protocol
@@ -26,6 +26,8 @@ from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import Term
 from registry.voltage import Law
 from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.bench.reading import ToneReader
+from sim.bench.sensing import PlateSensor, Sensing
 from sim.plant.felt import Felt, measure_vibration
 from sim.plant.fingers import KEPT, Fingers, Position, Record
 from sim.plant.imperfections import Imperfections, delayed, draw_noise, realised
@@ -89,6 +91,12 @@ class Bench:
             )
             for name in rig.amplifiers
         }
+        self._sensing = [
+            Sensing(self, amplifier, _feet(rig, name), seed=number)
+            for number, (name, amplifier) in enumerate(self.amplifiers.items())
+        ]
+        for amplifier, sensing in zip(self.amplifiers.values(), self._sensing, strict=True):
+            amplifier.attach(sensing)
         # By ERA: the output of its channel, the output that moves the base, and the changes between
         # them that are delayed, each with its time [s].
         self._commanded: list[Output] = [()] * len(rig.eras)
@@ -167,6 +175,19 @@ class Bench:
                 self._shapes_at.cache_clear()
         self.fingers.place(positions, reduced=self._plant.reduced)
 
+    def place_sensors(self, sensors: Sequence[PlateSensor]) -> None:
+        """Replace the sensors of the first amplifier beside those at its ERAs."""
+        self._sensing[0].place(sensors)
+
+    def listen_to_plate(self, reader: ToneReader) -> None:
+        """Pass samples on to a reader from now on."""
+        self.probes.append(reader)
+
+    def forget_reader(self, reader: ToneReader) -> None:
+        """Pass no more samples on to a reader."""
+        if reader in self.probes:
+            self.probes.remove(reader)
+
     def records(self, since: float, until: float) -> tuple[dict[str, Record], list[float]]:
         """The record of each finger in a window of the last ten seconds [s], by id.
 
@@ -197,13 +218,14 @@ class Bench:
         if not (is_sampled and (self.fingers.layout.positions or self.probes)):
             return
         self._plant.skip(since)
-        shapes = [self.fingers.layout.shapes, *(probe.shapes for probe in self.probes)]
+        probes = tuple(self.probes)
+        shapes = [self.fingers.layout.shapes, *(probe.shapes for probe in probes)]
         times, accelerations = self._plant.advance(
             to_time, sample_rate=self.sample_rate, shapes=np.concatenate(shapes)
         )
         parts = np.split(accelerations, np.cumsum([len(shapes) for shapes in shapes])[:-1], axis=1)
         self.fingers.record(times, parts[0])
-        for probe, part in zip(self.probes, parts[1:], strict=True):
+        for probe, part in zip(probes, parts[1:], strict=True):
             probe.record(times, part)
 
     def _update_plant(self) -> None:
@@ -279,6 +301,18 @@ def _reduced(
 ) -> ReducedPlate:
     points = footprints_of(eras, loads)
     return reduce_plate(plate, mesh, points, frequency_max=frequency_max)
+
+
+def _feet(rig: Rig, amplifier: str) -> list[PlateSensor]:
+    """A sensor at the foot of each ERA of an amplifier, in the order of its channels."""
+    wired = [
+        (channel.number, era)
+        for era in rig.eras
+        if (channel := rig.wiring[era.name]).amplifier == amplifier
+    ]
+    return [
+        PlateSensor(era.x, era.y, number) for number, era in sorted(wired, key=lambda one: one[0])
+    ]
 
 
 def _channel_count(rig: Rig, amplifier: str) -> int:

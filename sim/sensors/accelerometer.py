@@ -1,8 +1,8 @@
 """Virtual accelerometers on the simulated plate.
 
 A reading is the acceleration times the scale, plus white noise up to half the sampling rate,
-clipped to the range and rounded to the resolution. Not modelled: mass, resonance, anti-alias
-filter, cross-axis sensitivity.
+clipped to the range and rounded to the resolution: see `sim.plant.transducer`. The first amplifier
+of the bench reports them as its own sensors, beside those at its ERAs.
 """
 
 import math
@@ -17,7 +17,9 @@ from model.config.points import in_metres
 from model.errors import InputError
 from model.structure.plate import Plate
 from sim.bench.bench import Bench
+from sim.bench.sensing import PlateSensor
 from sim.plant.fingers import KEPT
+from sim.plant.transducer import read_accelerations
 from sim.sensors.recording import Recording
 
 MAX_SENSORS = 64  # ten seconds of readings take 50 MB
@@ -86,15 +88,7 @@ def read_sensors(
     rng: np.random.Generator,
 ) -> Recording:
     """Readings of sensors for accelerations (n, s) [m/s²]; start: time of the first sample [s]."""
-    density = np.array([sensor.noise_density for sensor in sensors])
-    reach = np.array([sensor.reach for sensor in sensors])
-    resolution = np.array([sensor.resolution for sensor in sensors])
-    readings = accelerations * [sensor.scale for sensor in sensors]
-    # White noise of this density up to half the sampling rate has this standard deviation.
-    readings += density * math.sqrt(sample_rate / 2) * rng.standard_normal(readings.shape)
-    readings = np.clip(readings, -reach, reach)
-    step = np.where(resolution > 0, resolution, 1.0)
-    readings = np.where(resolution > 0, step * np.round(readings / step), readings)
+    readings = read_accelerations(sensors, accelerations, sample_rate=sample_rate, rng=rng)
     names = tuple(sensor.name for sensor in sensors)
     return Recording(names, positions(sensors), sample_rate, start, readings)
 
@@ -129,6 +123,19 @@ class Accelerometers:
                     f"{in_metres(sensor.x, sensor.y, length=plate.length, width=plate.width)}"
                 )
         self.sensors = tuple(sensors)
+        self._bench.place_sensors(
+            [
+                PlateSensor(
+                    one.x,
+                    one.y,
+                    noise_density=one.noise_density,
+                    reach=one.reach,
+                    resolution=one.resolution,
+                    scale=one.scale,
+                )
+                for one in sensors
+            ]
+        )
         self._pieces.clear()
         if self in self._bench.probes:
             self._bench.probes.remove(self)

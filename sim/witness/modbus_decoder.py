@@ -27,13 +27,18 @@ _STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS = 1001, 1033, 13
 _TEXT_WORDS = 16
 _WORDS = {15: RequestKind.ARM, 0: RequestKind.DISARM, 2: RequestKind.STOP, 128: RequestKind.CLEAR}
 _MEASURED = 1421
+_OF_SENSORS = (221, 231, 261)  # written to select or begin what is read: nothing that plays
+_SENSORS, _READING, _SAMPLES = 1501, 1641, 1781
 _READ_KINDS = {
     _IDENTITY: RequestKind.HELLO,
     _CAPABILITIES: RequestKind.CAPABILITIES,
     _FAULTS: RequestKind.FAULTS,
 }
-_TAGGED = (_CONTROL, _HEARTBEAT, _SET, _ENVELOPE, _ADDRESS)
-_READ_TAGS = (*_TAGGED, _STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS)
+_TAGGED = (_CONTROL, _HEARTBEAT, _SET, _ENVELOPE, _ADDRESS, *_OF_SENSORS)
+_READ_TAGS = (
+    *(*_TAGGED, _STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS),
+    *(_SENSORS, _READING, _SAMPLES),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +177,8 @@ def _of_write(
         kind = kinds.get(read_from or 0, RequestKind.STATUS)
         return Request(kind, unit, key)
     head = 1 if at in _TAGGED else 0
+    if at in _OF_SENSORS:
+        return Request(RequestKind.READ, unit, key)
     block, body = at + head, words[head:]
     match block:
         case 2:

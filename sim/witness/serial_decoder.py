@@ -40,6 +40,7 @@ _KINDS = {
     13: RequestKind.ENVELOPE,
     14: RequestKind.READ,
     15: RequestKind.ADDRESS,
+    **dict.fromkeys((16, 17, 18, 19), RequestKind.READ),  # of sensors: nothing that plays
 }
 _EVENT, _NAK = 30, 31
 _VOICES_AT = 27  # in capabilities
@@ -53,6 +54,8 @@ _SIZES = {  # of the payload
     RequestKind.CLEAR: 1,
     RequestKind.PING: 2,
 }
+_MEASURE = 17
+_READ_SIZES = {16: 1, _MEASURE: 5, 18: 1, 19: 5}
 _HELLO, _NEUTRAL, _VERSION = 1, 0, 2
 _WITH_STATUS = {
     RequestKind.ARM,
@@ -164,12 +167,15 @@ def _decode_request(number: int, address: int, sequence: int, payload: bytes) ->
         return Request(kind, address, key, envelope=_envelope(payload))
     if kind in (RequestKind.HELLO, RequestKind.ADDRESS):
         return Request(kind, address, key)
-    size = _SIZES.get(kind, 0)
+    tones = payload[4] if number == _MEASURE and len(payload) > 4 else 0
+    size = _READ_SIZES.get(number, _SIZES.get(kind, 0)) + 2 * tones
     if len(payload) != size:
         raise OutOfRange(f"{kind.value} payload must have {size} bytes, got {len(payload)}")
     first = int.from_bytes(payload[:2], "little")
     second = int.from_bytes(payload[2:], "little")
     match kind:
+        case RequestKind.READ:
+            return Request(kind, address, key)
         case RequestKind.ARM:
             return q.request_of(kind, address, key, watchdog=first, session=second)
         case RequestKind.COMMIT:

@@ -28,6 +28,7 @@ from drivers.protocol.messages import (
 )
 from fake_device import FakeDevice
 from sim.far_ends.can_bus.node import CanNode
+from vendor_pages import ScriptedSensors
 
 NODE = 1
 HEARTBEAT, INCOMPLETE_LIFE = 0.05, 0.1  # s, as on the page
@@ -93,6 +94,8 @@ class Session:
             serial_number="A-17",
             firmware="1.2",
         )
+        self.device.amplifier.attach(ScriptedSensors())
+        self.device.capabilities = self.device.amplifier.capabilities
         self._said: list[CanFrame] = []
         self.timers = Timers()
         self.node = CanNode(self.device, NODE, send=self._said.append)  # type: ignore[arg-type]
@@ -123,6 +126,22 @@ class Session:
         self.device.pass_time(0.05)
         yield self._ordered("Ping: the host's heartbeat, and a status order", Ping(), 4)
         yield self._asked("Read the voltage of channel 0, 200Csub1", _read(0x200C, 1))
+        yield self._asked(
+            "Describe sensor 1, 2010sub2",
+            *(_read(0x2010, 2), *(_next_segment(n % 2) for n in range(3))),
+        )
+        yield self._asked("Measure 110 and 250.5 Hz for 200 ms as reading 1234, 2011", *_MEASURE)
+        yield self._asked(
+            "Read reading 1234, 2012", *(_read(0x2012, 0), _next_segment(0), _next_segment(1))
+        )
+        yield self._asked(
+            "Its tones at sensor 0, 2013sub1",
+            *(_read(0x2013, 1), *(_next_segment(n % 2) for n in range(3))),
+        )
+        yield self._asked("Raw samples of sensor 1 from 1595 on, 2014", *_FIRST_SAMPLE)
+        yield self._asked(
+            "Read them, 2015", *(_read(0x2015, 0), *(_next_segment(n % 2) for n in range(3)))
+        )
         staged = self.guard.check(CommandSet(514, _COMMANDS[:1], ramp=0.0, valid_for=0.0))
         yield self._ordered("Stage token 514", Stage(staged), 5)
         yield self._ordered("Commit token 514", Commit(514), 6)
@@ -207,6 +226,14 @@ _NUMBER = (  # five bytes, the node and the serial number
     CanFrame(0x601, bytes.fromhex("21 0E 20 00 05 00 00 00")),
     CanFrame(0x601, bytes.fromhex("05 05 41 2D 31 37 00 00")),
 )
+_MEASURE = [
+    CanFrame(0x600 + NODE, bytes.fromhex(text))
+    for text in ("21 11 20 00 09 00 00 00", "00 D2 04 C8 00 02 98 08", "1B 92 13 00 00 00 00 00")
+]
+_FIRST_SAMPLE = [
+    CanFrame(0x600 + NODE, bytes.fromhex(text))
+    for text in ("21 14 20 00 05 00 00 00", "05 01 3B 06 00 00 00 00")
+]
 _ENVELOPE = [
     CanFrame(0x600 + NODE, bytes.fromhex(text))
     for text in ("21 00 21 05 0B 00 00 00", "00 32 00 02 E8 03 28 23", "17 10 27 FF FF 00 00 00")

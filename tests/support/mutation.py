@@ -24,9 +24,13 @@ from drivers.protocol.messages import (
     Clear,
     Commit,
     Feature,
+    GetBlock,
+    GetReading,
+    GetSensors,
     GetStatus,
     Hello,
     LoadEnvelope,
+    Measure,
     Ping,
     Request,
     Stage,
@@ -53,7 +57,8 @@ def sample_requests() -> list[Request]:
     return [
         *(Hello(), GetStatus(), Ping(SESSION), Arm(0.25, SESSION), Stop(0.005)),
         *(Commit(513, SESSION), Stage(wanted, SESSION), Apply(wanted, SESSION)),
-        *(Clear(1), LoadEnvelope(shape)),
+        *(Clear(1), LoadEnvelope(shape), GetSensors(1), GetReading(1), GetBlock(1, 70_000)),
+        Measure(1234, 0.2, (110.0, 250.5)),
     ]
 
 
@@ -173,6 +178,10 @@ def is_within_limits(asked: object) -> bool:
             return 0.1 <= watchdog <= 2
         case Stop(ramp=ramp):
             return 0 <= ramp <= 1
+        case Measure(window=window, frequencies=frequencies):
+            return 0.001 <= window <= 10 and 1 <= len(frequencies) <= 16
+        case GetSensors(first=first) | GetReading(first=first) | GetBlock(sensor=first):
+            return 0 <= first <= 31
         case _:
             return True
 

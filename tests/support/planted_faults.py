@@ -37,6 +37,7 @@ from drivers.protocol.messages import (
     Status,
 )
 from planted_bugs import Plant, both, replaced, with_voices, wrapped
+from planted_sensor_faults import SENSOR_FAULTS
 from sim.amplifier import amplifier as simulated
 from sim.amplifier import channels as channel_outputs
 from sim.amplifier import set_store
@@ -1270,12 +1271,8 @@ FAULTS: dict[str, PlantedFault] = {
         ),
         wires=CAN,
     ),
-}
-"""Faults that the wire shows, by what is wrong."""
-
-UNSEEN: dict[str, PlantedFault] = {
     "outputs vibrate at half the frequency": PlantedFault(
-        "",
+        "readings_of_tones",
         wrapped(
             Channels,
             "play",
@@ -1290,9 +1287,12 @@ UNSEEN: dict[str, PlantedFault] = {
                 time,
             ),
         ),
-        wires=SERIAL,
-        unseen="no message reports the frequency of an output, only that of the set",
     ),
+    **{name: PlantedFault(fault.check, fault.plant) for name, fault in SENSOR_FAULTS.items()},
+}
+"""Faults that the wire shows, by what is wrong."""
+
+UNSEEN: dict[str, PlantedFault] = {
     "the last two channels are exchanged behind their levels": PlantedFault(
         "",
         lambda patch: None,

@@ -1,7 +1,7 @@
 """The exchanges that the pages for vendors show, and an amplifier that replies by script."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.guard import Guard, GuardLimits
@@ -22,25 +22,37 @@ from drivers.protocol.messages import (
     FaultList,
     FaultRecord,
     Feature,
+    GetBlock,
     GetCaps,
     GetFaults,
     GetMeasured,
+    GetReading,
+    GetSensors,
     GetStatus,
     Hello,
     Identity,
     Loaded,
     LoadEnvelope,
+    Measure,
     Measured,
     Measurement,
     Nak,
     NakCode,
     Ping,
+    Reading,
+    ReadingState,
     Reply,
     Request,
+    SampleBlock,
+    Sensor,
+    SensorList,
+    SensorReading,
+    SensorUnit,
     SetAddress,
     Stage,
     Status,
     Stop,
+    ToneReading,
 )
 from sim.faults.fault_window import Faults
 
@@ -51,6 +63,7 @@ CAPABILITIES = Capabilities(
     | Feature.BROADCAST
     | Feature.INTERLOCK
     | Feature.ELECTRICAL
+    | Feature.SENSORS
     | Feature.ADDRESS,
     voices=4,
 )
@@ -73,6 +86,21 @@ MEASURED = Measured(
         Measurement(1272.8, 0.001002),
     )
 )
+SENSORS = (
+    Sensor(SensorUnit.ACCELERATION, 0, None, None, 512.0, 1000.0, 8000, 1 / 64),
+    Sensor(SensorUnit.ACCELERATION, None, 0.25, 0.18, 512.0, 1000.0, 8000, 1 / 64),
+)
+BEGUN = Reading(1234, ReadingState.RUNNING, 0.2, 1.5, 513, 2)
+READ = replace(
+    BEGUN,
+    state=ReadingState.COMPLETE,
+    left=0.0,
+    sensors=(
+        SensorReading((ToneReading(12.5, -170.25), ToneReading(0.25, 35.5))),
+        SensorReading((ToneReading(3.0, -180.0), ToneReading(0.0, 0.0)), is_overloaded=True),
+    ),
+)
+SAMPLES = SampleBlock(1234, 1595, 1600, (800, -1, 32767, -32768, 0))
 S = AmplifierState
 OFF = Status(S.SWITCH_ON_DISABLED, Fault.NONE, 0, False, 25.0, 0.0, (0.0,) * 4)
 ARMED = Status(S.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4, 1800.0)
@@ -117,6 +145,10 @@ EXAMPLES: dict[str, Example] = {
     "GetMeasured": Example(GetMeasured(), MEASURED),
     "SetAddress": Example(SetAddress(5, "A-17"), AddressSet(5), OFF),
     "Clear": Example(Clear(latch=2), CLEARED, CLEARED),
+    "GetSensors": Example(GetSensors(), SensorList(2, SENSORS)),
+    "Measure": Example(Measure(1234, 0.2, (110.0, 250.5)), BEGUN),
+    "GetReading": Example(GetReading(), READ),
+    "GetBlock": Example(GetBlock(1, 1595), SAMPLES),
 }
 
 
@@ -143,6 +175,14 @@ def usual_reply(request: Request) -> Reply:
             return FaultList(())
         case GetMeasured():
             return MEASURED
+        case GetSensors(first=first):
+            return SensorList(2, SENSORS[first:])
+        case Measure():
+            return BEGUN
+        case GetReading(first=first):
+            return replace(READ, sensors=READ.sensors[first:])
+        case GetBlock():
+            return SAMPLES
         case SetAddress(address=address):
             return AddressSet(address)
         case Stage(command_set=wanted) | Apply(command_set=wanted):
@@ -157,6 +197,24 @@ def usual_reply(request: Request) -> Reply:
             return HALTED
         case _:
             return ARMED
+
+
+class ScriptedSensors:
+    """Sensors of a simulated amplifier with the replies of the pages."""
+
+    def __init__(self, sensors: Sequence[Sensor] = SENSORS) -> None:
+        self._sensors = tuple(sensors)
+
+    def handle(self, request: Request, now: float) -> Reply:
+        if isinstance(request, GetSensors):
+            return SensorList(len(self._sensors), self._sensors[request.first :])
+        return usual_reply(request)
+
+    def changed(self, moment: float) -> None:
+        """Nothing is being measured."""
+
+    def forget(self) -> None:
+        """Nothing is kept."""
 
 
 class ScriptedDevice:

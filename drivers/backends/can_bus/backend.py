@@ -37,11 +37,15 @@ from drivers.protocol.messages import (
     Arm,
     Broadcast,
     Commit,
+    GetBlock,
     GetCaps,
     GetFaults,
     GetMeasured,
+    GetReading,
+    GetSensors,
     Hello,
     LoadEnvelope,
+    Measure,
     Nak,
     NakCode,
     Ping,
@@ -146,6 +150,22 @@ class CanBackend(WireBackend):
             case GetMeasured():
                 measure = partial(ObjectClient.measured, channels=self._channels)
                 return await self._objects_job(measure, request, timeout)
+            case GetSensors():
+                return await self._objects_job(
+                    partial(ObjectClient.sensors, request=request), request, timeout
+                )
+            case Measure():
+                return await self._objects_job(
+                    partial(ObjectClient.measure, request=request), request, timeout
+                )
+            case GetReading():
+                return await self._objects_job(
+                    partial(ObjectClient.reading, request=request), request, timeout
+                )
+            case GetBlock():
+                return await self._objects_job(
+                    partial(ObjectClient.samples, request=request), request, timeout
+                )
             case LoadEnvelope():
                 load = partial(ObjectClient.load_envelope, request=request)
                 return await self._objects_job(load, request, timeout)

@@ -33,22 +33,42 @@ from drivers.codec.can_bus.objects import (
     unpack_identity,
     unpack_measured,
 )
+from drivers.codec.payload import Cursor
+from drivers.codec.sensors import (
+    pack_get_block,
+    pack_measure,
+    unpack_block,
+    unpack_reading_head,
+    unpack_sensor,
+    unpack_sensor_reading,
+    with_sensors,
+)
 from drivers.errors import FrameError, LinkError, LinkTimeout
+from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
     Capabilities,
     FaultList,
+    GetBlock,
+    GetReading,
+    GetSensors,
     Identity,
     Loaded,
     LoadEnvelope,
+    Measure,
     Measured,
     Nak,
     NakCode,
+    Reading,
+    ReadingState,
+    SampleBlock,
+    SensorList,
     SetAddress,
 )
 from drivers.statistics import WireCounters
 
 _LENGTH = 8
+_SENSORS_LISTED = 8  # in one exchange
 _WAITING_MAX = 256  # replies; bounds the memory on a flooded bus
 _RESYNCHRONISE = 5  # tries
 _BLOCK_FROM = 15  # bytes; segments are faster below
@@ -185,6 +205,75 @@ class ObjectClient:
             return unpack_measured(each)
 
         return self._transfer(read, timeout)
+
+    def sensors(self, request: GetSensors, *, timeout: float) -> SensorList | Nak:
+        """Describe the sensors from one on."""
+
+        def read() -> SensorList:
+            (count,) = self._client.upload(index_of("sensors"), 0)
+            last = min(count, request.first + _SENSORS_LISTED)
+            each = (self._sensor_object("sensors", n) for n in range(request.first, last))
+            return SensorList(count, tuple(unpack_sensor(cursor) for cursor in each))
+
+        return self._sensor_transfer(read, timeout)
+
+    def measure(self, request: Measure, *, timeout: float) -> Reading | Nak:
+        """Begin a reading; returns it without sensors."""
+        data = pack_measure(request)
+
+        def write() -> Reading:
+            self._client.download(index_of("measure"), 0, data, force_segment=True)
+            return self._reading_head()
+
+        return self._sensor_transfer(write, timeout)
+
+    def reading(self, request: GetReading, *, timeout: float) -> Reading | Nak:
+        """Read the reading, its sensors from one on; none if it was replaced meanwhile."""
+
+        def read() -> Reading:
+            head = self._reading_head()
+            if head.state not in (ReadingState.COMPLETE, ReadingState.DISTURBED):
+                return head
+            (count,) = self._client.upload(index_of("sensor_reading"), 0)
+            sensors = []
+            for number in range(request.first, min(count, request.first + _SENSORS_LISTED)):
+                cursor = self._sensor_object("sensor_reading", number)
+                if cursor.integer(PROTOCOL.quantities.held_reading) != head.number:
+                    return self._reading_head()
+                sensors.append(unpack_sensor_reading(cursor, head.tone_count))
+            return with_sensors(head, sensors)
+
+        return self._sensor_transfer(read, timeout)
+
+    def samples(self, request: GetBlock, *, timeout: float) -> SampleBlock | Nak:
+        """Read raw samples of a sensor."""
+        data = pack_get_block(request)
+
+        def read() -> SampleBlock:
+            self._client.download(index_of("first_sample"), 0, data, force_segment=True)
+            return unpack_block(Cursor(self._client.upload(index_of("samples"), 0)))
+
+        return self._sensor_transfer(read, timeout)
+
+    def _reading_head(self) -> Reading:
+        return unpack_reading_head(Cursor(self._client.upload(index_of("reading"), 0)))
+
+    def _sensor_object(self, name: str, sensor: int) -> Cursor:
+        return Cursor(self._client.upload(index_of(name), sensor + 1))
+
+    def _sensor_transfer(self, work: Callable[[], _T], timeout: float) -> _T | Nak:
+        """Run one transfer; a refusal, or a node without sensors, is a Nak."""
+
+        def run() -> _T | Nak:
+            try:
+                return work()
+            except SdoAbortedError as abort:
+                code = nak_of_abort(abort.code)
+                if code is None:
+                    raise
+                return Nak(code)
+
+        return self._transfer(run, timeout)
 
     def achieved(self, *, timeout: float) -> Achieved:
         """Read what the last set plays."""

@@ -36,6 +36,8 @@ HEAD = len(_MAP["head"])  # registers at the start of every block
 CHANNEL_SIZE: int = _MAP["channel_registers"]
 LIMIT_SIZE: int = _MAP["limit_registers"]
 MEASURED_SIZE: int = _MAP["measured_registers"]
+SENSOR_SIZE: int = _MAP["sensor_registers"]
+READING_SIZE: int = _MAP["reading_registers"]
 FAULT_SIZE: int = _MAP["fault_registers"]
 TEXT_SIZE: int = _MAP["text_registers"]
 _NO_CHANNEL = 255
@@ -51,7 +53,7 @@ _QUANTITIES: dict[str, WireQuantity] = vars(_Q) | {
 _EnumT = TypeVar("_EnumT", bound=IntEnum)
 
 
-def _fields(
+def fields_of(
     names: Collection[str], registers: Sequence[int]
 ) -> tuple[dict[str, int], Sequence[int]]:
     """Split off the named registers after the head."""
@@ -59,7 +61,8 @@ def _fields(
     return dict(zip(names, registers[HEAD:end], strict=True)), registers[end:]
 
 
-def _integer(name: str, register: int) -> int:
+def integer_of(name: str, register: int) -> int:
+    """Decode the integer of a register by its name; FrameError out of range."""
     quantity = _QUANTITIES[name]
     value = register - (1 << 16) if quantity.wire == "i16" and register >> 15 else register
     if not quantity.holds(value):
@@ -67,37 +70,40 @@ def _integer(name: str, register: int) -> int:
     return value
 
 
-def _number(name: str, register: int) -> float:
-    return _QUANTITIES[name].from_wire(_integer(name, register))
+def number_of(name: str, register: int) -> float:
+    """Decode the value of a register by its name, in its unit."""
+    return _QUANTITIES[name].from_wire(integer_of(name, register))
 
 
 def _channel_count(register: int, *, read: int) -> int:
-    channels = _integer("channel_count", register)
+    channels = integer_of("channel_count", register)
     if channels > read:
         raise FrameError(f"channel count must be at most {read}, got {channels}")
     return channels
 
 
-def _one_of(kind: type[_EnumT], register: int) -> _EnumT:
+def one_of(kind: type[_EnumT], register: int) -> _EnumT:
+    """Decode a member of an enumeration."""
     try:
         return kind(register)
     except ValueError:
         raise FrameError(f"unknown {kind.__name__} {register}") from None
 
 
-def _channel(register: int) -> int | None:
-    return None if register == _NO_CHANNEL else _integer("channel", register)
+def channel_of(register: int) -> int | None:
+    """Decode a channel, None for 255."""
+    return None if register == _NO_CHANNEL else integer_of("channel", register)
 
 
 def unpack_identity(registers: Sequence[int]) -> Identity:
     """Decode an identity."""
     block = _MAP["input"]["identity"]
-    found, rest = _fields(block["registers"], registers)
+    found, rest = fields_of(block["registers"], registers)
     texts = {
         name: read_text(_raw(rest[number * TEXT_SIZE : (number + 1) * TEXT_SIZE]), name)
         for number, name in enumerate(block["texts"])
     }
-    return Identity(versions=versions_of(_integer("versions", found["versions"])), **texts)
+    return Identity(versions=versions_of(integer_of("versions", found["versions"])), **texts)
 
 
 def _raw(registers: Sequence[int]) -> bytes:
@@ -106,22 +112,22 @@ def _raw(registers: Sequence[int]) -> bytes:
 
 def unpack_capabilities(registers: Sequence[int]) -> Capabilities:
     """Decode capabilities."""
-    found, rest = _fields(_MAP["input"]["capabilities"]["registers"], registers)
+    found, rest = fields_of(_MAP["input"]["capabilities"]["registers"], registers)
     whole: dict[str, Any] = {
-        name: _integer(name, found.pop(name))
+        name: integer_of(name, found.pop(name))
         for name in ("envelope_knots", "envelope_slots", "voices")
     }
     channels = _channel_count(found.pop("channel_count"), read=len(rest) // LIMIT_SIZE)
     features = Feature(found.pop("features"))
     limits = tuple(
         ChannelLimits(
-            frequency_min=_number("frequency_min", lowest),
-            frequency_max=_number("frequency_max", highest),
-            level_max=_number("level_max", level),
+            frequency_min=number_of("frequency_min", lowest),
+            frequency_max=number_of("frequency_max", highest),
+            level_max=number_of("level_max", level),
         )
-        for lowest, highest, level in list(_groups(rest, LIMIT_SIZE))[:channels]
+        for lowest, highest, level in list(groups_of(rest, LIMIT_SIZE))[:channels]
     )
-    numbers: dict[str, Any] = {name: _number(name, register) for name, register in found.items()}
+    numbers: dict[str, Any] = {name: number_of(name, register) for name, register in found.items()}
     return Capabilities(
         channels=channels, channel_limits=limits, features=features, **numbers, **whole
     )
@@ -129,35 +135,36 @@ def unpack_capabilities(registers: Sequence[int]) -> Capabilities:
 
 def unpack_status(registers: Sequence[int]) -> Status:
     """Decode a status."""
-    found, levels = _fields(_MAP["input"]["status"]["registers"], registers)
+    found, levels = fields_of(_MAP["input"]["status"]["registers"], registers)
     channels = _channel_count(found["channel_count"], read=len(levels))
     return Status(
-        state=_one_of(AmplifierState, found["state"]),
-        fault=_one_of(Fault, found["fault"]),
-        token=_integer("active_token", found["active_token"]),
-        temperature=_number("temperature", found["temperature"]),
-        watchdog_left=_number("watchdog_left", found["watchdog_left"]),
-        levels=tuple(_number("level", register) for register in levels[:channels]),
-        voltage=_number("voltage", found["voltage"]),
-        latch=_integer("latch", found["latch"]),
+        state=one_of(AmplifierState, found["state"]),
+        fault=one_of(Fault, found["fault"]),
+        token=integer_of("active_token", found["active_token"]),
+        temperature=number_of("temperature", found["temperature"]),
+        watchdog_left=number_of("watchdog_left", found["watchdog_left"]),
+        levels=tuple(number_of("level", register) for register in levels[:channels]),
+        voltage=number_of("voltage", found["voltage"]),
+        latch=integer_of("latch", found["latch"]),
         **flags_of(found["flags"]),
     )
 
 
-def _groups(registers: Sequence[int], size: int) -> Iterable[Sequence[int]]:
+def groups_of(registers: Sequence[int], size: int) -> Iterable[Sequence[int]]:
+    """Split registers into groups of a size; what is left over is ignored."""
     return (registers[at : at + size] for at in range(0, len(registers) - size + 1, size))
 
 
 def unpack_achieved(registers: Sequence[int]) -> Achieved:
     """Decode an achieved set, in the order of its channels."""
-    found, rest = _fields(_MAP["input"]["achieved"]["registers"], registers)
+    found, rest = fields_of(_MAP["input"]["achieved"]["registers"], registers)
     _channel_count(found["channel_count"], read=len(rest) // CHANNEL_SIZE)
     commands = tuple(
         _command(channel, group)
-        for channel, group in enumerate(_groups(rest, CHANNEL_SIZE))
+        for channel, group in enumerate(groups_of(rest, CHANNEL_SIZE))
         if any(group)
     )
-    return Achieved(token=_integer("token", found["token"]), commands=commands)
+    return Achieved(token=integer_of("token", found["token"]), commands=commands)
 
 
 def _command(channel: int, group: Sequence[int]) -> DriveCommand:
@@ -168,9 +175,9 @@ def _command(channel: int, group: Sequence[int]) -> DriveCommand:
     }
     return DriveCommand(
         channel=channel,
-        frequency=_number("frequency", frequency),
-        level=_number("level", level),
-        phase=_number("phase", phase),
+        frequency=number_of("frequency", frequency),
+        level=number_of("level", level),
+        phase=number_of("phase", phase),
         keep_phase=bool(shape["keep_phase"]),
         onset=shape["onset"],
         ending=shape["ending"],
@@ -180,14 +187,14 @@ def _command(channel: int, group: Sequence[int]) -> DriveCommand:
 
 def unpack_faults(registers: Sequence[int]) -> FaultList:
     """Decode the faults that were read; see `unpack_fault_count`."""
-    found, rest = _fields(_MAP["input"]["faults"]["registers"], registers)
-    count = _integer("fault_count", found["fault_count"])
-    records = list(_groups(rest, FAULT_SIZE))[:count]
+    found, rest = fields_of(_MAP["input"]["faults"]["registers"], registers)
+    count = integer_of("fault_count", found["fault_count"])
+    records = list(groups_of(rest, FAULT_SIZE))[:count]
     return FaultList(
         tuple(
             FaultRecord(
-                fault=_one_of(Fault, fault),
-                channel=_channel(channel),
+                fault=one_of(Fault, fault),
+                channel=channel_of(channel),
                 age=_Q.age.from_wire(high << 16 | low),
             )
             for fault, channel, high, low in records
@@ -197,41 +204,41 @@ def unpack_faults(registers: Sequence[int]) -> FaultList:
 
 def unpack_measured(registers: Sequence[int]) -> Measured:
     """Decode measurements."""
-    found, rest = _fields(_MAP["input"]["measured"]["registers"], registers)
+    found, rest = fields_of(_MAP["input"]["measured"]["registers"], registers)
     channels = _channel_count(found["channel_count"], read=len(rest) // MEASURED_SIZE)
     volts, amperes = _Q.channel_voltage, _Q.channel_current
     return Measured(
         tuple(
             Measurement(volts.from_wire(voltage), amperes.from_wire(current))
-            for voltage, current in list(_groups(rest, MEASURED_SIZE))[:channels]
+            for voltage, current in list(groups_of(rest, MEASURED_SIZE))[:channels]
         )
     )
 
 
 def unpack_fault_count(registers: Sequence[int]) -> int:
     """Decode the number of faults."""
-    found, _ = _fields(_MAP["input"]["faults"]["registers"], registers)
-    return _integer("fault_count", found["fault_count"])
+    found, _ = fields_of(_MAP["input"]["faults"]["registers"], registers)
+    return integer_of("fault_count", found["fault_count"])
 
 
 def unpack_loaded(registers: Sequence[int]) -> Loaded:
     """Decode the confirmation of a loaded envelope."""
-    found, _ = _fields(_MAP["holding"]["envelope"]["registers"], registers)
+    found, _ = fields_of(_MAP["holding"]["envelope"]["registers"], registers)
     return Loaded(
-        slot=_integer("slot", found["slot"]),
-        knots=_integer("envelope_knots", found["envelope_knots"]),
+        slot=integer_of("slot", found["slot"]),
+        knots=integer_of("envelope_knots", found["envelope_knots"]),
     )
 
 
 def unpack_refusal(registers: Sequence[int]) -> tuple[Nak, int] | None:
     """Decode the last refusal and its tag, or None."""
-    found, _ = _fields(_MAP["input"]["refusal"]["registers"], registers)
+    found, _ = fields_of(_MAP["input"]["refusal"]["registers"], registers)
     if not found["nak"]:
         return None
-    return Nak(_one_of(NakCode, found["nak"]), _channel(found["channel"])), found["refused_tag"]
+    return Nak(one_of(NakCode, found["nak"]), channel_of(found["channel"])), found["refused_tag"]
 
 
 def unpack_state(registers: Sequence[int]) -> tuple[AmplifierState, Fault]:
     """Decode state and fault, with which a status and an achieved set begin."""
-    found, _ = _fields(("state", "fault"), registers)
-    return _one_of(AmplifierState, found["state"]), _one_of(Fault, found["fault"])
+    found, _ = fields_of(("state", "fault"), registers)
+    return one_of(AmplifierState, found["state"]), one_of(Fault, found["fault"])

@@ -9,13 +9,15 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from drivers.codec.modbus import blocks
+from drivers.codec.modbus import blocks, sensor_blocks
 from drivers.codec.modbus.blocks import (
     CHANNEL_SIZE,
     FAULT_SIZE,
     HEAD,
     LIMIT_SIZE,
     MEASURED_SIZE,
+    READING_SIZE,
+    SENSOR_SIZE,
     TEXT_SIZE,
 )
 from drivers.command import CommandSet, DriveCommand, Envelope
@@ -31,12 +33,16 @@ from drivers.protocol.messages import (
     Commit,
     Disarm,
     Fault,
+    GetBlock,
     GetCaps,
     GetFaults,
     GetMeasured,
+    GetReading,
+    GetSensors,
     GetStatus,
     Hello,
     LoadEnvelope,
+    Measure,
     Nak,
     NakCode,
     Ping,
@@ -52,6 +58,12 @@ _Q = PROTOCOL.quantities
 _CONTROLWORDS: Mapping[str, int] = _MAP["controlwords"]
 CHANNELS_MAX = _Q.channel_count.maximum
 RECORDS_FIRST = 4  # usually fewer; further ones are read separately
+
+
+_WITHOUT_STATE = (
+    *(Hello, GetCaps, GetFaults, GetMeasured, LoadEnvelope),
+    *(GetSensors, Measure, GetReading, GetBlock),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +112,8 @@ def encode_request(
         case GetMeasured():
             beyond = channels * MEASURED_SIZE
             return Exchange(_read("measured", beyond=beyond), Write(_MAP["look"], (tag,)))
+        case GetSensors() | GetReading() | GetBlock() | Measure():
+            return _of_sensors(request, tag)
         case SetAddress():
             raise CommandError("on Modbus an address is set by a broadcast")
         case Ping(session=session):
@@ -123,6 +137,29 @@ def encode_request(
                 Read(kept["address"], HEAD + len(kept["registers"])),
                 _block("envelope", tag, _pack_envelope(envelope)),
             )
+
+
+def _of_sensors(request: GetSensors | GetReading | GetBlock | Measure, tag: int) -> Exchange:
+    """Encode a request for sensors: from which one on, then what is listed from there."""
+    match request:
+        case GetSensors(first=first):
+            beyond = _MAP["sensors_listed"] * SENSOR_SIZE
+            read, block, words = _read("sensors", beyond=beyond), "sensor", [first]
+        case GetReading(first=first):
+            beyond = READING_SIZE
+            read, block, words = _read("reading", beyond=beyond), "sensor", [first]
+        case GetBlock(sensor=sensor, sample=sample):
+            read = _read("samples", beyond=_Q.sample_count.maximum)
+            block, words = "sample", [sensor, sample >> 16, sample & 0xFFFF]
+        case Measure():
+            read, block = _read("reading"), "measure"
+            words = _unsigned(
+                (_Q.reading, request.number),
+                (_Q.window, request.window),
+                (_Q.tone_count, len(request.frequencies)),
+                *((_Q.frequency, frequency) for frequency in request.frequencies),
+            )
+    return Exchange(read, _block(block, tag, words))
 
 
 def encode_broadcast(request: Broadcast) -> Write:
@@ -171,6 +208,12 @@ def decode_reply(request: Request, registers: Sequence[int]) -> Reply:
             return blocks.unpack_loaded(registers)
         case GetMeasured():
             return blocks.unpack_measured(registers)
+        case GetSensors():
+            return sensor_blocks.unpack_sensors(registers)
+        case Measure() | GetReading():
+            return sensor_blocks.unpack_reading(registers)
+        case GetBlock():
+            return sensor_blocks.unpack_samples(registers)
         case _:
             return blocks.unpack_status(registers)
 
@@ -179,7 +222,7 @@ def reported_state(
     request: Request, registers: Sequence[int]
 ) -> tuple[AmplifierState, Fault] | None:
     """Decode state and fault if the block has them; raises FrameError."""
-    if isinstance(request, Hello | GetCaps | GetFaults | GetMeasured | LoadEnvelope):
+    if isinstance(request, _WITHOUT_STATE):
         return None
     return blocks.unpack_state(registers)
 

@@ -10,6 +10,21 @@ from dataclasses import dataclass
 from typing import Any
 
 from drivers.codec.payload import Cursor, Malformed, pack, pack_optional_channel, pack_text
+from drivers.codec.sensors import (
+    pack_block,
+    pack_get_block,
+    pack_get_sensors,
+    pack_measure,
+    pack_reading,
+    pack_sensors,
+    unpack_block,
+    unpack_get_block,
+    unpack_get_reading,
+    unpack_get_sensors,
+    unpack_measure,
+    unpack_reading,
+    unpack_sensors,
+)
 from drivers.codec.serial_line.frame import NEUTRAL, REPLY, Frame
 from drivers.codec.serial_line.reports import (
     pack_capabilities,
@@ -46,20 +61,27 @@ from drivers.protocol.messages import (
     Disarm,
     Fault,
     FaultList,
+    GetBlock,
     GetCaps,
     GetFaults,
     GetMeasured,
+    GetReading,
+    GetSensors,
     GetStatus,
     Hello,
     Identity,
     Loaded,
     LoadEnvelope,
+    Measure,
     Measured,
     Nak,
     NakCode,
     Ping,
+    Reading,
     Reply,
     Request,
+    SampleBlock,
+    SensorList,
     SetAddress,
     Stage,
     Status,
@@ -108,6 +130,7 @@ _STATUS = _Layout(Status, pack_status, unpack_status)
 _ACHIEVED = _Layout(Achieved, pack_achieved, unpack_achieved)
 _FAULTS = _Layout(FaultList, pack_faults, unpack_faults)
 _MEASURED = _Layout(Measured, pack_measured, unpack_measured)
+_READING = _Layout(Reading, pack_reading, unpack_reading)
 
 
 def _set(message: type[Stage] | type[Apply]) -> _Layout:
@@ -171,6 +194,19 @@ _EXCHANGES: dict[int, tuple[_Layout, _Layout]] = {
         _numbers(Loaded, slot=_Q.envelope_slot, knots=_Q.envelope_knots),
     ),
     PROTOCOL.types["get_measured"]: (_empty(GetMeasured), _MEASURED),
+    PROTOCOL.types["get_sensors"]: (
+        _Layout(GetSensors, pack_get_sensors, unpack_get_sensors),
+        _Layout(SensorList, pack_sensors, unpack_sensors),
+    ),
+    PROTOCOL.types["measure"]: (_Layout(Measure, pack_measure, unpack_measure), _READING),
+    PROTOCOL.types["get_reading"]: (
+        _Layout(GetReading, pack_get_sensors, unpack_get_reading),
+        _READING,
+    ),
+    PROTOCOL.types["get_block"]: (
+        _Layout(GetBlock, pack_get_block, unpack_get_block),
+        _Layout(SampleBlock, pack_block, unpack_block),
+    ),
     PROTOCOL.types["set_address"]: (_SET_ADDRESS, _numbers(AddressSet, address=_Q.address)),
 }
 _TYPE_OF = {request.message: code for code, (request, _) in _EXCHANGES.items()}

@@ -34,6 +34,7 @@ from sim.far_ends.can_bus.sdo import (
     WRITE_ONLY,
     SdoAbort,
 )
+from sim.far_ends.can_bus.sensor_objects import SensorObjects
 from sim.far_ends.can_bus.set_buffer import NO_CHANNEL
 
 CANOPEN: Mapping[str, Any] = PROTOCOL.canopen
@@ -178,6 +179,10 @@ class ObjectDictionary:
             )
         if Feature.ELECTRICAL in self._device.capabilities.features:
             self._measurements()
+        if Feature.SENSORS in self._device.capabilities.features:
+            self._sensors = SensorObjects(self._device)
+            self._reads |= self._sensors.reads()
+            self._writes |= self._sensors.writes()
         self._reads[_INDEX["achieved"], 0] = lambda: self.achieved
         self._reads[_INDEX["faults"], 0] = self._faults
 

@@ -18,9 +18,12 @@ from drivers.protocol.messages import (
     Commit,
     Disarm,
     FaultList,
+    GetBlock,
     GetCaps,
     GetFaults,
     GetMeasured,
+    GetReading,
+    GetSensors,
     GetStatus,
     Hello,
     Identity,
@@ -65,6 +68,13 @@ from sim.far_ends.modbus.registers import (
     status_words,
     value_of,
 )
+from sim.far_ends.modbus.sensor_registers import (
+    decode_measure,
+    decode_sample,
+    reading_words,
+    sample_words,
+    sensor_words,
+)
 
 _T = TypeVar("_T")
 
@@ -77,6 +87,9 @@ _HEARTBEAT: int = MAP["holding"]["heartbeat"]["address"]
 _SET: int = MAP["holding"]["set"]["address"]
 _ENVELOPE: int = MAP["holding"]["envelope"]["address"]
 _ADDRESS: int = MAP["holding"]["address"]["address"]
+_SENSOR: int = MAP["holding"]["sensor"]["address"]
+_MEASURE: int = MAP["holding"]["measure"]["address"]
+_SAMPLE: int = MAP["holding"]["sample"]["address"]
 _CHANNELS, _KNOTS = 16, 32
 # How many registers follow those of a block that have names of their own.
 _FOLLOWING = {
@@ -85,6 +98,12 @@ _FOLLOWING = {
     "set": _CHANNELS * _GROUP,
     "envelope": 2 * _KNOTS,
     "address": MAP["text_registers"],
+    "sensor": 0,
+    "measure": _Q.tone_count.maximum,
+    "sample": 0,
+    "sensors": MAP["sensors_listed"] * MAP["sensor_registers"],
+    "reading": MAP["reading_registers"],
+    "samples": _Q.sample_count.maximum,
     "status": _CHANNELS,
     "refusal": 0,
     "capabilities": _CHANNELS * MAP["limit_registers"],
@@ -132,6 +151,8 @@ class ModbusUnit:
         self._tag = 0
         self._refusal = [0, NO_CHANNEL, 0]
         self._achieved: Achieved | None = None
+        self._first_sensor = 0
+        self._first_sample = GetBlock(0, 0)
         # As written last; initially the defaults of watchdog and ramp.
         self._written = dict.fromkeys(range(_CONTROL, _ENDS[_CONTROL]), 0)
         self._written |= {_WORD + 1: _Q.watchdog.to_wire(0.25), _WORD + 2: 5}
@@ -222,6 +243,13 @@ class ModbusUnit:
             case "measured":
                 reply = self._amplifier.exchange(GetMeasured())
                 return measured_words(reply if isinstance(reply, Measured) else Measured(()))
+            case "sensors":
+                listed = GetSensors(self._first_sensor)
+                return sensor_words(self._amplifier.exchange(listed))
+            case "reading":
+                return reading_words(self._amplifier.exchange(GetReading(self._first_sensor)))
+            case "samples":
+                return sample_words(self._amplifier.exchange(self._first_sample))
             case "faults":
                 return fault_words(self._query(GetFaults(), FaultList))
             case "achieved":
@@ -249,6 +277,10 @@ class ModbusUnit:
             raise ModbusException(MAP["exceptions"][refused.code.name]) from None
         if isinstance(reply, Achieved):
             self._achieved = reply
+        if isinstance(request, GetSensors):
+            self._first_sensor = request.first
+        if isinstance(request, GetBlock):
+            self._first_sample = request
         self._written.update(enumerate(words, start=address))
         if isinstance(reply, Loaded):  # reads return it as stored
             slot = _ENVELOPE + _HEAD
@@ -283,6 +315,12 @@ class ModbusUnit:
             return Ping(words[0])
         if begin == _ADDRESS:
             return decode_address(words)
+        if begin == _SENSOR:
+            return GetSensors(int(value_of(_Q.sensor, words[0])))
+        if begin == _MEASURE:
+            return decode_measure(words)
+        if begin == _SAMPLE:
+            return decode_sample(words)
         return decode_set(words) if begin == _SET else decode_envelope(words)
 
     def _control_request(self, words: Sequence[int]) -> Request:

@@ -28,7 +28,12 @@ FRAMES = {
 }
 MAP = PROTOCOL.modbus
 EXAMPLES = {name: one for name, one in ALL.items() if not isinstance(one.request, SetAddress)}
-NUMBERED = [(name, number) for number, name in enumerate(EXAMPLES, start=1)]
+OF_SENSORS = ("GetSensors", "Measure", "GetReading", "GetBlock")  # at the end of the session
+_BEFORE = [name for name in EXAMPLES if name not in OF_SENSORS]
+NUMBERED = [
+    (name, number)
+    for number, name in (*enumerate(_BEFORE, start=1), *enumerate(OF_SENSORS, start=27))
+]
 BESIDE = ("Refusal", "FC16 Apply", "FC4 Apply", "FC43 Identification", "FC16 Disarm")
 BROADCASTS = {
     "Broadcast Commit": (22, Commit(513, 9)),
@@ -36,7 +41,9 @@ BROADCASTS = {
     "Broadcast SetAddress": (26, SetAddress(5, "A-17")),
 }
 every_wire = pytest.mark.parametrize("wire", ["RTU", "TCP"])
-every_example = pytest.mark.parametrize(("name", "number"), NUMBERED, ids=EXAMPLES)
+every_example = pytest.mark.parametrize(
+    ("name", "number"), NUMBERED, ids=[name for name, _ in NUMBERED]
+)
 
 
 def pdu_of(frame: bytes, wire: str) -> bytes:
@@ -113,7 +120,8 @@ def test_far_end_decodes_and_replies(name: str, number: int, wire: str) -> None:
     device = ScriptedDevice()
     device.follow(EXAMPLES[name])
     assert answered(device, name, wire) == FRAMES[f"{name} reply, {wire}"]
-    assert device.asked[0] == plain(EXAMPLES[name].request)
+    # What is read behind a selection is asked for once more, by the block that is read.
+    assert device.asked[-1 if name == "GetReading" else 0] == plain(EXAMPLES[name].request)
 
 
 @every_wire
@@ -199,6 +207,8 @@ def addresses() -> dict[int, str]:
     named = {MAP["look"]: "look"}
     behind = {"set": "channels", "envelope": "knots", "status": "levels", "achieved": "channels"}
     behind |= {"capabilities": "limits", "measured": "measurements", "address": "serial_number"}
+    behind |= {"measure": "frequencies", "sensors": "descriptions", "reading": "tones"}
+    behind["samples"] = "counts"
     for name, block in [*MAP["holding"].items(), *MAP["input"].items()]:
         registers = [*MAP["head"], *block["registers"]]
         if name in behind:

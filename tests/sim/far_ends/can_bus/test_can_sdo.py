@@ -22,6 +22,7 @@ from fake_device import FakeDevice
 from sim.far_ends.can_bus import sdo
 from sim.far_ends.can_bus.node import CanNode
 from sim.far_ends.can_bus.sdo import NO_OBJECT, SdoAbort, SdoServer
+from vendor_pages import SENSORS, ScriptedSensors
 
 INDEX = 0x2100
 DOCS = Path(drivers.__file__).parent.parent / "docs" / "reference"
@@ -160,6 +161,8 @@ def node(device: FakeDevice) -> canopen.RemoteNode:
             """To the far end."""
             far.receive(CanFrame(can_id, bytes(data)))
 
+    device.amplifier.attach(ScriptedSensors(SENSORS * 2))  # one for each channel
+    device.capabilities = device.amplifier.capabilities
     network = Wire()
     far = CanNode(
         device,  # type: ignore[arg-type]

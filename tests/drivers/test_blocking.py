@@ -51,6 +51,18 @@ def test_blocking_amplifier_refuses_what_exceeds_its_limits() -> None:
         assert amplifier.disarm().state is AmplifierState.SWITCH_ON_DISABLED
 
 
+def test_blocking_amplifier_measures_while_it_feeds_the_watchdog() -> None:
+    """Over a window longer than the watchdog; the ERA that plays moves its own foot most."""
+    with BlockingAmplifier(URL, limits=LIMITS) as amplifier:
+        amplifier.arm(0.1)
+        amplifier.apply([DriveCommand(2, 110.0, 0.2)], ramp=0.0)
+        reading = amplifier.measure([110.0], 0.3)
+        assert amplifier.status().state is AmplifierState.OPERATION_ENABLED
+        sensors = amplifier.sensors()
+        loudest = max(range(len(sensors)), key=lambda n: reading.sensors[n].tones[0].amplitude)
+        assert sensors[loudest].channel == 2
+
+
 def test_play_raises_when_the_watchdog_has_tripped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

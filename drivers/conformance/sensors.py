@@ -138,6 +138,7 @@ async def disturbed_readings(bench: Bench) -> None:
     await bench.arm()
     played = bench.tones(1.0)
     committed = await bench.apply(played)
+    await bench.wait(0.05)  # so that t differs from 0
     started, when = await bench.timed(amplifier.start_reading([tone], _WINDOW))
     await bench.apply(played)  # again: it is played once
     whole = await _finished(bench, started)

@@ -284,7 +284,7 @@ def conformance(
             f"{len(driving)} more checks arm the amplifier and drive its channels at {LEVEL:.0%} "
             "of full stroke. Continue?"
         )
-    if write and report.problems == 0:
+    if write and report.overall != "failed":
         report = _run(conform(url, driving, show, process=process, before=report), trace)
     if json_:
         print(json.dumps(report.to_json()))

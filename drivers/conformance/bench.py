@@ -90,13 +90,10 @@ class Bench:
         return self._raw
 
     async def prepare(self, *, drives: bool) -> None:
-        """Open the amplifier again if it was lost, and measure its typical exchange.
+        """Measure the typical exchange.
 
         drives: whether it must be disarmed first, as after an attempt that was cut short.
         """
-        if self.amplifier.is_lost:
-            await self.amplifier.close()
-            await self.amplifier.open()
         off = AmplifierState.SWITCH_ON_DISABLED
         if drives and (await self.amplifier.status()).state is not off:
             await self.rest()
@@ -171,7 +168,7 @@ class Bench:
         """Feed the watchdog."""
         status, when = await self.timed(self.amplifier.heartbeat())
         self.fed = when
-        return Sample(when, status)
+        return self._sample(when, status)
 
     async def apply(self, requested: SafeCommandSet) -> Interval:
         """Apply a set; returns when."""
@@ -186,6 +183,14 @@ class Bench:
     async def sample(self) -> Sample:
         """Read the status."""
         status, when = await self.timed(self.amplifier.status())
+        return self._sample(when, status)
+
+    def _sample(self, when: Interval, status: Status) -> Sample:
+        """Make a sample of a status, which must have a level for each channel."""
+        count = len(status.levels)
+        expect(
+            count == self.can.channels, "levels of Status", expected=self.can.channels, seen=count
+        )
         return Sample(when, status)
 
     async def rest(self) -> None:

@@ -8,9 +8,15 @@ from typing import Any, TypeAlias
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.conformance.bench import Bench
-from drivers.conformance.findings import ContractViolation, Inconclusive, NotApplicable
+from drivers.conformance.findings import (
+    ContractViolation,
+    Inconclusive,
+    LinkGone,
+    NotApplicable,
+)
 from drivers.conformance.lateness import STALL, Lateness
 from drivers.conformance.raw.line import RawLine
+from drivers.conformance.reopening import reopened
 from drivers.errors import DriverError, LinkError
 
 MAX_ATTEMPTS = 10
@@ -160,7 +166,7 @@ async def run_check(
     while len(attempts) < MAX_ATTEMPTS:
         attempt = await _attempt(check, Bench(amplifier, raw, url=url), process)
         attempts.append(attempt)
-        if not attempt.is_doubtful:
+        if not attempt.is_doubtful or isinstance(attempt.finding, LinkGone):
             break
     finding, reason, took = attempt.finding, attempt.reason, clock.now() - start
     if finding is None:
@@ -203,6 +209,8 @@ async def _attempt(check: Check, bench: Bench, process: int | None) -> _Attempt:
 async def _finding(check: Check, bench: Bench) -> Exception | None:
     """Return what the steps found, None if all is as required."""
     finding: Exception | None = None
+    if loss := await reopened(bench.amplifier):
+        return LinkGone(f"the link was lost: {loss}")
     try:
         await bench.prepare(drives=check.drives)
         await check.run(bench)

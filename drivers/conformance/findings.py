@@ -20,6 +20,10 @@ class Inconclusive(Exception):
     """What was seen does not suffice to pass or to fail, as where this host was delayed."""
 
 
+class LinkGone(Inconclusive):
+    """The link was lost and could not be opened again."""
+
+
 class NotApplicable(Exception):
     """The amplifier, or its wire, does not have what is checked."""
 

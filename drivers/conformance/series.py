@@ -1,16 +1,11 @@
 """Checks in turn on one amplifier, whose link may be lost on the way."""
 
-import asyncio
 from collections.abc import Callable, Iterable
 
-from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.conformance.check import Check, CheckResult, Result, run_check
 from drivers.conformance.raw.line import RawLine
-from drivers.errors import DriverError
-
-_REOPENING = 2.0  # s; an adapter that was reset has its port again by then
-_PAUSE = 0.1  # s; between tries
+from drivers.conformance.reopening import reopened
 
 
 async def run_checks(
@@ -30,7 +25,7 @@ async def run_checks(
     results: list[CheckResult] = []
     loss = ""
     for check in checks:
-        loss = loss or await _reopened(amplifier)
+        loss = loss or await reopened(amplifier)
         if loss:
             results.append(not_begun(check, raw, loss))
         else:
@@ -51,17 +46,3 @@ def not_begun(check: Check, raw: RawLine | None, loss: str) -> CheckResult:
         expected=check.requirement,
         attempts=0,
     )
-
-
-async def _reopened(amplifier: Amplifier) -> str:
-    """Open the amplifier again if it was lost; return why it cannot be opened, or nothing."""
-    end = clock.now() + _REOPENING
-    while amplifier.is_lost:
-        try:
-            await amplifier.close()
-            await amplifier.open()
-        except DriverError as error:
-            if clock.now() >= end:
-                return str(error)
-            await asyncio.sleep(_PAUSE)
-    return ""

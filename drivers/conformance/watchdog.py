@@ -87,7 +87,9 @@ async def watchdog_without_reading(bench: Bench) -> None:
     await bench.pause_until(bench.fed.latest + bench.watchdog + 0.3)
     status = (await bench.sample()).status
     bench.expect_state(status, AmplifierState.FAULT, after="the time of the watchdog")
-    age = (await bench.amplifier.faults())[0].age
+    faults = await bench.amplifier.faults()
+    expect(bool(faults), "faults after the time of the watchdog", expected="some", seen="none")
+    age = faults[0].age
     elapsed = clock.now() - bench.fed.latest - bench.watchdog
     expect(
         age >= elapsed - 0.02 - 4 * bench.exchange_time,

@@ -721,6 +721,13 @@ FAULTS: dict[str, PlantedFault] = {
             ),
         ),
     ),
+    "an armed amplifier reports a level too few": PlantedFault(
+        "every_channel",
+        status_of(lambda one, self: {"levels": one.levels[: -1 if one.high_voltage else None]}),
+    ),
+    "its list of faults is empty": PlantedFault(
+        "watchdog_without_reading", reply_of(FaultList, lambda reply, _: {"faults": ()})
+    ),
     # Ramps and phases
     "fades are linear": PlantedFault("ramp_up", replaced(FadingTone, "gain", _linear)),
     "ramps are ignored": PlantedFault("ramp_up", played(lambda one: replace(one, ramp=0.0))),

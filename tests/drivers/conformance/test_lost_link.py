@@ -11,6 +11,7 @@ from drivers.amp_actions import conform
 from drivers.conformance import CHECKS, CheckResult, Result
 from drivers.conformance.bench import Bench
 from drivers.conformance.check import Check
+from drivers.conformance.findings import Inconclusive
 from drivers.conformance.report import ConformanceReport
 from drivers.errors import LinkError
 from memory_machine import live_in_memory
@@ -79,6 +80,28 @@ def test_checks_after_a_short_loss_are_run(wire: str, coarse_rig: Rig) -> None:
         wire, coarse_rig, lambda far: (unplugging(far, lasts=0.5), *named("identity", "disarm"))
     )
     assert [one.result for one in report.results] == [Result.PASSED] * 3
+
+
+@pytest.mark.parametrize(("lasts", "result"), [(1.0, Result.PASSED), (1e9, Result.INCONCLUSIVE)])
+@pytest.mark.parametrize("wire", ALL)
+def test_check_is_repeated_once_the_link_is_back(
+    wire: str, lasts: float, result: Result, coarse_rig: Rig
+) -> None:
+    """A port that cannot be opened at once, as while its old one closes, is no failure."""
+    tries = []
+
+    def flaky(far: FarSide) -> tuple[Check, ...]:
+        async def steps(bench: Bench) -> None:
+            tries.append(clock.now())
+            if len(tries) == 1:
+                await unplugging(far, lasts=lasts).run(bench)
+                raise Inconclusive("nothing was seen")
+
+        return (Check("flaky", "is repeated", ("wire-protocol.md#hello",), False, steps),)
+
+    (found,) = report_of(wire, coarse_rig, flaky).results
+    assert (found.result, found.attempts) == (result, 2)
+    assert len(tries) == (2 if result is Result.PASSED else 1)
 
 
 @pytest.mark.parametrize("after", [0.03, 0.31, 0.72])

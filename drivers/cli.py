@@ -190,7 +190,7 @@ def sensors(url: Url, trace: Trace = None, json_: Json = False) -> None:
     """Show what the sensors measure, and where."""
     from drivers import amp_actions
 
-    _show(_run(amp_actions.sensors(url), trace), as_json=json_)
+    _show_sensors(_run(amp_actions.sensors(url), trace), as_json=json_)
 
 
 @amp.command()
@@ -207,7 +207,7 @@ def measure(
     """Measure amplitude and phase of tones at every sensor. Changes nothing that plays."""
     from drivers import amp_actions
 
-    _show(_run(amp_actions.measure(url, frequency, window), trace), as_json=json_)
+    _show_sensors(_run(amp_actions.measure(url, frequency, window), trace), as_json=json_)
 
 
 @amp.command()
@@ -331,6 +331,18 @@ def _show(result: dict[str, Any], *, as_json: bool) -> None:
     width = max(len(key) for key in result)
     for key, value in result.items():
         print(f"{key:{width}}  {in_words(value)}")
+
+
+def _show_sensors(result: dict[str, Any], *, as_json: bool) -> None:
+    """Show a result with a line for each sensor."""
+    if as_json:
+        print(json.dumps(result))
+        return
+    _show({key: value for key, value in result.items() if key != "sensors"}, as_json=False)
+    for one in result["sensors"]:
+        print(in_words(one))
+    if not result["sensors"]:
+        print("no sensors")
 
 
 def in_words(value: Any) -> str:

@@ -34,6 +34,7 @@ REACH = 2000.0
 """Largest range [m/s²]; the paper's plate stays below with all ERAs at full stroke."""
 
 _Q = PROTOCOL.quantities
+_ROUNDING = 1e-6
 _BELOW_NYQUIST, _FREQUENCY_MAX = 0.8, 3000.0  # Hz
 
 
@@ -152,9 +153,9 @@ class Sensing:
     def _measure(self, request: Measure, now: float) -> Reply:
         if self._reader is not None and request == self._reader.request:
             return self._reading(_Q.sensor.maximum + 1, now)  # its reply was lost
-        lowest, ascending = 1 / request.window, sorted(request.frequencies)
-        apart = [after - before for before, after in pairwise([0.0, *ascending])]
-        if min(apart) < lowest - _Q.frequency.step / 2 or ascending[-1] > self._frequency_max:
+        ascending = sorted(request.frequencies)
+        apart = min(after - before for before, after in pairwise([0.0, *ascending]))
+        if apart * request.window < 1 - _ROUNDING or ascending[-1] > self._frequency_max:
             return Nak(NakCode.BAD_VALUE)
         self.forget()
         sensors = self._sensors

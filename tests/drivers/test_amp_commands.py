@@ -35,6 +35,7 @@ from drivers.protocol.messages import (
     Reply,
     Stop,
 )
+from model.rig.file import example_rig_path
 from scripted_amplifier import FarEnd
 from sim.amplifier.amplifier import SimulatedAmplifier
 from vendor_pages import ARMED, PLAYING, usual_reply
@@ -263,7 +264,10 @@ def test_conformance_stops_after_a_failed_reading_check(background: BackgroundFa
     assert result.exit_code == 1, result.output
     answer = json.loads(result.stdout)
     rows = {row["name"]: row for row in answer["checks"]}
-    assert (answer["overall"], answer["failed"]) == ("failed", 1)
+    assert (answer["overall"], answer["failed"]) == ("failed", 2)
+    # By script, its readings never end.
+    failed = {name for name, row in rows.items() if row["result"] == "failed"}
+    assert failed == {"starts_disarmed", "readings"}
     assert "OPERATION_ENABLED" in rows["starts_disarmed"]["seen"]
     assert rows["starts_disarmed"]["place"] == "wire-protocol.md#states"
     assert rows["identity"]["result"] == "passed"
@@ -316,3 +320,27 @@ def test_results_have_the_documented_keys(background: BackgroundFarEnd) -> None:
     for command, more in beside.items():
         keys = set(re.findall(r"`(\w+)`", re.sub(r"\(.*?\)", "", common + more)))
         assert set(result_of(command, background.end.url)) == keys
+
+
+def test_tones_are_measured_by_hand() -> None:
+    """Sensors with unit and channel; a reading of two tones at each, of a plate at rest."""
+    url = f"sim://{example_rig_path()}?exact"
+    described = CliRunner().invoke(app, ["amp", "sensors", url, "--json"])
+    sensors = json.loads(described.stdout)["sensors"]
+    assert [one["channel"] for one in sensors] == [0, 1, 2, 3]
+    assert {one["unit"] for one in sensors} == {"m/s²"}
+    tones = ["--frequency", "110", "--frequency", "150", "--window", "0.1"]
+    result = CliRunner().invoke(app, ["amp", "measure", url, *tones, "--json"])
+    reading = json.loads(result.stdout)
+    assert (reading["state"], reading["token"]) == ("COMPLETE", 0)
+    for one in reading["sensors"]:
+        assert [tone["frequency_hz"] for tone in one["tones"]] == [110.0, 150.0]
+        assert [tone["amplitude"] for tone in one["tones"]] == [0.0, 0.0]
+
+
+def test_tones_too_close_are_an_error_of_the_command() -> None:
+    """Exit status 2 of the program, by the error's class."""
+    url = f"sim://{example_rig_path()}"
+    tones = ["--frequency", "110", "--frequency", "112", "--window", "0.1"]
+    result = CliRunner().invoke(app, ["amp", "measure", url, *tones])
+    assert isinstance(result.exception, CommandError)

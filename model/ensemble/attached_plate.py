@@ -19,6 +19,7 @@ from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces, full_strokes
 from model.structure.fingertip import Fingertip
+from model.structure.modal_elasticity import ModalElasticity
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 
@@ -137,8 +138,9 @@ def attach(
     """
     w = 2 * np.pi * frequencies
     w2 = (w**2)[:, None]
-    eta = plate.loss_factor
-    g = 1 / ((1 + 1j * eta) * omega**2 - w2)
+    elasticity = ModalElasticity.of(plate, omega**2)
+    g = 1 / (elasticity.stiffness(w) - w2)
+    by_loss = -1j * elasticity.loss_factors(w) * elasticity.eigenvalues * g**2
     k, c = (np.array([getattr(era, key) for era in eras]) for key in ("stiffness", "damping"))
     log_damping = math.log(uncertainty.damping)
     single = np.complex64
@@ -146,7 +148,7 @@ def attach(
         minus_omega2=-w2[:, 0].astype(np.float32),
         receptance=g.astype(single),
         by_thickness=(uncertainty.thickness * (-3 * g - 2 * w2 * g**2)).astype(single),
-        by_loss=(log_damping * (-1j * eta) * omega**2 * g**2).astype(single),
+        by_loss=(log_damping * by_loss).astype(single),
         shapes=shapes.astype(np.float32),
         stiffness=attached_stiffness(eras, masses, w).astype(single),
         forces=drive_forces(eras, w).astype(single),

@@ -17,6 +17,7 @@ from model.fem.factorisation import factorise
 from model.fem.plate_mesh import check_frequencies
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
+from model.structure.modal_elasticity import check_of_theory, loss_factors
 from model.structure.point_load import Load, footprints_of
 
 
@@ -34,15 +35,17 @@ def direct_acceleration(
     frequency: the reference that `FreePlate.acceleration` is compared with. Raises InputError as
     `check_frequencies`, and for points off the plate.
     """
+    check_of_theory(matrices.plate)
     check_frequencies(matrices.plate, matrices.mesh, frequencies)
     touch = matrices.deflection_at(footprints_of(eras, loads))
     observe = matrices.deflection_at(points)
     result = np.empty((len(frequencies), len(eras), observe.shape[0]), dtype=complex)
     omegas = 2 * np.pi * np.asarray(frequencies, dtype=float)
     attached, forces = attached_stiffness(eras, loads, omegas), drive_forces(eras, omegas)
-    for row, omega in enumerate(omegas):
+    losses = loss_factors(matrices.plate, omegas)
+    for row, (omega, loss) in enumerate(zip(omegas, losses, strict=True)):
         dynamic_stiffness = (
-            (1 + 1j * matrices.plate.loss_factor) * matrices.stiffness
+            (1 + 1j * loss) * matrices.stiffness
             - omega**2 * matrices.mass
             + touch.T @ sparse.diags_array(attached[row]) @ touch
         )

@@ -60,6 +60,11 @@ class FiniteElementModes:
         self._trim_cache()
         return PointSolutions(points, np.hstack(shapes), residuals, truncated_terms)
 
+    def shapes_at(self, points: FloatArray) -> FloatArray:
+        """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
+        shapes, _ = self._observe(np.asarray(points, dtype=float))
+        return shapes
+
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Sums between points (n, 2) and others (m, 2), as in `PointSolutions`."""
         return self._between(self._solutions(points), self._solutions(others))

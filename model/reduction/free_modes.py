@@ -45,6 +45,9 @@ class FreeModes(Protocol):
     def solve_at(self, points: FloatArray) -> PointSolutions:
         """Solve for forces at points [m] (n, 2)."""
 
+    def shapes_at(self, points: FloatArray) -> FloatArray:
+        """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r) [1/sqrt(kg)]."""
+
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Sums between points (n, 2) and others (m, 2), as in `PointSolutions`."""
 

@@ -10,6 +10,7 @@ their number, independent of the mesh.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 from model.structure.footprint import as_footprints
 from model.structure.low_rank import coupled_forces, on_diagonal
+from model.structure.modal_elasticity import ModalElasticity, loss_factors
 from model.structure.plate import Plate
 from model.structure.point_load import Load, footprints_of
 
@@ -107,15 +109,19 @@ class FreePlate:
             between = between[:, :n, :n] - forces @ between[:, n:, :n]
         return between, to_points
 
+    @cached_property
+    def _elasticity(self) -> ModalElasticity:
+        return ModalElasticity.of(self.plate, self.modes.eigenvalues)
+
     def _modal_receptance(self, omega: FloatArray, terms: int) -> tuple[ComplexArray, ComplexArray]:
         """Receptance of each mode (f, r) [s²], and weights of the truncated ones, (f, terms).
 
         1 / ((1 + i eta) lambda - omega²) for an eigenvalue lambda at modal mass 1.
         """
-        loss = 1 + 1j * self.plate.loss_factor
-        shifted = np.asarray(omega**2 / loss + self.shift, dtype=complex)
+        loss = (1 + 1j * loss_factors(self.plate, omega))[:, None]
+        shifted = np.asarray(omega**2 / loss[:, 0] + self.shift, dtype=complex)
         weights = truncation_weights(shifted, self.modes.largest_truncated, terms)
-        receptance = 1 / (loss * self.modes.eigenvalues - (omega**2)[:, None])
+        receptance = 1 / (self._elasticity.stiffness(omega) - (omega**2)[:, None])
         return np.asarray(receptance, dtype=complex), np.asarray(weights / loss, dtype=complex)
 
     def _between(self, attached: PointSolutions, omega: FloatArray) -> ComplexArray:

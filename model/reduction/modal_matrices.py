@@ -7,7 +7,8 @@ force of the pulp, a spring and a damper between the plate and the phalanx.
 
 Structural damping. The frequency domain uses a hysteretic stiffness (1 + i eta) diag(omega²),
 which no causal equation in time has. C_s is its viscous equivalent: in the modes psi_j, omega_j of
-the plate *on its ERAs*, C_s,jk = eta psi_j^T diag(omega²) psi_k / sqrt(omega_j omega_k). That is
+the plate *on its ERAs*, C_s,jk = eta psi_j^T diag(omega²) psi_k / sqrt(omega_j omega_k), eta the
+geometric mean of those at omega_j and omega_k where it varies with frequency. That is
 positive semidefinite, and at every resonance of the supported plate it dissipates exactly the power
 of the hysteretic one; a ratio eta/2 on the modes of the *free* plate would not, because the energy
 in the springs has no loss. Contacts do not change it. The two differ off resonance: with eta = 1 %
@@ -24,6 +25,7 @@ from scipy import linalg
 from model.arrays import FloatArray
 from model.structure.actuator import Era
 from model.structure.fingertip import Fingertip, FingertipLoad
+from model.structure.modal_elasticity import ModalElasticity, loss_factors
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, footprints_of
 from model.structure.support import check_supported
@@ -68,13 +70,16 @@ def modal_matrices(
         if attachment_shapes is None
         else attachment_shapes
     )
-    elastic = np.diag(reduced.omega**2)
+    elasticity = ModalElasticity.of(reduced.plate, reduced.omega**2)
+    elastic = np.diag(elasticity.eigenvalues)
     M, C, K = _contribution(phi[: len(fixed)], fixed)
     M += np.eye(len(elastic))
     K += elastic
     eigenvalues, psi = linalg.eigh(K, M)
     omega = np.sqrt(eigenvalues)
-    viscous = reduced.plate.loss_factor * (psi.T @ elastic @ psi) / np.sqrt(np.outer(omega, omega))
+    lossy = (psi.T * elasticity.eigenvalues * elasticity.relative_loss) @ psi
+    share = np.sqrt(loss_factors(reduced.plate, omega) / omega)
+    viscous = lossy * np.outer(share, share)
     mass_weighted_modes = M @ psi
     C += mass_weighted_modes @ viscous @ mass_weighted_modes.T
     return _under_fingertips((M, C, K), phi[len(fixed) :], [each.fingertip for each in contacts])

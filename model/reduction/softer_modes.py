@@ -30,6 +30,10 @@ class SofterModes:
         truncated_terms[0] += self.modes.uncertain(points, points)
         return replace(solved, truncated_terms=truncated_terms)
 
+    def shapes_at(self, points: FloatArray) -> FloatArray:
+        """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
+        return self.modes.shapes_at(points)
+
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Sums between points (n, 2) and others (m, 2), as in `PointSolutions`."""
         truncated_terms = self.modes.truncated_terms(points, others)

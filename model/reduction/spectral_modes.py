@@ -70,6 +70,10 @@ class SpectralModes:
         )
         return PointSolutions(points, at.shapes, residuals, self.truncated_terms(points, points))
 
+    def shapes_at(self, points: FloatArray) -> FloatArray:
+        """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
+        return self._observe(points).shapes
+
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Sums between points (n, 2) and others (m, 2), as in `PointSolutions`."""
         if self._is_solved_alone(len(points) + len(others)):

@@ -32,6 +32,13 @@ def truncation_weights(
     return np.asarray(largest * exact @ inverse.T)
 
 
+def truncation_slopes(shifted_eigenvalue: ComplexArray, largest: float, terms: int) -> ComplexArray:
+    """Derivatives of `truncation_weights` by s: (f, terms)."""
+    v, inverse = _interpolation(terms)
+    exact = 1 / (1 - largest * shifted_eigenvalue[:, None] * v)
+    return np.asarray(largest**2 * (v * exact**2) @ inverse.T)
+
+
 @lru_cache(maxsize=16)
 def _interpolation(terms: int) -> tuple[FloatArray, FloatArray]:
     """Zeros of T_k, where the approximation is exact, and the inverse of their Vandermonde matrix.

@@ -1,6 +1,7 @@
 """Conversion of the sections of a rig file to values of the model."""
 
 import math
+from dataclasses import replace
 
 from model.rig.sections import (
     EraSection,
@@ -24,11 +25,13 @@ from registry.voltage import VoltageDrive
 
 def plate_of(section: PlateSection) -> Plate:
     """The plate, of a laminate the equivalent one."""
+    deviations = tuple((2 * math.log(f), math.log(loss)) for f, loss in section.modes)
     laminate = laminate_of(section)
     if laminate is not None:
-        return equivalent_plate(
+        plate = equivalent_plate(
             laminate, length=section.length, width=section.width, loss_factor=section.loss_factor
         )
+        return replace(plate, loss_exponent=section.loss_exponent, mode_deviations=deviations)
     assert section.thickness is not None  # noqa: S101  see model.rig.checks
     assert section.material is not None  # noqa: S101
     return Plate(
@@ -37,6 +40,8 @@ def plate_of(section: PlateSection) -> Plate:
         thickness=section.thickness,
         material=_material(section.material),
         loss_factor=section.loss_factor,
+        loss_exponent=section.loss_exponent,
+        mode_deviations=deviations,
     )
 
 

@@ -145,6 +145,10 @@ def physics_fingerprint(felt: Physics) -> str:
     """
     numbers = asdict(felt.plate)
     del numbers["material"]["name"]
+    # Plates as their theory has them keep the fingerprint that they had before there were others.
+    for key in ("loss_exponent", "mode_deviations"):
+        if not numbers[key]:
+            del numbers[key]
     # ERAs without gains have the fingerprint of a rig that has no such key.
     held = [
         {key: value for key, value in asdict(era).items() if key != "gains" or value}

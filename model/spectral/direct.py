@@ -15,6 +15,7 @@ from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 from model.structure.footprint import as_footprints
 from model.structure.low_rank import coupled_forces, on_diagonal
+from model.structure.modal_elasticity import check_of_theory, loss_factors
 from model.structure.plate import Plate
 from model.structure.point_load import Load, footprints_of
 
@@ -33,11 +34,12 @@ def direct_spectral_acceleration(
     As `direct_acceleration` on finite elements: ((1 + i eta) K - omega² M) u = F in all unknowns,
     plus the compliance that the polynomials do not resolve.
     """
+    check_of_theory(plate)
     check_frequencies(plate, mesh, frequencies)
     attached = footprints_of(eras, loads)
     x, y = mesh.directions(plate)
-    loss = 1 + 1j * plate.loss_factor
     omega = 2 * np.pi * np.asarray(frequencies, dtype=float)
+    loss = (1 + 1j * loss_factors(plate, omega))[:, None, None]
     everywhere = np.concatenate([attached, as_footprints(points)])
     degrees = (mesh.nx, mesh.ny)
     receptance = np.empty((len(omega), len(everywhere), len(attached)), dtype=complex)
@@ -48,7 +50,7 @@ def direct_spectral_acceleration(
         forces = np.zeros((len(K), len(attached)))
         forces[: shapes.shape[1]] = shapes[: len(attached)].T
         for number, each in enumerate(omega):
-            moved = np.linalg.solve(loss * K - each**2 * np.eye(len(K)), forces)
+            moved = np.linalg.solve(loss[number] * K - each**2 * np.eye(len(K)), forces)
             receptance[number] += shapes @ moved[: shapes.shape[1]]
     between, to_points = np.split(receptance, [len(attached)], axis=1)
     stiffness = attached_stiffness(eras, loads, omega)

@@ -35,13 +35,20 @@ class Material:
         return self.E / (2 * (1 + self.nu))
 
 
+LOSS_FREQUENCY = 150.0
+"""Frequency [Hz] at which a plate has its loss factor, where that varies."""
+
+
 @dataclass(frozen=True)
 class Plate:
     """A rectangular plate of constant thickness with its corner at the origin.
 
     length [m] along x, width [m] along y, thickness [m]; loss_factor is the structural loss
     factor eta of a hysteretic stiffness (1 + i eta) K. The paper does not print it; 1 % is the
-    usual order for a metal or glass panel with its bonded layers.
+    usual order for a metal or glass panel with its bonded layers. It is the one at LOSS_FREQUENCY
+    and varies as the power loss_exponent of the frequency. mode_deviations: of the lowest elastic
+    modes, ascending, logarithms of eigenvalue and loss factor relative to those of the theory, as
+    `era rig identify` finds them (`model.structure.modal_elasticity`).
     """
 
     length: float
@@ -49,6 +56,8 @@ class Plate:
     thickness: float
     material: Material
     loss_factor: float = 0.01
+    loss_exponent: float = 0.0
+    mode_deviations: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse dimensions out of range."""
@@ -59,6 +68,18 @@ class Plate:
         if not (math.isfinite(self.loss_factor) and 0 <= self.loss_factor < 1):
             raise InputError(
                 f"plate: loss_factor must be between 0 and 1, got {self.loss_factor} (0.01 is 1 %)"
+            )
+        if not abs(self.loss_exponent) <= 2:  # False for NaN
+            raise InputError(
+                f"plate: loss_exponent must be between -2 and 2, got {self.loss_exponent}"
+            )
+        # A file gives lists; only tuples can be compared and hashed with the rest.
+        deviations = tuple((float(a), float(b)) for a, b in self.mode_deviations)
+        object.__setattr__(self, "mode_deviations", deviations)
+        if not all(abs(a) <= 0.5 and abs(b) <= 5 for a, b in deviations):
+            raise InputError(
+                "plate: logarithms of mode_deviations must be up to 0.5 of an eigenvalue and 5 of "
+                f"a loss factor, got {deviations}"
             )
 
     @property

@@ -18,6 +18,7 @@ from model.rig.uncertainty import Uncertainty
 from model.structure.dynamic_stiffness import attached_stiffness, dynamic_stiffness
 from model.structure.fingertip import FingertipLoad, fingertip_loads
 from model.structure.low_rank import coupled_forces
+from model.structure.modal_elasticity import ModalElasticity
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation
@@ -119,8 +120,9 @@ def _response(
     )
     shapes = np.vstack([table.attachment_shapes, discs[:, 0]])
     scale = plates.thickness[:, None]
-    loss = 1 + 1j * table.plate.loss_factor * plates.loss[:, None]
-    modal = 1 / ((loss * (table.omega * scale) ** 2 - omega**2) * scale)
+    elasticity = ModalElasticity.of(table.plate, table.omega**2)
+    loss = 1 + 1j * plates.loss[:, None] * elasticity.loss_factors(np.array([omega]))
+    modal = 1 / ((loss * elasticity.eigenvalues * scale**2 - omega**2) * scale)
     receptance = np.asarray((modal[:, None, :] * shapes) @ shapes.T, dtype=complex)
     applied = np.zeros((*stiffness.shape, 1), dtype=complex)
     gains = np.array([complex(era.gain(np.array(frequency))) for era in table.eras])

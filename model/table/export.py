@@ -120,6 +120,8 @@ def _plate(table: LocalizationTable) -> dict[str, Any]:
         "width_m": plate.width,
         "thickness_m": plate.thickness,
         "loss_factor": plate.loss_factor,
+        "loss_exponent": plate.loss_exponent,
+        "mode_deviations": [list(each) for each in plate.mode_deviations],
         "material": material.name,
         "E_pa": material.E,
         "rho_kg_m3": material.rho,

@@ -16,6 +16,7 @@ from model.fem.plate_mesh import PlateMesh
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.spectral.mesh import SpectralMesh
+from model.structure.modal_elasticity import ModalElasticity
 from model.structure.point_load import PointLoad, footprints_of
 
 
@@ -85,7 +86,8 @@ def _on_polynomials(rig: Rig, count: int, *, support: str, mesh: SpectralMesh) -
 def _modes_with(reduced: ReducedPlate, attached: list[PointLoad]) -> tuple[FloatArray, FloatArray]:
     """Frequencies [Hz] (r,) and coordinates (r, r) of the undamped plate with attachments."""
     phi = reduced.at(footprints_of(attached)).T
-    K = np.diag(reduced.omega**2) + (phi * [load.stiffness for load in attached]) @ phi.T
+    elastic = ModalElasticity.of(reduced.plate, reduced.omega**2).eigenvalues
+    K = np.diag(elastic) + (phi * [load.stiffness for load in attached]) @ phi.T
     M = np.eye(len(K)) + (phi * [load.mass for load in attached]) @ phi.T
     squares, coordinates = linalg.eigh(K, M)
     return np.sqrt(np.maximum(squares, 0)) / (2 * np.pi), coordinates

@@ -19,6 +19,7 @@ from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.dynamic_stiffness import attached_stiffness, dynamic_stiffness
 from model.structure.low_rank import coupled_forces, on_diagonal
+from model.structure.modal_elasticity import ModalElasticity
 from model.structure.plate import Plate
 from model.structure.point_load import Load, footprints_of
 
@@ -90,9 +91,11 @@ class ParametricPlate:
         """Receptances of the free plate for values (...), by default with its own thickness [m]."""
         thicker = np.asarray(1.0 if thickness is None else thickness / self.plate.thickness)
         stiffer = np.asarray(modulus) / self.plate.material.E * thicker**3
-        elastic = ((1 + 1j * np.asarray(loss_factor)) * stiffer)[..., None, None]
+        elasticity = ModalElasticity.of(self.plate, self.eigenvalues)
+        loss = np.asarray(loss_factor)[..., None, None] * elasticity.loss_ratios(self.omega)
+        elastic = (1 + 1j * loss) * np.asarray(stiffer)[..., None, None] * elasticity.eigenvalues
         inertia = thicker[..., None, None] * (self.omega**2)[:, None]
-        modal = np.asarray(1 / (elastic * self.eigenvalues - inertia))
+        modal = np.asarray(1 / (elastic - inertia))
         # Real products of both parts: the shapes are real.
         found = np.empty((*modal.shape[:-1], self._products.shape[1]), dtype=complex)
         found.real, found.imag = modal.real @ self._products, modal.imag @ self._products

@@ -1,0 +1,72 @@
+"""The model's answers for a rig as written, as identified, and for the plate known exactly."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.identification.hidden import finger_stiffness
+from benchmarks.identification.server import Truth
+from benchmarks.identification.thin_plate import Complexes, Reals
+from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
+from model.structure.plate import LOSS_FREQUENCY
+from model.structure.point_load import PointLoad
+from model.table.build import build_table
+from model.table.question import Question
+from model.table.table import LocalizationTable
+
+DRIVES = Uncertainty(gain=0.01, phase_deg=1, thickness=0, stiffness=0, damping=1, fingertip=0)
+
+
+def table_of(rig: Rig, frequencies: Reals, *, loaded: bool) -> LocalizationTable:
+    """The table of a rig with the rig's fingers or weightless ones."""
+    fingertip = rig.fingertip if loaded else None
+    return build_table(
+        replace(rig, fingertip=fingertip), frequencies=frequencies, drive_mode="phased"
+    )
+
+
+def known_table(table: LocalizationTable, truth: Truth, factors: Reals) -> LocalizationTable:
+    """A table of the plate as it is, and of fingers (k, 4) as they are, if not weightless."""
+    eras = tuple(
+        replace(
+            era,
+            x=float(truth.at[n, 0]),
+            y=float(truth.at[n, 1]),
+            stiffness=float(truth.stiffness[n]),
+            damping=float(truth.damping[n]),
+            bolt_mass=float(truth.bolt[n]),
+            gains=((LOSS_FREQUENCY, float(abs(truth.gain[n])), float(np.angle(truth.gain[n]))),),
+        )
+        for n, era in enumerate(table.eras)
+    )
+    known = replace(
+        table,
+        eras=eras,
+        masses=tuple(PointLoad(x, y, mass=mass) for x, y, mass in truth.masses.tolist()),
+        uncertainty=DRIVES,
+        omega=np.sqrt(truth.eigenvalues),
+        attachment_shapes=truth.attached,
+        shapes=truth.shapes.astype(np.float32),
+        discretisation_error=np.zeros(len(table.frequencies)),
+    )
+    # Its loss is not hysteretic, and its fingers are not multiples of one.
+    attached = replace(known.attached, receptance=truth.receptance.astype(np.complex64))
+    if len(factors):
+        stiffness = [
+            [finger_stiffness(float(f), each) for each in factors] for f in table.frequencies
+        ]
+        attached._by_count[len(factors)] = attached._attach_fingers(np.array(stiffness))
+    known.__dict__["attached"] = attached
+    return known
+
+
+def answer(table: LocalizationTable, places: Reals) -> tuple[float, Complexes]:
+    """Frequency [Hz] and base amplitudes (n,) [m] for fingers (k, 2) [m], the first the target."""
+    points = [(float(x), float(y)) for x, y in places]
+    question = Question((points[0],), tuple(points[1:]), level_db_sl=0.0, envelopes=True)
+    tones = [table.query(question).excitation.get(era.name) for era in table.eras]
+    (frequency,) = {tone.frequency for tone in tones if tone is not None}
+    return float(frequency), np.array(
+        [0 if tone is None else tone.phasor for tone in tones], dtype=complex
+    )

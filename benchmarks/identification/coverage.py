@@ -1,0 +1,97 @@
+"""How often 95 % intervals of parameters and regions of fields hold the truth."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.identification.server import HiddenPlates, Truth
+from benchmarks.identification.thin_plate import Reals
+from model.identification.derivatives import jacobian
+from model.identification.forward import Sensor
+from model.identification.identify import Identification
+from model.identification.parameters import space_of
+from model.identification.posterior import relevant
+from model.identification.priors import Priors
+
+_WITHIN = 1.96
+_REGION = 5.991  # of two normal numbers
+_PLACES = np.array([(0.25, 0.2), (0.5, 0.5), (0.8, 0.4), (0.35, 0.75)])
+
+
+def parameters_held(found: Identification, truth: Truth) -> dict[str, Reals]:
+    """Errors in standard deviations by kind: springs and dampers over mass, gains, frequencies."""
+    space, posterior, plate = found.posterior.space, found.posterior, found.before.plate
+    mass = np.log(truth.thickness / plate.thickness)
+    model = found.fitted.problem.model
+    elastic = np.sort(truth.eigenvalues)[3 : 3 + len(model.shifted_modes)]
+    solved = model.free
+    theory = solved.modes.eigenvalues[model.shifted_modes]
+    # Of the plate as written: that solved is of the thickness found.
+    theory = theory * (plate.thickness / solved.plate.thickness) ** 2
+    theory = theory * plate.material.E / solved.plate.material.E
+    gain = np.log(np.abs(truth.gain))
+    phase = np.angle(truth.gain)
+    true = {
+        "frequency": np.log(elastic / theory) / 2,
+        "stiffness": np.log(truth.stiffness / [era.stiffness for era in found.before.eras]) - mass,
+        "damping": np.log(truth.damping / [era.damping for era in found.before.eras]) - mass,
+        "gain": gain - gain.mean(),
+        "phase": phase - phase.mean(),
+    }
+    errors = {}
+    for kind, value in true.items():
+        rows = relevant(space)[kind]
+        estimate = rows @ (space.std * posterior.x)
+        errors[kind] = (estimate - value) / posterior.std_of(rows)
+    places = space.groups["place"]
+    written = np.array([(era.x, era.y) for era in found.before.eras])
+    errors["place"] = (
+        space.std[places] * posterior.x[places] - (truth.at - written).ravel()
+    ) / posterior.std[places]
+    if len(truth.masses) and len(found.values.masses):
+        x, y, weight = truth.masses[0]
+        at = space.groups["masses"].start
+        own = found.values.masses[0] - [weight, x, y]
+        errors["mass"] = own / posterior.std[at : at + 3]
+    return errors
+
+
+def fields_held(
+    found: Identification, plates: HiddenPlates, kind: str, seed: int, frequencies: Reals
+) -> Reals:
+    """Squared distances of true fields from those identified, in their covariance, (values,)."""
+    plate, model = found.before.plate, found.fitted.problem.model
+    points = _PLACES * [plate.length, plate.width]
+    pads = [Sensor(f"point {n}", x=x, y=y) for n, (x, y) in enumerate(points.tolist())]
+    sensors = [*model.sensors, *pads]
+    priors = Priors.of(found.before.uncertainty)
+    count = len(found.posterior.space.indices("mode_shifts"))
+    names = [sensor.name for sensor in sensors]
+    space = space_of(found.before, names, priors, masses=model.mass_count, mode_count=count)
+    own = [space.index(name) for name in found.posterior.space.names]
+    x, covariance = np.zeros(space.size), np.zeros((space.size, space.size))
+    x[own] = found.posterior.x
+    covariance[np.ix_(own, own)] = found.posterior.covariance
+    tones = frequencies[1::4]
+    wider = replace(model, sensors=sensors, frequencies=tones, space=space, last_places={})
+    at = wider.at(x)
+    J = jacobian(at)[:, len(model.sensors) :]
+    own_fields = at.responses[:, len(model.sensors) :]
+    nothing = np.zeros((0, 4))
+    true = np.array([plates.felt(kind, seed, float(f), points, points, nothing) for f in tones])
+    error = own_fields - true
+    parts = np.stack([J.real, J.imag], axis=-2)
+    spread = parts @ covariance @ parts.swapaxes(-1, -2)
+    both = np.stack([error.real, error.imag], axis=-1)
+    solved = np.linalg.solve(spread, both[..., None])[..., 0]
+    return np.asarray((both * solved).sum(axis=-1)).ravel()
+
+
+def share_within(errors: Reals) -> float:
+    """Share of errors in standard deviations that are within the 95 % interval."""
+    return float((np.abs(errors) < _WITHIN).mean())
+
+
+def share_in_region(distances: Reals) -> float:
+    """Share of squared distances that are in the 95 % region."""
+    return float((distances < _REGION).mean())

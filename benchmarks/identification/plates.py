@@ -1,0 +1,124 @@
+"""What is found of one hidden plate, and what answers then give on it."""
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from benchmarks.identification.answers import answer, known_table, table_of
+from benchmarks.identification.coverage import fields_held, parameters_held
+from benchmarks.identification.hidden import LOAD_STD
+from benchmarks.identification.server import HiddenPlates
+from benchmarks.identification.thin_plate import Complexes, Reals
+from benchmarks.setting import random_contacts
+from model.errors import InputError
+from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.identification.forward import Sensor
+from model.identification.identify import Identification, identify
+from model.identification.measurement import Measurement
+from model.rig.rig import Rig
+from model.table.table import LocalizationTable
+
+FREQUENCIES = np.linspace(40.0, 500.0, 27)
+QUIET = (1, 2, 3)
+WAYS = ("written", "identified", "known")
+GAIN, PHASE_DEG = 0.01, 1.0
+_MARGIN = 0.013
+
+
+@dataclass
+class Outcome:
+    """Of one plate: contrasts [dB] by way, load and number of quiet fingers, and its fit.
+
+    seconds: of processor time of the identification; errors, fields: see `coverage`.
+    """
+
+    kind: str
+    contrasts: dict[tuple[str, bool, int], list[float]]
+    chi2: float = np.nan
+    held_out: float = np.nan
+    seconds: float = np.nan
+    errors: dict[str, Reals] = field(default_factory=dict)
+    fields: Reals = field(default_factory=lambda: np.zeros(0))
+    refusal: str = ""
+
+
+def outcome(
+    plates: HiddenPlates,
+    rig: Rig,
+    written: dict[bool, LocalizationTable],
+    kind: str,
+    seed: int,
+    *,
+    sets: int,
+    rounds: int = 4,
+) -> Outcome:
+    """Identify a hidden plate and judge answers on it.
+
+    written: tables of the rig as it is written, by whether fingers load it; rounds: of interleaved
+    tones, four for every ERA at each tone.
+    """
+    found = Outcome(kind, {})
+    started = time.process_time()
+    try:
+        identified = identify(rig, _measurement(plates, rig, kind, seed, rounds), seed=seed)
+    except InputError as refusal:
+        found.refusal = str(refusal)
+        return found
+    found.seconds = time.process_time() - started
+    found.chi2 = identified.chi2
+    found.held_out = identified.held_out.total if identified.held_out else np.nan
+    raster = written[False].raster.points
+    truth = plates.truth(kind, seed, FREQUENCIES, raster)
+    found.errors = parameters_held(identified, truth)
+    found.fields = fields_held(identified, plates, kind, seed, FREQUENCIES)
+    for loaded in (False, True):
+        tables = {"written": written[loaded], "identified": _table(identified, loaded)}
+        for quiet in QUIET:
+            rng = np.random.default_rng([seed, quiet])
+            for _ in range(sets):
+                size = (rig.plate.length, rig.plate.width)
+                places = random_contacts(rng, quiet + 1, size, margin=_MARGIN)
+                factors = np.exp(LOAD_STD * rng.standard_normal((quiet + 1, 4)))
+                if not loaded:
+                    factors = factors[:0]
+                known = known_table(written[loaded], truth, factors)
+                error = 1 + GAIN * rng.standard_normal(len(rig.eras))
+                turn = np.radians(PHASE_DEG) * rng.standard_normal(len(rig.eras))
+                drives = error * np.exp(1j * turn)
+                for way, table in {**tables, "known": known}.items():
+                    frequency, bases = answer(table, places)
+                    contrast = _contrast(
+                        plates, rig, (kind, seed), places, factors, frequency, bases * drives
+                    )
+                    found.contrasts.setdefault((way, loaded, quiet), []).append(contrast)
+    return found
+
+
+def _table(identified: Identification, loaded: bool) -> LocalizationTable:
+    return table_of(identified.rig, FREQUENCIES, loaded=loaded)
+
+
+def _measurement(plates: HiddenPlates, rig: Rig, kind: str, seed: int, rounds: int) -> Measurement:
+    values = plates.measured(kind, seed, FREQUENCIES)
+    played = (np.arange(len(FREQUENCIES))[:, None] + np.arange(len(rig.eras))) % 4 < rounds
+    sensors = [Sensor(era.name, era.name) for era in rig.eras]
+    return Measurement.of(sensors, FREQUENCIES, np.where(played[:, None], values, np.nan))
+
+
+def _contrast(
+    plates: HiddenPlates,
+    rig: Rig,
+    which: tuple[str, int],
+    places: Reals,
+    factors: Reals,
+    frequency: float,
+    bases: Complexes,
+) -> float:
+    """Mean under the target over the loudest point under a quiet finger, on the hidden plate."""
+    discs = [fingertip_points(float(x), float(y), rig.plate) for x, y in places]
+    points = np.concatenate(discs)
+    fields = np.abs(plates.felt(*which, frequency, points, places, factors) @ bases)
+    weights = fingertip_weights(float(places[0, 0]), float(places[0, 1]), rig.plate)
+    own = len(discs[0])
+    return float(20 * np.log10(weights @ fields[:own] / fields[own:].max()))

@@ -1,0 +1,82 @@
+"""Tables of what was reached beside the goals."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from benchmarks.identification.coverage import share_in_region, share_within
+from benchmarks.identification.hidden import SETS
+from benchmarks.identification.plates import QUIET, WAYS, Outcome
+
+NAMES = {
+    "plain": "no form errors",
+    "form": "places off by 1.5 mm, a hidden 3 g",
+    "hard": "sides, ratio, modulus, bolts and loss law off too",
+}
+GOALS = {
+    ("plain", False): "within 0.5 dB of the plate known",
+    ("plain", True): "30 (24.5) / 17.5 / 13.5",
+    ("form", False): "32.5 (27) / 19 / 14",
+    ("form", True): "30.5 (24.5) / 18.5 / 13",
+    ("hard", False): "31 (26) / 18.5 / 13.5",
+    ("hard", True): "29.5 (24.5) / 18 / 12.5",
+}
+
+
+def as_markdown(outcomes: Sequence[Outcome]) -> str:
+    """Contrasts, fits and coverage."""
+    lines = [
+        "Median (tenth percentile) of the contrast [dB] for one / two / three quiet fingers:",
+        "",
+        "| | rig as written | identified | goal | plate known |",
+        "|---|---|---|---|---|",
+    ]
+    kinds = [kind for kind in SETS if any(each.kind == kind for each in outcomes)]
+    for kind in kinds:
+        own = [each for each in outcomes if each.kind == kind and not each.refusal]
+        for loaded in (False, True):
+            cells = [" / ".join(_cell(own, way, loaded, quiet) for quiet in QUIET) for way in WAYS]
+            fingers = "loaded" if loaded else "weightless"
+            goal = GOALS[kind, loaded]
+            lines.append(
+                f"| {NAMES[kind]}, {fingers} | {cells[0]} | {cells[1]} | {goal} | {cells[2]} |"
+            )
+    lines += [
+        "",
+        "Fits, and shares of 95 % intervals and regions that hold the truth:",
+        "",
+        "| | plates, refused | chi², median (most) | beyond 2 | held-out error | springs | "
+        "dampers | gains, phases | frequencies | places | mass | fields | processor time |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for kind in kinds:
+        every = [each for each in outcomes if each.kind == kind]
+        own = [each for each in every if not each.refusal]
+        chi2 = np.array([each.chi2 for each in own])
+        held = np.median([each.held_out for each in own])
+        shares = [
+            _share(own, "stiffness"),
+            _share(own, "damping"),
+            _share(own, "gain", "phase"),
+            _share(own, "frequency"),
+            _share(own, "place"),
+            _share(own, "mass"),
+            f"{100 * share_in_region(np.concatenate([each.fields for each in own])):.0f} %",
+        ]
+        seconds = np.median([each.seconds for each in own])
+        lines.append(
+            f"| {NAMES[kind]} | {len(every)}, {len(every) - len(own)} | {np.median(chi2):.2f} "
+            f"({chi2.max():.2f}) | {(chi2 > 2).sum()} | {100 * held:.1f} % | "
+            f"{' | '.join(shares)} | {seconds:.1f} s |"
+        )
+    return "\n".join(lines)
+
+
+def _cell(outcomes: Sequence[Outcome], way: str, loaded: bool, quiet: int) -> str:
+    values = [c for each in outcomes for c in each.contrasts[way, loaded, quiet]]
+    return f"{np.median(values):.1f} ({np.percentile(values, 10):.1f})"
+
+
+def _share(outcomes: Sequence[Outcome], *kinds: str) -> str:
+    errors = [each.errors[kind] for each in outcomes for kind in kinds if kind in each.errors]
+    return f"{100 * share_within(np.concatenate(errors)):.0f} %" if errors else "–"

@@ -1,0 +1,103 @@
+"""What a measurement has not shown, and the tone and the sensor that would show it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.identification.derivatives import jacobian
+from model.identification.forward import Sensor
+from model.identification.parameters import space_of
+from model.identification.posterior import Posterior, relevant
+from model.identification.stages import Fitted, Setting
+
+UNKNOWN = 0.5
+"""Share of its standard deviation before, beyond which a measurement has not shown something."""
+
+_STEP = 20.0  # Hz between the tones that are considered
+_NOISE = 0.01
+_SHARES = (0.13, 0.5, 0.87)  # of the sides, where further sensors are considered
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """Something that was not identified: its name and standard deviations before and after.
+
+    Advised: an ERA and a frequency [Hz] to play, and a sensor at an ERA or at x, y [m].
+    """
+
+    name: str
+    before: float
+    after: float
+    era: str
+    frequency: float
+    sensor: Sensor
+
+    def __str__(self) -> str:
+        sensor = self.sensor
+        place = f"ERA {sensor.era}" if sensor.era else f"({sensor.x:.3g}, {sensor.y:.3g}) m"
+        return (
+            f"{self.name}: known to {100 * self.after:.2g} %, before {100 * self.before:.2g} %; "
+            f"play ERA {self.era} at {self.frequency:.0f} Hz and measure at {place}"
+        )
+
+
+def unknowns(setting: Setting, fitted: Fitted, posterior: Posterior) -> list[Unknown]:
+    """All that answers depend on and the measurement has not shown, with what would show it."""
+    space, found = posterior.space, []
+    prior = replace(posterior, covariance=np.diag(space.uncertain.astype(float)))
+    for kind, rows in relevant(space).items():
+        before, after = prior.std_of(rows), posterior.std_of(rows)
+        unknown = np.flatnonzero((before > 0) & (after > UNKNOWN * before))
+        # Of losses and frequencies of single modes only those count that no tone has shown.
+        if not len(unknown) or (kind in ("frequency", "loss") and len(unknown) < len(rows)):
+            continue
+        worst = unknown[int(after[unknown].argmax())]
+        name = kind if kind in ("frequency", "loss") else _name(rows[worst], space.names)
+        best = _best(setting, fitted, posterior, rows[worst])
+        found.append(Unknown(name, float(before[worst]), float(after[worst]), *best))
+    return found
+
+
+def _name(row: FloatArray, names: tuple[str, ...]) -> str:
+    return names[int(np.abs(row).argmax())]
+
+
+def _best(
+    setting: Setting, fitted: Fitted, posterior: Posterior, row: FloatArray
+) -> tuple[str, float, Sensor]:
+    """ERA, frequency and sensor whose response would tell most of a combination (p,)."""
+    rig, model = setting.rig, fitted.problem.model
+    plate, limits = rig.plate, rig.limits
+    measured = {sensor.era for sensor in model.sensors}
+    more = [Sensor(f"ERA {era.name}", era.name) for era in rig.eras if era.name not in measured]
+    more += [
+        Sensor(f"{x:g} {y:g}", x=x * plate.length, y=y * plate.width)
+        for x in _SHARES
+        for y in _SHARES
+    ]
+    sensors = [*model.sensors, *more]
+    names = [sensor.name for sensor in sensors]
+    count = len(posterior.space.indices("mode_shifts"))
+    space = space_of(rig, names, setting.priors, masses=model.mass_count, mode_count=count)
+    tones = np.arange(limits.frequency_min, limits.frequency_max + 1e-9, _STEP)
+    wider = replace(model, sensors=sensors, frequencies=tones, space=space, last_places={})
+    own = np.array([space.index(name) for name in posterior.space.names])
+    covariance, x, wanted = np.diag(space.uncertain.astype(float)), *np.zeros((2, space.size))
+    covariance[np.ix_(own, own)] = posterior.covariance
+    x[own], wanted[own] = posterior.x, row
+    at = wider.at(x)
+    scale = _NOISE * np.sqrt((np.abs(at.responses) ** 2).mean(axis=(0, 2), keepdims=True))
+    direction = covariance @ (wanted * space.std)
+    gains = _gains(jacobian(at) / scale[..., None], covariance, direction)
+    f, s, e = np.unravel_index(int(gains.argmax()), gains.shape)
+    return rig.eras[e].name, float(tones[f]), sensors[s]
+
+
+def _gains(J: ComplexArray, covariance: FloatArray, direction: FloatArray) -> FloatArray:
+    """Decrease of a combination's variance by each response measured on its own, (f, s, e)."""
+    total = np.zeros(J.shape[:3])
+    for part in (J.real, J.imag):
+        variance = ((part @ covariance) * part).sum(axis=-1)
+        total += (part @ direction) ** 2 / (1 + variance)
+    return total

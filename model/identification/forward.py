@@ -1,0 +1,243 @@
+"""Responses of a rig's plate at its sensors for a vector of parameters.
+
+With A the receptance of the free plate between all attachments and sensors, Z the dynamic stiffness
+of what is attached there (0 at a sensor) and T = A (1 + Z A)^-1, a sensor s answers to the base of
+ERA j, moved by its gain g_j, with
+
+    Y_sj = -w² sigma_s T_sj (k_j + i w c_j) g_j.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray, IntArray
+from model.identification.free_receptance import (
+    FrequencyFunctions,
+    Places,
+    combined,
+    places_of,
+)
+from model.identification.parameters import Space
+from model.identification.values import Values
+from model.reduction.free_plate import FreePlate
+from model.rig.rig import Rig
+from model.structure.dynamic_stiffness import attached_stiffness
+from model.structure.fingertip import Fingertip
+from model.structure.modal_elasticity import ModalElasticity, lowest_elastic
+from model.structure.plate import LOSS_FREQUENCY
+from model.structure.point_load import footprints_of
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor of acceleration: at the bolt of an ERA, or at x, y [m] where era is ""."""
+
+    name: str
+    era: str = ""
+    x: float = 0.0
+    y: float = 0.0
+
+
+@dataclass(frozen=True)
+class RestingFinger:
+    """A finger that rests at x, y [m], as far as its load is known."""
+
+    x: float
+    y: float
+    fingertip: Fingertip
+
+
+@dataclass(frozen=True, eq=False)
+class ForwardModel:
+    """A rig's plate, as it was solved, on its attachments, with sensors and fingers.
+
+    frequencies (f,) [Hz]; free: of the rig's plate, solved for its own thickness and modulus or
+    others; space: what may differ.
+    """
+
+    rig: Rig
+    sensors: Sequence[Sensor]
+    frequencies: FloatArray
+    space: Space
+    free: FreePlate
+    fingers: Sequence[RestingFinger] = ()
+    last_places: dict[bytes, Places] = field(default_factory=dict)
+
+    @cached_property
+    def omega(self) -> FloatArray:
+        """2 pi f [rad/s], (f,)."""
+        return 2 * np.pi * self.frequencies
+
+    @cached_property
+    def mass_count(self) -> int:
+        """Number of additional masses."""
+        return len(self.space.indices("masses")) // 3
+
+    @cached_property
+    def observed(self) -> IntArray:
+        """Where each sensor is among the attachments, (s,)."""
+        names = [era.name for era in self.rig.eras]
+        after = len(names) + len(self.rig.masses) + self.mass_count + len(self.fingers)
+        found = []
+        for sensor in self.sensors:
+            found.append(names.index(sensor.era) if sensor.era else after)
+            after += not sensor.era
+        return np.array(found, dtype=int)
+
+    @cached_property
+    def shifted_modes(self) -> IntArray:
+        """Numbers of the modes whose eigenvalues may shift, the lowest elastic ones, ascending."""
+        return lowest_elastic(self.free.modes.eigenvalues, len(self.space.indices("mode_shifts")))
+
+    @cached_property
+    def elasticity(self) -> ModalElasticity:
+        """Eigenvalues and loss factors of the modes as the rig has them."""
+        return ModalElasticity.of(self.free.plate, self.free.modes.eigenvalues)
+
+    @cached_property
+    def fixed_stiffness(self) -> ComplexArray:
+        """Dynamic stiffness of the rig's own masses (f, m) [N/m]."""
+        return attached_stiffness((), self.rig.masses, self.omega)
+
+    @cached_property
+    def drive_gains(self) -> ComplexArray:
+        """Gains of the rig's ERAs in its file, (f, eras)."""
+        return np.array([era.gain(self.frequencies) for era in self.rig.eras]).T
+
+    @cached_property
+    def pads(self) -> FloatArray:
+        """Footprints (q, 3) of the sensors that are not at ERAs [m]."""
+        alone = [(each.x, each.y, 0.0) for each in self.sensors if not each.era]
+        return np.array(alone, dtype=float).reshape(-1, 3)
+
+    @cached_property
+    def movable(self) -> IntArray:
+        """Numbers of the attachments that may move: ERAs and additional masses."""
+        first = len(self.rig.eras) + len(self.rig.masses)
+        movable = [*range(len(self.rig.eras)), *range(first, first + self.mass_count)]
+        return np.array(movable, dtype=int)
+
+    def with_frequencies(self, frequencies: FloatArray) -> Self:
+        """The same at other frequencies (f,) [Hz]."""
+        return replace(self, frequencies=frequencies, last_places=dict(self.last_places))
+
+    def at(self, x: FloatArray) -> "PlateAt":
+        """The plate for parameters x (p,)."""
+        return PlateAt(self, x)
+
+    def places(self, footprints: FloatArray) -> Places:
+        """Solution for all attachments (a, 3) [m]; the last one is kept."""
+        key = footprints.tobytes()
+        if key not in self.last_places:
+            self.last_places.clear()
+            self.last_places[key] = places_of(self.free, footprints, self.movable)
+        return self.last_places[key]
+
+
+class PlateAt:
+    """The plate of a forward model for one vector of parameters x (p,), a attachments on it.
+
+    values: of x; located: where all is; functions: of frequency; base (f, n): force of an ERA on
+    the plate per displacement of its base [N/m]; receptance T, of the plate with its attachments,
+    and left factor L (f, a, a); finger_slopes: by finger, derivatives of its dynamic stiffness by
+    its parts (f, 4).
+    """
+
+    def __init__(self, model: ForwardModel, x: FloatArray) -> None:
+        self.model, self.values = model, Values.of(model.rig, model.space, x)
+        self.functions = self._functions()
+        self.located = model.places(self._footprints())
+        w, values = model.omega[:, None], self.values
+        self.base = values.stiffness + 1j * w * values.damping
+        loads = [
+            _finger(*each, model.omega) for each in zip(self._tips, values.fingers, strict=True)
+        ]
+        self.finger_slopes = [slopes for _, slopes in loads]
+        held = [
+            self.base - w**2 * values.bolt_mass,
+            model.fixed_stiffness,
+            -(w**2) * values.masses[:, 0],
+            *(load[:, None] for load, _ in loads),
+            np.zeros((len(w), len(model.pads))),
+        ]
+        Z = np.concatenate(held, axis=1)
+        A = combined(self.functions.receptance, self.located.products)
+        self.left = np.linalg.inv(np.eye(Z.shape[1]) + A * Z[:, None])
+        self.receptance = self.left @ A
+
+    @cached_property
+    def scale(self) -> ComplexArray:
+        """What turns T at sensors and ERAs into responses, (f, s, n)."""
+        drive = self.base * self.values.drive_gains * self.model.drive_gains
+        drive *= -(self.model.omega**2)[:, None]
+        return np.asarray(self.values.sensor_gains[:, None] * drive[:, None])
+
+    @cached_property
+    def responses(self) -> ComplexArray:
+        """Acceleration at each sensor per base displacement of each ERA (f, s, n) [1/s²]."""
+        n = self.base.shape[1]
+        return np.asarray(self.scale * self.receptance[:, self.model.observed, :n])
+
+    @property
+    def _tips(self) -> list[Fingertip]:
+        return [finger.fingertip for finger in self.model.fingers]
+
+    def _functions(self) -> FrequencyFunctions:
+        model, values = self.model, self.values
+        modes, theory = model.shifted_modes, model.elasticity
+        eta = values.loss_factor * (model.frequencies / LOSS_FREQUENCY) ** values.loss_exponent
+        eigenvalues, relative = theory.eigenvalues.copy(), theory.relative_loss.copy()
+        eigenvalues[modes] *= np.exp(values.mode_shifts)
+        relative[modes] *= np.exp(values.mode_losses)
+        loss: FloatArray = np.multiply.outer(eta, relative)
+        rig, solved = model.rig.plate, model.free.plate
+        thickness = values.thickness * rig.thickness / solved.thickness
+        modulus = values.modulus * rig.material.E / solved.material.E
+        stiffer = modulus * thickness**2
+        return FrequencyFunctions(
+            model.free,
+            model.omega,
+            np.asarray((1 + 1j * eta) * stiffer, dtype=complex),
+            thickness,
+            np.asarray((1 + 1j * loss) * stiffer * eigenvalues, dtype=complex),
+            np.asarray(1j * loss / (1 + 1j * loss)),
+            np.asarray(1j * eta / (1 + 1j * eta)),
+        )
+
+    def _footprints(self) -> FloatArray:
+        """Of ERAs, masses, additional masses, fingers and sensors, (a, 3) [m]."""
+        model, values = self.model, self.values
+        feet = [era.foot for era in model.rig.eras]
+        fingers = np.array([(each.x, each.y) for each in model.fingers]).reshape(-1, 2)
+        points = np.vstack([values.masses[:, 1:], fingers])
+        return np.vstack(
+            [
+                np.column_stack([values.places, feet]),
+                footprints_of(model.rig.masses),
+                np.column_stack([points, np.zeros(len(points))]),
+                model.pads,
+            ]
+        )
+
+
+def _finger(
+    tip: Fingertip, logs: FloatArray, omega: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """Dynamic stiffness (f,) of a finger whose parts are larger, and derivatives by each (f, 4).
+
+    logs (4,): of the factors of contact mass, pulp, phalanx and joint.
+    """
+    mass, pulp, phalanx, joint = np.exp(logs)
+    w = omega
+    Zm = -(w**2) * tip.contact_mass * mass
+    Zp = pulp * (tip.stiffness + 1j * w * tip.damping)
+    Zb = -(w**2) * tip.phalanx_mass * phalanx
+    Zj = joint * (tip.joint_stiffness + 1j * w * tip.joint_damping)
+    total = Zp + Zb + Zj
+    by_pulp, by_bone = ((Zb + Zj) / total) ** 2, (Zp / total) ** 2
+    D = Zm + Zp * (Zb + Zj) / total
+    return D, np.column_stack([Zm, by_pulp * Zp, by_bone * Zb, by_bone * Zj])

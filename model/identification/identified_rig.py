@@ -1,0 +1,72 @@
+"""A rig with identified values: what its parameters say, and the text of its file with them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from model.identification.values import Values
+from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
+from model.structure.actuator import Era, Gain
+from model.structure.plate import LOSS_FREQUENCY, Plate
+from model.structure.point_load import PointLoad
+
+_LEAST_MASS = 1e-5  # kg; less is none
+
+
+def plate_with(plate: Plate, values: Values) -> Plate:
+    """The plate with identified thickness, modulus, losses and modes."""
+    count = max(len(plate.mode_deviations), len(values.mode_shifts))
+    deviations = np.zeros((count, 2))
+    deviations[: len(plate.mode_deviations)] = np.reshape(plate.mode_deviations, (-1, 2))
+    deviations[: len(values.mode_shifts)] += np.column_stack(
+        [values.mode_shifts, values.mode_losses]
+    )
+    return replace(
+        plate,
+        thickness=values.thickness * plate.thickness,
+        material=replace(plate.material, E=values.modulus * plate.material.E),
+        loss_factor=values.loss_factor,
+        loss_exponent=values.loss_exponent,
+        mode_deviations=tuple((float(a), float(b)) for a, b in deviations if len(deviations)),
+    )
+
+
+def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
+    """The rig with identified values; additional masses come after its own."""
+    eras = tuple(
+        replace(
+            era,
+            x=float(values.places[number, 0]),
+            y=float(values.places[number, 1]),
+            stiffness=float(values.stiffness[number]),
+            damping=float(values.damping[number]),
+            bolt_mass=float(max(values.bolt_mass[number], 0.0)),
+            gains=_gains(era, complex(values.drive_gains[number])),
+        )
+        for number, era in enumerate(rig.eras)
+    )
+    return replace(
+        rig,
+        plate=plate_with(rig.plate, values),
+        eras=eras,
+        masses=(*rig.masses, *additional_masses(values)),
+        uncertainty=uncertainty,
+    )
+
+
+def additional_masses(values: Values) -> Sequence[PointLoad]:
+    """The masses that were found on the plate, without those that weigh nothing."""
+    return [
+        PointLoad(float(x), float(y), mass=float(mass))
+        for mass, x, y in values.masses
+        if mass > _LEAST_MASS
+    ]
+
+
+def _gains(era: Era, factor: complex) -> tuple[Gain, ...]:
+    """Measured gains times a factor; of an ERA without any the factor at all frequencies."""
+    before = era.gains or ((LOSS_FREQUENCY, 1.0, 0.0),)
+    size, phase = float(abs(factor)), float(np.angle(factor))
+    return tuple((f, magnitude * size, turned + phase) for f, magnitude, turned in before)

@@ -1,0 +1,142 @@
+"""Identification of a rig by responses measured in place."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from model.errors import InputError
+from model.fem.plate_mesh import PlateMesh
+from model.identification.advice import unknowns
+from model.identification.held_out import HeldOut, hold_out
+from model.identification.identified_rig import rig_with
+from model.identification.measurement import Measurement
+from model.identification.posterior import Posterior
+from model.identification.priors import Priors
+from model.identification.stages import Fitted, Setting, chi2, fit_in_stages
+from model.identification.values import Values
+from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.rig.meshes import mesh_of
+from model.rig.rig import Rig
+from model.spectral.mesh import SpectralMesh
+
+MAX_CHI2 = 2.0
+"""chi² beyond which a model does not explain a measurement, and nothing is promised from it."""
+
+DRIVE_GAIN, DRIVE_PHASE_DEG = 0.01, 1.0
+"""How far a drive repeats from one day to the next, which no measurement tells."""
+
+_LEAST_VALUES = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """A rig as its responses show it.
+
+    before: the rig as written; rig: with identified values and their uncertainty; values: of the
+    parameters, gains of sensors among them; posterior: their distribution; chi2: squared residuals
+    per value; held_out: how well unseen tones are predicted, None where there are too few;
+    seed: of the draws.
+    """
+
+    before: Rig
+    rig: Rig
+    values: Values
+    posterior: Posterior
+    chi2: float
+    held_out: HeldOut | None
+    fitted: Fitted
+    seed: int
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether the model explains the measurement, so that answers may rely on it."""
+        return self.chi2 <= MAX_CHI2
+
+    def draws(self, count: int) -> list[Rig]:
+        """Rigs within the posterior distribution, with the uncertainty of fingers and drives."""
+        space = self.posterior.space
+        found = (
+            Values.of(self.before, space, x) for x in self.posterior.draws(count, seed=self.seed)
+        )
+        return [rig_with(self.before, values, self.rig.uncertainty) for values in found]
+
+    @cached_property
+    def rows(self) -> list[str]:
+        """One line for each parameter: its value less the rig's and the standard deviation."""
+        space, posterior = self.posterior.space, self.posterior
+        return [
+            f"{name}: {std * x:+.3g} ± {after:.2g} (before ± {std:.2g})"
+            for name, std, x, after in zip(
+                space.names, space.std, posterior.x, posterior.std, strict=True
+            )
+            if std > 0
+        ]
+
+
+def identify(
+    rig: Rig,
+    measurement: Measurement,
+    *,
+    seed: int = 0,
+    drive_gain: float = DRIVE_GAIN,
+    drive_phase_deg: float = DRIVE_PHASE_DEG,
+) -> Identification:
+    """Identify a rig by a measurement on it; the same for the same data and seed.
+
+    drive_gain, drive_phase_deg: how far drives repeat. Raises InputError for a plate that was not
+    linear or has changed during the measurement, and where it leaves unknown what answers depend
+    on, with the tone and the sensor that would show it.
+    """
+    _check(rig, measurement)
+    setting = Setting(rig, _solved(rig, measurement), Priors.of(rig.uncertainty), measurement)
+    fitted = fit_in_stages(setting)
+    posterior = Posterior.of(fitted.space, fitted.best)
+    unknown = unknowns(setting, fitted, posterior)
+    if unknown:
+        raise InputError("measurement must show more: " + "; ".join(map(str, unknown)))
+    values = Values.of(rig, fitted.space, fitted.best.x)
+    uncertainty = posterior.uncertainty(rig.uncertainty, gain=drive_gain, phase_deg=drive_phase_deg)
+    return Identification(
+        rig,
+        rig_with(rig, values, uncertainty),
+        values,
+        posterior,
+        chi2(fitted),
+        hold_out(fitted),
+        fitted,
+        seed,
+    )
+
+
+def _check(rig: Rig, measurement: Measurement) -> None:
+    names = [era.name for era in rig.eras]
+    for sensor in measurement.sensors:
+        if sensor.era and sensor.era not in names:
+            raise InputError(
+                f"sensor {sensor.name} must be at one of {', '.join(names)}, got {sensor.era}"
+            )
+        if not sensor.era and not rig.plate.contains(sensor.x, sensor.y):
+            raise InputError(
+                f"sensor {sensor.name} must be on the plate, got ({sensor.x:g}, {sensor.y:g}) m"
+            )
+    if len(measurement.values) < _LEAST_VALUES:
+        raise InputError(
+            f"a measurement must have at least {_LEAST_VALUES} values, got "
+            f"{len(measurement.values)}; play more tones"
+        )
+    limits, tones = rig.limits, measurement.tones
+    if tones[0] < limits.frequency_min or tones[-1] > limits.frequency_max:
+        raise InputError(
+            "tones must be within the rig's limits.frequency of "
+            f"{limits.frequency_min:g} to {limits.frequency_max:g} Hz, got {tones[0]:g} to "
+            f"{tones[-1]:g} Hz"
+        )
+    measurement.check(names)
+
+
+def _solved(rig: Rig, measurement: Measurement) -> FreePlate:
+    mesh: PlateMesh = rig.mesh
+    if not isinstance(mesh, SpectralMesh):
+        # Places move freely only where a plate is solved in functions over all of it.
+        mesh = mesh_of("auto", rig.plate, frequency_max=rig.limits.frequency_max)
+    highest = max(float(measurement.tones[-1]), 200.0)
+    return solve_free_plate(rig.plate, mesh, frequency_max=highest)

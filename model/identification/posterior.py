@@ -1,0 +1,92 @@
+"""Covariance of identified parameters, and what it leaves unknown of what answers depend on.
+
+The scale of mass, springs and dampers together changes no response to a moving base, that of all
+drives no contrast. What counts is each natural frequency, each spring and damper relative to the
+plate's mass, and each gain relative to the others.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import linalg
+
+from model.arrays import FloatArray
+from model.identification.fit import Linearised
+from model.identification.parameters import Space
+from model.rig.uncertainty import Uncertainty
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Normal distribution of x (p,) with a covariance (p, p)."""
+
+    space: Space
+    x: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def of(cls, space: Space, best: Linearised) -> "Posterior":
+        """That about the most likely parameters: (J^T J + 1)^-1, known ones without variance."""
+        free = np.flatnonzero(space.uncertain)
+        covariance = np.zeros((space.size, space.size))
+        covariance[np.ix_(free, free)] = linalg.inv(best.information[np.ix_(free, free)])
+        return cls(space, best.x, covariance)
+
+    @cached_property
+    def std(self) -> FloatArray:
+        """Standard deviation of each parameter in its unit (p,)."""
+        return np.asarray(self.space.std * np.sqrt(np.diagonal(self.covariance)))
+
+    def draws(self, count: int, *, seed: int) -> FloatArray:
+        """Draw parameters (count, p) within their bounds."""
+        values, vectors = linalg.eigh(self.covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0))
+        numbers = np.random.default_rng(seed).standard_normal((count, len(self.x)))
+        return np.clip(self.x + numbers @ root.T, self.space.lower, self.space.upper)
+
+    def std_of(self, combinations: FloatArray) -> FloatArray:
+        """Standard deviations of linear combinations (m, p) of parameters in their units, (m,)."""
+        scaled = combinations * self.space.std
+        return np.asarray(np.sqrt(np.einsum("mp,pq,mq->m", scaled, self.covariance, scaled)))
+
+    def uncertainty(self, before: Uncertainty, *, gain: float, phase_deg: float) -> Uncertainty:
+        """What a rig states of itself after it was identified.
+
+        before: its own, of which the fingers stay; gain, phase_deg: how far drives repeat.
+        """
+        rms = {name: _rms(self.std_of(rows)) for name, rows in relevant(self.space).items()}
+        damping = max(rms["damping"], rms["loss"])
+        return Uncertainty(
+            gain=min(math.hypot(rms["gain"], gain), 0.5),
+            phase_deg=min(math.hypot(math.degrees(rms["phase"]), phase_deg), 60.0),
+            thickness=min(rms["frequency"], 0.03),
+            stiffness=min(rms["stiffness"], 0.5),
+            damping=math.exp(min(damping, math.log(4.0))),
+            fingertip=before.fingertip,
+        )
+
+
+def relevant(space: Space) -> dict[str, FloatArray]:
+    """Combinations (m, p) of the parameters that answers depend on, by name."""
+    mass = _rows(space, "thickness")
+    by_rigidity = mass + _rows(space, "modulus") / 2
+    gain, phase = _rows(space, "gain"), _rows(space, "phase")
+    return {
+        "frequency": by_rigidity + _rows(space, "mode_shifts") / 2,
+        "stiffness": _rows(space, "stiffness") - mass,
+        "damping": _rows(space, "damping_each") + _rows(space, "damping") - mass,
+        "loss": _rows(space, "loss") + _rows(space, "mode_losses"),
+        "gain": gain - gain.mean(axis=0),
+        "phase": phase - phase.mean(axis=0),
+    }
+
+
+def _rows(space: Space, kind: str) -> FloatArray:
+    """One row for each parameter of a kind, (m, p)."""
+    return np.eye(space.size)[space.groups[kind]]
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt((values**2).mean())) if len(values) else 0.0

@@ -1,0 +1,191 @@
+"""The stages of an identification, since all parameters at once end in wrong minima.
+
+Springs, damping, thickness and gains first, with a noise that hides the rest, from several
+thicknesses; then one additional mass, sought where it would explain most; then everything with the
+noise as measured. A second mass only where the first leaves something that it explains.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import linalg
+
+from model.arrays import FloatArray
+from model.identification.derivatives import by_mass_at
+from model.identification.fit import Linearised, Problem, solve
+from model.identification.forward import ForwardModel
+from model.identification.identified_rig import plate_with
+from model.identification.measurement import Measurement
+from model.identification.parameters import Space, inwards, space_of
+from model.identification.priors import Priors
+from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.rig.rig import Rig
+
+_EXTRA_NOISE = 0.05  # of the rms at each frequency
+_THICKNESSES = (0.0, 1.5, -1.5)  # standard deviations
+_GOOD = 0.5  # chi² under the raised noise that needs no further start
+_INWARDS = 0.6  # standard deviations
+_SCANNED = (8, 6)
+_KEPT = 4
+_MORE_MASS_BEYOND = 1.5  # chi²
+_MASS_GAINS = 25.0  # of the cost: five standard deviations
+
+SIMPLE = (
+    "thickness",
+    "stiffness",
+    "damping",
+    "damping_each",
+    "loss",
+    "gain",
+    "phase",
+    "sensor_gain",
+    "sensor_phase",
+)
+LOCATED = (*SIMPLE, "place", "masses")
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """What is fitted to what: a rig with its solved plate, and a measurement on it."""
+
+    rig: Rig
+    free: FreePlate
+    priors: Priors
+    measurement: Measurement
+
+    def model(self, masses: int) -> ForwardModel:
+        """The rig with a number of additional masses at the tones that were measured."""
+        sensors = self.measurement.sensors
+        names = [sensor.name for sensor in sensors]
+        elastic = int((self.free.modes.eigenvalues > 0).sum())
+        space = space_of(self.rig, names, self.priors, masses=masses, mode_count=elastic)
+        return ForwardModel(self.rig, sensors, self.measurement.tones, space, self.free)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """The most likely parameters in one model, and the problem that they solve."""
+
+    problem: Problem
+    best: Linearised
+
+    @property
+    def space(self) -> Space:
+        """The parameters."""
+        return self.problem.model.space
+
+
+def fit_in_stages(setting: Setting) -> Fitted:
+    """Find the most likely parameters of a measurement."""
+    measurement = setting.measurement
+    model = setting.model(masses=1)
+    raised = Problem(model, measurement, _EXTRA_NOISE * measurement.tone_rms)
+    simple = _simple(raised)
+    located = _with_mass(raised, simple.x, number=0)
+    found = _in_full(Problem(model, measurement), located)
+    while chi2(found) > _MORE_MASS_BEYOND and found.problem.model.mass_count < 2:
+        more = _another_mass(setting, found)
+        if more.best.cost > found.best.cost - _MASS_GAINS:
+            break
+        found = more
+    return _solved_anew(setting, found)
+
+
+def _solved_anew(setting: Setting, found: Fitted) -> Fitted:
+    """Fit from there with the plate solved for its thickness and modulus, as a table will be."""
+    values, plate = found.problem.model.at(found.best.x).values, setting.rig.plate
+    identified = plate_with(plate, values)
+    free = solve_free_plate(
+        replace(identified, mode_deviations=plate.mode_deviations),
+        setting.free.mesh,
+        frequency_max=setting.free.frequency_max,
+    )
+    model = replace(found.problem.model, free=free, last_places={})
+    problem = Problem(model, setting.measurement)
+    return Fitted(problem, solve(problem, found.best.x, found.space.uncertain))
+
+
+def chi2(fitted: Fitted) -> float:
+    """Squared residuals in standard deviations, per value beyond the parameters they determine."""
+    r, J = fitted.best.residuals, fitted.best.jacobian
+    determined = np.trace(linalg.solve(fitted.best.information, J.T @ J, assume_a="pos"))
+    return float(r @ r / max(len(r) - determined, 1.0))
+
+
+def _simple(problem: Problem) -> Linearised:
+    """Fit without form errors from several thicknesses."""
+    space = problem.model.space
+    free = space.of(*SIMPLE)
+    best: Linearised | None = None
+    for thickness in _THICKNESSES:
+        start = np.zeros(space.size)
+        start[space.groups["thickness"]] = thickness
+        found = solve(problem, start, free)
+        if best is None or found.cost < best.cost:
+            best = found
+        if best.residuals @ best.residuals < _GOOD * len(best.residuals):
+            break
+    assert best is not None  # noqa: S101  the loop has starts
+    return best
+
+
+def _with_mass(problem: Problem, x: FloatArray, *, number: int) -> list[Linearised]:
+    """Fit places and an additional mass from where it explains most, and from none."""
+    space = problem.model.space
+    start = inwards(space, x, by=_INWARDS)
+    own = space.groups["masses"].start + 3 * number
+    starts = [start]
+    for place, mass in _scan(problem, start, own):
+        moved = start.copy()
+        moved[own : own + 3] = mass, *place
+        starts.append(moved)
+    free = space.of(*LOCATED)
+    found = [solve(problem, each, free) for each in starts]
+    return sorted(found, key=lambda each: each.cost)
+
+
+def _scan(problem: Problem, x: FloatArray, own: int) -> list[tuple[FloatArray, float]]:
+    """Places and sizes of x at which an additional mass would explain most, all else linear."""
+    model, m = problem.model, problem.measurement
+    space = model.space
+    now = problem.linearised(x)
+    kinds = [
+        kind
+        for kind in space.groups
+        if kind not in ("masses", "mode_shifts", "mode_losses", "fingers")
+    ]
+    others = np.flatnonzero(space.of(*kinds))
+    J = now.jacobian[:, others]
+    sides = np.array([model.rig.plate.length, model.rig.plate.width])
+    axes = [side * (np.arange(n) + 0.5) / n for side, n in zip(sides, _SCANNED, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    by_mass = by_mass_at(model.at(x), points)[m.rows, m.at, m.eras] / problem.std[:, None]
+    columns = np.concatenate([by_mass.real, by_mass.imag]) * space.std[own]
+    H = linalg.cho_factor(now.information[np.ix_(others, others)])
+    # Of the residuals that the other parameters leave after one step of theirs.
+    left = now.residuals - J @ linalg.cho_solve(H, now.gradient[others])
+    beside = columns - J @ linalg.cho_solve(H, J.T @ columns)
+    curvature = (columns * beside).sum(axis=0) + 1
+    sizes = -(left @ columns) / curvature
+    gains = np.where(sizes > 0, sizes**2 * curvature, 0.0)
+    best = np.argsort(-gains, kind="stable")[:_KEPT]
+    reach = space.std[own + 1 : own + 3]
+    return [((points[n] - sides / 2) / reach, float(sizes[n])) for n in best if gains[n] > 0]
+
+
+def _in_full(problem: Problem, starts: list[Linearised]) -> Fitted:
+    """Fit everything to the noise as it is, from the two best starts."""
+    free = problem.model.space.uncertain
+    found = [solve(problem, each.x, free) for each in starts[:2]]
+    return Fitted(problem, min(found, key=lambda each: each.cost))
+
+
+def _another_mass(setting: Setting, found: Fitted) -> Fitted:
+    """Fit with one mass more."""
+    before = found.problem.model.mass_count
+    model = setting.model(masses=before + 1)
+    raised = Problem(model, setting.measurement, _EXTRA_NOISE * setting.measurement.tone_rms)
+    at = found.space.groups["masses"].stop
+    x = np.insert(found.best.x, at, np.zeros(3))
+    starts = _with_mass(raised, x, number=before)
+    return _in_full(Problem(model, setting.measurement), starts)

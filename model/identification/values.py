@@ -1,0 +1,67 @@
+"""What a vector of parameters says of a rig: springs, places, masses, losses, gains."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.identification.parameters import Space
+from model.rig.rig import Rig
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """A rig's plate with n ERAs, m additional masses and k fingers, in units of the model.
+
+    thickness, modulus: factors; loss_factor at LOSS_FREQUENCY, loss_exponent; stiffness [N/m],
+    damping [N s/m], bolt_mass [kg] (n,) and places (n, 2) [m] of the ERAs; masses (m, 3): kg and x,
+    y [m]; mode_shifts, mode_losses: logarithms of the factors of the lowest modes' eigenvalues and
+    loss factors beside the rig's; drive_gains (n,), sensor_gains (s,): complex, those of the drives
+    beside the rig's; fingers (k, 4): logarithms of FINGER_PARTS.
+    """
+
+    thickness: float
+    modulus: float
+    loss_factor: float
+    loss_exponent: float
+    stiffness: FloatArray
+    damping: FloatArray
+    bolt_mass: FloatArray
+    places: FloatArray
+    masses: FloatArray
+    mode_shifts: FloatArray
+    mode_losses: FloatArray
+    drive_gains: ComplexArray
+    sensor_gains: ComplexArray
+    fingers: FloatArray
+
+    @classmethod
+    def of(cls, rig: Rig, space: Space, x: FloatArray) -> Self:
+        """Those of parameters x (p,)."""
+
+        def own(kind: str) -> FloatArray:
+            return space.values(x, kind)
+
+        plate, n = rig.plate, len(rig.eras)
+        k, c, m = np.array([(era.stiffness, era.damping, era.bolt_mass) for era in rig.eras]).T
+        at = np.array([(era.x, era.y) for era in rig.eras])
+        sides = np.array([plate.length, plate.width])
+        masses = own("masses").reshape(-1, 3)
+        masses[:, 1:] = np.clip(masses[:, 1:] + sides / 2, 0, sides)
+        return cls(
+            thickness=float(np.exp(own("thickness")[0])),
+            modulus=float(np.exp(own("modulus")[0])),
+            loss_factor=float(plate.loss_factor * np.exp(own("loss")[0])),
+            loss_exponent=float(plate.loss_exponent + own("loss_exponent")[0]),
+            stiffness=k * np.exp(own("stiffness")),
+            damping=c * np.exp(own("damping") + own("damping_each")),
+            bolt_mass=m + own("bolt_mass"),
+            places=np.clip(at + own("place").reshape(n, 2), 0, sides),
+            masses=masses,
+            mode_shifts=own("mode_shifts"),
+            mode_losses=own("mode_losses"),
+            drive_gains=np.exp(own("gain") + 1j * own("phase")),
+            sensor_gains=np.exp(own("sensor_gain") + 1j * own("sensor_phase")),
+            fingers=own("fingers").reshape(-1, 4),
+        )

@@ -1,0 +1,77 @@
+"""Stiffness and loss of each mode of a free plate, where they were found to differ from its theory.
+
+A plate is made of nothing as homogeneous as its theory has it: laminate, seams, air and edges
+change the lowest modes each in its own way. So a plate may state by how much the eigenvalue and the
+loss factor of its lowest elastic modes differ (`Plate.mode_deviations`), and that its loss factor
+varies as a power of the frequency. Shapes stay those of the theory, and so do all higher modes.
+"""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray, IntArray
+from model.errors import InputError
+from model.structure.plate import LOSS_FREQUENCY, Plate
+
+
+def loss_factors(plate: Plate, omega: FloatArray) -> FloatArray:
+    """Loss factor of the plate at omega [rad/s], of its shape."""
+    return np.asarray(plate.loss_factor * _powers(plate, omega))
+
+
+def lowest_elastic(eigenvalues: FloatArray, count: int) -> IntArray:
+    """Numbers of the lowest elastic modes among eigenvalues (r,), ascending, at most count.
+
+    Equal ones, as of a square plate, in the order that they have.
+    """
+    with np.errstate(divide="ignore"):
+        order = np.argsort(np.round(np.log(eigenvalues), 9), kind="stable")
+    elastic = order[eigenvalues[order] > 0]
+    return np.asarray(elastic[:count])
+
+
+def check_of_theory(plate: Plate) -> None:
+    """Raise InputError for a plate whose modes differ from its theory."""
+    if plate.mode_deviations:
+        raise InputError(
+            "a direct solution has no modes; remove plate.modes from the rig, which change them"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ModalElasticity:
+    """Eigenvalues omega² (r,) [rad²/s²] of a plate, and loss factors (r,) relative to its own."""
+
+    plate: Plate
+    eigenvalues: FloatArray
+    relative_loss: FloatArray
+
+    @classmethod
+    def of(cls, plate: Plate, eigenvalues: FloatArray) -> Self:
+        """Those of a plate whose theory has eigenvalues (r,), all of its lowest among them."""
+        deviations = np.array(plate.mode_deviations, dtype=float).reshape(-1, 2)
+        if not len(deviations):
+            return cls(plate, eigenvalues, np.ones(len(eigenvalues)))
+        factors = np.ones((2, len(eigenvalues)))
+        modes = lowest_elastic(eigenvalues, len(deviations))
+        factors[:, modes] = np.exp(deviations[: len(modes)].T)
+        return cls(plate, eigenvalues * factors[0], factors[1])
+
+    def loss_ratios(self, omega: FloatArray) -> FloatArray:
+        """Loss factor of each mode at omega (f,) [rad/s] over the plate's, (f, r)."""
+        return np.multiply.outer(_powers(self.plate, omega), self.relative_loss)
+
+    def loss_factors(self, omega: FloatArray) -> FloatArray:
+        """Loss factor of each mode at omega (f,) [rad/s], (f, r)."""
+        return np.asarray(self.plate.loss_factor * self.loss_ratios(omega))
+
+    def stiffness(self, omega: FloatArray) -> ComplexArray:
+        """Complex stiffness (1 + i eta) lambda of each mode at omega (f,), (f, r) [rad²/s²]."""
+        return np.asarray((1 + 1j * self.loss_factors(omega)) * self.eigenvalues)
+
+
+def _powers(plate: Plate, omega: FloatArray) -> FloatArray:
+    ratio = np.abs(omega) / (2 * np.pi * LOSS_FREQUENCY)
+    return np.asarray(ratio**plate.loss_exponent)

@@ -1,0 +1,136 @@
+"""Responses of the identified plate and their derivatives, against the plate solved anew."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.arrays import ComplexArray, FloatArray
+from model.identification.derivatives import by_mass_at, jacobian
+from model.identification.forward import ForwardModel, RestingFinger, Sensor
+from model.identification.parameters import Space, inwards, space_of
+from model.identification.priors import Priors
+from model.reduction.free_plate import solve_free_plate
+from model.rig.file import example_rig_path, load_rig
+from model.rig.rig import Rig
+from model.spectral.direct import direct_spectral_acceleration
+from model.spectral.mesh import SpectralMesh
+from model.structure.fingertip import Fingertip, FingertipLoad
+from model.structure.point_load import Load, PointLoad
+
+FREQUENCIES = np.array([60.0, 140.0, 222.0, 350.0, 480.0])
+PAD = Sensor("pad", x=0.1, y=0.07)
+FINGER = RestingFinger(0.2, 0.05, Fingertip())
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The paper's plate."""
+    return load_rig(example_rig_path())
+
+
+@pytest.fixture(scope="module")
+def model(rig: Rig) -> ForwardModel:
+    """That plate with sensors at its ERAs and elsewhere, an additional mass and a finger."""
+    sensors = [*(Sensor(era.name, era.name) for era in rig.eras), PAD]
+    names = [sensor.name for sensor in sensors]
+    space = space_of(rig, names, Priors.of(rig.uncertainty), masses=1, fingers=1)
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
+    return ForwardModel(rig, sensors, FREQUENCIES, space, free, [FINGER])
+
+
+def somewhere(space: Space, seed: int) -> FloatArray:
+    """Parameters that all differ from the rig's, within their bounds."""
+    x = 0.5 * np.random.default_rng(seed).standard_normal(space.size)
+    x[space.groups["masses"].start] = 1.0
+    return np.clip(inwards(space, x * space.uncertain, by=0.6), space.lower, space.upper)
+
+
+def direct(rig: Rig, loads: list[Load]) -> ComplexArray:
+    """Responses at ERAs and pad per base displacement (f, s, n), from the rig solved directly."""
+    assert isinstance(rig.mesh, SpectralMesh)
+    points = np.array([*((era.x, era.y) for era in rig.eras), (PAD.x, PAD.y)])
+    found = direct_spectral_acceleration(
+        rig.plate, rig.mesh, rig.eras, FREQUENCIES, points, loads=loads
+    )
+    return found.swapaxes(1, 2) / [era.stroke for era in rig.eras]
+
+
+def test_responses_are_those_of_the_rig_solved_directly(rig: Rig, model: ForwardModel) -> None:
+    """Without deviations the responses are those of a direct solution with the finger on it."""
+    x = np.zeros(model.space.size)
+    expected = direct(rig, [FingertipLoad(FINGER.x, FINGER.y, FINGER.fingertip)])
+    found = model.at(x).responses
+    np.testing.assert_allclose(found, expected, atol=2e-4 * np.abs(expected).max())
+
+
+def test_deviating_rig_is_solved_without_solving_it_again(rig: Rig, model: ForwardModel) -> None:
+    """Springs, bolts, places, modulus, loss and a mass move the responses as a solution anew."""
+    space = model.space
+    x = somewhere(space, 1)
+    x[space.of("thickness", "mode_shifts", "mode_losses", "sensor_gain", "sensor_phase")] = 0
+    x[space.of("gain", "phase", "fingers")] = 0
+    values = model.at(x).values
+    eras = tuple(
+        replace(era, stiffness=k, damping=c, bolt_mass=m, x=place[0], y=place[1])
+        for era, k, c, m, place in zip(
+            rig.eras, values.stiffness, values.damping, values.bolt_mass, values.places, strict=True
+        )
+    )
+    material = replace(rig.plate.material, E=values.modulus * rig.plate.material.E)
+    plate = replace(
+        rig.plate,
+        material=material,
+        loss_factor=values.loss_factor,
+        loss_exponent=values.loss_exponent,
+    )
+    ((mass, at_x, at_y),) = values.masses
+    loads: list[Load] = [
+        PointLoad(at_x, at_y, mass=mass),
+        FingertipLoad(FINGER.x, FINGER.y, FINGER.fingertip),
+    ]
+    expected = direct(replace(rig, plate=plate, eras=eras), loads)
+    found = model.at(x).responses
+    np.testing.assert_allclose(found, expected, atol=3e-4 * np.abs(expected).max())
+
+
+def test_derivatives_are_the_slopes_of_the_responses(model: ForwardModel) -> None:
+    """Every analytic derivative is that of a central difference of the responses."""
+    x, step = somewhere(model.space, 2), 1e-4
+    found = jacobian(model.at(x))
+    for number, name in enumerate(model.space.names):
+        sides = []
+        for sign in (1, -1):
+            moved = x.copy()
+            moved[number] += sign * step
+            sides.append(model.at(moved).responses)
+        slope = (sides[0] - sides[1]) / (2 * step)
+        error = np.abs(found[..., number] - slope).max() / np.abs(slope).max()
+        assert error < 1e-4, name
+
+
+def test_mass_anywhere_changes_responses_as_derived(rig: Rig, model: ForwardModel) -> None:
+    """The derivative by a mass at a point is the change that a small load there makes."""
+    space = model.space
+    x = np.zeros(space.size)
+    point, mass = np.array([[0.21, 0.16]]), 1e-6
+    finger = FingertipLoad(FINGER.x, FINGER.y, FINGER.fingertip)
+    change = direct(rig, [finger, PointLoad(*point[0], mass=mass)]) - direct(rig, [finger])
+    found = mass * by_mass_at(model.at(x), point)[..., 0]
+    np.testing.assert_allclose(found, change, atol=2e-3 * np.abs(change).max())
+
+
+def test_finger_of_known_parts_has_its_dynamic_stiffness(model: ForwardModel) -> None:
+    """A finger with twice the pulp and half the phalanx loads the plate as such a fingertip."""
+    x = np.zeros(model.space.size)
+    x[model.space.groups["fingers"]] = np.log([1.0, 2.0, 0.5, 1.0]) / 0.5
+    tip = FINGER.fingertip
+    other = replace(
+        tip,
+        stiffness=2 * tip.stiffness,
+        damping=2 * tip.damping,
+        phalanx_mass=tip.phalanx_mass / 2,
+    )
+    same = replace(model, fingers=[replace(FINGER, fingertip=other)], last_places={})
+    expected = same.at(np.zeros(model.space.size)).responses
+    np.testing.assert_allclose(model.at(x).responses, expected, rtol=1e-10)

@@ -1,0 +1,133 @@
+"""A rig identified in place: refusals, repeatability, the new rig and its file."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.identification.hidden import Hidden, draw
+from model.config.document import read_document
+from model.errors import InputError
+from model.files.array_file import whole_or_nothing
+from model.identification.forward import Sensor
+from model.identification.identify import Identification, identify
+from model.identification.measurement import Measurement, Repeat
+from model.rig.file import example_rig_path, load_rig
+from model.rig.rewritten import rewritten_text
+from model.rig.rig import Rig
+
+FREQUENCIES = np.linspace(40.0, 500.0, 21)
+ONE_ROUND = (np.arange(len(FREQUENCIES))[:, None] + np.arange(4)) % 4 == 0
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The paper's plate as it is written."""
+    return load_rig(example_rig_path())
+
+
+@pytest.fixture(scope="module")
+def hidden() -> Hidden:
+    """A thin plate with places and a mass of its own."""
+    return draw("form", 3)
+
+
+@pytest.fixture(scope="module")
+def measurement(rig: Rig, hidden: Hidden) -> Measurement:
+    """Responses of the hidden plate at its ERAs to interleaved tones."""
+    values = hidden.measured(FREQUENCIES, np.random.default_rng(3))
+    values = np.where(ONE_ROUND[:, None], values, np.nan)
+    return Measurement.of([Sensor(era.name, era.name) for era in rig.eras], FREQUENCIES, values)
+
+
+@pytest.fixture(scope="module")
+def found(rig: Rig, measurement: Measurement) -> Identification:
+    """The rig as the measurement shows it."""
+    return identify(rig, measurement, seed=1)
+
+
+def test_identified_rig_has_the_springs_and_the_mass(found: Identification, hidden: Hidden) -> None:
+    """Springs within 2 %, the hidden 3 g within 10 % and 5 mm, from a single round of tones."""
+    assert found.is_explained
+    springs = [era.stiffness for era in found.rig.eras]
+    np.testing.assert_allclose(springs, hidden.mounted.stiffness, rtol=0.02)
+    (mass,) = found.rig.masses
+    ((x, y, weight),) = hidden.mounted.masses
+    assert mass.mass == pytest.approx(weight, rel=0.1)
+    np.testing.assert_allclose([mass.x, mass.y], [x, y], atol=5e-3)
+
+
+def test_identified_rig_states_less_uncertainty_but_for_fingers(found: Identification) -> None:
+    """Thickness and springs are known better; drives repeat to 1 %; fingers are as they were."""
+    before, after = found.before.uncertainty, found.rig.uncertainty
+    assert after.thickness < before.thickness / 5
+    assert after.stiffness < before.stiffness / 5
+    assert 0.01 <= after.gain < before.gain
+    assert after.fingertip == before.fingertip
+
+
+def test_same_data_and_seed_give_the_same_rig_and_draws(
+    rig: Rig, measurement: Measurement, found: Identification
+) -> None:
+    """Identifying again gives the same rig to the last digit, and the same draws."""
+    again = identify(rig, measurement, seed=1)
+    assert again.rig == found.rig
+    assert again.draws(2) == found.draws(2)
+    assert found.draws(1)[0] != found.rig
+
+
+def test_file_with_identified_values_reads_back(found: Identification, tmp_path: Path) -> None:
+    """The rig written with comments kept is the one identified, to the digits of the file."""
+    document = read_document(example_rig_path())
+    text = rewritten_text(document, found.before, found.rig, comment="identified")
+    path = tmp_path / "identified.yaml"
+    with whole_or_nothing(path) as stream:
+        stream.write(text.encode())
+    back = load_rig(path)
+    assert "# The plate of the founding paper" in text
+    assert back.plate.thickness == pytest.approx(found.rig.plate.thickness, rel=1e-5)
+    assert pytest.approx(found.rig.plate.material.E, rel=1e-5) == back.plate.material.E
+    assert back.plate.loss_exponent == pytest.approx(found.rig.plate.loss_exponent, rel=1e-5)
+    np.testing.assert_allclose(
+        back.plate.mode_deviations, found.rig.plate.mode_deviations, atol=1e-4
+    )
+    for era, expected in zip(back.eras, found.rig.eras, strict=True):
+        np.testing.assert_allclose([era.x, era.y], [expected.x, expected.y], atol=1e-6)
+        np.testing.assert_allclose(era.gains, expected.gains, atol=1e-4)
+        assert era.damping == pytest.approx(expected.damping, rel=1e-5)
+    assert back.masses[0].mass == pytest.approx(found.rig.masses[0].mass, rel=1e-5)
+    assert back.uncertainty.stiffness == pytest.approx(found.rig.uncertainty.stiffness, rel=1e-5)
+
+
+def test_era_that_never_played_is_named_with_the_tone_that_helps(
+    rig: Rig, measurement: Measurement
+) -> None:
+    """Without tones of SE its gain is unknown; the advice is to play SE."""
+    silent = measurement.part(measurement.eras != 1)
+    with pytest.raises(InputError, match=r"gain SE.*play ERA SE at"):
+        identify(rig, silent)
+
+
+@pytest.mark.parametrize(("kind", "change"), [("half_level", 1.05), ("at_end", 1.05)])
+def test_plate_that_is_not_linear_or_drifts_is_refused(
+    rig: Rig, measurement: Measurement, kind: str, change: float
+) -> None:
+    """A response that is another at half the level, or at the end, refuses the measurement."""
+    loudest = measurement.rows == measurement.rows[np.abs(measurement.values).argmax()]
+    values, era = measurement.values[loudest], rig.eras[measurement.eras[loudest][0]].name
+    frequency = float(measurement.frequencies[loudest][0])
+    for factor, is_refused in ((change, True), (1.005, False)):
+        repeat = Repeat(era, frequency, values, factor * values)
+        repeated = replace(measurement, **{kind: (repeat,)})
+        if is_refused:
+            with pytest.raises(InputError):
+                repeated.check([each.name for each in rig.eras])
+        else:
+            repeated.check([each.name for each in rig.eras])
+
+
+def test_plate_of_another_kind_is_not_explained(rig: Rig, measurement: Measurement) -> None:
+    """A sensor whose phases are conjugated leaves chi² beyond what promises anything."""
+    wrong = np.where(measurement.at == 2, measurement.values.conj(), measurement.values)
+    assert not identify(rig, replace(measurement, values=wrong)).is_explained

@@ -1,0 +1,50 @@
+"""Identification of hidden thin plates in Hermite elements, whose theory is not the model's."""
+
+import numpy as np
+import pytest
+
+from benchmarks.identification.hidden import Hidden, draw
+from model.identification.forward import Sensor
+from model.identification.measurement import Measurement
+from model.identification.priors import Priors
+from model.identification.stages import Fitted, Setting, chi2, fit_in_stages
+from model.reduction.free_plate import solve_free_plate
+from model.rig.file import example_rig_path, load_rig
+
+FREQUENCIES = np.linspace(40.0, 500.0, 27)
+
+
+def identified(hidden: Hidden, *, rounds: int = 4) -> Fitted:
+    """The paper's rig fitted to a hidden plate; each ERA plays as many in four tones."""
+    rig = load_rig(example_rig_path())
+    sensors = [Sensor(era.name, era.name) for era in rig.eras]
+    values = hidden.measured(FREQUENCIES, np.random.default_rng(1))
+    played = (np.arange(len(FREQUENCIES))[:, None] + np.arange(4)) % 4 < rounds
+    values = np.where(played[:, None], values, np.nan)
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
+    measurement = Measurement.of(sensors, FREQUENCIES, values)
+    return fit_in_stages(Setting(rig, free, Priors.of(rig.uncertainty), measurement))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_hidden_mass_and_places_are_found(seed: int) -> None:
+    """A mass of 3 g is found within 5 % and 2 mm, places within 0.5 mm, springs within 2 %."""
+    hidden = draw("form", seed)
+    found = identified(hidden)
+    assert chi2(found) < 1.3
+    values = found.problem.model.at(found.best.x).values
+    ((x, y, mass),) = hidden.mounted.masses
+    assert values.masses[0, 0] == pytest.approx(mass, rel=0.05)
+    np.testing.assert_allclose(values.masses[0, 1:], [x, y], atol=2e-3)
+    np.testing.assert_allclose(values.places, hidden.mounted.at, atol=5e-4)
+    np.testing.assert_allclose(values.stiffness, hidden.mounted.stiffness, rtol=0.02)
+
+
+def test_one_round_of_interleaved_tones_finds_the_springs() -> None:
+    """Where each ERA plays every fourth tone only, springs are found within 2 %, and no mass."""
+    hidden = draw("plain", 4)
+    found = identified(hidden, rounds=1)
+    assert chi2(found) < 1.4
+    values = found.problem.model.at(found.best.x).values
+    np.testing.assert_allclose(values.stiffness, hidden.mounted.stiffness, rtol=0.02)
+    assert values.masses[0, 0] < 0.3e-3

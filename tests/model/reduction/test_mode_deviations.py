@@ -1,0 +1,116 @@
+"""Modes that differ from a plate's theory, and a loss factor that varies, in every solution."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.errors import InputError
+from model.reduction.free_plate import solve_free_plate
+from model.reduction.modal_matrices import modal_matrices
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.file import example_rig_path, load_rig
+from model.rig.rig import Rig
+from model.spectral.direct import direct_spectral_acceleration
+from model.spectral.mesh import SpectralMesh
+from model.structure.plate import LOSS_FREQUENCY, Plate
+from model.structure.point_load import footprints_of
+from model.table.build import build_table
+from model.vibration.parametric_plate import parametric_plate
+
+FREQUENCIES = np.array([65.0, 150.0, 240.0, 430.0])
+DEVIATIONS = ((0.02, 0.3), (0.0, 0.0), (-0.03, -0.4))
+POINTS = np.array([[0.05, 0.04], [0.2, 0.11]])
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The paper's plate with three modes off its theory, and a loss that rises with frequency."""
+    rig = load_rig(example_rig_path())
+    plate = replace(rig.plate, loss_exponent=0.4, mode_deviations=DEVIATIONS)
+    return replace(rig, plate=plate)
+
+
+def test_only_the_modes_named_change_the_receptance(rig: Rig) -> None:
+    """The receptance changes by that of three oscillators with stiffness and loss of their own."""
+    plain = replace(rig, plate=replace(rig.plate, mode_deviations=()))
+    solved = [solve_free_plate(each.plate, each.mesh, frequency_max=500.0) for each in (rig, plain)]
+    found, before = (free.receptances(POINTS, POINTS, FREQUENCIES)[0] for free in solved)
+    modes = solved[0].modes
+    elastic = np.sort(modes.eigenvalues)[3:6]
+    omega = 2 * np.pi * FREQUENCIES
+    eta = rig.plate.loss_factor * (FREQUENCIES / LOSS_FREQUENCY) ** 0.4
+    expected = before.copy()
+    for eigenvalue, (shift, loss) in zip(elastic, DEVIATIONS, strict=True):
+        phi = modes.shapes_at(POINTS)[:, np.flatnonzero(modes.eigenvalues == eigenvalue)[0]]
+        for factor, more, sign in ((np.exp(shift), np.exp(loss), 1), (1.0, 1.0, -1)):
+            oscillator = 1 / ((1 + 1j * eta * more) * eigenvalue * factor - omega**2)
+            expected += sign * oscillator[:, None, None] * np.outer(phi, phi)
+    np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
+
+
+def test_loss_varies_alike_in_modes_and_in_a_direct_solution(rig: Rig) -> None:
+    """Modal and direct accelerations agree where the loss factor rises with frequency."""
+    plate = replace(rig.plate, mode_deviations=())
+    assert isinstance(rig.mesh, SpectralMesh)
+    direct = direct_spectral_acceleration(plate, rig.mesh, rig.eras, FREQUENCIES, POINTS)
+    free = solve_free_plate(plate, rig.mesh, frequency_max=500.0)
+    found = free.acceleration(rig.eras, FREQUENCIES, POINTS)
+    np.testing.assert_allclose(found, direct, atol=1e-4 * np.abs(direct).max())
+
+
+def test_direct_solution_refuses_modes_of_its_own(rig: Rig) -> None:
+    """What has no modes cannot have some that deviate."""
+    assert isinstance(rig.mesh, SpectralMesh)
+    with pytest.raises(InputError):
+        direct_spectral_acceleration(rig.plate, rig.mesh, rig.eras, FREQUENCIES, POINTS)
+
+
+def test_tables_and_parametric_plates_have_them(rig: Rig) -> None:
+    """Fields of a table and of a plate with parameters are those of the plate solved alone."""
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
+    expected = free.acceleration(rig.eras, FREQUENCIES, POINTS)
+    largest = np.abs(expected).max()
+    table = build_table(rig, frequencies=FREQUENCIES)
+    np.testing.assert_allclose(table.unit_fields(POINTS), expected, atol=3e-3 * largest)
+    responses = parametric_plate(rig, POINTS, FREQUENCIES).responses(rig)
+    strokes = np.array([era.stroke for era in rig.eras])[:, None]
+    np.testing.assert_allclose(responses * strokes, expected, atol=3e-3 * largest)
+
+
+def test_plate_in_time_has_them(rig: Rig) -> None:
+    """Steady vibration of the viscous plate in time is that of the hysteretic one within 1 %."""
+    reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras))
+    M, C, K = modal_matrices(reduced, rig.eras)
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
+    expected = free.acceleration(rig.eras, FREQUENCIES, POINTS)[:, 0]
+    era = rig.eras[0]
+    forces = reduced.at(footprints_of(rig.eras[:1]))[0]
+    for row, omega in enumerate(2 * np.pi * FREQUENCIES):
+        base = (era.stiffness + 1j * omega * era.damping) * era.stroke
+        moved = np.linalg.solve(K + 1j * omega * C - omega**2 * M, forces * base)
+        found = -(omega**2) * (reduced.at(POINTS) @ moved)
+        error = np.linalg.norm(found - expected[row]) / np.linalg.norm(expected[row])
+        assert error < 0.01
+
+
+def test_fingerprint_tells_plates_with_other_modes_apart(rig: Rig) -> None:
+    """A table of a plate as its theory has it is not one of the plate that was identified."""
+    prints = {
+        replace(
+            rig, plate=replace(rig.plate, loss_exponent=exponent, mode_deviations=modes)
+        ).fingerprint
+        for exponent in (0.0, 0.4)
+        for modes in ((), DEVIATIONS)
+    }
+    assert len(prints) == 4
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"loss_exponent": 3.0}, {"loss_exponent": float("nan")}, {"mode_deviations": ((0.9, 0.0),)}],
+)
+def test_plate_refuses_what_is_no_deviation(rig: Rig, values: dict[str, float]) -> None:
+    """Exponents and deviations beyond what a plate may have are refused."""
+    with pytest.raises(InputError):
+        Plate(**{**vars(rig.plate), **values})

@@ -15,7 +15,7 @@ from drivers.backends.urls.address import with_address
 from drivers.command import CommandSet, DriveCommand
 from drivers.conformance import Check, CheckResult, raw_line
 from drivers.conformance.report import ConformanceReport
-from drivers.conformance.series import not_begun, run_checks
+from drivers.conformance.series import not_started, run_checks
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, Guard, GuardLimits
 from drivers.link.link import REPLY_TIMEOUT
@@ -259,7 +259,7 @@ async def conform(
     except LinkError as loss:
         if before is None:
             raise
-        results = tuple(not_begun(check, raw, str(loss)) for check in checks)
+        results = tuple(not_started(check, raw, str(loss)) for check in checks)
         for result in results:
             on_result(result)
         stated = before.amplifier_class

@@ -95,10 +95,10 @@ async def endings_amid_onsets(bench: Bench) -> None:
     await _load(bench, 1, 1.0, 1.0)
     await _load(bench, 2, 0.5)
     await bench.arm()
-    begun = await bench.apply(bench.tones(0.0, onset=1, ending=2))
-    await bench.pause_until(begun.latest + 1.3 * step)
+    started = await bench.apply(bench.tones(0.0, onset=1, ending=2))
+    await bench.pause_until(started.latest + 1.3 * step)
     when = await bench.play()
-    if when.latest > begun.earliest + 2 * step:
+    if when.latest > started.earliest + 2 * step:
         raise Inconclusive("the silent set came after the level that stays")
     falling = _along(step, level, 0.5 * level, 0.0)
     samples = await samples_until(bench, when.latest + 2.2 * step)

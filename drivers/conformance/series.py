@@ -27,14 +27,14 @@ async def run_checks(
     for check in checks:
         loss = loss or await reopened(amplifier)
         if loss:
-            results.append(not_begun(check, raw, loss))
+            results.append(not_started(check, raw, loss))
         else:
             results.append(await run_check(check, amplifier, raw, url=url, process=process))
         on_result(results[-1])
     return tuple(results)
 
 
-def not_begun(check: Check, raw: RawLine | None, loss: str) -> CheckResult:
+def not_started(check: Check, raw: RawLine | None, loss: str) -> CheckResult:
     """Make the result of a check before which the link was lost, and why."""
     reason = f"the link was lost before it: {loss}"
     return CheckResult(

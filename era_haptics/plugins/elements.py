@@ -2,6 +2,7 @@
 
 from model.arrays import FloatArray
 from model.fem.elements.element import Element, rigidities
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+from model.structure.plate import Plate
 
 __all__ = ["Element", "FloatArray", "Material", "Plate", "rigidities"]

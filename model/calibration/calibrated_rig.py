@@ -26,7 +26,9 @@ def check_reads_back(rig: Rig, expected: Calibration, path: Path) -> None:
     """Raise InputError unless a rig read from its new file has the calibrated values."""
 
     def numbers(one: Rig) -> list[float]:
-        plate = [one.plate.material.E, one.plate.loss_factor]
+        layers = one.laminate.layers if one.laminate else ()
+        materials = [layer.material for layer in layers] or [one.plate.material]
+        plate = [one.plate.loss_factor, *(material.E for material in materials)]
         return plate + [v for era in one.eras for v in _numbers_of(era)]
 
     # The absolute part is for numbers near zero: 1 mg, 1 µN s/m, a millionth of a gain.

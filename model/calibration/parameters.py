@@ -122,10 +122,11 @@ def rig_with(rig: Rig, parameters: Sequence[Parameter], x: FloatArray) -> Rig:
         (parameter.era, parameter.kind): parameter.value(float(at))
         for parameter, at in zip(parameters, x, strict=True)
     }
-    material = replace(rig.plate.material, E=values["", "modulus"])
-    plate = replace(rig.plate, material=material, loss_factor=values["", "loss_factor"])
+    factor = values["", "modulus"] / rig.plate.material.E
+    plate = replace(rig.plate.scaled(modulus=factor), loss_factor=values["", "loss_factor"])
+    laminate = rig.laminate and rig.laminate.scaled(modulus=factor)
     eras = tuple(_era_with(era, values) for era in rig.eras)
-    return replace(rig, plate=plate, eras=eras)
+    return replace(rig, plate=plate, laminate=laminate, eras=eras)
 
 
 def starts(parameters: Sequence[Parameter]) -> list[FloatArray]:

@@ -69,7 +69,7 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     laminate = summary["laminate"]
     if laminate is not None:
         _print_laminate(laminate)
-    print("equivalent plate" if laminate is not None else "plate")
+    print("homogeneous plate like it" if laminate is not None else "plate")
     print(
         f"    {1e3 * summary['thickness_m']:.4g} mm of {summary['material']}: "
         f"E {summary['E_pa'] / 1e9:.4g} GPa, rho {summary['rho_kg_m3']:.5g} kg/m³, "
@@ -78,6 +78,7 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     print(f"    flexural rigidity  {summary['flexural_rigidity_n_m']:.4g} N m")
     bare = in_display_unit(summary["mass_kg"], "kg", digits=4)
     print(f"    mass  {bare} ({summary['surface_density_kg_m2']:.4g} kg/m²)")
+    _print_air(summary["air_gap"])
     for key, wavelength in summary["bending_wavelength_m"].items():
         print(f"    bending wavelength at {_frequency(key)}  {100 * wavelength:.3g} cm")
     for mass in summary["point_masses"]:
@@ -112,19 +113,23 @@ def _print_laminate(laminate: dict[str, Any]) -> None:
             f"    {1e3 * layer['thickness_m']:g} mm of {layer['material']}: "
             f"E {layer['E_pa'] / 1e9:g} GPa, rho {layer['rho_kg_m3']:g} kg/m³, nu {layer['nu']:g}"
         )
-    used = laminate["rigidity_n_m"]
-    rows = {
-        "perfectly bonded": laminate["rigidity_perfectly_bonded_n_m"],
-        "freely sliding": laminate["rigidity_freely_sliding_n_m"],
-    }
+    bonded = laminate["rigidity_perfectly_bonded_n_m"]
+    rows = {"perfectly bonded": bonded, "freely sliding": laminate["rigidity_freely_sliding_n_m"]}
     for key, rigidity in laminate.get("rigidity_by_frequency_n_m", {}).items():
-        rows[f"adhesive in shear at {_frequency(key)}"] = rigidity
-    print(f"    rigidity used  {used:.4g} N m", end="")
-    at = laminate["bond_frequency_hz"]
-    print("" if at is None else f", adhesive in shear at {at:g} Hz")
+        rows[f"in free waves of {_frequency(key)}"] = rigidity
     for name, rigidity in rows.items():
-        ratio = math.sqrt(rigidity / used)
+        ratio = math.sqrt(rigidity / bonded)
         print(f"    {name}  {rigidity:.4g} N m: natural frequencies of bending x {ratio:.3f}")
+
+
+def _print_air(air: dict[str, Any] | None) -> None:
+    if air is None:
+        print("    no air: a plate in a vacuum, unless air_gap is given")
+        return
+    edges = "sealed" if air["closed"] else "open"
+    print(f"    air gap of {1e3 * air['depth_m']:g} mm behind it, edges {edges}")
+    if air["closed"]:
+        print(f"        stiffness against even motion  {air['stiffness_n_m3'] / 1e6:.4g} MN/m³")
 
 
 def _frequency(key: str) -> str:

@@ -229,8 +229,7 @@ def _stretched(rig: Rig, along_x: float, along_y: float) -> Rig:
 
 
 def _modulus(rig: Rig, factor: float) -> Rig:
-    material = replace(rig.plate.material, E=rig.plate.material.E * factor)
-    return replace(rig, plate=replace(rig.plate, material=material))
+    return replace(rig, plate=rig.plate.scaled(modulus=factor))
 
 
 def _loss(rig: Rig, factor: float) -> Rig:

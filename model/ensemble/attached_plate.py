@@ -1,10 +1,10 @@
 """The reduced plate at its drive frequencies, with what is fixed to it and what may be wrong.
 
 Free plate in reduced coordinates: A(x, y) = phi_x diag(g) phi_y^T with g = 1 / (s lambda - w²),
-s = 1 + i eta. A plate thicker by a factor has modal masses larger by it and frequencies higher by
-it (`model.vibration.parametric_plate`), so that
+s lambda = (1 + i eta) lambda + i loss. A plate thicker by a factor has modal masses larger by it
+and frequencies higher by it (`model.vibration.parametric_plate`), so that
 
-    dg / d ln h = -3 g - 2 w² g²,    dg / d ln eta = -i eta lambda g².
+    dg / d ln h = -3 g - 2 w² g²,    dg / d ln loss = -i Im(s lambda) g².
 """
 
 import math
@@ -124,6 +124,7 @@ class Attachments:
 def attach(
     plate: Plate,
     omega: FloatArray,
+    losses: FloatArray,
     shapes: FloatArray,
     *,
     eras: Sequence[Era],
@@ -134,13 +135,14 @@ def attach(
 ) -> AttachedPlate:
     """Attach ERAs and masses to a reduced free plate.
 
-    omega (r,) [rad/s]: of its coordinates; shapes (eras + masses, r); frequencies (f,) [Hz].
+    omega (r,) [rad/s], losses (r,) [rad²/s²]: of its coordinates; shapes (eras + masses, r);
+    frequencies (f,) [Hz].
     """
     w = 2 * np.pi * frequencies
     w2 = (w**2)[:, None]
-    elasticity = ModalElasticity.of(plate, omega**2)
+    elasticity = ModalElasticity.of(plate, omega**2, losses)
     g = 1 / (elasticity.stiffness(w) - w2)
-    by_loss = -1j * elasticity.loss_factors(w) * elasticity.eigenvalues * g**2
+    by_loss = -1j * elasticity.stiffness(w).imag * g**2
     k, c = (np.array([getattr(era, key) for era in eras]) for key in ("stiffness", "damping"))
     log_damping = math.log(uncertainty.damping)
     single = np.complex64

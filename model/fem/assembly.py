@@ -51,8 +51,14 @@ class ElementMatrices:
 def element_matrices(plate: Plate, mesh: Mesh) -> ElementMatrices:
     """Compute the matrices of one size of element, or of four with strips along the edges.
 
-    Raises InputError for a mesh of another plate.
+    Raises InputError for a mesh of another plate, and for a plate of layers or with air behind it.
     """
+    if plate.is_layered:
+        what = "a laminate" if plate.laminate is not None else "a plate with an air gap"
+        raise InputError(
+            f"mesh: must be of polynomials for {what}, got {mesh}; finite elements are for "
+            "homogeneous plates in a vacuum: use mesh auto, or Legendre with degrees"
+        )
     sides = ((plate.length, mesh.length), (plate.width, mesh.width))
     if not all(math.isclose(*side) for side in sides):
         raise InputError(

@@ -16,7 +16,8 @@ from model.fem.assembly import assemble
 from model.fem.elements.element import DOF_PER_NODE, Element, rigidities
 from model.fem.mesh import Mesh
 from model.fem.modal import shift_invert_modes
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+from model.structure.plate import Plate
 
 DX, DY = 0.03, 0.02  # m; not square, so that a swap of x and y shows
 PLATE = Plate(0.3, 0.24, 0.002, Material("aluminium", E=70e9, rho=2700.0, nu=0.33))

@@ -96,7 +96,9 @@ class ForwardModel:
     @cached_property
     def elasticity(self) -> ModalElasticity:
         """Eigenvalues and loss factors of the modes as the rig has them."""
-        return ModalElasticity.of(self.free.plate, self.free.modes.eigenvalues)
+        return ModalElasticity.of(
+            self.free.plate, self.free.modes.eigenvalues, self.free.modes.losses
+        )
 
     @cached_property
     def fixed_stiffness(self) -> ComplexArray:
@@ -198,13 +200,17 @@ class PlateAt:
         thickness = values.thickness * rig.thickness / solved.thickness
         modulus = values.modulus * rig.material.E / solved.material.E
         stiffer = modulus * thickness**2
+        lossy = (1 + 1j * loss) * eigenvalues + 1j * theory.losses
+        elastic = np.asarray(stiffer * lossy, dtype=complex)
+        by_loss = np.zeros(elastic.shape, dtype=complex)
+        np.divide(1j * loss * stiffer * eigenvalues, elastic, out=by_loss, where=elastic != 0)
         return FrequencyFunctions(
             model.free,
             model.omega,
             np.asarray((1 + 1j * eta) * stiffer, dtype=complex),
             thickness,
-            np.asarray((1 + 1j * loss) * stiffer * eigenvalues, dtype=complex),
-            np.asarray(1j * loss / (1 + 1j * loss)),
+            elastic,
+            by_loss,
             np.asarray(1j * eta / (1 + 1j * eta)),
         )
 

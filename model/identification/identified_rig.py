@@ -24,9 +24,7 @@ def plate_with(plate: Plate, values: Values) -> Plate:
         [values.mode_shifts, values.mode_losses]
     )
     return replace(
-        plate,
-        thickness=values.thickness * plate.thickness,
-        material=replace(plate.material, E=values.modulus * plate.material.E),
+        plate.scaled(modulus=values.modulus, thickness=values.thickness),
         loss_factor=values.loss_factor,
         loss_exponent=values.loss_exponent,
         mode_deviations=tuple((float(a), float(b)) for a, b in deviations if len(deviations)),
@@ -50,6 +48,8 @@ def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
     return replace(
         rig,
         plate=plate_with(rig.plate, values),
+        laminate=rig.laminate
+        and rig.laminate.scaled(modulus=values.modulus, thickness=values.thickness),
         eras=eras,
         masses=(*rig.masses, *additional_masses(values)),
         uncertainty=uncertainty,

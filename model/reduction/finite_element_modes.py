@@ -39,6 +39,7 @@ class FiniteElementModes:
     def __init__(self, classes: Sequence[ClassModes]) -> None:
         self._classes = tuple(classes)
         self.eigenvalues = np.concatenate([part.eigenvalues for part in classes])
+        self.losses = np.zeros(len(self.eigenvalues))
         self.largest_truncated = max(part.largest_truncated for part in classes)
         self._solved: dict[tuple[float, ...], tuple[_Solved, ...]] = {}
         self._observed: dict[bytes, tuple[FloatArray, tuple[sparse.csr_array, ...]]] = {}

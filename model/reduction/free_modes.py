@@ -39,6 +39,10 @@ class FreeModes(Protocol):
         """omega² of the modes (r,) [rad²/s²], class by class; the first of a class may be 0."""
 
     @property
+    def losses(self) -> FloatArray:
+        """Imaginary part of the eigenvalues (r,) [rad²/s²] beside the plate's own loss factor."""
+
+    @property
     def largest_truncated(self) -> float:
         """1 / (lambda + shift) of the lowest truncated mode [s²/rad²]."""
 

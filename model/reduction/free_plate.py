@@ -20,6 +20,7 @@ from model.fem.mesh import Mesh
 from model.fem.plate_mesh import PlateMesh, check_frequencies
 from model.reduction.finite_element_modes import finite_element_modes
 from model.reduction.free_modes import RESIDUAL_ORDER, FreeModes, PointSolutions
+from model.reduction.layered_modes import layered_modes
 from model.reduction.spectral_modes import spectral_modes
 from model.reduction.truncation import truncation_weights
 from model.spectral.mesh import SpectralMesh
@@ -111,12 +112,12 @@ class FreePlate:
 
     @cached_property
     def _elasticity(self) -> ModalElasticity:
-        return ModalElasticity.of(self.plate, self.modes.eigenvalues)
+        return ModalElasticity.of(self.plate, self.modes.eigenvalues, self.modes.losses)
 
     def _modal_receptance(self, omega: FloatArray, terms: int) -> tuple[ComplexArray, ComplexArray]:
         """Receptance of each mode (f, r) [s²], and weights of the truncated ones, (f, terms).
 
-        1 / ((1 + i eta) lambda - omega²) for an eigenvalue lambda at modal mass 1.
+        1 / ((1 + i eta) lambda + i loss - omega²) for an eigenvalue lambda at modal mass 1.
         """
         loss = (1 + 1j * loss_factors(self.plate, omega))[:, None]
         shifted = np.asarray(omega**2 / loss[:, 0] + self.shift, dtype=complex)
@@ -154,7 +155,10 @@ def _apply(basis: FloatArray, coordinates: ComplexArray) -> ComplexArray:
 
 
 def solve_free_plate(plate: Plate, mesh: PlateMesh, *, frequency_max: float = 500.0) -> FreePlate:
-    """Solve the free plate on a mesh, for responses up to a frequency [Hz]."""
+    """Solve the free plate on a mesh, for responses up to a frequency [Hz].
+
+    Raises InputError for finite elements of a plate that they do not model.
+    """
     if not (math.isfinite(frequency_max) and frequency_max > 0):
         raise InputError(f"frequency_max must be above zero, got {frequency_max} Hz")
     # Above zero, since K alone is singular, and well below the truncated modes, whose sum converges
@@ -163,6 +167,14 @@ def solve_free_plate(plate: Plate, mesh: PlateMesh, *, frequency_max: float = 50
     cutoff_frequency = FREQUENCY_MARGIN * frequency_max
     modes: FreeModes
     match mesh:
+        case SpectralMesh() if plate.is_layered:
+            modes = layered_modes(
+                plate,
+                mesh,
+                shift=shift,
+                cutoff_frequency=cutoff_frequency,
+                frequency_max=frequency_max,
+            )
         case SpectralMesh():
             modes = spectral_modes(plate, mesh, shift=shift, cutoff_frequency=cutoff_frequency)
         case Mesh():

@@ -8,7 +8,8 @@ force of the pulp, a spring and a damper between the plate and the phalanx.
 Structural damping. The frequency domain uses a hysteretic stiffness (1 + i eta) diag(omega²),
 which no causal equation in time has. C_s is its viscous equivalent: in the modes psi_j, omega_j of
 the plate *on its ERAs*, C_s,jk = eta psi_j^T diag(omega²) psi_k / sqrt(omega_j omega_k), eta the
-geometric mean of those at omega_j and omega_k where it varies with frequency. That is
+geometric mean of those at omega_j and omega_k where it varies with frequency, and what soft layers
+and air lose added to eta omega². That is
 positive semidefinite, and at every resonance of the supported plate it dissipates exactly the power
 of the hysteretic one; a ratio eta/2 on the modes of the *free* plate would not, because the energy
 in the springs has no loss. Contacts do not change it. The two differ off resonance: with eta = 1 %
@@ -34,7 +35,8 @@ from model.structure.support import check_supported
 class Reduced(Protocol):
     """A free plate in few coordinates, its mass the identity and its stiffness diag(omega²).
 
-    As `ReducedPlate`: omega (r,) [rad/s]; at(points) gives its shapes (p, r).
+    As `ReducedPlate`: omega (r,) [rad/s], losses (r,) [rad²/s²]; at(points) gives its shapes
+    (p, r).
     """
 
     @property
@@ -44,6 +46,10 @@ class Reduced(Protocol):
     @property
     def omega(self) -> FloatArray:
         """Natural frequencies [rad/s], (r,)."""
+
+    @property
+    def losses(self) -> FloatArray:
+        """Losses beside those of the plate's loss factor [rad²/s²], (r,)."""
 
     def at(self, points: FloatArray) -> FloatArray:
         """Shapes at points (p, 2) or footprints (p, 3) [m], (p, r)."""
@@ -70,7 +76,7 @@ def modal_matrices(
         if attachment_shapes is None
         else attachment_shapes
     )
-    elasticity = ModalElasticity.of(reduced.plate, reduced.omega**2)
+    elasticity = ModalElasticity.of(reduced.plate, reduced.omega**2, reduced.losses)
     elastic = np.diag(elasticity.eigenvalues)
     M, C, K = _contribution(phi[: len(fixed)], fixed)
     M += np.eye(len(elastic))
@@ -78,8 +84,9 @@ def modal_matrices(
     eigenvalues, psi = linalg.eigh(K, M)
     omega = np.sqrt(eigenvalues)
     lossy = (psi.T * elasticity.eigenvalues * elasticity.relative_loss) @ psi
-    share = np.sqrt(loss_factors(reduced.plate, omega) / omega)
-    viscous = lossy * np.outer(share, share)
+    share = np.sqrt(loss_factors(reduced.plate, omega))
+    lost = lossy * np.outer(share, share) + (psi.T * elasticity.losses) @ psi
+    viscous = lost / np.sqrt(np.outer(omega, omega))
     mass_weighted_modes = M @ psi
     C += mass_weighted_modes @ viscous @ mass_weighted_modes.T
     return _under_fingertips((M, C, K), phi[len(fixed) :], [each.fingertip for each in contacts])

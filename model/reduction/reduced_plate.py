@@ -55,13 +55,14 @@ class ReductionBasis:
 class ReducedPlate:
     """The free plate in coordinates with M = I and K = diag(omega²).
 
-    omega: (r,) [rad/s], 0 for rigid-body modes, the last ones of the residual vectors; at: shapes
-    at points (p, 2) or footprints (p, 3) [m], (p, r) [1/sqrt(kg)]; origin: None where only the
-    coordinates are known.
+    omega: (r,) [rad/s], 0 for rigid-body modes, the last ones of the residual vectors; losses:
+    (r,) [rad²/s²] beside those of the plate's loss factor; at: shapes at points (p, 2) or
+    footprints (p, 3) [m], (p, r) [1/sqrt(kg)]; origin: None where only the coordinates are known.
     """
 
     plate: Plate
     omega: FloatArray
+    losses: FloatArray
     at: Callable[[FloatArray], FloatArray]
     origin: ReductionBasis | None = None
 
@@ -130,6 +131,7 @@ def reduce_free_plate(free: FreePlate, attachments: FloatArray) -> ReducedPlate:
     return ReducedPlate(
         free.plate,
         np.concatenate([np.sqrt(free.modes.eigenvalues), omega]),
+        np.concatenate([free.modes.losses, np.zeros(len(omega))]),
         shapes,
         ReductionBasis(free, attached.points, attached.truncated_terms, residual_transform),
     )

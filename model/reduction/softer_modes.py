@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 from model.arrays import FloatArray
 from model.reduction.free_modes import PointSolutions
+from model.reduction.layered_modes import LayeredModes
 from model.reduction.spectral_modes import SpectralModes
 
 
@@ -11,12 +12,17 @@ from model.reduction.spectral_modes import SpectralModes
 class SofterModes:
     """Modes of a free plate with more of the unresolved compliance; see `FreeModes`."""
 
-    modes: SpectralModes
+    modes: SpectralModes | LayeredModes
 
     @property
     def eigenvalues(self) -> FloatArray:
         """As of the plate itself."""
         return self.modes.eigenvalues
+
+    @property
+    def losses(self) -> FloatArray:
+        """As of the plate itself."""
+        return self.modes.losses
 
     @property
     def largest_truncated(self) -> float:

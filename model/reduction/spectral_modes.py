@@ -49,6 +49,7 @@ class SpectralModes:
         self._directions = mesh.directions(plate)
         self._classes = classes
         self.eigenvalues = np.concatenate([part.eigenvalues for part in classes])
+        self.losses = np.zeros(len(self.eigenvalues))
         self.largest_truncated = max(part.largest_truncated for part in classes)
         self._first: PointSolutions | None = None
         self._alone_count = 0

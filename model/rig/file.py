@@ -45,7 +45,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
     validation = Validation(document, RigSection)
     check_across(validation, mesh_given=mesh is not None)
     section = validation.finish()
-    plate = plate_of(section.plate)
+    plate = plate_of(section.plate, frequency_max=section.limits.frequency[1])
     wanted = section.mesh if mesh is None else mesh
     everything = {
         name: era_of(name, era, plate, era_count=len(section.eras))

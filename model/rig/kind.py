@@ -1,10 +1,13 @@
 """Rig files as a kind of configuration of `era config`."""
 
+import math
 from typing import Any
 
 from model.config.document import ConfigError, Document, Problem
 from model.config.kinds import CheckedFile
+from model.fem.elements.element import SHEAR_CORRECTION
 from model.rig.amplifiers import check_amplifiers
+from model.rig.checks import STIFF_MOUNT
 from model.rig.file import example_rig_path, rig_of, rig_schema
 from model.rig.rig import Rig
 from model.rig.voltage_costs import voltage_costs
@@ -35,7 +38,7 @@ class RigKind:
         if rig is None or problems:
             raise ConfigError(document.source, problems)
         note = rig.uncertainty.note
-        costs = voltage_costs(rig)
+        costs = [*voltage_costs(rig), *_air_costs(rig), *_point_costs(rig)]
         return CheckedFile(_summary(rig), [*warnings, *costs, *([note] if note else [])])
 
     def example(self) -> str:
@@ -50,6 +53,39 @@ class RigKind:
 RIG = RigKind()
 
 
+def _air_costs(rig: Rig) -> list[str]:
+    gap, low = rig.plate.air_gap, rig.limits.frequency_min
+    if gap is None or not gap.is_narrow(low):
+        return []
+    return [
+        f"plate.air_gap: in {1e3 * gap.depth:g} mm friction of the air couples the modes at "
+        f"{low:g} Hz, which is left out: the response may be off by 10 % and more there"
+    ]
+
+
+def _point_costs(rig: Rig) -> list[str]:
+    """What stiff mounts cost that the rig says are points."""
+    plate = rig.plate
+    decade = math.log(10) / (2 * math.pi * SHEAR_CORRECTION * plate.material.shear_modulus)
+    decade /= plate.thickness
+    mounts = [
+        *((era.name, era.stiffness, era.foot) for era in rig.eras),
+        *(
+            (name, load.stiffness, load.foot)
+            for name, load in zip(
+                rig.supports, rig.masses[len(rig.masses) - len(rig.supports) :], strict=True
+            )
+        ),
+    ]
+    return [
+        f"eras.{name}.foot: the dent under a point of {stiffness:g} N/m has no limit, a tenfold "
+        f"smaller one adds at least {100 * decade * stiffness:.1f} % of the mount's own "
+        "compliance; give its radius, and see `era plate convergence`"
+        for name, stiffness, foot in mounts
+        if stiffness >= STIFF_MOUNT and not foot
+    ]
+
+
 def _summary(rig: Rig) -> str:
     plate, laminate = rig.plate, rig.laminate
     thickness = plate.thickness if laminate is None else laminate.thickness
@@ -62,6 +98,10 @@ def _summary(rig: Rig) -> str:
         f"mesh {rig.mesh}",
         f"ERAs {', '.join(era.name for era in rig.eras)}",
     ]
+    gap = plate.air_gap
+    if gap is not None:
+        edges = "sealed" if gap.closed else "open"
+        parts.insert(1, f"{1e3 * gap.depth:g} mm of air behind it, {edges} at the edges")
     if rig.supports:
         parts.append(f"supported without being driven by {', '.join(rig.supports)}")
     if carried := sum(mass.mass for mass in rig.masses):

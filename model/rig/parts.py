@@ -15,23 +15,37 @@ from model.rig.sections import (
 )
 from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era, damping_from_ratio
+from model.structure.air_gap import AirGap
+from model.structure.equivalent import equivalent_plate
 from model.structure.fingertip import Fingertip
-from model.structure.laminate import Laminate, Layer, equivalent_plate
-from model.structure.plate import Material, Plate
+from model.structure.laminate import Laminate, Layer
+from model.structure.material import Material
+from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 from registry.limits import GuardLimits
 from registry.voltage import VoltageDrive
 
 
-def plate_of(section: PlateSection) -> Plate:
-    """The plate, of a laminate the equivalent one."""
+def plate_of(section: PlateSection, *, frequency_max: float) -> Plate:
+    """The plate; what is like a homogeneous one of a laminate is so at the highest frequency."""
+    gap = section.air_gap
+    air_gap = None if gap is None else AirGap(gap.depth, closed=gap.closed)
     deviations = tuple((2 * math.log(f), math.log(loss)) for f, loss in section.modes)
     laminate = laminate_of(section)
     if laminate is not None:
         plate = equivalent_plate(
-            laminate, length=section.length, width=section.width, loss_factor=section.loss_factor
+            laminate,
+            length=section.length,
+            width=section.width,
+            frequency=frequency_max,
+            loss_factor=section.loss_factor,
         )
-        return replace(plate, loss_exponent=section.loss_exponent, mode_deviations=deviations)
+        return replace(
+            plate,
+            loss_exponent=section.loss_exponent,
+            mode_deviations=deviations,
+            air_gap=air_gap,
+        )
     assert section.thickness is not None  # noqa: S101  see model.rig.checks
     assert section.material is not None  # noqa: S101
     return Plate(
@@ -42,6 +56,7 @@ def plate_of(section: PlateSection) -> Plate:
         loss_factor=section.loss_factor,
         loss_exponent=section.loss_exponent,
         mode_deviations=deviations,
+        air_gap=air_gap,
     )
 
 
@@ -49,8 +64,16 @@ def laminate_of(section: PlateSection) -> Laminate | None:
     """The laminate of the plate; None without layers."""
     if section.layers is None:
         return None
-    layers = (Layer(_material(layer.material), layer.thickness) for layer in section.layers)
-    return Laminate(tuple(layers), bond=section.bond, bond_frequency=section.bond_frequency)
+    layers = (
+        Layer(
+            _material(layer.material),
+            layer.thickness,
+            loss_factor=layer.loss_factor or 0.0,
+            by_frequency=tuple(layer.by_frequency or ()),
+        )
+        for layer in section.layers
+    )
+    return Laminate(tuple(layers), bond=section.bond)
 
 
 def era_of(name: str, section: EraSection, plate: Plate, *, era_count: int) -> Era:

@@ -1,10 +1,13 @@
 """Numbers of a rig's plate: materials, rigidity, bending wavelengths."""
 
-from dataclasses import replace
+import math
 from typing import Any
 
 from model.rig.rig import Rig
-from model.structure.laminate import Bond, Laminate, bending, freely_sliding, perfectly_bonded
+from model.structure.air_gap import AirGap
+from model.structure.equivalent import bending
+from model.structure.laminate import Bond, Laminate, freely_sliding, perfectly_bonded, wavenumber_of
+from model.structure.plate import Plate
 from registry.limits import GuardLimits
 
 
@@ -12,10 +15,10 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
     """The plate that is solved, the laminate that it stands for, and what it carries.
 
     Keys carry their units. A laminate comes with both bounds of its rigidity, perfectly bonded and
-    freely sliding layers, and, where its adhesives shear, the rigidity at both ends of the rig's
-    frequencies.
+    freely sliding layers, and, where its layers are bonded, the rigidity in free bending waves at
+    both ends of the rig's frequencies.
     """
-    plate, limits = rig.plate, rig.limits
+    plate, limits, gap = rig.plate, rig.limits, rig.plate.air_gap
     return {
         "length_m": plate.length,
         "width_m": plate.width,
@@ -29,13 +32,35 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
         "surface_density_kg_m2": plate.material.rho * plate.thickness,
         "flexural_rigidity_n_m": plate.flexural_rigidity,
         "bending_wavelength_m": {
-            f"{frequency:g}_hz": plate.bending_wavelength(frequency)
+            f"{frequency:g}_hz": _wavelength(plate, frequency)
             for frequency in (limits.frequency_min, limits.frequency_max)
         },
+        "air_gap": None if gap is None else _air_gap(gap, limits),
         "point_masses": [
             {"at_m": [mass.x, mass.y], "mass_kg": mass.mass} for mass in rig.masses if mass.mass
         ],
         "laminate": None if rig.laminate is None else _laminate(rig.laminate, limits),
+    }
+
+
+def _wavelength(plate: Plate, frequency: float) -> float:
+    """Of a free bending wave [m], without air."""
+    if plate.laminate is None:
+        return plate.bending_wavelength(frequency)
+    return 2 * math.pi / wavenumber_of(plate.laminate, frequency).real
+
+
+def _air_gap(gap: AirGap, limits: GuardLimits) -> dict[str, Any]:
+    return {
+        "depth_m": gap.depth,
+        "closed": gap.closed,
+        "inertia_kg_m3": {
+            f"{frequency:g}_hz": gap.inertia(frequency).real
+            for frequency in (limits.frequency_min, limits.frequency_max)
+        },
+        "stiffness_n_m3": gap.bulk_modulus(limits.frequency_max).real / gap.depth
+        if gap.closed
+        else 0.0,
     }
 
 
@@ -48,19 +73,19 @@ def _laminate(laminate: Laminate, limits: GuardLimits) -> dict[str, Any]:
                 "E_pa": layer.material.E,
                 "rho_kg_m3": layer.material.rho,
                 "nu": layer.material.nu,
+                "loss_factor": layer.loss_factor,
+                "by_frequency": [list(row) for row in layer.by_frequency],
             }
             for layer in laminate.layers
         ],
         "thickness_m": laminate.thickness,
         "bond": laminate.bond.value,
-        "bond_frequency_hz": laminate.bond_frequency,
-        "rigidity_n_m": bending(laminate).rigidity,
         "rigidity_perfectly_bonded_n_m": perfectly_bonded(laminate.layers).rigidity,
         "rigidity_freely_sliding_n_m": freely_sliding(laminate.layers).rigidity,
     }
-    if laminate.bond is Bond.SHEAR:
+    if laminate.bond is Bond.FULL:
         summary["rigidity_by_frequency_n_m"] = {
-            f"{frequency:g}_hz": bending(replace(laminate, bond_frequency=frequency)).rigidity
+            f"{frequency:g}_hz": bending(laminate, frequency).rigidity
             for frequency in (limits.frequency_min, limits.frequency_max)
         }
     return summary

@@ -3,19 +3,17 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
-from scipy.optimize import brentq
 
 from model.config.document import Document
 from model.config.editing import edited_text
 from model.rig.rig import Rig
 from model.structure.actuator import Gain
-from model.structure.laminate import Laminate, equivalent_plate
-from model.structure.plate import Material
+from model.structure.material import Material
 
 _PER_LINE = 4
 
@@ -123,12 +121,7 @@ def _set_modulus(plate: CommentedMap, before: Rig, after: Rig) -> None:
     if before.laminate is None:
         _set_material(plate, before.plate.material, after.plate.material.E)
         return
-    thicker = after.plate.thickness / before.plate.thickness
-    layers = (
-        replace(layer, thickness=thicker * layer.thickness) for layer in before.laminate.layers
-    )
-    laminate = replace(before.laminate, layers=tuple(layers))
-    factor = _layer_factor(before, laminate, wanted=after.plate.material.E)
+    factor = after.plate.material.E / before.plate.material.E
     for entry, layer in zip(plate["layers"], before.laminate.layers, strict=True):
         _set_material(entry, layer.material, factor * layer.material.E)
 
@@ -142,22 +135,6 @@ def _set_material(entry: CommentedMap, material: Material, modulus: float) -> No
     entry["material"] = _flow(
         {"name": material.name, "E": text, "rho": material.rho, "nu": material.nu}
     )
-
-
-def _layer_factor(rig: Rig, laminate: Laminate, *, wanted: float) -> float:
-    """Factor on the moduli of all layers for which the equivalent plate has a modulus [Pa]."""
-
-    def excess(factor: float) -> float:
-        layers = tuple(
-            replace(layer, material=replace(layer.material, E=factor * layer.material.E))
-            for layer in laminate.layers
-        )
-        plate = equivalent_plate(
-            replace(laminate, layers=layers), length=rig.plate.length, width=rig.plate.width
-        )
-        return plate.material.E / wanted - 1
-
-    return float(brentq(excess, 0.1, 10.0, xtol=1e-9))
 
 
 def _free_name(masses: CommentedMap) -> str:

@@ -39,10 +39,10 @@ class Rig:
 
     eras: those that are driven. wiring: channel by the name of the ERA; amplifiers: URL by name;
     masses: on the plate, ERAs without an amplifier among them, whose names are supports; laminate:
-    of which the plate is the equivalent, for display; uncertainty: of its parameters; fingertip:
-    load of each finger on the plate, None for weightless ones; threshold: name of the set of
-    detection thresholds (`model.finger.perception`); voltage: of ERAs behind amplifiers of voltage,
-    by name.
+    of which the plate is made, also where its layers are solved as a homogeneous one; uncertainty:
+    of its parameters; fingertip: load of each finger on the plate, None for weightless ones;
+    threshold: name of the set of detection thresholds (`model.finger.perception`); voltage: of ERAs
+    behind amplifiers of voltage, by name.
     """
 
     plate: Plate
@@ -145,10 +145,16 @@ def physics_fingerprint(felt: Physics) -> str:
     """
     numbers = asdict(felt.plate)
     del numbers["material"]["name"]
-    # Plates as their theory has them keep the fingerprint that they had before there were others.
-    for key in ("loss_exponent", "mode_deviations"):
+    # A laminate is its layers; what it is like depends on the frequency.
+    if numbers["laminate"] is not None:
+        del numbers["material"], numbers["thickness"]
+    # Plates without layers or air, and as their theory has them, keep the fingerprint of a rig that
+    # has no such keys.
+    for key in ("laminate", "air_gap", "loss_exponent", "mode_deviations"):
         if not numbers[key]:
             del numbers[key]
+    for layer in numbers.get("laminate", {}).get("layers", ()):
+        del layer["material"]["name"]
     # ERAs without gains have the fingerprint of a rig that has no such key.
     held = [
         {key: value for key, value in asdict(era).items() if key != "gains" or value}

@@ -106,6 +106,18 @@ def _modes(rows: list[tuple[float, float]]) -> list[tuple[float, float]]:
     return rows
 
 
+def _moduli(rows: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
+    for frequency, factor, loss in rows:
+        if not (0 < frequency < 1e5 and 1e-3 <= factor <= 1e3 and 0 <= loss <= 2):
+            raise ValueError(
+                "must be rows of [frequency in Hz, factor of E 0.001 to 1000, loss factor 0 to 2], "
+                f"got [{frequency:g}, {factor:g}, {loss:g}]"
+            )
+    if any(low[0] >= high[0] for low, high in pairwise(rows)):
+        raise ValueError("frequencies must ascend; sort the rows by the first number")
+    return rows
+
+
 def _threshold(name: str) -> str:
     if name not in THRESHOLDS:
         raise ValueError(
@@ -143,6 +155,18 @@ class LayerSection(Section):
 
     material: MaterialOrName
     thickness: Thickness
+    loss_factor: Annotated[float, Quantity(RATIO, at_least=0, at_most=2)] | None = None
+    by_frequency: (
+        Annotated[list[GainRow], Field(min_length=2, max_length=200), AfterValidator(_moduli)]
+        | None
+    ) = None
+
+
+class AirGapSection(Section):
+    """Air between the plate and a rigid wall behind it."""
+
+    depth: Annotated[float, Quantity(LENGTH, at_least=1e-5, at_most=0.1)]
+    closed: bool = False
 
 
 class PlateSection(Section):
@@ -165,7 +189,7 @@ class PlateSection(Section):
     material: MaterialOrName | None = None
     layers: Annotated[list[LayerSection], Field(min_length=1, max_length=20)] | None = None
     bond: Annotated[Bond, Strict(strict=False)] = Bond.FULL
-    bond_frequency: Frequency | None = None
+    air_gap: AirGapSection | None = None
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, below=1)] = 0.01
     loss_exponent: Annotated[float, Quantity(RATIO, at_least=-2, at_most=2)] = 0.0
     modes: Annotated[

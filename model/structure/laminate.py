@@ -1,32 +1,30 @@
-"""A laminate, such as cover glass on adhesive on a panel, and its equivalent homogeneous plate.
+"""A laminate, such as cover glass on adhesive on a panel, layer by layer.
 
-Its rigidity depends on how its layers are joined:
+Every layer bends, stretches and shears by itself; displacements along the plate are continuous
+from layer to layer and linear within each (a layerwise theory of first order: Reddy, Mechanics of
+Laminated Composite Plates and Shells, 2nd ed., ch. 12), the deflection is the same through the
+thickness. Soft adhesives between stiff layers then shear as in the theories of Kerwin (J. Acoust.
+Soc. Am. 31 (1959) 952) and Mead and Markus (J. Sound Vib. 10 (1969) 163), more the shorter the
+wave. With stiff adhesives it becomes classical laminate theory.
 
-- `full`: no slip. Classical laminate theory, stiffness integrals A, B, D over the thickness and
-  D* = D - B A⁻¹ B (Jones, Mechanics of Composite Materials, 2nd ed., ch. 4; the reduction is
-  Ashton's, J. Compos. Mater. 3 (1969) 189). Exact where all layers have the same Poisson's ratio.
-  An upper bound: a soft adhesive shears, so optically clear adhesives make a laminate softer.
-- `none`: layers slide on each other, their own rigidities add up. The lower bound.
-- `shear`: stiff layers joined by adhesives that shear (Ross, Ungar and Kerwin, in Structural
-  Damping, ASME 1959, p. 49; Kerwin, J. Acoust. Soc. Am. 31 (1959) 952). The shorter the wave, the
-  more the adhesive shears, so it is valid at one frequency: the rigidity is that for a straight
-  bending wave of that frequency, which solves D(k) k⁴ = m'' omega².
+Layers may also be laid loosely (`Bond.NONE`): they slide on each other without friction.
 
-Not modelled: edges (free ends let the layers slide more within a few centimetres), the adhesive's
-own damping (give it as the plate's loss factor), change of the adhesive with temperature, waves not
-much longer than the laminate is thick.
+Not modelled: layers that change their thickness, as a foam does under a force at a point; change of
+an adhesive with temperature; air between loose layers.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+
+_MAX_STEPS = 200  # of the iteration for a wavenumber, which takes some twenty
 
 
 class Bond(StrEnum):
@@ -34,20 +32,41 @@ class Bond(StrEnum):
 
     FULL = "full"
     NONE = "none"
-    SHEAR = "shear"
 
 
 @dataclass(frozen=True)
 class Layer:
-    """One layer of a laminate; thickness [m]."""
+    """One layer of a laminate; thickness [m].
+
+    loss_factor: eta of its modulus E (1 + i eta). by_frequency: rows of frequency [Hz], ascending,
+    factor of E and loss factor, which then replaces loss_factor; linear in the logarithms of
+    frequency and factor, constant outside.
+    """
 
     material: Material
     thickness: float
+    loss_factor: float = 0.0
+    by_frequency: tuple[tuple[float, float, float], ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse a thickness that is not above zero."""
         if not (math.isfinite(self.thickness) and self.thickness > 0):
             raise InputError(f"layer: thickness must be above zero, got {self.thickness} m")
+
+    def modulus(self, frequency: float) -> complex:
+        """E (1 + i eta) [Pa] at a frequency [Hz]."""
+        if not self.by_frequency:
+            return self.material.E * (1 + 1j * self.loss_factor)
+        rows = np.array(self.by_frequency)
+        at = math.log(frequency)
+        factor = math.exp(np.interp(at, np.log(rows[:, 0]), np.log(rows[:, 1])))
+        loss = float(np.interp(at, np.log(rows[:, 0]), rows[:, 2]))
+        return self.material.E * factor * (1 + 1j * loss)
+
+    @property
+    def is_elastic(self) -> bool:
+        """Whether its modulus is real and the same at all frequencies."""
+        return not self.by_frequency and not self.loss_factor
 
     @property
     def surface_density(self) -> float:
@@ -55,45 +74,26 @@ class Layer:
         return self.material.rho * self.thickness
 
     @property
-    def extensional_stiffness(self) -> float:
-        """E h / (1 - nu²) [N/m]: of a wide strip pulled lengthwise."""
-        return self.material.E * self.thickness / (1 - self.material.nu**2)
-
-    @property
     def flexural_rigidity(self) -> float:
-        """Flexural rigidity of the layer alone [N m]."""
-        return self.extensional_stiffness * self.thickness**2 / 12
+        """Flexural rigidity of the layer alone [N m], of its modulus E."""
+        return self.material.E * self.thickness**3 / (12 * (1 - self.material.nu**2))
 
 
 @dataclass(frozen=True)
 class Laminate:
-    """Layers from one face to the other.
-
-    bond_frequency [Hz]: with `shear` only, where the rigidity is evaluated.
-    """
+    """Layers from one face to the other."""
 
     layers: tuple[Layer, ...]
     bond: Bond = Bond.FULL
-    bond_frequency: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse layers or a bond_frequency that do not fit the bond."""
+        """Refuse a laminate without layers, and losses of layers that slide."""
         if not self.layers:
             raise InputError("laminate: must have at least one layer")
-        if self.bond is not Bond.SHEAR:
-            if self.bond_frequency is not None:
-                raise InputError("laminate: bond_frequency must be left out unless bond is shear")
-            return
-        if len(self.layers) < 3 or len(self.layers) % 2 == 0:
+        if self.bond is Bond.NONE and not all(layer.is_elastic for layer in self.layers):
             raise InputError(
-                f"laminate: with bond shear layers must be 3, 5, 7, ..., every second one an "
-                f"adhesive, got {len(self.layers)}"
-            )
-        frequency = self.bond_frequency
-        if frequency is None or not (math.isfinite(frequency) and frequency > 0):
-            raise InputError(
-                f"laminate: with bond shear bond_frequency must be above zero, got {frequency}; "
-                "take the middle of the driven range"
+                "laminate: layers must be without loss_factor and by_frequency with bond none; "
+                "give the loss factor of the plate"
             )
 
     @property
@@ -106,6 +106,18 @@ class Laminate:
         """Mass per area of all layers [kg/m²]."""
         return sum(layer.surface_density for layer in self.layers)
 
+    def scaled(self, *, modulus: float = 1.0, thickness: float = 1.0) -> "Laminate":
+        """The laminate with all moduli and all thicknesses times a factor."""
+        layers = (
+            replace(
+                layer,
+                material=replace(layer.material, E=modulus * layer.material.E),
+                thickness=thickness * layer.thickness,
+            )
+            for layer in self.layers
+        )
+        return replace(self, layers=tuple(layers))
+
 
 @dataclass(frozen=True)
 class Bending:
@@ -115,11 +127,85 @@ class Bending:
     nu: float
 
 
+@dataclass(frozen=True, eq=False)
+class Section:
+    """Stiffness per area of n layers in the displacements u along the plate at n + 1 interfaces.
+
+    stretch, across, twist (n + 1, n + 1) [N/m]: of u_x,x u_x,x, of u_x,x u_y,y, and of
+    (u_x,y + u_y,x)²; slip (n + 1, n + 1) [N/m³]: of u u; lever (n + 1,) [N/m²] and shear [N/m]: of
+    u w,x and of (w,x)². Linear in the moduli, complex with losses.
+    """
+
+    stretch: ComplexArray
+    across: ComplexArray
+    twist: ComplexArray
+    slip: ComplexArray
+    lever: ComplexArray
+    shear: complex
+
+
+def section_of(
+    layers: Sequence[Layer], moduli: Sequence[complex], corrections: FloatArray
+) -> Section:
+    """Section of layers with these Young's moduli [Pa]; corrections: of `shear_corrections`."""
+    size = len(layers) + 1
+    stretch, across, twist, slip = (np.zeros((size, size), dtype=complex) for _ in range(4))
+    lever = np.zeros(size, dtype=complex)
+    shear = 0j
+    ends = np.array([-1.0, 1.0])
+    for number, (layer, modulus, kappa) in enumerate(zip(layers, moduli, corrections, strict=True)):
+        nu, h = layer.material.nu, layer.thickness
+        own = slice(number, number + 2)
+        linear = h / 6 * np.array([[2.0, 1.0], [1.0, 2.0]])
+        plane, G = modulus / (1 - nu**2), modulus / (2 * (1 + nu))
+        stretch[own, own] += plane * linear
+        across[own, own] += nu * plane * linear
+        twist[own, own] += G * linear
+        slip[own, own] += kappa * G / h * np.outer(ends, ends)
+        lever[own] += kappa * G * ends
+        shear += kappa * G * h
+    return Section(stretch, across, twist, slip, lever, shear)
+
+
+def interface_mass(layers: Sequence[Layer]) -> FloatArray:
+    """Mass per area [kg/m²] of displacements along the plate at the interfaces, (n + 1, n + 1)."""
+    mass = np.zeros((len(layers) + 1, len(layers) + 1))
+    for number, layer in enumerate(layers):
+        mass[number : number + 2, number : number + 2] += (
+            layer.surface_density / 6 * np.array([[2.0, 1.0], [1.0, 2.0]])
+        )
+    return mass
+
+
+def shear_corrections(layers: Sequence[Layer]) -> FloatArray:
+    """Shear correction factor of each layer (n,): 5/6 of a single one, 1 of a soft core.
+
+    (∫ tau)² / (h ∫ tau²) over the layer, tau the shear stress that balances the bending stress of
+    layers without slip: exact wherever shear matters, in soft layers between stiff ones.
+    """
+    factors = np.empty(len(layers))
+    plane = np.array([layer.material.E / (1 - layer.material.nu**2) for layer in layers])
+    thickness = np.array([layer.thickness for layer in layers])
+    centres = _centres(layers)
+    neutral = plane * thickness @ centres / (plane @ thickness)
+    bottoms = centres - thickness / 2 - neutral
+    stress = 0.0  # tau at the bottom of the layer; tau' = -E (z - neutral)
+    t, weights = np.polynomial.legendre.leggauss(4)
+    for number, (E, h, bottom) in enumerate(zip(plane, thickness, bottoms, strict=True)):
+        z = bottom + h * (1 + t) / 2
+        tau = stress - E * (z**2 - bottom**2) / 2
+        factors[number] = (weights @ tau) ** 2 / (2 * (weights @ tau**2))
+        top = bottom + h
+        stress -= E * (top**2 - bottom**2) / 2
+    return factors
+
+
 def perfectly_bonded(layers: Sequence[Layer]) -> Bending:
     """Layers without slip: D* = D - B A⁻¹ B of classical laminate theory.
 
-    For isotropic layers A, B and D share their eigenvectors, so the matrices fall apart into equal
-    bending both ways, modulus E / (1 - nu), and opposite bending, E / (1 + nu).
+    Jones, Mechanics of Composite Materials, 2nd ed., ch. 4; the reduction is Ashton's, J. Compos.
+    Mater. 3 (1969) 189. For isotropic layers A, B and D share their eigenvectors, so the matrices
+    fall apart into equal bending both ways, modulus E / (1 - nu), and opposite, E / (1 + nu).
     """
     centres = _centres(layers)
 
@@ -144,99 +230,38 @@ def freely_sliding(layers: Sequence[Layer]) -> Bending:
     return Bending(rigidity, coupling / rigidity)
 
 
-def bonded_share(laminate: Laminate) -> float:
-    """Fraction of the rigidity added by perfect bonding that the bond provides: 1 full, 0 none.
+def wave_rigidity(laminate: Laminate, wavenumber: complex, frequency: float) -> complex:
+    """D(k) [N m] of a straight wave of w = cos(k x), k [1/m], with the moduli at a frequency [Hz].
 
-    With shear it follows from the adhesives' shear and the stiff layers' extension in a wave of
-    bond_frequency; for three layers it is Kerwin's g / (1 + g), g = G / (h k²) (1/A1 + 1/A3).
+    The displacements at the interfaces take the least energy: k⁴ D = k² shear - k² lever (k²
+    stretch + slip)⁻¹ lever.
     """
-    if laminate.bond is Bond.SHEAR and laminate.bond_frequency is not None:
-        return _share_in_shear(laminate.layers, laminate.bond_frequency)
-    return 0.0 if laminate.bond is Bond.NONE else 1.0
+    layers, k2 = laminate.layers, wavenumber**2
+    if laminate.bond is Bond.NONE:
+        return freely_sliding(layers).rigidity + 0j
+    moduli = [layer.modulus(frequency) for layer in layers]
+    section = section_of(layers, moduli, shear_corrections(layers))
+    moved = np.linalg.solve(k2 * section.stretch + section.slip, section.lever)
+    return complex((section.shear - section.lever @ moved) / k2)
 
 
-def bending(laminate: Laminate) -> Bending:
-    """Rigidity and Poisson's ratio of a laminate by its bond, between the two bounds."""
-    share = bonded_share(laminate)
-    bonded, sliding = perfectly_bonded(laminate.layers), freely_sliding(laminate.layers)
-    rigidity = share * bonded.rigidity + (1 - share) * sliding.rigidity
-    coupling = share * bonded.nu * bonded.rigidity + (1 - share) * sliding.nu * sliding.rigidity
-    return Bending(rigidity, coupling / rigidity)
+def wavenumber_of(laminate: Laminate, frequency: float) -> complex:
+    """k [1/m] of the free bending wave of a frequency [Hz], D(k) k⁴ = m'' omega².
 
-
-def equivalent_plate(
-    laminate: Laminate, *, length: float, width: float, loss_factor: float = 0.01
-) -> Plate:
-    """The homogeneous plate with the laminate's rigidity, Poisson's ratio and surface density.
-
-    length, width [m]. Its thickness gives it the laminate's rotary inertia too: that is the
-    laminate's own thickness where its layers are of one material and bonded, one layer's where
-    equal layers slide. Its shear stiffness, right in these two cases, is otherwise only what
-    follows; for bending waves far longer than the thickness neither matters.
+    Rotary inertia is left out. Complex with losses: a wave exp(-i k x) then decays, k has a
+    negative imaginary part.
     """
-    bent = bending(laminate)
-    density = laminate.surface_density
-    thickness = math.sqrt(12 * _rotary_inertia(laminate) / density)
-    return Plate(
-        length=length,
-        width=width,
-        thickness=_rounded(thickness),
-        material=Material(
-            "laminate",
-            E=_rounded(12 * bent.rigidity * (1 - bent.nu**2) / thickness**3),
-            rho=_rounded(density / thickness),
-            nu=_rounded(bent.nu),
-        ),
-        loss_factor=loss_factor,
-    )
+    inertia = laminate.surface_density * (2 * math.pi * frequency) ** 2
+    better = complex((inertia / freely_sliding(laminate.layers).rigidity) ** 0.25)
+    for _ in range(_MAX_STEPS):
+        k = better
+        better = (inertia / wave_rigidity(laminate, k, frequency)) ** 0.25
+        if abs(better - k) < 1e-12 * abs(k):
+            break
+    return better
 
 
 def _centres(layers: Sequence[Layer]) -> FloatArray:
     """Heights of the layers' middles above the first face [m]."""
     thickness = np.array([layer.thickness for layer in layers])
     return np.asarray(np.cumsum(thickness) - thickness / 2)
-
-
-def _share_in_shear(layers: Sequence[Layer], frequency: float) -> float:
-    """The share for stiff layers and, every second one, adhesives, at a frequency [Hz].
-
-    Under w = sin(k x) the stiff layers' in-plane movements take the least energy of extension and
-    adhesive shear together; what they add to the rigidity is arms . (slip + k² shear)⁻¹ . arms.
-    """
-    from scipy.optimize import brentq  # a fifth of a second that other rigs need not wait for
-
-    stiff, adhesives = layers[0::2], layers[1::2]
-    arms = np.diff(_centres(layers)[0::2])
-    neighbours = np.diff(np.eye(len(stiff)), axis=0)
-    compliance = np.diag([1 / layer.extensional_stiffness for layer in stiff])
-    slip = neighbours @ compliance @ neighbours.T
-    shear = np.diag([layer.thickness / layer.material.shear_modulus for layer in adhesives])
-    rigid = arms @ np.linalg.solve(slip, arms)
-
-    def share(wavenumber: float) -> float:
-        return float(arms @ np.linalg.solve(slip + wavenumber**2 * shear, arms) / rigid)
-
-    loose = freely_sliding(layers).rigidity
-    gain = perfectly_bonded(layers).rigidity - loose
-    inertia = sum(layer.surface_density for layer in layers) * (2 * math.pi * frequency) ** 2
-
-    def excess(wavenumber: float) -> float:
-        return (loose + share(wavenumber) * gain) * wavenumber**4 / inertia - 1
-
-    low, high = ((inertia / rigidity) ** 0.25 for rigidity in (loose + gain, loose))
-    return share(float(brentq(excess, 0.999 * low, 1.001 * high)))
-
-
-def _rotary_inertia(laminate: Laminate) -> float:
-    """Mass moment per area [kg]: each layer about its own middle, and what moves it lengthwise."""
-    densities = np.array([layer.surface_density for layer in laminate.layers])
-    thickness = np.array([layer.thickness for layer in laminate.layers])
-    stiffness = np.array([layer.extensional_stiffness for layer in laminate.layers])
-    centres = _centres(laminate.layers)
-    off_neutral = bonded_share(laminate) * (centres - stiffness @ centres / stiffness.sum())
-    return float(densities @ (thickness**2 / 12 + off_neutral**2))
-
-
-def _rounded(value: float) -> float:
-    """Round to twelve digits, so that the same plate has the same fingerprint."""
-    return float(f"{value:.12g}")

@@ -42,22 +42,26 @@ def check_of_theory(plate: Plate) -> None:
 
 @dataclass(frozen=True, eq=False)
 class ModalElasticity:
-    """Eigenvalues omega² (r,) [rad²/s²] of a plate, and loss factors (r,) relative to its own."""
+    """Eigenvalues omega² (r,) [rad²/s²] of a plate, and loss factors (r,) relative to its own.
+
+    losses (r,) [rad²/s²]: what modes lose beside those, in soft layers and air.
+    """
 
     plate: Plate
     eigenvalues: FloatArray
     relative_loss: FloatArray
+    losses: FloatArray
 
     @classmethod
-    def of(cls, plate: Plate, eigenvalues: FloatArray) -> Self:
-        """Those of a plate whose theory has eigenvalues (r,), all of its lowest among them."""
+    def of(cls, plate: Plate, eigenvalues: FloatArray, losses: FloatArray) -> Self:
+        """Those of a plate whose theory has these (r,), all of its lowest among them."""
         deviations = np.array(plate.mode_deviations, dtype=float).reshape(-1, 2)
         if not len(deviations):
-            return cls(plate, eigenvalues, np.ones(len(eigenvalues)))
+            return cls(plate, eigenvalues, np.ones(len(eigenvalues)), losses)
         factors = np.ones((2, len(eigenvalues)))
         modes = lowest_elastic(eigenvalues, len(deviations))
         factors[:, modes] = np.exp(deviations[: len(modes)].T)
-        return cls(plate, eigenvalues * factors[0], factors[1])
+        return cls(plate, eigenvalues * factors[0], factors[1], losses * factors.prod(axis=0))
 
     def loss_ratios(self, omega: FloatArray) -> FloatArray:
         """Loss factor of each mode at omega (f,) [rad/s] over the plate's, (f, r)."""
@@ -68,8 +72,12 @@ class ModalElasticity:
         return np.asarray(self.plate.loss_factor * self.loss_ratios(omega))
 
     def stiffness(self, omega: FloatArray) -> ComplexArray:
-        """Complex stiffness (1 + i eta) lambda of each mode at omega (f,), (f, r) [rad²/s²]."""
-        return np.asarray((1 + 1j * self.loss_factors(omega)) * self.eigenvalues)
+        """Complex stiffness (1 + i eta) lambda of each mode at omega (f,), (f, r) [rad²/s²].
+
+        With i times its further losses.
+        """
+        lossy = (1 + 1j * self.loss_factors(omega)) * self.eigenvalues
+        return np.asarray(lossy + 1j * self.losses)
 
 
 def _powers(plate: Plate, omega: FloatArray) -> FloatArray:

@@ -1,39 +1,12 @@
 """The touch plate: its material, dimensions and closed-form properties."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from model.errors import InputError
-
-
-@dataclass(frozen=True)
-class Material:
-    """An isotropic, linear material.
-
-    E: Young's modulus [Pa]; rho: density [kg/m³]; nu: Poisson's ratio.
-    """
-
-    name: str
-    E: float
-    rho: float
-    nu: float
-
-    def __post_init__(self) -> None:
-        """Refuse values of no isotropic solid."""
-        for key, value in (("E", self.E), ("rho", self.rho)):
-            if not (math.isfinite(value) and value > 0):
-                raise InputError(f"material {self.name}: {key} must be above zero, got {value}")
-        if not -1 < self.nu < 0.5:
-            raise InputError(
-                f"material {self.name}: nu must be between -1 and 0.5, got {self.nu} (most solids: "
-                "0.2 to 0.45)"
-            )
-
-    @property
-    def shear_modulus(self) -> float:
-        """G = E / 2 (1 + nu) [Pa]."""
-        return self.E / (2 * (1 + self.nu))
-
+from model.structure.air_gap import AirGap
+from model.structure.laminate import Laminate
+from model.structure.material import Material
 
 LOSS_FREQUENCY = 150.0
 """Frequency [Hz] at which a plate has its loss factor, where that varies."""
@@ -58,6 +31,8 @@ class Plate:
     loss_factor: float = 0.01
     loss_exponent: float = 0.0
     mode_deviations: tuple[tuple[float, float], ...] = ()
+    laminate: Laminate | None = None
+    air_gap: AirGap | None = None
 
     def __post_init__(self) -> None:
         """Refuse dimensions out of range."""
@@ -81,6 +56,21 @@ class Plate:
                 "plate: logarithms of mode_deviations must be up to 0.5 of an eigenvalue and 5 of "
                 f"a loss factor, got {deviations}"
             )
+
+    @property
+    def is_layered(self) -> bool:
+        """Whether it is solved by layers and with the air behind it, in polynomials only."""
+        return self.laminate is not None or self.air_gap is not None
+
+    def scaled(self, *, modulus: float = 1.0, thickness: float = 1.0) -> "Plate":
+        """The plate with its moduli and thickness, those of every layer, times a factor."""
+        laminate = self.laminate
+        return replace(
+            self,
+            material=replace(self.material, E=modulus * self.material.E),
+            thickness=thickness * self.thickness,
+            laminate=laminate and laminate.scaled(modulus=modulus, thickness=thickness),
+        )
 
     @property
     def mass(self) -> float:

@@ -120,9 +120,10 @@ def _response(
     )
     shapes = np.vstack([table.attachment_shapes, discs[:, 0]])
     scale = plates.thickness[:, None]
-    elasticity = ModalElasticity.of(table.plate, table.omega**2)
-    loss = 1 + 1j * plates.loss[:, None] * elasticity.loss_factors(np.array([omega]))
-    modal = 1 / ((loss * elasticity.eigenvalues * scale**2 - omega**2) * scale)
+    elasticity = ModalElasticity.of(table.plate, table.omega**2, table.losses)
+    stiffness_of_modes = elasticity.stiffness(np.array([omega]))
+    lost = 1j * plates.loss[:, None] * stiffness_of_modes.imag
+    modal = 1 / (((stiffness_of_modes.real + lost) * scale**2 - omega**2) * scale)
     receptance = np.asarray((modal[:, None, :] * shapes) @ shapes.T, dtype=complex)
     applied = np.zeros((*stiffness.shape, 1), dtype=complex)
     gains = np.array([complex(era.gain(np.array(frequency))) for era in table.eras])

@@ -34,7 +34,7 @@ FORMAT = "era-haptics localization table"
 ZIP = b"PK\x03\x04"
 """Magic number of .npz files."""
 
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 
 # A table of the paper's plate has 0.3 MB.
 MAX_BYTES = 2 << 30
@@ -43,6 +43,7 @@ _DTYPES = {
     "header": "|u1",
     "frequencies": "<f8",
     "omega": "<f8",
+    "losses": "<f8",
     "attachment_shapes": "<f8",
     "shapes": "<f4",
 }
@@ -212,6 +213,7 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
         "frequencies": (count,),
         "discretisation_error": (count,),
         "omega": (coordinates,),
+        "losses": (coordinates,),
         "attachment_shapes": (era_count + len(table.masses), coordinates),
         "shapes": (table.raster.point_count, coordinates),
     }

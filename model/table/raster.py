@@ -160,6 +160,7 @@ class ReducedOnRaster:
 
     plate: Plate
     omega: FloatArray
+    losses: FloatArray
     raster: Raster
     shapes: NDArray[np.float32]
 

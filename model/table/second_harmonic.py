@@ -131,6 +131,7 @@ def _amplitudes(
     plate = attach(
         table.plate,
         table.omega,
+        table.losses,
         table.attachment_shapes,
         eras=table.eras,
         masses=table.masses,

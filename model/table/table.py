@@ -77,6 +77,7 @@ class LocalizationTable:
     - drive_mode: default of a question
     - frequencies: (f,) [Hz]
     - omega: (r,) [rad/s], of the reduced free plate (`model.reduction.reduced_plate`)
+    - losses: (r,) [rad²/s²], of it beside those of the plate's loss factor
     - attachment_shapes: (eras + masses, r) [1/sqrt(kg)], its shapes at ERAs and masses
     - shapes: (points, r) [1/sqrt(kg)], its shapes on the raster
     - discretisation_error: (f,), estimated relative L2 error of the fields over the raster
@@ -96,6 +97,7 @@ class LocalizationTable:
     code_version: str
     frequencies: FloatArray
     omega: FloatArray
+    losses: FloatArray
     attachment_shapes: FloatArray
     shapes: NDArray[np.float32]
     reference_mesh: PlateMesh
@@ -269,7 +271,7 @@ class LocalizationTable:
         fingers = fingertip_loads(self.fingertip, contacts, loads)
         shapes = self.shapes_at(contacts if fingers else ())
         return plate_in_time(
-            ReducedOnRaster(self.plate, self.omega, self.raster, self.shapes),
+            ReducedOnRaster(self.plate, self.omega, self.losses, self.raster, self.shapes),
             self.eras,
             loads=self.masses,
             contacts=fingers,
@@ -310,6 +312,7 @@ class LocalizationTable:
         return attach(
             self.plate,
             self.omega,
+            self.losses,
             self.attachment_shapes,
             eras=self.eras,
             masses=self.masses,

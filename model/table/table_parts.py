@@ -112,6 +112,7 @@ def _modes(problem: TableProblem, part: Part) -> Arrays:
     reduced = reduce_plate(rig.plate, rig.mesh, attached, frequency_max=highest)
     return {
         "omega": reduced.omega,
+        "losses": reduced.losses,
         "attachment_shapes": reduced.at(attached),
         "shapes": reduced.at(problem.raster.points).astype(np.float32),
     }
@@ -138,7 +139,7 @@ PARTS: dict[str, Callable[[TableProblem, Part], Arrays]] = {
 
 PART_TYPES: dict[str, dict[str, str]] = {
     "discretisation": {"discretisation_error": "<f8"},
-    "modes": {"omega": "<f8", "attachment_shapes": "<f8", "shapes": "<f4"},
+    "modes": {"omega": "<f8", "losses": "<f8", "attachment_shapes": "<f8", "shapes": "<f4"},
 }
 """Arrays of each kind of part, with their types."""
 

@@ -68,7 +68,7 @@ class Convergence:
     MOVED nearer to the middle, and where it stands on a disc FOOT wider in radius.
     """
 
-    reference: Mesh
+    reference: PlateMesh
     frequencies: FloatArray
     natural_frequencies: FloatArray
     errors: tuple[MeshError, ...]
@@ -77,14 +77,21 @@ class Convergence:
 
 
 def meshes_to_compare(rig: Rig) -> tuple[PlateMesh, ...]:
-    """List four MITC4 meshes, `mesh: auto`, one of Q5 with strips, and the rig's own."""
+    """List four MITC4 meshes, `mesh: auto`, one of Q5 with strips, and the rig's own.
+
+    For a plate of layers or with air behind it, which are solved in polynomials only, three degrees
+    in place of meshes of elements.
+    """
     plate, high = rig.plate, rig.limits.frequency_max
-    size = plate.bending_wavelength(high) / _COARSEST_PER_WAVELENGTH
-    nx, ny = (max(1, math.ceil(side / size)) for side in (plate.length, plate.width))
-    plain = [Mesh(nx << n, ny << n, plate.length, plate.width) for n in range(_DOUBLINGS + 1)]
     stiffness = max(era.stiffness for era in rig.eras)
     foot = min(era.foot for era in rig.eras)
     automatic = mesh_of("auto", plate, frequency_max=high, stiffness=stiffness, foot=foot)
+    if plate.is_layered and isinstance(automatic, SpectralMesh):
+        lowest = automatic.resolving(plate, high)
+        return tuple(dict.fromkeys([lowest, automatic, automatic.finer(), rig.mesh]))
+    size = plate.bending_wavelength(high) / _COARSEST_PER_WAVELENGTH
+    nx, ny = (max(1, math.ceil(side / size)) for side in (plate.length, plate.width))
+    plain = [Mesh(nx << n, ny << n, plate.length, plate.width) for n in range(_DOUBLINGS + 1)]
     chosen = [*plain, automatic, Mesh.accurate(plate, frequency_max=high), rig.mesh]
     return tuple(dict.fromkeys(chosen))
 
@@ -115,7 +122,7 @@ def study_convergence(
             f"frequencies must be at most the rig's limits.frequency of {high:g} Hz, got "
             f"{checked.max():g} Hz; take lower frequencies or raise the limit"
         )
-    reference = reference_mesh(rig.plate, frequency_max=high)
+    reference = _reference(rig)
     exact = _natural_frequencies(rig, reference)
     supported = exact > _MIN_FREQUENCY_RATIO * rig.plate.lowest_bending_frequency
     (exact_response,) = _responses(rig, _solved(rig, reference), rig.eras, frequencies=checked)
@@ -163,13 +170,24 @@ def _nearer_the_middle(era: Era, plate: Plate) -> Era:
 
 def _changes(rig: Rig, *layouts: Sequence[Era], frequencies: FloatArray) -> tuple[FloatArray, ...]:
     """Change of the response by other ERAs, relative L2, the worst driven ERA, (f,) for each."""
-    mesh = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)
+    mesh: PlateMesh = rig.mesh
+    if not rig.plate.is_layered:
+        mesh = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)
     free = _solved(rig, mesh)
     before, *others = _responses(rig, free, rig.eras, *layouts, frequencies=frequencies)
     size = np.linalg.norm(before, axis=2)
     return tuple(
         np.asarray((np.linalg.norm(after - before, axis=2) / size).max(axis=1)) for after in others
     )
+
+
+def _reference(rig: Rig) -> PlateMesh:
+    """The mesh that others are compared with: of elements, or of polynomials for layers."""
+    high = rig.limits.frequency_max
+    if not rig.plate.is_layered:
+        return reference_mesh(rig.plate, frequency_max=high)
+    automatic = mesh_of("auto", rig.plate, frequency_max=high)
+    return replace(automatic, nx=2 * automatic.nx, ny=2 * automatic.ny)  # type: ignore[type-var]
 
 
 def _natural_frequencies(rig: Rig, mesh: PlateMesh) -> FloatArray:

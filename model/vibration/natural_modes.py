@@ -39,12 +39,17 @@ def natural_modes(
 
     support: free (elastic modes only), eras or simply-supported, for which polynomials over the
     plate give way to finite elements. Raises InputError for a count below 1 or above what the mesh
-    has.
+    has, and for a simply supported plate of layers.
     """
     chosen = rig.mesh if mesh is None else mesh
     if isinstance(chosen, SpectralMesh):
         if support != "simply-supported":
             return _on_polynomials(rig, count, support=support, mesh=chosen)
+        if rig.plate.is_layered:
+            raise InputError(
+                "support must be free or eras for a plate of layers or with an air gap, got "
+                f"{support}: finite elements of it are not solved"
+            )
         chosen = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)
     if not isinstance(chosen, Mesh):
         raise TypeError(f"mesh must be a Mesh or SpectralMesh, got {type(chosen).__name__}")
@@ -86,7 +91,7 @@ def _on_polynomials(rig: Rig, count: int, *, support: str, mesh: SpectralMesh) -
 def _modes_with(reduced: ReducedPlate, attached: list[PointLoad]) -> tuple[FloatArray, FloatArray]:
     """Frequencies [Hz] (r,) and coordinates (r, r) of the undamped plate with attachments."""
     phi = reduced.at(footprints_of(attached)).T
-    elastic = ModalElasticity.of(reduced.plate, reduced.omega**2).eigenvalues
+    elastic = ModalElasticity.of(reduced.plate, reduced.omega**2, reduced.losses).eigenvalues
     K = np.diag(elastic) + (phi * [load.stiffness for load in attached]) @ phi.T
     M = np.eye(len(K)) + (phi * [load.mass for load in attached]) @ phi.T
     squares, coordinates = linalg.eigh(K, M)

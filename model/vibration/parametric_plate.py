@@ -57,11 +57,13 @@ class FreeReceptances:
 class ParametricPlate:
     """The reduced plate of a rig at its ERAs and loads (h, r) and at points (p, r).
 
-    plate: that was solved; eigenvalues: omega² of its modes (r,) [rad²/s²]; omega (f,) [rad/s].
+    plate: that was solved; eigenvalues: omega² of its modes and losses, (r,) [rad²/s²]; omega (f,)
+    [rad/s].
     """
 
     plate: Plate
     eigenvalues: FloatArray
+    losses: FloatArray
     attachment_shapes: FloatArray
     shapes: FloatArray
     omega: FloatArray
@@ -91,9 +93,10 @@ class ParametricPlate:
         """Receptances of the free plate for values (...), by default with its own thickness [m]."""
         thicker = np.asarray(1.0 if thickness is None else thickness / self.plate.thickness)
         stiffer = np.asarray(modulus) / self.plate.material.E * thicker**3
-        elasticity = ModalElasticity.of(self.plate, self.eigenvalues)
+        elasticity = ModalElasticity.of(self.plate, self.eigenvalues, self.losses)
         loss = np.asarray(loss_factor)[..., None, None] * elasticity.loss_ratios(self.omega)
-        elastic = (1 + 1j * loss) * np.asarray(stiffer)[..., None, None] * elasticity.eigenvalues
+        complex_eigenvalues = (1 + 1j * loss) * elasticity.eigenvalues + 1j * elasticity.losses
+        elastic = np.asarray(stiffer)[..., None, None] * complex_eigenvalues
         inertia = thicker[..., None, None] * (self.omega**2)[:, None]
         modal = np.asarray(1 / (elastic - inertia))
         # Real products of both parts: the shapes are real.
@@ -131,6 +134,7 @@ def parametric_plate(rig: Rig, points: FloatArray, frequencies: FloatArray) -> P
     return ParametricPlate(
         rig.plate,
         reduced.omega**2,
+        reduced.losses,
         reduced.at(attached),
         reduced.at(points),
         2 * np.pi * frequencies,

@@ -75,8 +75,7 @@ class PlateErrors:
             )
 
         plate = replace(
-            rig.plate,
-            thickness=self.thickness * rig.plate.thickness,
+            rig.plate.scaled(thickness=self.thickness),
             loss_factor=min(self.loss_factor * rig.plate.loss_factor, _MAX_LOSS_FACTOR),
         )
         return replace(rig, plate=plate, eras=tuple(map(of, rig.eras)), mesh=self.mesh or rig.mesh)

@@ -23,7 +23,8 @@ from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+from model.structure.plate import Plate
 from model.table.pattern import Pattern
 from model.transients.envelope import BaseEnvelope
 from model.vibration.excitation import Tone

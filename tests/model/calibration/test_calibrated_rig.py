@@ -59,10 +59,13 @@ eras:
 amplifiers: {m: {url: "sim://"}}
 """
 
+BONDED = BLOCK.replace("bond: none", "bond: full").replace("12x9", "auto")
+
 
 def calibration(rig: Rig) -> Calibration:
     """Other values everywhere, gains for all but the last ERA."""
-    material = replace(rig.plate.material, E=1.2345678 * rig.plate.material.E)
+    plate = replace(rig.plate.scaled(modulus=1.2345678), loss_factor=0.0234)
+    laminate = rig.laminate and rig.laminate.scaled(modulus=1.2345678)
     eras = tuple(
         replace(
             era,
@@ -73,7 +76,7 @@ def calibration(rig: Rig) -> Calibration:
         )
         for number, era in enumerate(rig.eras)
     )
-    new = replace(rig, plate=replace(rig.plate, material=material, loss_factor=0.0234), eras=eras)
+    new = replace(rig, plate=plate, laminate=laminate, eras=eras)
     none = np.zeros((0, 3, 0), dtype=complex)
     return Calibration(
         rig=new,
@@ -94,7 +97,7 @@ def calibration(rig: Rig) -> Calibration:
     )
 
 
-@pytest.mark.parametrize("text", [FLOW, BLOCK], ids=["flow", "block"])
+@pytest.mark.parametrize("text", [FLOW, BLOCK, BONDED], ids=["flow", "block", "bonded"])
 def test_calibrated_text_keeps_comments_and_reads_back(tmp_path: Path, text: str) -> None:
     """Every value is read back, and every comment is kept."""
     path = tmp_path / "rig.yaml"
@@ -109,7 +112,11 @@ def test_calibrated_text_keeps_comments_and_reads_back(tmp_path: Path, text: str
     path.write_text(written, encoding="utf-8")
     back = load_rig(path)
     check_reads_back(back, found, path)
-    assert pytest.approx(found.rig.plate.material.E, rel=1e-6) == back.plate.material.E
+    if back.plate.laminate is None:
+        assert pytest.approx(found.rig.plate.material.E, rel=1e-6) == back.plate.material.E
+    else:
+        moduli = [layer.material.E for layer in back.plate.laminate.layers]
+        assert moduli == pytest.approx([1.2345678 * 70e9, 1.2345678 * 60e9], rel=1e-6)
     assert back.plate.loss_factor == 0.0234
     for era, wanted in zip(back.eras, found.rig.eras, strict=True):
         assert era.stiffness == pytest.approx(wanted.stiffness, rel=1e-5)

@@ -34,6 +34,7 @@ def solved(uncertainty, loads=()):
     plate = attach(
         RIG.plate,
         reduced.omega,
+        reduced.losses,
         reduced.at(fixed),
         eras=RIG.eras,
         masses=RIG.masses,
@@ -175,6 +176,7 @@ def test_without_errors_the_best_contrast_does_not_depend_on_the_mounts():
         plate = attach(
             RIG.plate,
             reduced.omega,
+            reduced.losses,
             reduced.at(footprints_of(eras)),
             eras=eras,
             masses=(),

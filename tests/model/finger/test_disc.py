@@ -8,7 +8,8 @@ from scipy.integrate import dblquad
 
 from model.finger.disc import FINE_POINTS, FIVE_POINTS, DiscRule
 from model.finger.fingertip import FINGERTIP_RADIUS, fingertips_on
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+from model.structure.plate import Plate
 
 PLATE = Plate(0.3, 0.2, 0.0015, Material("any", E=70e9, rho=2700.0, nu=0.33))
 

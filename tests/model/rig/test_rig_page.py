@@ -12,6 +12,7 @@ from model.cli import app
 from model.config.units import quantity
 from model.rig.file import load_rig
 from model.rig.sections import (
+    AirGapSection,
     AmplifierSection,
     EraSection,
     FingertipSection,
@@ -32,6 +33,7 @@ SECTIONS = {
     "The file": RigSection,
     "plate": PlateSection,
     "layers": LayerSection,
+    "air_gap": AirGapSection,
     "material": MaterialSection,
     "eras": EraSection,
     "voltage": VoltageSection,
@@ -105,5 +107,5 @@ def test_page_quotes_the_output_for_the_glass_panel():
     """Every quoted line is in the output of the command that the page names."""
     result = CliRunner().invoke(app, ["plate", "show", str(ROOT / "examples" / "glass_panel.yaml")])
     quoted = PAGE[PAGE.index("    laminate of 2.7 mm") :].split("\n\n")[0].splitlines()
-    assert len(quoted) == 6
+    assert len(quoted) == 8
     assert {line.removeprefix("    ") for line in quoted} <= set(result.stdout.splitlines())

@@ -20,7 +20,8 @@ from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
 from model.spectral.stiffness import class_stiffness
 from model.structure.actuator import Era
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, footprints_of
 from model.vibration.natural_modes import natural_modes
 from paper_plate import make_paper_rig

@@ -1,26 +1,27 @@
-"""Laminates: bounds by hand, shear between them against elasticity solved through the thickness."""
+"""Laminates: bounds by hand, waves against elasticity and published sandwich plates."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import linalg
 
+from benchmarks.layers.elasticity import wave_number
 from model.errors import InputError
-from model.fem.assembly import assemble
-from model.fem.modal import modes
 from model.rig.file import load_rig
+from model.structure.equivalent import bending, equivalent_plate
 from model.structure.laminate import (
     Bond,
     Laminate,
     Layer,
-    bending,
-    equivalent_plate,
     freely_sliding,
     perfectly_bonded,
+    shear_corrections,
+    wave_rigidity,
+    wavenumber_of,
 )
-from model.structure.plate import Material
+from model.structure.material import Material
 
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
 ALUMINIUM = Material("aluminium", E=70e9, rho=2700.0, nu=0.33)
@@ -32,45 +33,7 @@ PANEL = (Layer(GLASS, 1.8e-3), Layer(ADHESIVE, 0.2e-3), Layer(GLASS, 0.7e-3))
 
 def of_plate(laminate, **changes):
     """The equivalent plate of some size."""
-    return equivalent_plate(laminate, length=0.4, width=0.25, **changes)
-
-
-def wave_rigidity(layers, frequency):
-    """D = m'' omega² / k⁴ of the bending wave of a frequency [Hz], by plane-strain elasticity.
-
-    Elements of the second order through the thickness, exp(i k x) along it; nothing of a plate is
-    assumed. Displacements u (imaginary part, along x) and w per node.
-    """
-    gauss = [(-math.sqrt(0.6), 5 / 9), (0.0, 8 / 9), (math.sqrt(0.6), 5 / 9)]
-    density = sum(layer.material.rho * layer.thickness for layer in layers)
-    pieces = [(layer.material, layer.thickness / 4) for layer in layers for _ in range(4)]
-
-    def lowest(k):
-        size = 2 * (2 * len(pieces) + 1)
-        K, M = np.zeros((size, size)), np.zeros((size, size))
-        for number, (material, h) in enumerate(pieces):
-            nu, factor = material.nu, material.E / ((1 + material.nu) * (1 - 2 * material.nu))
-            C = factor * np.array([[1 - nu, nu, 0], [nu, 1 - nu, 0], [0, 0, (1 - 2 * nu) / 2]])
-            dofs = slice(4 * number, 4 * number + 6)
-            for xi, weight in gauss:
-                N = np.array([xi * (xi - 1) / 2, 1 - xi**2, xi * (xi + 1) / 2])
-                dN = np.array([xi - 0.5, -2 * xi, xi + 0.5]) * 2 / h
-                B = np.zeros((3, 6))  # u = i U exp(ikx): strains -kU, dw/dz, i (dU/dz + k w)
-                B[0, 0::2] = -k * N
-                B[1, 1::2] = dN
-                B[2, 0::2] = dN
-                B[2, 1::2] = k * N
-                fields = np.kron(N, np.eye(2))
-                K[dofs, dofs] += weight * h / 2 * B.T @ C @ B
-                M[dofs, dofs] += weight * h / 2 * material.rho * fields.T @ fields
-        return linalg.eigh(K, M, eigvals_only=True, subset_by_index=[0, 0])[0]
-
-    target = (2 * math.pi * frequency) ** 2
-    low, high = 1.0, 500.0
-    for _ in range(60):
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if lowest(middle) < target else (low, middle)
-    return density * target / low**4
+    return equivalent_plate(laminate, length=0.4, width=0.25, frequency=150.0, **changes)
 
 
 def test_bonded_layers_equal_laminate_theory():
@@ -97,81 +60,128 @@ def test_bonded_layers_equal_laminate_theory():
     np.testing.assert_allclose(whole, expected, rtol=1e-9, atol=1e-9 * bent.rigidity)
 
 
-@pytest.mark.parametrize(("bond", "frequency"), [("full", None), ("none", None), ("shear", 150.0)])
-def test_equivalent_plate_keeps_rigidity_nu_and_mass(bond, frequency):
-    """What the solver is given carries D*, nu and the surface density, by hand 6.45 kg/m²."""
-    laminate = Laminate(PANEL, Bond(bond), frequency)
+@pytest.mark.parametrize("bond", ["full", "none"])
+def test_equivalent_plate_keeps_rigidity_nu_and_mass(bond):
+    """What is like the laminate carries D, nu and the surface density, by hand 6.45 kg/m²."""
+    laminate = Laminate(PANEL, Bond(bond))
     plate = of_plate(laminate, loss_factor=0.02)
-    bent = bending(laminate)
+    bent = bending(laminate, 150.0)
     assert plate.flexural_rigidity == pytest.approx(bent.rigidity, rel=1e-8)
     assert plate.material.nu == pytest.approx(bent.nu, rel=1e-8)
     assert plate.mass == pytest.approx(6.45 * 0.4 * 0.25, rel=1e-8)
     assert (plate.length, plate.width, plate.loss_factor) == (0.4, 0.25, 0.02)
+    assert plate.laminate == (laminate if bond == "full" else None)
 
 
 def test_equivalent_plate_keeps_rotary_inertia():
     """Bonded glass: rho H³ / 12 of the whole; sliding: of each; a sandwich: faces at their arms."""
     three = (Layer(GLASS, 1e-3),) * 3
-    assert of_plate(Laminate(three)).thickness == pytest.approx(3e-3, rel=1e-9)
+    assert of_plate(Laminate(three)).thickness == pytest.approx(3e-3, rel=1e-3)
     assert of_plate(Laminate(three, Bond.NONE)).thickness == pytest.approx(1e-3, rel=1e-9)
-    sandwich = Laminate((Layer(ALUMINIUM, 1e-3), Layer(FOAM, 10e-3), Layer(ALUMINIUM, 1e-3)))
+    stiff = replace(FOAM, E=7e9)
+    sandwich = Laminate((Layer(ALUMINIUM, 1e-3), Layer(stiff, 10e-3), Layer(ALUMINIUM, 1e-3)))
     inertia = 2 * (2.7 * 1e-6 / 12 + 2.7 * 5.5e-3**2) + 1.0 * 1e-4 / 12
     plate = of_plate(sandwich)
-    assert plate.material.rho * plate.thickness**3 / 12 == pytest.approx(inertia, rel=1e-8)
+    assert plate.material.rho * plate.thickness**3 / 12 == pytest.approx(inertia, rel=0.02)
 
 
 @pytest.mark.parametrize("modulus", [0.1e6, 1e6, 10e6, 1e9])
-@pytest.mark.parametrize("frequency", [40.0, 150.0, 500.0])
-def test_shear_bond_equals_elasticity(modulus, frequency):
-    """Within 0.2 % for adhesives from gel to epoxy; the bounds are a factor of 3 apart."""
+@pytest.mark.parametrize("frequency", [40.0, 150.0, 500.0, 2000.0])
+def test_waves_equal_elasticity(modulus, frequency):
+    """Frequency of a wave within 0.5 % for adhesives from gel to epoxy, over the limits of a rig.
+
+    At one wavenumber the frequency differs twice as much as the wavenumber at one frequency.
+    """
     adhesive = Material("adhesive", E=modulus, rho=1000.0, nu=0.49)
     layers = (PANEL[0], Layer(adhesive, 0.2e-3), PANEL[2])
-    bent = bending(Laminate(layers, Bond.SHEAR, frequency))
-    assert bent.rigidity == pytest.approx(wave_rigidity(layers, frequency), rel=0.002)
+    expected = wave_number(layers, frequency)
+    assert wavenumber_of(Laminate(layers), frequency).real == pytest.approx(expected, rel=0.0025)
 
 
-def test_shear_bond_of_two_adhesives_equals_elasticity():
-    """Cover, sensor and display glass on two different adhesives, within 0.2 %."""
+def test_waves_on_two_adhesives_equal_elasticity():
+    """Cover, sensor and display glass on two different adhesives, frequency within 0.1 %."""
     other = Material("other", E=3e6, rho=1000.0, nu=0.49)
     layers = (*PANEL, Layer(other, 0.1e-3), Layer(GLASS, 1.1e-3))
-    bent = bending(Laminate(layers, Bond.SHEAR, 150.0))
-    assert bent.rigidity == pytest.approx(wave_rigidity(layers, 150.0), rel=0.002)
+    k = wavenumber_of(Laminate(layers), 150.0).real
+    assert k == pytest.approx(wave_number(layers, 150.0), rel=5e-4)
 
 
-def test_example_panel_equals_thin_plate():
-    """Simply supported, its lowest modes are those of a thin plate of the stack's own rigidity.
+def test_simply_supported_sandwich_equals_published_frequencies_and_losses():
+    """Five modes of a damped sandwich plate within 0.3 %, losses within 0.001.
 
-    f = pi/2 (m²/a² + n²/b²) sqrt(D / m''), D by elasticity through the thickness and m'' = 6.306
-    kg/m² by hand; finite elements come out up to 1 % lower, for they shear and turn.
+    Analytical values after Abdulhadi, as in Johnson and Kienholz, AIAA J. 20 (1982) 1284, table 3.
+    The modes of a simply supported plate are standing waves of its wavenumbers.
     """
-    rig = load_rig(Path(__file__).parents[3] / "examples" / "glass_panel.yaml", mesh="60x36")
-    cover = Material("cover", E=71.5e9, rho=2420.0, nu=0.21)
-    layers = (Layer(cover, 1.8e-3), PANEL[1], PANEL[2])
-    speed = math.sqrt(wave_rigidity(layers, 150.0) / 6.306)
-    orders = [(1, 1), (2, 1), (3, 1), (1, 2)]
-    thin = [math.pi / 2 * (m**2 / 0.375**2 + n**2 / 0.225**2) * speed for m, n in orders]
-    solved = modes(assemble(rig.plate, rig.mesh), 4, support="simply-supported")
-    np.testing.assert_allclose(solved.natural_frequencies, sorted(thin), rtol=0.01)
+    face = Layer(Material("face", E=68.9e9, rho=2740.0, nu=0.3), 0.762e-3)
+    core = Material("core", E=0.896e6 * 2 * 1.49, rho=999.0, nu=0.49)
+    laminate = Laminate((face, Layer(core, 0.254e-3, loss_factor=0.5), face))
+    published = {
+        (1, 1): (60.3, 0.190),
+        (2, 1): (115.4, 0.203),
+        (1, 2): (130.6, 0.199),
+        (2, 2): (178.7, 0.181),
+        (3, 1): (195.7, 0.174),
+    }
+    for (m, n), (frequency, loss) in published.items():
+        k = math.pi * math.hypot(m / 0.348, n / 0.3048)
+        square = wave_rigidity(laminate, k, 100.0) * k**4 / laminate.surface_density
+        assert math.sqrt(square.real) / (2 * math.pi) == pytest.approx(frequency, rel=3e-3)
+        assert square.imag / square.real == pytest.approx(loss, abs=1e-3)
+
+
+def test_wave_rigidity_equals_the_formula_of_ross_ungar_and_kerwin():
+    """D of thin faces, D1 + D3 + gain g / (1 + g), with g = G / (h k²) (1/A1 + 1/A3)."""
+    face = Layer(ALUMINIUM, 1e-3)
+    core = Layer(Material("core", E=1e6, rho=1000.0, nu=0.49), 0.1e-3)
+    k = 20.0
+    A = 70e9 * 1e-3 / (1 - 0.33**2)
+    g = core.material.shear_modulus / (0.1e-3 * k**2) * (2 / A)
+    gain = A / 2 * 1.1e-3**2
+    expected = 2 * A * 1e-6 / 12 + gain * g / (1 + g)
+    found = wave_rigidity(Laminate((face, core, face)), k, 100.0)
+    assert found.real == pytest.approx(expected, rel=1e-3)
+    assert found.imag == 0
+
+
+def test_wave_rigidity_has_the_bounds_of_stiff_and_soft_adhesives():
+    """A core as stiff as the glass bonds perfectly; one of 1 Pa lets its faces slide."""
+    for modulus, bound in ((70e9, perfectly_bonded), (1e3, freely_sliding)):
+        core = Layer(Material("core", E=modulus, rho=1000.0, nu=0.2), 0.2e-3)
+        layers = (PANEL[0], core, PANEL[2])
+        found = wave_rigidity(Laminate(layers), 20.0, 100.0).real
+        assert found == pytest.approx(bound(layers).rigidity, rel=2e-3)
+
+
+def test_shear_corrections_are_those_of_one_layer_and_of_a_soft_core():
+    """5/6 of a single layer (Reissner), 1 where shear is uniform, 3/4 where it grows from zero."""
+    assert shear_corrections(PANEL[:1]) == pytest.approx([5 / 6])
+    face = Layer(ALUMINIUM, 1e-5)
+    corrections = shear_corrections((face, Layer(FOAM, 1e-2), face))
+    assert corrections == pytest.approx([0.75, 1.0, 0.75], abs=5e-3)
+
+
+def test_modulus_by_frequency_is_a_power_law_between_rows():
+    """Half way in the logarithm of frequency E is the geometric mean; outside it is constant."""
+    layer = Layer(FOAM, 1e-3, by_frequency=((10.0, 0.25, 0.2), (1000.0, 4.0, 0.6)))
+    assert layer.modulus(100.0) == pytest.approx(70e6 * (1 + 0.4j))
+    assert layer.modulus(1.0) == pytest.approx(0.25 * 70e6 * (1 + 0.2j))
+    assert layer.modulus(5e3) == pytest.approx(4 * 70e6 * (1 + 0.6j))
+
+
+def test_example_panel_has_six_eras_and_the_mass_of_its_layers():
+    """m'' = 6.306 kg/m² by hand, and 13 g on it."""
+    rig = load_rig(Path(__file__).parents[3] / "examples" / "glass_panel.yaml")
+    assert rig.plate.mass == pytest.approx(6.306 * 0.375 * 0.225, rel=1e-6)
     assert len(rig.eras) == 6
     assert sum(mass.mass for mass in rig.masses) == pytest.approx(0.013)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "place"),
-    [
-        (((),), "layer"),
-        ((PANEL, Bond.SHEAR), "bond_frequency"),
-        ((PANEL, Bond.SHEAR, 0.0), "bond_frequency"),
-        ((PANEL, Bond.SHEAR, math.nan), "bond_frequency"),
-        ((PANEL[:2], Bond.SHEAR, 100.0), "layers .*got"),
-        ((PANEL[:1], Bond.SHEAR, 100.0), "layers .*got"),
-        ((PANEL, Bond.FULL, 100.0), "bond_frequency"),
-    ],
-)
-def test_laminate_refuses_layers_and_frequencies_that_do_not_fit_its_bond(arguments, place):
-    """Missing layers, and frequencies that are missing, out of range or not allowed."""
-    with pytest.raises(InputError, match=rf"^laminate: .*{place}"):
-        Laminate(*arguments)
+def test_laminate_refuses_no_layers_and_losses_of_layers_that_slide():
+    """Neither has a meaning."""
+    with pytest.raises(InputError, match=r"^laminate: .*layer"):
+        Laminate(())
+    with pytest.raises(InputError, match=r"^laminate: .*bond none"):
+        Laminate((PANEL[0], replace(PANEL[1], loss_factor=0.1)), Bond.NONE)
 
 
 def test_sliding_layers_add_their_rigidities():

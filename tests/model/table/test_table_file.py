@@ -58,7 +58,7 @@ def test_header_names_every_input(table, path):
     with np.load(path, allow_pickle=False) as content:
         assert content["shapes"].shape == (table.raster.point_count, len(table.omega))
         header = json.loads(content["header"].tobytes())
-    assert header["format_version"] == 6
+    assert header["format_version"] == 7
     assert header["frequencies_hz"] == FREQUENCIES.tolist()
     assert header["plate"]["thickness"] == 0.0015
     assert [era["stroke"] for era in header["eras"]] == [100e-6] * 4

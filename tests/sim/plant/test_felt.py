@@ -13,7 +13,9 @@ from sim.plant.fingers import Fingers, Record
 
 def flat_plate(rig: Rig) -> ReducedPlate:
     """A plate that can only move up and down."""
-    return ReducedPlate(rig.plate, np.zeros(1), lambda points: np.ones((len(points), 1)))
+    return ReducedPlate(
+        rig.plate, np.zeros(1), np.zeros(1), lambda points: np.ones((len(points), 1))
+    )
 
 
 def test_feel_separates_driven_frequencies() -> None:

@@ -9,7 +9,8 @@ from model.fem.mesh import Mesh
 from model.reduction.modal_matrices import modal_matrices
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.structure.actuator import Era
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+from model.structure.plate import Plate
 from model.transients.base_motion import Term
 from model.transients.time_response import plate_in_time
 from plate_in_time import apart, lock_in, stepped_acceleration

@@ -209,7 +209,7 @@ def test_contacts_on_a_plate_without_nodes(coarse_rig: Rig) -> None:
         x, y = (points[:, :2] - mesh.nodes.mean(axis=0)).T
         return np.column_stack([np.ones(len(x)), 10 * x, 10 * y])
 
-    rigid = ReducedPlate(coarse_rig.plate, np.zeros(3), shapes)
+    rigid = ReducedPlate(coarse_rig.plate, np.zeros(3), np.zeros(3), shapes)
     plant = Plant(rigid, coarse_rig.eras)
     x, y = map(float, mesh.nodes[4])
     plant.set_contacts({"a": FingertipLoad(x, y, FINGERTIP)})

@@ -1,0 +1,1 @@
+"""Accuracy of plates of layers and of the air behind them: `python -m benchmarks.layers`."""

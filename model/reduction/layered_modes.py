@@ -1,0 +1,140 @@
+"""Modes of a free plate of layers, and its truncated ones between any points.
+
+All modes of the polynomials of the deflection are known, so that the sums over the truncated ones
+are taken as they stand.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import FloatArray
+from model.fem.symmetry import CLASSES
+from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
+from model.spectral.layered_class import Band, LayeredClass, LayeredPlate
+from model.spectral.local_compliance import (
+    Unresolved,
+    compliance_between,
+    uncertain_compliance,
+    unresolved_at,
+)
+from model.spectral.mesh import SpectralMesh
+from model.spectral.modes import deflections_by_class
+from model.structure.equivalent import short_wave_plate
+from model.structure.footprint import check_on_plate
+from model.structure.plate import Plate
+
+_MAX_CACHED = 4  # sets of points whose shapes are kept
+
+
+@dataclass(frozen=True, eq=False)
+class _Observed:
+    """At p points: shapes of the modes (p, r) and truncated ones (p, t), unresolved compliance."""
+
+    shapes: FloatArray
+    truncated: FloatArray
+    unresolved: Unresolved
+
+
+class LayeredModes:
+    """Modes of a free plate of layers in the polynomials of a mesh; see `FreeModes`."""
+
+    def __init__(
+        self,
+        plate: Plate,
+        mesh: SpectralMesh,
+        classes: tuple[LayeredClass, ...],
+        *,
+        shift: float,
+        band: Band,
+    ) -> None:
+        self._plate = plate
+        self._mesh = mesh
+        self._directions = mesh.directions(plate)
+        self._classes = classes
+        self._local_plate = local_plate(plate, mesh, band.middle)
+        self.eigenvalues = np.concatenate([part.eigenvalues for part in classes])
+        self.losses = np.concatenate([part.losses for part in classes])
+        u = 1 / (np.concatenate([part.truncated for part in classes]) + shift)
+        self.largest_truncated = float(u.max())
+        # u / u_c of each truncated mode to the powers 1, 2, ...
+        self._powers = (u / u.max()) ** np.arange(1, 2 * RESIDUAL_ORDER + 1)[:, None]
+        self._known: dict[bytes, _Observed] = {}
+
+    def solve_at(self, points: FloatArray) -> PointSolutions:
+        """Solve for forces at points [m] (n, 2)."""
+        at = self._observe(points)
+        residuals = at.truncated[:, None] * self._powers[:RESIDUAL_ORDER]
+        return PointSolutions(points, at.shapes, (residuals,), self.truncated_terms(points, points))
+
+    def shapes_at(self, points: FloatArray) -> FloatArray:
+        """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
+        return self._observe(points).shapes
+
+    def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
+        """Sums between points (n, 2) and others (m, 2), as in `PointSolutions`."""
+        own, other = self._observe(points), self._observe(others)
+        terms = (own.truncated * self._powers[:, None]) @ other.truncated.T
+        terms[0] += self._local(own, other)
+        return np.asarray(terms)
+
+    def basis(self, attached: PointSolutions, points: FloatArray) -> FloatArray:
+        """Deflection at points of modes and residual vectors, (p, r + RESIDUAL_ORDER n)."""
+        at, count = self._observe(points), len(attached.points)
+        (residuals,) = attached.residuals
+        extra = residuals.transpose(1, 0, 2).reshape(RESIDUAL_ORDER * count, -1) @ at.truncated.T
+        extra[:count] += self._local(self._observe(attached.points), at)
+        return np.hstack([at.shapes, extra.T])
+
+    def uncertain(self, points: FloatArray, others: FloatArray) -> FloatArray:
+        """By how much `truncated_terms` of the first power may be too low, (n, m)."""
+        own, other = self._observe(points), self._observe(others)
+        return (
+            uncertain_compliance(self._local_plate, own.unresolved, other.unresolved)
+            / self.largest_truncated
+        )
+
+    def _local(self, own: _Observed, other: _Observed) -> FloatArray:
+        """Compliance in waves that the polynomials do not resolve, in units of u_c."""
+        missing = compliance_between(self._local_plate, own.unresolved, other.unresolved)
+        return missing / self.largest_truncated
+
+    def _observe(self, points: FloatArray) -> _Observed:
+        """What is known of points or footprints on the plate, cached."""
+        points = np.atleast_2d(np.asarray(points, dtype=float))
+        key = points.tobytes()
+        if key not in self._known:
+            check_on_plate(points, length=self._mesh.length, width=self._mesh.width)
+            if len(self._known) >= _MAX_CACHED:
+                self._known.pop(next(iter(self._known)))
+            density = self._plate.material.rho * self._plate.thickness
+            bases = deflections_by_class(self._plate, *self._directions, points)
+            found = [
+                np.split(math.sqrt(density) * own @ part.shapes, [len(part.eigenvalues)], axis=1)
+                for own, part in zip(bases, self._classes, strict=True)
+            ]
+            shapes, truncated = (np.hstack(each) for each in zip(*found, strict=True))
+            degrees = (self._mesh.nx, self._mesh.ny)
+            unresolved = unresolved_at(self._local_plate, degrees, points)
+            self._known[key] = _Observed(shapes, truncated, unresolved)
+        return self._known[key]
+
+
+def local_plate(plate: Plate, mesh: SpectralMesh, frequency: float) -> Plate:
+    """The homogeneous plate that yields under a force in waves that a mesh does not resolve."""
+    return short_wave_plate(plate, 2 * math.pi / mesh.shortest_wavelength, frequency)
+
+
+def layered_modes(
+    plate: Plate, mesh: SpectralMesh, *, shift: float, cutoff_frequency: float, frequency_max: float
+) -> LayeredModes:
+    """Solve the four symmetry classes of a plate of layers for all modes below a cutoff [Hz].
+
+    shift [rad²/s²]: of the order of the lowest modes; frequency_max [Hz]: of responses.
+    """
+    band = Band(math.sqrt(shift) / (2 * math.pi), frequency_max)
+    layered = LayeredPlate(plate, (mesh.nx, mesh.ny), band.middle)
+    cut = (2 * math.pi * cutoff_frequency) ** 2
+    classes = tuple(layered.modes(each, shift=shift, cut=cut, band=band) for each in CLASSES)
+    return LayeredModes(plate, mesh, classes, shift=shift, band=band)

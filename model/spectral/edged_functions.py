@@ -1,0 +1,148 @@
+"""Functions of one direction for layers: Legendre polynomials, and several boundary layers.
+
+As `model.spectral.functions`, with one boundary layer for each way in which the layers of a
+laminate can be twisted against each other at a free edge. Integrals are by Gauss's rule on pieces
+that shrink towards the edges.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss
+from scipy import linalg
+
+from model.arrays import FloatArray
+from model.spectral.functions import EVEN, ODD, first_degree
+from model.structure.laminate import Section
+
+# A boundary layer with less than this share of its norm outside what is there already is left out.
+_NEGLIGIBLE = 0.02
+_ALIKE = 1.5  # ratio of decays for which one function serves
+_MAX_LAYERS = 3  # boundary layers of a side
+_PIECES = (0.0, 1.5, 5.0, 14.0)  # of a boundary layer, over its decay
+
+
+@dataclass(frozen=True, eq=False)
+class EdgedFunctions:
+    """Orthonormal functions of x in (0, length) [m], by parity: EVEN or ODD about the middle.
+
+    Those of a parity are its Legendre polynomials up to a degree, ascending, then boundary layers
+    of these decays [1/m] at both ends, orthogonalised.
+    """
+
+    length: float
+    degree: int
+    decays: tuple[float, ...] = ()
+
+    def polynomial_count(self, parity: int) -> int:
+        """Number of polynomials of a parity; these are its first functions."""
+        return (self.degree - first_degree(parity)) // 2 + 1 if self._has(parity) else 0
+
+    def count(self, parity: int) -> int:
+        """Number of functions of a parity."""
+        return int(self._values[parity].shape[1])
+
+    @cached_property
+    def slope_products(self) -> dict[int, FloatArray]:
+        """By parity: integrals of f' g over the length, f of the parity, g of the other, (n, m)."""
+        return {
+            parity: self._slopes[parity].T @ (self._weights[:, None] * self._values[-parity])
+            for parity in (EVEN, ODD)
+        }
+
+    @cached_property
+    def slope_squares(self) -> dict[int, FloatArray]:
+        """By parity: integrals of f' g' over the length, both of the parity, (n, n)."""
+        return {
+            parity: slopes.T @ (self._weights[:, None] * slopes)
+            for parity, slopes in self._slopes.items()
+        }
+
+    def polynomial_products(self, values: FloatArray, parity: int) -> FloatArray:
+        """Integrals with the polynomials of a parity of functions at `points` (q, m), (n, m)."""
+        own = self._values[parity][:, : self.polynomial_count(parity)]
+        return np.asarray(own.T @ (self._weights[:, None] * values))
+
+    @property
+    def points(self) -> FloatArray:
+        """Points of the integrals [m] (q,)."""
+        return self._rule[0]
+
+    @property
+    def _weights(self) -> FloatArray:
+        return self._rule[1]
+
+    @cached_property
+    def _rule(self) -> tuple[FloatArray, FloatArray]:
+        half = self.length / 2
+        breaks = {piece / decay for decay in self.decays for piece in _PIECES}
+        edges = np.array(sorted({0.0, half, *(each for each in breaks if each < half)}))
+        t, w = leggauss(self.degree + 12)
+        sizes = np.diff(edges)
+        x = (edges[:-1, None] + sizes[:, None] * (1 + t) / 2).ravel()
+        weights = (sizes[:, None] * w / 2).ravel()
+        return np.concatenate([x, self.length - x[::-1]]), np.concatenate([weights, weights[::-1]])
+
+    def _has(self, parity: int) -> bool:
+        return self.degree >= first_degree(parity)
+
+    @property
+    def _values(self) -> dict[int, FloatArray]:
+        return self._functions[0]
+
+    @property
+    def _slopes(self) -> dict[int, FloatArray]:
+        return self._functions[1]
+
+    @cached_property
+    def _functions(self) -> tuple[dict[int, FloatArray], dict[int, FloatArray]]:
+        """Values and slopes at the points, by parity."""
+        x, weights = self._rule
+        n = np.arange(self.degree + 1)
+        scale = np.sqrt((2 * n + 1) / self.length)
+        t = 2 * x / self.length - 1
+        values, slopes = _legendre(t, self.degree)
+        values, slopes = values * scale, slopes * scale * (2 / self.length)
+        root = np.sqrt(weights)[:, None]
+        found: tuple[dict[int, FloatArray], dict[int, FloatArray]] = ({}, {})
+        for parity in (EVEN, ODD):
+            own = slice(first_degree(parity), None, 2)
+            value, slope = values[:, own], slopes[:, own]
+            for k in self.decays if self._has(parity) else ():
+                near, far = np.exp(-k * x), np.exp(-k * (self.length - x))
+                layer, rate = near + parity * far, -k * (near - parity * far)
+                size = np.linalg.norm(root[:, 0] * layer)
+                for _ in range(2):
+                    shares = value.T @ (weights * layer)
+                    layer, rate = layer - value @ shares, rate - slope @ shares
+                norm = np.linalg.norm(root[:, 0] * layer)
+                if norm > _NEGLIGIBLE * size:
+                    value = np.column_stack([value, layer / norm])
+                    slope = np.column_stack([slope, rate / norm])
+            found[0][parity], found[1][parity] = value, slope
+        return found
+
+
+def edge_decays(section: Section) -> tuple[float, ...]:
+    """Decays [1/m] of the boundary layers of a laminate's free edge, the widest first.
+
+    Displacements along an edge twist the layers against each other: twist v'' = slip v over the
+    distance from it. Of one homogeneous layer k = sqrt(10) / h.
+    """
+    slip, twist = np.real(section.slip), np.real(section.twist)
+    squares = linalg.eigh(slip, twist, eigvals_only=True)[1:]
+    decays: list[float] = []
+    for k in np.sqrt(np.maximum(squares, 0)):
+        if k > 0 and (not decays or k > _ALIKE * decays[-1]):
+            decays.append(float(k))
+    return tuple(decays[:_MAX_LAYERS])
+
+
+def _legendre(t: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
+    """Legendre polynomials at t (q,) and their derivatives, (q, degree + 1)."""
+    values: FloatArray = np.asarray(np.polynomial.legendre.legvander(t, degree), dtype=float)
+    slopes: FloatArray = np.zeros(values.shape)
+    for n in range(1, degree + 1):
+        slopes[:, n] = n * values[:, n - 1] + t * slopes[:, n - 1]
+    return values, slopes

@@ -1,0 +1,131 @@
+"""Stiffness and mass of a free laminate in the functions of both directions.
+
+Unknowns of a symmetry class: the deflection w, in polynomials; then the displacements along the
+plate u_x and u_y of every interface between the layers, with boundary layers. u_x has the other
+parity along x, u_y along y. Energy, with the sections of `model.structure.laminate` summed over the
+interfaces:
+
+    stretch (u_x,x u_x,x + u_y,y u_y,y) + 2 across u_x,x u_y,y + twist (u_x,y + u_y,x)²
+    + slip (u_x² + u_y²) + 2 lever (u_x w,x + u_y w,y) + shear (w,x² + w,y²)
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from model.arrays import FloatArray
+from model.spectral.edged_functions import EdgedFunctions
+from model.structure.laminate import Section
+
+
+@dataclass(frozen=True, eq=False)
+class ClassFunctions:
+    """Functions along x and y of one symmetry class, for a number of interfaces.
+
+    of_w, of_x, of_y: numbers of functions along x and y of w and of one interface's u_x and u_y.
+    """
+
+    x: EdgedFunctions
+    y: EdgedFunctions
+    parity: tuple[int, int]
+    interfaces: int
+
+    @property
+    def of_w(self) -> tuple[int, int]:
+        """Functions of the deflection along x and y."""
+        a, b = self.parity
+        return self.x.polynomial_count(a), self.y.polynomial_count(b)
+
+    @property
+    def of_x(self) -> tuple[int, int]:
+        """Functions of u_x along x and y."""
+        a, b = self.parity
+        return self.x.count(-a), self.y.count(b)
+
+    @property
+    def of_y(self) -> tuple[int, int]:
+        """Functions of u_y along x and y."""
+        a, b = self.parity
+        return self.x.count(a), self.y.count(-b)
+
+    @property
+    def deflections(self) -> int:
+        """Number of unknowns of the deflection, the first ones."""
+        nx, ny = self.of_w
+        return nx * ny
+
+    @property
+    def size(self) -> int:
+        """Number of all unknowns."""
+        along = self.of_x[0] * self.of_x[1] + self.of_y[0] * self.of_y[1]
+        return self.deflections + self.interfaces * along
+
+
+def layered_stiffness(of: ClassFunctions, section: Section) -> FloatArray:
+    """Stiffness (n, n) [N/m per m² of the orthonormal functions] of a section's real part."""
+    x, y = of.x, of.y
+    a, b = of.parity
+    (wx, wy), (xx, xy), (yx, yy) = of.of_w, of.of_x, of.of_y
+    stretch, across, twist, slip = (
+        np.real(each) for each in (section.stretch, section.across, section.twist, section.slip)
+    )
+    lever, shear = np.real(section.lever), float(np.real(section.shear))
+    w = slice(0, of.deflections)
+    u = slice(w.stop, w.stop + of.interfaces * xx * xy)
+    v = slice(u.stop, of.size)
+    K = np.zeros((of.size, of.size))
+
+    def laid(matrix: FloatArray, along_x: FloatArray, along_y: FloatArray) -> FloatArray:
+        return np.kron(matrix, np.kron(along_x, along_y))
+
+    K[w, w] = shear * (
+        np.kron(x.slope_squares[a][:wx, :wx], np.eye(wy))
+        + np.kron(np.eye(wx), y.slope_squares[b][:wy, :wy])
+    )
+    K[u, u] = (
+        laid(stretch, x.slope_squares[-a], np.eye(xy))
+        + laid(twist, np.eye(xx), y.slope_squares[b])
+        + laid(slip, np.eye(xx), np.eye(xy))
+    )
+    K[v, v] = (
+        laid(stretch, np.eye(yx), y.slope_squares[-b])
+        + laid(twist, x.slope_squares[a], np.eye(yy))
+        + laid(slip, np.eye(yx), np.eye(yy))
+    )
+    K[u, v] = laid(across, x.slope_products[-a], y.slope_products[-b].T)
+    K[u, v] += laid(twist, x.slope_products[a].T, y.slope_products[b])
+    row = lever[None]
+    K[w, u] = laid(row, x.slope_products[a][:wx], np.eye(wy, xy))
+    K[w, v] = laid(row, np.eye(wx, yx), y.slope_products[b][:wy])
+    K[v, u], K[u, w], K[v, w] = K[u, v].T, K[w, u].T, K[w, v].T
+    return K
+
+
+def along_mass(of: ClassFunctions, mass: FloatArray, forces: FloatArray) -> FloatArray:
+    """Mass matrix of the displacements along the plate times columns (m, k): (m, k).
+
+    mass: of `interface_mass`.
+    """
+    count = of.interfaces * of.of_x[0] * of.of_x[1]
+    parts = (
+        np.tensordot(mass, each.reshape(of.interfaces, -1, each.shape[1]), axes=1).reshape(
+            each.shape
+        )
+        for each in (forces[:count], forces[count:])
+    )
+    return np.vstack([*parts])
+
+
+def follow(of: ClassFunctions, stiffness: FloatArray, mass: FloatArray, shift: float) -> FloatArray:
+    """Displacements along the plate under unit deflections, (m, deflections), by least energy.
+
+    shift [rad²/s²]: times the mass, keeps the rigid motions along the plate at rest.
+    """
+    w = of.deflections
+    own = stiffness[w:, w:].copy()
+    count = of.interfaces * of.of_x[0] * of.of_x[1]
+    for part, each in ((slice(0, count), of.of_x), (slice(count, None), of.of_y)):
+        own[part, part] += shift * np.kron(mass, np.eye(each[0] * each[1]))
+    factor = linalg.cho_factor(own, lower=True, overwrite_a=True, check_finite=False)
+    return -linalg.cho_solve(factor, stiffness[w:, :w], check_finite=False)

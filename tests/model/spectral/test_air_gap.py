@@ -1,0 +1,155 @@
+"""Air behind a plate against finite differences of its pressure and published squeeze films."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.layers.gap import air_pressure, cell_middles
+from model.errors import InputError
+from model.reduction.free_plate import solve_free_plate
+from model.reduction.reduced_plate import reduce_free_plate
+from model.reduction.supported_modes import supported_modes
+from model.spectral.air_motion import air_motion
+from model.spectral.layered_class import LayeredPlate
+from model.spectral.mesh import SpectralMesh
+from model.structure.actuator import Era
+from model.structure.air_gap import DENSITY, HEAT_RATIO, PRESSURE, VISCOSITY, AirGap
+from model.structure.material import Material
+from model.structure.plate import Plate
+from model.structure.point_load import footprints_of
+from model.vibration.direct import direct_responder
+
+GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
+PLATE = Plate(0.375, 0.225, 2.5e-3, GLASS)
+CLASSES = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+
+
+def force_of(gap, frequency, parity, degrees=(12, 10)):
+    """Matrix of the air's dynamic stiffness [N/m per m²] in the polynomials of a class."""
+    plate = replace(PLATE, air_gap=gap)
+    of = LayeredPlate(plate, degrees, 150.0).functions(parity)
+    air, m = air_motion(of, gap), of.deflections
+    full = gap.bulk_modulus(frequency) * air.stiffness.astype(complex)
+    full -= (2 * np.pi * frequency) ** 2 * gap.inertia(frequency) * np.diag(air.inertia)
+    return of, full[:m, :m] - full[:m, m:] @ np.linalg.solve(full[m:, m:], full[m:, :m])
+
+
+def polynomial(degree, x, side):
+    """Legendre polynomial of norm 1 over a side."""
+    coefficients = np.zeros(degree + 1)
+    coefficients[degree] = np.sqrt((2 * degree + 1) / side)
+    return np.polynomial.legendre.legval(2 * x / side - 1, coefficients)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("parity", CLASSES)
+@pytest.mark.parametrize(("depth", "frequency"), [(0.5e-3, 60.0), (5e-3, 300.0)])
+def test_air_equals_finite_differences(closed, parity, depth, frequency):
+    """Its force on the first two deflections of each symmetry, to 1.5 %, far from any resonance."""
+    gap = AirGap(depth, closed=closed)
+    of, found = force_of(gap, frequency, parity)
+    x, y = cell_middles(PLATE.length, PLATE.width, (100, 60))
+    area = PLATE.length * PLATE.width / x.size
+    first = [(1 - each) // 2 for each in parity]
+    shapes = [
+        polynomial(first[0] + 2 * i, x, PLATE.length) * polynomial(first[1], y, PLATE.width)
+        for i in range(2)
+    ]
+    numbers = [i * of.of_w[1] for i in range(2)]
+    for shape, number in zip(shapes, numbers, strict=True):
+        pressure = air_pressure(gap, shape, frequency, length=PLATE.length, width=PLATE.width)
+        # p pushes towards larger w; the dynamic stiffness resists it.
+        expected = [-(other * pressure).sum() * area for other in shapes]
+        scale = abs(found[number, number])
+        np.testing.assert_allclose(found[numbers, number], expected, atol=0.015 * scale)
+
+
+def test_a_slow_square_squeezes_as_reynolds_equation_says():
+    """Damping of a rigid square in an open film, 0.4217 mu L⁴ / d³ (Bao and Yang 2007, Eq. 21)."""
+    side, depth, frequency = 0.02, 0.1e-3, 1.0
+    plate = Plate(side, side, 1e-3, GLASS, air_gap=AirGap(depth))
+    of = LayeredPlate(plate, (24, 24), 150.0).functions((1, 1))
+    air, m, gap = air_motion(of, plate.air_gap), of.deflections, plate.air_gap
+    omega = 2 * np.pi * frequency
+    full = 1e12 * air.stiffness.astype(complex)  # incompressible
+    full -= omega**2 * gap.inertia(frequency) * np.diag(air.inertia)
+    force = full[0, 0] - full[0, m:] @ np.linalg.solve(full[m:, m:], full[m:, 0])
+    damping = force.imag / omega * side**2  # the first polynomial is 1 / side everywhere
+    assert damping == pytest.approx(0.4217 * VISCOSITY * side**4 / depth**3, rel=0.01)
+
+
+def test_a_wave_carries_the_air_that_flows_under_it():
+    """rho / (k² d) of a wave k: 1.75 kg/m² under a panel of 47.5 N m and 6.3 kg/m² at 150 Hz.
+
+    A wide strip of many wavelengths without viscosity; the frequency falls by 11 %.
+    """
+    gap = AirGap(2e-3)
+    k = (6.3 * (2 * np.pi * 150) ** 2 / 47.5) ** 0.25
+    mass = DENSITY / (k**2 * gap.depth)
+    assert mass == pytest.approx(1.75, abs=0.02)
+    assert 1 - np.sqrt(6.3 / (6.3 + mass)) == pytest.approx(0.11, abs=0.01)
+    length, waves = 4.0, 24
+    plate = Plate(length, 1.0, 2.5e-3, GLASS, air_gap=gap)
+    of = LayeredPlate(plate, (90, 0), 150.0).functions((-1, 1))
+    air, m = air_motion(of, gap), of.deflections
+    k = np.pi * (2 * waves) / length
+    shape = np.sin(k * (of.x.points - length / 2))[:, None]
+    q = of.x.polynomial_products(shape, -1)[:, 0]
+    omega2 = (2 * np.pi * 150) ** 2
+    full = 1e9 * air.stiffness - omega2 * DENSITY * np.diag(air.inertia)
+    force = full[:m, :m] - full[:m, m:] @ np.linalg.solve(full[m:, m:], full[m:, :m])
+    found = -(q @ force @ q) / (omega2 * (q @ q))
+    # sin(k x) has p = 0 at its own nodes, so that open ends fit.
+    assert found == pytest.approx(DENSITY / (k**2 * gap.depth), rel=0.01)
+
+
+def test_a_sealed_gap_is_a_spring_of_gas():
+    """gamma p0 / d of fast and p0 / d of slow even motion; an open gap has no stiffness."""
+    for depth, frequency, modulus in ((20e-3, 400.0, HEAT_RATIO * PRESSURE), (5e-5, 1.0, PRESSURE)):
+        of, force = force_of(AirGap(depth, closed=True), frequency, (1, 1))
+        assert of.of_w[0] > 1
+        assert force[0, 0].real == pytest.approx(modulus / depth, rel=0.02)
+
+
+def test_air_lowers_frequencies_and_its_friction_damps():
+    """Every mode of a plate over an open gap is lower and lossier, and less over a deeper one."""
+    eras = [
+        Era(name, x, y, stiffness=17e3, damping=0.0, bolt_mass=0.0, stroke=1e-4)
+        for name, x, y in (("a", 0, 0), ("b", 0.375, 0), ("c", 0, 0.225), ("d", 0.375, 0.225))
+    ]
+    mesh = SpectralMesh(10, 8, PLATE.length, PLATE.width)
+    found = []
+    for gap in (None, AirGap(5e-3), AirGap(2e-3)):
+        free = solve_free_plate(replace(PLATE, air_gap=gap), mesh, frequency_max=500.0)
+        reduced = reduce_free_plate(free, footprints_of(eras, ()))
+        found.append(supported_modes(reduced, eras, frequency_max=400.0))
+    none, deep, narrow = ((each.natural_frequencies[:6], each.damping_ratios[:6]) for each in found)
+    assert (none[0] > deep[0]).all()
+    assert (deep[0] > narrow[0]).all()
+    assert (none[1] < deep[1]).all()
+    assert (deep[1] < narrow[1]).all()
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_modes_over_air_answer_as_the_direct_solution(closed):
+    """Response over 5 mm of air within 4 % of the one at each frequency, relative L2."""
+    plate = replace(PLATE, air_gap=AirGap(5e-3, closed=closed), loss_factor=0.02)
+    mesh = SpectralMesh(10, 8, PLATE.length, PLATE.width)
+    eras = [
+        Era(name, x, y, stiffness=17e3, damping=1.0, bolt_mass=0.0, stroke=1e-4)
+        for name, x, y in (("a", 0, 0), ("b", 0.375, 0), ("c", 0, 0.225), ("d", 0.375, 0.225))
+    ]
+    frequencies = np.array([150.0, 250.0, 400.0])
+    points = np.array([[0.05, 0.04], [0.2, 0.1], [0.3, 0.2], [0.375, 0.1]])
+    free = solve_free_plate(plate, mesh, frequency_max=500.0)
+    found = free.acceleration(eras, frequencies, points)
+    exact = direct_responder(plate, mesh)(eras, frequencies, points)
+    error = np.linalg.norm(found - exact, axis=2) / np.linalg.norm(exact, axis=2)
+    assert error.max() < 0.04
+
+
+def test_air_gap_refuses_a_depth_of_none():
+    """A gap of nothing has no air."""
+    with pytest.raises(InputError, match=r"^air gap: depth must be above zero, got 0"):
+        AirGap(0.0)

@@ -14,7 +14,8 @@ from model.rig.rig import Rig
 from model.spectral.layered_class import Band, LayeredPlate
 from model.structure.air_gap import AirGap
 from model.structure.equivalent import bending, equivalent_plate
-from model.structure.laminate import Laminate, Layer, wavenumber_of
+from model.structure.laminate import Laminate, Layer
+from model.structure.laminate_section import wavenumber_of
 from model.structure.material import Material
 from model.structure.plate import Plate
 from model.vibration.direct import direct_responder

@@ -14,7 +14,7 @@ from scipy import linalg
 
 from model.arrays import FloatArray
 from model.spectral.functions import EVEN, ODD, first_degree
-from model.structure.laminate import Section
+from model.structure.laminate_section import Section
 
 # A boundary layer with less than this share of its norm outside what is there already is left out.
 _NEGLIGIBLE = 0.02

@@ -24,7 +24,8 @@ from model.spectral.layered_stiffness import (
     follow,
     layered_stiffness,
 )
-from model.structure.laminate import Layer, interface_mass, section_of, shear_corrections
+from model.structure.laminate import Layer
+from model.structure.laminate_section import interface_mass, section_of, shear_corrections
 from model.structure.modal_elasticity import loss_factors
 from model.structure.plate import Plate
 

@@ -16,7 +16,7 @@ from scipy import linalg
 
 from model.arrays import FloatArray
 from model.spectral.edged_functions import EdgedFunctions
-from model.structure.laminate import Section
+from model.structure.laminate_section import Section
 
 
 @dataclass(frozen=True, eq=False)

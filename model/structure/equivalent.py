@@ -8,10 +8,9 @@ import math
 
 import numpy as np
 
-from model.structure.laminate import (
+from model.structure.laminate import Bond, Laminate
+from model.structure.laminate_section import (
     Bending,
-    Bond,
-    Laminate,
     freely_sliding,
     perfectly_bonded,
     wave_rigidity,

@@ -11,10 +11,8 @@ from benchmarks.layers.elasticity import wave_number
 from model.errors import InputError
 from model.rig.file import load_rig
 from model.structure.equivalent import bending, equivalent_plate
-from model.structure.laminate import (
-    Bond,
-    Laminate,
-    Layer,
+from model.structure.laminate import Bond, Laminate, Layer
+from model.structure.laminate_section import (
     freely_sliding,
     perfectly_bonded,
     shear_corrections,

@@ -1,0 +1,163 @@
+"""Stiffness of a laminate's section, the bounds of its rigidity, and bending waves in it.
+
+The theory of `model.structure.laminate`, per area.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.structure.laminate import Bond, Laminate, Layer
+
+_MAX_STEPS = 200  # of the iteration for a wavenumber, which takes some twenty
+
+
+@dataclass(frozen=True)
+class Bending:
+    """Bending properties of a thin plate: flexural rigidity D [N m] and Poisson's ratio."""
+
+    rigidity: float
+    nu: float
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """Stiffness per area of n layers in the displacements u along the plate at n + 1 interfaces.
+
+    stretch, across, twist (n + 1, n + 1) [N/m]: of u_x,x u_x,x, of u_x,x u_y,y, and of
+    (u_x,y + u_y,x)²; slip (n + 1, n + 1) [N/m³]: of u u; lever (n + 1,) [N/m²] and shear [N/m]: of
+    u w,x and of (w,x)². Linear in the moduli, complex with losses.
+    """
+
+    stretch: ComplexArray
+    across: ComplexArray
+    twist: ComplexArray
+    slip: ComplexArray
+    lever: ComplexArray
+    shear: complex
+
+
+def section_of(
+    layers: Sequence[Layer], moduli: Sequence[complex], corrections: FloatArray
+) -> Section:
+    """Section of layers with these Young's moduli [Pa]; corrections: of `shear_corrections`."""
+    size = len(layers) + 1
+    stretch, across, twist, slip = (np.zeros((size, size), dtype=complex) for _ in range(4))
+    lever = np.zeros(size, dtype=complex)
+    shear = 0j
+    ends = np.array([-1.0, 1.0])
+    for number, (layer, modulus, kappa) in enumerate(zip(layers, moduli, corrections, strict=True)):
+        nu, h = layer.material.nu, layer.thickness
+        own = slice(number, number + 2)
+        linear = h / 6 * np.array([[2.0, 1.0], [1.0, 2.0]])
+        plane, G = modulus / (1 - nu**2), modulus / (2 * (1 + nu))
+        stretch[own, own] += plane * linear
+        across[own, own] += nu * plane * linear
+        twist[own, own] += G * linear
+        slip[own, own] += kappa * G / h * np.outer(ends, ends)
+        lever[own] += kappa * G * ends
+        shear += kappa * G * h
+    return Section(stretch, across, twist, slip, lever, shear)
+
+
+def interface_mass(layers: Sequence[Layer]) -> FloatArray:
+    """Mass per area [kg/m²] of displacements along the plate at the interfaces, (n + 1, n + 1)."""
+    mass = np.zeros((len(layers) + 1, len(layers) + 1))
+    for number, layer in enumerate(layers):
+        mass[number : number + 2, number : number + 2] += (
+            layer.surface_density / 6 * np.array([[2.0, 1.0], [1.0, 2.0]])
+        )
+    return mass
+
+
+def shear_corrections(layers: Sequence[Layer]) -> FloatArray:
+    """Shear correction factor of each layer (n,): 5/6 of a single one, 1 of a soft core.
+
+    (∫ tau)² / (h ∫ tau²) over the layer, tau the shear stress that balances the bending stress of
+    layers without slip: exact wherever shear matters, in soft layers between stiff ones.
+    """
+    factors = np.empty(len(layers))
+    plane = np.array([layer.material.E / (1 - layer.material.nu**2) for layer in layers])
+    thickness = np.array([layer.thickness for layer in layers])
+    centres = _centres(layers)
+    neutral = plane * thickness @ centres / (plane @ thickness)
+    bottoms = centres - thickness / 2 - neutral
+    stress = 0.0  # tau at the bottom of the layer; tau' = -E (z - neutral)
+    t, weights = np.polynomial.legendre.leggauss(4)
+    for number, (E, h, bottom) in enumerate(zip(plane, thickness, bottoms, strict=True)):
+        z = bottom + h * (1 + t) / 2
+        tau = stress - E * (z**2 - bottom**2) / 2
+        factors[number] = (weights @ tau) ** 2 / (2 * (weights @ tau**2))
+        top = bottom + h
+        stress -= E * (top**2 - bottom**2) / 2
+    return factors
+
+
+def perfectly_bonded(layers: Sequence[Layer]) -> Bending:
+    """Layers without slip: D* = D - B A⁻¹ B of classical laminate theory.
+
+    Jones, Mechanics of Composite Materials, 2nd ed., ch. 4; the reduction is Ashton's, J. Compos.
+    Mater. 3 (1969) 189. For isotropic layers A, B and D share their eigenvectors, so the matrices
+    fall apart into equal bending both ways, modulus E / (1 - nu), and opposite, E / (1 + nu).
+    """
+    centres = _centres(layers)
+
+    def reduced(moduli: Sequence[float]) -> float:
+        A = B = D = 0.0
+        for layer, z, modulus in zip(layers, centres, moduli, strict=True):
+            h = layer.thickness
+            A += modulus * h
+            B += modulus * h * z
+            D += modulus * (h**3 / 12 + h * z**2)
+        return float(D - B**2 / A)
+
+    equal = reduced([layer.material.E / (1 - layer.material.nu) for layer in layers])
+    opposite = reduced([layer.material.E / (1 + layer.material.nu) for layer in layers])
+    return Bending((equal + opposite) / 2, (equal - opposite) / (equal + opposite))
+
+
+def freely_sliding(layers: Sequence[Layer]) -> Bending:
+    """Layers that share only their deflection: the sum of their rigidities."""
+    rigidity = sum(layer.flexural_rigidity for layer in layers)
+    coupling = sum(layer.material.nu * layer.flexural_rigidity for layer in layers)
+    return Bending(rigidity, coupling / rigidity)
+
+
+def wave_rigidity(laminate: Laminate, wavenumber: complex, frequency: float) -> complex:
+    """D(k) [N m] of a straight wave of w = cos(k x), k [1/m], with the moduli at a frequency [Hz].
+
+    The displacements at the interfaces take the least energy: k⁴ D = k² shear - k² lever (k²
+    stretch + slip)⁻¹ lever.
+    """
+    layers, k2 = laminate.layers, wavenumber**2
+    if laminate.bond is Bond.NONE:
+        return freely_sliding(layers).rigidity + 0j
+    moduli = [layer.modulus(frequency) for layer in layers]
+    section = section_of(layers, moduli, shear_corrections(layers))
+    moved = np.linalg.solve(k2 * section.stretch + section.slip, section.lever)
+    return complex((section.shear - section.lever @ moved) / k2)
+
+
+def wavenumber_of(laminate: Laminate, frequency: float) -> complex:
+    """k [1/m] of the free bending wave of a frequency [Hz], D(k) k⁴ = m'' omega².
+
+    Rotary inertia is left out. Complex with losses: a wave exp(-i k x) then decays, k has a
+    negative imaginary part.
+    """
+    inertia = laminate.surface_density * (2 * math.pi * frequency) ** 2
+    better = complex((inertia / freely_sliding(laminate.layers).rigidity) ** 0.25)
+    for _ in range(_MAX_STEPS):
+        k = better
+        better = (inertia / wave_rigidity(laminate, k, frequency)) ** 0.25
+        if abs(better - k) < 1e-12 * abs(k):
+            break
+    return better
+
+
+def _centres(layers: Sequence[Layer]) -> FloatArray:
+    """Heights of the layers' middles above the first face [m]."""
+    thickness = np.array([layer.thickness for layer in layers])
+    return np.asarray(np.cumsum(thickness) - thickness / 2)

@@ -1,0 +1,140 @@
+"""What may have happened to a plate at once: one spring, one gain, its thickness, or a mass on it.
+
+Each is a wide prior of the parameters that would have changed. The most likely one is that whose
+batch estimate over the last patterns costs least, a further cost for each parameter that changed;
+where even that leaves residuals that chance does not, the plate has changed in a way not known.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import linalg, stats
+
+from model.arrays import FloatArray
+from model.identification.derivatives import by_mass_at
+from model.identification.kalman import State, Updated, update
+from model.identification.parameters import Space
+from model.identification.settled import Touched
+
+_SPRING, _THICKNESS, _GAIN, _PHASE = 0.3, 0.05, 0.3, 0.5  # of logarithms, and radians
+_MASS = 5e-3
+_COST_OF_CHANGE = 4.0
+_UNLIKELY = 1e-4
+_SCANNED, _STARTS = (9, 7), 3
+_FIRST_ITERATIONS, _ITERATIONS = 3, 8
+_FOLLOWED = 3  # of the least cost after the first iterations
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """What explains some patterns: its name, "" for nothing known, and the state it leads to.
+
+    change: of the parameter, in its unit; lead: by how much the next best costs more.
+    """
+
+    name: str
+    change: float
+    lead: float
+    state: State
+
+    def __str__(self) -> str:
+        return f"{self.name} by {self.change:+.3g}" if self.name else "the plate has changed"
+
+
+def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
+    """Find the one change that explains patterns, from the state before it."""
+    space = patterns[0].space
+    tried = [
+        _Tried(name, changed, wider, update(wider, patterns, iterations=_FIRST_ITERATIONS))
+        for name, changed in _kinds(space)
+        for wider in [_widened(before, space, changed)]
+    ]
+    tried += _by_mass(before, patterns)
+    tried.sort(key=lambda each: each.cost)
+    for number, each in enumerate(tried[:_FOLLOWED]):
+        x = each.after.state.x
+        after = update(each.prior, patterns, iterations=_ITERATIONS, start=x)
+        tried[number] = replace(each, after=after)
+    tried.sort(key=lambda each: each.cost)
+    best = tried[0]
+    others = [each.cost for each in tried if each.name != best.name]
+    if stats.chi2.sf(best.cost, best.after.count) < _UNLIKELY:
+        return Explanation("", 0.0, 0.0, before)
+    index = next(iter(best.changed))
+    change = float(space.std[index] * (best.after.state.x[index] - before.x[index]))
+    return Explanation(best.name, change, min(others) - best.cost, best.after.state)
+
+
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """One hypothesis: name, what changes by which deviation, its prior, and what it leads to."""
+
+    name: str
+    changed: dict[int, float]
+    prior: State
+    after: Updated
+
+    @property
+    def cost(self) -> float:
+        """Of residuals and changes, and of supposing a change."""
+        return self.after.cost + _COST_OF_CHANGE * len(self.changed)
+
+
+def _kinds(space: Space) -> list[tuple[str, dict[int, float]]]:
+    """Names, and by number of the parameters that change their standard deviations."""
+    kinds = [(space.names[n], {n: _SPRING}) for n in space.indices("stiffness")]
+    for gain, phase in zip(space.indices("gain"), space.indices("phase"), strict=True):
+        kinds.append((space.names[gain], {gain: _GAIN, phase: _PHASE}))
+    kinds.append(("thickness", {space.groups["thickness"].start: _THICKNESS}))
+    return [kind for kind in kinds if all(space.std[n] > 0 for n in kind[1])]
+
+
+def _widened(before: State, space: Space, changed: dict[int, float]) -> State:
+    covariance = before.covariance.copy()
+    for number, std in changed.items():
+        covariance[number, number] += (std / space.std[number]) ** 2
+    return State(before.x, covariance)
+
+
+def _by_mass(before: State, patterns: Sequence[Touched]) -> list[_Tried]:
+    """Batch estimates with a mass, from the places where it would explain most."""
+    space = patterns[0].space
+    mass = space.groups["masses"].stop - 3
+    plate = patterns[0].touched.rig.plate
+    sides = np.array([plate.length, plate.width])
+    changed = {mass: _MASS, mass + 1: sides[0] / 3, mass + 2: sides[1] / 3}
+    wider = _widened(before, space, changed)
+    found = []
+    for size, place in _scan(before, patterns, sides):
+        start = before.x.copy()
+        start[mass] = size / space.std[mass]
+        start[mass + 1 : mass + 3] = (place - sides / 2) / space.std[mass + 1 : mass + 3]
+        after = update(wider, patterns, iterations=_FIRST_ITERATIONS, start=start)
+        found.append(_Tried("a mass", changed, wider, after))
+    return found
+
+
+def _scan(
+    before: State, patterns: Sequence[Touched], sides: FloatArray
+) -> list[tuple[float, FloatArray]]:
+    """Sizes [kg] and places [m] of a mass that would explain most, all else linear."""
+    axes = [side * (np.arange(n) + 0.5) / n for side, n in zip(sides, _SCANNED, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    slope, curvature = np.zeros(len(points)), np.zeros(len(points))
+    for each in patterns:
+        fingers = np.zeros(each.touched.space.size - len(before.x))
+        predicted, H = each.predicted(before.x, fingers)
+        P = linalg.block_diag(before.covariance, np.eye(len(fingers)))
+        S = H @ P @ H.T + np.diag(each.pattern.std**2)
+        at = each.touched.at(np.concatenate([before.x, fingers]))
+        columns = np.einsum("snp,n->sp", by_mass_at(at, points)[0], each.pattern.bases)
+        column = np.concatenate([columns.real, columns.imag])
+        weighted = linalg.solve(S, column, assume_a="pos")
+        slope += (each.pattern.numbers - predicted) @ weighted
+        curvature += (column * weighted).sum(axis=0)
+    curvature += 1 / _MASS**2
+    sizes = slope / curvature
+    gains = np.where(sizes > 0, sizes * slope, 0.0)
+    best = np.argsort(-gains, kind="stable")[:_STARTS]
+    return [(float(sizes[n]), points[n]) for n in best if gains[n] > 0]

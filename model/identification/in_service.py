@@ -1,0 +1,158 @@
+"""A plate that stays known while it plays: every settled pattern updates it.
+
+The parameters of an identification drift; an update moves them together with the fingers of its
+pattern, which are dropped afterwards. Where the innovation is unlikely the state is held, since an
+update would smear a jump over all parameters: five patterns later the last six are explained
+together by one change (`model.identification.hypotheses`), or the plate counts as changed.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from model.arrays import FloatArray
+from model.identification.forward import ForwardModel
+from model.identification.hypotheses import Explanation, explain
+from model.identification.identified_rig import rig_with
+from model.identification.identify import Identification
+from model.identification.kalman import State, update
+from model.identification.parameters import FINGER_PARTS, Space, space_of
+from model.identification.priors import Priors
+from model.identification.settled import SettledPattern, Touched
+from model.identification.values import Values
+from model.rig.rig import Rig
+
+_WINDOW, _UNLIKELY_TOGETHER, _UNLIKELY_ALONE = 8, 1e-6, 1e-8
+_HELD = 5
+_ITERATIONS = 3
+
+DRIFT = {
+    "thickness": 0.01,
+    "stiffness": 0.03,
+    "damping_each": 0.07,
+    "loss": 0.1,
+    "gain": 0.01,
+    "phase": math.radians(1),
+}
+"""By kind, how far a parameter walks in an hour, one standard deviation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """What one pattern has shown.
+
+    nis: squared innovation in its covariance, of `count` numbers; alarm: whether it began one;
+    is_held: whether the state waits for an explanation; explanation: where one was found now;
+    fingers (k, 4): factors of FINGER_PARTS of each finger of the pattern, none while held.
+    """
+
+    nis: float
+    count: int
+    alarm: bool
+    is_held: bool
+    explanation: Explanation | None
+    fingers: FloatArray
+
+
+class LivePlate:
+    """The state of an identified plate in service."""
+
+    def __init__(self, found: Identification) -> None:
+        self._before, self._rig = found.before, found.rig
+        self.can_update = found.is_explained
+        """Whether its identification explains the plate; otherwise there are only alarms."""
+        self._model = _with_spare_mass(found)
+        space = self._model.space
+        own = [space.index(name) for name in found.posterior.space.names]
+        x, covariance = np.zeros(space.size), np.zeros((space.size, space.size))
+        x[own] = found.posterior.x
+        covariance[np.ix_(own, own)] = found.posterior.covariance
+        self._state = State(x, covariance)
+        self._priors = Priors.of(found.before.uncertainty)
+        self._time: float | None = None
+        self._recent: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
+        self._held: list[Touched] = []
+        self.has_changed = False
+        """Whether the plate has changed in a way that no hypothesis explains."""
+
+    @property
+    def state(self) -> State:
+        """Parameters and covariance now."""
+        return self._state
+
+    @property
+    def space(self) -> Space:
+        """The parameters, a spare mass among them."""
+        return self._model.space
+
+    @property
+    def rig(self) -> Rig:
+        """The rig as it is known now."""
+        values = Values.of(self._before, self.space, self._state.x)
+        return rig_with(self._before, values, self._rig.uncertainty)
+
+    def take(self, pattern: SettledPattern) -> Report:
+        """Take a settled pattern: update the state, or hold it and explain what happened."""
+        touched = Touched.of(self._model, pattern, self._priors.finger)
+        drifted = self._drifted(pattern.time)
+        if self._held:
+            self._held.append(touched)
+            if len(self._held) > _HELD:
+                return self._explained(drifted, pattern.time)
+            return Report(np.nan, 0, False, True, None, np.zeros((0, 4)))
+        after = update(drifted, [touched], iterations=_ITERATIONS)
+        self._recent.append((after.nis, after.count))
+        if self._is_alarming(after.nis, after.count):
+            self._recent.clear()
+            if self.can_update and not self.has_changed:
+                self._held = [touched]
+            return Report(after.nis, after.count, True, bool(self._held), None, np.zeros((0, 4)))
+        if self.can_update and not self.has_changed:
+            self._state, self._time = after.state, pattern.time
+        fingers = np.exp(self._priors.finger * after.fingers.reshape(-1, len(FINGER_PARTS)))
+        return Report(after.nis, after.count, False, False, None, fingers)
+
+    def _explained(self, drifted: State, time: float) -> Report:
+        found = explain(drifted, self._held)
+        self._held = []
+        if found.name:
+            self._state, self._time = found.state, time
+        else:
+            self.has_changed = True
+        return Report(np.nan, 0, False, False, found, np.zeros((0, 4)))
+
+    def _is_alarming(self, nis: float, count: int) -> bool:
+        if stats.chi2.sf(nis, count) < _UNLIKELY_ALONE:
+            return True
+        total = sum(each for each, _ in self._recent)
+        numbers = sum(each for _, each in self._recent)
+        is_full = len(self._recent) == _WINDOW
+        return is_full and bool(stats.chi2.sf(total, numbers) < _UNLIKELY_TOGETHER)
+
+    def _drifted(self, time: float) -> State:
+        """The state at a time [s], less certain by what drifted since it was updated."""
+        hours = 0.0 if self._time is None else max(time - self._time, 0.0) / 3600
+        if self._time is None:
+            self._time = time
+        space, variance = self.space, np.zeros(self.space.size)
+        for kind, std in DRIFT.items():
+            known = space.std[space.groups[kind]]
+            drift = np.divide(std, known, out=np.zeros_like(known), where=known > 0)
+            variance[space.groups[kind]] = drift**2 * hours
+        return State(self._state.x, self._state.covariance + np.diag(variance))
+
+
+def _with_spare_mass(found: Identification) -> ForwardModel:
+    """The model of an identification with one mass more, which weighs nothing so far."""
+    model = found.fitted.problem.model
+    space = space_of(
+        found.before,
+        [sensor.name for sensor in model.sensors],
+        Priors.of(found.before.uncertainty),
+        masses=model.mass_count + 1,
+        mode_count=len(found.posterior.space.indices("mode_shifts")),
+    )
+    return replace(model, space=space, last_places={})

@@ -1,0 +1,108 @@
+"""A plate in service: a thin plate, whose theory is not the model's, that changes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.identification.hidden import LENGTH, WIDTH, Hidden, draw, finger_stiffness
+from benchmarks.identification.thin_plate import Mounted
+from benchmarks.setting import random_contacts
+from model.identification.forward import RestingFinger, Sensor
+from model.identification.identify import Identification, identify
+from model.identification.in_service import LivePlate, Report
+from model.identification.measurement import Measurement
+from model.identification.settled import SettledPattern
+from model.rig.file import example_rig_path, load_rig
+from model.structure.fingertip import Fingertip
+
+FREQUENCIES = np.linspace(40.0, 500.0, 27)
+SECONDS = 12.0  # between patterns
+NE = 2  # number of that ERA
+
+
+@pytest.fixture(scope="module")
+def hidden() -> Hidden:
+    """A plate with places and a mass of its own."""
+    return draw("form", 1)
+
+
+@pytest.fixture(scope="module")
+def found(hidden: Hidden) -> Identification:
+    """The paper's rig identified on it."""
+    rig = load_rig(example_rig_path())
+    sensors = [Sensor(era.name, era.name) for era in rig.eras]
+    values = hidden.measured(FREQUENCIES, np.random.default_rng(1))
+    return identify(rig, Measurement.of(sensors, FREQUENCIES, values))
+
+
+def play(
+    live: LivePlate, hidden: Hidden, plate: Mounted, *, count: int, start: int
+) -> list[Report]:
+    """Reports of patterns at random touches of two to four fingers of unknown loads."""
+    reports = []
+    for number in range(start, start + count):
+        rng = np.random.default_rng([7, number])
+        places = random_contacts(rng, int(rng.integers(2, 5)), (LENGTH, WIDTH), margin=0.013)
+        frequency = float(rng.choice(FREQUENCIES))
+        bases = 50e-6 * rng.uniform(0.2, 1, 4) * np.exp(2j * np.pi * rng.uniform(size=4))
+        factors = np.exp(0.5 * rng.standard_normal(len(places)))
+        loads = np.array([finger_stiffness(frequency, np.full(4, each)) for each in factors])
+        felt = plate.accelerations(frequency, plate.at, fingers=places, loads=loads)
+        values = hidden.sensor_gain * (felt @ bases)
+        noise = rng.standard_normal((2, 4))
+        values = values + 0.01 * np.abs(values) * (noise[0] + 1j * noise[1])
+        fingers = tuple(RestingFinger(x, y, Fingertip()) for x, y in places.tolist())
+        pattern = SettledPattern(number * SECONDS, frequency, bases, values, fingers)
+        reports.append(live.take(pattern))
+    return reports
+
+
+def test_loosened_mount_is_named_and_followed(hidden: Hidden, found: Identification) -> None:
+    """Quiet patterns raise no alarm; a mount 20 % softer does within 8, and is named NE."""
+    live = LivePlate(found)
+    quiet = play(live, hidden, hidden.mounted, count=20, start=0)
+    assert not any(report.alarm for report in quiet)
+    assert np.mean([report.nis / report.count for report in quiet]) < 1.5
+    factors = np.where(np.arange(4) == NE, 0.8, 1.0)
+    loose = replace(hidden.mounted, stiffness=factors * hidden.mounted.stiffness)
+    after = play(live, hidden, loose, count=16, start=20)
+    assert any(report.alarm for report in after[:8])
+    (explanation,) = (each.explanation for each in after if each.explanation)
+    assert explanation.name == "stiffness NE"
+    assert explanation.change == pytest.approx(np.log(0.8), abs=0.03)
+    assert live.rig.eras[NE].stiffness == pytest.approx(loose.stiffness[NE], rel=0.02)
+    assert not live.has_changed
+
+
+def test_plate_that_was_not_explained_is_not_updated(hidden: Hidden, found: Identification) -> None:
+    """After an identification with chi² above 2 patterns leave the state as it was."""
+    live = LivePlate(replace(found, chi2=2.5))
+    before = live.state
+    play(live, hidden, hidden.mounted, count=2, start=0)
+    assert live.state is before
+
+
+def test_change_that_nothing_explains_is_said(hidden: Hidden, found: Identification) -> None:
+    """Two mounts and a gain at once are no known change: the state stays and says so."""
+    live = LivePlate(found)
+    mounted = hidden.mounted
+    odd = replace(
+        mounted,
+        stiffness=mounted.stiffness * [0.5, 1.0, 2.0, 1.0],
+        gain=mounted.gain * [1.0, 0.5j, 1.0, 1.0],
+    )
+    before = live.state
+    reports = play(live, hidden, odd, count=6, start=0)
+    assert reports[0].alarm
+    assert reports[-1].explanation is not None
+    assert reports[-1].explanation.name == ""
+    assert live.has_changed
+    assert live.state is before
+
+
+def test_fingers_of_a_touch_are_refined(hidden: Hidden, found: Identification) -> None:
+    """Factors of the parts of every finger come with the report, above zero."""
+    (report,) = play(LivePlate(found), hidden, hidden.mounted, count=1, start=3)
+    assert report.fingers.shape[1] == 4
+    assert (report.fingers > 0).all()

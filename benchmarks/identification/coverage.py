@@ -10,7 +10,7 @@ from model.identification.derivatives import jacobian
 from model.identification.forward import Sensor
 from model.identification.identify import Identification
 from model.identification.parameters import space_of
-from model.identification.posterior import relevant
+from model.identification.posterior import THEORY, relevant
 from model.identification.priors import Priors
 
 _WITHIN = 1.96
@@ -38,21 +38,21 @@ def parameters_held(found: Identification, truth: Truth) -> dict[str, Reals]:
         "gain": gain - gain.mean(),
         "phase": phase - phase.mean(),
     }
-    errors = {}
+    errors, stds = {}, posterior.stds()
     for kind, value in true.items():
-        rows = relevant(space)[kind]
-        estimate = rows @ (space.std * posterior.x)
-        errors[kind] = (estimate - value) / posterior.std_of(rows)
+        estimate = relevant(space)[kind] @ (space.std * posterior.x)
+        errors[kind] = (estimate - value) / stds[kind]
     places = space.groups["place"]
     written = np.array([(era.x, era.y) for era in found.before.eras])
     errors["place"] = (
         space.std[places] * posterior.x[places] - (truth.at - written).ravel()
-    ) / posterior.std[places]
+    ) / stds["place"]
     if len(truth.masses) and len(found.values.masses):
         x, y, weight = truth.masses[0]
         at = space.groups["masses"].start
         own = found.values.masses[0] - [weight, x, y]
-        errors["mass"] = own / posterior.std[at : at + 3]
+        std = np.hypot(posterior.std[at : at + 3], [0.0, THEORY["place"], THEORY["place"]])
+        errors["mass"] = own / std
     return errors
 
 

@@ -13,6 +13,7 @@ from model.files.array_file import whole_or_nothing
 from model.identification.forward import Sensor
 from model.identification.identify import Identification, identify
 from model.identification.measurement import Measurement, Repeat
+from model.identification.promise import expected_contrast
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rewritten import rewritten_text
 from model.rig.rig import Rig
@@ -75,6 +76,24 @@ def test_same_data_and_seed_give_the_same_rig_and_draws(
     assert again.rig == found.rig
     assert again.draws(2) == found.draws(2)
     assert found.draws(1)[0] != found.rig
+
+
+def test_contrast_is_promised_from_the_held_out_error(found: Identification) -> None:
+    """Identified answers give more than those of the rig as written; a larger error promises less.
+
+    Nothing is promised of a plate that the model does not explain.
+    """
+    (one, two, three) = expected_contrast(found, frequencies=FREQUENCIES, sets=4)
+    for each in (one, two, three):
+        assert each.after > each.before
+        assert each.promised < each.after
+    assert found.held_out is not None
+    worse = replace(found.held_out, errors=np.full(len(FREQUENCIES), 0.2))
+    (doubtful, *_) = expected_contrast(
+        replace(found, held_out=worse), frequencies=FREQUENCIES, sets=4
+    )
+    assert doubtful.promised < one.promised - 3
+    assert expected_contrast(replace(found, chi2=2.1)) == []
 
 
 def test_file_with_identified_values_reads_back(found: Identification, tmp_path: Path) -> None:

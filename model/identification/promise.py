@@ -1,0 +1,88 @@
+"""The contrast that an identified rig promises, with the error of tones it was not shown.
+
+Answers are those of the rig's table, which rely on its uncertainty alone: weighing drives by where
+a fit is bad would lose contrast where its nulls are right. What is promised of them is less by the
+held-out error, as an error of the field at every finger of its own.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from model.arrays import FloatArray
+from model.ensemble.measures import PERCENTILE
+from model.identification.identify import Identification
+from model.table.build import build_table
+from model.table.exact_plates import draw_plates, felt_on
+from model.table.question import MIN_LEVEL_DB_SL, Point, Question
+from model.table.table import LocalizationTable
+
+_PLATES = 60
+_APART, _MARGIN = 0.05, 0.013  # m, of fingers from each other and from the edges
+
+
+@dataclass(frozen=True)
+class ExpectedContrast:
+    """Contrast [dB] with a number of quiet fingers, medians over sets of contacts.
+
+    before, after: what half of the plates like the identified one give with the answers of the rig
+    as written and as identified; promised: what nine of ten give with the latter.
+    """
+
+    quiet: int
+    before: float
+    after: float
+    promised: float
+
+
+def expected_contrast(
+    found: Identification, *, frequencies: FloatArray | None = None, sets: int = 12
+) -> list[ExpectedContrast]:
+    """Expect contrasts for one, two and three quiet fingers; the same for the same seed.
+
+    frequencies (f,) [Hz]: of the tables, by default those of any. Nothing is promised, an empty
+    list, where chi² is beyond what explains a measurement or too few tones were measured.
+    """
+    if not found.is_explained or found.held_out is None:
+        return []
+    written, identified = (
+        build_table(rig, frequencies=frequencies, drive_mode="phased")
+        for rig in (found.before, found.rig)
+    )
+    error = np.hypot(identified.discretisation_error, found.held_out.at(identified.frequencies))
+    judged = replace(identified, discretisation_error=error)
+    expected = []
+    for quiet in (1, 2, 3):
+        rng = np.random.default_rng([found.seed, quiet])
+        rows = []
+        for _ in range(sets):
+            places = _contacts(rng, quiet + 1, identified)
+            question = Question(places[:1], places[1:], level_db_sl=MIN_LEVEL_DB_SL)
+            plates = draw_plates(
+                rng,
+                identified.uncertainty,
+                count=_PLATES,
+                era_count=len(identified.eras),
+                contact_count=quiet + 1,
+            )
+            each = []
+            for table in (written, identified):
+                drive = table.query(question).excitation
+                contrast = felt_on(judged, question, drive, plates).contrast
+                assert contrast is not None  # noqa: S101  there are quiet fingers
+                each.append(20 * np.log10(contrast.acceleration[0]))
+            before, after = each
+            rows.append((np.median(before), np.median(after), np.percentile(after, PERCENTILE)))
+        expected.append(ExpectedContrast(quiet, *np.median(rows, axis=0).tolist()))
+    return expected
+
+
+def _contacts(rng: np.random.Generator, count: int, table: LocalizationTable) -> tuple[Point, ...]:
+    """Random contacts on a plate, apart from each other as fingers are."""
+    sides = np.array([table.plate.length, table.plate.width])
+    margin, apart = min(_MARGIN, sides.min() / 4), min(_APART, sides.min() / (2 * count))
+    while True:
+        places = rng.uniform(margin, sides - margin, (count, 2))
+        gaps = np.linalg.norm(places[:, None] - places, axis=-1)
+        if gaps[np.triu_indices(count, 1)].min() > apart:
+            return tuple((float(x), float(y)) for x, y in places)

@@ -1,6 +1,5 @@
 """Calibration of a rig by measured responses, without dead channels and outliers."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,30 +8,40 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_result import (
     MAX_FIT_ERROR,
+    MAX_OUTLIERS,
     Calibration,
     FittedParameter,
-    HeldOut,
     SensorScale,
 )
-from model.calibration.calibration_screening import sensors_off_model, silent_eras, silent_sensors
+from model.calibration.calibration_screening import (
+    check_enough_sensors,
+    sensors_off_model,
+    silent_eras,
+    silent_sensors,
+)
 from model.calibration.fit import Fit, Problem, misfit, solve
+from model.calibration.fitted_rig import (
+    gain_rows,
+    moved_eras,
+    predicted_by,
+    rig_of_fit,
+    standard_error,
+    uncertainty_of,
+)
+from model.calibration.form_errors import SIDE, FormModel, form_model
+from model.calibration.form_fit import FormFit, solve_with_form
 from model.calibration.held_out import hold_out, initial_responses, relative_error
-from model.calibration.parameters import Parameter, parameters_of, rig_with, starts
+from model.calibration.parameters import Parameter, parameters_of, starts
 from model.calibration.responses import Responses
 from model.calibration.variable_projection import row_rms
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.structure.actuator import Gain
 from model.vibration.parametric_plate import ParametricPlate, parametric_plate
 
 _STARTS = 2  # those with the least misfit of shapes
 _WRONG_SCALE = 0.02  # common tolerance of sensors
 _SIGNIFICANCE = 4.0  # standard errors
-_LEAST_SENSORS = 3
-
-# Relative error of values by idealisations of the model: viscous instead of hysteretic damping
-# changes the loss factor by 0.15 %, other values by less.
-_MODEL_ERROR = 2e-3
+_MAX_SIDE = 4.0  # tolerances by which a side of the plate may be off
 
 
 def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Calibration:
@@ -44,7 +53,7 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
     alive, dead_eras = ~silent_sensors(responses), silent_eras(responses)
     values = responses.values.copy()
     values[:, dead_eras] = np.nan
-    _check_enough(alive, responses)
+    check_enough_sensors(alive, responses)
     plate = parametric_plate(rig, responses.points, responses.frequencies)
     parameters = parameters_of(rig)
 
@@ -55,7 +64,7 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
     unlike = sensors_off_model(problem, fit, relative)
     if unlike.any():
         alive[alive] = ~unlike
-        _check_enough(alive, responses)
+        check_enough_sensors(alive, responses)
         relative = relative[~unlike] / np.median(relative[~unlike])
         problem = _problem(rig, plate, parameters, values, alive)
         fit = solve(problem, fit.x, relative)
@@ -67,31 +76,26 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
     if not all_scales:
         relative = np.where(wrong, relative, 1.0)
     problem = replace(problem, free_scales=free_scales)
-    problem, fit = _identified(problem, solve(problem, fit.x, relative))
+    points = responses.points[alive]
+    model = form_model(rig, points, responses.frequencies)
+    problem, found = _identified(problem, model, solve(problem, fit.x, relative))
     if all_scales:
-        fit = _with_median_scale_one(fit)
+        found = _with_median_scale_one(found)
+    _check_outliers(problem, found)
+    _check_sides(problem, model, found)
     names = tuple(name for name, live in zip(responses.sensors, alive, strict=True) if live)
     return _report(
         problem,
-        fit,
+        model,
+        found,
+        points=points,
         names=names,
         frequencies=responses.frequencies,
         dead_sensors=tuple(
             name for name, live in zip(responses.sensors, alive, strict=True) if not live
         ),
         dead_eras=tuple(era.name for era, dead in zip(rig.eras, dead_eras, strict=True) if dead),
-        held_out=hold_out(problem, fit, names),
     )
-
-
-def _check_enough(alive: NDArray[np.bool_], responses: Responses) -> None:
-    if alive.sum() < _LEAST_SENSORS:
-        dead = [n for n, live in zip(responses.sensors, alive, strict=True) if not live]
-        without = f" ({', '.join(dead)} without a signal)" if dead else ""
-        raise InputError(
-            f"at least {_LEAST_SENSORS} sensors must have a signal, better eight or more, got "
-            f"{alive.sum()}{without}"
-        )
 
 
 def _problem(
@@ -121,28 +125,57 @@ def _best_fit(problem: Problem) -> Fit:
     return min(fits, key=lambda fit: misfit(problem, fit.x))
 
 
-def _identified(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+def _identified(problem: Problem, model: FormModel, start: Fit) -> tuple[Problem, FormFit]:
     """Hold parameters that the data determine less than their prior does, and fit again."""
     prior = np.array([parameter.prior_std for parameter in problem.parameters])
     own = np.array([parameter.start for parameter in problem.parameters])
+    fit = solve_with_form(problem, model, start)
     while True:
         excess = np.where(problem.free, fit.x_error / prior, 0)
         # Values of a plate that does not fit are meaningless.
-        if not excess.max() > 1 or _fit_error(problem, fit) > MAX_FIT_ERROR:
+        if not excess.max() > 1 or _fit_error(problem, model, fit) > MAX_FIT_ERROR:
             return problem, fit
         free = problem.free.copy()
         free[int(excess.argmax())] = False
         problem = replace(problem, free=free)
-        fit = solve(problem, np.where(free, fit.x, own), fit.scales)
+        fit = solve_with_form(problem, model, replace(fit, x=np.where(free, fit.x, own)))
 
 
-def _fit_error(problem: Problem, fit: Fit) -> float:
-    rig = rig_with(problem.rig, problem.parameters, fit.x)
-    predicted = fit.gains[:, :, None] * problem.plate.responses(rig) * fit.scales
+def _fit_error(problem: Problem, model: FormModel, fit: FormFit) -> float:
+    responses, _ = model.responses(problem.parameters, fit.x, fit.form)
+    predicted = fit.gains[:, :, None] * responses * fit.scales
     return relative_error(problem.values, predicted, row_rms(problem.values, fit.used), fit.used)
 
 
-def _with_median_scale_one(fit: Fit) -> Fit:
+def _check_outliers(problem: Problem, fit: FormFit) -> None:
+    count = int(np.isfinite(problem.values).sum())
+    out = count - int(fit.used.sum())
+    if out > MAX_OUTLIERS * count:
+        raise InputError(
+            f"outliers must be at most {100 * MAX_OUTLIERS:g} % of the values, got {out} of "
+            f"{count} ({100 * out / count:.0f} %); check that it is this plate, names and places "
+            "of sensors and ERAs, and loose contacts"
+        )
+
+
+def _check_sides(problem: Problem, model: FormModel, fit: FormFit) -> None:
+    """Raise InputError where the responses fit a plate of another size better."""
+    if _fit_error(problem, model, fit) > MAX_FIT_ERROR:
+        return
+    plate = problem.rig.plate
+    for key, side, off in zip(
+        ("length", "width"), (plate.length, plate.width), fit.form[model.sides], strict=True
+    ):
+        if abs(off) > _MAX_SIDE:
+            found = side + SIDE * float(off)
+            raise InputError(
+                f"plate.{key} must be that of the measured plate, got {1e3 * side:.4g} mm in the "
+                f"rig while responses fit {1e3 * found:.4g} mm, as it looks; measure it, and "
+                "correct the rig or take its own measurement"
+            )
+
+
+def _with_median_scale_one(fit: FormFit) -> FormFit:
     middle = float(np.median(fit.scales))
     return replace(
         fit,
@@ -155,36 +188,40 @@ def _with_median_scale_one(fit: Fit) -> Fit:
 
 def _report(
     problem: Problem,
-    fit: Fit,
+    model: FormModel,
+    fit: FormFit,
     *,
+    points: FloatArray,
     names: tuple[str, ...],
     frequencies: FloatArray,
     dead_sensors: tuple[str, ...],
     dead_eras: tuple[str, ...],
-    held_out: HeldOut | None,
 ) -> Calibration:
-    rig = rig_with(problem.rig, problem.parameters, fit.x)
-    model = problem.plate.responses(rig)
-    after = fit.gains[:, :, None] * model
+    before = problem.rig
+    rig = rig_of_fit(problem, model, fit)
+    responses, gains = predicted_by(rig, problem, points, fit)
     eras = tuple(
-        replace(era, gains=_gain_rows(fit.gains[:, number], frequencies) or era.gains)
+        replace(era, gains=gain_rows(gains[:, number], frequencies) or era.gains)
         for number, era in enumerate(rig.eras)
     )
     parameters = tuple(
         FittedParameter(
             parameter,
             parameter.value(float(x)),
-            _with_model_error(parameter, float(x), float(error)) if free else None,
+            standard_error(before, parameter, float(x), float(error)) if free else None,
             bool(free and min(x - parameter.lower, parameter.upper - x) < 1e-6),
         )
         for parameter, x, error, free in zip(
             problem.parameters, fit.x, fit.x_error, problem.free, strict=True
         )
     )
+    held_out = hold_out(problem, model, fit, points, names)
+    uncertainty = uncertainty_of(before.uncertainty, problem, fit, parameters, held_out)
     measured_count = int(np.isfinite(problem.values).sum())
     return Calibration(
-        rig=replace(rig, eras=eras),
+        rig=replace(rig, eras=eras, uncertainty=uncertainty),
         parameters=parameters,
+        moved=moved_eras(before, model, fit),
         gains_error=fit.gains_error,
         dead_sensors=dead_sensors,
         dead_eras=dead_eras,
@@ -197,23 +234,12 @@ def _report(
         ),
         outlier_count=measured_count - int(fit.used.sum()),
         value_count=measured_count,
-        error=_fit_error(problem, fit),
+        error=_fit_error(problem, model, fit),
+        chi2=fit.chi2,
         held_out=held_out,
         sensors=names,
         frequencies=frequencies,
         measured=problem.values / fit.scales,
         before=initial_responses(problem),
-        after=after,
-    )
-
-
-def _with_model_error(parameter: Parameter, x: float, error: float) -> float:
-    return math.hypot(parameter.standard_error(x, error), _MODEL_ERROR * parameter.value(x))
-
-
-def _gain_rows(gains: ComplexArray, frequencies: FloatArray) -> tuple[Gain, ...]:
-    known = np.isfinite(gains) & (gains != 0)
-    return tuple(
-        (float(f), float(abs(gain)), float(np.angle(gain)))
-        for f, gain in zip(frequencies[known], gains[known], strict=True)
+        after=gains[:, :, None] * responses,
     )

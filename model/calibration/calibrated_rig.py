@@ -1,5 +1,6 @@
 """Text of a rig file with calibrated values and unchanged comments and layout."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ def check_reads_back(rig: Rig, expected: Calibration, path: Path) -> None:
         layers = one.laminate.layers if one.laminate else ()
         materials = [layer.material for layer in layers] or [one.plate.material]
         plate = [one.plate.loss_factor, *(material.E for material in materials)]
+        plate += asdict(one.uncertainty).values()
         return plate + [v for era in one.eras for v in _numbers_of(era)]
 
     # The absolute part is for numbers near zero: 1 mg, 1 µN s/m, a millionth of a gain.
@@ -42,4 +44,4 @@ def check_reads_back(rig: Rig, expected: Calibration, path: Path) -> None:
 
 def _numbers_of(era: Era) -> list[float]:
     gains = [part for _, size, phase in era.gains for part in (size, np.cos(phase), np.sin(phase))]
-    return [era.stiffness, era.damping, era.bolt_mass, *gains]
+    return [era.x, era.y, era.stiffness, era.damping, era.bolt_mass, *gains]

@@ -1,5 +1,6 @@
 """Report of a calibration, as text and as JSON."""
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,20 @@ def change_rows(calibration: Calibration) -> list[str]:
     return [
         f"{fitted.parameter.name:{width}}  {_change(fitted)}" for fitted in calibration.parameters
     ]
+
+
+def place_rows(calibration: Calibration) -> list[str]:
+    """Lines of ERAs that are not at the rig's places: before -> after with standard errors."""
+    return [
+        f"{moved.name} place  {_millimetres(moved.before)} -> {_millimetres(moved.after)} ± "
+        f"{_millimetres(moved.standard_error)} mm"
+        for moved in calibration.moved
+    ]
+
+
+def uncertainty_row(calibration: Calibration) -> str:
+    """Line of the uncertainty that the new rig states."""
+    return f"uncertainty in the new rig: {calibration.rig.uncertainty}"
 
 
 def gain_rows(calibration: Calibration) -> list[str]:
@@ -93,6 +108,16 @@ def as_json(calibration: Calibration, before: Rig, files: list[str]) -> dict[str
             }
             for number, era in enumerate(calibration.rig.eras)
         },
+        "moved_eras": [
+            {
+                "era": moved.name,
+                "before_m": list(moved.before),
+                "after_m": list(moved.after),
+                "standard_error_m": list(moved.standard_error),
+            }
+            for moved in calibration.moved
+        ],
+        "uncertainty": asdict(calibration.rig.uncertainty),
         "not_identified": [p.parameter.name for p in calibration.parameters if not p.is_identified],
         "dead_sensors": list(calibration.dead_sensors),
         "dead_eras": list(calibration.dead_eras),
@@ -105,18 +130,24 @@ def as_json(calibration: Calibration, before: Rig, files: list[str]) -> dict[str
         "values": calibration.value_count,
         "outliers": calibration.outlier_count,
         "fit_error": calibration.error,
+        "chi2": calibration.chi2,
         "held_out": None
         if held_out is None
         else {
             "sensors": list(held_out.sensors),
             "error_before": held_out.before,
             "error_after": held_out.after,
+            "median_error_after": held_out.median,
         },
         "good": calibration.is_good,
         "fingerprint_before": before.fingerprint,
         "fingerprint_after": calibration.rig.fingerprint,
         "files": files,
     }
+
+
+def _millimetres(place: tuple[float, float]) -> str:
+    return f"({1e3 * place[0]:.1f}, {1e3 * place[1]:.1f})"
 
 
 def _known(errors: np.ndarray[Any, np.dtype[np.float64]]) -> list[float]:

@@ -9,6 +9,9 @@ from model.rig.rig import Rig
 MAX_FIT_ERROR = 0.25
 """Largest relative error at held-out sensors of an acceptable fit."""
 
+MAX_OUTLIERS = 0.1
+"""Largest share of values left out of an acceptable fit."""
+
 
 @dataclass(frozen=True)
 class FittedParameter:
@@ -38,29 +41,43 @@ class SensorScale:
 
 
 @dataclass(frozen=True)
+class MovedEra:
+    """An ERA that is clearly not at the rig's place: x, y [m] before and after, standard errors."""
+
+    name: str
+    before: tuple[float, float]
+    after: tuple[float, float]
+    standard_error: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class HeldOut:
     """Prediction at sensors held out of the fit.
 
     before, after: error of the old and the fitted rig, root mean square over responses, each
-    relative to all sensors' at its frequency and ERA.
+    relative to all sensors' at its frequency and ERA; median: of the fitted rig's.
     """
 
     sensors: tuple[str, ...]
     before: float
     after: float
+    median: float
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """Calibrated rig with everything found about the measurement.
 
-    dead_sensors, dead_eras: left out of the fit; scales: of sensors with a wrong scale, or of all
-    if requested; held_out: None with too few sensors; error: as in HeldOut, of the fit; measured,
-    before, after: responses (f, eras, s) [1/s²] of the live sensors, divided by their scales.
+    moved: ERAs at other places than in the rig before; dead_sensors, dead_eras: left out of the
+    fit; scales: of sensors with a wrong scale, or of all if requested; held_out: None with too few
+    sensors; error: as in HeldOut, of the fit with its form errors; chi2: of that fit, about 1;
+    measured, before, after: responses (f, eras, s) [1/s²] of the live sensors, divided by their
+    scales.
     """
 
     rig: Rig
     parameters: tuple[FittedParameter, ...]
+    moved: tuple[MovedEra, ...]
     gains_error: FloatArray
     dead_sensors: tuple[str, ...]
     dead_eras: tuple[str, ...]
@@ -68,6 +85,7 @@ class Calibration:
     outlier_count: int
     value_count: int
     error: float
+    chi2: float
     held_out: HeldOut | None
     sensors: tuple[str, ...]
     frequencies: FloatArray

@@ -12,6 +12,7 @@ from model.errors import InputError
 _SILENT_ERA = 0.02  # of what the others do
 _SILENT_SENSOR = 0.005  # of the loudest sensor, in the median over frequencies and ERAs
 _DEAD_SCALE = 0.1  # of the others' scale
+_LEAST_SENSORS = 3
 _DEAD_COHERENCE = 0.5  # with what the fitted plate does at the sensor
 
 
@@ -33,6 +34,17 @@ def silent_sensors(responses: Responses) -> NDArray[np.bool_]:
     share = size / np.where(loudest > 0, loudest, np.nan)
     typical = [_median(share[:, :, s]) for s in range(size.shape[2])]
     return ~(np.array(typical) >= _SILENT_SENSOR)
+
+
+def check_enough_sensors(alive: NDArray[np.bool_], responses: Responses) -> None:
+    """Raise InputError unless enough sensors (s,) have a signal."""
+    if alive.sum() < _LEAST_SENSORS:
+        dead = [n for n, live in zip(responses.sensors, alive, strict=True) if not live]
+        without = f" ({', '.join(dead)} without a signal)" if dead else ""
+        raise InputError(
+            f"at least {_LEAST_SENSORS} sensors must have a signal, better eight or more, got "
+            f"{alive.sum()}{without}"
+        )
 
 
 def _median(values: NDArray[np.inexact]) -> float:

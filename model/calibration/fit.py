@@ -31,7 +31,7 @@ from model.vibration.parametric_plate import ParametricPlate
 
 _Loss: TypeAlias = Literal["linear", "soft_l1"]
 
-_OUTLIER = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
+MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
 _PEAK = 3.0  # times the median of a row; twice that is rare on a plate
 _ROUNDS = 8
 _STEPS = 60  # of one search; a plate that fits takes ten
@@ -83,7 +83,7 @@ def solve(problem: Problem, x: FloatArray, scales: FloatArray) -> Fit:
     for number in range(_ROUNDS):
         left = _residual(problem, x, scales, used / noise[:, :, None])
         raw = np.abs(left) * noise[:, :, None]
-        noise = _noise(problem.values, raw, used)
+        noise = noise_of(problem.values, raw, used)
         kept = _without_outliers(raw / noise[:, :, None], used)
         is_settled = number > 0 and bool((kept == used).all())
         used = kept
@@ -210,7 +210,7 @@ def _without_peaks(values: ComplexArray, used: NDArray[np.bool_]) -> ComplexArra
     return np.asarray(values * np.minimum(1, limit[:, :, None] / np.maximum(size, 1e-300)))
 
 
-def _noise(values: ComplexArray, raw: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
+def noise_of(values: ComplexArray, raw: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
     """Standard deviation (f, e) of a value's real or imaginary part: sqrt(a² + b² size²).
 
     From the medians of residuals raw (f, e, s), over rows from weak to strong.
@@ -229,7 +229,7 @@ def _noise(values: ComplexArray, raw: FloatArray, used: NDArray[np.bool_]) -> Fl
     for group in np.array_split(order, min(12, len(rows) // 2)):
         # The median of |z|² of complex noise with variance 2 is 2 log 2.
         found.append(np.nanmedian(power[group]) / np.log(2))
-        at.append(np.mean(size.ravel()[rows][group] ** 2))
+        at.append(np.median(size.ravel()[rows][group] ** 2))
     scale = np.maximum(found, 1e-12 * np.array(at))
     matrix = np.column_stack([1 / scale, np.array(at) / scale])
     weight = np.linalg.norm(matrix, axis=0)
@@ -241,7 +241,7 @@ def _without_outliers(deviation: FloatArray, used: NDArray[np.bool_]) -> NDArray
     """Take the worst value out of each row that has one beyond bounds and others to stay."""
     deviation = np.where(used, deviation / np.sqrt(2), 0)
     worst = deviation.argmax(axis=2)
-    f, e = np.nonzero((deviation.max(axis=2) > _OUTLIER) & (used.sum(axis=2) > 2))
+    f, e = np.nonzero((deviation.max(axis=2) > MAX_DEVIATION) & (used.sum(axis=2) > 2))
     kept = used.copy()
     kept[f, e, worst[f, e]] = False
     return kept

@@ -7,16 +7,23 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_result import HeldOut
-from model.calibration.fit import Fit, Problem, solve
-from model.calibration.parameters import rig_with
+from model.calibration.fit import Problem
+from model.calibration.fitted_rig import predicted_by, rig_of_fit
+from model.calibration.form_errors import FormModel
+from model.calibration.form_fit import FormFit, solve_with_form
 from model.calibration.variable_projection import row_rms
 
 _HELD_OUT_SHARE = 0.2  # of the sensors
 _LEAST_TO_HOLD_OUT = 5  # sensors
 
 
-def hold_out(problem: Problem, fit: Fit, names: tuple[str, ...]) -> HeldOut | None:
-    """Fit without some of the sensors of known scale, and predict their responses."""
+def hold_out(
+    problem: Problem, model: FormModel, fit: FormFit, points: FloatArray, names: tuple[str, ...]
+) -> HeldOut | None:
+    """Fit without some of the sensors of known scale, and predict their responses.
+
+    points (s, 2) [m]. Predicted by the rig as its file has it, without other form errors.
+    """
     count = len(names)
     candidates = np.flatnonzero(~problem.free_scales)
     if len(candidates) == 0:
@@ -33,16 +40,21 @@ def hold_out(problem: Problem, fit: Fit, names: tuple[str, ...]) -> HeldOut | No
         values=problem.values[:, :, ~unseen],
         free_scales=problem.free_scales[~unseen],
     )
-    seen = solve(part, fit.x, fit.scales[~unseen])
+    model_part = model.at(~unseen)
+    seen = solve_with_form(part, model_part, fit.at(~unseen, model))
+    rig = rig_of_fit(part, model_part, seen)
+    everywhere = replace(seen, used=fit.used & ~unseen, noise=fit.noise, scales=fit.scales)
+    responses, gains = predicted_by(rig, problem, points, everywhere)
+    predicted = gains[:, :, None] * responses * fit.scales
     size = row_rms(problem.values)
-    rig = rig_with(problem.rig, problem.parameters, seen.x)
-    predicted = seen.gains[:, :, None] * problem.plate.responses(rig) * fit.scales
+    which = fit.used & unseen
     return HeldOut(
         tuple(name for name, out in zip(names, unseen, strict=True) if out),
         relative_error(
             problem.values, initial_responses(problem) * fit.scales, size, unseen[None, None]
         ),
-        relative_error(problem.values, predicted, size, fit.used & unseen),
+        relative_error(problem.values, predicted, size, which),
+        float(np.median((np.abs(predicted - problem.values) / size[:, :, None])[which])),
     )
 
 

@@ -40,10 +40,11 @@ def calibrate(
     from model.calibration.calibrate import calibrate as fit
     from model.calibration.responses import responses_of
     from model.calibration.responses_file import read_functions
-    from model.config.document import read_document
+    from model.config.document import parse_document, read_document
+    from model.diagnosis.consistency import check_consistency
     from model.files.array_file import whole_or_nothing
     from model.files.replacing import check_ending, check_picture, check_place
-    from model.rig.file import load_rig, rig_of
+    from model.rig.file import rig_of
 
     check_place(output, example="rig2.yaml")
     check_ending(output, ".yaml", ".yml", what="a rig file")
@@ -56,11 +57,16 @@ def calibrate(
     rig = rig_of(document, mesh=mesh)
     responses = responses_of(read_functions(measured_file), rig)
     started = time.perf_counter()
+    check_consistency(rig, responses)
     calibration = fit(rig, responses, all_scales=all_scales)
     elapsed = time.perf_counter() - started
-    rows = calibration_report.change_rows(calibration)
+    rows = [
+        *calibration_report.change_rows(calibration),
+        *calibration_report.place_rows(calibration),
+    ]
     notes = [
         *calibration_report.finding_rows(calibration),
+        calibration_report.uncertainty_row(calibration),
         calibration_report.check_row(calibration),
     ]
     files = []
@@ -72,9 +78,10 @@ def calibrate(
             + [f"  {row}" for row in [*rows, *notes]]
         )
         text = calibrated_text(document, rig, calibration, comment=comment)
+        new = rig_of(parse_document(str(output), text), mesh=mesh)
+        check_reads_back(new, calibration, output)
         with whole_or_nothing(output) as stream:
             stream.write(text.encode())
-        check_reads_back(load_rig(output, mesh=mesh), calibration, output)
         files.append(str(output))
     if picture is not None:
         from model.figures import save_figure

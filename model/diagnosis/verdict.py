@@ -83,9 +83,12 @@ class Verdict:
         )
 
 
-def diagnose(rig: Rig, observation: Observation) -> Verdict:
+def diagnose(
+    rig: Rig, observation: Observation, *, max_deviation: float = MAX_DEVIATION
+) -> Verdict:
     """Compare a measurement with the rig's prediction.
 
+    max_deviation: of a parameter of the plate, in standard deviations of its prior.
     Raises InputError for fewer than three usable sensors or four frequencies.
     """
     if not observation.measured.any():
@@ -112,9 +115,9 @@ def diagnose(rig: Rig, observation: Observation) -> Verdict:
     off = off_scale(observation, values, match)
     if off and len(observation.sensors) - len(off) >= LEAST_SENSORS:
         wrong = np.isin(observation.sensors, [name for name, _ in off])
-        again = diagnose(rig, observation.without(wrong))
+        again = diagnose(rig, observation.without(wrong), max_deviation=max_deviation)
         return replace(again, bad_sensors=(*removed, *off, *again.bad_sensors))
-    matches = match.error <= MAX_FIT_ERROR and match.worst <= MAX_DEVIATION
+    matches = match.error <= MAX_FIT_ERROR and match.worst <= max_deviation
     explanations: Sequence[Explanation] = ()
     fitted = match
     if not matches:

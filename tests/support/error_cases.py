@@ -31,7 +31,11 @@ from ruamel.yaml import YAML
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.cli.main import run
+from distorted_responses import DISTORTIONS, every
 from gateway_bench import real_daemon, wait_for
+from model.calibration.responses import responses_of
+from model.calibration.responses_file import read_functions, write_responses_csv
+from model.rig.file import example_rig_path, load_rig
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "reference" / "errors.md"
@@ -220,6 +224,15 @@ _BEFORE: dict[str, Callable[[contextlib.ExitStack, io.StringIO], None]] = {
 }
 
 
+def _write_distorted(shelf: Path) -> None:
+    """Put measured responses on the shelf that are not what they claim, such as g.csv."""
+    rig = load_rig(example_rig_path())
+    measured = responses_of(read_functions(ROOT / "examples" / "measured.csv"), rig)
+    few = every(measured, 2, up_to=300.0)
+    for name, distort in DISTORTIONS.items():
+        write_responses_csv(shelf / f"{name}.csv", distort(few), rig)
+
+
 @contextlib.contextmanager
 def filled(shelf: Path) -> Iterator[None]:
     """Put a small table and copies of examples on a shelf, and run a daemon meanwhile."""
@@ -230,6 +243,7 @@ def filled(shelf: Path) -> Iterator[None]:
     (shelf / "rig.yaml").unlink()
     for name in ("measured.csv", "measured.uff", "touches.tuio"):
         (shelf / name).write_bytes((ROOT / "examples" / name).read_bytes())
+    _write_distorted(shelf)
     (shelf / _DAEMON).mkdir()
     with real_daemon(shelf / _DAEMON):
         yield

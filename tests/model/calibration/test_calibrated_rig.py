@@ -12,6 +12,7 @@ from model.config.document import read_document
 from model.errors import InputError
 from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
 
 FLOW = """\
 # my panel
@@ -72,15 +73,18 @@ def calibration(rig: Rig) -> Calibration:
             stiffness=era.stiffness * 1.1 + number,
             damping=era.damping + 1.5,
             bolt_mass=era.bolt_mass + 0.0123456,
+            x=0.00123 if number == 0 else era.x,
             gains=((50.0, 0.91234, -0.2), (60.5, 1.1, 3.0)) if number < 2 else (),
         )
         for number, era in enumerate(rig.eras)
     )
-    new = replace(rig, plate=plate, laminate=laminate, eras=eras)
+    known = Uncertainty(0.004, 0.3, 0.002, 0.01, 1.02, 0.5)
+    new = replace(rig, plate=plate, laminate=laminate, eras=eras, uncertainty=known)
     none = np.zeros((0, 3, 0), dtype=complex)
     return Calibration(
         rig=new,
         parameters=(),
+        moved=(),
         gains_error=np.zeros((0, 3)),
         dead_sensors=(),
         dead_eras=(),
@@ -88,6 +92,7 @@ def calibration(rig: Rig) -> Calibration:
         outlier_count=0,
         value_count=0,
         error=0.0,
+        chi2=1.0,
         held_out=None,
         sensors=(),
         frequencies=np.zeros(0),

@@ -161,12 +161,13 @@ def test_calibrate_estimates_all_scales_when_requested(rig, truth):
     assert scales["P12"] == pytest.approx(1.0, abs=0.005)
 
 
-def test_calibrate_does_not_fit_another_plate(rig):
-    """Responses of a plate twice as thick and shorter do not fit, whatever the values."""
+def test_calibrate_refuses_a_plate_of_another_size(rig):
+    """A plate twice as thick and 9 mm shorter: its length is refused, whatever the values."""
     plate = replace(rig.plate, thickness=0.003, length=0.296)
     eras = tuple(replace(era, x=min(era.x, 0.296)) for era in rig.eras)
     other = replace(rig, plate=plate, eras=eras, mesh=Mesh(16, 12, 0.296, rig.plate.width))
-    assert not calibrate(rig, measured(perturbed(other))).is_good
+    with pytest.raises(InputError, match=r"plate\.length"):
+        calibrate(rig, measured(perturbed(other)))
 
 
 def test_calibrate_refuses_too_few_sensors_and_silence(rig, truth):

@@ -1,4 +1,4 @@
-"""Accuracy of calibration by noise and sensors: `python -m benchmarks.calibration`.
+"""Accuracy of calibration by noise and sensors.
 
 The plate of examples/make_measured.py, measured on the simulated bench; errors of the fitted
 values, and contrast of the calibrated rig's patterns on the true plate.
@@ -102,7 +102,3 @@ def main() -> None:
             print(f"{count:8d} {noise:6g} {' '.join(cells)} {held:5d} {elapsed:4.1f}", flush=True)
     print()
     show_contrast(rig, truth, measure(rig, truth, grid=(4, 3), noise=1.0))
-
-
-if __name__ == "__main__":
-    main()

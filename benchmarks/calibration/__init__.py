@@ -1,0 +1,1 @@
+"""Calibration: accuracy by noise and sensors, and intervals over hidden plates."""

@@ -1,0 +1,11 @@
+"""Runs both: `python -m benchmarks.calibration [PLATES]`."""
+
+import sys
+
+from benchmarks.calibration import accuracy, intervals
+
+PLATES = 200
+
+if __name__ == "__main__":
+    intervals.main(int(sys.argv[1]) if len(sys.argv) > 1 else PLATES)
+    accuracy.main()

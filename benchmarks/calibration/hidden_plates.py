@@ -1,0 +1,180 @@
+"""Plates that calibration must identify without knowing how they were made.
+
+Solved with finite elements of fourth order (Q4, strips along the edges) and a sparse solve for each
+frequency, where the product uses modes of polynomials; with form errors that the rig's description
+cannot express.
+
+    python -m benchmarks.calibration.hidden_plates FOLDER COUNT FORM
+
+writes what sensors read of each plate as CSV, and its true values as JSON: calibration runs in
+another process and has the CSV alone.
+"""
+
+import json
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.setting import RIG
+from model.arrays import ComplexArray, FloatArray
+from model.calibration.responses import Responses
+from model.calibration.responses_file import write_responses_csv
+from model.fem.assembly import PlateMatrices, assemble
+from model.fem.elements import ELEMENTS
+from model.fem.harmonic import direct_acceleration
+from model.fem.mesh import Mesh
+from model.rig.file import load_rig
+from model.rig.rig import Rig
+from model.structure.point_load import PointLoad
+
+MESH = (6, 5)  # within 0.1 % of converged, with strips
+STRIP = 3e-3  # m, twice the plate's thickness
+FREQUENCIES = np.arange(40.0, 501.0, 20.0)
+# Twelve sensors on no line of symmetry, as shares of the sides.
+SENSORS = np.array(
+    [
+        *([0.07, 0.15], [0.37, 0.08], [0.67, 0.18], [0.94, 0.12]),
+        *([0.14, 0.44], [0.42, 0.53], [0.62, 0.41], [0.91, 0.57]),
+        *([0.06, 0.91], [0.31, 0.80], [0.71, 0.86], [0.96, 0.93]),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class FormErrors:
+    """Standard deviations of what a rig file does not say.
+
+    place [m]: of an ERA, along each side; mass [kg]: of one foreign mass anywhere; side [m]: of
+    length and width; poisson: of Poisson's ratio; sensor_place [m]; sensor_scale: relative.
+    """
+
+    place: float = 0.0
+    mass: float = 0.0
+    side: float = 0.0
+    poisson: float = 0.0
+    sensor_place: float = 0.0
+    sensor_scale: float = 0.0
+
+
+FORMS = {
+    "none": FormErrors(),
+    "usual": FormErrors(1.5e-3, 3e-3, 0.5e-3, 0.01, 0.3e-3, 0.005),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenPlate:
+    """A plate: its rig with true values, as it is built, and the matrices of its solver."""
+
+    rig: Rig
+    masses: tuple[PointLoad, ...]
+    matrices: PlateMatrices
+    points: FloatArray
+    scales: FloatArray
+
+    def responses(self, frequencies: FloatArray, points: FloatArray) -> ComplexArray:
+        """Acceleration per commanded displacement [1/s²], gains included, (f, e, p)."""
+        eras = self.rig.eras
+        found = direct_acceleration(self.matrices, eras, frequencies, points, loads=self.masses)
+        return np.asarray(found / np.array([era.stroke for era in eras])[:, None])
+
+
+def draw_plate(
+    rig: Rig,
+    form: FormErrors,
+    *,
+    seed: int,
+    sensors: FloatArray = SENSORS,
+    frequencies: FloatArray = FREQUENCIES,
+) -> HiddenPlate:
+    """Draw a plate within a builder's tolerances of a rig, with form errors."""
+    rng = np.random.default_rng([seed, 50])
+    plate = rig.plate
+    sides = np.array([plate.length, plate.width]) + form.side * rng.standard_normal(2)
+    material = replace(
+        plate.material,
+        E=float(plate.material.E * np.exp(0.05 * rng.standard_normal())),
+        nu=float(plate.material.nu + form.poisson * rng.standard_normal()),
+    )
+    loss_factor = plate.loss_factor * np.exp(0.35 * rng.standard_normal())
+    real = replace(
+        plate,
+        length=float(sides[0]),
+        width=float(sides[1]),
+        material=material,
+        loss_factor=float(loss_factor),
+    )
+    eras = []
+    for era in rig.eras:
+        # Bolts of an edge can only be off inwards.
+        at = np.array([era.x, era.y]) / [plate.length, plate.width]
+        inwards = np.where(at > 0.5, -1.0, 1.0)
+        place = at * sides + inwards * np.abs(form.place * rng.standard_normal(2))
+        size = 1 + 0.05 * rng.standard_normal(len(frequencies))
+        phase = np.radians(5.0) * rng.standard_normal(len(frequencies))
+        eras.append(
+            replace(
+                era,
+                x=float(place[0]),
+                y=float(place[1]),
+                stiffness=float(era.stiffness * np.exp(0.1 * rng.standard_normal())),
+                damping=float(era.damping * np.exp(0.35 * rng.standard_normal())),
+                bolt_mass=float(rng.uniform(0.004, 0.016)),
+                gains=tuple(zip(frequencies.tolist(), size, phase, strict=True)),
+            )
+        )
+    x, y = (rng.uniform(0.05, 0.95, 2) * sides).tolist()
+    hidden = PointLoad(x, y, mass=float(form.mass * rng.choice([0.5, 1.0])))
+    points = sensors * [plate.length, plate.width]
+    points = points + form.sensor_place * rng.standard_normal(points.shape)
+    grid = Mesh(*MESH, real.length, real.width, ELEMENTS["Q4"], STRIP)
+    return HiddenPlate(
+        replace(rig, plate=real, eras=tuple(eras), mesh=grid),
+        (hidden,) if form.mass else (),
+        assemble(real, grid),
+        np.clip(points, 0, sides),
+        1 + form.sensor_scale * rng.standard_normal(len(points)),
+    )
+
+
+def measure(
+    hidden: HiddenPlate,
+    rig: Rig,
+    *,
+    seed: int,
+    sensors: FloatArray = SENSORS,
+    frequencies: FloatArray = FREQUENCIES,
+    noise: float = 0.01,
+) -> Responses:
+    """Measure with sensors where the rig's owner believes them; noise of each row's rms."""
+    rng = np.random.default_rng([seed, 51])
+    values = hidden.scales * hidden.responses(frequencies, hidden.points)
+    size = np.sqrt((np.abs(values) ** 2).mean(axis=2, keepdims=True))
+    white = rng.standard_normal(values.shape) + 1j * rng.standard_normal(values.shape)
+    names = tuple(f"P{number}" for number in range(1, len(sensors) + 1))
+    points = sensors * [rig.plate.length, rig.plate.width]
+    return Responses(names, points, frequencies, values + noise * size * white / np.sqrt(2))
+
+
+def true_values(hidden: HiddenPlate) -> list[float]:
+    """The fitted values in the order of `model.calibration.parameters.parameters_of`."""
+    plate = hidden.rig.plate
+    values = [plate.material.E, plate.loss_factor]
+    return values + [
+        v for era in hidden.rig.eras for v in (era.stiffness, era.damping, era.bolt_mass)
+    ]
+
+
+def main() -> None:
+    folder, count, form = Path(sys.argv[1]), int(sys.argv[2]), FORMS[sys.argv[3]]
+    rig = load_rig(RIG)
+    for seed in range(count):
+        hidden = draw_plate(rig, form, seed=seed)
+        write_responses_csv(folder / f"{seed}.csv", measure(hidden, rig, seed=seed), rig)
+        (folder / f"{seed}.json").write_text(json.dumps(true_values(hidden)))
+
+
+if __name__ == "__main__":
+    main()

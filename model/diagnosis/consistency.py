@@ -1,0 +1,241 @@
+"""Checks of measured responses before a rig is fitted to them: are they what they claim to be?
+
+A fit can absorb almost any error of a measurement: gains take wrong units, springs a swapped plug,
+outlier rejection whole sensors. Each check here looks for one such error alone, in what the fit
+would leave free, and names it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from model.arrays import ComplexArray, FloatArray
+from model.calibration.calibration_screening import (
+    check_enough_sensors,
+    silent_eras,
+    silent_sensors,
+)
+from model.calibration.parameters import parameters_of, responses_at
+from model.calibration.responses import Responses
+from model.calibration.variable_projection import project_gains, row_rms
+from model.diagnosis.assignment import ShapeMatch, match_shapes
+from model.diagnosis.observation import Observation
+from model.diagnosis.plate_match import MAX_FIT_ERROR, Match, match_plate
+from model.diagnosis.verdict import Verdict, diagnose
+from model.errors import InputError
+from model.quantities import in_display_unit
+from model.rig.rig import Rig
+from model.vibration.parametric_plate import ParametricPlate, parametric_plate
+
+GRAVITY = 9.80665  # m/s², standard
+_MAX_GAIN = 3.0  # of all channels together; a factor either way is another quantity or unit
+_MAX_FREQUENCIES = 16  # ample for every check
+_CLEAR = 20.0  # difference of costs
+_OWN_PLACE, _OTHER_PLACE = 0.8, 0.9  # coherence of a sensor that is elsewhere
+
+
+@dataclass(frozen=True)
+class _Quantity:
+    """What responses may be instead of acceleration per displacement: name, remedy, and factor.
+
+    factor * (i omega)^power times that is recorded.
+    """
+
+    name: str
+    remedy: str
+    factor: float
+    power: int = 0
+
+
+_QUANTITIES = (
+    _Quantity("g", f"multiply by {GRAVITY}", 1 / GRAVITY),
+    _Quantity("mm/s² per m", "divide by 1000", 1e3),
+    _Quantity("m/s² per mm", "multiply by 1000", 1e-3),
+    _Quantity("m/s² per µm", "multiply by 1000000", 1e-6),
+    _Quantity("g per mm", f"multiply by {1000 * GRAVITY}", 1e-3 / GRAVITY),
+    _Quantity("g per µm", f"multiply by {1e6 * GRAVITY}", 1e-6 / GRAVITY),
+    _Quantity("velocity in m/s", "multiply by i omega, 2 pi times the frequency", 1.0, -1),
+    _Quantity("velocity in mm/s", "multiply by i omega / 1000", 1e3, -1),
+    _Quantity("displacement in m", "multiply by -omega², omega 2 pi times the frequency", 1.0, -2),
+    _Quantity("displacement in mm", "multiply by -omega² / 1000", 1e3, -2),
+    _Quantity("displacement in µm", "multiply by -omega² / 1000000", 1e6, -2),
+)
+
+
+def check_consistency(rig: Rig, responses: Responses) -> Verdict:
+    """Refuse responses that are not what they claim; return the diagnosis of the rig.
+
+    Raises InputError that names the cause: too few sensors or frequencies, another quantity or
+    unit, conjugated phases, sensors at swapped places, swapped or inverted channels.
+    """
+    rows = np.unique(
+        np.linspace(0, len(responses.frequencies) - 1, _MAX_FREQUENCIES).round().astype(int)
+    )
+    observation = Observation(
+        responses.sensors,
+        responses.points,
+        responses.frequencies[rows],
+        responses.values[rows],
+        has_phases=True,
+    )
+    if not observation.measured.any():
+        raise InputError("no channel was driven; drive each in turn and measure again")
+    silent_eras(responses)
+    silent = silent_sensors(responses)
+    check_enough_sensors(~silent, responses)
+    heard = observation.without(silent)
+    plate = parametric_plate(rig, heard.points, heard.frequencies)
+    shapes = match_shapes(rig, plate, heard.values)
+    _check_quantity(rig, plate, shapes, heard)
+    _check_phases_and_places(rig, plate, shapes, heard)
+    # Values of the plate that are off are what a calibration is for.
+    verdict = diagnose(rig, observation, max_deviation=math.inf)
+    _check_wiring(verdict)
+    _check_size(verdict)
+    return verdict
+
+
+def _check_quantity(
+    rig: Rig, plate: ParametricPlate, shapes: ShapeMatch, observation: Observation
+) -> None:
+    """Raise InputError where gains of all channels are those of another quantity or unit."""
+    parameters = parameters_of(rig)
+    moves = dict(zip(("modulus", "stiffness"), shapes.start, strict=True))
+    x = np.array([p.start + moves.get(p.kind, 0.0) for p in parameters])
+    model = responses_at(plate, rig, parameters, x)[:, list(shapes.nearest)]
+    weight = np.isfinite(observation.values) / row_rms(observation.values)[:, :, None]
+    gains, _ = project_gains(model, observation.values, weight)
+    size = np.log(row_rms(observation.values) / row_rms(model))
+    known = np.isfinite(gains)
+    omega = 2 * np.pi * observation.frequencies[:, None]
+
+    def distance(factor: float, power: int) -> float:
+        """Of gains from those of a quantity, by size and by phase."""
+        expected = factor * (1j * omega) ** power
+        off = np.abs(size - np.log(np.abs(expected)))[known]
+        phase = np.angle(gains / expected)[known]
+        return float(np.median(off) + 1 - np.median(np.cos(phase)))
+
+    level = float(np.median(size[known]))
+    own = distance(1.0, 0)
+    nearest = min(_QUANTITIES, key=lambda each: distance(each.factor, each.power))
+    gap = distance(nearest.factor, nearest.power)
+    if abs(level) < np.log(_MAX_GAIN) or own < gap:
+        return
+    if gap < np.log(_MAX_GAIN):
+        raise InputError(
+            f"responses must be acceleration per base displacement in 1/s², got {nearest.name}, as "
+            f"it looks: all are {np.exp(level):.3g} of what the rig predicts; {nearest.remedy}"
+        )
+    raise InputError(
+        f"responses must be those of the rig to a factor of {_MAX_GAIN:g}, got "
+        f"{np.exp(level):.3g} of what it predicts; check their unit and the stroke of the ERAs"
+    )
+
+
+def _check_phases_and_places(
+    rig: Rig, plate: ParametricPlate, shapes: ShapeMatch, observation: Observation
+) -> None:
+    """Raise InputError for conjugated phases, and for sensors at each other's places."""
+    starts = tuple(dict.fromkeys([(0.0, 0.0), shapes.start]))
+    own = tuple(range(len(rig.eras)))
+
+    def best(values: ComplexArray) -> tuple[Match, tuple[int, ...]]:
+        found = [
+            (match_plate(rig, plate, values, drives=drives, starts=starts), drives)
+            for drives in dict.fromkeys([own, shapes.nearest])
+        ]
+        return min(found, key=lambda each: each[0].cost)
+
+    match, drives = best(observation.values)
+    other, _ = best(observation.values.conj())
+    if other.cost < match.cost - _CLEAR:
+        raise InputError(
+            "phases must be for exp(+i omega t), got conjugated ones, as it looks: with the signs "
+            "of all imaginary parts changed the plate explains the responses better "
+            f"({100 * other.error:.1f} % unexplained instead of {100 * match.error:.1f} %); "
+            "change them"
+        )
+    exchanged = _exchanged(observation, match.responses[:, list(drives)])
+    if exchanged:
+        pairs = ", ".join(f"{name} at that of {place}" for name, place in exchanged)
+        raise InputError(
+            f"sensors must be at their places, got responses that fit exchanged ones: {pairs}; "
+            "correct their positions or names"
+        )
+
+
+def _exchanged(observation: Observation, model: ComplexArray) -> list[tuple[str, str]]:
+    """Pairs of a sensor and the one at whose place it is, from responses (f, e, s) of the model."""
+    values = observation.values
+    weight = np.isfinite(values) / row_rms(values)[:, :, None]
+    gains, _ = project_gains(model, values, weight)
+    measured = np.where(weight > 0, values * weight, 0j)
+    predicted = np.nan_to_num(gains)[:, :, None] * model / row_rms(values)[:, :, None]
+    coherence = _coherence(measured, predicted, weight > 0)
+    sensors, places = linear_sum_assignment(-(coherence**2))
+    names = observation.sensors
+    return [
+        (names[sensor], names[place])
+        for sensor, place in zip(sensors, places, strict=True)
+        if sensor != place
+        and coherence[sensor, sensor] < _OWN_PLACE
+        and coherence[sensor, place] > _OTHER_PLACE
+    ]
+
+
+def _coherence(
+    measured: ComplexArray, predicted: ComplexArray, used: NDArray[np.bool_]
+) -> FloatArray:
+    """Coherence (s, s) of each sensor's responses with the model's at each place."""
+    inner = np.abs(np.einsum("fes,fep->sp", measured, predicted.conj()))
+    own = (np.abs(measured) ** 2).sum(axis=(0, 1))
+    other = np.einsum("fes,fep->sp", used.astype(float), np.abs(predicted) ** 2)
+    return np.asarray(inner / np.sqrt(np.maximum(own[:, None] * other, 1e-300)))
+
+
+def _check_wiring(verdict: Verdict) -> None:
+    """Raise InputError for channels that drive another ERA or have the opposite sign."""
+    swapped = {era for cycle in verdict.swapped for era in cycle}
+    for cycle in verdict.swapped:
+        raise InputError(
+            f"channels must drive the ERAs of the rig, got swapped ones: those of "
+            f"{_joined(cycle)} drive each other's ERA, as it looks; correct the plugs, the names "
+            "in the file, or the channels in the rig, or the sensors' positions if they are "
+            "mirrored, and measure again"
+        )
+    for channel in verdict.channels:
+        if "other ERA" in channel.states and channel.era not in swapped:
+            raise InputError(
+                f"channels must drive the ERAs of the rig, got ERA {channel.drives} driven by that "
+                f"of {channel.era}, as it looks; correct the plug or the names in the file"
+            )
+    inverted = [channel.era for channel in verdict.channels if "inverted" in channel.states]
+    if inverted:
+        raise InputError(
+            f"signs must be upwards positive for sensors and ERAs, got opposite ones of "
+            f"{_joined(inverted)}; swap the two wires of these, or turn the sensors over if it is "
+            "all of them"
+        )
+
+
+def _check_size(verdict: Verdict) -> None:
+    """Raise InputError where another length or width of the plate explains the responses best."""
+    if verdict.plate_matches or not verdict.explanations:
+        return
+    best = verdict.explanations[0]
+    if best.cause.is_geometry and best.match.error <= MAX_FIT_ERROR:
+        raise InputError(
+            f"{best.cause.key} must be that of the measured plate, got "
+            f"{in_display_unit(best.expected, best.cause.unit)} in the rig while responses fit "
+            f"{in_display_unit(best.value, best.cause.unit)}, as it looks; measure it, and correct "
+            "the rig or take its own measurement"
+        )
+
+
+def _joined(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))

@@ -1,0 +1,65 @@
+"""Responses that are not what they claim are refused before a rig is fitted to them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from distorted_responses import DISTORTIONS
+from model.calibration.responses import Responses
+from model.diagnosis.consistency import check_consistency
+from model.errors import InputError
+from model.fem.mesh import Mesh
+from model.rig.rig import Rig
+from paper_plate import make_paper_rig
+from perturbed_plate import measured, perturbed
+
+FREQUENCIES = np.arange(60.0, 421.0, 40.0)
+
+NAMED = {
+    "g": "9.80665",
+    "velocity": "velocity in m/s",
+    "displacement": "displacement in m",
+    "opposite": "SW, SE, NE and NW",
+    "conjugated": "exp",
+    "swapped_channels": "SW and SE",
+    "swapped_sensors": "P1 at that of P6, P6 at that of P1",
+    "two_sensors": "got 2",
+}
+"""By distortion, what the refusal names."""
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The paper's plate on a coarse mesh."""
+    return make_paper_rig(16, 12)
+
+
+@pytest.fixture(scope="module")
+def responses(rig: Rig) -> Responses:
+    """Of a plate within a builder's tolerances, with 1 % noise."""
+    return measured(perturbed(rig, frequencies=FREQUENCIES), frequencies=FREQUENCIES)
+
+
+def test_consistent_responses_are_accepted(rig: Rig, responses: Responses) -> None:
+    """Stiffness, damping, bolts and gains that are off are for the fit to find."""
+    assert all(channel.drives for channel in check_consistency(rig, responses).channels)
+
+
+@pytest.mark.parametrize("name", DISTORTIONS)
+def test_distorted_responses_are_refused_by_their_cause(
+    rig: Rig, responses: Responses, name: str
+) -> None:
+    """Each distortion alone, with its own cause named."""
+    with pytest.raises(InputError, match=NAMED[name]):
+        check_consistency(rig, DISTORTIONS[name](responses))
+
+
+def test_plate_of_another_length_is_refused_by_its_length(rig: Rig) -> None:
+    """A plate that is a fifth longer than the rig's, sensors where they are said to be."""
+    plate = replace(rig.plate, length=1.2 * rig.plate.length)
+    eras = tuple(replace(era, x=1.2 * era.x) for era in rig.eras)
+    longer = replace(rig, plate=plate, eras=eras, mesh=Mesh(16, 12, plate.length, plate.width))
+    found = measured(perturbed(longer, frequencies=FREQUENCIES), frequencies=FREQUENCIES)
+    with pytest.raises(InputError, match=r"plate\.length"):
+        check_consistency(rig, found)

@@ -26,6 +26,7 @@ from model.calibration.parameters import Parameter
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.dynamic_stiffness import attached_stiffness
+from model.structure.modal_elasticity import ModalElasticity
 from model.structure.plate import Plate
 from model.structure.point_load import footprints_of
 
@@ -54,8 +55,9 @@ class FormModel:
 
     *_shapes (n, r); *_slopes (2, n, r): their derivatives along x and y [1/m]; rest (f, r, r):
     dynamic stiffness of the rig's own masses; stiffening (g, r, r): derivatives of the modal
-    stiffness by length, width (relative) and Poisson's ratio; shifted: modes with a shift of
-    their own; std (t,): tolerances of the form errors, in that order.
+    stiffness by length, width (relative) and Poisson's ratio; loss_ratios (f, r, r): of its loss
+    factor to the plate's; shifted: modes with a shift of their own; std (t,): tolerances of the
+    form errors, in that order.
     """
 
     modulus: float
@@ -68,6 +70,7 @@ class FormModel:
     sensor_slopes: FloatArray
     cell_shapes: FloatArray
     stiffening: FloatArray
+    loss_ratios: FloatArray
     shifted: IntArray
     std: FloatArray
 
@@ -130,7 +133,7 @@ class FormModel:
         attached = np.concatenate([base - omega**2 * m, -(omega**2) * masses], axis=1)
         shapes = np.vstack([phi, self.cell_shapes])
         system = self.rest + np.einsum("fj,jr,jq->frq", attached, shapes, shapes, optimize=True)
-        lossy = 1 + 1j * values[1]
+        lossy = 1 + 1j * values[1] * self.loss_ratios
         system += lossy * elastic
         diagonal = np.arange(len(elastic))
         system[:, diagonal, diagonal] -= omega**2
@@ -150,11 +153,15 @@ class FormModel:
         by_spring = extension[:, :, None, :] * seen[:, None, :, :era_count]  # (f, e, s, e)
         by_mass = moved[:, :, None, :] * seen[:, None, :, :]  # (f, e, s, j), times omega²
         wide = omega[:, :, None, None]
-        by_stiffness = np.swapaxes(np.swapaxes(P, 1, 2) @ (elastic @ q), 1, 2)
+        seen_modes = np.swapaxes(P, 1, 2)
+
+        def bent_by(stiffness: ComplexArray) -> ComplexArray:
+            return np.asarray(np.swapaxes(seen_modes @ (stiffness @ q), 1, 2))
+
         slope = self._slope(parameters, x)
         found = [
-            -lossy * by_stiffness * slope[0] / values[0],
-            -1j * by_stiffness * slope[1],
+            -bent_by(lossy * elastic) * slope[0] / values[0],
+            -1j * bent_by(self.loss_ratios * elastic) * slope[1],
         ]
         for era in range(era_count):
             at = 2 + 3 * era
@@ -183,12 +190,11 @@ class FormModel:
         by_cell = wide**2 * by_mass[..., era_count:]
         by_cell = by_cell - by_cell.mean(axis=3, keepdims=True)
         found += list(np.moveaxis(by_cell, 3, 0))
-        for change in self.stiffening:
-            bending = np.swapaxes(np.swapaxes(P, 1, 2) @ (change @ q), 1, 2)
-            found.append(-lossy * stiffer * bending)
+        found += [-stiffer * bent_by(lossy * change) for change in self.stiffening]
         for mode in self.shifted:
             alone = q[:, mode, :, None] * P[:, mode, None, :]
-            found.append(-lossy * stiffer * self.eigenvalues[mode] * alone)
+            loss = lossy[:, mode, mode, None, None]
+            found.append(-loss * stiffer * self.eigenvalues[mode] * alone)
         derivatives = np.array(found)
         derivatives[len(x) :] *= self.std[:, None, None, None]
         scale = -(omega**2)[:, :, None]
@@ -212,6 +218,7 @@ def form_model(rig: Rig, points: FloatArray, frequencies: FloatArray) -> FormMod
     attached = np.vstack([at_eras, at_masses])
     reduced = reduce_plate(plate, rig.mesh, attached, frequency_max=high)
     eigenvalues = reduced.omega**2
+    elasticity = ModalElasticity.of(plate, eigenvalues)
     omega = 2 * np.pi * frequencies
 
     def slopes(places: FloatArray) -> FloatArray:
@@ -254,9 +261,10 @@ def form_model(rig: Rig, points: FloatArray, frequencies: FloatArray) -> FormMod
             np.full(len(low), _MODE_SHIFT),
         ]
     )
+    ratios = np.sqrt(elasticity.loss_ratios(omega))
     return FormModel(
         plate.material.E,
-        eigenvalues,
+        elasticity.eigenvalues,
         omega,
         np.einsum("fj,jr,jq->frq", loads, mass_shapes, mass_shapes, optimize=True),
         reduced.at(at_eras),
@@ -265,6 +273,7 @@ def form_model(rig: Rig, points: FloatArray, frequencies: FloatArray) -> FormMod
         slopes(points),
         reduced.at(cells),
         np.array(stiffening),
+        ratios[:, :, None] * ratios[:, None, :],
         low,
         std,
     )

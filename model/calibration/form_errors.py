@@ -53,8 +53,9 @@ def mass_scale_error(rig: Rig) -> float:
 class FormModel:
     """A reduced plate (r modes) at e ERAs, s sensors and c cells of foreign mass.
 
-    *_shapes (n, r); *_slopes (2, n, r): their derivatives along x and y [1/m]; rest (f, r, r):
-    dynamic stiffness of the rig's own masses; stiffening (g, r, r): derivatives of the modal
+    losses (r,): of the modes beside the plate's loss factor; *_shapes (n, r); *_slopes (2, n, r):
+    their derivatives along x and y [1/m]; rest (f, r, r): dynamic stiffness of the rig's own
+    masses; stiffening (g, r, r): derivatives of the modal
     stiffness by length, width (relative) and Poisson's ratio; loss_ratios (f, r, r): of its loss
     factor to the plate's; shifted: modes with a shift of their own; std (t,): tolerances of the
     form errors, in that order.
@@ -62,6 +63,7 @@ class FormModel:
 
     modulus: float
     eigenvalues: FloatArray
+    losses: FloatArray
     omega: FloatArray
     rest: ComplexArray
     era_shapes: FloatArray
@@ -134,7 +136,8 @@ class FormModel:
         shapes = np.vstack([phi, self.cell_shapes])
         system = self.rest + np.einsum("fj,jr,jq->frq", attached, shapes, shapes, optimize=True)
         lossy = 1 + 1j * values[1] * self.loss_ratios
-        system += lossy * elastic
+        bending = lossy * elastic + 1j * stiffer * np.diag(self.losses)
+        system += bending
         diagonal = np.arange(len(elastic))
         system[:, diagonal, diagonal] -= omega**2
         right = np.empty((len(self.omega), len(elastic), era_count + sensor_count), dtype=complex)
@@ -160,7 +163,7 @@ class FormModel:
 
         slope = self._slope(parameters, x)
         found = [
-            -bent_by(lossy * elastic) * slope[0] / values[0],
+            -bent_by(bending) * slope[0] / values[0],
             -1j * bent_by(self.loss_ratios * elastic) * slope[1],
         ]
         for era in range(era_count):
@@ -218,7 +221,7 @@ def form_model(rig: Rig, points: FloatArray, frequencies: FloatArray) -> FormMod
     attached = np.vstack([at_eras, at_masses])
     reduced = reduce_plate(plate, rig.mesh, attached, frequency_max=high)
     eigenvalues = reduced.omega**2
-    elasticity = ModalElasticity.of(plate, eigenvalues)
+    elasticity = ModalElasticity.of(plate, eigenvalues, reduced.losses)
     omega = 2 * np.pi * frequencies
 
     def slopes(places: FloatArray) -> FloatArray:
@@ -265,6 +268,7 @@ def form_model(rig: Rig, points: FloatArray, frequencies: FloatArray) -> FormMod
     return FormModel(
         plate.material.E,
         elasticity.eigenvalues,
+        elasticity.losses,
         omega,
         np.einsum("fj,jr,jq->frq", loads, mass_shapes, mass_shapes, optimize=True),
         reduced.at(at_eras),

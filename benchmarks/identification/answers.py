@@ -46,6 +46,7 @@ def known_table(table: LocalizationTable, truth: Truth, factors: Reals) -> Local
         masses=tuple(PointLoad(x, y, mass=mass) for x, y, mass in truth.masses.tolist()),
         uncertainty=DRIVES,
         omega=np.sqrt(truth.eigenvalues),
+        losses=np.zeros(len(truth.eigenvalues)),
         attachment_shapes=truth.attached,
         shapes=truth.shapes.astype(np.float32),
         discretisation_error=np.zeros(len(table.frequencies)),

@@ -63,7 +63,7 @@ def _by_modes(plate: PlateAt) -> Columns:
     modes, functions = plate.model.shifted_modes, plate.functions
     reach = plate.left @ plate.located.shapes[:, modes]
     by_stiffness = functions.by_mode[:, modes]
-    by_loss = functions.loss[:, modes] * by_stiffness
+    by_loss = functions.mode_loss[:, modes] * by_stiffness
     return {
         "mode_shifts": _outer(plate, reach, reach, by_stiffness),
         "mode_losses": _outer(plate, reach, reach, by_loss),

@@ -200,17 +200,23 @@ class PlateAt:
         thickness = values.thickness * rig.thickness / solved.thickness
         modulus = values.modulus * rig.material.E / solved.material.E
         stiffer = modulus * thickness**2
-        lossy = (1 + 1j * loss) * eigenvalues + 1j * theory.losses
-        elastic = np.asarray(stiffer * lossy, dtype=complex)
-        by_loss = np.zeros(elastic.shape, dtype=complex)
-        np.divide(1j * loss * stiffer * eigenvalues, elastic, out=by_loss, where=elastic != 0)
+        # Soft layers and air lose beside the plate's loss factor, and deviate with their mode.
+        further = theory.losses.copy()
+        further[modes] *= np.exp(values.mode_shifts + values.mode_losses)
+        own = loss * eigenvalues
+        lossy = eigenvalues + 1j * (own + further)
+        by_loss, by_mode_loss = (
+            np.divide(1j * each, lossy, out=np.zeros(lossy.shape, dtype=complex), where=lossy != 0)
+            for each in (own, own + further)
+        )
         return FrequencyFunctions(
             model.free,
             model.omega,
             np.asarray((1 + 1j * eta) * stiffer, dtype=complex),
             thickness,
-            elastic,
+            np.asarray(stiffer * lossy, dtype=complex),
             by_loss,
+            by_mode_loss,
             np.asarray(1j * eta / (1 + 1j * eta)),
         )
 

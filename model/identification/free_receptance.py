@@ -88,7 +88,7 @@ class FrequencyFunctions:
 
     omega (f,) [rad/s]; q (f,): see above; mass: factor of the modal masses; elastic (f, r): q
     lambda of each mode [rad²/s²]; loss (f, r), loss_of_rest (f,): d ln elastic / d ln eta of each
-    mode and of the truncated ones.
+    mode and of the truncated ones; mode_loss (f, r): the same by all that a mode loses.
     """
 
     free: FreePlate
@@ -97,6 +97,7 @@ class FrequencyFunctions:
     mass: float
     elastic: ComplexArray
     loss: ComplexArray
+    mode_loss: ComplexArray
     loss_of_rest: ComplexArray
 
     @cached_property

@@ -1,7 +1,7 @@
 """The vector of parameters x, in prior standard deviations, and the values that it stands for."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -141,19 +141,6 @@ def inwards(space: Space, x: FloatArray, *, by: float) -> FloatArray:
         elif space.std[number] * (space.upper[number] - x[number]) < _AT_EDGE:
             moved[number] -= by
     return np.where(space.uncertain, moved, x)
-
-
-def without_finger(space: Space) -> Space:
-    """The parameters without those of fingers."""
-    stop = space.groups["fingers"].start
-    return replace(
-        space,
-        names=space.names[:stop],
-        std=space.std[:stop],
-        lower=space.lower[:stop],
-        upper=space.upper[:stop],
-        groups=space.groups | {"fingers": slice(stop, stop)},
-    )
 
 
 class _Builder:

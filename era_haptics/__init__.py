@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from drivers.guard import GuardLimits as GuardLimits
     from era_haptics.amplifiers import commands_for as commands_for
     from era_haptics.amplifiers import open_amplifier as open_amplifier
+    from era_haptics.calibration import calibrate as calibrate
     from era_haptics.drive import Drive as Drive
     from era_haptics.pictures import draw_map as draw_map
     from era_haptics.pictures import draw_pattern as draw_pattern
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from era_haptics.solved_plate import SolvedPlate as SolvedPlate
     from era_haptics.tables import query as query
     from era_haptics.tables import table as table
+    from model.calibration.calibration_result import Calibration as Calibration
     from model.errors import InputError as InputError
     from model.finger.grid import Grid as Grid
     from model.reduction.supported_modes import SupportedModes as SupportedModes
@@ -62,10 +64,12 @@ _NAMES = {
     "drivers.errors": "CommandRefused DriverError LinkError",
     "drivers.guard": "GuardLimits",
     "era_haptics.amplifiers": "commands_for open_amplifier",
+    "era_haptics.calibration": "calibrate",
     "era_haptics.drive": "Drive",
     "era_haptics.pictures": "draw_map draw_pattern draw_playback",
     "era_haptics.solved_plate": "SolvedPlate",
     "era_haptics.tables": "query table",
+    "model.calibration.calibration_result": "Calibration",
     "model.errors": "InputError",
     "model.finger.grid": "Grid",
     "model.reduction.supported_modes": "SupportedModes",

@@ -129,6 +129,7 @@ def check(
                     *diagnosis_report.channel_table(verdict),
                     "",
                     *diagnosis_report.verdict_rows(verdict),
+                    *diagnosis_report.difference_rows(verdict),
                 ]
             )
         )

@@ -106,7 +106,8 @@ def calibrate(
     if not calibration.is_good:
         typer.echo(
             "era: the fit must predict the measurement within 25 %; no rig is written. Check that "
-            "it is this plate, places of sensors and ERAs, noise, and phases as exp(+i omega t)",
+            "it is this plate, places of sensors and ERAs, noise, phases as exp(+i omega t), and "
+            "that the rig's mesh is as fine as auto",
             err=True,
         )
         raise typer.Exit(NO_FIT)

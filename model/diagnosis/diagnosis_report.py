@@ -3,6 +3,7 @@
 from typing import Any
 
 from model.diagnosis.causes import Explanation
+from model.diagnosis.plate_difference import NOTICEABLE_DB
 from model.diagnosis.plate_match import MAX_FIT_ERROR
 from model.diagnosis.polarity import UNDECIDED
 from model.diagnosis.verdict import MAX_DEVIATION, ChannelState, ChannelVerdict, Verdict
@@ -16,6 +17,7 @@ _REMEDIES: dict[ChannelState, str] = {
     "inverted": "swap its two wires",
     "out of phase": "measure its gains with `era calibrate`",
 }
+_MIN_CHANGE = 0.03  # relative, of a reported value
 _MIN_SHARE = 0.05  # likelihood of a reported explanation
 
 
@@ -48,7 +50,30 @@ def verdict_rows(verdict: Verdict) -> list[str]:
     rows += [f"SENSOR {name} {why}: left out" for name, why in verdict.bad_sensors]
     if not verdict.plate_matches:
         rows += _plate_rows(verdict)
-    return rows or ["ALL WELL: plate and channels match the rig"]
+    if rows:
+        return rows
+    if difference_rows(verdict):
+        return ["WIRING WELL: every channel that was driven drives its ERA as the rig says"]
+    return ["ALL WELL: plate and channels match the rig"]
+
+
+def difference_rows(verdict: Verdict) -> list[str]:
+    """Line on how far the plate is from the rig and what it costs; none if hardly anything."""
+    difference = verdict.difference
+    if difference is None or difference.loss_db < NOTICEABLE_DB:
+        return []
+    names = {"loss_factor": "loss factor", "stiffness": "ERA stiffness", "damping": "ERA damping"}
+    changes = ", ".join(
+        f"{names.get(kind, kind)} {100 * change:+.0f} %"
+        for kind, change in difference.changes.items()
+        if abs(change) >= _MIN_CHANGE
+    )
+    within = "within tolerances, but not as written: " if verdict.plate_matches else ""
+    return [
+        f"PLATE DIFFERS: {within}{changes or 'single ERAs or bolts'}; patterns for the rig reach "
+        f"{difference.contrast_db:.0f} dB instead of {difference.contrast_known_db:.0f} dB, "
+        f"{difference.loss_db:.1f} dB less: calibrate it with `era calibrate`"
+    ]
 
 
 def _plate_rows(verdict: Verdict) -> list[str]:
@@ -103,7 +128,7 @@ def channel_table(verdict: Verdict) -> list[str]:
 
 def as_json(verdict: Verdict) -> dict[str, Any]:
     """Verdict as JSON; units are in the keys."""
-    match = verdict.match
+    match, difference = verdict.match, verdict.difference
     return {
         "all_well": verdict.is_well,
         "channels": [
@@ -122,8 +147,13 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
             for channel in verdict.channels
         ],
         "swapped": [list(cycle) for cycle in verdict.swapped],
+        "wiring_matches": verdict.wiring_matches,
         "plate": {
             "matches": verdict.plate_matches,
+            "changes": {} if difference is None else difference.changes,
+            "contrast_db": None if difference is None else difference.contrast_db,
+            "contrast_known_db": None if difference is None else difference.contrast_known_db,
+            "contrast_loss_db": None if difference is None else difference.loss_db,
             "unexplained": None if match is None else match.error,
             "farthest_standard_deviations": None if match is None else match.worst,
             "parameters": []

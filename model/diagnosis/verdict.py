@@ -19,6 +19,7 @@ from model.diagnosis.diagnosis_screening import (
     usable_sensors,
 )
 from model.diagnosis.observation import Observation
+from model.diagnosis.plate_difference import PlateDifference, plate_difference
 from model.diagnosis.plate_match import MAX_FIT_ERROR, MODEL_ERROR, Match, match_plate
 from model.diagnosis.polarity import ChannelPhase, phases_of_drive, signs_of_pairs
 from model.errors import InputError
@@ -63,7 +64,8 @@ class Verdict:
 
     plate_matches: whether the rig's plate within its priors explains the measurement; match: that
     plate; explanations: other plates that do, most likely first, if it does not; bad_sensors: left
-    out, and why; swapped: cycles of channels by their ERAs.
+    out, and why; swapped: cycles of channels by their ERAs; difference: of that plate from the
+    rig's, None without a plate that fits.
     """
 
     channels: tuple[ChannelVerdict, ...]
@@ -72,15 +74,19 @@ class Verdict:
     explanations: tuple[Explanation, ...]
     bad_sensors: tuple[tuple[str, str], ...]
     swapped: tuple[tuple[str, ...], ...]
+    difference: PlateDifference | None
     sensor_count: int
     frequencies: FloatArray
 
     @property
+    def wiring_matches(self) -> bool:
+        """Whether every driven channel drives its ERA as the rig says."""
+        return all(set(channel.states) <= {"well", "not driven"} for channel in self.channels)
+
+    @property
     def is_well(self) -> bool:
         """Whether no fault was found."""
-        return self.plate_matches and all(
-            set(channel.states) <= {"well", "not driven"} for channel in self.channels
-        )
+        return self.plate_matches and self.wiring_matches
 
 
 def diagnose(
@@ -108,7 +114,15 @@ def diagnose(
             for number in range(len(rig.eras))
         )
         return Verdict(
-            channels, True, None, (), removed, (), len(observation.sensors), observation.frequencies
+            channels,
+            True,
+            None,
+            (),
+            removed,
+            (),
+            None,
+            len(observation.sensors),
+            observation.frequencies,
         )
     shape_match = match_shapes(rig, plate, values)
     match, drives, error = _best_match(rig, plate, values, shape_match, observation)
@@ -147,6 +161,9 @@ def diagnose(
         tuple(explanations),
         removed,
         _cycles(rig, drives, dead),
+        plate_difference(rig, plate.responses(rig), match)
+        if match.error <= MAX_FIT_ERROR
+        else None,
         len(observation.sensors),
         observation.frequencies,
     )

@@ -4,14 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import FloatArray, lattice
+from model.arrays import ComplexArray, FloatArray, lattice
 from model.counting import counted
 from model.errors import InputError
 from model.reduction.free_plate import FreePlate
 from model.rig.rig import Rig
 from model.vibration.direct import direct_responder
 from model.vibration.excitation import Excitation
-from model.vibration.peak import find_nulls, peak_acceleration, tone_amplitudes
+from model.vibration.peak import find_nulls, peak_acceleration, tone_fields
 
 MAX_POINTS = 1_000_000
 """More would be finer than any screen, at some hundred bytes of memory each."""
@@ -21,13 +21,17 @@ MAX_POINTS = 1_000_000
 class PlateMap:
     """Peak acceleration [m/s²] at raster points x (nx,), y (ny,) [m]: peak (ny, nx), and its nulls.
 
-    nulls: positions [m] (n, 2).
+    nulls: positions [m] (n, 2); frequencies (f,) [Hz] and field (f, ny, nx): the complex
+    acceleration [m/s²] at each, of which the peak is the sum of magnitudes. Phases are those of
+    exp(+i omega t), as a tone's.
     """
 
     x: FloatArray
     y: FloatArray
     peak: FloatArray
     nulls: FloatArray
+    frequencies: FloatArray
+    field: ComplexArray
 
     def __repr__(self) -> str:
         return (
@@ -61,8 +65,9 @@ def plate_map(
     y = np.linspace(0, rig.plate.width, rows)
     points = lattice(x, y)
     respond = free.acceleration if free else direct_responder(rig.plate, mesh)
-    _, amplitudes = tone_amplitudes(
+    frequencies, field = tone_fields(
         excitation, rig.eras, lambda f: respond(rig.eras, f, points, loads=rig.masses)
     )
-    peak = peak_acceleration(amplitudes).reshape(rows, columns)
-    return PlateMap(x, y, peak, find_nulls(x, y, peak))
+    peak = peak_acceleration(np.abs(field)).reshape(rows, columns)
+    nulls = find_nulls(x, y, peak)
+    return PlateMap(x, y, peak, nulls, frequencies, field.reshape(-1, rows, columns))

@@ -48,10 +48,19 @@ def tone_amplitudes(
 
     response: frequencies (f,) -> acceleration of each ERA at full stroke (f, eras, p).
     """
+    frequencies, field = tone_fields(excitation, eras, response)
+    return frequencies, np.abs(field)
+
+
+def tone_fields(
+    excitation: Excitation,
+    eras: Sequence[Era],
+    response: Callable[[FloatArray], ComplexArray],
+) -> tuple[FloatArray, ComplexArray]:
+    """Complex acceleration [m/s²] per distinct frequency: as `tone_amplitudes`, with phases."""
     frequencies, amplitudes = base_amplitudes(excitation, eras)
     weights = amplitudes / np.array([era.stroke for era in eras])
-    coherent = np.einsum("fe,fep->fp", weights, response(frequencies))
-    return frequencies, np.abs(coherent)
+    return frequencies, np.einsum("fe,fep->fp", weights, response(frequencies))
 
 
 def peak_acceleration(amplitudes: FloatArray) -> FloatArray:

@@ -59,7 +59,8 @@ def shelf(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 def furnish(folder: Path, shelf: Path) -> None:
     """Write a rig, a table, and every fourth frequency of a measurement."""
-    (folder / "rig.yaml").write_text(RIG.replace("[40, 300]", "[40, 500]"), encoding="utf-8")
+    rig = RIG.replace("[40, 300]", "[40, 500]").replace("mesh: 12x9", "mesh: auto")
+    (folder / "rig.yaml").write_text(rig, encoding="utf-8")
     (folder / "table.npz").write_bytes((shelf / "table.npz").read_bytes())
     head, *rows = (shelf / "measured.csv").read_text("utf-8").splitlines(keepends=True)
     frequencies = list(dict.fromkeys(row.split(",")[6] for row in rows))[::4]

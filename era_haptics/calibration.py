@@ -1,0 +1,25 @@
+"""Calibration of a rig by responses measured on it."""
+
+from pathlib import Path
+
+from era_haptics.arguments import expect_rig
+from model.arguments import expect_path
+from model.calibration.calibrate import calibrate as fit
+from model.calibration.calibration_result import Calibration
+from model.calibration.responses import responses_of
+from model.calibration.responses_file import read_functions
+from model.diagnosis.consistency import check_consistency
+from model.rig.rig import Rig
+
+
+def calibrate(rig: Rig, measured: Path | str, *, all_scales: bool = False) -> Calibration:
+    """Fit a rig to measured responses, a .csv, .uff or .unv file, as `era calibrate` does.
+
+    all_scales: estimate the scale of every sensor, not only of wrong ones. The result's `rig` has
+    the fitted values and their uncertainty, its `parameters` their standard errors; use it only if
+    `is_good`. Raises InputError for responses that are not what they claim, by their cause.
+    """
+    expect_rig(rig)
+    responses = responses_of(read_functions(expect_path(measured, what="measured")), rig)
+    check_consistency(rig, responses)
+    return fit(rig, responses, all_scales=all_scales)

@@ -23,6 +23,7 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
         "table": None, "target": TARGET, "quiet": (), "level_db_sl": 20.0, "drive_mode": "signed",
         "loads": (1.5,),
     },
+    era.calibrate: {"rig": RIG, "measured": "measured.csv"},
     era.SolvedPlate: {"rig": RIG, "seed": 1},
     PLATE.map: {"drive": DRIVE, "raster": (3, 3)},
     PLATE.play: {
@@ -38,7 +39,7 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
 }  # fmt: skip
 """Valid arguments by function; None: a small table."""
 
-TAKES_ANYTHING = {"title", "envelopes", "measures"}
+TAKES_ANYTHING = {"title", "envelopes", "measures", "all_scales"}
 
 
 STRAYS = (object(), "here", 3.5, [object()])

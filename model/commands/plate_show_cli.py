@@ -69,7 +69,7 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     laminate = summary["laminate"]
     if laminate is not None:
         _print_laminate(laminate)
-    print("homogeneous plate like it" if laminate is not None else "plate")
+    print("homogeneous plate like it at the highest frequency" if laminate is not None else "plate")
     print(
         f"    {1e3 * summary['thickness_m']:.4g} mm of {summary['material']}: "
         f"E {summary['E_pa'] / 1e9:.4g} GPa, rho {summary['rho_kg_m3']:.5g} kg/m³, "

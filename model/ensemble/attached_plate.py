@@ -17,6 +17,7 @@ import numpy as np
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
 from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era
+from model.structure.dispersion import Dispersion
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces, full_strokes
 from model.structure.fingertip import Fingertip
 from model.structure.modal_elasticity import ModalElasticity
@@ -132,15 +133,16 @@ def attach(
     fingertip: Fingertip | None,
     uncertainty: Uncertainty,
     frequencies: FloatArray,
+    dispersion: Dispersion | None = None,
 ) -> AttachedPlate:
     """Attach ERAs and masses to a reduced free plate.
 
     omega (r,) [rad/s], losses (r,) [rad²/s²]: of its coordinates; shapes (eras + masses, r);
-    frequencies (f,) [Hz].
+    frequencies (f,) [Hz]; dispersion: how omega² changes with them.
     """
     w = 2 * np.pi * frequencies
     w2 = (w**2)[:, None]
-    elasticity = ModalElasticity.of(plate, omega**2, losses)
+    elasticity = ModalElasticity.of(plate, omega**2, losses, dispersion)
     g = 1 / (elasticity.stiffness(w) - w2)
     by_loss = -1j * elasticity.stiffness(w).imag * g**2
     k, c = (np.array([getattr(era, key) for era in eras]) for key in ("stiffness", "damping"))

@@ -97,7 +97,10 @@ class ForwardModel:
     def elasticity(self) -> ModalElasticity:
         """Eigenvalues and loss factors of the modes as the rig has them."""
         return ModalElasticity.of(
-            self.free.plate, self.free.modes.eigenvalues, self.free.modes.losses
+            self.free.plate,
+            self.free.modes.eigenvalues,
+            self.free.modes.losses,
+            self.free.modes.dispersion,
         )
 
     @cached_property
@@ -205,6 +208,8 @@ class PlateAt:
         further[modes] *= np.exp(values.mode_shifts + values.mode_losses)
         own = loss * eigenvalues
         lossy = eigenvalues + 1j * (own + further)
+        if theory.dispersion is not None:
+            lossy = lossy + theory.dispersion.at(model.omega)
         by_loss, by_mode_loss = (
             np.divide(1j * each, lossy, out=np.zeros(lossy.shape, dtype=complex), where=lossy != 0)
             for each in (own, own + further)

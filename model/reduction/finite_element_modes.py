@@ -10,6 +10,7 @@ from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.reduction.class_modes import ClassModes, finite_element_classes
 from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
+from model.structure.dispersion import Dispersion
 from model.structure.footprint import as_footprints
 from model.structure.plate import Plate
 
@@ -40,6 +41,7 @@ class FiniteElementModes:
         self._classes = tuple(classes)
         self.eigenvalues = np.concatenate([part.eigenvalues for part in classes])
         self.losses = np.zeros(len(self.eigenvalues))
+        self.dispersion: Dispersion | None = None
         self.largest_truncated = max(part.largest_truncated for part in classes)
         self._solved: dict[tuple[float, ...], tuple[_Solved, ...]] = {}
         self._observed: dict[bytes, tuple[FloatArray, tuple[sparse.csr_array, ...]]] = {}

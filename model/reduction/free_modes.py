@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from model.arrays import FloatArray
+from model.structure.dispersion import Dispersion
 
 RESIDUAL_ORDER = 4
 """Residual vectors of each point.
@@ -41,6 +42,10 @@ class FreeModes(Protocol):
     @property
     def losses(self) -> FloatArray:
         """Imaginary part of the eigenvalues (r,) [rad²/s²] beside the plate's own loss factor."""
+
+    @property
+    def dispersion(self) -> Dispersion | None:
+        """How eigenvalues change with frequency, None where they do not."""
 
     @property
     def largest_truncated(self) -> float:

@@ -112,7 +112,8 @@ class FreePlate:
 
     @cached_property
     def _elasticity(self) -> ModalElasticity:
-        return ModalElasticity.of(self.plate, self.modes.eigenvalues, self.modes.losses)
+        modes = self.modes
+        return ModalElasticity.of(self.plate, modes.eigenvalues, modes.losses, modes.dispersion)
 
     def _modal_receptance(self, omega: FloatArray, terms: int) -> tuple[ComplexArray, ComplexArray]:
         """Receptance of each mode (f, r) [s²], and weights of the truncated ones, (f, terms).

@@ -21,6 +21,7 @@ from model.spectral.local_compliance import (
 )
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import deflections_by_class
+from model.structure.dispersion import Dispersion
 from model.structure.equivalent import short_wave_plate
 from model.structure.footprint import check_on_plate
 from model.structure.plate import Plate
@@ -56,6 +57,8 @@ class LayeredModes:
         self._local_plate = local_plate(plate, mesh, band.middle)
         self.eigenvalues = np.concatenate([part.eigenvalues for part in classes])
         self.losses = np.concatenate([part.losses for part in classes])
+        dispersion = np.hstack([part.dispersion for part in classes])
+        self.dispersion = Dispersion(band.frequencies, dispersion) if dispersion.any() else None
         u = 1 / (np.concatenate([part.truncated for part in classes]) + shift)
         self.largest_truncated = float(u.max())
         # u / u_c of each truncated mode to the powers 1, 2, ...

@@ -15,6 +15,7 @@ from scipy import linalg
 from model.arrays import FloatArray
 from model.fem.plate_mesh import PlateMesh
 from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.structure.dispersion import Dispersion
 from model.structure.footprint import as_footprints
 from model.structure.plate import Plate
 
@@ -57,7 +58,8 @@ class ReducedPlate:
 
     omega: (r,) [rad/s], 0 for rigid-body modes, the last ones of the residual vectors; losses:
     (r,) [rad²/s²] beside those of the plate's loss factor; at: shapes at points (p, 2) or
-    footprints (p, 3) [m], (p, r) [1/sqrt(kg)]; origin: None where only the coordinates are known.
+    footprints (p, 3) [m], (p, r) [1/sqrt(kg)]; origin: None where only the coordinates are known;
+    dispersion: how omega² changes with frequency, None where it does not.
     """
 
     plate: Plate
@@ -65,6 +67,7 @@ class ReducedPlate:
     losses: FloatArray
     at: Callable[[FloatArray], FloatArray]
     origin: ReductionBasis | None = None
+    dispersion: Dispersion | None = None
 
     def with_attachments_at(self, points: FloatArray) -> "ReducedPlate":
         """Reduce the same plate for further points of attachment [m] (n, 2).
@@ -134,6 +137,7 @@ def reduce_free_plate(free: FreePlate, attachments: FloatArray) -> ReducedPlate:
         np.concatenate([free.modes.losses, np.zeros(len(omega))]),
         shapes,
         ReductionBasis(free, attached.points, attached.truncated_terms, residual_transform),
+        free.modes.dispersion and free.modes.dispersion.padded(len(omega)),
     )
 
 

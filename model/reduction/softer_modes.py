@@ -6,6 +6,7 @@ from model.arrays import FloatArray
 from model.reduction.free_modes import PointSolutions
 from model.reduction.layered_modes import LayeredModes
 from model.reduction.spectral_modes import SpectralModes
+from model.structure.dispersion import Dispersion
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +24,11 @@ class SofterModes:
     def losses(self) -> FloatArray:
         """As of the plate itself."""
         return self.modes.losses
+
+    @property
+    def dispersion(self) -> Dispersion | None:
+        """As of the plate itself."""
+        return self.modes.dispersion
 
     @property
     def largest_truncated(self) -> float:

@@ -22,6 +22,7 @@ from model.spectral.local_compliance import (
 )
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import SpectralClass, deflections_by_class, solve_class
+from model.structure.dispersion import Dispersion
 from model.structure.footprint import check_on_plate
 from model.structure.plate import Plate
 
@@ -50,6 +51,7 @@ class SpectralModes:
         self._classes = classes
         self.eigenvalues = np.concatenate([part.eigenvalues for part in classes])
         self.losses = np.zeros(len(self.eigenvalues))
+        self.dispersion: Dispersion | None = None
         self.largest_truncated = max(part.largest_truncated for part in classes)
         self._first: PointSolutions | None = None
         self._alone_count = 0

@@ -59,7 +59,7 @@ def _air_costs(rig: Rig) -> list[str]:
         return []
     return [
         f"plate.air_gap: in {1e3 * gap.depth:g} mm friction of the air couples the modes at "
-        f"{low:g} Hz, which is left out: the response may be off by 10 % and more there"
+        f"{low:g} Hz, which is left out: the response may be off by 10 % there"
     ]
 
 

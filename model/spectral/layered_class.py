@@ -4,13 +4,14 @@ Displacements along the plate follow the deflection (`layered_stiffness.follow`)
 the deflection, and the air. Moduli that depend on the frequency or lose energy, and the friction of
 air, are taken for every mode at its own natural frequency: the complex mode is solved for in the
 space of the lowest modes of three real plates, whose moduli span those of the frequencies in
-question. Its imaginary eigenvalue is its loss. Modes beyond them are those of the plate at the
-middle frequency.
+question. Its imaginary eigenvalue is its loss; at other frequencies the mode keeps its shape, and
+has another eigenvalue. Modes beyond them are those of the plate at the middle frequency.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import linalg
@@ -29,6 +30,9 @@ from model.structure.laminate_section import interface_mass, section_of, shear_c
 from model.structure.modal_elasticity import loss_factors
 from model.structure.plate import Plate
 
+NODES = 12
+"""Frequencies of a band at which modes state their stiffness."""
+
 _SPAN = 1.5  # of the moduli of the three plates where only losses matter
 _DEPENDENT = 1e-10  # share of the largest below which directions of the space are left out
 _STEPS = 12  # of the iteration for a complex mode, which takes three or four
@@ -39,12 +43,14 @@ class LayeredClass:
     """Modes of a symmetry class of m polynomials of the deflection.
 
     eigenvalues omega² (r,) and losses (r,) [rad²/s²], the imaginary part beyond the plate's loss
-    factor times omega²; below zero of air that vibrates by itself, which has less; truncated (t,):
-    eigenvalues of the other modes; shapes (m, r + t): polynomials of the deflection, of all.
+    factor times omega²; below zero of air that vibrates by itself, which has less; dispersion (k,
+    r): what is to be added to them at the frequencies of the band; truncated (t,): eigenvalues of
+    the other modes; shapes (m, r + t): polynomials of the deflection, of all.
     """
 
     eigenvalues: FloatArray
     losses: FloatArray
+    dispersion: ComplexArray
     truncated: FloatArray
     shapes: FloatArray
 
@@ -55,6 +61,11 @@ class Band:
 
     low: float
     high: float
+
+    @property
+    def frequencies(self) -> FloatArray:
+        """Evenly spaced in the logarithm, from a third of the lowest to the highest."""
+        return np.geomspace(self.low / 3, self.high, NODES)
 
     @property
     def middle(self) -> float:
@@ -137,16 +148,18 @@ class LayeredPlate:
         eigenvalues[np.abs(eigenvalues) < 1e-6 * shift] = 0.0
         count = int(np.searchsorted(eigenvalues, cut))
         kept, losses = eigenvalues[:count].copy(), np.zeros(count)
+        dispersion, own = np.zeros((NODES, count), dtype=complex), 1 + 1j * self._plate.loss_factor
         shapes = q[: of.deflections].copy()
         if count and (air is not None or not all(layer.is_elastic for layer in self._layers)):
             space = _Space(self, of, air, band, shift, count)
             for number in range(count):
-                value, shape = space.mode(number, float(eigenvalues[number]))
+                value, shape, elsewhere = space.mode(number, float(eigenvalues[number]))
                 value = complex(value.real if eigenvalues[number] else 0.0, value.imag)
                 kept[number] = value.real
                 losses[number] = max(value.imag, 0.0) - self._plate.loss_factor * value.real
+                dispersion[:, number] = elsewhere - kept[number] * own - 1j * losses[number]
                 shapes[:, number] = shape
-        return LayeredClass(kept, losses, eigenvalues[count:], shapes)
+        return LayeredClass(kept, losses, dispersion, eigenvalues[count:], shapes)
 
     def _stiffness(self, of: ClassFunctions, moduli: Sequence[float]) -> FloatArray:
         return layered_stiffness(of, section_of(self._layers, moduli, self._corrections))
@@ -231,8 +244,11 @@ class _Space:
         self._deflections = w @ basis
         self._starts = basis.T @ whole[:, : last + 1]
 
-    def mode(self, number: int, eigenvalue: float) -> tuple[complex, FloatArray]:
-        """Complex eigenvalue [rad²/s²] of a mode near a real one, and its deflection (m,)."""
+    def mode(self, number: int, eigenvalue: float) -> tuple[complex, FloatArray, ComplexArray]:
+        """Complex eigenvalue [rad²/s²] of a mode near a real one, and its deflection (m,).
+
+        And what it is at the frequencies of the band, in its own shape, (k,).
+        """
         value, start = complex(eigenvalue), self._starts[:, number].astype(complex)
         mode = start
         for _ in range(_STEPS):
@@ -247,7 +263,15 @@ class _Space:
             nearest = int(np.argmax(np.abs(start @ self._mass @ modes)))
             value, mode = complex(values[nearest]), modes[:, nearest]
         mode = mode / np.sqrt(mode @ B @ mode)
-        return value, self._deflections @ mode.real
+        elsewhere = [
+            mode @ A @ mode + (2 * math.pi * frequency) ** 2 * (1 - mode @ B @ mode)
+            for frequency, (A, B) in zip(self._band.frequencies, self._at_nodes, strict=True)
+        ]
+        return value, self._deflections @ mode.real, np.array(elsewhere)
+
+    @cached_property
+    def _at_nodes(self) -> list[tuple[ComplexArray, FloatArray]]:
+        return [self._matrices(frequency) for frequency in self._band.frequencies]
 
     def _matrices(self, frequency: float) -> tuple[ComplexArray, FloatArray]:
         """Stiffness with all losses, and mass, at a frequency [Hz]."""

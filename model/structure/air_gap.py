@@ -43,11 +43,11 @@ class AirGap:
     def is_narrow(self, frequency: float) -> bool:
         """Whether friction couples modes at a frequency [Hz], which mode by mode leaves out.
 
-        Below five thicknesses of the boundary layer sqrt(2 mu / (rho omega)) between open edges,
-        ten between sealed ones: beyond them the response is within 5 % (`benchmarks.layers`).
+        Below five thicknesses of the boundary layer sqrt(2 mu / (rho omega)), between open edges:
+        beyond them the response is within 3 % (`benchmarks.layers`).
         """
         layer = math.sqrt(VISCOSITY / (math.pi * DENSITY * frequency))
-        return self.depth < (10 if self.closed else 5) * layer
+        return not self.closed and self.depth < 5 * layer
 
     def inertia(self, frequency: float) -> complex:
         """rho b [kg/m³] at a frequency [Hz]: density of air that friction holds back."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
+from model.structure.dispersion import Dispersion
 from model.structure.plate import LOSS_FREQUENCY, Plate
 
 
@@ -44,24 +45,34 @@ def check_of_theory(plate: Plate) -> None:
 class ModalElasticity:
     """Eigenvalues omega² (r,) [rad²/s²] of a plate, and loss factors (r,) relative to its own.
 
-    losses (r,) [rad²/s²]: what modes lose beside those, in soft layers and air.
+    losses (r,) [rad²/s²]: what modes lose beside those, in soft layers and air; dispersion: how
+    they change with frequency, None where they do not.
     """
 
     plate: Plate
     eigenvalues: FloatArray
     relative_loss: FloatArray
     losses: FloatArray
+    dispersion: Dispersion | None = None
 
     @classmethod
-    def of(cls, plate: Plate, eigenvalues: FloatArray, losses: FloatArray) -> Self:
+    def of(
+        cls,
+        plate: Plate,
+        eigenvalues: FloatArray,
+        losses: FloatArray,
+        dispersion: Dispersion | None = None,
+    ) -> Self:
         """Those of a plate whose theory has these (r,), all of its lowest among them."""
         deviations = np.array(plate.mode_deviations, dtype=float).reshape(-1, 2)
         if not len(deviations):
-            return cls(plate, eigenvalues, np.ones(len(eigenvalues)), losses)
+            return cls(plate, eigenvalues, np.ones(len(eigenvalues)), losses, dispersion)
         factors = np.ones((2, len(eigenvalues)))
         modes = lowest_elastic(eigenvalues, len(deviations))
         factors[:, modes] = np.exp(deviations[: len(modes)].T)
-        return cls(plate, eigenvalues * factors[0], factors[1], losses * factors.prod(axis=0))
+        return cls(
+            plate, eigenvalues * factors[0], factors[1], losses * factors.prod(axis=0), dispersion
+        )
 
     def loss_ratios(self, omega: FloatArray) -> FloatArray:
         """Loss factor of each mode at omega (f,) [rad/s] over the plate's, (f, r)."""
@@ -74,10 +85,16 @@ class ModalElasticity:
     def stiffness(self, omega: FloatArray) -> ComplexArray:
         """Complex stiffness (1 + i eta) lambda of each mode at omega (f,), (f, r) [rad²/s²].
 
-        With i times its further losses.
+        With what soft layers and air add.
         """
         lossy = (1 + 1j * self.loss_factors(omega)) * self.eigenvalues
-        return np.asarray(lossy + 1j * self.losses)
+        return np.asarray(lossy + self.further(omega))
+
+    def further(self, omega: FloatArray) -> ComplexArray:
+        """What soft layers and air add to it at omega (f,), (f, r) or (r,) [rad²/s²]."""
+        if self.dispersion is None:
+            return np.asarray(1j * self.losses, dtype=complex)
+        return np.asarray(1j * self.losses + self.dispersion.at(omega))
 
 
 def _powers(plate: Plate, omega: FloatArray) -> FloatArray:

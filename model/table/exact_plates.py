@@ -120,7 +120,9 @@ def _response(
     )
     shapes = np.vstack([table.attachment_shapes, discs[:, 0]])
     scale = plates.thickness[:, None]
-    elasticity = ModalElasticity.of(table.plate, table.omega**2, table.losses)
+    elasticity = ModalElasticity.of(
+        table.plate, table.omega**2, table.losses, table.modal_dispersion
+    )
     stiffness_of_modes = elasticity.stiffness(np.array([omega]))
     lost = 1j * plates.loss[:, None] * stiffness_of_modes.imag
     modal = 1 / (((stiffness_of_modes.real + lost) * scale**2 - omega**2) * scale)

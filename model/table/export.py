@@ -56,6 +56,8 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
         "acceleration_m_s2": _fields(table),
         "mode_omega_rad_s": table.omega,
         "mode_loss_rad2_s2": table.losses,
+        "mode_dispersion_hz": table.dispersion_frequencies,
+        "mode_dispersion_rad2_s2": table.dispersion,
         "mode_shape": table.shapes,
         "mode_shape_attachments": table.attachment_shapes,
         "cell_centre_m": table.cell_centres,

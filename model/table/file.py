@@ -44,6 +44,8 @@ _DTYPES = {
     "frequencies": "<f8",
     "omega": "<f8",
     "losses": "<f8",
+    "dispersion_frequencies": "<f8",
+    "dispersion": "<c16",
     "attachment_shapes": "<f8",
     "shapes": "<f4",
 }
@@ -209,11 +211,14 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
     if table.drive_mode not in DRIVE_MODES:
         raise InputError(f"{path}: unknown drive mode {table.drive_mode!r}")
     count, era_count, coordinates = len(table.frequencies), len(table.eras), len(table.omega)
+    nodes = len(table.dispersion_frequencies)
     expected = {
         "frequencies": (count,),
         "discretisation_error": (count,),
         "omega": (coordinates,),
         "losses": (coordinates,),
+        "dispersion_frequencies": (nodes,),
+        "dispersion": (nodes, coordinates),
         "attachment_shapes": (era_count + len(table.masses), coordinates),
         "shapes": (table.raster.point_count, coordinates),
     }

@@ -138,6 +138,7 @@ def _amplitudes(
         fingertip=table.fingertip,
         uncertainty=table.uncertainty,
         frequencies=frequencies,
+        dispersion=table.modal_dispersion,
     )
     fingers = table.shapes_at(question.contacts).astype(np.float32)
     modal = modal_fields(plate, fingers, question.loads)

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
 from model.drive_modes.exact_search import pattern_count
 from model.drive_modes.forms import Forms
 from model.drive_modes.sources import (
@@ -31,6 +31,7 @@ from model.finger.perception import decibels, detection_threshold
 from model.rig.rig import physics_fingerprint
 from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era
+from model.structure.dispersion import Dispersion
 from model.structure.fingertip import Fingertip, fingertip_loads
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
@@ -78,6 +79,8 @@ class LocalizationTable:
     - frequencies: (f,) [Hz]
     - omega: (r,) [rad/s], of the reduced free plate (`model.reduction.reduced_plate`)
     - losses: (r,) [rad²/s²], of it beside those of the plate's loss factor
+    - dispersion_frequencies: (k,) [Hz], dispersion: (k, r) [rad²/s²], change of its omega² with
+      frequency (`model.structure.dispersion`), k = 0 for none
     - attachment_shapes: (eras + masses, r) [1/sqrt(kg)], its shapes at ERAs and masses
     - shapes: (points, r) [1/sqrt(kg)], its shapes on the raster
     - discretisation_error: (f,), estimated relative L2 error of the fields over the raster
@@ -98,6 +101,8 @@ class LocalizationTable:
     frequencies: FloatArray
     omega: FloatArray
     losses: FloatArray
+    dispersion_frequencies: FloatArray
+    dispersion: ComplexArray
     attachment_shapes: FloatArray
     shapes: NDArray[np.float32]
     reference_mesh: PlateMesh
@@ -307,6 +312,13 @@ class LocalizationTable:
         return detection_threshold(self.frequencies, self.threshold).astype(np.float32)
 
     @cached_property
+    def modal_dispersion(self) -> Dispersion | None:
+        """Change of the eigenvalues with frequency, None where they do not."""
+        if not len(self.dispersion_frequencies):
+            return None
+        return Dispersion(self.dispersion_frequencies, self.dispersion)
+
+    @cached_property
     def attached(self) -> AttachedPlate:
         """The plate with its ERAs and masses at the drive frequencies."""
         return attach(
@@ -319,6 +331,7 @@ class LocalizationTable:
             fingertip=self.fingertip,
             uncertainty=self.uncertainty,
             frequencies=self.frequencies,
+            dispersion=self.modal_dispersion,
         )
 
     @cached_property

@@ -17,6 +17,7 @@ from model.finger.perception import check_has_threshold
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig, canonical_json
+from model.structure.dispersion import Dispersion
 from model.structure.point_load import footprints_of
 from model.structure.support import check_supported
 from model.table.file import FORMAT_VERSION, MAX_BYTES
@@ -110,9 +111,15 @@ def _modes(problem: TableProblem, part: Part) -> Arrays:
     rig, highest = problem.rig, float(problem.frequencies[-1])
     attached = footprints_of(rig.eras, rig.masses)
     reduced = reduce_plate(rig.plate, rig.mesh, attached, frequency_max=highest)
+    dispersion = reduced.dispersion
+    if dispersion is None:
+        nothing = np.zeros((0, len(reduced.omega)), dtype=complex)
+        dispersion = Dispersion(np.empty(0), nothing)
     return {
         "omega": reduced.omega,
         "losses": reduced.losses,
+        "dispersion_frequencies": dispersion.frequencies,
+        "dispersion": dispersion.values,
         "attachment_shapes": reduced.at(attached),
         "shapes": reduced.at(problem.raster.points).astype(np.float32),
     }
@@ -139,7 +146,14 @@ PARTS: dict[str, Callable[[TableProblem, Part], Arrays]] = {
 
 PART_TYPES: dict[str, dict[str, str]] = {
     "discretisation": {"discretisation_error": "<f8"},
-    "modes": {"omega": "<f8", "losses": "<f8", "attachment_shapes": "<f8", "shapes": "<f4"},
+    "modes": {
+        "omega": "<f8",
+        "losses": "<f8",
+        "dispersion_frequencies": "<f8",
+        "dispersion": "<c16",
+        "attachment_shapes": "<f8",
+        "shapes": "<f4",
+    },
 }
 """Arrays of each kind of part, with their types."""
 

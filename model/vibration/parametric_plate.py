@@ -17,6 +17,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.fem.plate_mesh import check_frequencies
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
+from model.structure.dispersion import Dispersion
 from model.structure.dynamic_stiffness import attached_stiffness, dynamic_stiffness
 from model.structure.low_rank import coupled_forces, on_diagonal
 from model.structure.modal_elasticity import ModalElasticity
@@ -57,13 +58,14 @@ class FreeReceptances:
 class ParametricPlate:
     """The reduced plate of a rig at its ERAs and loads (h, r) and at points (p, r).
 
-    plate: that was solved; eigenvalues: omega² of its modes and losses, (r,) [rad²/s²]; omega (f,)
-    [rad/s].
+    plate: that was solved; eigenvalues: omega² of its modes and losses, (r,) [rad²/s²], which
+    change with frequency by the dispersion; omega (f,) [rad/s].
     """
 
     plate: Plate
     eigenvalues: FloatArray
     losses: FloatArray
+    dispersion: Dispersion | None
     attachment_shapes: FloatArray
     shapes: FloatArray
     omega: FloatArray
@@ -93,9 +95,11 @@ class ParametricPlate:
         """Receptances of the free plate for values (...), by default with its own thickness [m]."""
         thicker = np.asarray(1.0 if thickness is None else thickness / self.plate.thickness)
         stiffer = np.asarray(modulus) / self.plate.material.E * thicker**3
-        elasticity = ModalElasticity.of(self.plate, self.eigenvalues, self.losses)
+        elasticity = ModalElasticity.of(self.plate, self.eigenvalues, self.losses, self.dispersion)
         loss = np.asarray(loss_factor)[..., None, None] * elasticity.loss_ratios(self.omega)
-        complex_eigenvalues = (1 + 1j * loss) * elasticity.eigenvalues + 1j * elasticity.losses
+        complex_eigenvalues = (1 + 1j * loss) * elasticity.eigenvalues + elasticity.further(
+            self.omega
+        )
         elastic = np.asarray(stiffer)[..., None, None] * complex_eigenvalues
         inertia = thicker[..., None, None] * (self.omega**2)[:, None]
         modal = np.asarray(1 / (elastic - inertia))
@@ -135,6 +139,7 @@ def parametric_plate(rig: Rig, points: FloatArray, frequencies: FloatArray) -> P
         rig.plate,
         reduced.omega**2,
         reduced.losses,
+        reduced.dispersion,
         reduced.at(attached),
         reduced.at(points),
         2 * np.pi * frequencies,

@@ -142,7 +142,7 @@ def test_complex_modes_equal_a_complex_eigenproblem():
     [
         ({}, 1e-3),
         ({"loss_factor": 0.3}, 0.01),
-        ({"by_frequency": ((10.0, 0.5, 0.3), (100.0, 1.0, 0.4), (1000.0, 2.0, 0.5))}, 0.05),
+        ({"by_frequency": ((10.0, 0.5, 0.3), (100.0, 1.0, 0.4), (1000.0, 2.0, 0.5))}, 0.02),
     ],
 )
 def test_modes_answer_as_the_direct_solution(core, error):

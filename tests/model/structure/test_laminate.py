@@ -30,7 +30,7 @@ PANEL = (Layer(GLASS, 1.8e-3), Layer(ADHESIVE, 0.2e-3), Layer(GLASS, 0.7e-3))
 
 
 def of_plate(laminate, **changes):
-    """The equivalent plate of some size."""
+    """The plate of a laminate, of some size."""
     return equivalent_plate(laminate, length=0.4, width=0.25, frequency=150.0, **changes)
 
 

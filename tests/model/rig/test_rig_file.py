@@ -276,6 +276,17 @@ def test_a_stiff_mount_says_how_large_it_is(tmp_path: Path) -> None:
         assert all("1.1 %" in each for each in found)
 
 
+def test_check_warns_of_an_air_gap_whose_friction_couples_modes(tmp_path: Path) -> None:
+    """Below five boundary layers, by hand 5 sqrt(2 1.82e-5 / (1.204 2 pi 40)) = 1.7 mm at 40 Hz."""
+    for gap, warnings in (("1.6 mm", 1), ("1.8 mm", 0), ("0.5 mm, closed: true", 0)):
+        text = LAMINATE.replace("  bond: full\n", f"  air_gap: {{depth: {gap}}}\n")
+        text = text.replace(
+            "amplifiers:", "  SE: {at: [12 in, 0], stiffness: 17 kN/m}\namplifiers:"
+        )
+        checked = RIG.check(read_document(write(tmp_path, text)))
+        assert sum(each.startswith("plate.air_gap") for each in checked.warnings) == warnings
+
+
 def test_load_rig_reads_a_laminate(tmp_path: Path) -> None:
     """The plate has the stack's mass, by hand 2.7 + 0.2 + 2.38 kg/m², and the bond is read."""
     rig = load_rig(write(tmp_path, LAMINATE))

@@ -53,7 +53,7 @@ def mass_scale_error(rig: Rig) -> float:
 class FormModel:
     """A reduced plate (r modes) at e ERAs, s sensors and c cells of foreign mass.
 
-    losses (r,): of the modes beside the plate's loss factor; *_shapes (n, r); *_slopes (2, n, r):
+    further (f, r): what layers and air add to the eigenvalues; *_shapes (n, r); *_slopes (2, n, r):
     their derivatives along x and y [1/m]; rest (f, r, r): dynamic stiffness of the rig's own
     masses; stiffening (g, r, r): derivatives of the modal
     stiffness by length, width (relative) and Poisson's ratio; loss_ratios (f, r, r): of its loss
@@ -63,7 +63,7 @@ class FormModel:
 
     modulus: float
     eigenvalues: FloatArray
-    losses: FloatArray
+    further: ComplexArray
     omega: FloatArray
     rest: ComplexArray
     era_shapes: FloatArray
@@ -136,7 +136,7 @@ class FormModel:
         shapes = np.vstack([phi, self.cell_shapes])
         system = self.rest + np.einsum("fj,jr,jq->frq", attached, shapes, shapes, optimize=True)
         lossy = 1 + 1j * values[1] * self.loss_ratios
-        bending = lossy * elastic + 1j * stiffer * np.diag(self.losses)
+        bending = lossy * elastic + stiffer * self.further[:, :, None] * np.eye(len(elastic))
         system += bending
         diagonal = np.arange(len(elastic))
         system[:, diagonal, diagonal] -= omega**2
@@ -221,7 +221,7 @@ def form_model(rig: Rig, points: FloatArray, frequencies: FloatArray) -> FormMod
     attached = np.vstack([at_eras, at_masses])
     reduced = reduce_plate(plate, rig.mesh, attached, frequency_max=high)
     eigenvalues = reduced.omega**2
-    elasticity = ModalElasticity.of(plate, eigenvalues, reduced.losses)
+    elasticity = ModalElasticity.of(plate, eigenvalues, reduced.losses, reduced.dispersion)
     omega = 2 * np.pi * frequencies
 
     def slopes(places: FloatArray) -> FloatArray:
@@ -268,7 +268,7 @@ def form_model(rig: Rig, points: FloatArray, frequencies: FloatArray) -> FormMod
     return FormModel(
         plate.material.E,
         elasticity.eigenvalues,
-        elasticity.losses,
+        np.broadcast_to(elasticity.further(omega), (len(omega), len(eigenvalues))),
         omega,
         np.einsum("fj,jr,jq->frq", loads, mass_shapes, mass_shapes, optimize=True),
         reduced.at(at_eras),

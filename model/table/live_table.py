@@ -53,6 +53,7 @@ def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
         fingertip=rig.fingertip,
         omega=faster * table.omega,
         losses=faster**2 * table.losses,
+        dispersion=faster**2 * table.dispersion,
         attachment_shapes=_attachment_shapes(table, rig) / np.sqrt(thicker),
         shapes=(table.shapes / np.float32(np.sqrt(thicker))).astype(np.float32),
     )

@@ -22,7 +22,9 @@ PAGE = Path(__file__).parents[2] / "docs" / "measured" / "identification.md"
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.identification")
     parser.add_argument("--plates", type=int, default=50)
-    parser.add_argument("--sets", type=int, default=2, help="of contacts, on each plate")
+    parser.add_argument(
+        "--sets", type=int, default=2, help="of contacts on each plate, 0 for fits only"
+    )
     parser.add_argument("--first", type=int, default=1, help="seed of the first plate")
     parser.add_argument("--kinds", default="plain,form,hard")
     parser.add_argument("--rounds", type=int, default=4)
@@ -33,7 +35,7 @@ def main() -> None:
     from benchmarks.identification.answers import table_of
     from benchmarks.identification.plates import FREQUENCIES, outcome
     from benchmarks.identification.server import hidden_plates
-    from benchmarks.identification.tables import as_markdown
+    from benchmarks.identification.tables import contrasts, fits
     from model.rig.file import load_rig
 
     rig = load_rig(RIG)
@@ -47,13 +49,15 @@ def main() -> None:
                 )
                 found.append(one)
                 print(f"plate {seed} {kind}: chi² {one.chi2:.2f} {one.refusal}", flush=True)
-    text = as_markdown(found)
-    print(text)
+    texts = {f"fits-{options.rounds}": fits(found)}
+    if options.sets:
+        texts[f"contrasts-{options.rounds}"] = contrasts(found)
+    print("\n\n".join(texts.values()))
     if options.report:
         run = f"python -m benchmarks.identification --plates {options.plates} --sets {options.sets}"
-        part = f"rounds-{options.rounds}"
         rounds = f" --rounds {options.rounds}" if options.rounds != 4 else ""
-        write_parts(PAGE, {part: f"Printed by `{run}{rounds} --report`.\n\n{text}"})
+        printed = f"Printed by `{run}{rounds} --report`."
+        write_parts(PAGE, {part: f"{printed}\n\n{text}" for part, text in texts.items()})
 
 
 if __name__ == "__main__":

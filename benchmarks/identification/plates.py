@@ -72,7 +72,7 @@ def outcome(
     truth = plates.truth(kind, seed, FREQUENCIES, raster)
     found.errors = parameters_held(identified, truth)
     found.fields = fields_held(identified, plates, kind, seed, FREQUENCIES)
-    for loaded in (False, True):
+    for loaded in (False, True) if sets else ():
         tables = {"written": written[loaded], "identified": _table(identified, loaded)}
         for quiet in QUIET:
             rng = np.random.default_rng([seed, quiet])

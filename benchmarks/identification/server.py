@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.identification.hidden import Hidden, draw, finger_stiffness
-from benchmarks.identification.thin_plate import Complexes, Reals
+from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,11 @@ def _felt(
 
 
 def _truth(kind: str, seed: int, frequencies: Reals, points: Reals) -> Truth:
-    mounted = _plate(kind, seed).mounted
+    return truth_of(_plate(kind, seed).mounted, frequencies, points)
+
+
+def truth_of(mounted: Mounted, frequencies: Reals, points: Reals) -> Truth:
+    """A mounted plate laid open at frequencies (f,) [Hz], with shapes at points (p, 2) [m]."""
     plate = mounted.plate
     places = np.vstack([mounted.at, mounted.masses[:, :2]])
     return Truth(

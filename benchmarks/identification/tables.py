@@ -24,16 +24,15 @@ GOALS = {
 }
 
 
-def as_markdown(outcomes: Sequence[Outcome]) -> str:
-    """Contrasts, fits and coverage."""
+def contrasts(outcomes: Sequence[Outcome]) -> str:
+    """What answers give."""
     lines = [
         "Median (tenth percentile) of the contrast [dB] for one / two / three quiet fingers:",
         "",
         "| | rig as written | identified | goal | plate known |",
         "|---|---|---|---|---|",
     ]
-    kinds = [kind for kind in SETS if any(each.kind == kind for each in outcomes)]
-    for kind in kinds:
+    for kind in _kinds(outcomes):
         own = [each for each in outcomes if each.kind == kind and not each.refusal]
         for loaded in (False, True):
             cells = [" / ".join(_cell(own, way, loaded, quiet) for quiet in QUIET) for way in WAYS]
@@ -42,19 +41,24 @@ def as_markdown(outcomes: Sequence[Outcome]) -> str:
             lines.append(
                 f"| {NAMES[kind]}, {fingers} | {cells[0]} | {cells[1]} | {goal} | {cells[2]} |"
             )
-    lines += [
-        "",
+    return "\n".join(lines)
+
+
+def fits(outcomes: Sequence[Outcome]) -> str:
+    """How well plates are explained, and how often intervals hold the truth."""
+    lines = [
         "Fits; shares of 95 % intervals and regions that hold the truth, where chi² is up to 2:",
         "",
         "| | plates, refused | chi², median (most) | beyond 2 | held-out error | springs | "
         "dampers | gains, phases | frequencies | places | mass | fields | processor time |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for kind in kinds:
+    for kind in _kinds(outcomes):
         every = [each for each in outcomes if each.kind == kind]
         own = [each for each in every if not each.refusal]
         chi2 = np.array([each.chi2 for each in own])
         held = np.median([each.held_out for each in own])
+        refused = len(every) - len(own)
         beyond = int((chi2 > MAX_CHI2).sum())
         seconds = np.median([each.seconds for each in own])
         own = [each for each in own if each.chi2 <= MAX_CHI2]
@@ -68,11 +72,15 @@ def as_markdown(outcomes: Sequence[Outcome]) -> str:
             f"{100 * share_in_region(np.concatenate([each.fields for each in own])):.0f} %",
         ]
         lines.append(
-            f"| {NAMES[kind]} | {len(every)}, {len(every) - len(own)} | {np.median(chi2):.2f} "
+            f"| {NAMES[kind]} | {len(every)}, {refused} | {np.median(chi2):.2f} "
             f"({chi2.max():.2f}) | {beyond} | {100 * held:.1f} % | "
             f"{' | '.join(shares)} | {seconds:.1f} s |"
         )
     return "\n".join(lines)
+
+
+def _kinds(outcomes: Sequence[Outcome]) -> list[str]:
+    return [kind for kind in SETS if any(each.kind == kind for each in outcomes)]
 
 
 def _cell(outcomes: Sequence[Outcome], way: str, loaded: bool, quiet: int) -> str:

@@ -5,7 +5,7 @@ regular grid, all of its modes; ERAs, masses and fingers attached by their equat
 loss is that of viscous modes, eta w w_r in place of eta w_r². Nothing of the model is used.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
 
@@ -92,6 +92,13 @@ class ThinPlate:
         values, vectors = linalg.eigh(rigidity * stiffness, mass)
         values[:3] = 0.0
         return values, vectors
+
+    def thinned(self, factor: float) -> "ThinPlate":
+        """The plate with its thickness times a factor, whose modes scale exactly."""
+        values, vectors = self.modes
+        thinner = replace(self, thickness=factor * self.thickness)
+        thinner.__dict__["modes"] = (factor**2 * values, vectors / np.sqrt(factor))
+        return thinner
 
     def shapes(self, points: Reals) -> Reals:
         """Mode shapes at points (p, 2) [m], (p, r)."""

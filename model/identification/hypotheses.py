@@ -22,7 +22,7 @@ _MASS = 5e-3
 _COST_OF_CHANGE = 4.0
 _UNLIKELY = 1e-4
 _SCANNED, _STARTS = (9, 7), 3
-_FIRST_ITERATIONS, _ITERATIONS = 3, 8
+_FIRST_ITERATIONS, _ITERATIONS = 5, 30
 _FOLLOWED = 3  # of the least cost after the first iterations
 
 
@@ -53,7 +53,7 @@ def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
     tried += _by_mass(before, patterns)
     tried.sort(key=lambda each: each.cost)
     for number, each in enumerate(tried[:_FOLLOWED]):
-        x = each.after.state.x
+        x = np.concatenate([each.after.state.x, each.after.fingers])
         after = update(each.prior, patterns, iterations=_ITERATIONS, start=x)
         tried[number] = replace(each, after=after)
     tried.sort(key=lambda each: each.cost)

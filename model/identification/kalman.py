@@ -9,7 +9,8 @@ from scipy import linalg
 from model.arrays import FloatArray
 from model.identification.settled import Touched, finger_count
 
-_CONVERGED = 1e-3
+_CONVERGED = 3e-3  # standard deviations
+_MAX_STEP = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +39,10 @@ class Updated:
 def update(
     before: State, patterns: Sequence[Touched], *, iterations: int, start: FloatArray | None = None
 ) -> Updated:
-    """Most likely state after patterns, by Gauss-Newton steps from the state or from a start (p,).
+    """Most likely state after patterns, by Gauss-Newton steps from the state or from a start.
 
-    In the form of the innovation: only a matrix as large as the patterns' numbers is inverted.
+    start: of the plate (p,), or of plate and fingers (p + q,). In the form of the innovation: only
+    a matrix as large as the patterns' numbers is inverted.
     """
     space = patterns[0].space
     p, q = len(before.x), finger_count([each.pattern for each in patterns])
@@ -48,7 +50,9 @@ def update(
     centre = np.concatenate([before.x, np.zeros(q)])
     values = np.concatenate([each.pattern.numbers for each in patterns])
     std = np.concatenate([each.pattern.std for each in patterns])
-    at = centre.copy() if start is None else np.concatenate([start, np.zeros(q)])
+    at = centre.copy()
+    if start is not None:
+        at[: len(start)] = start
     nis = np.nan
     for step in range(iterations):
         predicted, H = _linearised(patterns, at, p, q)
@@ -60,7 +64,9 @@ def update(
             nis = float(innovation @ weighted)
         moved = centre + gain @ weighted
         moved[:p] = np.clip(moved[:p], space.lower, space.upper)
-        change, at = np.abs(moved - at).max(), moved
+        change = np.abs(moved - at).max()
+        # What is loose moves far where a step's slopes no longer hold.
+        at = at + min(1.0, _MAX_STEP / max(change, 1e-12)) * (moved - at)
         if change < _CONVERGED:
             break
     predicted, H = _linearised(patterns, at, p, q)

@@ -1,0 +1,129 @@
+"""An hour of a plate in service: it thins, a mount loosens and a sticker comes.
+
+    python -m benchmarks.identification.hour [--plates 3] [--quiet]
+
+Hidden thin plates with form errors, identified at first; 300 patterns, the table's own answers at
+random touches of two to four fingers of unknown loads. Thickness falls by 1 % an hour, a mount
+loses 20 % after 20 minutes, a sticker of 3 g comes after 40. Printed are alarms, explanations and
+the contrast [dB] for one quiet finger: as identified and never updated, followed in service, and
+for the plate known. --quiet: without mount and sticker, for false alarms.
+"""
+
+import argparse
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.identification.answers import answer, known_table, table_of
+from benchmarks.identification.hidden import LENGTH, WIDTH, draw, finger_stiffness
+from benchmarks.identification.plates import FREQUENCIES
+from benchmarks.identification.server import truth_of
+from benchmarks.identification.thin_plate import Mounted
+from benchmarks.setting import RIG, random_contacts, use_one_thread
+from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.identification.forward import RestingFinger, Sensor
+from model.identification.identify import identify
+from model.identification.in_service import LivePlate
+from model.identification.measurement import Measurement
+from model.identification.settled import SettledPattern
+from model.rig.file import load_rig
+from model.structure.fingertip import Fingertip
+from model.table.live_table import table_following
+from model.table.table import LocalizationTable
+
+MINUTES_BETWEEN = 0.2
+MOUNT_AT, STICKER_AT = 20.0, 40.0
+JUDGED_AT = (19.8, 23.0, 39.8, 43.0, 59.8)
+SETS = 12
+_FOLLOWED_EVERY = 5  # patterns
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.identification.hour")
+    parser.add_argument("--plates", type=int, default=3)
+    parser.add_argument("--first", type=int, default=1, help="seed of the first plate")
+    parser.add_argument("--quiet", action="store_true")
+    options = parser.parse_args()
+    use_one_thread()
+    found: dict[tuple[float, str], list[float]] = {}
+    for seed in range(options.first, options.first + options.plates):
+        for key, values in _hour(seed, is_quiet=options.quiet).items():
+            found.setdefault(key, []).extend(values)
+    print("| minute | never updated | in service | plate known |\n|---|---|---|---|")
+    for minute in JUDGED_AT:
+        cells = [f"{np.median(found[minute, way]):.1f}" for way in ("frozen", "live", "known")]
+        print(f"| {minute:g} | {' | '.join(cells)} |")
+
+
+def _hour(seed: int, *, is_quiet: bool) -> dict[tuple[float, str], list[float]]:
+    rig, hidden = load_rig(RIG), draw("form", seed)
+    sensors = [Sensor(era.name, era.name) for era in rig.eras]
+    values = hidden.measured(FREQUENCIES, np.random.default_rng([seed, 1]))
+    identified = identify(rig, Measurement.of(sensors, FREQUENCIES, values), seed=seed)
+    live, mounted = LivePlate(identified), hidden.mounted
+    loaded = table_of(identified.rig, FREQUENCIES, loaded=True)
+    weightless = table_of(identified.rig, FREQUENCIES, loaded=False)
+    table, first, rng = loaded, mounted.plate, np.random.default_rng([seed, 2])
+    found: dict[tuple[float, str], list[float]] = {}
+    judged = list(JUDGED_AT)
+    for number in range(300):
+        minute = number * MINUTES_BETWEEN
+        mounted = replace(mounted, plate=first.thinned(1 - 0.01 * minute / 60))
+        if not is_quiet and np.isclose(minute, MOUNT_AT):
+            loose = np.where(np.arange(4) == seed % 4, 0.8, 1.0)
+            mounted = replace(mounted, stiffness=loose * mounted.stiffness)
+        if not is_quiet and np.isclose(minute, STICKER_AT):
+            sticker = [*(rng.uniform(0.1, 0.9, 2) * (LENGTH, WIDTH)), 3e-3]
+            mounted = replace(mounted, masses=np.vstack([mounted.masses, sticker]))
+        places = random_contacts(rng, int(rng.integers(2, 5)), (LENGTH, WIDTH), margin=0.013)
+        frequency, bases = answer(table, places)
+        bases = 0.2 * bases
+        factors = np.exp(0.5 * rng.standard_normal(len(places)))
+        loads = np.array([finger_stiffness(frequency, np.full(4, each)) for each in factors])
+        felt = mounted.accelerations(frequency, mounted.at, fingers=places, loads=loads) @ bases
+        measured = hidden.sensor_gain * felt
+        noise = rng.standard_normal((2, len(measured)))
+        measured = measured + 0.01 * np.abs(measured) * (noise[0] + 1j * noise[1])
+        fingers = tuple(RestingFinger(x, y, Fingertip()) for x, y in places.tolist())
+        report = live.take(SettledPattern(60 * minute, frequency, bases, measured, fingers))
+        if report.alarm:
+            print(f"plate {seed}, minute {minute:.1f}: alarm", flush=True)
+        if report.explanation:
+            print(f"plate {seed}, minute {minute:.1f}: {report.explanation}", flush=True)
+        if number % _FOLLOWED_EVERY == 0:
+            table = table_following(loaded, live.rig)
+        if judged and minute >= judged[0] - 1e-6:
+            at = judged.pop(0)
+            tables = {
+                "frozen": weightless,
+                "live": table_following(weightless, replace(live.rig, fingertip=None)),
+            }
+            for way, contrasts in _judged(tables, mounted, seed).items():
+                found[at, way] = contrasts
+    return found
+
+
+def _judged(
+    tables: dict[str, LocalizationTable], mounted: Mounted, seed: int
+) -> dict[str, list[float]]:
+    """Contrast [dB] at the same sets of contacts by the tables and for the plate known."""
+    live = tables["live"]
+    truth = truth_of(mounted, live.frequencies, live.raster.points)
+    tables = {**tables, "known": known_table(live, truth, np.zeros((0, 4)))}
+    rng, found = np.random.default_rng([seed, 3]), {way: list[float]() for way in tables}
+    for _ in range(SETS):
+        places = random_contacts(rng, 2, (LENGTH, WIDTH), margin=0.013)
+        drives = 1 + 0.01 * rng.standard_normal(4)
+        drives = drives * np.exp(1j * np.radians(1) * rng.standard_normal(4))
+        discs = [fingertip_points(float(x), float(y), live.plate) for x, y in places]
+        weights = fingertip_weights(float(places[0, 0]), float(places[0, 1]), live.plate)
+        for way, table in tables.items():
+            frequency, bases = answer(table, places)
+            felt = mounted.accelerations(frequency, np.concatenate(discs)) @ (bases * drives)
+            size, own = np.abs(felt), len(discs[0])
+            found[way].append(float(20 * np.log10(weights @ size[:own] / size[own:].max())))
+    return found
+
+
+if __name__ == "__main__":
+    main()

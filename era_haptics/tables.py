@@ -3,9 +3,7 @@
 from collections.abc import Sequence
 from functools import lru_cache
 
-import numpy as np
-
-from era_haptics.arguments import expect_rig
+from era_haptics.arguments import as_frequencies, expect_rig
 from era_haptics.positions import Positions, as_loads, as_points
 from model.arguments import expect, expect_number, shown
 from model.arrays import FloatArray
@@ -38,7 +36,7 @@ def table(
     expect_rig(rig)
     expect(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
     _expect_mode(drive_mode)
-    chosen = None if frequencies is None else _as_frequencies(frequencies)
+    chosen = None if frequencies is None else as_frequencies(frequencies)
     found, _ = cached_table(rig, frequencies=chosen, grid=grid, drive_mode=drive_mode)
     return found
 
@@ -84,20 +82,6 @@ def _expect_mode(given: object) -> None:
     """Raise InputError for anything but text."""
     if not isinstance(given, str):
         raise InputError(f"drive_mode must be a name such as 'phased', got {shown(given)}")
-
-
-def _as_frequencies(given: object) -> FloatArray:
-    """Frequencies (f,) [Hz] in the order given."""
-    try:
-        found = np.asarray(given, dtype=float)
-    except (TypeError, ValueError):
-        found = np.empty(())
-    if found.ndim != 1:
-        raise InputError(
-            f"frequencies must be a sequence of numbers in hertz, such as range(60, 321, 10), got "
-            f"{shown(given)}"
-        )
-    return found
 
 
 @lru_cache(maxsize=2)  # a notebook asks one table after the other, many times each

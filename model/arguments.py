@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections.abc import Iterable
 from numbers import Integral, Real
 from pathlib import Path
 
@@ -28,6 +29,13 @@ def expect_at_least(value: float, least: float, *, what: str) -> None:
     """Raise InputError for a value that is not finite or below the least."""
     if not (math.isfinite(value) and value >= least):
         raise InputError(f"{what} must be finite and at least {least:g}, got {value}")
+
+
+def expect_one_of(names: Iterable[str], value: object, *, what: str) -> None:
+    """Raise InputError for anything but one of these names."""
+    known = tuple(names)
+    if value not in known:
+        raise InputError(f"{what} must be one of {', '.join(known)}, got {shown(value)}")
 
 
 def is_whole(value: object) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 
 from model.studies.cases import Cases
 from model.studies.finished import FinishedCases
-from model.studies.solve import CaseResults, StudyProblem
+from model.studies.solve import CaseResults, StudyProblem, empty_results
 from model.studies.workers import Workers
 
 # A twentieth of a second of work; to hand one over takes a cluster's scheduler milliseconds.
@@ -28,15 +28,17 @@ def run_study(
     cases: Cases,
     *,
     workers: Workers,
-    finished: FinishedCases,
+    finished: FinishedCases | None = None,
     progress: Callable[[int], None] = lambda count: None,
 ) -> StudyRun:
     """Solve all cases that are not finished, in chunks that workers share.
 
-    progress: called with the number of further cases done. After an exception, Ctrl-C included,
-    the chunks that are done are saved.
+    finished: None if nothing is kept; progress: called with the number of further cases done.
+    After an exception, Ctrl-C included, the chunks that are done are saved.
     """
-    done, results = finished.find(cases)
+    done, results = np.zeros(len(cases), dtype=bool), empty_results(len(cases))
+    if finished is not None:
+        done, results = finished.find(cases)
     cached_count = int(done.sum())
     progress(cached_count)
     missing = np.flatnonzero(~done)
@@ -46,8 +48,10 @@ def run_study(
         for number, solved in workers(problem, chunks) if chunks else ():
             results.statistics[parts[number]] = solved.statistics
             results.active[parts[number]] = solved.active
-            finished.add(chunks[number], solved)
+            if finished is not None:
+                finished.add(chunks[number], solved)
             progress(len(parts[number]))
     finally:
-        finished.save()
+        if finished is not None:
+            finished.save()
     return StudyRun(results, len(missing), cached_count)

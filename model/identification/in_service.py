@@ -9,6 +9,7 @@ together by one change (`model.identification.hypotheses`), or the plate counts 
 import math
 from collections import deque
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import stats
@@ -20,6 +21,7 @@ from model.identification.identified_rig import rig_with
 from model.identification.identify import Identification
 from model.identification.kalman import State, update
 from model.identification.parameters import FINGER_PARTS, Space, space_of
+from model.identification.posterior import THEORY
 from model.identification.priors import Priors
 from model.identification.settled import SettledPattern, Touched
 from model.identification.values import Values
@@ -103,7 +105,7 @@ class LivePlate:
             if len(self._held) > _HELD:
                 return self._explained(drifted, pattern.time)
             return Report(np.nan, 0, False, True, None, np.zeros((0, 4)))
-        after = update(drifted, [touched], iterations=_ITERATIONS)
+        after = update(drifted, [touched], iterations=_ITERATIONS, theory=self._theory)
         self._recent.append((after.nis, after.count))
         if self._is_alarming(after.nis, after.count):
             self._recent.clear()
@@ -131,6 +133,22 @@ class LivePlate:
         numbers = sum(each for _, each in self._recent)
         is_full = len(self._recent) == _WINDOW
         return is_full and bool(stats.chi2.sf(total, numbers) < _UNLIKELY_TOGETHER)
+
+    @cached_property
+    def _theory(self) -> FloatArray:
+        """Variances (p,) of what the theory gets wrong, which patterns at other tones show anew."""
+        space, variance = self.space, np.zeros(self.space.size)
+        for kind, std in (
+            ("stiffness", THEORY["stiffness"]),
+            ("damping_each", THEORY["damping"]),
+            ("mode_shifts", 2 * THEORY["frequency"]),
+            ("place", THEORY["place"]),
+        ):
+            known = space.std[space.groups[kind]]
+            variance[space.groups[kind]] = (
+                np.divide(std, known, out=np.zeros_like(known), where=known > 0) ** 2
+            )
+        return variance
 
     def _drifted(self, time: float) -> State:
         """The state at a time [s], less certain by what drifted since it was updated."""

@@ -37,12 +37,18 @@ class Updated:
 
 
 def update(
-    before: State, patterns: Sequence[Touched], *, iterations: int, start: FloatArray | None = None
+    before: State,
+    patterns: Sequence[Touched],
+    *,
+    iterations: int,
+    start: FloatArray | None = None,
+    theory: FloatArray | None = None,
 ) -> Updated:
     """Most likely state after patterns, by Gauss-Newton steps from the state or from a start.
 
-    start: of the plate (p,), or of plate and fingers (p + q,). In the form of the innovation: only
-    a matrix as large as the patterns' numbers is inverted.
+    start: of the plate (p,), or of plate and fingers (p + q,); theory (p,): variances of what the
+    theory gets wrong, which count in how unlikely an innovation is, and only there. In the form of
+    the innovation: only a matrix as large as the patterns' numbers is inverted.
     """
     space = patterns[0].space
     p, q = len(before.x), finger_count([each.pattern for each in patterns])
@@ -61,7 +67,10 @@ def update(
         S = linalg.cho_factor(H @ gain + np.diag(std**2))
         weighted = linalg.cho_solve(S, innovation)
         if step == 0 and start is None:
-            nis = float(innovation @ weighted)
+            wrong = np.zeros(p + q)
+            wrong[:p] = 0.0 if theory is None else theory
+            expected = H @ (gain + wrong[:, None] * H.T) + np.diag(std**2)
+            nis = float(innovation @ linalg.solve(expected, innovation, assume_a="pos"))
         moved = centre + gain @ weighted
         moved[:p] = np.clip(moved[:p], space.lower, space.upper)
         change = np.abs(moved - at).max()

@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware firmware-test test pages lint format docs fuzz conformance-faults kill-test fault-test stop-test estimate-test soak bench bench-latency \
+.PHONY: demo firmware firmware-test test test-long lint format docs fuzz conformance-faults kill-test fault-test stop-test estimate-test soak bench bench-latency \
 	bench-localization bench-plant bench-promise bench-wires dist smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -29,14 +29,14 @@ firmware-test: .venv/installed-test
 
 # What needs the processors; what plays in real time; what loads the processors itself.
 test: .venv/installed-test
-	$(BIN)/pytest -m 'not real_time and not alone and not pages' --numprocesses auto --dist loadfile --no-loadscope-reorder
-	$(BIN)/pytest -m 'real_time and not alone' --numprocesses 3 --dist loadfile --no-loadscope-reorder
-	$(BIN)/pytest -m alone
+	$(BIN)/pytest -m 'not real_time and not alone and not long' --numprocesses auto --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest -m 'real_time and not alone and not long' --numprocesses 3 --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest -m 'alone and not long'
 
-# Every command of the tutorials and of the pages for extensions, typed from an empty folder;
-# `make test` takes one of each.
-pages: .venv/installed-test
-	$(BIN)/pytest -m pages --numprocesses auto
+# Whole programmes of which `make test` has a short form: every command of the pages typed from an
+# empty folder, conformance of the examples, an identified plate, the firmware on the plate.
+test-long: .venv/installed-test
+	$(BIN)/pytest -m long --numprocesses auto
 
 lint: .venv/installed-test
 	$(BIN)/ruff check .

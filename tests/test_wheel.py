@@ -111,6 +111,7 @@ def test_sdist_holds_what_is_needed_to_test_and_document_it(sdist: Path) -> None
     assert [name for name in names if unwanted.search(name)] == []
 
 
+@pytest.mark.long
 def test_it_works_without_the_checkout(wheel: Path, tmp_path: Path) -> None:
     """From an empty folder, with the wheel and its dependencies alone; `make smoke` does more."""
     environment, folder = tmp_path / "environment", tmp_path / "empty"

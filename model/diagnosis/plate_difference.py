@@ -65,8 +65,8 @@ def _contrasts(model: ComplexArray, true: ComplexArray, variance: float) -> Floa
         at = np.moveaxis(responses, 2, 1)
         target = np.abs(np.einsum("fte,fqet->fqt", at, weights)) ** 2
         rest = np.abs(np.einsum("fqe,fqet->fqt", at, weights)) ** 2
-        spread = variance * np.einsum("fqe,fqet->fqt", np.abs(at) ** 2, np.abs(weights) ** 2)
-        return np.asarray(10 * np.log10(target / (rest + spread)))
+        leakage = variance * np.einsum("fqe,fqet->fqt", np.abs(at) ** 2, np.abs(weights) ** 2)
+        return np.asarray(10 * np.log10(target / (rest + leakage)))
 
     best = ratio(model).argmax(axis=0)
     found = np.take_along_axis(ratio(true), best[None], axis=0)[0]

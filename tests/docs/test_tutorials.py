@@ -13,7 +13,7 @@ from typed_page import Typed, Written, read_steps
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "tutorials"
 SHORT = "own-plate"
-"""Followed by every run of the tests; the others by `make pages`."""
+"""Followed by every run of the tests; the others by `make test-long`."""
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def home() -> Iterator[Path]:
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, marks=[] if page == SHORT else [pytest.mark.pages])
+        pytest.param(page, marks=[] if page == SHORT else [pytest.mark.long])
         for page in sorted(path.stem for path in PAGES.glob("*.md"))
     ],
 )

@@ -49,6 +49,7 @@ def number_in(text: str, pattern: str) -> float:
     return float(found)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("cache")
 def test_researcher_example_reproduces_the_paper(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

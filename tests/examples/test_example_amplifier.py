@@ -118,6 +118,7 @@ def test_serial_end_obeys_only_stop_and_commit_as_broadcasts(
     assert end.amplifier.state == 5
 
 
+@pytest.mark.long
 def test_serial_end_passes_conformance(serial: ModuleType) -> None:
     """Every check on a line in memory; skipped are those of what it has not."""
 

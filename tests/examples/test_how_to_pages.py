@@ -27,7 +27,7 @@ NAMES = [
 WITH_CONFORMANCE = ["add-a-backend", "write-an-amplifier"]
 """They run the whole of it."""
 SHORT = "add-a-material"
-"""Executed by every run of the tests; the others by `make pages`."""
+"""Executed by every run of the tests; the others by `make test-long`."""
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[] if name == SHORT else [pytest.mark.pages])
+        pytest.param(name, marks=[] if name == SHORT else [pytest.mark.long])
         for name in [*NAMES, *WITH_CONFORMANCE]
     ],
 )

@@ -28,6 +28,8 @@ from sim.plant.plant import Plant
 from sim.plant.playback import Playback
 from sim.plant.sampled import SampledPlant
 
+pytestmark = pytest.mark.long
+
 QUESTION = Question(((0.10, 0.03),), ((0.22, 0.16),))
 COMMIT, END = 50.0, 1250.0  # ms; the set plays from one to the other
 AFTER = 200.0  # ms

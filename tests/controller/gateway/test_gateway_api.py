@@ -192,6 +192,7 @@ def test_openapi_describes_every_http_method(gateway: GatewayProcess) -> None:
     assert (lease["minimum"], lease["maximum"]) == (1.0, 60.0)
 
 
+@pytest.mark.long
 def test_openapi_matches_the_responses(
     gateway: GatewayProcess, daemon: ScriptedDaemon, tmp_path: Path
 ) -> None:

@@ -1,6 +1,7 @@
 """The benchmark of identification in its short form: one hard plate in a process of its own."""
 
 import numpy as np
+import pytest
 
 from benchmarks.identification.answers import table_of
 from benchmarks.identification.plates import FREQUENCIES, outcome
@@ -8,6 +9,7 @@ from benchmarks.identification.server import hidden_plates
 from model.rig.file import example_rig_path, load_rig
 
 
+@pytest.mark.long
 def test_hard_plate_gives_the_contrast_of_the_plate_known() -> None:
     """Identified, weightless fingers feel within 2 dB of the plate known, and more than before."""
     rig = load_rig(example_rig_path())

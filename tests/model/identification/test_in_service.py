@@ -83,6 +83,7 @@ def test_plate_that_was_not_explained_is_not_updated(hidden: Hidden, found: Iden
     assert live.state is before
 
 
+@pytest.mark.long
 def test_change_that_nothing_explains_is_said(hidden: Hidden, found: Identification) -> None:
     """Two mounts and a gain at once are no known change: the state stays and says so."""
     live = LivePlate(found)

@@ -34,7 +34,9 @@ def contrast(pattern: Pattern) -> float:
     return pattern.robust_felt_contrast_db
 
 
-@pytest.mark.parametrize("uncertainty", [Uncertainty.none(), Uncertainty()])
+@pytest.mark.parametrize(
+    "uncertainty", [pytest.param(Uncertainty.none(), marks=pytest.mark.long), Uncertainty()]
+)
 def test_contrast_falls_with_the_level_and_rises_with_the_mode(
     uncertainty: Uncertainty, monkeypatch: pytest.MonkeyPatch
 ) -> None:

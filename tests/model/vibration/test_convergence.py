@@ -28,6 +28,7 @@ def study():
     )
 
 
+@pytest.mark.long
 def test_meshes_to_compare_include_the_papers(study):
     """12x9 and its doublings of MITC4, polynomials once, though they are the rig's, and Q5."""
     assert [str(error.mesh) for error in study.errors] == [

@@ -78,6 +78,7 @@ def kept_for(plant: Plant, rig: Rig, until: float) -> Books:
     return Books(float(put_in), float(lost), float(stored[0]), float(stored[-1]))
 
 
+@pytest.mark.long
 def test_plant_energy_balance(rig: Rig) -> None:
     """From knot to knot the books balance to 1e-5 of what went through them, for ramps as well.
 

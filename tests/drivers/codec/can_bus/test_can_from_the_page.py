@@ -64,6 +64,7 @@ async def test_vendor_amplifier_takes_broadcasts_and_sends_emergencies(
     assert [record.fault for record in await amplifier.faults()] == [Fault.WATCHDOG]
 
 
+@pytest.mark.long
 def test_vendor_amplifier_passes_conformance() -> None:
     """The suite for vendors, in virtual time; it has no envelopes."""
 

@@ -30,16 +30,20 @@ _FOLLOWED = 3  # of the least cost after the first iterations
 class Explanation:
     """What explains some patterns: its name, "" for nothing known, and the state it leads to.
 
-    change: of the parameter, in its unit; lead: by how much the next best costs more.
+    change: of the parameter, in its unit; lead: by how much the next best costs more; resembles:
+    what explains most of it, though not enough.
     """
 
     name: str
     change: float
     lead: float
     state: State
+    resembles: str = ""
 
     def __str__(self) -> str:
-        return f"{self.name} by {self.change:+.3g}" if self.name else "the plate has changed"
+        if self.name:
+            return f"{self.name} by {self.change:+.3g}"
+        return f"the plate has changed, most as if {self.resembles} had"
 
 
 def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
@@ -60,7 +64,7 @@ def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
     best = tried[0]
     others = [each.cost for each in tried if each.name != best.name]
     if stats.chi2.sf(best.cost, best.after.count) < _UNLIKELY:
-        return Explanation("", 0.0, 0.0, before)
+        return Explanation("", 0.0, 0.0, before, resembles=best.name)
     index = next(iter(best.changed))
     change = float(space.std[index] * (best.after.state.x[index] - before.x[index]))
     return Explanation(best.name, change, min(others) - best.cost, best.after.state)

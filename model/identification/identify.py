@@ -87,7 +87,9 @@ def identify(
     on, with the tone and the sensor that would show it.
     """
     _check(rig, measurement)
-    setting = Setting(rig, _solved(rig, measurement), Priors.of(rig.uncertainty), measurement)
+    setting = Setting(
+        rig, solved_for(rig, float(measurement.tones[-1])), Priors.of(rig.uncertainty), measurement
+    )
     fitted = fit_in_stages(setting)
     posterior = Posterior.of(fitted.space, fitted.best)
     unknown = unknowns(setting, fitted, posterior)
@@ -133,10 +135,10 @@ def _check(rig: Rig, measurement: Measurement) -> None:
     measurement.check(names)
 
 
-def _solved(rig: Rig, measurement: Measurement) -> FreePlate:
+def solved_for(rig: Rig, frequency_max: float) -> FreePlate:
+    """The free plate of a rig, solved for tones up to a frequency [Hz]."""
     mesh: PlateMesh = rig.mesh
     if not isinstance(mesh, SpectralMesh):
         # Places move freely only where a plate is solved in functions over all of it.
         mesh = mesh_of("auto", rig.plate, frequency_max=rig.limits.frequency_max)
-    highest = max(float(measurement.tones[-1]), 200.0)
-    return solve_free_plate(rig.plate, mesh, frequency_max=highest)
+    return solve_free_plate(rig.plate, mesh, frequency_max=max(frequency_max, 200.0))

@@ -8,28 +8,35 @@ together by one change (`model.identification.hypotheses`), or the plate counts 
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from scipy import stats
 
 from model.arrays import FloatArray
-from model.identification.forward import ForwardModel
+from model.identification.forward import ForwardModel, Sensor
 from model.identification.hypotheses import Explanation, explain
 from model.identification.identified_rig import rig_with
-from model.identification.identify import Identification
+from model.identification.identify import Identification, solved_for
 from model.identification.kalman import State, update
-from model.identification.parameters import FINGER_PARTS, Space, space_of
+from model.identification.parameters import FINGER_PARTS, MODE_SHIFTS, Space, space_of
 from model.identification.posterior import THEORY
 from model.identification.priors import Priors
 from model.identification.settled import SettledPattern, Touched
 from model.identification.values import Values
 from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
+from model.structure.modal_elasticity import lowest_elastic
 
 _WINDOW, _UNLIKELY_TOGETHER, _UNLIKELY_ALONE = 8, 1e-6, 1e-8
 _HELD = 5
 _ITERATIONS = 3
+
+_NOT_STATED = ("modulus", "damping_each", "loss_exponent", "bolt_mass", "place")
+_NOT_STATED += ("mode_shifts", "mode_losses")
 
 DRIFT = {
     "thickness": 0.01,
@@ -59,21 +66,63 @@ class Report:
     fingers: FloatArray
 
 
-class LivePlate:
-    """The state of an identified plate in service."""
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known of a plate when its service begins.
 
-    def __init__(self, found: Identification) -> None:
-        self._before, self._rig = found.before, found.rig
-        self.can_update = found.is_explained
-        """Whether its identification explains the plate; otherwise there are only alarms."""
-        self._model = _with_spare_mass(found)
-        space = self._model.space
+    before: the rig that parameters count from; uncertainty: of the rig as known; model: with a
+    spare mass; is_explained: whether it may be updated.
+    """
+
+    before: Rig
+    uncertainty: Uncertainty
+    model: ForwardModel
+    state: State
+    is_explained: bool = True
+
+    @classmethod
+    def of(cls, found: Identification) -> Self:
+        """What an identification has shown."""
+        model = _with_spare_mass(found)
+        space = model.space
         own = [space.index(name) for name in found.posterior.space.names]
         x, covariance = np.zeros(space.size), np.zeros((space.size, space.size))
         x[own] = found.posterior.x
         covariance[np.ix_(own, own)] = found.posterior.covariance
-        self._state = State(x, covariance)
-        self._priors = Priors.of(found.before.uncertainty)
+        state = State(x, covariance)
+        return cls(found.before, found.rig.uncertainty, model, state, found.is_explained)
+
+    @classmethod
+    def of_rig(cls, rig: Rig, sensors: Sequence[Sensor]) -> Self:
+        """What a rig says of itself by its `uncertainty`; gains of the sensors are not known.
+
+        What it does not state is known the better, the better its thickness is: by identification.
+        """
+        free = solved_for(rig, rig.limits.frequency_max)
+        priors = Priors.of(rig.uncertainty)
+        count = len(lowest_elastic(free.modes.eigenvalues, MODE_SHIFTS))
+        names = [each.name for each in sensors]
+        space = space_of(rig, names, priors, masses=1, mode_count=count)
+        model = ForwardModel(rig, sensors, np.array([rig.limits.frequency_max]), space, free)
+        variance = space.uncertain.astype(float)
+        variance[space.of(*_NOT_STATED)] = min(priors.thickness / Uncertainty.thickness, 1.0) ** 2
+        variance[space.groups["masses"]] = 0.0
+        state = State(np.zeros(space.size), np.diag(variance))
+        return cls(rig, rig.uncertainty, model, state)
+
+
+class LivePlate:
+    """The state of an identified plate in service."""
+
+    def __init__(self, known: Known | Identification) -> None:
+        if isinstance(known, Identification):
+            known = Known.of(known)
+        self._before, self._uncertainty = known.before, known.uncertainty
+        self.can_update = known.is_explained
+        """Whether its identification explains the plate; otherwise there are only alarms."""
+        self._model = known.model
+        self._state = known.state
+        self._priors = Priors.of(known.before.uncertainty)
         self._time: float | None = None
         self._recent: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
         self._held: list[Touched] = []
@@ -94,7 +143,12 @@ class LivePlate:
     def rig(self) -> Rig:
         """The rig as it is known now."""
         values = Values.of(self._before, self.space, self._state.x)
-        return rig_with(self._before, values, self._rig.uncertainty)
+        return rig_with(self._before, values, self._uncertainty)
+
+    @property
+    def before(self) -> Rig:
+        """The rig that parameters count from."""
+        return self._before
 
     def take(self, pattern: SettledPattern) -> Report:
         """Take a settled pattern: update the state, or hold it and explain what happened."""

@@ -7,6 +7,7 @@ level 1 being the full stroke, with the imperfections given.
 import asyncio
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from types import MappingProxyType
 from typing import Protocol
@@ -30,7 +31,7 @@ from sim.bench.reading import ToneReader
 from sim.bench.sensing import PlateSensor, Sensing
 from sim.plant.felt import Felt, measure_vibration
 from sim.plant.fingers import KEPT, Fingers, Position, Record
-from sim.plant.imperfections import Imperfections, delayed, draw_noise, realised
+from sim.plant.imperfections import Imperfections, PlateErrors, delayed, draw_noise, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
 from sim.plant.voltage import moved_by_voltage
 from sim.waveform import Output, ToneSegment
@@ -73,16 +74,12 @@ class Bench:
         self.sample_rate = sample_rate
         self.imperfections = imperfections
         self.probes: list[Probe] = []
-        real = imperfections.plate.realised(rig)
-        reduced = _reduced(
-            real.plate, real.mesh, tuple(real.eras), tuple(real.masses), rig.limits.frequency_max
-        )
-        self.fingers = Fingers(reduced)
-        self.observers: frozenset[str] = frozenset()  # fingers without weight
-        self.loads: Mapping[str, float] = {}  # by finger, relative to the rig's fingertip
         self._time = now
         # Advanced only where its drive changes or its motion is sampled.
-        self._plant = Plant(reduced, real.eras, loads=real.masses, time=now)
+        self._plant = _plant_of(imperfections.plate.realised(rig), now)
+        self.fingers = Fingers(self._plant.reduced)
+        self.observers: frozenset[str] = frozenset()  # fingers without weight
+        self.loads: Mapping[str, float] = {}  # by finger, relative to the rig's fingertip
         self.amplifiers: Mapping[str, SimulatedAmplifier] = {
             name: SimulatedAmplifier(
                 name,
@@ -174,6 +171,23 @@ class Bench:
             if self._plant.reduced is not before:
                 self._shapes_at.cache_clear()
         self.fingers.place(positions, reduced=self._plant.reduced)
+
+    def change_plate(self, errors: PlateErrors, *, now: float) -> None:
+        """Replace plate and ERAs by those of these errors, at rest; what plays drives them on.
+
+        Raises InputError for ERAs that do not support the plate, which changes nothing.
+        """
+        self.advance(now)
+        plant = _plant_of(errors.realised(self.rig), self._time)
+        plant.set_contacts(self._plant.contacts)
+        for index, playing in enumerate(self._applied_outputs):
+            plant.set_input(index, self._motion(index, playing))
+        self.imperfections = replace(self.imperfections, plate=errors)
+        self._plant = plant
+        self._shapes_at.cache_clear()
+        self.fingers.place(self.fingers.layout.positions, reduced=plant.reduced)
+        for sensing in self._sensing:
+            sensing.changed(self._time)
 
     def place_sensors(self, sensors: Sequence[PlateSensor]) -> None:
         """Replace the sensors of the first amplifier beside those at its ERAs."""
@@ -289,6 +303,14 @@ class Bench:
         if drive is None or drive.law is Law.LINEAR:
             return (frequency,)
         return (2 * frequency,) if drive.is_halved else (frequency, 2 * frequency)
+
+
+def _plant_of(real: Rig, time: float) -> Plant:
+    """The plant of a rig as it is, at rest at a time [s]."""
+    reduced = _reduced(
+        real.plate, real.mesh, tuple(real.eras), tuple(real.masses), real.limits.frequency_max
+    )
+    return Plant(reduced, real.eras, loads=real.masses, time=time)
 
 
 @lru_cache(maxsize=2)  # successive benches of one rig share it

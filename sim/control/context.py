@@ -9,6 +9,7 @@ from typing import Any
 from model.errors import InputError
 from sim.bench.bench import Bench
 from sim.bench.simulated_device import SimulatedDevice
+from sim.plant.imperfections import PlateErrors
 from sim.sensors.accelerometer import Accelerometers
 from sim.sensors.recorder import Recorder
 
@@ -26,10 +27,12 @@ class SimulationContext:
     step: Callable[[float], Coroutine[Any, Any, None]] | None = None
     recorder: Recorder | None = None
     accelerometers: Accelerometers = field(init=False)
+    first_plate: PlateErrors = field(init=False)
 
     def __post_init__(self) -> None:
-        """Start without sensors."""
+        """Start without sensors, from the plate as it is."""
         self.accelerometers = Accelerometers(self.bench)
+        self.first_plate = self.bench.imperfections.plate
 
     def record(self, path: Path) -> None:
         """Start recording the present sensors and fingers; InputError while another one runs."""

@@ -30,6 +30,10 @@
         {"sensors": {NAME: {"at_m", "real_m_s2": [one per frequency], "imag_m_s2": [...]}}}
         least squares over the signals; Im[a exp(i omega t)], t on the simulation's clock
 
+    {"op": "plate", "modulus": factor, "stiffness": {ERA: factor}, "masses": [[x, y, kg], ...]}
+                                               change the plate as it was at first, at rest; a key
+                                               left out is as at first: {"ok": true, "time_s"}
+
     {"op": "inject_fault", "fault": ..., "lasts": ..., ...}   keys as in a fault file, begins now
     {"op": "faults"}                                   {"faults": {NAME: [{"fault", "begin_s",
                                                            "end_s" or null, "is_on"}]}}
@@ -48,7 +52,7 @@ import math
 from collections.abc import Mapping
 
 from model.errors import InputError
-from sim.control import finger_operations, sensor_operations
+from sim.control import finger_operations, plate_operations, sensor_operations
 from sim.control.context import SimulationContext
 from sim.control.values import Operation, Request, Response, parse_number
 from sim.faults.fault_file import parse_fault
@@ -148,6 +152,7 @@ _OPERATIONS: Mapping[str, Operation] = {
     "state": _state,
     **finger_operations.OPERATIONS,
     **sensor_operations.OPERATIONS,
+    **plate_operations.OPERATIONS,
     "inject_fault": _inject_fault,
     "faults": _faults,
     "recover": _recover,

@@ -19,6 +19,7 @@ from model.rig.meshes import mesh_of
 from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
 from model.structure.fingertip import Fingertip
+from model.structure.point_load import PointLoad
 from model.transients.base_motion import Term
 from model.vibration.discretisation import finer_mesh
 from sim.waveform import Output
@@ -55,13 +56,16 @@ class ChannelErrors:
 class PlateErrors:
     """A plate on its ERAs relative to the rig's: factors, by default 1.
 
-    stiffness: by ERA; era_damping: of all ERAs; mesh: on which it is solved, None for the rig's.
+    stiffness: by ERA; era_damping: of all ERAs; masses: on the plate beside the rig's; mesh: on
+    which it is solved, None for the rig's.
     """
 
     thickness: float = 1.0
+    modulus: float = 1.0
     loss_factor: float = 1.0
     era_damping: float = 1.0
     stiffness: Mapping[str, float] = field(default_factory=dict)
+    masses: tuple[PointLoad, ...] = ()
     mesh: PlateMesh | None = None
 
     def realised(self, rig: Rig) -> Rig:
@@ -75,10 +79,16 @@ class PlateErrors:
             )
 
         plate = replace(
-            rig.plate.scaled(thickness=self.thickness),
+            rig.plate.scaled(thickness=self.thickness, modulus=self.modulus),
             loss_factor=min(self.loss_factor * rig.plate.loss_factor, _MAX_LOSS_FACTOR),
         )
-        return replace(rig, plate=plate, eras=tuple(map(of, rig.eras)), mesh=self.mesh or rig.mesh)
+        return replace(
+            rig,
+            plate=plate,
+            eras=tuple(map(of, rig.eras)),
+            masses=(*rig.masses, *self.masses),
+            mesh=self.mesh or rig.mesh,
+        )
 
 
 @dataclass(frozen=True)

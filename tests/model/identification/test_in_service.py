@@ -5,19 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.identification.hidden import LENGTH, WIDTH, Hidden, draw, finger_stiffness
+from benchmarks.identification.hidden import Hidden, draw
 from benchmarks.identification.thin_plate import Mounted
-from benchmarks.setting import random_contacts
-from model.identification.forward import RestingFinger, Sensor
+from model.identification.forward import Sensor
 from model.identification.identify import Identification, identify
 from model.identification.in_service import LivePlate, Report
 from model.identification.measurement import Measurement
-from model.identification.settled import SettledPattern
 from model.rig.file import example_rig_path, load_rig
-from model.structure.fingertip import Fingertip
+from settled_patterns import FREQUENCIES, settled_patterns
 
-FREQUENCIES = np.linspace(40.0, 500.0, 27)
-SECONDS = 12.0  # between patterns
 NE = 2  # number of that ERA
 
 
@@ -40,22 +36,8 @@ def play(
     live: LivePlate, hidden: Hidden, plate: Mounted, *, count: int, start: int
 ) -> list[Report]:
     """Reports of patterns at random touches of two to four fingers of unknown loads."""
-    reports = []
-    for number in range(start, start + count):
-        rng = np.random.default_rng([7, number])
-        places = random_contacts(rng, int(rng.integers(2, 5)), (LENGTH, WIDTH), margin=0.013)
-        frequency = float(rng.choice(FREQUENCIES))
-        bases = 50e-6 * rng.uniform(0.2, 1, 4) * np.exp(2j * np.pi * rng.uniform(size=4))
-        factors = np.exp(0.5 * rng.standard_normal(len(places)))
-        loads = np.array([finger_stiffness(frequency, np.full(4, each)) for each in factors])
-        felt = plate.accelerations(frequency, plate.at, fingers=places, loads=loads)
-        values = hidden.sensor_gain * (felt @ bases)
-        noise = rng.standard_normal((2, 4))
-        values = values + 0.01 * np.abs(values) * (noise[0] + 1j * noise[1])
-        fingers = tuple(RestingFinger(x, y, Fingertip()) for x, y in places.tolist())
-        pattern = SettledPattern(number * SECONDS, frequency, bases, values, fingers)
-        reports.append(live.take(pattern))
-    return reports
+    patterns = settled_patterns(hidden, plate, count=count, start=start)
+    return [live.take(pattern) for pattern in patterns]
 
 
 def test_loosened_mount_is_named_and_followed(hidden: Hidden, found: Identification) -> None:

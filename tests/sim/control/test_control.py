@@ -16,10 +16,12 @@ from bench_driving import play
 from drivers.command import DriveCommand
 from drivers.errors import LinkError
 from model.rig.rig import Rig
+from model.structure.point_load import PointLoad
 from sim.bench.bench import Bench
 from sim.control.context import SimulationContext
 from sim.control.operations import carry_out
 from sim.control.server import LINE_MAX, control_socket
+from sim.plant.imperfections import Imperfections, PlateErrors
 
 
 @pytest.fixture
@@ -182,3 +184,59 @@ async def test_control_refuses_an_unusable_path(coarse_rig: Rig, socket_path: Pa
             async with control_socket(SimulationContext(bench), path):
                 pass
     assert plain.read_text() == "kept"
+
+
+async def test_plate_operation_changes_what_is_felt_and_can_be_undone(coarse_rig: Rig) -> None:
+    """A softer mount and 50 g change the amplitude under a finger; without keys it is as at first.
+
+    Amplitudes of the changed plate are those of a bench that was built with these errors.
+    """
+    name = coarse_rig.eras[2].name
+    mass = PointLoad(0.2, 0.06, mass=0.05)
+    errors = PlateErrors(modulus=0.9, stiffness={name: 0.8}, masses=(mass,))
+    changes = {"modulus": 0.9, "stiffness": {name: 0.8}, "masses": [[0.2, 0.06, 0.05]]}
+    first = await felt_after(coarse_rig, Imperfections())
+    built = await felt_after(coarse_rig, Imperfections(plate=errors))
+    changed = await felt_after(coarse_rig, Imperfections(), changes)
+    restored = await felt_after(coarse_rig, Imperfections(), changes, {})
+    assert changed == pytest.approx(built, rel=1e-4)
+    assert abs(changed / first - 1) > 0.05
+    assert restored == pytest.approx(first, rel=1e-4)
+
+
+async def felt_after(rig: Rig, imperfections: Imperfections, *changes: dict[str, Any]) -> float:
+    """Amplitude under a finger [m/s²] of a vibration on the plate after some changes of it."""
+    bench = Bench(rig, now=0.0, imperfections=imperfections)
+    context = SimulationContext(bench)
+
+    async def asked(now: float, **request: Any) -> dict[str, Any]:
+        reply = await carry_out(context, json.dumps(request).encode(), now=now)
+        assert "error" not in reply, reply
+        return reply
+
+    await asked(0.1, op="fingers", fingers={"1": [0.1, 0.08]})
+    for change in changes:
+        await asked(0.1, op="plate", **change)
+    play(bench, DriveCommand(0, 110.0, 0.5), now=0.2, token=9, watchdog=2.0)
+    reply = await asked(2.0, op="felt", since_s=1.5, until_s=2.0)
+    return float(reply["fingers"]["1"]["amplitude_m_s2"][0][0])
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        {"stiffness": {"nowhere": 1.0}},
+        {"stiffness": {"NE": 0.0}},
+        {"modulus": -1},
+        {"masses": [[0.1, 0.1]]},
+        {"masses": [[9.0, 0.1, 0.001]]},
+        {"thickness": 1.0},
+    ],
+)
+async def test_plate_operation_refuses_what_is_no_plate(
+    coarse_rig: Rig, request_: dict[str, Any]
+) -> None:
+    """An error, and the plate stays."""
+    bench = Bench(coarse_rig, now=5.0)
+    assert "error" in await ask(bench, 5.1, op="plate", **request_)
+    assert bench.imperfections == Imperfections()

@@ -1,0 +1,79 @@
+"""The file of a learned plate: parameters and covariance, beside the table that they correct."""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from model.errors import InputError
+from model.files.array_file import UNREADABLE, read_arrays, write_arrays
+from model.identification.kalman import State
+
+_VERSION = 1
+_TYPES = {"header": "|u1", "x": "<f8", "covariance": "<f8", "digest": "|u1"}
+_MAX_BYTES = 1 << 24
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedPlate:
+    """A state of parameters by name, counted from a rig; table, base: fingerprints of both."""
+
+    table: str
+    base: str
+    names: tuple[str, ...]
+    state: State
+
+
+def save_learned(learned: LearnedPlate, file: Path) -> None:
+    """Write a learned plate, atomically; raises OSError."""
+    header = {
+        "version": _VERSION,
+        "table": learned.table,
+        "base": learned.base,
+        "names": learned.names,
+    }
+    text = json.dumps(header)
+    x, covariance = learned.state.x, learned.state.covariance
+    write_arrays(
+        file,
+        {
+            "header": np.frombuffer(text.encode(), dtype=np.uint8),
+            "x": x,
+            "covariance": covariance,
+            "digest": np.frombuffer(_digest(text, x, covariance), dtype=np.uint8),
+        },
+    )
+
+
+def load_learned(file: Path, *, table: str) -> LearnedPlate:
+    """Read a learned plate of a table by its fingerprint.
+
+    Raises InputError for a damaged file, another version or another table.
+    """
+    try:
+        arrays = read_arrays(file, _TYPES, max_bytes=_MAX_BYTES)
+        text, x, covariance = arrays["header"].tobytes().decode(), arrays["x"], arrays["covariance"]
+        if arrays["digest"].tobytes() != _digest(text, x, covariance):
+            raise ValueError("digest must be that of the content")
+        header = json.loads(text)
+        version, names = header["version"], tuple(header["names"])
+        found = LearnedPlate(header["table"], header["base"], names, State(x, covariance))
+    except (*UNREADABLE, KeyError, TypeError) as error:
+        raise InputError(
+            f"{file}: must be a learned plate: {error}; remove the file to learn anew"
+        ) from error
+    p = len(names)
+    if version != _VERSION or x.shape != (p,) or covariance.shape != (p, p):
+        raise InputError(f"{file}: version must be {_VERSION}; remove the file to learn anew")
+    if found.table != table:
+        raise InputError(
+            f"{file}: must be learned for this table, got one of another rig; remove the file to "
+            "learn anew"
+        )
+    return found
+
+
+def _digest(text: str, x: np.ndarray, covariance: np.ndarray) -> bytes:
+    return hashlib.sha256(text.encode() + x.tobytes() + covariance.tobytes()).digest()

@@ -1,0 +1,145 @@
+"""A table that learns its plate: answers after a change, what is kept of it, and its refusals."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.identification.hidden import Hidden, draw
+from benchmarks.identification.thin_plate import Mounted
+from model.errors import InputError
+from model.identification.forward import Sensor
+from model.identification.identify import identify
+from model.identification.in_service import Known
+from model.identification.learned_table import LearnedTable
+from model.identification.measurement import Measurement
+from model.rig.file import example_rig_path, load_rig
+from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
+from model.table.build import build_table
+from model.table.table import LocalizationTable
+from settled_patterns import FREQUENCIES, settled_patterns
+
+TONES = np.array([85.0, 150.0, 215.0, 330.0])
+POINTS = np.array([[0.06, 0.05], [0.15, 0.11], [0.26, 0.17], [0.22, 0.04]])
+
+
+@pytest.fixture(scope="module")
+def hidden() -> Hidden:
+    """A plate with places and a mass of its own."""
+    return draw("form", 1)
+
+
+@pytest.fixture(scope="module")
+def rig(hidden: Hidden) -> Rig:
+    """The paper's rig as identified on it."""
+    written = load_rig(example_rig_path())
+    values = hidden.measured(FREQUENCIES, np.random.default_rng(1))
+    return identify(written, Measurement.of(sensors_of(written), FREQUENCIES, values)).rig
+
+
+@pytest.fixture(scope="module")
+def table(rig: Rig) -> LocalizationTable:
+    """Its table at a few tones."""
+    return build_table(rig, frequencies=TONES, drive_mode="phased")
+
+
+def sensors_of(rig: Rig) -> list[Sensor]:
+    """One at each ERA."""
+    return [Sensor(era.name, era.name) for era in rig.eras]
+
+
+def loosened(mounted: Mounted) -> Mounted:
+    """The plate after the third mount has lost a fifth of its stiffness."""
+    return replace(mounted, stiffness=mounted.stiffness * [1.0, 1.0, 0.8, 1.0])
+
+
+def error(table: LocalizationTable, plate: Mounted) -> float:
+    """Relative error of a table's fields on a plate without fingers."""
+    strokes = [era.stroke for era in table.eras]
+    true = np.array([plate.accelerations(float(f), POINTS) * strokes for f in TONES])
+    found = table.unit_fields(POINTS).swapaxes(1, 2)
+    return float(np.linalg.norm(found - true) / np.linalg.norm(true))
+
+
+def test_answers_follow_a_loosened_mount(
+    hidden: Hidden, rig: Rig, table: LocalizationTable
+) -> None:
+    """Fields that a loose mount puts off by over a tenth are within a third of that afterwards."""
+    learned = LearnedTable(table, Known.of_rig(rig, sensors_of(rig)))
+    for pattern in settled_patterns(hidden, hidden.mounted, count=12, start=0):
+        learned.take(pattern)
+    loose = loosened(hidden.mounted)
+    stale = learned.current
+    for pattern in settled_patterns(hidden, loose, count=14, start=12):
+        learned.take(pattern)
+    assert not learned.has_changed
+    assert error(stale, loose) > 0.1
+    assert error(learned.current, loose) < error(stale, loose) / 3
+
+
+def test_answers_wait_for_an_explanation(
+    hidden: Hidden, rig: Rig, table: LocalizationTable
+) -> None:
+    """A quiet pattern gives a new table, one that raises an alarm none."""
+    learned = LearnedTable(table, Known.of_rig(rig, sensors_of(rig)))
+    quiet = [
+        learned.take(each) for each in settled_patterns(hidden, hidden.mounted, count=12, start=0)
+    ]
+    assert all(each.table is not None for each in quiet)
+    odd = replace(hidden.mounted, stiffness=hidden.mounted.stiffness * [0.5, 1.0, 2.0, 1.0])
+    (pattern,) = settled_patterns(hidden, odd, count=1, start=12)
+    after = learned.take(pattern)
+    assert after.report.alarm
+    assert after.table is None
+
+
+def test_unexplained_change_widens_the_errors_of_answers(
+    hidden: Hidden, rig: Rig, table: LocalizationTable, tmp_path: Path
+) -> None:
+    """Answers then are robust to the errors of a plate that was not measured, and none is kept."""
+    file = tmp_path / "learned.npz"
+    learned = LearnedTable(table, Known.of_rig(rig, sensors_of(rig)), file=file)
+    for pattern in settled_patterns(hidden, hidden.mounted, count=12, start=0):
+        learned.take(pattern)
+    odd = replace(
+        hidden.mounted,
+        stiffness=hidden.mounted.stiffness * [0.5, 1.0, 2.0, 1.0],
+        gain=hidden.mounted.gain * [1.0, 0.5j, 1.0, 1.0],
+    )
+    last = [learned.take(each) for each in settled_patterns(hidden, odd, count=6, start=12)][-1]
+    assert last.report.explanation is not None
+    assert last.report.explanation.resembles
+    assert learned.has_changed
+    assert last.table is learned.current
+    wide, built = learned.current.uncertainty, Uncertainty()
+    assert (wide.gain, wide.thickness, wide.damping) == (built.gain, built.thickness, built.damping)
+    learned.save()
+    assert not file.exists()
+
+
+def test_what_was_learned_is_resumed_for_its_table_only(
+    hidden: Hidden, rig: Rig, table: LocalizationTable, tmp_path: Path
+) -> None:
+    """The same state and answers come back; another rig's table and a damaged file are refused."""
+    file = tmp_path / "learned.npz"
+    known = Known.of_rig(rig, sensors_of(rig))
+    learned = LearnedTable.resumed(table, known, file=file)
+    for pattern in settled_patterns(hidden, hidden.mounted, count=3, start=0):
+        learned.take(pattern)
+    learned.save()
+    again = LearnedTable.resumed(table, known, file=file)
+    np.testing.assert_array_equal(again.live.state.covariance, learned.live.state.covariance)
+    np.testing.assert_array_equal(
+        again.current.unit_fields(POINTS), learned.current.unit_fields(POINTS)
+    )
+    with pytest.raises(InputError, match="this table"):
+        LearnedTable.resumed(replace(table, masses=()), known, file=file)
+    with pytest.raises(InputError, match="this rig"):
+        LearnedTable.resumed(table, Known.of_rig(rig, sensors_of(rig)[:2]), file=file)
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(bytes(content))
+    with pytest.raises(InputError, match="remove the file"):
+        LearnedTable.resumed(table, known, file=file)

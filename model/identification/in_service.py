@@ -9,7 +9,7 @@ together by one change (`model.identification.hypotheses`), or the plate counts 
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Self
 
@@ -35,8 +35,10 @@ _WINDOW, _UNLIKELY_TOGETHER, _UNLIKELY_ALONE = 8, 1e-6, 1e-8
 _HELD = 5
 _ITERATIONS = 3
 
-_NOT_STATED = ("modulus", "damping_each", "loss_exponent", "bolt_mass", "place")
-_NOT_STATED += ("mode_shifts", "mode_losses")
+_NOT_STATED = (
+    *("modulus", "damping_each", "loss_exponent", "bolt_mass"),
+    *("place", "mode_shifts", "mode_losses"),
+)
 
 DRIFT = {
     "thickness": 0.01,
@@ -99,15 +101,17 @@ class Known:
         What it does not state is known the better, the better its thickness is: by identification.
         """
         free = solved_for(rig, rig.limits.frequency_max)
-        priors = Priors.of(rig.uncertainty)
+        # Counted in the deviations of a plate that was not measured, which steps are limited by.
+        priors, own = Priors.of(widest(rig.uncertainty)), Priors.of(rig.uncertainty)
         count = len(lowest_elastic(free.modes.eigenvalues, MODE_SHIFTS))
         names = [each.name for each in sensors]
         space = space_of(rig, names, priors, masses=1, mode_count=count)
+        stated = space_of(rig, names, own, masses=1, mode_count=count)
         model = ForwardModel(rig, sensors, np.array([rig.limits.frequency_max]), space, free)
-        variance = space.uncertain.astype(float)
-        variance[space.of(*_NOT_STATED)] = min(priors.thickness / Uncertainty.thickness, 1.0) ** 2
-        variance[space.groups["masses"]] = 0.0
-        state = State(np.zeros(space.size), np.diag(variance))
+        std = np.divide(stated.std, space.std, out=np.zeros(space.size), where=space.uncertain)
+        std[space.of(*_NOT_STATED)] = own.thickness / priors.thickness
+        std[space.groups["masses"]] = 0.0
+        state = State(np.zeros(space.size), np.diag(std**2))
         return cls(rig, rig.uncertainty, model, state)
 
 
@@ -215,6 +219,17 @@ class LivePlate:
             drift = np.divide(std, known, out=np.zeros_like(known), where=known > 0)
             variance[space.groups[kind]] = drift**2 * hours
         return State(self._state.x, self._state.covariance + np.diag(variance))
+
+
+def widest(uncertainty: Uncertainty) -> Uncertainty:
+    """Of each standard deviation the larger one of these and a plate's that was not measured."""
+    built = Uncertainty()
+    return Uncertainty(
+        **{
+            each.name: max(getattr(uncertainty, each.name), getattr(built, each.name))
+            for each in fields(Uncertainty)
+        }
+    )
 
 
 def _with_spare_mass(found: Identification) -> ForwardModel:

@@ -5,16 +5,15 @@ explanation, and where none is found they become those of the plate as last know
 wide as those of a plate that nobody measured.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
 from model.errors import InputError
-from model.identification.in_service import Known, LivePlate, Report
+from model.identification.in_service import Known, LivePlate, Report, widest
 from model.identification.learned_file import LearnedPlate, load_learned, save_learned
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig, physics_fingerprint
-from model.rig.uncertainty import Uncertainty
 from model.table.live_table import table_following
 from model.table.table import LocalizationTable
 
@@ -90,14 +89,4 @@ class LearnedTable:
     def cautious_rig(self) -> Rig:
         """The rig as last known, with the errors of a plate that was not measured."""
         rig = self.live.rig
-        return replace(rig, uncertainty=widest(rig.uncertainty, Uncertainty()))
-
-
-def widest(one: Uncertainty, other: Uncertainty) -> Uncertainty:
-    """Of each standard deviation the larger one."""
-    return Uncertainty(
-        **{
-            each.name: max(getattr(one, each.name), getattr(other, each.name))
-            for each in fields(Uncertainty)
-        }
-    )
+        return replace(rig, uncertainty=widest(rig.uncertainty))

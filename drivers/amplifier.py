@@ -3,17 +3,14 @@
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
-from itertools import pairwise
 from typing import final
 
 from drivers import clock, trace
 from drivers.backend import Backend
 from drivers.errors import (
     CommandError,
-    CommandRefused,
     DriverError,
     FrameError,
     LinkError,
@@ -25,13 +22,7 @@ from drivers.line.sender import SUPERSEDED
 from drivers.link.link import REPLY_TIMEOUT, Link, ReplyT
 from drivers.link.pacing import Pacing
 from drivers.link.refusals import PROTOCOL_VIOLATION
-from drivers.protocol.definition import (
-    PROTOCOL,
-    random_reading,
-    random_session,
-    random_token,
-    token_after,
-)
+from drivers.protocol.definition import PROTOCOL, random_session, random_token, token_after
 from drivers.protocol.messages import (
     Achieved,
     AmplifierEvent,
@@ -60,18 +51,14 @@ from drivers.protocol.messages import (
     Measured,
     Measurement,
     Ping,
-    Reading,
-    ReadingState,
     Request,
-    SampleBlock,
-    Sensor,
-    SensorList,
     SetAddress,
     Stage,
     Status,
     Stop,
 )
 from drivers.protocol.wire_times import WireTimes
+from drivers.sensor_client import SensorClient
 from drivers.statistics import LinkStatistics
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms
@@ -81,9 +68,6 @@ DISARM_RAMP = 0.05  # s; long enough to avoid a click
 STOP_RAMP = 0.005  # s; the shortest without a step
 # s; from the expiry of a watchdog until the outputs are silent, by the protocol
 WATCHDOG_REACTION = 0.005 + PROTOCOL.reaction
-
-_READING_MARGIN = 0.002  # s; of the amplifier's clock
-_WHOLE_PERIODS = 1e-6  # rounding
 
 _logger = logging.getLogger(__name__)
 
@@ -96,7 +80,7 @@ _NOT_FEEDING = (
 
 
 @final
-class Amplifier:
+class Amplifier(SensorClient):
     """One amplifier over one backend, with at most one request on the wire at a time.
 
     Requests without a reply, or to a busy amplifier, are repeated up to twice (see `Link`), which
@@ -365,61 +349,6 @@ class Amplifier:
             return ()
         return (await self._request(GetMeasured(), expect=Measured)).channels
 
-    async def sensors(self, first: int = 0) -> tuple[Sensor, ...]:
-        """Read what its sensors measure, and where, from one on; empty if it has none."""
-        if Feature.SENSORS not in self.capabilities.features:
-            return ()
-        found: list[Sensor] = []
-        while True:
-            listed = await self._request(GetSensors(first + len(found)), expect=SensorList)
-            found += listed.sensors
-            if first + len(found) >= listed.count or not listed.sensors:
-                return tuple(found)
-
-    async def start_reading(self, frequencies: Sequence[float], window: float) -> Reading:
-        """Begin to measure tones [Hz] at all sensors, over a window [s] from now on.
-
-        It needs no session, does not feed the watchdog, and changes nothing that plays. Raises
-        CommandRefused for frequencies that the window does not tell apart, or beyond the sensors.
-        """
-        request = Measure(random_reading(), window, tuple(frequencies))
-        return await self._request(request, expect=Reading)
-
-    async def reading(self, first: int = 0) -> Reading:
-        """Read the reading, its sensors from one on, as many as one reply holds."""
-        return await self._request(GetReading(first), expect=Reading)
-
-    async def raw_samples(self, sensor: int, sample: int = 0) -> SampleBlock:
-        """Read raw samples [counts] of a sensor within the reading's window, from one on."""
-        return await self._request(GetBlock(sensor, sample), expect=SampleBlock)
-
-    async def measure(self, frequencies: Sequence[float], window: float) -> Reading:
-        """Measure tones [Hz] at all sensors over a window [s] from now on, and wait for its end.
-
-        Tones are in the order of the frequencies. The caller feeds the watchdog meanwhile, and has
-        waited until the plate has settled. Raises CommandError for tones that the window does not
-        tell apart, and CommandRefused if another host has started a reading meanwhile.
-        """
-        _check_tones(frequencies, window)
-        return await self.finish_reading(await self.start_reading(frequencies, window))
-
-    async def finish_reading(self, started: Reading) -> Reading:
-        """Wait for the end of a reading, and return it with all its sensors."""
-        found = started
-        while found.state is ReadingState.RUNNING:
-            await asyncio.sleep(found.left + _READING_MARGIN)
-            found = await self.reading()
-            _check_same(started, found)
-        sensors = found.sensors
-        count = (await self._request(GetSensors(0), expect=SensorList)).count
-        while len(sensors) < count:
-            more = await self.reading(len(sensors))
-            _check_same(started, more)
-            if not more.sensors:
-                break
-            sensors += more.sensors
-        return replace(found, sensors=sensors)
-
     async def clear(self, latch: int | None = None) -> Status:
         """Acknowledge a stop, or faults whose cause is gone; the amplifier stays disarmed.
 
@@ -566,28 +495,6 @@ def _errors_logged_for_stop(request: Request) -> Iterator[None]:
         if not isinstance(request, Stop | Disarm):
             raise
         _logger.exception("amplifier: %s is not recorded", type(request).__name__)
-
-
-def _check_tones(frequencies: Sequence[float], window: float) -> None:
-    """Raise CommandError for tones that a window [s] does not tell apart."""
-    limit = PROTOCOL.quantities.tone_count.maximum
-    if not 1 <= len(frequencies) <= limit:
-        raise CommandError(f"a reading must have 1 to {limit} tones, got {len(frequencies)}")
-    apart = min(after - before for before, after in pairwise([0.0, *sorted(frequencies)]))
-    if not apart * window >= 1 - _WHOLE_PERIODS:
-        raise CommandError(
-            f"window must be at least a period of each frequency and of the differences between "
-            f"them, 1/({apart:g} Hz), got {window:g} s"
-        )
-
-
-def _check_same(started: Reading, found: Reading) -> None:
-    """Raise CommandRefused unless a reading is the one that was started."""
-    if found.number != started.number:
-        raise CommandRefused(
-            f"reading {started.number} was replaced by {found.number or 'none'}: another host "
-            "measures, or the amplifier has restarted; measure again"
-        )
 
 
 def _of_token(achieved: Achieved, token: int) -> Achieved:

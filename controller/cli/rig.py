@@ -1,4 +1,4 @@
-"""`era rig check`: whether a rig is wired and built as its file says."""
+"""`era rig check`: whether a rig is wired and built as its file says; the group `era rig`."""
 
 import json
 import sys
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from controller.cli.identify import identify
 from model.counting import counted
 from model.errors import InputError
 
@@ -14,16 +15,14 @@ if TYPE_CHECKING:
     from model.diagnosis.observation import Observation
     from model.rig.rig import Rig
 
-rig_app = typer.Typer(no_args_is_help=True, help="Check a rig.")
+rig_app = typer.Typer(no_args_is_help=True, help="Check and identify a rig.")
 
 FAILED = 1
 _REPLY_TIMEOUT = 0.5  # s; a check may be slow, and silence is the task of the watchdog
 _MAX_LEVEL = 0.2  # more than any check needs
 
 
-@rig_app.callback()
-def _group() -> None:
-    """Keep `check` a command of its own while it is the only one."""
+rig_app.command()(identify)
 
 
 @rig_app.command()
@@ -178,6 +177,7 @@ def _live(
 ) -> "Observation":
     import asyncio
 
+    from controller.cli.amplifier_urls import urls_of
     from controller.diagnosis.channel_sweep import ChannelSweep
     from controller.diagnosis.sensors import simulated_sensors
     from drivers.amplifier import Amplifier
@@ -197,7 +197,7 @@ def _live(
         for row in range(ny)
         for column in range(nx)
     ]
-    at = _urls(rig, urls)
+    at = urls_of(rig, urls)
     show = sys.stderr.isatty() and not quiet
 
     def on_step(text: str) -> None:
@@ -228,16 +228,3 @@ def _live(
         return asyncio.run(measure())
     finally:
         on_step("")
-
-
-def _urls(rig: "Rig", texts: list[str]) -> dict[str, str]:
-    """Return the URL of each amplifier: of the rig, or of an option."""
-    found = dict(rig.amplifiers)
-    for text in texts:
-        name, equals, url = text.partition("=")
-        if not equals or name not in found:
-            raise InputError(
-                f"--url must be NAME=URL with one of {', '.join(rig.amplifiers)}, got {text}"
-            )
-        found[name] = url
-    return found

@@ -77,7 +77,7 @@ def daemon_config_of(document: Document) -> DaemonConfig:
     """Load what a daemon's file names; raises as `load_daemon_config`."""
     _check_kind(document)
     validation = Validation(document, DaemonSection)
-    rig_file = _file(document, "rig")
+    rig_file = rig_file_of(document)
     rig, rig_text = _rig(validation, rig_file)
     urls = _urls(validation, rig, rig_file)
     touch = _touch(validation, document, rig)
@@ -109,6 +109,11 @@ def daemon_config_of(document: Document) -> DaemonConfig:
 def is_daemon_document(document: Document) -> bool:
     """Whether a document is a daemon's: it names a rig and does not describe a plate."""
     return "rig" in document.data and "plate" not in document.data
+
+
+def rig_file_of(document: Document) -> Path | None:
+    """The path of the rig that a daemon's file names; None if it names none."""
+    return _file(document, "rig")
 
 
 def _check_kind(document: Document) -> None:

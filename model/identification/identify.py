@@ -132,7 +132,7 @@ def _check(rig: Rig, measurement: Measurement) -> None:
             f"{limits.frequency_min:g} to {limits.frequency_max:g} Hz, got {tones[0]:g} to "
             f"{tones[-1]:g} Hz"
         )
-    measurement.check(names)
+    measurement.check()
 
 
 def solved_for(rig: Rig, frequency_max: float) -> FreePlate:

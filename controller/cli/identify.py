@@ -1,0 +1,226 @@
+"""`era rig identify`: the plate on the table, by its own ERAs and the sensors of its amplifiers."""
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from model.commands.next_line import next_line
+from model.commands.options import JsonOption
+from model.counting import counted
+from model.errors import InputError
+
+if TYPE_CHECKING:
+    from controller.diagnosis.plate_measurement import PlateMeasurement
+    from model.config.document import Document
+    from model.rig.rig import Rig
+
+REFUSED = 1
+_REPLY_TIMEOUT = 0.5  # s; a measurement may be slow, and silence is the task of the watchdog
+
+
+def identify(
+    rig_file: Annotated[
+        Path, typer.Argument(metavar="RIG", help="Rig file, or the daemon's file that names it.")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="RIG2.yaml", help="Rig file to write.")
+    ],
+    url: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[NAME=]URL", help="URL of an amplifier instead of the one in the rig file."
+        ),
+    ] = None,
+    level: Annotated[
+        float | None,
+        typer.Option(
+            help="Level of every tone; default: 0.1 of full stroke, or less if limits ask for it."
+        ),
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Play every tone on one ERA only: a third of the time.")
+    ] = False,
+    untouched: Annotated[
+        bool,
+        typer.Option(
+            "--yes", help="Nothing touches the plate, and nothing will: do not ask on a terminal."
+        ),
+    ] = False,
+    seed: Annotated[
+        int, typer.Option(metavar="N", help="Draw other fingers for the expected contrast.", min=0)
+    ] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Identify the plate in place by its own ERAs.
+
+    Write its rig with what is left uncertain. Every ERA plays small tones of its own at the same time, the amplifiers' sensors listen. Exit
+    status 1, and no rig is written, where the model does not explain what they heard.
+    """
+    import time
+
+    from model.files.array_file import whole_or_nothing
+    from model.files.replacing import check_ending, check_place
+    from model.identification import identification_report
+    from model.identification.identified_text import identified_text
+    from model.identification.identify import identify as fit
+    from model.identification.promise import expected_contrast
+
+    check_place(output, example="rig2.yaml")
+    check_ending(output, ".yaml", ".yml", what="a rig file")
+    with _rig_of(rig_file) as (document, rig):
+        source = Path(document.source)
+        for taken in (rig_file, source):
+            if output.resolve() == taken.resolve():
+                raise InputError(f"--output must differ from {taken}; choose another name")
+        _ask_whether_untouched(is_known=untouched, can_ask=not as_json)
+        measured = _measured(rig, url or [], level=level, is_quick=quick, is_shown=not as_json)
+    started = time.perf_counter()
+    try:
+        found = fit(rig, measured.measurement, seed=seed)
+    except InputError as error:
+        typer.echo(f"era: {error}; no rig is written", err=True)
+        raise typer.Exit(REFUSED) from error
+    expected = expected_contrast(found)
+    rows = [
+        _head(rig, measured),
+        *measured.sensors.unused,
+        *identification_report.parameter_rows(found),
+        *identification_report.fit_rows(found),
+        *identification_report.contrast_rows(expected),
+    ]
+    files = []
+    if found.is_explained:
+        comment = [f"{source.name} identified in place by `era rig identify`:"]
+        comment += [f"  {row}" for row in rows]
+        text = identified_text(document, rig, found.rig, comment="\n".join(comment))
+        with whole_or_nothing(output) as stream:
+            stream.write(text.encode())
+        files.append(str(output))
+    elapsed = time.perf_counter() - started
+    if as_json:
+        report = identification_report.as_json(found, expected) | _as_json(measured)
+        print(json.dumps(report | {"solve_time_s": elapsed, "files": files}))
+    else:
+        print("\n".join(rows))
+    if not found.is_explained:
+        typer.echo(
+            "era: chi² must be at most 2 for a plate that the model explains; no rig is written. "
+            "Check that nothing touches the plate, and by era rig check that it is that of the "
+            "file and wired as it says",
+            err=True,
+        )
+        raise typer.Exit(REFUSED)
+    if not as_json:
+        print(f"\nwrote {', '.join(files)}; computed in {elapsed:.1f} s")
+        print(next_line("era", "table", "build", output, "-o", output.with_suffix(".npz")))
+
+
+@contextmanager
+def _rig_of(path: Path) -> "Iterator[tuple[Document, Rig]]":
+    """Read a rig's file, or that which a daemon's file names while its daemon cannot run.
+
+    Raises InputError, also where the daemon runs: it holds the amplifiers.
+    """
+    from controller.daemon.config import daemon_config_of, is_daemon_document, rig_file_of
+    from controller.daemon.socket_lock import SocketLock
+    from model.config.document import read_document
+    from model.rig.file import rig_of
+
+    document = read_document(path)
+    if not is_daemon_document(document):
+        yield document, rig_of(document)
+        return
+    config, rig_file = daemon_config_of(document), rig_file_of(document)
+    assert rig_file is not None  # noqa: S101  else a problem was reported
+    lock = SocketLock(config.socket)
+    try:
+        yield read_document(rig_file), config.rig
+    finally:
+        lock.release()
+
+
+def _ask_whether_untouched(*, is_known: bool, can_ask: bool) -> None:
+    """Raise InputError, or typer.Abort, unless somebody says that nothing touches the plate."""
+    if is_known:
+        return
+    if not (can_ask and sys.stdin.isatty()):
+        raise InputError(
+            "nothing may touch the plate while it is identified; look, and say so with --yes"
+        )
+    typer.confirm("Nothing touches the plate, and will not for a minute?", abort=True, err=True)
+
+
+def _measured(
+    rig: "Rig", urls: list[str], *, level: float | None, is_quick: bool, is_shown: bool
+) -> "PlateMeasurement":
+    """Measure by the rig's amplifiers, with a progress bar on a terminal."""
+    import asyncio
+    from contextlib import ExitStack
+
+    from controller.cli.amplifier_urls import urls_of
+    from controller.diagnosis.plate_measurement import PlateSelfMeasurement
+    from drivers.amplifier import Amplifier
+    from drivers.registry import open_backend
+    from model.commands.progress import progress_bar
+
+    at = urls_of(rig, urls)
+
+    async def measure() -> "PlateMeasurement":
+        with ExitStack() as shown:
+            on_step = shown.enter_context(progress_bar("steps")) if is_shown else _ignore
+            amplifiers = {
+                name: Amplifier(
+                    open_backend(at[name], rig.voltage_of(name)), reply_timeout=_REPLY_TIMEOUT
+                )
+                for name in rig.amplifiers
+            }
+            return await PlateSelfMeasurement(
+                rig, amplifiers, level=level, is_quick=is_quick, on_step=on_step
+            ).run()
+
+    return asyncio.run(measure())
+
+
+def _ignore(done: int, of: int) -> None:
+    """Show nothing."""
+
+
+def _head(rig: "Rig", measured: "PlateMeasurement") -> str:
+    """What was measured, in one line."""
+    measurement = measured.measurement
+    low, high = measurement.tones[0], measurement.tones[-1]
+    return (
+        f"{counted(len(rig.eras), 'ERA')}, {counted(len(measurement.sensors), 'sensor')}, "
+        f"{counted(len(measurement.tones), 'tone')} from {low:g} to {high:g} Hz at a level of "
+        f"{measured.level:.3g}, {counted(len(measurement.values), 'response')} in "
+        f"{measured.duration:.1f} s"
+    )
+
+
+def _as_json(measured: "PlateMeasurement") -> dict[str, object]:
+    """How it was measured, for programs."""
+    measurement = measured.measurement
+    return {
+        "sensors": [
+            {
+                "amplifier": sensor.amplifier,
+                "sensor": sensor.number,
+                "era": sensor.place.era or None,
+                "x_m": None if sensor.place.era else sensor.place.x,
+                "y_m": None if sensor.place.era else sensor.place.y,
+            }
+            for sensor in measured.sensors.used
+        ],
+        "sensors_unused": list(measured.sensors.unused),
+        "frequencies_hz": measurement.tones.tolist(),
+        "level": measured.level,
+        "responses": len(measurement.values),
+        "settling_s": measured.tones.settling,
+        "window_s": measured.tones.window,
+        "measure_time_s": measured.duration,
+    }

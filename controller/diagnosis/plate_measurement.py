@@ -1,0 +1,292 @@
+"""Measuring a rig's plate by its own ERAs and the sensors of its amplifiers."""
+
+import asyncio
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from controller.diagnosis.interleaved_tones import Interleaved, Step, interleaved
+from controller.diagnosis.plate_sensors import PlateSensor, PlateSensors, plate_sensors
+from controller.diagnosis.tone_player import TonePlayer
+from controller.group.guards import check_watchdogs
+from drivers import clock
+from drivers.amplifier import Amplifier
+from drivers.command import DriveCommand
+from drivers.errors import CommandError, CommandRefused
+from drivers.operation.watchdog import HEARTBEAT
+from drivers.protocol.messages import Feature, Reading, ReadingState
+from model.arrays import ComplexArray, FloatArray
+from model.errors import InputError
+from model.identification.measurement import Measurement, Repeat
+from model.rig.rig import Rig
+from model.vibration.excitation import Tone
+
+LEVEL = 0.1
+"""Usual level of every tone, 20 dB below full stroke."""
+
+HIGHEST = 10**-0.5
+"""Highest level of every tone as a share of the highest allowed one, 10 dB below it."""
+
+_COMPARED = 2  # tones of a repeated step
+_READINGS = 2  # of a step, where the first is disturbed or overloaded
+
+
+@dataclass(frozen=True, eq=False)
+class PlateMeasurement:
+    """What was measured: responses, the sensors, the level and how long it took [s]."""
+
+    measurement: Measurement
+    sensors: PlateSensors
+    level: float
+    tones: Interleaved
+    duration: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Heard:
+    """One step: frequency [Hz] of each ERA (n,), NaN where silent; responses (s, n) [1/s²]."""
+
+    frequencies: FloatArray
+    responses: ComplexArray
+
+
+class PlateSelfMeasurement:
+    """Plays interleaved tones on all ERAs of a rig and reads the sensors of its amplifiers.
+
+    level: of every tone, 0..1 of full stroke, None for the usual one; is_quick: one round;
+    on_start: called with the steps to come, before anything plays; on_step: with the number of
+    steps done and of all.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        amplifiers: Mapping[str, Amplifier],
+        *,
+        level: float | None = None,
+        is_quick: bool = False,
+        on_step: Callable[[int, int], None] = lambda done, of: None,
+    ) -> None:
+        self._rig = rig
+        self._amplifiers = amplifiers
+        self._player = TonePlayer(rig, amplifiers)
+        self._level = checked_level(rig, level)
+        self._is_quick = is_quick
+        self._on_step = on_step
+
+    async def run(self) -> PlateMeasurement:
+        """Measure; always ends silent and disarmed.
+
+        Raises DriverError, among them CommandRefused for a reading that is disturbed or overloaded
+        twice.
+        """
+        try:
+            await self._player.open()
+            check_watchdogs(self._amplifiers)
+            sensors = await plate_sensors(self._rig, self._amplifiers)
+            tones = interleaved(
+                self._rig, self._frequency_range(sensors.used), is_quick=self._is_quick
+            )
+            started = clock.now()
+            await self._player.arm()
+            heard, half, last = await self._all(tones, sensors.used)
+            await self._player.play({})
+            await self._wait(self._player.ramp)
+            duration = clock.now() - started
+        finally:
+            await self._player.close()
+        measurement = self._measurement(sensors.used, heard, half, last)
+        return PlateMeasurement(measurement, sensors, self._level, tones, duration)
+
+    async def _all(
+        self, tones: Interleaved, sensors: Sequence[PlateSensor]
+    ) -> tuple[list[_Heard], tuple[int, _Heard], _Heard]:
+        """All steps; the loudest at half the level, with its number; the first once more."""
+        heard: list[_Heard] = []
+        count = len(tones.steps) + 2
+        for step in tones.steps:
+            heard.append(await self._hear(step, tones, sensors, level=self._level))
+            self._on_step(len(heard), count)
+        loudest = int(np.argmax([np.nanmax(np.abs(each.responses)) for each in heard]))
+        half = await self._hear(tones.steps[loudest], tones, sensors, level=self._level / 2)
+        self._on_step(count - 1, count)
+        last = await self._hear(tones.steps[0], tones, sensors, level=self._level)
+        self._on_step(count, count)
+        return heard, (loudest, half), last
+
+    def _frequency_range(self, sensors: Sequence[PlateSensor]) -> tuple[float, float]:
+        """Frequencies [Hz] that the rig allows, amplifiers play and sensors measure."""
+        limits = [self._rig.limits, *(guard.limits for guard in self._player.guards.values())]
+        low = max(each.frequency_min for each in limits)
+        high = min(
+            *(each.frequency_max for each in limits), *(each.frequency_max for each in sensors)
+        )
+        if not low < high:
+            raise CommandError(
+                f"sensors must measure above {low:g} Hz, the lowest frequency of rig and "
+                f"amplifiers, got up to {high:g} Hz"
+            )
+        return low, high
+
+    async def _hear(
+        self, step: Step, tones: Interleaved, sensors: Sequence[PlateSensor], *, level: float
+    ) -> _Heard:
+        """Play a step until the plate has settled, and read it."""
+        eras = {self._rig.eras[number].name: frequency for number, frequency in step}
+        if self._player.pause:
+            await self._player.play({})
+            await self._wait(self._player.pause)
+        plays = await self._player.play(
+            {
+                era: Tone(frequency, level * self._rig.era(era).stroke)
+                for era, frequency in eras.items()
+            }
+        )
+        await self._wait(self._player.ramp + tones.settling)
+        frequencies = np.array([plays[era].frequency for era in eras])
+        problem = ""
+        for _ in range(_READINGS):
+            readings = await self._read(frequencies.tolist(), tones.window)
+            problem = self._problem(readings, sensors)
+            if not problem:
+                return self._responses(plays, list(eras), frequencies, readings, sensors)
+        raise CommandRefused(problem)
+
+    def _problem(self, readings: Mapping[str, Reading], sensors: Sequence[PlateSensor]) -> str:
+        """What is wrong with readings by amplifier, or nothing."""
+        for name, reading in readings.items():
+            if reading.state is not ReadingState.COMPLETE or reading.token != self._player.token:
+                return (
+                    f"amplifier {name}: what plays must stay the same during a reading, got a "
+                    "change of it twice; leave the amplifier to this command, and start again"
+                )
+        for sensor in sensors:
+            several = readings[sensor.amplifier].sensors
+            if sensor.number >= len(several):
+                return (
+                    f"amplifier {sensor.amplifier} must read {sensor.number + 1} sensors or more, "
+                    f"as it says, got {len(several)}; it breaks the wire protocol"
+                )
+            if several[sensor.number].is_overloaded:
+                return (
+                    f"sensor {sensor.number} of amplifier {sensor.amplifier} must stay within its "
+                    "range, got an overload twice; choose a lower --level than "
+                    f"{self._level:g}"
+                )
+        return ""
+
+    async def _read(self, frequencies: list[float], window: float) -> dict[str, Reading]:
+        """Read all amplifiers over one window, feeding their watchdogs."""
+
+        async def measured() -> dict[str, Reading]:
+            readings = await asyncio.gather(
+                *(each.measure(frequencies, window) for each in self._amplifiers.values())
+            )
+            return dict(zip(self._amplifiers, readings, strict=True))
+
+        reading = asyncio.create_task(measured())
+        try:
+            while not reading.done():
+                await asyncio.wait({reading}, timeout=HEARTBEAT)
+                await self._player.heartbeat()
+            return reading.result()
+        finally:
+            reading.cancel()
+            await asyncio.gather(reading, return_exceptions=True)
+
+    def _responses(
+        self,
+        plays: Mapping[str, DriveCommand],
+        eras: Sequence[str],
+        frequencies: FloatArray,
+        readings: Mapping[str, Reading],
+        sensors: Sequence[PlateSensor],
+    ) -> _Heard:
+        """Responses to the tones that ERAs play, of sensors whose phases count from theirs."""
+        rig = self._rig
+        number = {era.name: n for n, era in enumerate(rig.eras)}
+        played = np.full(len(rig.eras), np.nan)
+        responses = np.full((len(sensors), len(rig.eras)), np.nan, dtype=complex)
+        for row, sensor in enumerate(sensors):
+            heard = sensor.accelerations(readings[sensor.amplifier], frequencies)
+            for era, frequency, acceleration in zip(eras, frequencies, heard, strict=True):
+                played[number[era]] = frequency
+                if self._starts_with(sensor.amplifier, rig.wiring[era].amplifier):
+                    command = plays[era]
+                    base = command.level * rig.era(era).stroke
+                    turned = np.exp(-1j * math.radians(command.phase))
+                    responses[row, number[era]] = acceleration * turned / base
+        return _Heard(played, responses)
+
+    def _starts_with(self, one: str, other: str) -> bool:
+        """Whether phases of two amplifiers count from one moment: that of a broadcast commit."""
+        if one == other:
+            return True
+        pair = [self._amplifiers[name] for name in (one, other)]
+        buses = {each.bus for each in pair}
+        features = [each.capabilities.features for each in pair]
+        return (
+            len(buses) == 1
+            and None not in buses
+            and all({Feature.BROADCAST, Feature.STAGING} <= {*each} for each in features)
+        )
+
+    async def _wait(self, seconds: float) -> None:
+        """Wait [s], feeding the watchdogs."""
+        end = clock.now() + seconds
+        while (left := end - clock.now()) > 0:
+            await asyncio.sleep(min(HEARTBEAT, left))
+            await self._player.heartbeat()
+
+    def _measurement(
+        self,
+        sensors: Sequence[PlateSensor],
+        heard: Sequence[_Heard],
+        half: tuple[int, _Heard],
+        last: _Heard,
+    ) -> Measurement:
+        """All responses, with the repeated ones."""
+        frequencies = np.unique(np.concatenate([each.frequencies for each in heard]))
+        frequencies = frequencies[np.isfinite(frequencies)]
+        values = np.full((len(frequencies), len(sensors), len(self._rig.eras)), np.nan + 0j)
+        for each in heard:
+            for era in np.flatnonzero(np.isfinite(each.frequencies)):
+                row = np.searchsorted(frequencies, each.frequencies[era])
+                values[row, :, era] = each.responses[:, era]
+        measurement = Measurement.of([each.place for each in sensors], frequencies, values)
+        loudest, at_half = half
+        return replace(
+            measurement,
+            half_level=self._repeats(heard[loudest], at_half),
+            at_end=self._repeats(heard[0], last),
+        )
+
+    def _repeats(self, first: _Heard, again: _Heard) -> tuple[Repeat, ...]:
+        """The loudest tones of a step and of its repetition: noise hides changes of the others."""
+        sizes = np.linalg.norm(np.nan_to_num(first.responses), axis=0)
+        found = []
+        for n in np.argsort(-sizes)[:_COMPARED]:
+            known = np.isfinite(first.responses[:, n])
+            values = first.responses[known, n], again.responses[known, n]
+            found.append(Repeat(self._rig.eras[n].name, float(first.frequencies[n]), *values))
+        return tuple(found)
+
+
+def checked_level(rig: Rig, level: float | None) -> float:
+    """Level of every tone: the usual one or less, as the rig's limits of level and power allow.
+
+    Raises InputError for one above 0.32 of full stroke or of what the limits allow.
+    """
+    limits = rig.limits
+    allowed = min(limits.level, math.sqrt(limits.power / len(rig.eras)), 1.0)
+    highest = HIGHEST * allowed
+    if level is None:
+        return min(LEVEL, highest)
+    if not 0 < level <= highest:
+        raise InputError(
+            f"--level must be above 0 and at most {highest:.3g}, 10 dB below what the rig allows, "
+            f"got {level:g}"
+        )
+    return level

@@ -1,0 +1,132 @@
+"""Report of an identification, as text and as JSON."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from model.identification.identify import MAX_CHI2, Identification
+from model.identification.promise import ExpectedContrast
+from model.quantities import percent
+
+_SHOWN = 2.0  # standard errors from the rig's value, beyond which a form error is listed
+
+# What a unit of a parameter is in the report, and how it is written; all others are factors.
+_UNITS = {
+    "phase": (math.degrees(1), "°", "deg"),
+    "sensor_phase": (math.degrees(1), "°", "deg"),
+    "bolt_mass": (1e3, "g", "g"),
+    "place": (1e3, "mm", "mm"),
+    "loss_exponent": (1.0, "", ""),
+}
+_PERCENT = (100.0, "%", "percent")
+_MASS_UNITS = (_UNITS["bolt_mass"], _UNITS["place"], _UNITS["place"])
+
+_ALWAYS = ("thickness", "modulus", "stiffness", "damping", "loss", "gain", "phase")
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter: its value less the rig's, standard error, standard deviation before; unit.
+
+    Per cent are those of the rig's value; places of a mass count from the middle of the plate. key:
+    the unit in words.
+    """
+
+    name: str
+    kind: str
+    difference: float
+    error: float
+    before: float
+    unit: str
+    key: str
+
+    def __str__(self) -> str:
+        unit = self.unit if self.unit in ("", "°") else f" {self.unit}"
+        return (
+            f"{self.name}: {self.difference:+.2f} ± {self.error:.2g}{unit} "
+            f"(before ± {self.before:.2g}{unit})"
+        )
+
+
+def estimates(found: Identification) -> list[Estimate]:
+    """All parameters that were uncertain."""
+    space, posterior = found.posterior.space, found.posterior
+    kinds = {number: kind for kind in space.groups for number in space.indices(kind)}
+    rows = []
+    for number, name in enumerate(space.names):
+        if not space.std[number]:
+            continue
+        kind = kinds[number]
+        if kind == "masses":
+            scale, unit, key = _MASS_UNITS[(number - space.groups[kind].start) % 3]
+        else:
+            scale, unit, key = _UNITS.get(kind, _PERCENT)
+        std, error = float(space.std[number]), float(posterior.std[number])
+        difference = std * float(posterior.x[number])
+        if unit == "%":  # of logarithms of factors
+            std, error = math.expm1(std), math.exp(difference) * error
+            difference = math.expm1(difference)
+        rows.append(Estimate(name, kind, scale * difference, scale * error, scale * std, unit, key))
+    return rows
+
+
+def parameter_rows(found: Identification) -> list[str]:
+    """Lines of what a rig file states, and of all else that differs from it significantly."""
+    return [
+        str(each)
+        for each in estimates(found)
+        if each.kind in _ALWAYS or abs(each.difference) > _SHOWN * each.error
+    ]
+
+
+def fit_rows(found: Identification) -> list[str]:
+    """Lines of how well the model explains the measurement."""
+    held = found.held_out
+    told = "too few tones to tell" if held is None else percent(held.total)
+    verdict = "explains" if found.is_explained else "does not explain"
+    return [
+        f"chi² {found.chi2:.2f}: the model {verdict} the measurement (at most {MAX_CHI2:g})",
+        f"tones left out are predicted within: {told}",
+    ]
+
+
+def contrast_rows(expected: Sequence[ExpectedContrast]) -> list[str]:
+    """Lines of the contrast to expect before and after, and of what is promised."""
+    if not expected:
+        return ["contrast: nothing is promised"]
+    rows = ["contrast on plates like this one, median over random fingers:"]
+    for each in expected:
+        rows.append(
+            f"  {each.quiet} quiet: as written {each.before:.1f} dB, identified {each.after:.1f} "
+            f"dB; nine of ten plates {each.promised:.1f} dB"
+        )
+    return rows
+
+
+def as_json(found: Identification, expected: Sequence[ExpectedContrast]) -> dict[str, Any]:
+    """All results for programs, units in the keys or beside the values."""
+    return {
+        "explained": found.is_explained,
+        "chi2": found.chi2,
+        "held_out_error": None if found.held_out is None else found.held_out.total,
+        "parameters": [
+            {
+                "name": each.name,
+                "unit": each.key,
+                "difference": each.difference,
+                "standard_error": each.error,
+                "standard_deviation_before": each.before,
+            }
+            for each in estimates(found)
+        ],
+        "expected_contrast": [
+            {
+                "quiet": each.quiet,
+                "before_db": each.before,
+                "after_db": each.after,
+                "promised_db": each.promised,
+            }
+            for each in expected
+        ],
+    }

@@ -1,0 +1,303 @@
+"""A rig's plate measured by its own ERAs over wires in virtual time, and identified by that."""
+
+import asyncio
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from controller.diagnosis.plate_measurement import (
+    PlateMeasurement,
+    PlateSelfMeasurement,
+    checked_level,
+)
+from controller.diagnosis.plate_sensors import PlateSensor
+from controller.diagnosis.tone_player import TonePlayer
+from drivers.amplifier import Amplifier
+from drivers.errors import CommandError, CommandRefused
+from drivers.protocol.messages import AmplifierState, Reading, ReadingState, SensorReading
+from drivers.protocol.messages import ToneReading as Heard
+from drivers.registry import open_backend
+from memory_machine import live_in_memory
+from model.errors import InputError
+from model.identification.forward import Sensor
+from model.identification.identify import identify
+from model.rig.file import example_rig_path, load_rig
+from model.rig.rig import Rig
+from model.structure.fingertip import Fingertip
+from model.structure.point_load import PointLoad
+from model.table.build import build_table
+from model.table.question import Question
+from model.vibration.direct import direct_responder
+from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.bench import bench
+from sim.bench.sensing import PlateSensor as SimulatedSensor
+from sim.sensors.accelerometer import Accelerometer, Accelerometers
+from virtual_loop import run_virtual
+from wires import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers, patient
+
+NOISE = 0.01  # m/s²/sqrt(Hz), of each foot: a thousandth of what it hears in a reading
+FINGERS = (
+    ((0.08, 0.06), (0.22, 0.16)),
+    ((0.25, 0.05), (0.06, 0.17)),
+    ((0.15, 0.11), (0.04, 0.04)),
+    ((0.05, 0.19), (0.24, 0.19)),
+    ((0.20, 0.08), (0.10, 0.15)),
+)
+TONES = np.arange(60.0, 480.0, 35.0)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The paper's rig with weightless fingers."""
+    return replace(load_rig(example_rig_path()), fingertip=None)
+
+
+@pytest.fixture(scope="module")
+def truth(rig: Rig) -> Rig:
+    """The plate on the table: other springs, losses, thickness, gains, places, and 3 g on it."""
+    changes = (
+        (0.90, 1.04, -3, 1.2),
+        (1.07, 0.95, 4, 0.4),
+        (1.12, 1.0, 2, 0.9),
+        (0.95, 0.97, -5, 0),
+    )
+    eras = tuple(
+        replace(
+            era,
+            x=abs(era.x - inwards * 1e-3),
+            stiffness=spring * era.stiffness,
+            damping=1.3 * era.damping,
+            gains=((110.0, gain, math.radians(phase)),),
+        )
+        for era, (spring, gain, phase, inwards) in zip(rig.eras, changes, strict=True)
+    )
+    plate = replace(rig.plate, thickness=1.015 * rig.plate.thickness, loss_factor=0.013)
+    return replace(rig, plate=plate, eras=eras, masses=(PointLoad(0.11, 0.15, mass=3e-3),))
+
+
+@pytest.fixture(autouse=True)
+def noisy_feet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sensors at the feet of ERAs with noise."""
+    quiet = bench._feet
+
+    def noisy(rig: Rig, amplifier: str) -> list[SimulatedSensor]:
+        return [replace(each, noise_density=NOISE) for each in quiet(rig, amplifier)]
+
+    monkeypatch.setattr(bench, "_feet", noisy)
+
+
+def amplifiers_of(far: FarSide) -> Mapping[str, Amplifier]:
+    """The amplifiers of a far side, by name, not yet open."""
+    return {name: Amplifier(open_backend(patient(url))) for name, url in far.urls.items()}
+
+
+async def measured(
+    rig: Rig,
+    far: FarSide,
+    *,
+    is_quick: bool = True,
+    on_step: Callable[[int, int], None] = lambda done, of: None,
+) -> PlateMeasurement:
+    """Measure a rig at a far side; then all its amplifiers are silent and disarmed."""
+    amplifiers = amplifiers_of(far)
+    try:
+        return await PlateSelfMeasurement(rig, amplifiers, is_quick=is_quick, on_step=on_step).run()
+    finally:
+        far.silent_from()
+        for each in far.bench.amplifiers.values():
+            assert each.state is AmplifierState.SWITCH_ON_DISABLED
+            assert not any(output for output in each.outputs)
+
+
+async def contrasts(rig: Rig, far: FarSide, known: Rig) -> list[float]:
+    """Contrast [dB] of a known rig's patterns at pairs of fingers, measured in time."""
+    sensors = Accelerometers(far.bench)
+    table = build_table(known, frequencies=TONES, drive_mode="phased")
+    player = TonePlayer(rig, amplifiers := amplifiers_of(far))
+    (amplifier,) = amplifiers.values()
+    found = []
+    try:
+        await player.open()
+        await player.arm()
+        for target, quiet in FINGERS:
+            sensors.place([Accelerometer("T", *target), Accelerometer("Q", *quiet)])
+            pattern = table.query(Question((target,), (quiet,), level_db_sl=35.0))
+            plays = await player.play(pattern.excitation)
+            for _ in range(30):
+                await asyncio.sleep(0.05)
+                await player.heartbeat()
+            (frequency,) = {command.frequency for command in plays.values()}
+            reading = await amplifier.measure([frequency], 0.1)
+            await player.heartbeat()
+            one, other = (each.tones[0].amplitude for each in reading.sensors[-2:])
+            found.append(20 * math.log10(one / other))
+    finally:
+        await player.close()
+    return found
+
+
+def test_identified_rig_is_the_truth_and_its_patterns_have_more_contrast(
+    rig: Rig, truth: Rig
+) -> None:
+    """Parameters agree within three standard errors; contrast in time rises by 6 dB and more."""
+
+    async def run() -> tuple[PlateMeasurement, list[float], Rig, list[float]]:
+        live_in_memory()
+        async with far_side(WIRES["serial"], truth) as far:
+            taken = await measured(rig, far)
+            found = identify(rig, taken.measurement)
+            assert found.is_explained
+            check(
+                found.posterior.space.names,
+                found.posterior.x * found.posterior.space.std,
+                found.posterior.std,
+            )
+            before = await contrasts(rig, far, rig)
+            return taken, before, found.rig, await contrasts(rig, far, found.rig)
+
+    def check(names: tuple[str, ...], x: np.ndarray, std: np.ndarray) -> None:
+        found = dict(zip(names, zip(x, std, strict=True), strict=True))
+        for era, real in zip(rig.eras, truth.eras, strict=True):
+            for name, expected in (
+                (f"stiffness {era.name}", math.log(real.stiffness / era.stiffness)),
+                (f"gain {era.name}", math.log(real.gains[0][1])),
+                (f"phase {era.name}", real.gains[0][2]),
+                (f"x of {era.name}", real.x - era.x),
+                ("mass 1", 3e-3),
+                ("x of mass 1", 0.11 - rig.plate.length / 2),
+                ("y of mass 1", 0.15 - rig.plate.width / 2),
+            ):
+                value, error = found[name]
+                assert abs(value - expected) < 3 * error, name
+
+    taken, before, _, after = run_virtual(run())
+    assert taken.duration < 10
+    assert np.median(after) > np.median(before) + 6
+
+
+@pytest.mark.parametrize(
+    ("wire", "is_shared"), [("can+socketcand", True), ("serial", False)], ids=["bus", "two wires"]
+)
+def test_two_amplifiers_hear_each_other_where_they_start_together(
+    wire: str, is_shared: bool, rig: Rig, truth: Rig
+) -> None:
+    """On one bus all responses, on two wires those to an amplifier's own: as a direct solution."""
+
+    async def run() -> PlateMeasurement:
+        live_in_memory()
+        wires = SHARED_WIRES if is_shared else WIRES
+        async with far_side(wires[wire], on_two_amplifiers(truth)) as far:
+            return await measured(on_two_amplifiers(rig), far)
+
+    taken = run_virtual(run())
+    measurement = taken.measurement
+    assert taken.duration < 10
+    assert len(measurement.tones) == 28
+    assert len(measurement.values) == 28 * (4 if is_shared else 2)
+    wiring = on_two_amplifiers(rig).wiring
+    for at, era in zip(measurement.at, measurement.eras, strict=True):
+        pair = {wiring[measurement.sensors[at].era].amplifier, wiring[rig.eras[era].name].amplifier}
+        assert is_shared or len(pair) == 1
+    expected = direct_responder(truth.plate, truth.mesh)(
+        truth.eras,
+        measurement.tones,
+        np.array([(era.x, era.y) for era in truth.eras]),
+        loads=truth.masses,
+    )
+    strokes = np.array([era.stroke for era in truth.eras])
+    number = {era.name: n for n, era in enumerate(rig.eras)}
+    at = np.array([number[sensor.era] for sensor in measurement.sensors])[measurement.at]
+    fields = (expected / strokes[:, None])[measurement.rows, measurement.eras, at]
+    assert abs(measurement.values - fields).max() < 0.01 * abs(fields).max()
+
+
+def test_finger_that_comes_meanwhile_is_noticed(rig: Rig, truth: Rig) -> None:
+    """The first tones, played last again, sound different: refused, with nothing identified."""
+
+    async def run() -> PlateMeasurement:
+        live_in_memory()
+        async with far_side(WIRES["serial"], replace(truth, fingertip=Fingertip())) as far:
+
+            def touched(done: int, of: int) -> None:
+                if done == 4:
+                    far.bench.place_fingers({"thumb": (0.2, 0.15)}, now=far.bench.time)
+
+            return await measured(rig, far, on_step=touched)
+
+    with pytest.raises(InputError, match="at the end"):
+        identify(rig, run_virtual(run()).measurement)
+
+
+@pytest.mark.parametrize("is_cancelled", [True, False])
+def test_interrupted_measurement_ends_silent(is_cancelled: bool, rig: Rig, truth: Rig) -> None:
+    """By Ctrl-C, as a cancelled task, or by an error of the caller; `measured` sees to silence."""
+
+    async def run() -> None:
+        live_in_memory()
+        async with far_side(WIRES["serial"], truth) as far:
+
+            def interrupt(done: int, of: int) -> None:
+                if done == 2 and not is_cancelled:
+                    raise ZeroDivisionError
+                if done == 2:
+                    task.cancel()
+
+            task = asyncio.create_task(measured(rig, far, on_step=interrupt))
+            with pytest.raises(asyncio.CancelledError if is_cancelled else ZeroDivisionError):
+                await task
+
+    run_virtual(run())
+
+
+def test_amplifier_without_sensors_is_refused(
+    rig: Rig, truth: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before anything is armed."""
+
+    async def run() -> None:
+        live_in_memory()
+        async with far_side(WIRES["serial"], truth) as far:
+            await measured(rig, far)
+
+    monkeypatch.setattr(SimulatedAmplifier, "attach", lambda amplifier, sensing: None)
+    with pytest.raises(CommandError, match="amplifier main must measure"):
+        run_virtual(run())
+
+
+def test_overloaded_sensor_is_named(rig: Rig, truth: Rig) -> None:
+    """One accelerometer beside the feet with a range of 1 mm/s²."""
+
+    async def run() -> None:
+        live_in_memory()
+        async with far_side(WIRES["serial"], truth) as far:
+            Accelerometers(far.bench).place([Accelerometer("A", 0.1, 0.1, reach=1e-3)])
+            await measured(rig, far)
+
+    with pytest.raises(CommandRefused, match=r"sensor 4 of amplifier main.*--level"):
+        run_virtual(run())
+
+
+@pytest.mark.parametrize("derivatives", [0, 1, 2])
+def test_velocity_and_displacement_become_acceleration(derivatives: int) -> None:
+    """Of 0.1 mm at 100 Hz, read as m/s², m/s or m: 39.5 m/s², in antiphase to the displacement."""
+    omega = 2 * math.pi * 100
+    amplitude, phase = 1e-4 * omega ** (2 - derivatives), 90.0 * (2 - derivatives)
+    reading = Reading(
+        1, ReadingState.COMPLETE, sensors=(SensorReading((Heard(amplitude, phase),)),)
+    )
+    sensor = PlateSensor("main", 0, Sensor("SW", "SW"), derivatives, 1000.0)
+    (found,) = sensor.accelerations(reading, np.array([100.0]))
+    assert found == pytest.approx(-39.478, rel=1e-4)
+
+
+def test_level_stays_10_db_below_what_the_rig_allows(rig: Rig) -> None:
+    """Usual 0.1; less where limits are narrow; 0.4 of full stroke is refused."""
+    assert checked_level(rig, None) == pytest.approx(0.1)
+    narrow = replace(rig, limits=replace(rig.limits, level=0.2))
+    assert checked_level(narrow, None) == pytest.approx(0.2 * 10**-0.5)
+    for each, level in ((rig, 0.4), (narrow, 0.1), (rig, 0.0), (rig, math.nan)):
+        with pytest.raises(InputError, match="--level"):
+            checked_level(each, level)

@@ -1,0 +1,127 @@
+"""`era rig identify` as typed, against simulated amplifiers on wires in virtual time."""
+
+import asyncio
+import json
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from controller.cli.demo import app
+from controller.daemon.socket_lock import SocketLock
+from memory_machine import live_in_memory
+from model.errors import InputError
+from model.rig.file import example_rig_path, load_rig
+from model.rig.rig import Rig
+from rig_files import TWO_AMPLIFIERS, write_rig
+from virtual_loop import run_virtual
+from wires import WIRES, far_side
+
+PORT = "serial:///dev/memory0?baud=921600"
+"""Where the first far end on a serial line in memory is."""
+
+Identify = Callable[..., Result]
+
+
+@pytest.fixture
+def truth() -> Rig:
+    """The plate on the table: of the example's file, thinner, on one softer spring."""
+    rig = load_rig(example_rig_path())
+    first, *others = rig.eras
+    eras = (replace(first, stiffness=0.88 * first.stiffness), *others)
+    return replace(rig, plate=replace(rig.plate, thickness=0.985 * rig.plate.thickness), eras=eras)
+
+
+@pytest.fixture
+def identify(truth: Rig, monkeypatch: pytest.MonkeyPatch) -> Identify:
+    """The command, on an event loop in virtual time with the far end in it."""
+
+    def run(rig: Path, *options: str, wire: str = "serial", on: Rig = truth) -> Result:
+        async def beside(main: Coroutine[Any, Any, Any]) -> Any:
+            live_in_memory()
+            async with far_side(WIRES[wire], on) as far:
+                run.urls = far.urls  # type: ignore[attr-defined]
+                return await main
+
+        monkeypatch.setattr(asyncio, "run", lambda main: run_virtual(beside(main)))
+        arguments = ["rig", "identify", str(rig), *options]
+        result = CliRunner().invoke(app, arguments)
+        if result.exception is not None and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        return result
+
+    return run
+
+
+def test_rig_is_written_with_the_plate_that_is_there(
+    tmp_path: Path, truth: Rig, identify: Identify
+) -> None:
+    """The spring that is softer, with less uncertainty, in a file that reads back; keys of JSON.
+
+    Named by a daemon's file.
+    """
+    rig, new = write_rig(tmp_path / "rig.yaml", mesh="auto"), tmp_path / "rig2.yaml"
+    daemon = tmp_path / "daemon.yaml"
+    daemon.write_text("rig: rig.yaml\nsocket: d.sock\n")
+    result = identify(daemon, "--url", PORT, "-o", str(new), "--yes", "--quick", "--json")
+    told = json.loads(result.stdout)
+    assert result.exit_code == 0
+    assert told["explained"]
+    assert told["files"] == [str(new)]
+    assert told["measure_time_s"] < 10
+    assert [each["era"] for each in told["sensors"]] == ["SW", "SE", "NE", "NW"]
+    (spring,) = (each for each in told["parameters"] if each["name"] == "stiffness SW")
+    assert abs(spring["difference"] + 12) < 3 * spring["standard_error"] < 6
+    for each in told["expected_contrast"]:
+        assert each["before_db"] < each["after_db"]
+    found = load_rig(new)
+    assert found.eras[0].stiffness == pytest.approx(truth.eras[0].stiffness, rel=0.03)
+    assert found.uncertainty.stiffness < load_rig(rig).uncertainty.stiffness / 3
+    assert "identified in place" in new.read_text("utf-8")
+
+
+def test_plate_that_is_not_explained_is_refused_and_nothing_written(
+    tmp_path: Path, identify: Identify, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exit status 1, nothing promised, and what was at the output stays."""
+    rig, new = write_rig(tmp_path / "rig.yaml", mesh="auto"), tmp_path / "rig2.yaml"
+    new.write_text("mine")
+    monkeypatch.setattr("model.identification.identify.MAX_CHI2", 1e-3)
+    result = identify(rig, "--url", PORT, "-o", str(new), "--yes", "--quick", "--json")
+    told = json.loads(result.stdout)
+    assert result.exit_code == 1
+    assert (told["explained"], told["expected_contrast"], told["files"]) == (False, [], [])
+    assert new.read_text() == "mine"
+
+
+def test_bad_input_is_refused_before_anything_plays(tmp_path: Path, identify: Identify) -> None:
+    """Nobody said that the plate is free, same file, wrong ending, level, URL of no amplifier."""
+    rig, new = write_rig(tmp_path / "rig.yaml"), str(tmp_path / "rig2.yaml")
+    two = write_rig(tmp_path / "two.yaml", *TWO_AMPLIFIERS)
+    for file, words, options in (
+        (rig, "--yes", ("-o", new)),
+        (rig, "--output", ("-o", str(rig), "--yes")),
+        (rig, "--output|ending|yaml", ("-o", str(tmp_path / "x.npz"), "--yes")),
+        (rig, "--level", ("-o", new, "--yes", "--level", "0.5", "--url", PORT)),
+        (two, "--url", ("-o", new, "--yes", "--url", PORT)),
+    ):
+        with pytest.raises(InputError, match=words):
+            identify(file, *options)
+    assert not Path(new).exists()
+
+
+def test_daemon_that_runs_keeps_its_amplifiers(tmp_path: Path, identify: Identify) -> None:
+    """A daemon's file names the rig; refused with its process while that holds the socket."""
+    write_rig(tmp_path / "rig.yaml", mesh="auto")
+    daemon, new = tmp_path / "daemon.yaml", tmp_path / "rig2.yaml"
+    daemon.write_text("rig: rig.yaml\nsocket: d.sock\n")
+    lock = SocketLock(tmp_path / "d.sock")
+    try:
+        with pytest.raises(InputError, match="daemon is running"):
+            identify(daemon, "--url", PORT, "-o", str(new), "--yes")
+    finally:
+        lock.release()
+    assert not new.exists()

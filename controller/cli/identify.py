@@ -58,8 +58,9 @@ def identify(
 ) -> None:
     """Identify the plate in place by its own ERAs.
 
-    Write its rig with what is left uncertain. Every ERA plays small tones of its own at the same time, the amplifiers' sensors listen. Exit
-    status 1, and no rig is written, where the model does not explain what they heard.
+    Write its rig with what is left uncertain. Every ERA plays small tones of its own at the same
+    time, the amplifiers' sensors listen. Exit status 1, and no rig is written, where the model does
+    not explain what they heard.
     """
     import time
 
@@ -77,7 +78,7 @@ def identify(
         for taken in (rig_file, source):
             if output.resolve() == taken.resolve():
                 raise InputError(f"--output must differ from {taken}; choose another name")
-        _ask_whether_untouched(is_known=untouched, can_ask=not as_json)
+        _require_untouched(is_known=untouched, has_terminal=not as_json)
         measured = _measured(rig, url or [], level=level, is_quick=quick, is_shown=not as_json)
     started = time.perf_counter()
     try:
@@ -144,11 +145,11 @@ def _rig_of(path: Path) -> "Iterator[tuple[Document, Rig]]":
         lock.release()
 
 
-def _ask_whether_untouched(*, is_known: bool, can_ask: bool) -> None:
+def _require_untouched(*, is_known: bool, has_terminal: bool) -> None:
     """Raise InputError, or typer.Abort, unless somebody says that nothing touches the plate."""
     if is_known:
         return
-    if not (can_ask and sys.stdin.isatty()):
+    if not (has_terminal and sys.stdin.isatty()):
         raise InputError(
             "nothing may touch the plate while it is identified; look, and say so with --yes"
         )

@@ -62,8 +62,8 @@ def _rounds(
     length = max(_PER_BAND, _TONES // n)
     bands = np.linspace(low, high, n * length).reshape(n, length)
     steps = [
-        tuple((era, float(bands[(j + place + turn) % n, place])) for j, era in enumerate(eras))
-        for turn in range(count)
+        tuple((era, float(bands[(j + place + number) % n, place])) for j, era in enumerate(eras))
+        for number in range(count)
         for place in range(length)
     ]
     return steps, float(bands[-1, 0] - bands[-2, 0]) if n > 1 else high

@@ -74,8 +74,8 @@ class TonePlayer:
                 "a set of tones was given up, since an amplifier does not reply or was stopped; "
                 "start again"
             )
-        asked, plays = (commands_by_era(sets, self._rig) for sets in (routed, played.achieved))
-        for era, command in asked.items():
+        requested, plays = (commands_by_era(sets, self._rig) for sets in (routed, played.achieved))
+        for era, command in requested.items():
             level = plays[era].level if era in plays else 0.0
             if not math.isclose(command.level, level, rel_tol=_LEVEL_TOLERANCE):
                 amplifier = self._rig.wiring[era].amplifier

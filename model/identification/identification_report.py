@@ -83,11 +83,11 @@ def parameter_rows(found: Identification) -> list[str]:
 def fit_rows(found: Identification) -> list[str]:
     """Lines of how well the model explains the measurement."""
     held = found.held_out
-    told = "too few tones to tell" if held is None else percent(held.total)
+    error = "too few tones to tell" if held is None else percent(held.total)
     verdict = "explains" if found.is_explained else "does not explain"
     return [
         f"chi² {found.chi2:.2f}: the model {verdict} the measurement (at most {MAX_CHI2:g})",
-        f"tones left out are predicted within: {told}",
+        f"tones left out are predicted within: {error}",
     ]
 
 

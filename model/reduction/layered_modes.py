@@ -86,7 +86,8 @@ class LayeredModes:
         """Deflection at points of modes and residual vectors, (p, r + RESIDUAL_ORDER n)."""
         at, count = self._observe(points), len(attached.points)
         (residuals,) = attached.residuals
-        extra = residuals.transpose(1, 0, 2).reshape(RESIDUAL_ORDER * count, -1) @ at.truncated.T
+        shape = RESIDUAL_ORDER * count, residuals.shape[2]
+        extra = residuals.transpose(1, 0, 2).reshape(shape) @ at.truncated.T
         extra[:count] += self._local(self._observe(attached.points), at)
         return np.hstack([at.shapes, extra.T])
 

@@ -24,6 +24,11 @@ from model.errors import InputError
 PRESSURE = 101_325.0
 DENSITY, VISCOSITY, CONDUCTIVITY, HEAT_CAPACITY, HEAT_RATIO = 1.204, 18.2e-6, 25.9e-3, 1006.0, 1.402
 
+# Depth [thicknesses of the boundary layer] down to which friction hardly couples modes, and down to
+# which by some 10 %: responses of the paper's plate and of a panel over 10 um to 10 mm, solved in
+# modes and at each frequency.
+_OPEN, _SEALED = (5.0, 1.4), (1.0, 0.28)
+
 
 @dataclass(frozen=True)
 class AirGap:
@@ -40,14 +45,16 @@ class AirGap:
         if not (math.isfinite(self.depth) and self.depth > 0):
             raise InputError(f"air gap: depth must be above zero, got {self.depth} m")
 
-    def is_narrow(self, frequency: float) -> bool:
-        """Whether friction couples modes at a frequency [Hz], which mode by mode leaves out.
+    def coupling_error(self, frequency: float) -> float:
+        """Error of the response where friction couples modes, which is left out, at least [-].
 
-        Below five thicknesses of the boundary layer sqrt(2 mu / (rho omega)), between open edges:
-        beyond them the response is within 3 % (`benchmarks.layers`).
+        At a frequency [Hz], by thicknesses of the boundary layer sqrt(2 mu / (rho omega)): within
+        3 % over a deeper open gap, 5 % over a deeper sealed one, where it is 0 here; then 10 %, and
+        in a gap too narrow for modes half of the response and more.
         """
-        layer = math.sqrt(VISCOSITY / (math.pi * DENSITY * frequency))
-        return not self.closed and self.depth < 5 * layer
+        layers = self.depth / math.sqrt(VISCOSITY / (math.pi * DENSITY * frequency))
+        within, modal = _SEALED if self.closed else _OPEN
+        return 0.0 if layers >= within else 0.1 if layers >= modal else 0.5
 
     def inertia(self, frequency: float) -> complex:
         """rho b [kg/m³] at a frequency [Hz]: density of air that friction holds back."""

@@ -73,6 +73,20 @@ def interface_mass(layers: Sequence[Layer]) -> FloatArray:
     return mass
 
 
+def slide_frequency(laminate: Laminate, frequency: float) -> float:
+    """Lowest frequency [Hz] at which bonded layers slide to and fro on each other by themselves.
+
+    Everywhere alike, without a deflection, by the moduli at a frequency [Hz]. Of two faces of m''
+    on a light core of G and h: sqrt(2 G / (h m'')) / 2 pi; they change their distance in the same
+    way, with the modulus of compression in place of G.
+    """
+    layers = laminate.layers
+    moduli = [layer.modulus(frequency).real for layer in layers]
+    slip = section_of(layers, moduli, shear_corrections(layers)).slip.real
+    squares = np.linalg.eigvals(np.linalg.solve(interface_mass(layers), slip)).real
+    return math.sqrt(np.sort(squares)[1]) / (2 * math.pi)
+
+
 def shear_corrections(layers: Sequence[Layer]) -> FloatArray:
     """Shear correction factor of each layer (n,): 5/6 of a single one, 1 of a soft core.
 

@@ -68,7 +68,9 @@ def _on_polynomials(rig: Rig, count: int, *, support: str, mesh: SpectralMesh) -
     attached = list(rig.masses)
     if support == "eras":
         attached += [PointLoad.of_era(era) for era in rig.eras]
-    rigid = RIGID_BODY_MODES if support == "free" else 0
+    gap = rig.plate.air_gap
+    # Air sealed in resists motion up and down; it only flows to and fro under tilts.
+    rigid = RIGID_BODY_MODES - (gap is not None and gap.closed) if support == "free" else 0
     highest = rig.limits.frequency_max
     while True:
         reduced = reduce_plate(rig.plate, mesh, footprints_of(attached), frequency_max=highest)

@@ -276,15 +276,48 @@ def test_a_stiff_mount_says_how_large_it_is(tmp_path: Path) -> None:
         assert all("1.1 %" in each for each in found)
 
 
-def test_check_warns_of_an_air_gap_whose_friction_couples_modes(tmp_path: Path) -> None:
-    """Below five boundary layers, by hand 5 sqrt(2 1.82e-5 / (1.204 2 pi 40)) = 1.7 mm at 40 Hz."""
-    for gap, warnings in (("1.6 mm", 1), ("1.8 mm", 0), ("0.5 mm, closed: true", 0)):
-        text = LAMINATE.replace("  bond: full\n", f"  air_gap: {{depth: {gap}}}\n")
-        text = text.replace(
-            "amplifiers:", "  SE: {at: [12 in, 0], stiffness: 17 kN/m}\namplifiers:"
-        )
+@pytest.mark.parametrize(
+    ("gap", "warned"),
+    [
+        ("1.8 mm", None),
+        ("1.6 mm", "10 %"),
+        ("0.1 mm", "half of it or more"),
+        ("0.5 mm, closed: true", None),
+        ("0.2 mm, closed: true", "10 %"),
+        ("0.05 mm, closed: true", "half of it or more"),
+    ],
+)
+def test_check_warns_of_an_air_gap_whose_friction_couples_modes(
+    tmp_path: Path, gap: str, warned: str | None
+) -> None:
+    """By boundary layers, by hand sqrt(2 1.82e-5 / (1.204 2 pi 40)) = 0.35 mm at 40 Hz."""
+    text = LAMINATE.replace("  bond: full\n", f"  air_gap: {{depth: {gap}}}\n")
+    text = text.replace("amplifiers:", "  SE: {at: [12 in, 0], stiffness: 17 kN/m}\namplifiers:")
+    checked = RIG.check(read_document(write(tmp_path, text)))
+    found = [each for each in checked.warnings if each.startswith("plate.air_gap")]
+    assert len(found) == (warned is not None)
+    assert all(f"off by {warned}" in each for each in found)
+
+
+def test_check_warns_of_layers_that_slide_within_the_frequencies(tmp_path: Path) -> None:
+    """Aluminium 0.5 mm on both sides of 50 mm of foam of G 40 kPa: by hand 151 Hz.
+
+    1.35 kg/m² of each face and a sixth of the foam's 2.5, since it turns about its middle:
+    sqrt(2 x 40e3 / (0.05 x 1.767)) / 2 pi.
+    """
+    layers = """  layers:
+    - {material: aluminium, thickness: 0.5 mm}
+    - {material: {name: foam, E: MODULUS, rho: 50, nu: 0.25}, thickness: 50 mm}
+    - {material: aluminium, thickness: 0.5 mm}
+"""
+    head, tail = LAMINATE[: LAMINATE.index("  layers:")], LAMINATE[LAMINATE.index("eras:") :]
+    tail = tail.replace("amplifiers:", "  SE: {at: [12 in, 0], stiffness: 17 kN/m}\namplifiers:")
+    for modulus, warned in (("0.1 MPa", True), ("100 MPa", False)):
+        text = head + layers.replace("MODULUS", modulus) + tail
         checked = RIG.check(read_document(write(tmp_path, text)))
-        assert sum(each.startswith("plate.air_gap") for each in checked.warnings) == warnings
+        found = [each for each in checked.warnings if each.startswith("plate.layers")]
+        assert len(found) == warned
+        assert all("at 15" in each and "above 7" in each for each in found)
 
 
 def test_load_rig_reads_a_laminate(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.reduction.supported_modes import supported_modes
+from model.rig.file import parse_rig
 from model.spectral.air_motion import air_motion
 from model.spectral.layered_class import LayeredPlate
 from model.spectral.mesh import SpectralMesh
@@ -19,6 +20,7 @@ from model.structure.material import Material
 from model.structure.plate import Plate
 from model.structure.point_load import footprints_of
 from model.vibration.direct import direct_responder
+from model.vibration.natural_modes import natural_modes
 
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
 PLATE = Plate(0.375, 0.225, 2.5e-3, GLASS)
@@ -129,6 +131,20 @@ def test_air_lowers_frequencies_and_its_friction_damps():
     assert (deep[0] > narrow[0]).all()
     assert (none[1] < deep[1]).all()
     assert (deep[1] < narrow[1]).all()
+
+
+def test_a_free_plate_over_a_sealed_gap_moves_up_and_down_on_its_air():
+    """Its lowest elastic mode, of a stiff plate, is at sqrt(gamma p0 / (d m'')) / 2 pi: 39.1 Hz."""
+    text = (
+        "plate: {length: 0.3, width: 0.2, thickness: 3 mm, material: steel,"
+        " air_gap: {depth: 100 mm, closed: true}}\n"
+        "eras: {A: {at: [0, 0], stiffness: 17000, amplifier: main, channel: 0}}\n"
+        'amplifiers: {main: {url: "sim://"}}\n'
+    )
+    expected = np.sqrt(HEAT_RATIO * PRESSURE / (0.1 * 7850 * 3e-3)) / (2 * np.pi)
+    modes = natural_modes(parse_rig("rig.yaml", text), 2, support="free")
+    assert modes.frequencies[0] == pytest.approx(expected, rel=0.01)
+    assert modes.frequencies[1] > 4 * expected
 
 
 @pytest.mark.parametrize("closed", [False, True])

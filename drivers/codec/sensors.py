@@ -3,7 +3,7 @@
 Unpacking yields values in range or raises Malformed. Packing a list takes as many sensors as fit.
 """
 
-from collections.abc import Sequence
+from dataclasses import replace
 
 from drivers.codec.payload import Cursor, Malformed, pack, pack_optional_channel, pack_real
 from drivers.protocol.definition import PROTOCOL
@@ -131,7 +131,7 @@ def unpack_reading(cursor: Cursor) -> Reading:
     head = unpack_reading_head(cursor)
     listed = cursor.integer(_Q.sensor_count)
     sensors = tuple(unpack_sensor_reading(cursor, head.tone_count) for _ in range(listed))
-    return with_sensors(head, sensors)
+    return replace(head, sensors=sensors)
 
 
 def pack_reading_head(reading: Reading) -> bytes:
@@ -157,19 +157,6 @@ def unpack_reading_head(cursor: Cursor) -> Reading:
         start=cursor.number(_Q.window_start),
         token=cursor.integer(_Q.active_token),
         tone_count=cursor.integer(_Q.tone_count),
-    )
-
-
-def with_sensors(head: Reading, sensors: Sequence[SensorReading]) -> Reading:
-    """Return a reading with these sensors."""
-    return Reading(
-        head.number,
-        head.state,
-        head.left,
-        head.start,
-        head.token,
-        head.tone_count,
-        tuple(sensors),
     )
 
 

@@ -20,7 +20,7 @@ _SETTLING = 3.0  # s; longest
 _SETTLED = 0.005  # of the largest amplitude; from one window to the next
 _ALIKE = 0.02  # of the largest amplitude; of readings that must be equal
 _RAW = 0.05  # of raw samples and the reading, without a fit
-_LEAST_KEPT = 256  # raw samples
+_MIN_KEPT = 256  # raw samples
 _FLOOR = 1e-4  # of the range; a plate that vibrates less is none
 _SLACK = 0.002  # s; of times in milliseconds
 
@@ -221,7 +221,7 @@ async def raw_samples(bench: Bench) -> None:
         counts += block.samples
     end = round(_WINDOW * sensor.sample_rate)
     expect(abs(block.end - end) <= 1, "number of samples", expected=end, seen=block.end)
-    least = min(_LEAST_KEPT, end)
+    least = min(_MIN_KEPT, end)
     expect(len(counts) >= least, "samples kept", expected=f"{least} at least", seen=len(counts))
     amplitude = 2 * abs(_correlation(counts, tone / sensor.sample_rate)) * sensor.count_step
     if read.amplitude < _FLOOR * sensor.range:

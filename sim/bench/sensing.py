@@ -154,6 +154,8 @@ class Sensing:
         if self._reader is not None and request == self._reader.request:
             return self._reading(_Q.sensor.maximum + 1, now)  # its reply was lost
         ascending = sorted(request.frequencies)
+        if not ascending:
+            return Nak(NakCode.BAD_VALUE)
         apart = min(after - before for before, after in pairwise([0.0, *ascending]))
         if apart * request.window < 1 - _ROUNDING or ascending[-1] > self._frequency_max:
             return Nak(NakCode.BAD_VALUE)

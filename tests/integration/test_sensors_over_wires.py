@@ -8,7 +8,7 @@ import pytest
 
 from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
-from drivers.errors import CommandError, CommandRefused
+from drivers.errors import CommandError, CommandRefused, FrameError
 from drivers.guard import Guard, GuardLimits
 from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.operation.keep_alive import keep_alive
@@ -18,6 +18,7 @@ from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from model.vibration.direct import direct_responder
 from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.far_ends.can_bus.sensor_objects import SensorObjects
 from sim.sensors.accelerometer import Accelerometer, Accelerometers
 from virtual_loop import run_virtual
 from wires import WIRES, FarSide, far_side, patient
@@ -128,6 +129,8 @@ def test_sensors_are_described_and_many_tones_read(wire: str, coarse_rig: Rig) -
             reading = await amplifier.measure(frequencies, 0.2)
             assert [one.is_overloaded for one in reading.sensors] == [False] * 4 + [True]
             assert all(len(one.tones) == 16 for one in reading.sensors)
+            # 97 bytes each, 255 at most while a heartbeat waits.
+            assert 1 <= len((await amplifier.reading()).sensors) <= 2
             tone = reading.sensors[0].tones[2]
             others = [tone.amplitude for one in reading.sensors[:4] for tone in one.tones]
             silent = [a for n, a in enumerate(others) if n % 16 != 2]
@@ -168,6 +171,53 @@ def test_measuring_is_refused_without_sensors(
             await amplifier.close()
 
     monkeypatch.setattr(SimulatedAmplifier, "attach", lambda amplifier, sensing: None)
+    run_virtual(run())
+
+
+@pytest.mark.parametrize("name", ["_count", "_sensor", "_tones", "_reading", "_samples"])
+def test_object_of_sensors_with_a_byte_too_many_is_an_error(
+    name: str, coarse_rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Objects over CAN end where their last field does."""
+
+    async def run() -> None:
+        live_in_memory()
+        async with far_side(WIRES["can+socketcand"], coarse_rig) as far:
+            amplifier = await opened(far)
+
+            async def read() -> None:
+                await amplifier.measure([110.0], 0.05)
+                await amplifier.raw_samples(0)
+                await amplifier.sensors()
+
+            with pytest.raises(FrameError):
+                await read()
+            await amplifier.close()
+
+    whole = getattr(SensorObjects, name)
+    monkeypatch.setattr(SensorObjects, name, lambda *given: whole(*given) + b"\0")
+    run_virtual(run())
+
+
+@pytest.mark.parametrize("wire", WIRES)
+@pytest.mark.parametrize(("sensor", "sample"), [(32, 0), (-1, 0), (0, 1 << 32)])
+def test_sensors_and_samples_out_of_range_are_not_sent(
+    wire: str, sensor: int, sample: int, coarse_rig: Rig
+) -> None:
+    """A sensor is 0 to 31, a sample a number of 32 bits."""
+
+    async def run() -> None:
+        live_in_memory()
+        async with far_side(WIRES[wire], coarse_rig) as far:
+            amplifier = await opened(far)
+            with pytest.raises(CommandError):
+                await amplifier.raw_samples(sensor, sample)
+            if sensor:
+                with pytest.raises(CommandError):
+                    await amplifier.reading(sensor)
+            assert len(await amplifier.sensors()) == 4  # the link is as it was
+            await amplifier.close()
+
     run_virtual(run())
 
 

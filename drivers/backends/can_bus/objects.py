@@ -7,6 +7,7 @@ first reads an object that is not used otherwise until its reply arrives.
 import queue
 import struct
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import TypeVar
 
 import canopen
@@ -41,7 +42,6 @@ from drivers.codec.sensors import (
     unpack_reading_head,
     unpack_sensor,
     unpack_sensor_reading,
-    with_sensors,
 )
 from drivers.errors import FrameError, LinkError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
@@ -68,7 +68,8 @@ from drivers.protocol.messages import (
 from drivers.statistics import WireCounters
 
 _LENGTH = 8
-_SENSORS_LISTED = 8  # in one exchange
+_SENSORS_LISTED = 8  # in one exchange, for whose end a heartbeat waits
+_TONES_HEAD, _TONE_SIZE = 3, 6  # bytes
 _WAITING_MAX = 256  # replies; bounds the memory on a flooded bus
 _RESYNCHRONISE = 5  # tries
 _BLOCK_FROM = 15  # bytes; segments are faster below
@@ -209,11 +210,16 @@ class ObjectClient:
     def sensors(self, request: GetSensors, *, timeout: float) -> SensorList | Nak:
         """Describe the sensors from one on."""
 
+        first = _number_of_sensor(request.first)
+
         def read() -> SensorList:
-            (count,) = self._client.upload(index_of("sensors"), 0)
-            last = min(count, request.first + _SENSORS_LISTED)
-            each = (self._sensor_object("sensors", n) for n in range(request.first, last))
-            return SensorList(count, tuple(unpack_sensor(cursor) for cursor in each))
+            count = self._sensor_count("sensors")
+            found = []
+            for number in range(first, min(count, first + _SENSORS_LISTED)):
+                cursor = self._sensor_object("sensors", number)
+                found.append(unpack_sensor(cursor))
+                cursor.end()
+            return SensorList(count, tuple(found))
 
         return self._sensor_transfer(read, timeout)
 
@@ -230,18 +236,24 @@ class ObjectClient:
     def reading(self, request: GetReading, *, timeout: float) -> Reading | Nak:
         """Read the reading, its sensors from one on; none if it was replaced meanwhile."""
 
+        first = _number_of_sensor(request.first)
+
         def read() -> Reading:
             head = self._reading_head()
             if head.state not in (ReadingState.COMPLETE, ReadingState.DISTURBED):
                 return head
-            (count,) = self._client.upload(index_of("sensor_reading"), 0)
+            count = self._sensor_count("sensor_reading")
             sensors = []
-            for number in range(request.first, min(count, request.first + _SENSORS_LISTED)):
+            # No more bytes than over a serial line.
+            fitting = PROTOCOL.serial.payload_max // (_TONES_HEAD + _TONE_SIZE * head.tone_count)
+            last = min(count, first + min(fitting, _SENSORS_LISTED))
+            for number in range(first, last):
                 cursor = self._sensor_object("sensor_reading", number)
                 if cursor.integer(PROTOCOL.quantities.held_reading) != head.number:
                     return self._reading_head()
                 sensors.append(unpack_sensor_reading(cursor, head.tone_count))
-            return with_sensors(head, sensors)
+                cursor.end()
+            return replace(head, sensors=tuple(sensors))
 
         return self._sensor_transfer(read, timeout)
 
@@ -251,12 +263,22 @@ class ObjectClient:
 
         def read() -> SampleBlock:
             self._client.download(index_of("first_sample"), 0, data, force_segment=True)
-            return unpack_block(Cursor(self._client.upload(index_of("samples"), 0)))
+            cursor = Cursor(self._client.upload(index_of("samples"), 0))
+            block = unpack_block(cursor)
+            cursor.end()
+            return block
 
         return self._sensor_transfer(read, timeout)
 
     def _reading_head(self) -> Reading:
-        return unpack_reading_head(Cursor(self._client.upload(index_of("reading"), 0)))
+        cursor = Cursor(self._client.upload(index_of("reading"), 0))
+        head = unpack_reading_head(cursor)
+        cursor.end()
+        return head
+
+    def _sensor_count(self, name: str) -> int:
+        entry = Entry(index_of(name), 0, "sensor_count", "u8", PROTOCOL.quantities.sensor_count)
+        return read_integer(entry, self._client.upload(entry.index, entry.subindex))
 
     def _sensor_object(self, name: str, sensor: int) -> Cursor:
         return Cursor(self._client.upload(index_of(name), sensor + 1))
@@ -383,3 +405,8 @@ class ObjectClient:
                     raise
             else:
                 return
+
+
+def _number_of_sensor(sensor: int) -> int:
+    """Return the number of a sensor; CommandError for one out of range."""
+    return PROTOCOL.quantities.sensor.to_wire(sensor)

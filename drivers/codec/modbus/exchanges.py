@@ -144,13 +144,16 @@ def _of_sensors(request: GetSensors | GetReading | GetBlock | Measure, tag: int)
     match request:
         case GetSensors(first=first):
             beyond = _MAP["sensors_listed"] * SENSOR_SIZE
-            read, block, words = _read("sensors", beyond=beyond), "sensor", [first]
+            read, block = _read("sensors", beyond=beyond), "sensor"
+            words = _unsigned((_Q.sensor, first))
         case GetReading(first=first):
             beyond = READING_SIZE
-            read, block, words = _read("reading", beyond=beyond), "sensor", [first]
+            read, block = _read("reading", beyond=beyond), "sensor"
+            words = _unsigned((_Q.sensor, first))
         case GetBlock(sensor=sensor, sample=sample):
             read = _read("samples", beyond=_Q.sample_count.maximum)
-            block, words = "sample", [sensor, sample >> 16, sample & 0xFFFF]
+            at, block = _Q.sample.to_wire(sample), "sample"
+            words = [*_unsigned((_Q.sensor, sensor)), at >> 16, at & 0xFFFF]
         case Measure():
             read, block = _read("reading"), "measure"
             words = _unsigned(

@@ -85,8 +85,13 @@ def test_each_amplifier_has_the_sensors_of_its_own_eras(coarse_rig: Rig) -> None
 
 @pytest.mark.parametrize(
     "request_",
-    [Measure(1, 0.1, (3000.05,)), Measure(1, 0.1, (9.0,)), Measure(1, 0.1, (110.0, 119.0))],
-    ids=["beyond the sensors", "less than a period", "too close"],
+    [
+        Measure(1, 0.1, (3000.05,)),
+        Measure(1, 0.1, (9.0,)),
+        Measure(1, 0.1, (110.0, 119.0)),
+        Measure(1, 0.1, ()),
+    ],
+    ids=["beyond the sensors", "less than a period", "too close", "none"],
 )
 def test_tones_out_of_range_are_refused(request_: Measure, coarse_rig: Rig) -> None:
     """And measure nothing."""

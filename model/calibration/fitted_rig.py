@@ -127,8 +127,8 @@ def uncertainty_of(
         error = max(math.hypot(float(np.nanmedian(share)), field), _LEAST)
         gain, phase_deg = min(error, before.gain), min(math.degrees(error), before.phase_deg)
     losses = (
-        max(rms(kind) for kind in ("loss_factor", "damping") if known[kind])
-        if (known["loss_factor"] and known["damping"])
+        max(rms("loss_factor"), rms("damping"))
+        if known["loss_factor"] and known["damping"]
         else math.log(before.damping)
     )
     return replace(

@@ -11,7 +11,7 @@ from drivers.protocol.messages import Feature
 _PLACE = "wire-protocol.md#envelopes"
 
 
-def _along(step: float, *values: complex) -> Curve:
+def along(step: float, *values: complex) -> Curve:
     """Make the level along straight lines between complex amplitudes, a step [s] apart."""
 
     def level(time: float) -> float:
@@ -23,7 +23,7 @@ def _along(step: float, *values: complex) -> Curve:
     return level
 
 
-def _step(bench: Bench) -> float:
+def step_of(bench: Bench) -> float:
     """Return a step [s] that is long against an exchange; NotApplicable without envelopes."""
     if not bench.can.envelope_knots:
         raise NotApplicable("it has no envelopes")
@@ -31,20 +31,20 @@ def _step(bench: Bench) -> float:
     return min(max(requested, bench.can.envelope_step_min), bench.can.envelope_step_max)
 
 
-async def _load(bench: Bench, slot: int, *amplitudes: complex) -> None:
+async def load(bench: Bench, slot: int, *amplitudes: complex) -> None:
     """Load an envelope of knots at these complex amplitudes, relative to the test level."""
     knots = tuple(
         Knot(abs(one) * bench.level, 180.0 if one.real < 0 else 0.0) for one in amplitudes
     )
-    envelope = Envelope(slot, _step(bench), knots)
+    envelope = Envelope(slot, step_of(bench), knots)
     await bench.amplifier.load_envelope(bench.guard.check_envelope(envelope))
 
 
 @driving(_PLACE)
 async def onsets(bench: Bench) -> None:
     """It begins along an onset through its knots, from silence, whatever the ramp."""
-    step, level = _step(bench), bench.level
-    await _load(bench, 1, 0.75, 0.25)
+    step, level = step_of(bench), bench.level
+    await load(bench, 1, 0.75, 0.25)
     await bench.arm()
     shaped = bench.tones(1.0, onset=1, ending=0, ramp=0.0)
     achieved = await bench.amplifier.apply(shaped)
@@ -52,7 +52,7 @@ async def onsets(bench: Bench) -> None:
     expect(slots == [(1, 0)], "achieved slots", expected=[(1, 0)], seen=slots)
     await bench.play()
     when = await bench.apply(bench.tones(1.0, onset=1))
-    rising = _along(step, 0.0, 0.75 * level, 0.25 * level, level)
+    rising = along(step, 0.0, 0.75 * level, 0.25 * level, level)
     samples = await samples_until(bench, when.latest + 3.2 * step)
     expect_curve(bench, samples, rising, commit=when, lasts=3 * step, what="of an onset")
     await bench.expect_levels(1.0, why="after an onset")
@@ -61,9 +61,9 @@ async def onsets(bench: Bench) -> None:
 @driving(_PLACE)
 async def endings(bench: Bench) -> None:
     """It ends along the ending of the set that plays: by a silent set, and by valid_for."""
-    step, level = _step(bench), bench.level
-    await _load(bench, 2, 0.5, -0.5)
-    falling = _along(step, level, 0.5 * level, -0.5 * level, 0.0)
+    step, level = step_of(bench), bench.level
+    await load(bench, 2, 0.5, -0.5)
+    falling = along(step, level, 0.5 * level, -0.5 * level, 0.0)
     await bench.arm()
     for last in ((), (0.0,)):
         await bench.apply(bench.tones(1.0, ending=2))
@@ -89,18 +89,18 @@ async def endings(bench: Bench) -> None:
 @driving(_PLACE)
 async def endings_amid_onsets(bench: Bench) -> None:
     """It ends along the ending from the present amplitude amid an onset to level 0, too."""
-    step, level = _step(bench), bench.level
+    step, level = step_of(bench), bench.level
     if bench.can.envelope_knots < 2:
         raise NotApplicable("an onset of one knot has no level that stays")
-    await _load(bench, 1, 1.0, 1.0)
-    await _load(bench, 2, 0.5)
+    await load(bench, 1, 1.0, 1.0)
+    await load(bench, 2, 0.5)
     await bench.arm()
     started = await bench.apply(bench.tones(0.0, onset=1, ending=2))
     await bench.pause_until(started.latest + 1.3 * step)
     when = await bench.play()
     if when.latest > started.earliest + 2 * step:
         raise Inconclusive("the silent set came after the level that stays")
-    falling = _along(step, level, 0.5 * level, 0.0)
+    falling = along(step, level, 0.5 * level, 0.0)
     samples = await samples_until(bench, when.latest + 2.2 * step)
     what = "of an ending amid an onset to level 0"
     expect_curve(bench, samples, falling, commit=when, lasts=2 * step, what=what)
@@ -110,8 +110,8 @@ async def endings_amid_onsets(bench: Bench) -> None:
 @driving(_PLACE)
 async def skipped_endings(bench: Bench) -> None:
     """It skips an ending by the flag, by Stop and by Disarm, each along its ramp."""
-    _step(bench)
-    await _load(bench, 2, 1.0)
+    step_of(bench)
+    await load(bench, 2, 1.0)
     ramp = bench.ramp
     falling = raised_cosine(ramp, start=bench.level, end=0.0)
     for name in ("flag", "Disarm", "Stop"):
@@ -132,8 +132,8 @@ async def skipped_endings(bench: Bench) -> None:
 @driving(_PLACE)
 async def interrupted_endings(bench: Bench) -> None:
     """It ends an ending amid which a longer ramp begins when it would have ended."""
-    step = _step(bench)
-    await _load(bench, 2, 1.0)
+    step = step_of(bench)
+    await load(bench, 2, 1.0)
     await bench.arm()
     await bench.apply(bench.tones(1.0, ending=2))
     ended = await bench.play()
@@ -147,23 +147,23 @@ async def interrupted_endings(bench: Bench) -> None:
 @driving(_PLACE)
 async def loaded_while_playing(bench: Bench) -> None:
     """It plays a set by the envelopes of its Stage, whatever is loaded afterwards."""
-    step, level = _step(bench), bench.level
-    await _load(bench, 1, 0.5)
-    await _load(bench, 2, 0.5)
+    step, level = step_of(bench), bench.level
+    await load(bench, 1, 0.5)
+    await load(bench, 2, 0.5)
     bench.require(Feature.STAGING)
     await bench.arm()
     staged = bench.tones(1.0, onset=1, ending=2)
     await bench.amplifier.stage(staged)
-    await _load(bench, 1, 1.0)
+    await load(bench, 1, 1.0)
     _, when = await bench.timed(bench.amplifier.commit(staged.token))
-    await _load(bench, 2, 1.0)
-    rising = _along(step, 0.0, 0.5 * level, level)
+    await load(bench, 2, 1.0)
+    rising = along(step, 0.0, 0.5 * level, level)
     samples = await samples_until(bench, when.latest + 2.2 * step)
     expect_curve(
         bench, samples, rising, commit=when, lasts=2 * step, what="of an onset loaded before"
     )
     when = await bench.play()
-    falling = _along(step, level, 0.5 * level, 0.0)
+    falling = along(step, level, 0.5 * level, 0.0)
     samples = await samples_until(bench, when.latest + 2.2 * step)
     expect_curve(
         bench, samples, falling, commit=when, lasts=2 * step, what="of an ending loaded before"
@@ -173,14 +173,14 @@ async def loaded_while_playing(bench: Bench) -> None:
 @driving(_PLACE)
 async def kept_phase_onset(bench: Bench) -> None:
     """It begins an onset with keep phase at the present amplitude, and without at zero."""
-    step, level = _step(bench), bench.level
-    await _load(bench, 1, 0.5)
+    step, level = step_of(bench), bench.level
+    await load(bench, 1, 0.5)
     for keep_phase, start in ((True, level), (False, 0.0)):
         await bench.arm()
         await bench.play(1.0)
         requested = bench.tones(1.0, onset=1, keep_phase=keep_phase, ramp=0.0)
         when = await bench.apply(requested)
-        curve = _along(step, start, 0.5 * level, level)
+        curve = along(step, start, 0.5 * level, level)
         samples = await samples_until(bench, when.latest + 2.2 * step)
         after = [one for one in samples if one.when.earliest > when.latest + 0.002]
         expect_curve(bench, after, curve, commit=when, lasts=2 * step, what="of an onset")
@@ -191,8 +191,8 @@ async def kept_phase_onset(bench: Bench) -> None:
 async def watchdog_skips_endings(bench: Bench) -> None:
     """It skips endings when the watchdog trips."""
     bench.require(Feature.WATCHDOG)
-    _step(bench)
-    await _load(bench, 2, 1.0)
+    step_of(bench)
+    await load(bench, 2, 1.0)
     await bench.arm(bench.can.watchdog_min)
     await bench.apply(bench.tones(1.0, ending=2))
     what = "silence by the watchdog, of a set with an ending"
@@ -204,13 +204,13 @@ async def watchdog_skips_endings(bench: Bench) -> None:
 @driving(_PLACE)
 async def missing_envelopes(bench: Bench) -> None:
     """It refuses a set that refers to an empty slot; the playing set stays."""
-    _step(bench)
+    step_of(bench)
     slot = bench.can.envelope_slots
-    await _load(bench, slot, 0.5)
+    await load(bench, slot, 0.5)
     await bench.arm()
     await bench.play(1.0)
     shaped = {"onset": bench.tones(1.0, onset=slot), "ending": bench.tones(1.0, ending=slot)}
-    await _load(bench, slot)
+    await load(bench, slot)
     for name, requested in shaped.items():
         await bench.refused(bench.amplifier.apply(requested), what=f"an {name} from an empty slot")
         await bench.refused(bench.amplifier.stage(requested), what=f"an {name} from an empty slot")

@@ -37,6 +37,7 @@ from drivers.protocol.messages import (
     Status,
 )
 from planted_bugs import Plant, both, replaced, with_voices, wrapped
+from planted_end_faults import END_FAULTS
 from planted_sensor_faults import SENSOR_FAULTS
 from sim.amplifier import amplifier as simulated
 from sim.amplifier import channels as channel_outputs
@@ -1296,6 +1297,10 @@ FAULTS: dict[str, PlantedFault] = {
         ),
     ),
     **{name: PlantedFault(fault.check, fault.plant) for name, fault in SENSOR_FAULTS.items()},
+    **{
+        name: PlantedFault(fault.check, fault.plant, wires=fault.wires or ALL)
+        for name, fault in END_FAULTS.items()
+    },
 }
 """Faults that the wire shows, by what is wrong."""
 

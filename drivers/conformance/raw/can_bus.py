@@ -30,7 +30,13 @@ class CanRaw(RawLine):
     page = "wire-can.md"
 
     def __init__(self, url: str) -> None:
+        self.url = url
         self._url = CanUrl.parse(url)
+
+    @property
+    def address(self) -> int:
+        """See `RawLine`."""
+        return self._url.node
 
     async def send(self, request: RawRequest) -> str:
         """See `RawLine`."""

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from drivers.protocol.messages import Apply, Broadcast, Ping, Stage
+from drivers.protocol.messages import Apply, Broadcast, Ping, SetAddress, Stage
 
 NO_REPLY = "no reply"
 REPLY = "a reply"
@@ -29,10 +29,16 @@ class RawRequest:
 class RawLine(ABC):
     """The line of an open amplifier, used between the exchanges of its backend.
 
-    page: that defines its wire.
+    page: that defines its wire; url, address: of the amplifier.
     """
 
     page: ClassVar[str]
+    url: str
+
+    @property
+    @abstractmethod
+    def address(self) -> int:
+        """Its address on the line."""
 
     @abstractmethod
     async def send(self, request: RawRequest) -> str:
@@ -56,6 +62,13 @@ class RawLine(ABC):
 
     def in_any_order(self, stage: Stage) -> Sequence[RawRequest]:
         """Make a valid request of several frames in other orders; none if it is one frame."""
+        return ()
+
+    def address_requests(self, own: SetAddress, other: SetAddress) -> Sequence[RawRequest]:
+        """Make SetAddress that do nothing, of its serial number to its own address and of another.
+
+        None where an address is set by broadcasts alone.
+        """
         return ()
 
     @abstractmethod

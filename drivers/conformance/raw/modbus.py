@@ -42,9 +42,15 @@ class ModbusRaw(RawLine):
     page = "wire-modbus.md"
 
     def __init__(self, url: str) -> None:
+        self.url = url
         self._url = ModbusUrl.parse(url)
         self._data = bytearray()
         self._came = asyncio.Event()
+
+    @property
+    def address(self) -> int:
+        """See `RawLine`."""
+        return self._url.unit
 
     async def send(self, request: RawRequest) -> str:
         """See `RawLine`."""

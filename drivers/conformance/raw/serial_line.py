@@ -21,6 +21,7 @@ from drivers.protocol.messages import (
     NakCode,
     Ping,
     Request,
+    SetAddress,
     Stop,
 )
 
@@ -40,6 +41,7 @@ class SerialRaw(RawLine):
     page = "wire-protocol.md"
 
     def __init__(self, url: str) -> None:
+        self.url = url
         self._url = SerialUrl.parse(url)
         self._replies: list[Frame] = []
         self._reader = FrameReader()
@@ -155,6 +157,18 @@ class SerialRaw(RawLine):
         return [
             self._made(f"a broadcast {type(one).__name__}", self._to_all(one), NO_REPLY)
             for one in (ping, apply, GetStatus())
+        ]
+
+    @property
+    def address(self) -> int:
+        """See `RawLine`."""
+        return self._url.address
+
+    def address_requests(self, own: SetAddress, other: SetAddress) -> Sequence[RawRequest]:
+        """See `RawLine`."""
+        return [
+            self._made("SetAddress of its own serial number", self._frame(own), REPLY),
+            self._made("SetAddress of another serial number", self._frame(other), NO_REPLY),
         ]
 
     def stop_out_of_range(self) -> RawRequest:

@@ -10,7 +10,13 @@ from model.rig.rig import Rig
 from planted_faults import ALL
 from witness_config import witness_of_one
 
-INVALID = ("invalid_frames", "invalid_frames_do_not_feed", "tolerated_frames", "broadcasts")
+INVALID = (
+    "invalid_frames",
+    "invalid_frames_do_not_feed",
+    "tolerated_frames",
+    "broadcasts",
+    "addresses",
+)
 KINDS = {
     "serial": "serial",
     "modbus+tcp": "modbus-tcp",

@@ -28,15 +28,20 @@ def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
     before, after = table.plate, rig.plate
     names = [era.name for era in table.eras]
     if [era.name for era in rig.eras] != names:
-        raise InputError(f"ERAs must be {', '.join(names)}, those of the table; build it again")
+        raise InputError(
+            f"ERAs must be {', '.join(names)}, those of the table, got "
+            f"{', '.join(era.name for era in rig.eras)}; build it again"
+        )
     fixed = ("length", "width", "air_gap")
     material = ("rho", "nu")
-    if any(getattr(before, key) != getattr(after, key) for key in fixed) or any(
-        getattr(before.material, key) != getattr(after.material, key) for key in material
-    ):
-        raise InputError(
-            "plate must have the sides, density and air gap of the table's; build it again"
-        )
+    parts: list[tuple[object, object, str]] = [(before, after, key) for key in fixed]
+    parts += [(before.material, after.material, key) for key in material]
+    for own, other, key in parts:
+        if getattr(own, key) != getattr(other, key):
+            raise InputError(
+                f"plate.{key} must be {getattr(own, key)}, that of the table, got "
+                f"{getattr(other, key)}; build it again"
+            )
     thicker = after.thickness / before.thickness
     faster = thicker * np.sqrt(after.material.E / before.material.E)
     if max(abs(thicker - 1), abs(faster - 1)) > _MAX_SCALE:

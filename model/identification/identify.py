@@ -9,6 +9,7 @@ from model.identification.advice import unknowns
 from model.identification.held_out import HeldOut, hold_out
 from model.identification.identified_rig import rig_with
 from model.identification.measurement import Measurement
+from model.identification.plausible import check_gains
 from model.identification.posterior import Posterior
 from model.identification.priors import Priors
 from model.identification.stages import Fitted, Setting, chi2, fit_in_stages
@@ -31,7 +32,8 @@ _LEAST_VALUES = 16
 class Identification:
     """A rig as its responses show it.
 
-    before: the rig as written; rig: with identified values and their uncertainty; values: of the
+    before: the rig as written; rig: with identified values and, where the model explains the
+    measurement, their uncertainty; values: of the
     parameters, gains of sensors among them; posterior: their distribution; chi2: squared residuals
     per value; held_out: how well unseen tones are predicted, None where there are too few;
     seed: of the draws.
@@ -83,7 +85,8 @@ def identify(
     """Identify a rig by a measurement on it; the same for the same data and seed.
 
     drive_gain, drive_phase_deg: how far drives repeat. Raises InputError for a plate that was not
-    linear or has changed during the measurement, and where it leaves unknown what answers depend
+    linear or has changed during the measurement, for gains that no drive or sensor has (another
+    unit, a wrong sign), and where it leaves unknown what answers depend
     on, with the tone and the sensor that would show it.
     """
     _check(rig, measurement)
@@ -91,12 +94,17 @@ def identify(
         rig, solved_for(rig, float(measurement.tones[-1])), Priors.of(rig.uncertainty), measurement
     )
     fitted = fit_in_stages(setting)
+    values = Values.of(rig, fitted.space, fitted.best.x)
+    is_explained = chi2(fitted) <= MAX_CHI2
+    if is_explained:
+        check_gains(rig, measurement, values, setting.priors)
     posterior = Posterior.of(fitted.space, fitted.best)
     unknown = unknowns(setting, fitted, posterior)
     if unknown:
         raise InputError("measurement must show more: " + "; ".join(map(str, unknown)))
-    values = Values.of(rig, fitted.space, fitted.best.x)
-    uncertainty = posterior.uncertainty(rig.uncertainty, gain=drive_gain, phase_deg=drive_phase_deg)
+    uncertainty = rig.uncertainty
+    if is_explained:
+        uncertainty = posterior.uncertainty(uncertainty, gain=drive_gain, phase_deg=drive_phase_deg)
     return Identification(
         rig,
         rig_with(rig, values, uncertainty),

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from model.arrays import FloatArray
 from model.identification.priors import Priors
 from model.rig.rig import Rig
+from model.structure.plate import MAX_LOSS_EXPONENT
 
 MODE_SHIFTS = 12
 """Of so many of the lowest elastic modes eigenvalue and loss factor may differ from the model's."""
@@ -90,7 +91,9 @@ def space_of(
     add("damping_each", [f"damping {name}" for name in eras], each)
     lossy = plate.loss_factor > 0
     add("loss", ["loss factor"], priors.loss * lossy)
-    add("loss_exponent", ["loss exponent"], priors.loss_exponent * lossy)
+    exponents = np.array([-MAX_LOSS_EXPONENT, MAX_LOSS_EXPONENT]) - plate.loss_exponent
+    low, high = exponents / (priors.loss_exponent or 1.0)
+    add("loss_exponent", ["loss exponent"], priors.loss_exponent * lossy, lower=low, upper=high)
     add("gain", [f"gain {name}" for name in eras], priors.gain)
     add("phase", [f"phase {name}" for name in eras], priors.phase)
     add("sensor_gain", [f"gain of sensor {name}" for name in sensors], priors.sensor_gain)

@@ -8,6 +8,8 @@ from model.structure.air_gap import AirGap
 from model.structure.laminate import Laminate
 from model.structure.material import Material
 
+MAX_LOSS_EXPONENT = 2.0
+
 LOSS_FREQUENCY = 150.0
 """Frequency [Hz] at which a plate has its loss factor, where that varies."""
 
@@ -44,9 +46,10 @@ class Plate:
             raise InputError(
                 f"plate: loss_factor must be between 0 and 1, got {self.loss_factor} (0.01 is 1 %)"
             )
-        if not abs(self.loss_exponent) <= 2:  # False for NaN
+        if not abs(self.loss_exponent) <= MAX_LOSS_EXPONENT:  # False for NaN
             raise InputError(
-                f"plate: loss_exponent must be between -2 and 2, got {self.loss_exponent}"
+                f"plate: loss_exponent must be between -{MAX_LOSS_EXPONENT:g} and "
+                f"{MAX_LOSS_EXPONENT:g}, got {self.loss_exponent}"
             )
         # A file gives lists; only tuples can be compared and hashed with the rest.
         deviations = tuple((float(a), float(b)) for a, b in self.mode_deviations)

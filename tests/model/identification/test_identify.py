@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.identification.hidden import Hidden, draw
+from model.arrays import FloatArray
 from model.config.document import read_document
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
@@ -66,6 +67,18 @@ def test_identified_rig_states_less_uncertainty_but_for_fingers(found: Identific
     assert after.stiffness < before.stiffness / 5
     assert 0.01 <= after.gain < before.gain
     assert after.fingertip == before.fingertip
+
+
+@pytest.mark.parametrize(
+    "factors", [np.full(4, 1 / 9.80665), np.full(4, -1.0), np.array([1.0, 1.0, -1.0, 1.0])]
+)
+def test_other_units_and_signs_are_refused(
+    rig: Rig, measurement: Measurement, factors: FloatArray
+) -> None:
+    """In g, all or one sensor upside down: the fit explains each by gains that nothing has."""
+    wrong = replace(measurement, values=measurement.values * factors[measurement.at])
+    with pytest.raises(InputError):
+        identify(rig, wrong)
 
 
 def test_same_data_and_seed_give_the_same_rig_and_draws(

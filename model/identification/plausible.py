@@ -1,0 +1,44 @@
+"""Whether identified gains are those of real drives and sensors.
+
+A response tells only the product of a drive's and a sensor's gain, so that the fit shares an error
+of either among both, and its residuals do not show a wrong unit or sign.
+"""
+
+import math
+
+import numpy as np
+
+from model.arrays import FloatArray
+from model.errors import InputError
+from model.identification.measurement import Measurement
+from model.identification.priors import Priors
+from model.identification.values import Values
+from model.rig.rig import Rig
+
+_STDS = 5.0
+_LEAST_GAIN, _LEAST_PHASE = 0.3, math.radians(20)  # what is allowed at least
+
+
+def check_gains(rig: Rig, measurement: Measurement, values: Values, priors: Priors) -> None:
+    """Raise InputError for gains no drive or sensor has: another unit, a sign, a wrong plug."""
+    drives = [f"drive {era.name}" for era in rig.eras]
+    sensors = [f"sensor {sensor.name}" for sensor in measurement.sensors]
+    wrong = [
+        *_wrong(drives, np.log(values.drive_gains), priors.gain, priors.phase),
+        *_wrong(sensors, np.log(values.sensor_gains), priors.sensor_gain, priors.sensor_phase),
+    ]
+    if wrong:
+        raise InputError(
+            "measurement must be acceleration in m/s² along the drives' motion, got gains of "
+            f"{'; '.join(wrong)}; check unit, sign and plug of each sensor and drive"
+        )
+
+
+def _wrong(names: list[str], logarithms: FloatArray, gain: float, phase: float) -> list[str]:
+    """Those whose complex logarithm of the gain is beyond what is usual, in words."""
+    return [
+        f"{name} {math.exp(one.real):.2f} at {math.degrees(one.imag):.0f}°"
+        for name, one in zip(names, logarithms.tolist(), strict=True)
+        if abs(one.real) > max(_LEAST_GAIN, _STDS * gain)
+        or abs(one.imag) > max(_LEAST_PHASE, _STDS * phase)
+    ]

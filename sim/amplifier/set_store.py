@@ -89,8 +89,15 @@ class SetStore:
                 if slot and slot not in self.slots:
                     raise RefusedSet(NakCode.NO_ENVELOPE, command.channel)
                 if slot:
-                    shapes[command.channel] = self.slots[slot]
+                    shapes[command.channel] = self._within(command.channel, self.slots[slot])
         return PlayableSet(quantised, wanted, onsets, endings)
+
+    def _within(self, channel: int, envelope: Envelope) -> Envelope:
+        """The envelope, whose knots must not exceed the channel's own level."""
+        highest = self._capabilities.limits_of_channels[channel].level_max
+        if any(knot.level > highest for knot in envelope.knots):
+            raise RefusedSet(NakCode.BAD_VALUE, channel)
+        return envelope
 
 
 def _quantised_set(wanted: CommandSet, capabilities: Capabilities) -> CommandSet:

@@ -1,6 +1,7 @@
 """Envelopes in the simulated amplifier, against their definition and against the model's own."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from drivers.protocol.messages import (
     Achieved,
     Apply,
     Arm,
+    ChannelLimits,
     Commit,
     Disarm,
     Loaded,
@@ -209,3 +211,18 @@ def test_load_envelope_refuses_invalid_values(envelope: Envelope) -> None:
     assert amplifier.handle(LoadEnvelope(envelope), 1.0) == Nak(NakCode.BAD_VALUE)
     amplifier.handle(Apply(playing(1, 0.8, onset=1)), 1.0)
     assert level(amplifier, 1.005) == pytest.approx(0.2)
+
+
+def test_knot_above_its_channels_level_is_refused() -> None:
+    """The set is refused with the channel, by the wire page; on another it plays."""
+    amplifier = SimulatedAmplifier("main", channels=2)
+    full, half = ChannelLimits(20.0, 600.0, 1.0), ChannelLimits(20.0, 600.0, 0.5)
+    can = replace(amplifier.capabilities, channel_limits=(full, half))
+    amplifier.capabilities = amplifier._sets._capabilities = can
+    amplifier.handle(Arm(2.0), 0.0)
+    amplifier.handle(LoadEnvelope(Envelope(1, 0.005, (Knot(0.6, 0.0),))), 0.0)
+    for channel, refusal in ((1, Nak(NakCode.BAD_VALUE, 1)), (0, None)):
+        command = DriveCommand(channel, 110.0, 0.2, onset=1)
+        wanted = CommandSet(1, (command,), ramp=0.0, valid_for=0.0)
+        reply = amplifier.handle(Apply(wanted), 0.0)
+        assert reply == refusal if refusal else isinstance(reply, Achieved)

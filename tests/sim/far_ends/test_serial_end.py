@@ -105,6 +105,11 @@ async def test_serial_end_skips_noise(end: SerialEnd, host: Host) -> None:
         (PROTOCOL.types["arm"], b"\xff\xff\x09\x00", NakCode.BAD_VALUE),
         (PROTOCOL.types["commit"], b"\x09\x00\x00\x00", NakCode.BAD_TOKEN),
         (29, b"", NakCode.UNKNOWN_TYPE),
+        (PROTOCOL.types["stop"], b"\x05", NakCode.BAD_LENGTH),
+        (PROTOCOL.types["stop"], b"\x05\x00\x00", NakCode.BAD_LENGTH),
+        (PROTOCOL.types["load_envelope"], b"\x01\x00\x00\x00", NakCode.BAD_VALUE),
+        (PROTOCOL.types["get_sensors"], b"\x20", NakCode.BAD_VALUE),
+        (PROTOCOL.types["set_address"], b"\x05\x04A-1", NakCode.BAD_LENGTH),
     ],
 )
 async def test_serial_end_refuses_invalid_payloads(

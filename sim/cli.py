@@ -10,6 +10,7 @@ import typer
 from drivers.errors import LinkError
 from model.commands.options import ExactOption, SeedOption, seed_of_plate
 from model.errors import InputError
+from sim.soft_amp_cli import soft_amp
 from sim.witness_cli import witness
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(pretty_exceptions_enable=False)
 app.command()(witness)
+app.command("soft-amp")(soft_amp)
 
 EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2, LinkError: 3}
 """Exit status by class of error."""

@@ -14,7 +14,7 @@
 struct set {
     uint16_t token, ramp, valid_for;
     uint8_t count;
-    struct command commands[CHANNELS];
+    struct command commands[CHANNELS_MAX];
 };
 
 struct shapes { // the envelopes of one command, copied when it is staged
@@ -58,10 +58,10 @@ struct amplifier {
     struct set active, staged;        // token 0: none
     uint32_t valid_left, staged_left; // samples until they end; 0: nothing waits
     const struct set *answered;      // the set staged or played last
-    struct shapes staged_shapes[CHANNELS];
+    struct shapes staged_shapes[CHANNELS_MAX];
     struct envelope slots[ENVELOPE_SLOTS];
 
-    struct channel channels[CHANNELS];
+    struct channel channels[CHANNELS_MAX];
     struct fault_record faults[FAULTS_KEPT]; // newest first
     uint8_t fault_count;
 };
@@ -69,7 +69,16 @@ struct amplifier {
 void amplifier_init(struct amplifier *amplifier, const char *serial_number);
 
 // Make the next sample of every channel, and let one sample's time pass.
-void amplifier_sample(struct amplifier *amplifier, int16_t samples[CHANNELS]);
+void amplifier_sample(struct amplifier *amplifier, int16_t samples[CHANNELS_MAX]);
+
+// The same in units of 2^-30 of full stroke, whatever SQUARE_LAW.
+void amplifier_forces(struct amplifier *amplifier, int32_t forces[CHANNELS_MAX]);
+
+// Let time pass without samples, for a converter that was late: what waits ends sooner by as much.
+void amplifier_late(struct amplifier *amplifier, uint32_t samples);
+
+// Enter the fault reaction, whether the high voltage is on or not.
+void amplifier_fail(struct amplifier *amplifier, enum fault fault, uint8_t channel);
 
 // Hand over what the board measures; an open interlock or another cause of a fault acts at once.
 void amplifier_measured(struct amplifier *amplifier, struct measured measured);

@@ -15,7 +15,7 @@ enum line { LINE_SERIAL, LINE_MODBUS, LINE_CAN };
 // Samples that are due since the last call: the one clock, which should be that of the converter.
 uint32_t board_samples_due(void);
 // Hand the next sample of every channel to the converter; 32767 is full stroke.
-void board_output(const int16_t samples[CHANNELS]);
+void board_output(const int16_t samples[CHANNELS_MAX]);
 // Go on sending; then sleep until a sample is due or a byte has arrived.
 void board_wait(void);
 

@@ -14,10 +14,10 @@ struct capability {
 
 #define CAPABILITY_COUNT 16
 #define FEATURES_SUB 15 // where FEATURES is in this list, from 1
-extern const struct capability CAPABILITIES[CAPABILITY_COUNT];
+struct capability capability_at(unsigned number); // from 0
 
 // Of each channel, here the same for all: lowest and highest frequency, highest level.
 #define LIMIT_COUNT 3
-extern const uint16_t CHANNEL_LIMITS[LIMIT_COUNT];
+uint16_t channel_limit(unsigned number); // from 0
 
 #endif

@@ -140,12 +140,19 @@ static int16_t voltage_of(int32_t force)
     return (int16_t)square_root((uint64_t)(force + INT16_MAX) * INT16_MAX / 2);
 }
 
-int16_t channel_sample(struct channel *channel)
+int32_t channel_force(struct channel *channel)
 {
     int64_t sum = 0;
     for (uint8_t i = 0; i < VOICES; i++)
         sum += voice_sample(&channel->voices[i]);
-    int32_t value = (int32_t)((sum + (1 << 14)) >> 15);
+    if (sum > ONE)
+        return ONE;
+    return sum < -ONE ? -ONE : (int32_t)sum;
+}
+
+int16_t sample_of(int32_t force)
+{
+    int32_t value = (force + (1 << 14)) >> 15;
     if (value > INT16_MAX)
         value = INT16_MAX;
     if (value < -INT16_MAX)

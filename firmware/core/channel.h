@@ -41,8 +41,11 @@ bool channel_is_sounding(const struct channel *channel);
 // Present level: the sum of its voices, at least one step while anything sounds.
 uint16_t channel_level(const struct channel *channel);
 
-// Value at this sample, 32767 being full stroke, or full voltage with SQUARE_LAW; then move on by one
-// sample.
-int16_t channel_sample(struct channel *channel);
+// Sum of the voices at this sample in units of 2^-30 of full stroke, within the full one; then move on
+// by one sample.
+int32_t channel_force(struct channel *channel);
+
+// A force as a sample, 32767 being full stroke, or full voltage with SQUARE_LAW.
+int16_t sample_of(int32_t force);
 
 #endif

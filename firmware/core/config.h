@@ -8,11 +8,17 @@
 
 #include "protocol.h"
 
+// A product may bring a file of its own instead: -DCONFIG_FILE='"its_config.h"'.
+#ifdef CONFIG_FILE
+#include CONFIG_FILE
+#else
+
 #define VENDOR "ERA haptics"
 #define PRODUCT "Example firmware"
 #define FIRMWARE_VERSION "1.0"
 
 #define CHANNELS 4
+#define CHANNELS_MAX CHANNELS // a constant, for memory
 #define SAMPLE_RATE 16000 // per second and channel; a multiple of 1000
 #define SAMPLES_PER_MS (SAMPLE_RATE / 1000)
 
@@ -36,5 +42,7 @@
 #define ENVELOPE_STEP_MAX 1000
 
 #define FAULTS_KEPT 8
+
+#endif
 
 #endif

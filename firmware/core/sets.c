@@ -97,7 +97,7 @@ static struct verdict check_room(const struct amplifier *amplifier, const struct
 // Play a set that was checked; shapes: of each of its commands if it was staged, else null.
 static void play(struct amplifier *amplifier, const struct set *set, const struct shapes *shapes)
 {
-    bool has_command[CHANNELS] = {false};
+    bool has_command[CHANNELS_MAX] = {false};
     for (unsigned i = 0; i < set->count; i++) {
         const struct command *command = &set->commands[i];
         const struct envelope *onset = slot(amplifier, command->onset);

@@ -67,7 +67,7 @@ void settle(struct amplifier *amplifier)
         amplifier->state = FAULT;
 }
 
-static void fail(struct amplifier *amplifier, enum fault fault, uint8_t channel)
+void amplifier_fail(struct amplifier *amplifier, enum fault fault, uint8_t channel)
 {
     leave_operation(amplifier, FAULT_REACTION_ACTIVE);
     amplifier->fault = fault;
@@ -90,9 +90,9 @@ void amplifier_measured(struct amplifier *amplifier, struct measured measured)
     if (!amplifier->high_voltage || amplifier->fault != FAULT_NONE)
         return;
     if (measured.is_interlock_open)
-        fail(amplifier, FAULT_INTERLOCK, NO_CHANNEL);
+        amplifier_fail(amplifier, FAULT_INTERLOCK, NO_CHANNEL);
     else if (measured.cause != FAULT_NONE)
-        fail(amplifier, measured.cause, measured.channel);
+        amplifier_fail(amplifier, measured.cause, measured.channel);
 }
 
 static bool is_cause_gone(const struct amplifier *amplifier)
@@ -178,12 +178,10 @@ struct verdict amplifier_ping(struct amplifier *amplifier, uint16_t session)
     return ACCEPTED;
 }
 
-void amplifier_sample(struct amplifier *amplifier, int16_t samples[CHANNELS])
+void amplifier_forces(struct amplifier *amplifier, int32_t forces[CHANNELS_MAX])
 {
     for (unsigned i = 0; i < CHANNELS; i++)
-        samples[i] = channel_sample(&amplifier->channels[i]);
-    if (SQUARE_LAW && !amplifier->high_voltage) // no bias either
-        memset(samples, 0, CHANNELS * sizeof samples[0]);
+        forces[i] = channel_force(&amplifier->channels[i]);
     amplifier->now++;
     settle(amplifier);
     if (amplifier->state != OPERATION_ENABLED)
@@ -191,7 +189,29 @@ void amplifier_sample(struct amplifier *amplifier, int16_t samples[CHANNELS])
     sets_sample(amplifier);
     amplifier->watchdog_left--;
     if (amplifier->watchdog_left == 0)
-        fail(amplifier, FAULT_WATCHDOG, NO_CHANNEL);
+        amplifier_fail(amplifier, FAULT_WATCHDOG, NO_CHANNEL);
+}
+
+void amplifier_sample(struct amplifier *amplifier, int16_t samples[CHANNELS_MAX])
+{
+    int32_t forces[CHANNELS_MAX];
+    bool is_on = amplifier->high_voltage || !SQUARE_LAW; // without it no bias either
+    amplifier_forces(amplifier, forces);
+    for (unsigned i = 0; i < CHANNELS; i++)
+        samples[i] = is_on ? sample_of(forces[i]) : 0;
+}
+
+static void shorten(uint32_t *left, uint32_t samples)
+{
+    if (*left > 0) // the last one ends with the next sample
+        *left = *left > samples ? *left - samples : 1;
+}
+
+void amplifier_late(struct amplifier *amplifier, uint32_t samples)
+{
+    shorten(&amplifier->watchdog_left, samples);
+    shorten(&amplifier->valid_left, samples);
+    shorten(&amplifier->staged_left, samples);
 }
 
 uint8_t amplifier_flags(const struct amplifier *amplifier)

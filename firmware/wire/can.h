@@ -27,8 +27,8 @@ struct can_collection {
     uint64_t since; // sample of its first frame
     uint64_t order;
     uint8_t commands_here, slots_here; // a bit for each channel; for each group of four
-    uint64_t commands[CHANNELS];
-    uint64_t slots[(CHANNELS + 3) / 4];
+    uint64_t commands[CHANNELS_MAX];
+    uint64_t slots[(CHANNELS_MAX + 3) / 4];
 };
 
 #define SDO_BUFFER 140

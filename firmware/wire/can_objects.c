@@ -68,12 +68,12 @@ static void read_identity(struct writer *writer, const struct amplifier *amplifi
 
 static void read_capability(struct writer *writer, uint8_t sub)
 {
-    const struct capability *capability = &CAPABILITIES[sub - 1];
+    struct capability capability = capability_at(sub - 1u);
     uint16_t events = sub == FEATURES_SUB ? FEATURE_EVENTS : 0; // CAN always sends them
-    if (capability->size == 1)
-        write_u8(writer, (uint8_t)capability->value);
+    if (capability.size == 1)
+        write_u8(writer, (uint8_t)capability.value);
     else
-        write_u16(writer, capability->value | events);
+        write_u16(writer, capability.value | events);
 }
 
 static void read_status(struct writer *writer, const struct amplifier *amplifier, uint8_t sub)
@@ -164,7 +164,7 @@ static uint32_t read_value(struct writer *writer, const struct can_node *node, u
     case 0x2009:
     case 0x200A:
     case 0x200B:
-        write_u16(writer, CHANNEL_LIMITS[index - 0x2009]);
+        write_u16(writer, channel_limit(index - 0x2009u));
         return 0;
     case 0x2020:
         write_u64(writer, collection->commands[sub - 1]);

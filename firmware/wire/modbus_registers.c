@@ -53,8 +53,9 @@ static uint16_t capabilities_field(const struct modbus *modbus, uint16_t field)
 {
     (void)modbus;
     if (field < CAPABILITY_COUNT)
-        return CAPABILITIES[field].value;
-    return CHANNEL_LIMITS[(field - CAPABILITY_COUNT) % LIMIT_COUNT];
+        return capability_at(field).value;
+    field = (uint16_t)(field - CAPABILITY_COUNT);
+    return field < CHANNELS * LIMIT_COUNT ? channel_limit(field % LIMIT_COUNT) : 0;
 }
 
 static uint16_t identity_field(const struct modbus *modbus, uint16_t field)
@@ -140,11 +141,11 @@ static const struct block {
     {HEARTBEAT_AT, 1, heartbeat_field},
     {SET_AT, SET_FIELDS, set_field},
     {ENVELOPE_AT, ENVELOPE_FIELDS, envelope_field},
-    {STATUS_AT, 9 + CHANNELS, status_field},
+    {STATUS_AT, 9 + CHANNELS_MAX, status_field},
     {REFUSAL_AT, 3, refusal_field},
-    {CAPABILITIES_AT, CAPABILITY_COUNT + CHANNELS * LIMIT_COUNT, capabilities_field},
+    {CAPABILITIES_AT, CAPABILITY_COUNT + CHANNELS_MAX * LIMIT_COUNT, capabilities_field},
     {IDENTITY_AT, 1 + 4 * TEXT_REGISTERS, identity_field},
-    {ACHIEVED_AT, 4 + CHANNELS * CHANNEL_REGISTERS, achieved_field},
+    {ACHIEVED_AT, 4 + CHANNELS_MAX * CHANNEL_REGISTERS, achieved_field},
     {FAULTS_AT, 1 + FAULTS_KEPT * FAULT_REGISTERS, faults_field},
 };
 

@@ -31,13 +31,14 @@ static void write_identity(struct writer *writer, const struct amplifier *amplif
 static void write_capabilities(struct writer *writer)
 {
     for (unsigned i = 0; i < CAPABILITY_COUNT; i++) {
-        if (CAPABILITIES[i].size == 1)
-            write_u8(writer, (uint8_t)CAPABILITIES[i].value);
+        struct capability capability = capability_at(i);
+        if (capability.size == 1)
+            write_u8(writer, (uint8_t)capability.value);
         else
-            write_u16(writer, CAPABILITIES[i].value);
+            write_u16(writer, capability.value);
     }
     for (unsigned i = 0; i < CHANNELS * LIMIT_COUNT; i++)
-        write_u16(writer, CHANNEL_LIMITS[i % LIMIT_COUNT]);
+        write_u16(writer, channel_limit(i % LIMIT_COUNT));
 }
 
 static void write_status(struct writer *writer, const struct amplifier *amplifier)

@@ -36,6 +36,7 @@ PROGRAMS = {
         "jumping_clock.py",
         "live_demonstration.py",
         "patient_daemon.py",
+        "steady_host.py",
     )
 }
 """Programs of the tests that do with `era` what no user can."""

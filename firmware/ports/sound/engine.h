@@ -1,0 +1,73 @@
+// SPDX-License-Identifier: MIT
+//
+// An amplifier made of software: the core, rendered by the callback of a sound device.
+//
+// Whoever renders owns the amplifiers: the sound thread while a stream runs, else the thread of the
+// lines (lines.c), which makes samples that nobody hears, in fault. Requests reach them through
+// a ring and take effect with the next block; replies come back through another. Nothing waits.
+//
+// More than 16 channels are two amplifiers of half as many, at addresses 1 and 2.
+
+#ifndef ENGINE_H
+#define ENGINE_H
+
+#include "amplifier.h"
+#include "counters.h"
+#include "modbus.h"
+#include "ring.h"
+#include "serial.h"
+
+#define AMPLIFIERS_MAX 2
+#define CONNECTIONS 4 // hosts at once
+#define GAPS_MAX 64   // that can be tolerated within a second
+
+enum law { LAW_LINEAR, LAW_SQUARE };
+enum protocol { SERIAL_PROTOCOL, MODBUS_PROTOCOL };
+
+struct sound_settings {
+    uint32_t rate, channels;    // of all amplifiers
+    uint32_t law, protocol;     // enum law, enum protocol
+    double limit;               // largest sample, 0..1
+    uint32_t max_gaps;          // within a second; more are a fault
+    uint32_t is_recovering;     // begin in fault, since a device was lost before
+    const char *serial_number;  // at most 30 bytes
+};
+
+struct engine {
+    struct sound_settings settings;
+    struct counters *counters;
+    unsigned amplifiers;
+    struct amplifier amplifier[AMPLIFIERS_MAX];
+    char serial_numbers[AMPLIFIERS_MAX][33];
+    struct serial serial[CONNECTIONS][AMPLIFIERS_MAX];
+    struct modbus modbus[AMPLIFIERS_MAX];
+    struct ring requests, replies;
+    int wake[2];                 // pipe to the thread of the lines: a reply waits
+    uint32_t risen[AMPLIFIERS_MAX]; // samples of the soft start
+    double clock_ahead;          // samples by which time is ahead of the samples made
+    uint64_t rendered_at;        // us, 0: never
+    uint64_t gaps_at[GAPS_MAX];  // frames at the last ones
+    uint32_t gap_count;
+    uint32_t wants_stream, has_stream; // handing over to the sound thread and that it is done
+    uint32_t is_ending;          // fall silent, the stream ends
+};
+
+// Where the samples of a channel go.
+struct output {
+    float *samples;
+    uint32_t stride;
+};
+
+// Set up; return 0, or -1 where there is no pipe. The counters are to be zero.
+int engine_init(struct engine *engine, const struct sound_settings *settings,
+                struct counters *counters);
+
+// Carry out requests, then make the next frames of every channel.
+void engine_render(struct engine *engine, const struct output outputs[], uint32_t frames);
+
+// Count a hole in the sample clock before this block.
+void engine_gap(struct engine *engine);
+
+uint64_t engine_microseconds(void);
+
+#endif

@@ -1,0 +1,205 @@
+// SPDX-License-Identifier: MIT
+
+#define _XOPEN_SOURCE 700
+
+#include "lines.h"
+
+#include <errno.h>
+#include <fcntl.h>
+#include <netinet/in.h>
+#include <netinet/tcp.h>
+#include <poll.h>
+#include <pthread.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <unistd.h>
+
+#define PRIORITY 4     // SCHED_RR, below that of sound threads
+#define PIECE 250      // bytes of the serial protocol in a record
+#define HEADER 7       // of Modbus TCP
+#define FRAME_MAX (HEADER + MODBUS_PDU_MAX)
+#define WAIT 100       // ms
+#define SILENT_RATE 1  // ms between samples that nobody hears
+#define WATCHED (CONNECTIONS + 3)
+
+static struct line {
+    int connection; // -1: none
+    uint32_t generation;
+    uint8_t received[FRAME_MAX];
+    uint16_t length;
+} lines[CONNECTIONS];
+
+static struct engine *engine;
+static struct lines_settings settings;
+static uint64_t silent_since; // us
+static uint64_t silent_samples;
+
+static bool pass_on(struct line *line, const uint8_t *bytes, uint16_t length)
+{
+    struct record *record = ring_free(&engine->requests);
+    if (record == NULL)
+        return false;
+    record->connection = (uint8_t)(line - lines);
+    record->generation = line->generation;
+    record->length = length;
+    memcpy(record->bytes, bytes, length);
+    ring_push(&engine->requests);
+    return true;
+}
+
+static void open_host(struct line *line, int connection)
+{
+    line->connection = connection;
+    line->generation++;
+    line->length = 0;
+    pass_on(line, line->received, 0); // there is room: hosts are accepted only then
+}
+
+static void close_host(struct line *line)
+{
+    close(line->connection);
+    line->connection = -1;
+}
+
+// Pass on the whole frames of Modbus TCP. What is no frame is discarded with all that came with it.
+static void take_frames(struct line *line)
+{
+    while (line->length >= HEADER) {
+        uint16_t following = (uint16_t)(line->received[4] << 8 | line->received[5]);
+        uint16_t size = (uint16_t)(6 + following);
+        if (line->received[2] != 0 || line->received[3] != 0 || following < 2 ||
+            following > MODBUS_PDU_MAX + 1) {
+            line->length = 0;
+            return;
+        }
+        if (line->length < size || !pass_on(line, line->received, size))
+            return;
+        line->length = (uint16_t)(line->length - size);
+        memmove(line->received, line->received + size, line->length);
+    }
+}
+
+static void take(struct line *line)
+{
+    bool is_serial = engine->settings.protocol == SERIAL_PROTOCOL;
+    uint16_t room = (uint16_t)((is_serial ? PIECE : FRAME_MAX) - line->length);
+    ssize_t size = 0;
+    if (room > 0) {
+        size = read(line->connection, line->received + line->length, room);
+        if (size < 0 && (errno == EAGAIN || errno == EINTR || line->connection == settings.terminal))
+            return;
+        if (size <= 0) {
+            if (line->connection != settings.terminal)
+                close_host(line);
+            return;
+        }
+        line->length = (uint16_t)(line->length + size);
+    }
+    if (!is_serial)
+        take_frames(line);
+    else if (pass_on(line, line->received, line->length))
+        line->length = 0;
+}
+
+static void accept_host(void)
+{
+    int yes = 1, connection = accept(settings.listening, NULL, NULL);
+    // A serial line has one host, the newest: one that vanished must not keep others out.
+    unsigned places = engine->settings.protocol == SERIAL_PROTOCOL ? 1 : CONNECTIONS;
+    if (connection < 0)
+        return;
+    fcntl(connection, F_SETFL, O_NONBLOCK);
+    setsockopt(connection, IPPROTO_TCP, TCP_NODELAY, &yes, sizeof yes);
+    for (unsigned i = 0; i < places; i++)
+        if (lines[i].connection < 0) {
+            open_host(&lines[i], connection);
+            return;
+        }
+    if (places == 1) {
+        close_host(&lines[0]);
+        open_host(&lines[0], connection);
+    } else {
+        close(connection);
+    }
+}
+
+static void send_replies(void)
+{
+    const struct record *reply;
+    while ((reply = ring_first(&engine->replies)) != NULL) {
+        struct line *line = &lines[reply->connection];
+        bool is_terminal = line->connection == settings.terminal;
+        ssize_t sent = 0;
+        if (line->connection >= 0 && line->generation == reply->generation)
+            sent = is_terminal ? write(line->connection, reply->bytes, reply->length)
+                               : send(line->connection, reply->bytes, reply->length, MSG_NOSIGNAL);
+        (void)sent; // what a full line does not take is lost, as on a wire that nobody reads
+        ring_pop(&engine->replies);
+    }
+}
+
+// Without a stream: samples that nobody hears keep the clock of the amplifiers.
+static void render_silently(void)
+{
+    uint64_t due = (engine_microseconds() - silent_since) * engine->settings.rate / 1000000;
+    uint64_t frames = due - silent_samples;
+    silent_samples = due;
+    if (frames > 0)
+        engine_render(engine, NULL, (uint32_t)(frames < 10000 ? frames : 10000));
+}
+
+static void watch(struct pollfd watched[WATCHED])
+{
+    bool has_room = engine->requests.written - GET(engine->requests.taken) <= RING_SIZE / 2;
+    for (unsigned i = 0; i < CONNECTIONS; i++)
+        watched[i] = (struct pollfd){has_room ? lines[i].connection : -1, POLLIN, 0};
+    watched[CONNECTIONS] = (struct pollfd){has_room ? settings.listening : -1, POLLIN, 0};
+    watched[CONNECTIONS + 1] = (struct pollfd){engine->wake[0], POLLIN, 0};
+    watched[CONNECTIONS + 2] = (struct pollfd){settings.parent, POLLIN, 0};
+    bool is_soon = !has_room || !engine->has_stream;
+    if (poll(watched, WATCHED, is_soon ? SILENT_RATE : WAIT) < 0)
+        for (unsigned i = 0; i < WATCHED; i++)
+            watched[i].revents = 0;
+}
+
+static void *serve_lines(void *ignored)
+{
+    char bytes[64];
+    struct pollfd watched[WATCHED];
+    for (;;) {
+        watch(watched);
+        if (watched[CONNECTIONS + 2].revents != 0)
+            _exit(1); // nobody watches any more
+        while (read(engine->wake[0], bytes, sizeof bytes) > 0)
+            continue;
+        send_replies();
+        for (unsigned i = 0; i < CONNECTIONS; i++)
+            if (watched[i].revents != 0 && lines[i].connection >= 0)
+                take(&lines[i]);
+        if (watched[CONNECTIONS].revents != 0)
+            accept_host();
+        if (!engine->has_stream) {
+            render_silently();
+            if (GET(engine->wants_stream))
+                SET(engine->has_stream, 1);
+        }
+    }
+    return ignored;
+}
+
+int lines_start(struct engine *served, const struct lines_settings *given)
+{
+    pthread_t thread;
+    struct sched_param priority = {.sched_priority = PRIORITY};
+    engine = served;
+    settings = *given;
+    silent_since = engine_microseconds();
+    for (unsigned i = 0; i < CONNECTIONS; i++)
+        lines[i].connection = -1;
+    if (settings.terminal >= 0)
+        open_host(&lines[0], settings.terminal);
+    int problem = pthread_create(&thread, NULL, serve_lines, NULL);
+    if (problem == 0 && pthread_setschedparam(thread, SCHED_RR, &priority) == 0)
+        __atomic_fetch_or(&engine->counters->is_realtime, 2, __ATOMIC_RELEASE);
+    return problem;
+}

@@ -1,0 +1,1 @@
+"""An amplifier made of software: the firmware's core, played by a sound device."""

@@ -1,0 +1,89 @@
+"""What a software amplifier is to do: what the command line hands to the process that plays."""
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from enum import IntEnum
+
+from model.errors import InputError
+
+MAX_CHANNELS = 32
+"""Of two amplifiers; one has at most 16 by the protocol."""
+
+CHANNELS_OF_AMPLIFIER = 16
+
+
+class Law(IntEnum):
+    """How a sample follows from the wanted one; the values are those of `enum law`."""
+
+    LINEAR = 0
+    SQUARE = 1
+
+
+class Protocol(IntEnum):
+    """Of the line; the values are those of `enum protocol`."""
+
+    SERIAL = 0
+    MODBUS = 1
+
+
+@dataclass(frozen=True)
+class Settings:
+    """A software amplifier.
+
+    device: `jack`, `jack:CLIENT`, or a name or number of PortAudio; rate [Hz] and block [frames]:
+    those of the device if None; limit: largest sample, 0..1; max_gaps: holes in the sound within
+    a second, more are a fault. Raises InputError.
+    """
+
+    device: str
+    channels: int
+    protocol: Protocol
+    serial_number: str
+    rate: int | None = None
+    block: int | None = None
+    law: Law = Law.LINEAR
+    limit: float = 1.0
+    max_gaps: int = 3
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.channels <= MAX_CHANNELS:
+            raise InputError(f"--channels must be 2 to {MAX_CHANNELS}, got {self.channels}")
+        if self.channels > CHANNELS_OF_AMPLIFIER and self.channels % 2:
+            raise InputError(
+                f"--channels above {CHANNELS_OF_AMPLIFIER} must be even, since they are two "
+                f"amplifiers of half as many, got {self.channels}"
+            )
+        least = math.sqrt(0.5) if self.law is Law.SQUARE else 0.0
+        if not least < self.limit <= 1:
+            raise InputError(
+                f"--limit must be above {least:.3g} and at most 1 with this law, got {self.limit:g}"
+            )
+        if self.rate is not None:
+            check_rate(self.rate, what="--rate")
+
+    @property
+    def amplifiers(self) -> int:
+        """Number of amplifiers, at addresses 1 and 2."""
+        return 1 if self.channels <= CHANNELS_OF_AMPLIFIER else 2
+
+    def to_json(self) -> str:
+        """These settings as text."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> "Settings":
+        """The settings of such a text."""
+        values = json.loads(text)
+        law, protocol = Law(values.pop("law")), Protocol(values.pop("protocol"))
+        return cls(**values, law=law, protocol=protocol)
+
+
+def check_rate(rate: float, *, what: str) -> int:
+    """A sample rate [Hz] that the engine can have; InputError otherwise."""
+    if rate % 1000 or not 8000 <= rate <= 192_000:
+        raise InputError(
+            f"{what}: sample rate must be a multiple of 1000 Hz from 8000 to 192000, got {rate:g} "
+            "Hz; use 48000 Hz"
+        )
+    return int(rate)

@@ -1,0 +1,156 @@
+"""A software amplifier through a real JACK server, as a client that captures it hears it."""
+
+import os
+import shutil
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.amplifier import Amplifier
+from drivers.errors import LinkError
+from drivers.protocol.messages import AmplifierState, Fault, Feature
+from drivers.registry import open_backend
+from model.errors import InputError
+from sim.soft_amp.output import open_output
+from sim.soft_amp.settings import Protocol, Settings
+from sound_card import BLOCK, RATE, Capture, SoftAmp, conformance, host, jack_server, until
+
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.skipif(
+        not (shutil.which("jackd") and shutil.which("cc")), reason="needs jackd2 and a C compiler"
+    ),
+]
+
+CHANNELS = 3
+SETTINGS = Settings(device="jack:card", channels=2, protocol=Protocol.SERIAL, serial_number="S")
+SILENCE = 0.05  # s; what the command promises once it is killed
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Capture, dict[str, str]]]:
+    """A client that captures, and the environment in which its server is found."""
+    name = f"era{os.getpid()}"
+    with jack_server(name) as environment:
+        capture = Capture("card", CHANNELS, server=name)
+        yield capture, environment
+        capture.close()
+
+
+@pytest.fixture(scope="module")
+def amp(
+    sound: tuple[Capture, dict[str, str]], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[SoftAmp]:
+    """An amplifier that plays to it, through JACK itself."""
+    folder = tmp_path_factory.mktemp("amp")
+    options = ("--device", "jack:card", "--channels", str(CHANNELS), "--link", str(folder / "amp"))
+    soft_amp = SoftAmp(*options, environment=sound[1], log=folder / "log")
+    yield soft_amp
+    soft_amp.end()
+
+
+def test_samples_are_those_of_the_page(sound: tuple[Capture, dict[str, str]], amp: SoftAmp) -> None:
+    """Level x sin(2 pi f t + phase) within 0.1 dB, and within 0.1 degrees between channels."""
+    capture, _ = sound
+    assert conformance(amp.url)["failed"] == 0
+    with host(amp.url, CHANNELS) as playing:
+        until(capture.is_sounding)
+        time.sleep(0.2)  # past the ramp; what is measured needs 0.1 s
+        samples = capture.samples(RATE // 10)
+        turning = np.exp(-2j * np.pi * 1000 * np.arange(len(samples)) / RATE)
+        amplitudes = 2 * (samples * turning[:, None]).mean(axis=0)
+        np.testing.assert_allclose(20 * np.log10(np.abs(amplitudes) / 0.5), 0, atol=0.1)
+        steps = np.degrees(np.angle(amplitudes[1:] / amplitudes[:-1]))
+        np.testing.assert_allclose(steps, 30, atol=0.1)
+        playing.kill()  # its watchdog is 250 ms, the fade 5 ms
+        killed = time.monotonic()
+        until(lambda: not capture.is_sounding())
+        assert capture.last_sound() - killed < 0.25 + SILENCE
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+async def test_killed_or_stopped_player_is_silent_and_then_in_fault(
+    sound: tuple[Capture, dict[str, str]], amp: SoftAmp, how: signal.Signals
+) -> None:
+    """No sound once it is gone; its line stays, reports the fault, and is disarmed once cleared."""
+    capture, _ = sound
+    with host(amp.url, CHANNELS):
+        until(capture.is_sounding)
+        player, reopened = amp.player, amp.log.count("open again")
+        os.kill(player, how)
+        done = time.monotonic()
+        until(lambda: amp.log.count("open again") > reopened)
+        assert capture.last_sound() - done < SILENCE
+        assert amp.player != player
+    amplifier = Amplifier(open_backend(amp.url), reply_timeout=2.0)
+    await amplifier.open()
+    status = await amplifier.status()
+    assert (status.state, status.fault) == (AmplifierState.FAULT, Fault.INTERNAL)
+    assert Feature.VOLTAGE in amplifier.capabilities.features
+    assert (await amplifier.clear()).state is AmplifierState.SWITCH_ON_DISABLED
+    await amplifier.close()
+
+
+def test_refused_device_is_one_message(
+    sound: tuple[Capture, dict[str, str]], tmp_path: Path
+) -> None:
+    """And an exit status, and no URL; PortAudio knows no device of this name."""
+    options = ("--device", "no such device", "--channels", "2")
+    soft_amp = SoftAmp(*options, environment=sound[1], log=tmp_path / "log")
+    soft_amp.end()
+    assert (soft_amp.url, soft_amp.process.returncode) == ("", 2)
+    assert soft_amp.log.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("changed", "key"),
+    [
+        ({"channels": CHANNELS + 1}, "--channels"),
+        ({"rate": 96_000}, "--rate"),
+        ({"block": 2 * BLOCK}, "--block"),
+        ({"device": "jack:nothing"}, "--device"),
+    ],
+)
+def test_unsuitable_device_is_refused(
+    sound: tuple[Capture, dict[str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    changed: dict[str, object],
+    key: str,
+) -> None:
+    """By the option at fault."""
+    monkeypatch.setenv("JACK_DEFAULT_SERVER", sound[1]["JACK_DEFAULT_SERVER"])
+    with pytest.raises(InputError, match=key):
+        open_output(replace(SETTINGS, **changed))
+
+
+def test_busy_device_is_refused(
+    sound: tuple[Capture, dict[str, str]], amp: SoftAmp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two programs on one port would add up beyond the limit."""
+    monkeypatch.setenv("JACK_DEFAULT_SERVER", sound[1]["JACK_DEFAULT_SERVER"])
+    with pytest.raises(LinkError, match="busy"):
+        open_output(SETTINGS)
+
+
+def test_all_of_it_killed_is_silent(sound: tuple[Capture, dict[str, str]], tmp_path: Path) -> None:
+    """The process that plays dies with the one that watches it; here through PortAudio."""
+    capture = Capture("other", 2, server=sound[1]["JACK_DEFAULT_SERVER"])
+    options = ("--device", "other", "--channels", "2", "--tcp", "0", "--law", "square")
+    soft_amp = SoftAmp(*options, environment=sound[1], log=tmp_path / "log")
+    with host(soft_amp.url, 2):
+        until(capture.is_sounding)
+        player = Path(f"/proc/{soft_amp.player}")
+        time.sleep(0.2)  # past the soft start and the ramp
+        forces = 2 * capture.samples(RATE // 10) ** 2 - 1  # u = sqrt((1 + force) / 2)
+        np.testing.assert_allclose(np.abs(np.fft.rfft(forces, axis=0)[100]) / 2400, 0.5, rtol=0.011)
+        soft_amp.process.kill()
+        killed = time.monotonic()
+        until(lambda: not player.exists())
+        assert capture.last_sound() - killed < SILENCE
+    soft_amp.end()
+    capture.close()

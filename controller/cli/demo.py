@@ -55,11 +55,24 @@ def demo(
             "--dashboard", help="Serve a page in the browser to touch the plate yourself."
         ),
     ] = False,
+    drift: Annotated[
+        bool,
+        typer.Option("--drift", help="Play an hour in which the plate changes, in virtual time."),
+    ] = False,
 ) -> None:
     """Play recorded touches on a simulated plate; measure contrast.
 
     The plate deviates from the table's within the rig's uncertainty, the same for the same --seed.
+    With --drift it is played for an hour of virtual time while it warms by 15 K, loosens a mount
+    and gains a sticker, and is identified in service.
     """
+    if drift:
+        if wire not in ("serial", "sim") or touches is not None or exact or dashboard:
+            raise InputError(
+                "--drift plays on wire sim; omit --wire, --touches, --exact, and --dashboard"
+            )
+        _drift(out, seed=seed, as_json=as_json)
+        return
     import asyncio
     import time
 
@@ -123,6 +136,34 @@ def demo(
         print(f"wrote {file}")
     if table_file is not None:
         print(next_line("era", "table", "show", table_file))
+
+
+def _drift(out: Path, *, seed: int | None, as_json: bool) -> None:
+    import asyncio
+
+    from controller.demo.drift import Event, run_drift
+    from controller.demo.drift_picture import write_drift_picture
+    from controller.demo.virtual_time import VirtualTimeLoop
+    from model.rig.file import example_rig_path
+
+    def show(event: Event) -> None:
+        if not as_json:
+            print(f"{event.time_s / 60:5.1f} min  {event.kind:11}  {event.text}", flush=True)
+
+    with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
+        hour = runner.run(run_drift(example_rig_path(), seed=seed or 0, on_event=show))
+    file = write_drift_picture(hour, out)
+    if as_json:
+        print(json.dumps({**hour.as_json(), "files": [str(file)]}))
+        return
+    for change, after in hour.named.items():
+        print(f"{change}: " + ("not named" if after is None else f"named after {after:.0f} s"))
+    print(f"false alarms: {hour.false_alarms}")
+    found = hour.as_json()
+    for key, what in (("last_ten_minutes_db", "last ten minutes"), ("end_of_hour_db", "end")):
+        figures = ", ".join(f"{way} {value:.1f} dB" for way, value in found[key].items())
+        print(f"median contrast, {what}: {figures}")
+    print(f"wrote {file}")
 
 
 _HEADING = (

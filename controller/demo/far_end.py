@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -54,6 +55,10 @@ class SimulatedPlate:
         await self._control.request(
             {"op": "fingers", "fingers": dict(positions), "loads": dict(loads)}
         )
+
+    async def change(self, **changes: Any) -> None:
+        """Change the plate as it was at first: factors of modulus and stiffness, masses on it."""
+        await self._control.request({"op": "plate", **changes})
 
     async def vibration(self, since: float, until: float) -> dict[str, FingerVibration]:
         """Vibration of each finger by id between two times [s] of time.monotonic()."""

@@ -22,10 +22,13 @@ import numpy as np
 from controller.demo.far_end import SimulatedPlate, simulated_plate
 from controller.demo.settled_player import SettledPlayer, base_of, tones_of
 from controller.demo.touch_row import steady_contrast_db
+from controller.diagnosis.interleaved_tones import interleaved
+from controller.diagnosis.plate_measurement import LEVEL
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.registry import open_backend
-from model.identification.forward import RestingFinger, Sensor
+from model.arrays import ComplexArray, FloatArray
+from model.identification.forward import RestingFinger
 from model.identification.identify import Identification, identify
 from model.identification.in_service import Known
 from model.identification.learned_table import LearnedTable
@@ -37,7 +40,7 @@ from model.structure.point_load import PointLoad
 from model.table.build import build_table
 from model.table.live_table import table_following
 from model.table.question import Question
-from model.table.table import LocalizationTable
+from model.table.table import DEFAULT_FREQUENCIES, LocalizationTable
 from model.vibration.excitation import Excitation, Tone
 
 WARMING, AT = 15.0, 293.0  # K
@@ -46,9 +49,7 @@ WAYS = ("identified", "in service", "known")
 
 _STEP = 60.0  # s; between changes of the plate by its temperature
 _END = 600.0  # s
-_TONES = 27
-_LEVEL = 0.1
-_WINDOW, _FELT = 0.2, 0.25  # s
+_FELT = 0.25  # s
 _APART, _MARGIN = 0.05, 0.013  # m
 NAMED_WITHIN = 120.0  # s
 
@@ -193,30 +194,29 @@ class _Drift:
         self._loose = rig.eras[int(self._rng.integers(len(rig.eras)))].name
         x, y = self._rng.uniform(0.1, 0.9, 2) * (rig.plate.length, rig.plate.width)
         self._sticker = (float(x), float(y), course.sticker)
-        self._begin = 0.0
+        self._started_at = 0.0
         self._changed: dict[str, Any] = {}
 
     async def run(self) -> Hour:
         course = self._course
         found = await self._identified()
         table = _table(found.rig)
-        sensors = [Sensor(era.name, era.name) for era in self._rig.eras]
-        learned = LearnedTable(table, Known.of_rig(found.rig, sensors))
+        learned = LearnedTable(table, Known.of_rig(found.rig, self._player.sensors))
         self._hour.chi2 = found.chi2
-        self._begin = clock.now()
+        self._started_at = clock.now()
         for number in range(round(course.duration / course.interval)):
             at = number * course.interval
-            await asyncio.sleep(max(0.0, self._begin + at - clock.now()))
+            await asyncio.sleep(max(0.0, self._started_at + at - clock.now()))
             await self._change(at)
             await self._touch(at, learned, table, found.rig, number % course.compared_every == 0)
         if not course.fresh_sets:
             return self._hour
         anew = await self._identified()
         ways = {"in service": learned.current, "identified anew": _table(anew.rig)}
-        for _ in range(course.fresh_sets):
+        for number in range(course.fresh_sets):
             places = self._places(2)
             for way, each in ways.items():
-                contrast, _ = await self._played(each, places)
+                contrast, _ = await self._played(each, places, touch=f"end {number}")
                 self._hour.fresh.setdefault(way, []).append(contrast)
         return self._hour
 
@@ -271,7 +271,7 @@ class _Drift:
     ) -> None:
         """One touch: the answer in service, what is learned of it, and other answers to it."""
         places = self._places(int(self._rng.integers(2, 5)))
-        _, pattern = await self._played(learned.current, places, at=at)
+        _, pattern = await self._played(learned.current, places, touch=f"{at:g} s", at=at)
         report = learned.take(pattern).report
         if report.alarm:
             self._say(at, "alarm", "the plate is not as known")
@@ -283,16 +283,18 @@ class _Drift:
             known = table_following(table, self._as_it_is(first, at))
             tables = dict(zip(WAYS, (table, learned.current, known), strict=True))
             for way, each in tables.items():
-                contrast, _ = await self._played(each, pair)
+                contrast, _ = await self._played(each, pair, touch=f"{at:g} s again")
                 self._hour.contrasts[way].append((at, contrast))
 
     async def _played(
-        self, table: LocalizationTable, places: np.ndarray, *, at: float = 0.0
+        self, table: LocalizationTable, places: FloatArray, *, touch: str, at: float = 0.0
     ) -> tuple[float, SettledPattern]:
-        """Contrast [dB] at fingers (k, 2) [m], the first the target, and what sensors read."""
+        """Contrast [dB] at fingers (k, 2) [m], the first the target, and what sensors read.
+
+        touch: whose fingers; each has loads of its own.
+        """
         points = [(float(x), float(y)) for x, y in places]
-        # Each touch has other fingers, of loads of their own.
-        ids = [f"{clock.now():.3f} {n}" for n in range(len(points))]
+        ids = [f"{touch} {n}" for n in range(len(points))]
         question = Question((points[0],), tuple(points[1:]), drive_mode="phased")
         await self._plate.place_fingers(dict(zip(ids, points, strict=True)))
         await self._player.arm()
@@ -317,7 +319,7 @@ class _Drift:
         )
         return contrast, SettledPattern(at, frequency, bases, values[:, 0], fingers)
 
-    def _places(self, count: int) -> np.ndarray:
+    def _places(self, count: int) -> FloatArray:
         size = np.array([self._rig.plate.length, self._rig.plate.width])
         while True:
             places = self._rng.uniform(_MARGIN, size - _MARGIN, (count, 2))
@@ -327,27 +329,32 @@ class _Drift:
 
     async def _identified(self) -> Identification:
         """The rig identified by interleaved tones of all ERAs, without fingers."""
-        rig = self._rig
-        frequencies = np.linspace(40.0, 500.0, _TONES)
-        n = len(rig.eras)
-        values = np.full((_TONES, n, n), np.nan, dtype=complex)
+        rig, low, high = self._rig, *DEFAULT_FREQUENCIES[[0, -1]]
+        tones = interleaved(rig, (float(low), float(high)))
+        sensors = self._player.sensors
+        values: dict[float, ComplexArray] = {}
         await self._player.arm()
-        for step in range(_TONES):
-            rows = [(step + _TONES * era // n) % _TONES for era in range(n)]
+        for step in tones.steps:
             excitation: Excitation = {
-                era.name: Tone(float(frequencies[row]), _LEVEL * era.stroke)
-                for era, row in zip(rig.eras, rows, strict=True)
+                rig.eras[number].name: Tone(frequency, LEVEL * rig.eras[number].stroke)
+                for number, frequency in step
             }
-            plays, heard = await self._player.play(excitation, window=_WINDOW)
-            tones = tones_of(plays)
-            for number, (era, row) in enumerate(zip(rig.eras, rows, strict=True)):
-                base = base_of(plays[era.name], era.stroke)
-                column = tones.index(plays[era.name].frequency)
-                values[row, :, number] = heard[:, column] / base
-                frequencies[row] = plays[era.name].frequency
+            plays, heard = await self._player.play(excitation, window=tones.window)
+            for column, frequency in enumerate(tones_of(plays)):
+                (number,) = (
+                    n
+                    for n, era in enumerate(rig.eras)
+                    if era.name in plays and plays[era.name].frequency == frequency
+                )
+                era = rig.eras[number]
+                found = values.setdefault(
+                    frequency, np.full((len(sensors), len(rig.eras)), np.nan, dtype=complex)
+                )
+                found[:, number] = heard[:, column] / base_of(plays[era.name], era.stroke)
         await self._player.disarm()
-        sensors = [Sensor(era.name, era.name) for era in rig.eras]
-        return identify(rig, Measurement.of(sensors, frequencies, values))
+        frequencies = sorted(values)
+        measured = np.array([values[each] for each in frequencies])
+        return identify(rig, Measurement.of(sensors, np.array(frequencies), measured))
 
 
 def _table(rig: Rig) -> LocalizationTable:

@@ -35,11 +35,13 @@ def drift_figure(hour: Hour) -> Figure:
         axes.plot(times / 60, contrasts, ".", color=_COLOURS[way], alpha=0.25)
         axes.plot(times / 60, medians, color=_COLOURS[way], label=_LABELS[way])
     low, high = axes.get_ylim()
-    for event in hour.events:
+    axes.set_ylim(low - 8, high + 2)  # room for the legend and what was said
+    low, high = axes.get_ylim()
+    for number, event in enumerate(hour.events):
         is_plate = event.kind == "plate"
         axes.axvline(event.time_s / 60, color="black", lw=1.0 if is_plate else 0.4, ls=":")
         if event.kind != "alarm":
-            at = high if is_plate else low
+            at = high if is_plate else low + number % 3
             axes.text(
                 event.time_s / 60,
                 at,
@@ -50,5 +52,5 @@ def drift_figure(hour: Hour) -> Figure:
     axes.set_xlim(0, hour.course.duration / 60)
     axes.set_xlabel("time / min")
     axes.set_ylabel("contrast to one quiet finger / dB")
-    axes.legend(loc="center left")
+    axes.legend(loc="lower left")
     return figure

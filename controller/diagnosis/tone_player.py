@@ -58,6 +58,10 @@ class TonePlayer:
         """Switch the high voltage on at level zero."""
         await self._group.arm()
 
+    async def disarm(self) -> None:
+        """Ramp to silence, then switch the high voltage off."""
+        await self._group.disarm()
+
     async def play(self, excitation: Excitation) -> Mapping[str, DriveCommand]:
         """Play on all amplifiers; what each driven ERA plays, by name, as its amplifier confirms.
 

@@ -13,7 +13,7 @@ from drivers.amplifier import Amplifier
 from drivers.command import DriveCommand
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, SafeCommandSet
-from drivers.protocol.definition import token_after
+from drivers.protocol.definition import PROTOCOL, token_after
 from model.rig.rig import Rig
 from model.vibration.excitation import Excitation
 
@@ -81,7 +81,8 @@ class TonePlayer:
         requested, plays = (commands_by_era(sets, self._rig) for sets in (routed, played.achieved))
         for era, command in requested.items():
             level = plays[era].level if era in plays else 0.0
-            if not math.isclose(command.level, level, rel_tol=_LEVEL_TOLERANCE):
+            step = PROTOCOL.quantities.level.step
+            if not math.isclose(command.level, level, rel_tol=_LEVEL_TOLERANCE, abs_tol=step):
                 amplifier = self._rig.wiring[era].amplifier
                 raise CommandRefused(
                     f"amplifier {amplifier}: level of channel {command.channel} must be "

@@ -200,6 +200,8 @@ async def valid_for(bench: Bench) -> None:
         await bench.amplifier.apply(ending)
         await bench.expect_levels(why="ended set applied again")
         if bench.has(Feature.STAGING):
+            await bench.amplifier.commit(ending.token)
+            await bench.expect_levels(why="ended set committed again")
             await bench.amplifier.commit(staged.token)
             await bench.expect_levels(0.5, why="commit of a set staged before another ended")
 

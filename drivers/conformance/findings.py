@@ -28,7 +28,13 @@ class NotApplicable(Exception):
     """The amplifier, or its wire, does not have what is checked."""
 
 
-def expect(condition: bool, what: str, *, expected: object, seen: object) -> None:
-    """Raise ContractViolation unless the condition holds."""
+class MeasuredNotApplicable(NotApplicable):
+    """There is nothing to check, as measured: it counts only if nothing was delayed."""
+
+
+def expect(
+    condition: bool, what: str, *, expected: object, seen: object, is_certain: bool = False
+) -> None:
+    """Raise ContractViolation unless the condition holds; is_certain: see there."""
     if not condition:
-        raise ContractViolation(what, expected=expected, seen=seen)
+        raise ContractViolation(what, expected=expected, seen=seen, is_certain=is_certain)

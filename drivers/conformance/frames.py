@@ -107,12 +107,16 @@ async def broadcasts(bench: Bench) -> None:
     ping, apply = await _armed(bench, bench.can.watchdog_max)
     await _expect_ignored(bench, raw.broadcasts(ping, apply))
     await _expect_commit(bench)
+    latch = (await bench.sample()).status.latch
     stop = raw.carried_out(Stop(0.0))
     outcome = await raw.send(stop)
     expect(outcome in stop.allowed, stop.name, expected="no reply", seen=outcome)
     status = (await bench.sample()).status
     bench.expect_state(status, AmplifierState.QUICK_STOP_ACTIVE, after=stop.name)
     expect(not any(status.levels), f"levels after {stop.name}", expected="0", seen=status.levels)
+    following = latch % 255 + 1
+    seen = status.latch
+    expect(seen == following, f"latch after {stop.name}", expected=following, seen=seen)
 
 
 async def _expect_commit(bench: Bench) -> None:
@@ -122,8 +126,12 @@ async def _expect_commit(bench: Bench) -> None:
     raw = bench.raw
     staged = bench.tones(0.75)
     await bench.amplifier.stage(staged)
+    session = bench.amplifier.session
+    if bench.amplifier.carries_sessions:
+        await raw.send(raw.carried_out(Commit(staged.token, session % 65535 + 1)))
+        await bench.expect_levels(1.0, why="after a broadcast Commit of another session")
     await asyncio.sleep(0.05)
-    commit = raw.carried_out(Commit(staged.token, bench.amplifier.session))
+    commit = raw.carried_out(Commit(staged.token, session))
     sent_at = clock.now()
     outcome = await raw.send(commit)
     expect(outcome in commit.allowed, commit.name, expected="no reply", seen=outcome)
@@ -143,6 +151,6 @@ async def _expect_commit(bench: Bench) -> None:
     )
     await bench.beat()
     await bench.amplifier.stage(bench.tones(0.5))
-    other = raw.carried_out(Commit(bench.amplifier.next_token(), bench.amplifier.session))
+    other = raw.carried_out(Commit(bench.amplifier.next_token(), session))
     await raw.send(other)
     await bench.expect_levels(0.75, why="after a broadcast Commit of another token")

@@ -20,27 +20,29 @@ async def sessions(bench: Bench) -> None:
     if not amplifier.carries_sessions:
         return
     own = amplifier.session
-    other = own % 65535 + 1
+    # One that differs in its high byte only, one in its low, and the next.
+    others = [one for one in (own ^ 0x0100, own ^ 0x0001, own % 65535 + 1) if one]
     await bench.play(1.0)
     staged = bench.tones(0.75)
     if bench.has(Feature.STAGING):
         await amplifier.stage(staged)
     _, bench.fed = await bench.timed(amplifier.arm(watchdog, session=own))
     await bench.expect_levels(1.0, why="after the same Arm again")
-    amplifier.session = other
-    try:
-        for name, request in (
-            ("a Ping", amplifier.heartbeat),
-            ("an Apply", lambda: amplifier.apply(bench.tones(0.5))),
-            ("a Stage", lambda: amplifier.stage(bench.tones(0.5))),
-            ("a Commit", lambda: amplifier.commit(staged.token)),
-            ("an Arm", lambda: amplifier.arm(watchdog, session=other)),
-        ):
-            await asyncio.sleep(0.01)
-            await bench.refused(request(), what=f"{name} of another session")
-            bench.expect_not_fed(await bench.sample(), by=f"{name} of another session")
-    finally:
-        amplifier.session = own
+    for other in others:
+        amplifier.session = other
+        try:
+            for name, request in (
+                ("a Ping", amplifier.heartbeat),
+                ("an Apply", lambda: amplifier.apply(bench.tones(0.5))),
+                ("a Stage", lambda: amplifier.stage(bench.tones(0.5))),
+                ("a Commit", lambda: amplifier.commit(staged.token)),
+                ("an Arm", lambda other=other: amplifier.arm(watchdog, session=other)),
+            ):
+                await asyncio.sleep(0.01)
+                await bench.refused(request(), what=f"{name} of another session")
+                bench.expect_not_fed(await bench.sample(), by=f"{name} of another session")
+        finally:
+            amplifier.session = own
     await bench.beat()
     await bench.expect_levels(1.0, why="after requests of another session")
     await amplifier.disarm(0.0)

@@ -38,6 +38,7 @@ from drivers.protocol.messages import (
 )
 from planted_bugs import Plant, both, replaced, with_voices, wrapped
 from planted_end_faults import END_FAULTS
+from planted_fading_faults import FADING_FAULTS
 from planted_sensor_faults import SENSOR_FAULTS
 from sim.amplifier import amplifier as simulated
 from sim.amplifier import channels as channel_outputs
@@ -1300,6 +1301,10 @@ FAULTS: dict[str, PlantedFault] = {
     **{
         name: PlantedFault(fault.check, fault.plant, wires=fault.wires or ALL)
         for name, fault in END_FAULTS.items()
+    },
+    **{
+        name: PlantedFault(fault.check, fault.plant, fault.wires)
+        for name, fault in FADING_FAULTS.items()
     },
 }
 """Faults that the wire shows, by what is wrong."""

@@ -35,10 +35,12 @@ LONG_WATCHDOG = 2.0  # s; does not trip during a check, on amplifiers that suppo
 EVENT_TIMEOUT = 5.0  # s; for changes without a request
 _LEAST_POLLS = 100
 _PREPARATION = 5  # exchanges whose fastest is the typical one
+_BEFORE = 0.1  # s; before an event's cause, in which a delay may still count
+_MANY = 20  # exchanges whose fastest shows the speed of the wire
 _POLL = 0.001  # s; pause between polls for an event
 _SLACK = 0.002  # s; of the amplifier's clock, and of times in milliseconds
 _DRIFT = 1e-3  # of a time; of the amplifier's clock
-_COARSE = 0.01  # s; uncertainty of an event's time beyond the wire's that proves nothing
+_COARSE = 0.0025  # s; uncertainty of an event's time beyond the wire's that proves nothing
 
 _T = TypeVar("_T")
 
@@ -67,6 +69,9 @@ class Bench:
         self.max_delay = 0.0  # s; of a reply, beyond the typical
         self.fed = Interval(-math.inf, math.inf)  # when the watchdog was fed last
         self.watchdog = 0.0
+        self._since = -math.inf  # from when delays count for the event that was timed last
+        # How long [s] the amplifier may not have run since a time, as an emulated one.
+        self.delayed_since: Callable[[float], float] = lambda time: 0.0
 
     def has(self, feature: Feature) -> bool:
         """Whether the amplifier has a feature."""
@@ -103,6 +108,14 @@ class Bench:
             durations.append(when.latest - when.earliest)
         self.exchange_time = min(durations)
         self.max_delay = 0.0
+
+    async def fastest_exchange(self) -> float:
+        """Measure the fastest of many exchanges [s], which no delay of a few makes slower."""
+        durations = [self.exchange_time]
+        for _ in range(_MANY):
+            when = (await self.sample()).when
+            durations.append(when.latest - when.earliest)
+        return min(durations)
 
     def guard_as(self, capabilities: Capabilities) -> Guard:
         """Make a guard for an amplifier with these capabilities.
@@ -277,50 +290,67 @@ class Bench:
         """Poll around a due time [s] after `since`; returns when a status was first reached.
 
         The result is relative to since. Raises ContractViolation if it is not reached by `margin`
-        [s] after the due time.
+        [s] after the due time, and what the amplifier may have been delayed.
         """
-        before = since.latest
+        before, self._since = since.latest, since.earliest - _BEFORE
         await self.pause_until(since.earliest + due - min(margin / 2, due / 4))
         while True:
             sample = await (self.beat() if feed else self.sample())
             if reached(sample.status):
                 return Interval(before - since.latest, sample.when.latest - since.earliest)
             before = sample.when.earliest
-            if before - since.latest > due + margin + 4 * self.exchange_time:
+            latest = due + margin + 4 * self.exchange_time
+            if before - since.latest > latest + self.delayed_since(since.earliest - _BEFORE):
                 raise ContractViolation(
                     what,
                     expected=f"{due * 1e3:.0f} ms after its request",
                     seen=f"not after {(before - since.latest) * 1e3:.0f} ms: "
                     f"{sample.status.state.name}, levels {_rounded(sample.status.levels)}",
+                    is_certain=True,
                 )
             await asyncio.sleep(_POLL)
 
-    def expect_time(self, what: str, seen: Interval, *, low: float, high: float) -> None:
-        """Require that an event came between two times [s]; Inconclusive if that is not certain."""
+    def expect_time(
+        self, what: str, seen: Interval, *, low: float, high: float, coarse: float = _COARSE
+    ) -> None:
+        """Require that an event came between two times [s]; Inconclusive if that is not certain.
+
+        coarse [s]: uncertainty, beyond the wire's, that proves nothing.
+        """
         bounds = f"{low * 1e3:.0f} to {high * 1e3:.0f} ms"
         found = f"{seen.earliest * 1e3:.1f} to {seen.latest * 1e3:.1f} ms"
+        delayed = self.delayed_since(self._since)
         early, late = low * (1 - _DRIFT) - _SLACK, high * (1 + _DRIFT) + _SLACK
-        expect(early <= seen.latest and seen.earliest <= late, what, expected=bounds, seen=found)
-        uncertain = _COARSE + 4 * self.exchange_time
+        expect(
+            early <= seen.latest and seen.earliest <= late,
+            what,
+            expected=bounds,
+            seen=found,
+            is_certain=seen.latest < early - delayed or seen.earliest > late + delayed,
+        )
+        uncertain = max(coarse, 2 * self.exchange_time)
         if seen.earliest < early - uncertain or seen.latest > late + uncertain:
             raise Inconclusive(f"{what} must be {bounds}, and was within {found}")
 
-    def expect_state(self, status: Status, state: AmplifierState, *, after: str) -> None:
-        """Require a state."""
+    def expect_state(
+        self, status: Status, state: AmplifierState, *, after: str, is_certain: bool = False
+    ) -> None:
+        """Require a state; is_certain: whether no delay can lead to another."""
         expect(
             status.state is state,
             f"state after {after}",
             expected=state.name,
             seen=status.state.name,
+            is_certain=is_certain,
         )
 
-    async def refused(self, call: Awaitable[object], *, what: str) -> None:
-        """Require a refusal."""
+    async def refused(self, call: Awaitable[object], *, what: str, is_certain: bool = True) -> None:
+        """Require a refusal; is_certain: whether no delay can make a reply right."""
         try:
             await call
         except CommandRefused:
             return
-        raise ContractViolation(what, expected="refused", seen="a reply")
+        raise ContractViolation(what, expected="refused", seen="a reply", is_certain=is_certain)
 
     def expect_not_fed(self, sample: Sample, *, by: str) -> None:
         """Require that the watchdog runs down since it was fed last."""
@@ -331,6 +361,8 @@ class Bench:
             f"watchdog_left after {by}",
             expected=f"at most {highest * 1e3:.0f} ms",
             seen=f"{sample.status.watchdog_left * 1e3:.0f} ms",
+            is_certain=sample.status.watchdog_left
+            > highest + self.delayed_since(self.fed.earliest),
         )
 
     def expect_fed(self, sample: Sample, *, by: str) -> None:

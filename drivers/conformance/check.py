@@ -12,6 +12,7 @@ from drivers.conformance.findings import (
     ContractViolation,
     Inconclusive,
     LinkGone,
+    MeasuredNotApplicable,
     NotApplicable,
 )
 from drivers.conformance.lateness import STALL, Lateness
@@ -107,7 +108,11 @@ class _Attempt:
     @property
     def is_doubtful(self) -> bool:
         """Whether it must be made again."""
-        if self.finding is None or isinstance(self.finding, NotApplicable):
+        if self.finding is None:
+            return False
+        if isinstance(self.finding, MeasuredNotApplicable):
+            return self._is_disturbed
+        if isinstance(self.finding, NotApplicable):
             return False
         if isinstance(self.finding, ContractViolation) and self.finding.is_certain:
             return False
@@ -157,9 +162,10 @@ async def run_check(
 
     A violation while this program or the wire was delayed does not count, nor does too little
     evidence: the check is repeated, and inconclusive if that does not end. It has failed if every
-    attempt failed and this program was not late in one. raw: access to the line, url: of the
-    amplifier; checks that need them are skipped without. process: number of the process that is the
-    amplifier, whose delays count as this program's.
+    attempt failed and this program was not late in one, or at once if no delay can explain it. It
+    is skipped only if no attempt failed. raw: access to the line, url: of the amplifier; checks
+    that need them are skipped without. process: number of the process that is the amplifier,
+    whose delays count as this program's.
     """
     start, place = clock.now(), check.place(raw)
     attempts: list[_Attempt] = []
@@ -172,7 +178,8 @@ async def run_check(
     if finding is None:
         result = Result.PASSED
     elif isinstance(finding, NotApplicable):
-        result = Result.SKIPPED
+        is_skipped = not attempt.is_doubtful and not any(map(_has_failed, attempts))
+        result = Result.SKIPPED if is_skipped else Result.INCONCLUSIVE
     elif attempt.is_doubtful and not _all_failed(attempts):
         result = Result.INCONCLUSIVE
     else:
@@ -192,15 +199,24 @@ async def run_check(
 
 def _all_failed(attempts: Sequence[_Attempt]) -> bool:
     """Whether every attempt failed, and several not for want of a reply, one without a delay."""
-    failed = [one for one in attempts if not isinstance(one.finding, Inconclusive | LinkError)]
-    is_unclear = any(isinstance(one.finding, Inconclusive) for one in attempts)
+    failed = [one for one in attempts if _has_failed(one) and not _is_mute(one)]
+    is_unclear = any(isinstance(one.finding, Inconclusive | NotApplicable) for one in attempts)
     return not is_unclear and len(failed) > 1 and any(one.lateness <= STALL for one in failed)
+
+
+def _has_failed(attempt: _Attempt) -> bool:
+    return not isinstance(attempt.finding, type(None) | Inconclusive | NotApplicable)
+
+
+def _is_mute(attempt: _Attempt) -> bool:
+    return isinstance(attempt.finding, LinkError)
 
 
 async def _attempt(check: Check, bench: Bench, process: int | None) -> _Attempt:
     """Run the steps once."""
     before = bench.amplifier.statistics.timeouts
     with Lateness(process) as lateness:
+        bench.delayed_since = lateness.since
         finding = await _finding(check, bench)
     missed = bench.amplifier.statistics.timeouts - before
     return _Attempt(finding, lateness.worst, bench.max_delay, missed)

@@ -17,6 +17,7 @@ _PAUSE = 0.004  # s; between samples
 _PARTS = 5  # of the curve, in each of which there must be a sharp sample
 _FINE = 8  # points of an interval at which the curve is looked at
 _SHARP = 0.15  # of the largest level; span of the curve over the interval of a sharp sample
+_BEFORE = 0.1  # s; before a commit, in which a delay may still count
 _LATEST_PAUSE = 0.04  # s
 
 
@@ -66,6 +67,7 @@ def expect_curve(
                 f"level {what} of channel {channel}, {middle * 1e3:.0f} ms after its commit",
                 expected=f"{max(low, 0):.4f} to {high:.4f}",
                 seen=f"{level:.4f}",
+                is_certain=_is_never(bench, level, curve, sample.when, commit),
             )
         if 0 <= middle < lasts and high - low <= _SHARP * peak:
             sharp[int(middle / lasts * _PARTS)] += 1
@@ -74,6 +76,13 @@ def expect_curve(
             f"level {what}: {len(samples)} statuses, of which {sum(sharp)} were quick enough, "
             "do not cover it"
         )
+
+
+def _is_never(bench: Bench, level: float, curve: Curve, when: Interval, commit: Interval) -> bool:
+    """Whether a level is none of a curve's even if the amplifier did not run for a while."""
+    apart = bench.delayed_since(commit.earliest - _BEFORE)  # its clock may catch up, too
+    low, high = _span(curve, Interval(when.earliest - apart, when.latest + apart), commit)
+    return not low - bench.tolerance <= level <= high + bench.tolerance
 
 
 def _span(curve: Curve, when: Interval, commit: Interval) -> tuple[float, float]:

@@ -93,7 +93,12 @@ async def clear_too_early(bench: Bench) -> None:
         await bench.pause_until(when.latest + share * ramp)
         cleared, sent = await bench.timed(bench.amplifier.clear(status.latch))
         if sent.latest < when.earliest + 0.9 * ramp:
-            bench.expect_state(cleared, AmplifierState.QUICK_STOP_ACTIVE, after="Clear amid a ramp")
+            bench.expect_state(
+                cleared,
+                AmplifierState.QUICK_STOP_ACTIVE,
+                after="Clear amid a ramp",
+                is_certain=True,
+            )
     falling = raised_cosine(ramp, start=bench.level, end=0.0)
     samples = await samples_until(bench, when.latest + 1.1 * ramp, feed=False)
     for sample in samples:

@@ -11,6 +11,7 @@ from drivers.conformance.ending import PROMPT, is_silent
 from drivers.conformance.findings import (
     ContractViolation,
     Inconclusive,
+    MeasuredNotApplicable,
     NotApplicable,
     expect,
 )
@@ -215,11 +216,13 @@ async def phases(bench: Bench) -> None:
     """It counts phases from the commit, or with keep phase from the tone that plays."""
     bench.require(Feature.PHASE)
     frequency = max(_LOW, bench.can.frequency_min)
-    if 2 * bench.exchange_time * frequency > _CYCLE_ERROR:
-        raise NotApplicable("the wire is too slow to tell phases apart at its lowest frequency")
+    if 2 * await bench.fastest_exchange() * frequency > _CYCLE_ERROR:
+        raise MeasuredNotApplicable(
+            "the wire is too slow to tell phases apart at its lowest frequency"
+        )
     found = [await _level_after(bench, case, frequency) for case in _TONES]
     if all(level > 0.9 * bench.level for level, _ in found):
-        raise NotApplicable("its levels do not show that tones of one frequency interfere")
+        raise MeasuredNotApplicable("its levels do not show that tones of one frequency interfere")
     for case, (level, error) in zip(_TONES, found, strict=True):
         allowed = bench.level * (math.pi * error + 0.05) + bench.tolerance
         if error > 1.5 * _CYCLE_ERROR:

@@ -2,7 +2,9 @@
 
 import asyncio
 import contextlib
+import math
 import os
+from collections import deque
 from pathlib import Path
 
 from drivers import clock
@@ -73,6 +75,7 @@ class Lateness:
         self._waits = ProcessorWaits(process)
         self._waited = self._waits.total()
         self.worst = 0.0
+        self._delays: deque[tuple[float, float]] = deque()
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
 
@@ -86,6 +89,15 @@ class Lateness:
         with self._waits:
             self._note()
 
+    def since(self, time: float) -> float:
+        """How long [s] an amplifier on this machine may not have run since a time, at most.
+
+        That is what its process waited; without one, what this program was late.
+        """
+        self._note()
+        self._due = max(self._due, clock.now())
+        return math.fsum(delay for at, delay in self._delays if at >= time)
+
     def _schedule(self) -> None:
         self._due = clock.now() + _PERIOD
         self._timer = asyncio.get_running_loop().call_at(self._due, self._fired)
@@ -96,5 +108,8 @@ class Lateness:
 
     def _note(self) -> None:
         before, self._waited = self._waited, self._waits.total()
-        late = max(clock.now() - self._due, self._waited - before)
-        self.worst = max(self.worst, late)
+        now = clock.now()
+        waited, late = self._waited - before, now - self._due
+        self.worst = max(self.worst, late, waited)
+        if waited > 0 or late > STALL:
+            self._delays.append((now, max(waited, late if late > STALL else 0.0)))

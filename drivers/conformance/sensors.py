@@ -76,7 +76,7 @@ async def readings(bench: Bench) -> None:
         expect(late < 1, "state", expected="complete after the window", seen=now.state.name)
         await bench.pause_until(clock.now() + min(0.005, now.left))
     ended = Interval(before - since.latest, when.latest - since.earliest)
-    bench.expect_time("end of the window", ended, low=_WINDOW, high=_WINDOW)
+    bench.expect_time("end of the window", ended, low=_WINDOW, high=_WINDOW, coarse=0.01)
     whole = await amplifier.finish_reading(started)
     _expect_state(whole, ReadingState.COMPLETE, after="nothing has changed")
     expect(

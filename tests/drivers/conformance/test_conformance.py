@@ -2,15 +2,21 @@
 
 import asyncio
 from collections.abc import Callable, Coroutine
+from dataclasses import replace
 
 import pytest
 
 from conformance_bench import results_on
 from drivers import clock
 from drivers.conformance import CHECKS, CheckResult, Result
-from drivers.conformance.bench import Bench
+from drivers.conformance.bench import Bench, Sample
 from drivers.conformance.check import MAX_ATTEMPTS, Check
-from drivers.conformance.findings import Inconclusive, NotApplicable, expect
+from drivers.conformance.findings import (
+    Inconclusive,
+    MeasuredNotApplicable,
+    NotApplicable,
+    expect,
+)
 from drivers.conformance.report import ConformanceReport
 from drivers.guard.channel_state import Interval
 from model.rig.rig import Rig
@@ -99,6 +105,55 @@ def test_check_without_object_is_skipped(coarse_rig: Rig) -> None:
     assert report["not_run"] == len(CHECKS) - 1
 
 
+def test_skip_after_a_failure_is_no_skip(coarse_rig: Rig) -> None:
+    """An attempt that failed amid a stall is not forgotten by one that found nothing to check."""
+    tries = []
+
+    async def steps(bench: Bench) -> None:
+        tries.append(clock.now())
+        if len(tries) == 1:
+            stall(0.05)
+            await bench.sample()
+            expect(False, "level", expected="0.2", seen="0.1")
+        raise NotApplicable("the wire is too slow")
+
+    found = result_of(steps, coarse_rig)
+    assert found.result is Result.INCONCLUSIVE
+    assert found.problem
+
+
+def test_skip_as_measured_amid_stalls_is_no_skip(coarse_rig: Rig) -> None:
+    """A wire that was slow while this program was late may be fast."""
+
+    async def steps(bench: Bench) -> None:
+        stall(0.05)
+        await bench.sample()
+        raise MeasuredNotApplicable("the wire is too slow")
+
+    found = result_of(steps, coarse_rig)
+    assert (found.result, found.attempts) == (Result.INCONCLUSIVE, MAX_ATTEMPTS)
+
+
+@pytest.mark.parametrize(
+    ("excess", "result", "attempts"),
+    [(0.2, Result.FAILED, 1), (0.03, Result.INCONCLUSIVE, MAX_ATTEMPTS)],
+)
+def test_what_no_delay_explains_fails_at_once(
+    excess: float, result: Result, attempts: int, coarse_rig: Rig
+) -> None:
+    """A watchdog that is left by more than the program was late, and one by less."""
+
+    async def steps(bench: Bench) -> None:
+        await bench.arm()
+        stall(0.05)
+        sample = await bench.sample()
+        left = sample.status.watchdog_left + excess
+        bench.expect_not_fed(Sample(sample.when, replace(sample.status, watchdog_left=left)), by="")
+
+    found = result_of(steps, coarse_rig)
+    assert (found.result, found.attempts) == (result, attempts)
+
+
 @pytest.mark.parametrize(
     ("earliest", "latest", "result"),
     [
@@ -107,6 +162,7 @@ def test_check_without_object_is_skipped(coarse_rig: Rig) -> None:
         (0.109, 0.112, Result.FAILED),  # certainly after 105 ms
         (0.060, 0.103, Result.INCONCLUSIVE),  # perhaps long before
         (0.101, 0.150, Result.INCONCLUSIVE),
+        (0.105, 0.1105, Result.INCONCLUSIVE),  # perhaps 10 ms late
     ],
 )
 def test_times_are_judged_by_what_is_certain(

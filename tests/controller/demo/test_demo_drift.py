@@ -21,6 +21,7 @@ def hour() -> Hour:
         return runner.run(run_drift(example_rig_path(), course=course, seed=1))
 
 
+@pytest.mark.long
 def test_plate_is_identified_over_the_wire_and_alarms_when_it_changes(hour: Hour) -> None:
     """The model explains the plate in time; the first pattern on a loose mount or the next alarms.
 

@@ -79,6 +79,7 @@ def test_answers_follow_a_loosened_mount(
     assert error(learned.current, loose) < error(stale, loose) / 3
 
 
+@pytest.mark.long
 def test_answers_wait_for_an_explanation(
     hidden: Hidden, rig: Rig, table: LocalizationTable
 ) -> None:
@@ -95,6 +96,7 @@ def test_answers_wait_for_an_explanation(
     assert after.table is None
 
 
+@pytest.mark.long
 def test_unexplained_change_widens_the_errors_of_answers(
     hidden: Hidden, rig: Rig, table: LocalizationTable, tmp_path: Path
 ) -> None:

@@ -28,9 +28,9 @@ async def addresses(bench: Bench) -> None:
     raw = bench.raw
     free = next(one for one in _FREE if one != raw.address)
     other = own[:-1] + ("0" if own[-1] != "0" else "1")
-    stays, foreign = SetAddress(raw.address, own), SetAddress(free, other)
+    stays, moves = SetAddress(raw.address, own), SetAddress(free, other)
     async with _restored(bench, free, own):
-        for request in raw.address_requests(stays, foreign):
+        for request in raw.address_requests(stays, moves):
             outcome = await raw.send(request)
             await _expect_there(bench, free, request.name)
             allowed = " or ".join(sorted(request.allowed))

@@ -17,8 +17,8 @@ async def levels_of_every_frequency(bench: Bench) -> None:
     between = math.sqrt(limits.frequency_min * limits.frequency_max)
     middle = (limits.frequency_min + limits.frequency_max) / 2
     await bench.arm()
-    for wanted in (limits.frequency_min, between, middle, limits.frequency_max):
-        frequency = min(max(wanted, limits.frequency_min), limits.frequency_max)
+    for target in (limits.frequency_min, between, middle, limits.frequency_max):
+        frequency = min(max(target, limits.frequency_min), limits.frequency_max)
         for fraction in _FRACTIONS:
             level = fraction * bench.level
             commands = tuple(

@@ -11,7 +11,7 @@ from drivers.protocol.messages import AmplifierState, Feature
 
 _SETS = "wire-protocol.md#sets-tokens-and-ramps"
 _Q = PROTOCOL.quantities
-_LONGEST = 8.0  # s; that stops may take
+_MAX_TIME = 8.0  # s; that stops may take
 
 
 @driving(_SETS)
@@ -46,7 +46,7 @@ async def altered_repeats(bench: Bench) -> None:
 
 
 @driving(_SETS)
-async def longest_valid_for(bench: Bench) -> None:
+async def max_valid_for(bench: Bench) -> None:
     """It plays on under the longest valid_for, and half of it."""
     bench.require(Feature.VALID_FOR)
     await bench.arm()
@@ -60,7 +60,7 @@ async def longest_valid_for(bench: Bench) -> None:
 async def latch_wraps(bench: Bench) -> None:
     """It numbers stops from 1 to 255, then 1 again."""
     largest = int(_Q.latch.high)
-    if largest * bench.exchange_time > _LONGEST:
+    if largest * bench.exchange_time > _MAX_TIME:
         raise MeasuredNotApplicable(f"the wire is too slow for {largest} Stops")
     before = (await bench.amplifier.status()).latch
     for _ in range(largest + 1):  # it may begin at 0

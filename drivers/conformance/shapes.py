@@ -34,13 +34,13 @@ def _of(bench: Bench, slot: int, step: float, *fractions: float) -> Envelope:
 
 
 @driving(_PLACE)
-async def most_knots(bench: Bench) -> None:
+async def max_knots(bench: Bench) -> None:
     """It moves along an envelope of as many knots as it states."""
     step_of(bench)
     can, level = bench.can, bench.level
     count = can.envelope_knots
-    wanted = max(_WHOLE / (count + 1), _SAMPLES * bench.exchange_time)
-    step = min(max(round(wanted, 3), can.envelope_step_min), can.envelope_step_max)
+    requested = max(_WHOLE / (count + 1), _SAMPLES * bench.exchange_time)
+    step = min(max(round(requested, 3), can.envelope_step_min), can.envelope_step_max)
     # Down and up again, so that neither order nor number can be another.
     fractions = [0.6 + 0.4 * math.cos(3 * math.pi * (at + 1) / count) for at in range(count)]
     await _shape(bench, 1, step, *fractions)
@@ -56,7 +56,7 @@ async def most_knots(bench: Bench) -> None:
 
 
 @driving(_CAPS)
-async def shortest_and_longest_steps(bench: Bench) -> None:
+async def extreme_steps(bench: Bench) -> None:
     """It plays envelopes of the shortest and of the longest step in their time."""
     step_of(bench)
     can = bench.can
@@ -120,8 +120,8 @@ async def _use(bench: Bench, slots: list[int]) -> None:
     for slot in slots:
         guard.check_envelope(_of(bench, slot, step_of(bench), 0.5))
     token = bench.amplifier.next_token()
-    wanted = CommandSet(token, commands, ramp=0.0, valid_for=0.0)
-    requested = guard.check(wanted)
+    command_set = CommandSet(token, commands, ramp=0.0, valid_for=0.0)
+    requested = guard.check(command_set)
     if bench.has(Feature.STAGING):
         await bench.amplifier.stage(requested)
     else:

@@ -101,16 +101,16 @@ END_FAULTS: Mapping[str, EndFault] = {
         "levels_of_every_frequency", _played(_half_above(300.0))
     ),
     "envelopes are cut after eight knots": EndFault(
-        "most_knots", _loaded(lambda one: replace(one, knots=one.knots[:8]))
+        "max_knots", _loaded(lambda one: replace(one, knots=one.knots[:8]))
     ),
     "envelopes move by two knots only": EndFault(
-        "most_knots", _loaded(lambda one: replace(one, knots=one.knots[:2]))
+        "max_knots", _loaded(lambda one: replace(one, knots=one.knots[:2]))
     ),
     "steps of envelopes are 50 ms at least": EndFault(
-        "shortest_and_longest_steps", _loaded(lambda one: replace(one, step=max(one.step, 0.05)))
+        "extreme_steps", _loaded(lambda one: replace(one, step=max(one.step, 0.05)))
     ),
     "steps of envelopes are 50 ms at most": EndFault(
-        "shortest_and_longest_steps", _loaded(lambda one: replace(one, step=min(one.step, 0.05)))
+        "extreme_steps", _loaded(lambda one: replace(one, step=min(one.step, 0.05)))
     ),
     "slots of envelopes repeat after eight": EndFault(
         "every_slot", _loaded(lambda one: replace(one, slot=(one.slot - 1) % 8 + 1))

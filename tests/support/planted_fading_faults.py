@@ -226,7 +226,7 @@ FADING_FAULTS: Mapping[str, FadingFault] = {
         "no_room_changes_nothing", wrapped(Channels, "without_room", _counts_at_ramp_0)
     ),
     "valid_for is taken as signed": FadingFault(
-        "longest_valid_for", wrapped(SimulatedAmplifier, "_play", _signed)
+        "max_valid_for", wrapped(SimulatedAmplifier, "_play", _signed)
     ),
     "a repeat with another valid_for is confirmed": FadingFault(
         "altered_repeats", wrapped(SetStore, "is_repeated", _whatever_valid_for)

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from era_haptics.arguments import as_frequencies, expect_rig
-from model.arguments import expect_one_of
+from model.arguments import expect_one_of, is_whole, shown
 from model.arrays import FloatArray
+from model.errors import InputError
 from model.rig.rig import Rig
 from model.structure.actuator import Era
 from model.studies.kinds import STUDIES
@@ -56,6 +57,12 @@ def study(
     expect_rig(rig)
     expect_one_of(STUDIES, what, what="what")
     expect_one_of(DRIVES, active, what="active")
+    counts = (("layouts", layouts), ("seed", seed), ("workers", workers))
+    for name, value in counts:
+        if not is_whole(value):
+            raise InputError(f"{name} must be a whole number, got {shown(value)}")
+    if not (isinstance(candidates, tuple | list) and [*map(is_whole, candidates)] == [True] * 2):
+        raise InputError(f"candidates must be two whole numbers, got {shown(candidates)}")
     cases = STUDIES[what](rig, layouts=layouts, seed=seed, raster=candidates)
     check_supported_cases(rig, cases)
     problem = study_problem(rig, cases, as_frequencies(frequencies))

@@ -34,7 +34,7 @@ def expect_at_least(value: float, least: float, *, what: str) -> None:
 def expect_one_of(names: Iterable[str], value: object, *, what: str) -> None:
     """Raise InputError for anything but one of these names."""
     known = tuple(names)
-    if value not in known:
+    if not isinstance(value, str) or value not in known:
         raise InputError(f"{what} must be one of {', '.join(known)}, got {shown(value)}")
 
 

@@ -24,6 +24,10 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
         "loads": (1.5,),
     },
     era.calibrate: {"rig": RIG, "measured": "measured.csv"},
+    era.study: {
+        "rig": RIG, "what": "count", "layouts": 9, "active": "1", "frequencies": [60],
+        "candidates": (7, 5), "seed": 0, "workers": 1,
+    },
     era.SolvedPlate: {"rig": RIG, "seed": 1},
     PLATE.map: {"drive": DRIVE, "raster": (3, 3)},
     PLATE.play: {

@@ -22,6 +22,7 @@ class ThreeMasses:
 
     plate = Plate(0.3, 0.2, 0.001, material("steel"), loss_factor=0.0)
     omega = np.zeros(3)
+    losses = np.zeros(3)
 
     def at(self, points: FloatArray) -> FloatArray:
         """A point each."""

@@ -61,7 +61,8 @@ def study(
     for name, value in counts:
         if not is_whole(value):
             raise InputError(f"{name} must be a whole number, got {shown(value)}")
-    if not (isinstance(candidates, tuple | list) and [*map(is_whole, candidates)] == [True] * 2):
+    pair: object = candidates  # callers may not use a type checker
+    if not (isinstance(pair, tuple | list) and [*map(is_whole, pair)] == [True, True]):
         raise InputError(f"candidates must be two whole numbers, got {shown(candidates)}")
     cases = STUDIES[what](rig, layouts=layouts, seed=seed, raster=candidates)
     check_supported_cases(rig, cases)

@@ -154,7 +154,7 @@ class Amplifier:
             self.state, self.fault = DISARMED, NO_FAULT
 
     def stage(self, session, token, ramp, valid_for, commands):
-        """Hold a set of (channel, frequency, level, phase) until its commit; return it."""
+        """Hold a set of (channel, flags, frequency, level, phase) until its commit; return it."""
         self._check(session, token, ramp, valid_for, commands)
         self._staged, self._staged_at = (token, ramp, valid_for, commands), self._clock()
         self.ping(session)
@@ -184,12 +184,12 @@ class Amplifier:
     def _play(self, wanted):
         """Play a checked set, if its channels have room for it."""
         token, ramp, valid_for, commands = wanted
-        for channel, _, level, _ in commands:
+        for channel, _, _, level, _ in commands:
             if level > 0 and len(self._fading(channel, ramp, self._clock())) > VOICES - 1:
                 raise Refused(FADING, channel)
         self._playing, self._staged, self.token = wanted, None, token
         levels = [0] * CHANNELS  # channels without a command fall silent
-        for channel, _, level, _ in commands:
+        for channel, _, _, level, _ in commands:
             levels[channel] = level
         self._fade_to(levels, ramp=ramp)
         self._ends_at = self._clock() + valid_for if valid_for else None
@@ -215,7 +215,7 @@ class Amplifier:
         if not (0 <= ramp <= MAX_RAMP and 0 <= valid_for <= 60000):
             raise Refused(BAD_VALUE)
         seen = set()
-        for channel, frequency, level, phase in commands:
+        for channel, _, frequency, level, phase in commands:
             if not 0 <= channel < CHANNELS or channel in seen:
                 raise Refused(BAD_CHANNEL, channel)
             seen.add(channel)

@@ -152,7 +152,7 @@ def read_set(payload):
             if any(payload[:2]):
                 raise Refused(parts.NO_ENVELOPE, channel)
             payload = payload[2:]
-        commands.append((channel, frequency, level, phase))
+        commands.append((channel, flags & 0b011, frequency, level, phase))
     if payload:
         raise Refused(BAD_LENGTH)
     return *head, commands
@@ -167,7 +167,7 @@ def hello():
 
 def achieved(token, commands):
     """Its payload: this amplifier plays every step of the wire."""
-    packed = (struct.pack("<BBHHh", c, 0, f, level, phase) for c, f, level, phase in commands)
+    packed = (struct.pack("<BBHHh", *command) for command in commands)
     return struct.pack("<HB", token, len(commands)) + b"".join(packed)
 
 

@@ -49,7 +49,7 @@ def test_amplifier_is_silent_5_ms_after_its_watchdog_expired(serial: ModuleType)
     now = [1000.0]
     amplifier = amplifier_at(serial, now)
     amplifier.arm(WATCHDOG, SESSION)
-    amplifier.apply(SESSION, 1, 0, 0, [(0, 2200, 10000, 0), (3, 2200, 5000, 0)])
+    amplifier.apply(SESSION, 1, 0, 0, [(0, 0, 2200, 10000, 0), (3, 0, 2200, 5000, 0)])
     for after, share in ((-0.1, 1.0), (1.25, (1 + math.cos(math.pi / 4)) / 2), (2.5, 0.5)):
         now[0] = 1000.0 + WATCHDOG + after
         amplifier.update()
@@ -69,7 +69,7 @@ def test_amplifier_ends_a_set_after_its_validity(serial: ModuleType) -> None:
     now = [0.0]
     amplifier = amplifier_at(serial, now)
     amplifier.arm(2000, SESSION)
-    amplifier.apply(SESSION, 1, 10, 100, [(0, 2200, 10000, 0)])
+    amplifier.apply(SESSION, 1, 10, 100, [(0, 0, 2200, 10000, 0)])
     now[0] = 105.0
     amplifier.update()
     assert amplifier.levels == [5000, 0, 0, 0]

@@ -170,6 +170,7 @@ def encode(request: Request) -> dict[str, Any] | None:
                 "commands": [
                     (
                         one.channel,
+                        int(one.keep_phase),
                         round(one.frequency / HERTZ),
                         round(one.level / LEVEL),
                         (round(one.phase / DEGREES) + 18000) % 36000 - 18000,
@@ -220,8 +221,14 @@ def read(request: Request, reply: dict[str, Any]) -> Reply:
             return Achieved(
                 reply["token"],
                 tuple(
-                    DriveCommand(channel, frequency * HERTZ, level * LEVEL, phase * DEGREES)
-                    for channel, frequency, level, phase in reply["commands"]
+                    DriveCommand(
+                        channel,
+                        frequency * HERTZ,
+                        level * LEVEL,
+                        phase * DEGREES,
+                        keep_phase=keep_phase == 1,
+                    )
+                    for channel, keep_phase, frequency, level, phase in reply["commands"]
                 ),
             )
     return Status(

@@ -1,8 +1,10 @@
 """Checks of arguments that several functions take."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from model.arguments import expect, shown
+from model.arguments import expect, is_whole, shown
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -25,3 +27,11 @@ def as_frequencies(given: object) -> FloatArray:
             f"{shown(given)}"
         )
     return found
+
+
+def as_pair(given: object, *, what: str, such_as: str) -> tuple[int, int]:
+    """Two whole numbers, also of an array; raises InputError for anything else."""
+    pair = tuple(given) if isinstance(given, Sequence | np.ndarray) else ()
+    if len(pair) != 2 or not all(is_whole(count) for count in pair):
+        raise InputError(f"{what} must be two whole numbers, {such_as}, got {shown(given)}")
+    return int(pair[0]), int(pair[1])

@@ -3,9 +3,7 @@
 from collections.abc import Sequence
 from functools import cached_property
 
-import numpy as np
-
-from era_haptics.arguments import expect_rig
+from era_haptics.arguments import as_pair, expect_rig
 from era_haptics.drive import Drives, excitation_of
 from era_haptics.positions import Positions, as_loads, as_points
 from model.arguments import expect_number, is_whole, shown
@@ -65,7 +63,11 @@ class SolvedPlate:
         (paper Eq. 28). Raises InputError for a drive that the rig cannot play. Within 1e-5 of
         `era plate map`, which is solved directly.
         """
-        points = None if raster is None else _as_raster(raster)
+        points = (
+            None
+            if raster is None
+            else as_pair(raster, what="raster", such_as="points along x and y such as (61, 46)")
+        )
         excitation = {}
         for name, tone in self._excitation(drive).items():
             factor = self._drawn.errors_of(name, self.rig).factor
@@ -126,14 +128,3 @@ class SolvedPlate:
     def _reduced(self) -> ReducedPlate:
         attached = footprints_of(self._real.eras, self._real.masses)
         return reduce_free_plate(self._free, attached)
-
-
-def _as_raster(given: object) -> tuple[int, int]:
-    """Two whole numbers, also of an array; raises InputError for anything else."""
-    pair = tuple(given) if isinstance(given, Sequence | np.ndarray) else ()
-    if len(pair) != 2 or not all(is_whole(count) for count in pair):
-        raise InputError(
-            f"raster must be two whole numbers, points along x and y such as (61, 46), got "
-            f"{shown(given)}"
-        )
-    return int(pair[0]), int(pair[1])

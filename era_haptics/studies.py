@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from era_haptics.arguments import as_frequencies, expect_rig
+from era_haptics.arguments import as_frequencies, as_pair, expect_rig
 from model.arguments import expect_one_of, is_whole, shown
 from model.arrays import FloatArray
 from model.errors import InputError
@@ -61,10 +61,8 @@ def study(
     for name, value in counts:
         if not is_whole(value):
             raise InputError(f"{name} must be a whole number, got {shown(value)}")
-    pair: object = candidates  # callers may not use a type checker
-    if not (isinstance(pair, tuple | list) and [*map(is_whole, pair)] == [True, True]):
-        raise InputError(f"candidates must be two whole numbers, got {shown(candidates)}")
-    cases = STUDIES[what](rig, layouts=layouts, seed=seed, raster=candidates)
+    raster = as_pair(candidates, what="candidates", such_as="places along x and y such as (13, 13)")
+    cases = STUDIES[what](rig, layouts=layouts, seed=seed, raster=raster)
     check_supported_cases(rig, cases)
     problem = study_problem(rig, cases, as_frequencies(frequencies))
     processes = on_processes(useful_processes(problem, cases, workers))

@@ -52,9 +52,20 @@ def direct_spectral_acceleration(
         for number, each in enumerate(omega):
             moved = np.linalg.solve(loss[number] * K - each**2 * np.eye(len(K)), forces)
             receptance[number] += shapes @ moved[: shapes.shape[1]]
-    between, to_points = np.split(receptance, [len(attached)], axis=1)
+    return driven_acceleration(receptance, eras, loads, omega)
+
+
+def driven_acceleration(
+    receptance: ComplexArray, eras: Sequence[Era], loads: Sequence[Load], omega: FloatArray
+) -> ComplexArray:
+    """Acceleration [m/s²] at p points per angular frequency (f,) and driven ERA: (f, eras, p).
+
+    receptance (f, n + p, n) [m/N]: of the free plate, from the n attachments of ERAs and loads to
+    themselves and then to the points.
+    """
+    count = receptance.shape[2]
+    between, to_points = np.split(receptance, [count], axis=1)
     stiffness = attached_stiffness(eras, loads, omega)
-    applied = on_diagonal(drive_forces(eras, omega), rows=len(attached))
-    forces_on_plate = coupled_forces(between, stiffness, applied)
-    displacement = (to_points @ forces_on_plate).transpose(0, 2, 1)
+    applied = on_diagonal(drive_forces(eras, omega), rows=count)
+    displacement = (to_points @ coupled_forces(between, stiffness, applied)).transpose(0, 2, 1)
     return np.asarray(-(omega**2)[:, None, None] * displacement)

@@ -12,15 +12,14 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray
 from model.fem.plate_mesh import check_frequencies
 from model.fem.symmetry import CLASSES
+from model.spectral.direct import driven_acceleration
 from model.spectral.layered_class import LayeredPlate
 from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import deflections_by_class
 from model.structure.actuator import Era
-from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 from model.structure.equivalent import short_wave_plate
 from model.structure.footprint import as_footprints
-from model.structure.low_rank import coupled_forces, on_diagonal
 from model.structure.modal_elasticity import check_of_theory, loss_factors
 from model.structure.plate import Plate
 from model.structure.point_load import Load, footprints_of
@@ -60,9 +59,4 @@ def direct_layered_acceleration(
         for parity, shapes in zip(CLASSES, bases, strict=True):
             D = layered.dynamic_stiffness(parity, frequency)
             receptance[number] += shapes @ np.linalg.solve(D, shapes[:count].T)
-    between, to_points = np.split(receptance, [count], axis=1)
-    stiffness = attached_stiffness(eras, loads, omega)
-    applied = on_diagonal(drive_forces(eras, omega), rows=count)
-    forces = coupled_forces(between, stiffness, applied)
-    displacement = (to_points @ forces).transpose(0, 2, 1)
-    return np.asarray(-(omega**2)[:, None, None] * displacement)
+    return driven_acceleration(receptance, eras, loads, omega)

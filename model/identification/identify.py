@@ -95,7 +95,8 @@ def identify(
     )
     fitted = fit_in_stages(setting)
     values = Values.of(rig, fitted.space, fitted.best.x)
-    is_explained = chi2(fitted) <= MAX_CHI2
+    misfit = chi2(fitted)
+    is_explained = misfit <= MAX_CHI2
     if is_explained:
         check_gains(rig, measurement, values, setting.priors)
     posterior = Posterior.of(fitted.space, fitted.best)
@@ -110,7 +111,7 @@ def identify(
         rig_with(rig, values, uncertainty),
         values,
         posterior,
-        chi2(fitted),
+        misfit,
         hold_out(fitted),
         fitted,
         seed,

@@ -80,7 +80,7 @@ def tracing(path: Path) -> Iterator[None]:
         yield
     finally:
         _root.removeHandler(writer)
-        if not _root.handlers:
+        if not any(isinstance(handler, TraceWriter) for handler in _root.handlers):
             _root.setLevel(logging.CRITICAL)
         writer.close()
 

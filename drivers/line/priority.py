@@ -9,6 +9,10 @@ from drivers.protocol.messages import (
     Clear,
     Commit,
     Disarm,
+    GetBlock,
+    GetReading,
+    GetSensors,
+    Measure,
     Ping,
     Request,
     Stage,
@@ -31,11 +35,17 @@ class Priority(IntEnum):
     ARM = 4
     CLEAR = 5
     OTHER = 6
+    READING = 7  # of sensors: nothing that is felt or that keeps safe waits for it
 
     @property
     def rank(self) -> int:
         """Place in the queue; equal ranks are sent in their order."""
-        return min(self, Priority.ARM)
+        return self if self is Priority.READING else min(self, Priority.ARM)
+
+    @property
+    def gains_rank(self) -> bool:
+        """Whether it goes before newer heartbeats and sets once it has waited for long."""
+        return self is not Priority.READING
 
     @property
     def is_stop_class(self) -> bool:
@@ -43,8 +53,12 @@ class Priority(IntEnum):
         return self <= Priority.SILENCE
 
     def preempts(self, other: "Priority") -> bool:
-        """Whether it abandons a request of that priority on the line."""
-        return self.is_stop_class and self < other
+        """Whether it abandons a request of that priority on the line.
+
+        A set disturbs the reading that is on the line, which is then worth nothing.
+        """
+        is_disturbing = self is Priority.APPLY and other is Priority.READING
+        return is_disturbing or (self.is_stop_class and self < other)
 
     def supersedes(self, other: "Priority") -> bool:
         """Whether this request makes a queued one of that priority obsolete."""
@@ -67,6 +81,10 @@ _BY_TYPE: dict[type[Request], Priority] = {
     Commit: Priority.APPLY,
     Arm: Priority.ARM,
     Clear: Priority.CLEAR,
+    GetSensors: Priority.READING,
+    Measure: Priority.READING,
+    GetReading: Priority.READING,
+    GetBlock: Priority.READING,
 }
 
 

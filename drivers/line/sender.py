@@ -19,7 +19,7 @@ from drivers.line import priority as priorities
 from drivers.line.priority import Priority
 
 MAX_WAIT = 0.05
-"""Time [s] after which a queued request goes before newer heartbeats and sets."""
+"""Time [s] after which a queued request goes before newer heartbeats and sets; readings never."""
 
 SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
 
@@ -80,7 +80,8 @@ class _Entry:
     def rank(self, now: float) -> int:
         """Place in the queue at a time [s]; one that has waited long is a heartbeat's equal."""
         rank = self.priority.rank
-        return min(rank, Priority.HEARTBEAT) if now - self.queued_at > MAX_WAIT else rank
+        has_waited = self.priority.gains_rank and now - self.queued_at > MAX_WAIT
+        return min(rank, Priority.HEARTBEAT) if has_waited else rank
 
     def fail(self, error: BaseException) -> None:
         """End it, unless its caller has gone."""

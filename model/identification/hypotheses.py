@@ -132,8 +132,9 @@ def _scan(
         P = linalg.block_diag(before.covariance, np.eye(len(fingers)))
         S = H @ P @ H.T + np.diag(each.pattern.std**2)
         at = each.touched.at(np.concatenate([before.x, fingers]))
-        columns = np.einsum("snp,n->sp", by_mass_at(at, points)[0], each.pattern.bases)
-        column = np.concatenate([columns.real, columns.imag])
+        bases = each.pattern.bases
+        columns = np.einsum("snp,n->sp", by_mass_at(at, points)[0], bases)
+        _, column = each.as_numbers(at.responses[0] @ bases, columns)
         weighted = linalg.solve(S, column, assume_a="pos")
         slope += (each.pattern.numbers - predicted) @ weighted
         curvature += (column * weighted).sum(axis=0)

@@ -19,6 +19,8 @@ class SettledPattern:
 
     bases (n,): amplitude of each ERA's base as commanded [m]; values (s,): acceleration at each
     sensor [m/s²], phases as exp(+i omega t); fingers: on the plate, as far as they are known.
+    has_phase: whether phases of values count from those of bases; otherwise one phase is unknown,
+    the same for all sensors, and no update depends on it.
     """
 
     time: float
@@ -26,6 +28,7 @@ class SettledPattern:
     bases: ComplexArray
     values: ComplexArray
     fingers: tuple[RestingFinger, ...] = ()
+    has_phase: bool = True
 
     @property
     def std(self) -> FloatArray:
@@ -87,8 +90,25 @@ class Touched:
         """
         plate = self.touched.at(np.concatenate([x, fingers]))
         values = plate.responses[0] @ self.pattern.bases
-        J = np.einsum("snp,n->sp", jacobian(plate)[0], self.pattern.bases)
+        changes = np.einsum("snp,n->sp", jacobian(plate)[0], self.pattern.bases)
+        return self.as_numbers(values, changes)
+
+    def as_numbers(
+        self, values: ComplexArray, changes: ComplexArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Real and imaginary parts of values at the sensors (s,) and their changes (s, q).
+
+        Without a known phase the values are turned to that of the pattern's own, v: a exp(-i phi)
+        with phi = arg(v^H a), which changes by d phi = Im(v^H da / v^H a).
+        """
+        if not self.pattern.has_phase:
+            measured = self.pattern.values.conj()
+            along = measured @ values
+            turned = (measured @ changes / along).imag
+            phase_factor = abs(along) / along
+            changes = phase_factor * (changes - 1j * np.outer(values, turned))
+            values = phase_factor * values
         return (
             np.concatenate([values.real, values.imag]),
-            np.concatenate([J.real, J.imag]),
+            np.concatenate([changes.real, changes.imag]),
         )

@@ -364,3 +364,38 @@ async def test_preemption_that_comes_too_late_leaves_its_caller_uncancelled() ->
     await sender.send(amplifier, Priority.STOP, stop)
     assert await called == ("reply", 0)
     assert events == ["cancelled", "stop"]
+
+
+@in_virtual_time
+async def test_reading_goes_last_however_long_it_waits() -> None:
+    """Heartbeats, sets and all else of both amplifiers are sent before a reading of sensors."""
+    line = Line()
+    east, west = Amplifier(line), Amplifier(line)
+    beats = 100
+
+    async def repeat() -> None:
+        for _ in range(beats):
+            await east.ask("beat", Priority.HEARTBEAT)
+
+    busy = [asyncio.create_task(repeat()), asyncio.create_task(repeat())]
+    await asyncio.sleep(0.01)
+    reading = west.ask("reading", Priority.READING)
+    await asyncio.gather(west.ask("other", Priority.OTHER), *busy)
+    await reading
+    assert line.sent.count("beat") == 2 * beats
+    assert line.sent[-1] == "reading"
+
+
+@pytest.mark.parametrize("newer", [Priority.STOP, Priority.SILENCE, Priority.APPLY])
+@in_virtual_time
+async def test_set_and_silence_abandon_a_reading_on_the_line(newer: Priority) -> None:
+    """After the grace, as other requests for a stop; the reading fails and is not repeated."""
+    line = Line()
+    east = Amplifier(line)
+    reading = east.ask("first", Priority.READING)
+    await asyncio.sleep(0.002)
+    begin = clock.now()
+    await east.ask("newer", newer)
+    assert east.last_sent_at - begin == pytest.approx(PREEMPTION_GRACE)
+    assert isinstance(await fate(reading), Preempted)
+    assert line.sent == ["first", "newer"]

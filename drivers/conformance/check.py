@@ -214,12 +214,10 @@ def _is_mute(attempt: _Attempt) -> bool:
 
 async def _attempt(check: Check, bench: Bench, process: int | None) -> _Attempt:
     """Run the steps once."""
-    before = bench.amplifier.statistics.timeouts
     with Lateness(process) as lateness:
         bench.delayed_since = lateness.since
         finding = await _finding(check, bench)
-    missed = bench.amplifier.statistics.timeouts - before
-    return _Attempt(finding, lateness.worst, bench.max_delay, missed)
+    return _Attempt(finding, lateness.worst, bench.max_delay, bench.missed_replies)
 
 
 async def _finding(check: Check, bench: Bench) -> Exception | None:

@@ -1,5 +1,6 @@
 """Checks of the levels during a cross-fade, when two voices of a channel sound."""
 
+import cmath
 import math
 from collections.abc import Sequence
 
@@ -73,15 +74,8 @@ def _added(bench: Bench, first: float, second: float) -> Curve:
 
 def _summed(bench: Bench, first: float, second: float, phase: float) -> Curve:
     """Make the curve of the magnitude of the sum of both voices, a phase [degrees] apart."""
-    falling = raised_cosine(bench.ramp, start=first * bench.level, end=0.0)
-    rising = raised_cosine(bench.ramp, start=0.0, end=second * bench.level)
-    cosine = math.cos(math.radians(phase))
-
-    def level(time: float) -> float:
-        one, other = falling(time), rising(time)
-        return math.sqrt(max(one**2 + other**2 + 2 * one * other * cosine, 0.0))
-
-    return level
+    end = cmath.rect(second * bench.level, math.radians(phase))
+    return raised_cosine(bench.ramp, start=first * bench.level, end=end)
 
 
 def _other_frequency(bench: Bench) -> float:

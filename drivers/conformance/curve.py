@@ -3,6 +3,8 @@
 import asyncio
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 
 from drivers import clock
 from drivers.conformance.bench import Bench, Sample
@@ -10,25 +12,74 @@ from drivers.conformance.findings import ContractViolation, Inconclusive
 from drivers.guard.channel_state import Interval
 from drivers.operation.plausibility import CYCLE
 
-Curve = Callable[[float], float]
-"""A level by the time [s] since its commit; any time."""
-
 _PAUSE = 0.004  # s; between samples
 _PARTS = 5  # of the curve, in each of which there must be a sharp sample
-_FINE = 8  # points of an interval at which the curve is looked at
 _SHARP = 0.15  # of the largest level; span of the curve over the interval of a sharp sample
 _BEFORE = 0.1  # s; before a commit, in which a delay may still count
-_LATEST_PAUSE = 0.04  # s
 
 
-def raised_cosine(ramp: float, *, start: float, end: float) -> Curve:
-    """Make the curve of a ramp [s] from one level to another."""
+@dataclass(frozen=True)
+class Curve:
+    """A level by the time [s] since its commit; any time.
+
+    turns [s]: all times at which it may begin or cease to rise or fall. Between them it is
+    monotonic, so that its values there and at the ends bound it over an interval.
+    """
+
+    level: Callable[[float], float]
+    turns: tuple[float, ...]
+
+    def __call__(self, time: float) -> float:
+        """Return the level at a time [s]."""
+        return self.level(time)
+
+    def span(self, first: float, last: float) -> tuple[float, float]:
+        """Return the least and the greatest level between two times [s]."""
+        within = [turn for turn in self.turns if first < turn < last]
+        values = [self.level(time) for time in (first, *within, last)]
+        return min(values), max(values)
+
+    def after(self, delay: float) -> "Curve":
+        """Make the same curve, a time [s] later."""
+        turns = tuple(turn + delay for turn in self.turns)
+        return Curve(lambda time: self.level(time - delay), turns)
+
+
+def raised_cosine(ramp: float, *, start: complex, end: complex) -> Curve:
+    """Make the curve of a ramp [s] from one complex amplitude to another.
+
+    That is how voices of one frequency cross-fade. It turns where it is nearest to zero.
+    """
 
     def level(time: float) -> float:
         share = min(max(time / ramp, 0.0), 1.0) if ramp else float(time >= 0)
-        return start + (end - start) * (1 - math.cos(math.pi * share)) / 2
+        return abs(start + (end - start) * (1 - math.cos(math.pi * share)) / 2)
 
-    return level
+    lowest = ramp * math.acos(1 - 2 * _nearest_to_zero(start, end)) / math.pi
+    return Curve(level, (0.0, lowest, ramp))
+
+
+def along(step: float, *values: complex) -> Curve:
+    """Make the curve along straight lines between complex amplitudes, a step [s] apart."""
+
+    def level(time: float) -> float:
+        share = min(max(time / step, 0.0), len(values) - 1.0)
+        number = min(int(share), len(values) - 2)
+        here, there = values[number : number + 2]
+        return abs(here + (there - here) * (share - number))
+
+    turns = []
+    for number, (here, there) in enumerate(pairwise(values)):
+        turns += [number * step, (number + _nearest_to_zero(here, there)) * step]
+    return Curve(level, (*turns, (len(values) - 1) * step))
+
+
+def _nearest_to_zero(here: complex, there: complex) -> float:
+    """Return the share of a straight line at which it is nearest to zero."""
+    way = there - here
+    if not way:
+        return 0.0
+    return min(max(-(here * way.conjugate()).real / abs(way) ** 2, 0.0), 1.0)
 
 
 async def samples_until(bench: Bench, end: float, *, feed: bool = True) -> list[Sample]:
@@ -57,14 +108,17 @@ def expect_curve(
     Inconclusive if too few samples are sharp enough to tell this curve from others.
     """
     sharp = [0] * _PARTS
-    peak = max(abs(curve(lasts * number / _FINE)) for number in range(_FINE + 1))
+    _, peak = curve.span(0.0, lasts)
     for sample in samples:
         low, high = _span(curve, sample.when, commit)
         level = sample.status.levels[channel]
+        first = max(sample.when.earliest - commit.latest, 0.0)
+        last = sample.when.latest - commit.earliest
         middle = (sample.when.earliest + sample.when.latest - commit.earliest - commit.latest) / 2
         if not low - bench.tolerance <= level <= high + bench.tolerance:
             raise ContractViolation(
-                f"level {what} of channel {channel}, {middle * 1e3:.0f} ms after its commit",
+                f"level {what} of channel {channel}, {first * 1e3:.1f} to {last * 1e3:.1f} ms "
+                "after its request",
                 expected=f"{max(low, 0):.4f} to {high:.4f}",
                 seen=f"{level:.4f}",
                 is_certain=_is_never(bench, level, curve, sample.when, commit),
@@ -88,6 +142,4 @@ def _is_never(bench: Bench, level: float, curve: Curve, when: Interval, commit: 
 def _span(curve: Curve, when: Interval, commit: Interval) -> tuple[float, float]:
     """Return the least and the greatest level of a curve in the interval of a sample."""
     first = when.earliest - commit.latest - CYCLE
-    last = when.latest - commit.earliest
-    values = [curve(first + (last - first) * number / _FINE) for number in range(_FINE + 1)]
-    return min(values), max(values)
+    return curve.span(first, when.latest - commit.earliest)

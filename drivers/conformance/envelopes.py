@@ -3,24 +3,12 @@
 from drivers.command import Envelope, Knot
 from drivers.conformance.bench import Bench
 from drivers.conformance.check import driving
-from drivers.conformance.curve import Curve, expect_curve, raised_cosine, samples_until
+from drivers.conformance.curve import along, expect_curve, raised_cosine, samples_until
 from drivers.conformance.ending import PROMPT, is_silent
 from drivers.conformance.findings import Inconclusive, NotApplicable, expect
 from drivers.protocol.messages import Feature
 
 _PLACE = "wire-protocol.md#envelopes"
-
-
-def along(step: float, *values: complex) -> Curve:
-    """Make the level along straight lines between complex amplitudes, a step [s] apart."""
-
-    def level(time: float) -> float:
-        share = min(max(time / step, 0.0), len(values) - 1.0)
-        number = min(int(share), len(values) - 2)
-        here, there = values[number : number + 2]
-        return abs(here + (there - here) * (share - number))
-
-    return level
 
 
 def step_of(bench: Bench) -> float:
@@ -79,7 +67,7 @@ async def endings(bench: Bench) -> None:
     expect_curve(
         bench,
         samples,
-        lambda time: falling(time - lasts),
+        falling.after(lasts),
         commit=when,
         lasts=lasts + 3 * step,
         what="of an ending by valid_for",

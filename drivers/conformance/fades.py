@@ -4,7 +4,7 @@ import asyncio
 import math
 from dataclasses import dataclass
 
-from drivers.conformance.bench import Bench
+from drivers.conformance.bench import Bench, Sample
 from drivers.conformance.check import driving
 from drivers.conformance.curve import Curve, expect_curve, raised_cosine, samples_until
 from drivers.conformance.ending import PROMPT, is_silent
@@ -224,9 +224,9 @@ async def phases(bench: Bench) -> None:
     if all(level > 0.9 * bench.level for level, _ in found):
         raise MeasuredNotApplicable("its levels do not show that tones of one frequency interfere")
     for case, (level, error) in zip(_TONES, found, strict=True):
-        allowed = bench.level * (math.pi * error + 0.05) + bench.tolerance
+        allowed = bench.level * (math.pi * error + 0.02) + bench.tolerance
         if error > 1.5 * _CYCLE_ERROR:
-            raise Inconclusive(f"a tone {case.name} was late by {error:.2f} turns")
+            raise Inconclusive(f"the time of a tone {case.name} is known to {error:.2f} turns")
         expect(
             abs(level - case.amid * bench.level) <= allowed,
             f"level amid a ramp to a tone {case.name}",
@@ -236,7 +236,7 @@ async def phases(bench: Bench) -> None:
 
 
 async def _level_after(bench: Bench, case: _FollowingTone, frequency: float) -> tuple[float, float]:
-    """Return the level amid the ramp to a tone, and the error of its turns."""
+    """Return the level amid the ramp to a tone, and the error of its time, in turns or ramps."""
     await bench.arm()
     first = await bench.apply(bench.tones(1.0, frequency=frequency))
     # Whole turns before, so that the pause is longer than an exchange.
@@ -251,25 +251,28 @@ async def _level_after(bench: Bench, case: _FollowingTone, frequency: float) -> 
             ramp=bench.ramp,
         )
     )
-    level = await _level_amid(bench, second, bench.ramp)
+    level, missed = await _level_amid(bench, second, bench.ramp)
     await bench.amplifier.disarm(0.0)
     await asyncio.sleep(0.01)
     delays = (second.earliest - first.latest, second.latest - first.earliest)
     turns = [one * frequency - case.cycles for one in delays]
     error = max(abs(one - round(one)) for one in turns)
-    return level, (0.0 if case.keep_phase else error)
+    # Half a ramp turns opposite gains as half a turn does phases.
+    return level, missed + (0.0 if case.keep_phase else error)
 
 
-async def _level_amid(bench: Bench, when: Interval, ramp: float) -> float:
-    """Read the level nearest to the middle of a ramp [s]."""
+async def _level_amid(bench: Bench, when: Interval, ramp: float) -> tuple[float, float]:
+    """Read the level nearest to the middle of a ramp [s]; how far off it may be, in ramps."""
     middle = (when.earliest + when.latest + ramp) / 2
     await bench.pause_until(middle - 0.01)
     samples = await samples_until(bench, middle + 0.01 + bench.exchange_time, feed=False)
-    nearest = min(
-        samples or [await bench.sample()],
-        key=lambda one: abs(one.when.earliest + one.when.latest - 2 * middle),
-    )
-    return nearest.status.levels[0]
+
+    def missed(sample: Sample) -> float:
+        early = when.latest + ramp / 2 - sample.when.earliest
+        return max(early, sample.when.latest - when.earliest - ramp / 2) / ramp
+
+    nearest = min(samples or [await bench.sample()], key=missed)
+    return nearest.status.levels[0], missed(nearest)
 
 
 @driving(_SETS)
@@ -280,12 +283,9 @@ async def ramps_of_valid_for(bench: Bench) -> None:
     ramp, lasts = bench.ramp / 2, 1.5 * bench.ramp
     when = await bench.play(1.0, ramp=ramp, valid_for=lasts)
     rising = raised_cosine(ramp, start=0.0, end=bench.level)
-    falling = raised_cosine(ramp, start=0.0, end=bench.level)
-
-    def level(time: float) -> float:
-        return min(rising(time), bench.level - falling(time - lasts))
-
+    falling = raised_cosine(ramp, start=bench.level, end=0.0).after(lasts)
+    both = Curve(lambda time: min(rising(time), falling(time)), (*rising.turns, *falling.turns))
     samples = await samples_until(bench, when.latest + lasts + 1.2 * ramp)
     expect_curve(
-        bench, samples, level, commit=when, lasts=lasts + ramp, what="of a set with valid_for"
+        bench, samples, both, commit=when, lasts=lasts + ramp, what="of a set with valid_for"
     )

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.conformance.bench import Bench
 from drivers.conformance.check import driving
-from drivers.conformance.curve import expect_curve, samples_until
+from drivers.conformance.curve import along, expect_curve, samples_until
 from drivers.conformance.ending import PROMPT, is_silent
-from drivers.conformance.envelopes import along, load, step_of
+from drivers.conformance.envelopes import load, step_of
 from drivers.conformance.findings import ContractViolation, NotApplicable
 from drivers.errors import CommandRefused
 from drivers.guard import SafeCommandSet

@@ -15,7 +15,7 @@ from model.arrays import FloatArray
 from model.identification.derivatives import by_mass_at
 from model.identification.kalman import State, Updated, update
 from model.identification.parameters import Space
-from model.identification.settled import Touched
+from model.identification.settled import Touched, finger_covariance
 
 _SPRING, _THICKNESS, _GAIN, _PHASE = 0.3, 0.05, 0.3, 0.5  # of logarithms, and radians
 _MASS = 5e-3
@@ -129,8 +129,8 @@ def _scan(
     for each in patterns:
         fingers = np.zeros(each.touched.space.size - len(before.x))
         predicted, H = each.predicted(before.x, fingers)
-        P = linalg.block_diag(before.covariance, np.eye(len(fingers)))
-        S = H @ P @ H.T + np.diag(each.pattern.std**2)
+        P = linalg.block_diag(before.covariance, finger_covariance([each.pattern]))
+        S = H @ P @ H.T + np.diag(each.std**2)
         at = each.touched.at(np.concatenate([before.x, fingers]))
         bases = each.pattern.bases
         columns = np.einsum("snp,n->sp", by_mass_at(at, points)[0], bases)

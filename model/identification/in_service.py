@@ -1,27 +1,28 @@
 """A plate that stays known while it plays: every settled pattern updates it.
 
 The parameters of an identification drift; an update moves them together with the fingers of its
-pattern, which are dropped afterwards. Where the innovation is unlikely the state is held, since an
-update would smear a jump over all parameters: five patterns later the last six are explained
-together by one change (`model.identification.hypotheses`), or the plate counts as changed.
+pattern, which are dropped afterwards. Where innovations are unlikely (`model.identification.alarm`)
+the state goes back to where they began, since an update smears a jump over all parameters, and is
+held until the patterns since then are explained together by one change
+(`model.identification.hypotheses`), or the plate counts as changed.
 """
 
 import math
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Self
 
 import numpy as np
-from scipy import stats
 
 from model.arrays import FloatArray
+from model.identification.alarm import Alarm, Taken, places_on
 from model.identification.forward import ForwardModel, Sensor
 from model.identification.hypotheses import Explanation, explain
 from model.identification.identified_rig import rig_with
 from model.identification.identify import Identification, solved_for
 from model.identification.kalman import State, update
+from model.identification.noise import NoiseLevel
 from model.identification.parameters import FINGER_PARTS, MODE_SHIFTS, Space, space_of
 from model.identification.posterior import THEORY
 from model.identification.priors import Priors
@@ -31,8 +32,9 @@ from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.modal_elasticity import lowest_elastic
 
-_WINDOW, _UNLIKELY_TOGETHER, _UNLIKELY_ALONE = 8, 1e-6, 1e-8
-_HELD = 5
+_EARLY, _HELD = 4, 6  # patterns that are explained together, at first and at last
+_AFTER_ALARM = 2  # patterns before a change counts as unexplained
+_CERTAIN = 25.0  # of the cost: by how much an early explanation is better than any other
 _ITERATIONS = 3
 
 _NOT_STATED = (
@@ -128,8 +130,11 @@ class LivePlate:
         self._state = known.state
         self._priors = Priors.of(known.before.uncertainty)
         self._time: float | None = None
-        self._recent: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
+        self._alarm = Alarm()
+        self._places = places_on(known.before.plate.length, known.before.plate.width)
+        self._noise = NoiseLevel()
         self._held: list[Touched] = []
+        self._since_alarm = 0
         self.has_changed = False
         """Whether the plate has changed in a way that no hypothesis explains."""
 
@@ -156,41 +161,51 @@ class LivePlate:
 
     def take(self, pattern: SettledPattern) -> Report:
         """Take a settled pattern: update the state, or hold it and explain what happened."""
-        touched = Touched.of(self._model, pattern, self._priors.finger)
+        touched = Touched.of(self._model, pattern, self._priors.finger, noise=self._noise.relative)
         drifted = self._drifted(pattern.time)
         if self._held:
             self._held.append(touched)
-            if len(self._held) > _HELD:
-                return self._explained(drifted, pattern.time)
-            return Report(np.nan, 0, False, True, None, np.zeros((0, 4)))
+            self._since_alarm += 1
+            return self._explained(pattern.time)
         after = update(drifted, [touched], iterations=_ITERATIONS, theory=self._theory)
-        self._recent.append((after.nis, after.count))
-        if self._is_alarming(after.nis, after.count):
-            self._recent.clear()
+        taken = Taken.of(touched, self._state, self._time, after, self._places)
+        suspect = self._alarm.take(taken)
+        if suspect is not None:
+            explanation = None
             if self.can_update and not self.has_changed:
-                self._held = [touched]
-            return Report(after.nis, after.count, True, bool(self._held), None, np.zeros((0, 4)))
+                self._go_back(suspect)
+                explanation = self._explained(pattern.time).explanation
+            self._alarm.clear()
+            return Report(
+                after.nis, after.count, True, bool(self._held), explanation, np.zeros((0, 4))
+            )
         if self.can_update and not self.has_changed:
             self._state, self._time = after.state, pattern.time
+            self._noise.take(after)
         fingers = np.exp(self._priors.finger * after.fingers.reshape(-1, len(FINGER_PARTS)))
         return Report(after.nis, after.count, False, False, None, fingers)
 
-    def _explained(self, drifted: State, time: float) -> Report:
-        found = explain(drifted, self._held)
+    def _go_back(self, suspect: list[Taken]) -> None:
+        """Return to the state before the first suspect pattern, and hold them."""
+        self._state, self._time = suspect[0].before, suspect[0].time
+        self._held, self._since_alarm = [each.touched for each in suspect], 0
+
+    def _explained(self, time: float) -> Report:
+        """Explain what was held, early if it is certain."""
+        count, drifted = len(self._held), self._drifted(time)
+        is_full = count >= _HELD and self._since_alarm >= _AFTER_ALARM
+        found = explain(drifted, self._held) if count >= _EARLY else None
+        if is_full and found and not found.name and count > _HELD:
+            # The first of them may be from before the change.
+            found = explain(drifted, self._held[-_HELD:])
+        if found is None or not (is_full or (found.name and found.lead > _CERTAIN)):
+            return Report(np.nan, 0, False, True, None, np.zeros((0, 4)))
         self._held = []
         if found.name:
             self._state, self._time = found.state, time
         else:
             self.has_changed = True
         return Report(np.nan, 0, False, False, found, np.zeros((0, 4)))
-
-    def _is_alarming(self, nis: float, count: int) -> bool:
-        if stats.chi2.sf(nis, count) < _UNLIKELY_ALONE:
-            return True
-        total = sum(each for each, _ in self._recent)
-        numbers = sum(each for _, each in self._recent)
-        is_full = len(self._recent) == _WINDOW
-        return is_full and bool(stats.chi2.sf(total, numbers) < _UNLIKELY_TOGETHER)
 
     @cached_property
     def _theory(self) -> FloatArray:

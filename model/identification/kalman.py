@@ -7,7 +7,7 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import FloatArray
-from model.identification.settled import Touched, finger_count
+from model.identification.settled import Touched, finger_count, finger_covariance
 
 _CONVERGED = 3e-3  # standard deviations
 _MAX_STEP = 1.5
@@ -26,14 +26,22 @@ class Updated:
     """A state after some patterns.
 
     nis: normalised innovation squared before the update, of `count` real numbers; cost: squared
-    residuals and changes after it, in standard deviations; fingers (q,): parameters of all fingers.
+    residuals and changes after it, in standard deviations; misfit: squared residuals alone, of
+    `freedom` numbers that plate and fingers do not take up; fingers (q,): parameters of all of
+    them; innovation (count,): at the slopes (count, p) by the plate where the update ended;
+    precision (count, count): the inverse of its covariance, what the theory gets wrong included.
     """
 
     state: State
     nis: float
     count: int
     cost: float
+    misfit: float
+    freedom: float
     fingers: FloatArray
+    innovation: FloatArray
+    slopes: FloatArray
+    precision: FloatArray
 
 
 def update(
@@ -51,26 +59,21 @@ def update(
     the innovation: only a matrix as large as the patterns' numbers is inverted.
     """
     space = patterns[0].space
-    p, q = len(before.x), finger_count([each.pattern for each in patterns])
-    prior = linalg.block_diag(before.covariance, np.eye(q))
+    settled = [each.pattern for each in patterns]
+    p, q = len(before.x), finger_count(settled)
+    prior = linalg.block_diag(before.covariance, finger_covariance(settled))
     centre = np.concatenate([before.x, np.zeros(q)])
     values = np.concatenate([each.pattern.numbers for each in patterns])
-    std = np.concatenate([each.pattern.std for each in patterns])
+    std = np.concatenate([each.std for each in patterns])
     at = centre.copy()
     if start is not None:
         at[: len(start)] = start
-    nis = np.nan
-    for step in range(iterations):
+    for _ in range(iterations):
         predicted, H = _linearised(patterns, at, p, q)
         innovation = values - predicted - H @ (centre - at)
         gain = prior @ H.T
         S = linalg.cho_factor(H @ gain + np.diag(std**2))
         weighted = linalg.cho_solve(S, innovation)
-        if step == 0 and start is None:
-            wrong = np.zeros(p + q)
-            wrong[:p] = 0.0 if theory is None else theory
-            expected = H @ (gain + wrong[:, None] * H.T) + np.diag(std**2)
-            nis = float(innovation @ linalg.solve(expected, innovation, assume_a="pos"))
         moved = centre + gain @ weighted
         moved[:p] = np.clip(moved[:p], space.lower, space.upper)
         change = np.abs(moved - at).max()
@@ -80,19 +83,31 @@ def update(
             break
     predicted, H = _linearised(patterns, at, p, q)
     gain = prior @ H.T
-    covariance = prior - gain @ linalg.solve(H @ gain + np.diag(std**2), gain.T, assume_a="pos")
+    inverse = linalg.inv(H @ gain + np.diag(std**2))
+    covariance = prior - gain @ inverse @ gain.T
     residuals = (values - predicted) / std
     # Of the change that led there: (x - x0)^T P^-1 (x - x0) through the numbers it explains.
     innovation = values - predicted - H @ (centre - at)
-    weighted = linalg.solve(H @ gain + np.diag(std**2), innovation, assume_a="pos")
+    weighted = inverse @ innovation
     changes = float(weighted @ H @ gain @ weighted)
+    wrong = np.zeros(p + q)
+    wrong[:p] = 0.0 if theory is None else theory
+    expected = H @ (gain + wrong[:, None] * H.T) + np.diag(std**2)
+    # In the slopes where it ended: those before are wrong for a finger of another load.
+    precision = linalg.inv(expected)
+    nis = float(innovation @ precision @ innovation)
     own = covariance[:p, :p]
     return Updated(
         State(at[:p], (own + own.T) / 2),
         nis,
         len(values),
         float(residuals @ residuals) + changes,
+        float(residuals @ residuals),
+        float(std**2 @ np.diagonal(inverse)),
         at[p:],
+        innovation,
+        H[:, :p],
+        precision,
     )
 
 

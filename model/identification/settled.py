@@ -10,7 +10,9 @@ from model.identification.derivatives import jacobian
 from model.identification.forward import ForwardModel, RestingFinger
 from model.identification.parameters import FINGER_PARTS, Space
 
+_OWN = 0.5  # of a finger's deviation as a whole
 _NOISE, _FLOOR = 0.01, 0.1
+"""Of a reading at most, relative to its size; of those near zero, to the mean of all sensors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +34,7 @@ class SettledPattern:
 
     @property
     def std(self) -> FloatArray:
-        """Error of each real number of `numbers`, (2 s,)."""
+        """Largest error of each real number of `numbers`, one standard deviation (2 s,)."""
         rms2 = (np.abs(self.values) ** 2).mean()
         own = _NOISE * np.sqrt(np.abs(self.values) ** 2 + _FLOOR**2 * rms2)
         return np.concatenate([own, own])
@@ -48,19 +50,39 @@ def finger_count(patterns: Sequence[SettledPattern]) -> int:
     return len(FINGER_PARTS) * sum(len(pattern.fingers) for pattern in patterns)
 
 
+def finger_covariance(patterns: Sequence[SettledPattern]) -> FloatArray:
+    """Covariance (q, q) of the parameters of all fingers of some patterns before any of them.
+
+    A finger loads a plate more or less as a whole, and each of its parts differs half as much
+    beside that: parts that varied on their own only would make a heavy finger as unlikely as four.
+    """
+    parts = len(FINGER_PARTS)
+    own = _OWN**2 * np.eye(parts) + np.ones((parts, parts))
+    return np.asarray(np.kron(np.eye(finger_count(patterns) // parts), own), dtype=float)
+
+
 @dataclass(frozen=True, eq=False)
 class Touched:
     """The plate of a forward model under the fingers of one pattern.
 
-    space: of the model, which has no fingers of its own; touched: the model with the fingers.
+    space: of the model, which has no fingers of its own; touched: the model with the fingers;
+    noise: of the pattern's readings, relative to its largest.
     """
 
     pattern: SettledPattern
     space: Space
     touched: ForwardModel
+    noise: float = 1.0
 
     @classmethod
-    def of(cls, model: ForwardModel, pattern: SettledPattern, finger_std: float) -> "Touched":
+    def of(
+        cls,
+        model: ForwardModel,
+        pattern: SettledPattern,
+        finger_std: float,
+        *,
+        noise: float = 1.0,
+    ) -> "Touched":
         """A model under the fingers of a pattern, of loads known to finger_std (of logarithms)."""
         count = len(FINGER_PARTS) * len(pattern.fingers)
         names = tuple(f"finger part {number}" for number in range(count))
@@ -81,7 +103,12 @@ class Touched:
             space=wider,
             last_places={},
         )
-        return cls(pattern, space, touched)
+        return cls(pattern, space, touched, noise)
+
+    @property
+    def std(self) -> FloatArray:
+        """Error of each number of the pattern, (2 s,)."""
+        return self.noise * self.pattern.std
 
     def predicted(self, x: FloatArray, fingers: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Numbers that a pattern is expected to give (2 s,), and their derivatives (2 s, p + q).

@@ -57,6 +57,27 @@ def test_loosened_mount_is_named_and_followed(hidden: Hidden, found: Identificat
     assert not live.has_changed
 
 
+def test_sticker_is_named_in_its_place(hidden: Hidden, found: Identification) -> None:
+    """3 g are named a mass within ten patterns, to 0.6 g and 1.5 cm."""
+    live = LivePlate(found)
+    play(live, hidden, hidden.mounted, count=10, start=0)
+    sticker = np.array([0.11, 0.16, 3e-3])
+    changed = replace(hidden.mounted, masses=np.vstack([hidden.mounted.masses, sticker]))
+    after = play(live, hidden, changed, count=10, start=10)
+    (explanation,) = (each.explanation for each in after if each.explanation)
+    assert explanation.name == "a mass"
+    added = live.rig.masses[-1]
+    assert added.mass == pytest.approx(3e-3, abs=0.6e-3)
+    assert (added.x, added.y) == pytest.approx((0.11, 0.16), abs=0.015)
+
+
+def test_heavy_finger_is_no_change(hidden: Hidden, found: Identification) -> None:
+    """Fingers of 4.5 times the usual load, three standard deviations, raise no alarm."""
+    live = LivePlate(found)
+    heavy = settled_patterns(hidden, hidden.mounted, count=12, start=0, heaviest=4.5)
+    assert not any(live.take(each).alarm for each in heavy)
+
+
 def test_plate_that_was_not_explained_is_not_updated(hidden: Hidden, found: Identification) -> None:
     """After an identification with chi² above 2 patterns leave the state as it was."""
     live = LivePlate(replace(found, chi2=2.5))

@@ -13,7 +13,7 @@ from drivers import clock
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.backends.urls.address import with_address
 from drivers.command import CommandSet, DriveCommand
-from drivers.conformance import Check, CheckResult, raw_line
+from drivers.conformance import LEVEL, Check, CheckResult, raw_line
 from drivers.conformance.report import ConformanceReport
 from drivers.conformance.series import not_started, run_checks
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
@@ -242,19 +242,28 @@ async def conform(
     on_result: Callable[[CheckResult], None],
     *,
     process: int | None = None,
+    level: float = LEVEL,
     before: ConformanceReport | None = None,
 ) -> ConformanceReport:
     """Run checks in turn on one amplifier; on_result: called with each result.
 
-    process: see `run_check`; before: report of earlier checks, which this one continues: then a
-    link that cannot be opened any more makes these checks inconclusive instead of a LinkError.
+    process, level: see `run_check`; before: report of earlier checks, which this one continues:
+    then a link that cannot be opened any more makes these checks inconclusive instead of a
+    LinkError.
     """
     raw = raw_line(url)
     try:
         async with _opened(url, reply_timeout=_PATIENT_TIMEOUT) as amplifier:
             results = await run_checks(
-                checks, amplifier, raw, url=url, process=process, on_result=on_result
+                checks,
+                amplifier,
+                raw,
+                url=url,
+                process=process,
+                level=level,
+                on_result=on_result,
             )
+            driven = min(level, amplifier.capabilities.level_max)
             stated = amplifier_class(amplifier.capabilities).value
     except LinkError as loss:
         if before is None:
@@ -262,8 +271,10 @@ async def conform(
         results = tuple(not_started(check, raw, str(loss)) for check in checks)
         for result in results:
             on_result(result)
-        stated = before.amplifier_class
-    report = ConformanceReport(url, stated, results)
+        stated, driven = before.amplifier_class, 0.0
+    if not any(result.check.drives for result in results):
+        driven = 0.0
+    report = ConformanceReport(url, stated, results, driven)
     return before.followed_by(report) if before else report
 
 

@@ -268,6 +268,16 @@ def conformance(
             help="Process of an emulated amplifier: its delays are not the amplifier's.",
         ),
     ] = None,
+    level: Annotated[
+        float | None,
+        typer.Option(
+            metavar="LEVEL",
+            min=0.1,  # below it fractions are too close together for measured levels
+            max=1.0,
+            show_default=False,
+            help="Level at which channels are driven, as a share of full stroke; 0.2 if not given.",
+        ),
+    ] = None,
     trace: Trace = None,
     json_: Json = False,
 ) -> None:
@@ -277,15 +287,18 @@ def conformance(
 
     reading = tuple(check for check in CHECKS if not check.drives)
     driving = tuple(check for check in CHECKS if check.drives)
+    level = LEVEL if level is None else level
     show = _no_result if json_ else _show_result
     report = _run(conform(url, reading, show, process=process), trace)
     if not write and not json_ and sys.stdin.isatty():
         write = typer.confirm(
-            f"{len(driving)} more checks arm the amplifier and drive its channels at {LEVEL:.0%} "
+            f"{len(driving)} more checks arm the amplifier and drive its channels at {level:.0%} "
             "of full stroke. Continue?"
         )
     if write and report.overall != "failed":
-        report = _run(conform(url, driving, show, process=process, before=report), trace)
+        report = _run(
+            conform(url, driving, show, process=process, level=level, before=report), trace
+        )
     if json_:
         print(json.dumps(report.to_json()))
     else:

@@ -29,7 +29,7 @@ from drivers.protocol.messages import (
 )
 
 LEVEL = 0.2
-"""Level of driven channels: perceptible, and far from any limit."""
+"""Level of driven channels unless another is given: perceptible, and far from any limit."""
 
 LONG_WATCHDOG = 2.0  # s; does not trip during a check, on amplifiers that support it
 EVENT_TIMEOUT = 5.0  # s; for changes without a request
@@ -54,9 +54,16 @@ class Sample:
 
 
 class Bench:
-    """An open amplifier under test, and sets for it; raw, url: see `run_check`."""
+    """An open amplifier under test, and sets for it; raw, url, level: see `run_check`."""
 
-    def __init__(self, amplifier: Amplifier, raw: RawLine | None = None, *, url: str = "") -> None:
+    def __init__(
+        self,
+        amplifier: Amplifier,
+        raw: RawLine | None = None,
+        *,
+        url: str = "",
+        level: float = LEVEL,
+    ) -> None:
         self.amplifier = amplifier
         self.url = url
         self._raw = raw
@@ -64,7 +71,7 @@ class Bench:
         self.guard = self.guard_as(self.can)
         limits = self.guard.limits
         self.frequency = min(max(110.0, limits.frequency_min), limits.frequency_max)
-        self.level = min(LEVEL, limits.level)
+        self.level = min(level, limits.level)
         self.exchange_time = 0.0  # s; the typical one of a status
         self.max_delay = 0.0  # s; of a reply, beyond the typical
         self.fed = Interval(-math.inf, math.inf)  # when the watchdog was fed last

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 from drivers import clock
 from drivers.amplifier import Amplifier
-from drivers.conformance.bench import Bench
+from drivers.conformance.bench import LEVEL, Bench
 from drivers.conformance.findings import (
     ContractViolation,
     Inconclusive,
@@ -157,6 +157,7 @@ async def run_check(
     *,
     url: str = "",
     process: int | None = None,
+    level: float = LEVEL,
 ) -> CheckResult:
     """Run a check on an open, disarmed amplifier, and leave it disarmed.
 
@@ -165,12 +166,12 @@ async def run_check(
     attempt failed and this program was not late in one, or at once if no delay can explain it. It
     is skipped only if no attempt failed. raw: access to the line, url: of the amplifier; checks
     that need them are skipped without. process: number of the process that is the amplifier,
-    whose delays count as this program's.
+    whose delays count as this program's. level: of driven channels, at most.
     """
     start, place = clock.now(), check.place(raw)
     attempts: list[_Attempt] = []
     while len(attempts) < MAX_ATTEMPTS:
-        attempt = await _attempt(check, Bench(amplifier, raw, url=url), process)
+        attempt = await _attempt(check, Bench(amplifier, raw, url=url, level=level), process)
         attempts.append(attempt)
         if not attempt.is_doubtful or isinstance(attempt.finding, LinkGone):
             break

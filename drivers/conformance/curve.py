@@ -22,12 +22,12 @@ _BEFORE = 0.1  # s; before a commit, in which a delay may still count
 class Curve:
     """A level by the time [s] since its commit; any time.
 
-    turns [s]: all times at which it may begin or cease to rise or fall. Between them it is
+    breakpoints [s]: all times at which it may begin or cease to rise or fall. Between them it is
     monotonic, so that its values there and at the ends bound it over an interval.
     """
 
     level: Callable[[float], float]
-    turns: tuple[float, ...]
+    breakpoints: tuple[float, ...]
 
     def __call__(self, time: float) -> float:
         """Return the level at a time [s]."""
@@ -35,20 +35,20 @@ class Curve:
 
     def span(self, first: float, last: float) -> tuple[float, float]:
         """Return the least and the greatest level between two times [s]."""
-        within = [turn for turn in self.turns if first < turn < last]
+        within = [time for time in self.breakpoints if first < time < last]
         values = [self.level(time) for time in (first, *within, last)]
         return min(values), max(values)
 
     def after(self, delay: float) -> "Curve":
         """Make the same curve, a time [s] later."""
-        turns = tuple(turn + delay for turn in self.turns)
-        return Curve(lambda time: self.level(time - delay), turns)
+        breakpoints = tuple(time + delay for time in self.breakpoints)
+        return Curve(lambda time: self.level(time - delay), breakpoints)
 
 
 def raised_cosine(ramp: float, *, start: complex, end: complex) -> Curve:
     """Make the curve of a ramp [s] from one complex amplitude to another.
 
-    That is how voices of one frequency cross-fade. It turns where it is nearest to zero.
+    That is how voices of one frequency cross-fade. It is least where it is nearest to zero.
     """
 
     def level(time: float) -> float:
@@ -68,10 +68,10 @@ def along(step: float, *values: complex) -> Curve:
         here, there = values[number : number + 2]
         return abs(here + (there - here) * (share - number))
 
-    turns = []
+    breakpoints = []
     for number, (here, there) in enumerate(pairwise(values)):
-        turns += [number * step, (number + _nearest_to_zero(here, there)) * step]
-    return Curve(level, (*turns, (len(values) - 1) * step))
+        breakpoints += [number * step, (number + _nearest_to_zero(here, there)) * step]
+    return Curve(level, (*breakpoints, (len(values) - 1) * step))
 
 
 def _nearest_to_zero(here: complex, there: complex) -> float:

@@ -4,8 +4,9 @@ from drivers.command import Envelope, Knot
 from drivers.conformance.bench import Bench
 from drivers.conformance.check import driving
 from drivers.conformance.curve import along, expect_curve, raised_cosine, samples_until
-from drivers.conformance.ending import PROMPT, is_silent
+from drivers.conformance.ending import is_silent
 from drivers.conformance.findings import Inconclusive, NotApplicable, expect
+from drivers.operation.plausibility import CYCLE
 from drivers.protocol.messages import Feature
 
 _PLACE = "wire-protocol.md#envelopes"
@@ -129,7 +130,7 @@ async def interrupted_endings(bench: Bench) -> None:
     await bench.play(ramp=min(4 * step, bench.can.ramp_max))
     what = "silence of an ending before a longer ramp"
     silent = await bench.time_of(is_silent, since=ended, due=2 * step, what=what)
-    bench.expect_time(what, silent, low=0.0, high=2 * step + PROMPT)
+    bench.expect_time(what, silent, low=0.0, high=2 * step + CYCLE)
 
 
 @driving(_PLACE)

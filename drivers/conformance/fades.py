@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from drivers.conformance.bench import Bench, Sample
 from drivers.conformance.check import driving
 from drivers.conformance.curve import Curve, expect_curve, raised_cosine, samples_until
-from drivers.conformance.ending import PROMPT, is_silent
+from drivers.conformance.ending import is_silent
 from drivers.conformance.findings import (
     ContractViolation,
     Inconclusive,
@@ -18,6 +18,7 @@ from drivers.conformance.findings import (
 from drivers.errors import CommandRefused
 from drivers.guard import SafeCommandSet
 from drivers.guard.channel_state import Interval
+from drivers.operation.plausibility import CYCLE
 from drivers.protocol.messages import Feature
 
 _SETS = "wire-protocol.md#sets-tokens-and-ramps"
@@ -131,7 +132,7 @@ async def earlier_ends_stay(bench: Bench) -> None:
         )
     what = "silence of a fade before a longer one"
     silent = await bench.time_of(is_silent, since=started, due=short, what=what)
-    bench.expect_time(what, silent, low=0.0, high=short + PROMPT)
+    bench.expect_time(what, silent, low=0.0, high=short + CYCLE)
 
 
 @driving(_SETS)
@@ -284,7 +285,9 @@ async def ramps_of_valid_for(bench: Bench) -> None:
     when = await bench.play(1.0, ramp=ramp, valid_for=lasts)
     rising = raised_cosine(ramp, start=0.0, end=bench.level)
     falling = raised_cosine(ramp, start=bench.level, end=0.0).after(lasts)
-    both = Curve(lambda time: min(rising(time), falling(time)), (*rising.turns, *falling.turns))
+    both = Curve(
+        lambda time: min(rising(time), falling(time)), (*rising.breakpoints, *falling.breakpoints)
+    )
     samples = await samples_until(bench, when.latest + lasts + 1.2 * ramp)
     expect_curve(
         bench, samples, both, commit=when, lasts=lasts + ramp, what="of a set with valid_for"

@@ -12,12 +12,14 @@ from drivers.conformance.check import CheckResult, Result
 class ConformanceReport:
     """Results of checks on the amplifier at a URL.
 
-    amplifier_class: A, B or C, by the capabilities that it states.
+    amplifier_class: A, B or C, by the capabilities that it states. level: the highest at which
+    channels were driven; 0 if none were.
     """
 
     url: str
     amplifier_class: str
     results: tuple[CheckResult, ...]
+    level: float = 0.0
 
     @property
     def not_run(self) -> int:
@@ -31,7 +33,8 @@ class ConformanceReport:
 
     def followed_by(self, other: "ConformanceReport") -> "ConformanceReport":
         """Return the report of both."""
-        return replace(self, results=(*self.results, *other.results))
+        level = max(self.level, other.level)
+        return replace(self, results=(*self.results, *other.results), level=level)
 
     @property
     def overall(self) -> str:
@@ -50,7 +53,8 @@ class ConformanceReport:
         parts = [f"{count} {name}" for name, count in counts.items()]
         if self.not_run:
             parts.append(f"{self.not_run} not run")
-        return f"class {self.amplifier_class}: {', '.join(parts)}"
+        driven = f", driven at up to {self.level:.0%} of full stroke" if self.level else ""
+        return f"class {self.amplifier_class}: {', '.join(parts)}{driven}"
 
     def to_json(self) -> dict[str, Any]:
         """Make an object with stable keys."""
@@ -58,6 +62,7 @@ class ConformanceReport:
             "url": self.url,
             "overall": self.overall,
             "class": self.amplifier_class,
+            "level": self.level,
             **self._counts(),
             "not_run": self.not_run,
             "seconds": round(sum(one.seconds for one in self.results), 3),

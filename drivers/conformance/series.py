@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable
 
 from drivers.amplifier import Amplifier
+from drivers.conformance.bench import LEVEL
 from drivers.conformance.check import Check, CheckResult, Result, run_check
 from drivers.conformance.raw.line import RawLine
 from drivers.conformance.reopening import reopened
@@ -15,12 +16,13 @@ async def run_checks(
     *,
     url: str = "",
     process: int | None = None,
+    level: float = LEVEL,
     on_result: Callable[[CheckResult], None] = lambda result: None,
 ) -> tuple[CheckResult, ...]:
     """Run checks on an open, disarmed amplifier; on_result is called with each result.
 
     A link that was lost is opened again before the next check. Once it cannot be, all that are left
-    are inconclusive. raw, url, process: see `run_check`.
+    are inconclusive. raw, url, process, level: see `run_check`.
     """
     results: list[CheckResult] = []
     loss = ""
@@ -29,7 +31,9 @@ async def run_checks(
         if loss:
             results.append(not_started(check, raw, loss))
         else:
-            results.append(await run_check(check, amplifier, raw, url=url, process=process))
+            results.append(
+                await run_check(check, amplifier, raw, url=url, process=process, level=level)
+            )
         on_result(results[-1])
     return tuple(results)
 

@@ -7,11 +7,12 @@ from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.conformance.bench import Bench
 from drivers.conformance.check import driving
 from drivers.conformance.curve import along, expect_curve, samples_until
-from drivers.conformance.ending import PROMPT, is_silent
+from drivers.conformance.ending import is_silent
 from drivers.conformance.envelopes import load, step_of
 from drivers.conformance.findings import ContractViolation, NotApplicable
 from drivers.errors import CommandRefused
 from drivers.guard import SafeCommandSet
+from drivers.operation.plausibility import CYCLE
 from drivers.protocol.messages import Feature
 
 _PLACE = "wire-protocol.md#envelopes"
@@ -72,7 +73,7 @@ async def extreme_steps(bench: Bench) -> None:
         silent = await bench.time_of(is_silent, since=ended, due=due, what=what, feed=True)
         # The last step of a level may round to silence.
         low = due - step * bench.can.level_step / bench.level
-        bench.expect_time(what, silent, low=low, high=due + PROMPT)
+        bench.expect_time(what, silent, low=low, high=due + CYCLE)
         await bench.amplifier.disarm(0.0)
 
 

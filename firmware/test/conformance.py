@@ -126,7 +126,8 @@ def emulator(scheme: str, uart: int) -> Iterator[tuple[str, int]]:
             process = started(stack, *uarts, "-serial", "pty")
             assert process.stdout is not None
             (path,) = re.findall(r"/dev/\S+", process.stdout.readline())
-            stack.enter_context(Path(path).open("r+b", buffering=0))  # held open for QEMU
+            # Held open for QEMU; never as the controlling terminal of a session that this leads.
+            stack.callback(os.close, os.open(path, os.O_RDWR | os.O_NOCTTY))
             time.sleep(QEMU_LOOKS)
             url = f"{scheme}://{path}{CAN_NODE}"
         else:

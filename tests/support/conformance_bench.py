@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import pytest
 
 from drivers.amplifier import Amplifier
-from drivers.conformance import CHECKS, Check, CheckResult, raw_line
+from drivers.conformance import CHECKS, LEVEL, Check, CheckResult, raw_line
 from drivers.conformance.series import run_checks
 from drivers.registry import open_backend
 from memory_machine import live_in_memory
@@ -15,25 +15,32 @@ from virtual_loop import Seen, run_virtual
 from wires import WIRES, far_side, patient
 
 
-async def results_at(url: str, checks: Sequence[Check] = CHECKS) -> list[CheckResult]:
-    """Results of checks on the amplifier at a URL."""
+async def results_at(
+    url: str, checks: Sequence[Check] = CHECKS, *, level: float = LEVEL
+) -> list[CheckResult]:
+    """Results of checks on the amplifier at a URL, driven at a level."""
     amplifier, raw = Amplifier(open_backend(url)), raw_line(url)
     await amplifier.open()
     try:
-        return list(await run_checks(checks, amplifier, raw))
+        return list(await run_checks(checks, amplifier, raw, level=level))
     finally:
         await amplifier.close()
 
 
 def results_on(
-    wire: str, rig: Rig, checks: Sequence[Check] = CHECKS, *, seen: Seen | None = None
+    wire: str,
+    rig: Rig,
+    checks: Sequence[Check] = CHECKS,
+    *,
+    seen: Seen | None = None,
+    level: float = LEVEL,
 ) -> list[CheckResult]:
     """Results of checks on the simulated amplifier of a rig; seen: observer of the bytes."""
 
     async def run() -> list[CheckResult]:
         live_in_memory()
         async with far_side(WIRES[wire], rig) as far:
-            return await results_at(patient(far.url), checks)
+            return await results_at(patient(far.url), checks, level=level)
 
     return run_virtual(run(), seen=seen)
 
@@ -43,5 +50,5 @@ def result_of(fault: PlantedFault, wire: str, rig: Rig) -> CheckResult:
     (check,) = [check for check in CHECKS if check.name == fault.check]
     with pytest.MonkeyPatch.context() as patch:
         fault.plant(patch)
-        (result,) = results_on(wire, rig, [check])
+        (result,) = results_on(wire, rig, [check], level=fault.level)
     return result

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from drivers.command import DriveCommand, Envelope
+from drivers.conformance import LEVEL
 from drivers.protocol.messages import AmplifierState, Nak, NakCode, SetAddress
 from planted_bugs import Plant, wrapped
 from sim.amplifier import amplifier as simulated
@@ -19,11 +20,15 @@ _SERIAL = ("serial",)
 
 @dataclass(frozen=True)
 class EndFault:
-    """What is changed, the check that must find it, and on which wires; none: on all."""
+    """What is changed, the check that must find it, and on which wires; none: on all.
+
+    level: at which channels must be driven for it.
+    """
 
     check: str
     plant: Plant
     wires: tuple[str, ...] = ()
+    level: float = LEVEL
 
 
 def _loaded(change: Any) -> Plant:
@@ -96,6 +101,11 @@ END_FAULTS: Mapping[str, EndFault] = {
     ),
     "SetAddress of another serial number is refused with a reply": EndFault(
         "addresses", wrapped(SimulatedDevice, "exchange", _refuses_others), wires=_SERIAL
+    ),
+    "outputs are limited to 30 % of full stroke": EndFault(
+        "levels_of_every_frequency",
+        _played(lambda one: replace(one, level=min(one.level, 0.3))),
+        level=0.5,
     ),
     "high frequencies are played at half their level": EndFault(
         "levels_of_every_frequency", _played(_half_above(300.0))

@@ -15,6 +15,7 @@ from drivers.codec.serial_line import exchanges as serial_exchanges
 from drivers.codec.serial_line import frame as serial_frame
 from drivers.codec.serial_line import sets as serial_sets
 from drivers.command import CommandSet, DriveCommand
+from drivers.conformance import LEVEL
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
@@ -72,13 +73,14 @@ _ENABLED = AmplifierState.OPERATION_ENABLED
 class PlantedFault:
     """What is changed, the check that must find it, and on which wires.
 
-    unseen: why no check can find it.
+    unseen: why no check can find it. level: at which channels must be driven for it.
     """
 
     check: str
     plant: Plant
     wires: tuple[str, ...] = ALL
     unseen: str = ""
+    level: float = LEVEL
 
 
 def handled(around: Callable[..., Any]) -> Plant:
@@ -582,6 +584,7 @@ FAULTS: dict[str, PlantedFault] = {
     # The watchdog
     "the watchdog trips four seconds late": PlantedFault("watchdog", due(lambda _, end: end + 4)),
     "the watchdog trips 20 ms late": PlantedFault("watchdog", due(lambda _, end: end + 0.02)),
+    "the watchdog trips 10 ms late": PlantedFault("watchdog_times", due(lambda _, end: end + 0.01)),
     "the watchdog trips a tenth early": PlantedFault(
         "watchdog_times", due(lambda self, end: end - 0.1 * self._watchdog)
     ),
@@ -807,7 +810,7 @@ FAULTS: dict[str, PlantedFault] = {
             ),
         ),
     ),
-    "valid_for is 20 ms long": PlantedFault(
+    "valid_for is 7 ms long": PlantedFault(
         "valid_for",
         instead_of(
             Apply,
@@ -816,7 +819,7 @@ FAULTS: dict[str, PlantedFault] = {
                 command_set=replace(
                     _plain(apply.command_set),
                     valid_for=apply.command_set.valid_for
-                    + 0.02 * (apply.command_set.valid_for > 0),
+                    + 0.007 * (apply.command_set.valid_for > 0),
                 ),
             ),
         ),
@@ -895,6 +898,9 @@ FAULTS: dict[str, PlantedFault] = {
     ),
     "a Stop is abrupt": PlantedFault("stop_ramp", silenced(lambda ramp: 0.0)),
     "a Stop takes twice its ramp": PlantedFault("stop_ramp", silenced(lambda ramp: 2 * ramp)),
+    "a Stop takes 8 ms longer": PlantedFault(
+        "silence_never_later", silenced(lambda ramp: ramp + 0.008)
+    ),
     "a Stop takes 100 ms at most": PlantedFault(
         "stop_ramp_clipped", silenced(lambda ramp: min(ramp, 0.1))
     ),
@@ -1299,7 +1305,7 @@ FAULTS: dict[str, PlantedFault] = {
     ),
     **{name: PlantedFault(fault.check, fault.plant) for name, fault in SENSOR_FAULTS.items()},
     **{
-        name: PlantedFault(fault.check, fault.plant, wires=fault.wires or ALL)
+        name: PlantedFault(fault.check, fault.plant, wires=fault.wires or ALL, level=fault.level)
         for name, fault in END_FAULTS.items()
     },
     **{

@@ -100,9 +100,27 @@ def test_check_without_object_is_skipped(coarse_rig: Rig) -> None:
         "it has no envelopes",
     )
     report = ConformanceReport("serial:///dev/null", "A", (found,)).to_json()
-    assert (report["overall"], report["class"]) == ("incomplete", "A")
+    assert (report["overall"], report["class"], report["level"]) == ("incomplete", "A", 0.0)
     assert (report["passed"], report["skipped"]) == (0, 1)
     assert report["not_run"] == len(CHECKS) - 1
+
+
+@pytest.mark.parametrize("level", [0.2, 0.5])
+def test_level_of_driven_channels_is_as_given(level: float, coarse_rig: Rig) -> None:
+    """On the far end, and in the report of what was tried."""
+    seen = []
+
+    async def steps(bench: Bench) -> None:
+        await bench.arm()
+        await bench.play(1.0)
+        seen.append((await bench.levels())[0])
+
+    check = Check("named", "does as told", ("wire-protocol.md#watchdog",), drives=True, run=steps)
+    (found,) = results_on("serial", coarse_rig, [check], level=level)
+    assert (found.result, seen) == (Result.PASSED, [level])
+    reading = ConformanceReport("serial:///dev/null", "A", ())
+    driving = ConformanceReport("serial:///dev/null", "A", (found,), level)
+    assert reading.followed_by(driving).to_json()["level"] == level
 
 
 def test_skip_after_a_failure_is_no_skip(coarse_rig: Rig) -> None:

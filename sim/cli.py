@@ -10,6 +10,8 @@ import typer
 from drivers.errors import LinkError
 from model.commands.options import ExactOption, SeedOption, seed_of_plate
 from model.errors import InputError
+from sim.desk_plate_cli import desk_plate
+from sim.measure_cli import measure
 from sim.soft_amp_cli import soft_amp
 from sim.witness_cli import witness
 
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 app = typer.Typer(pretty_exceptions_enable=False)
 app.command()(witness)
 app.command("soft-amp")(soft_amp)
+app.command("desk-plate")(desk_plate)
+app.command()(measure)
 
 EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2, LinkError: 3}
 """Exit status by class of error."""

@@ -182,11 +182,11 @@ def _place(
 
 
 def _list() -> None:
-    from sim.soft_amp.jack import jack_devices
+    from sim.libjack import IS_INPUT, jack_devices
     from sim.soft_amp.portaudio import portaudio_devices
 
     try:
-        for name, channels in jack_devices().items():
+        for name, channels in jack_devices(IS_INPUT).items():
             print(f"{name}: {channels} channels")
     except (InputError, LinkError) as problem:
         print(f"no JACK: {problem}", file=sys.stderr)

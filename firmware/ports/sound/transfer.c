@@ -1,0 +1,102 @@
+// SPDX-License-Identifier: MIT
+
+#include "transfer.h"
+
+#include <string.h>
+
+#define TROUBLE 0xf // underflow and overflow of input and output
+#define CONTINUE 0  // paContinue
+
+static struct transfer *transfer;
+static struct transfer_ports ports;
+static uint32_t next_frame; // of JACK's clock
+static int has_next;
+
+void transfer_use(struct transfer *used, const struct transfer_ports *of)
+{
+    transfer = used;
+    if (of != NULL)
+        ports = *of;
+    has_next = 0;
+}
+
+// Frames of this block that are to be moved; 0 while nothing runs.
+static uint32_t wanted(uint32_t frames)
+{
+    if (transfer == NULL || !GET(transfer->is_running))
+        return 0;
+    uint64_t left = transfer->frames - transfer->position;
+    return left < frames ? (uint32_t)left : frames;
+}
+
+static void done(uint32_t frames)
+{
+    uint64_t position = transfer->position + frames;
+    if (position == transfer->frames)
+        SET(transfer->is_running, 0);
+    SET(transfer->position, position);
+}
+
+int transfer_jack_process(uint32_t frames, void *ignored)
+{
+    (void)ignored;
+    uint32_t count = wanted(frames);
+    uint32_t frame = ports.frame_time(ports.client);
+    if (count && has_next && frame != next_frame && transfer->position)
+        COUNT(transfer->gaps, 1);
+    next_frame = frame + frames;
+    has_next = 1;
+    for (uint32_t i = 0; transfer != NULL && i < transfer->outputs; i++) {
+        float *to = ports.buffer(ports.outputs[i], frames);
+        memset(to, 0, frames * sizeof(float));
+        const float *from = transfer->play + transfer->position * transfer->outputs + i;
+        for (uint32_t n = 0; n < count; n++)
+            to[n] = from[(uint64_t)n * transfer->outputs];
+    }
+    for (uint32_t i = 0; count && i < transfer->inputs; i++) {
+        const float *from = ports.buffer(ports.inputs[i], frames);
+        float *to = transfer->record + transfer->position * transfer->inputs + i;
+        for (uint32_t n = 0; n < count; n++)
+            to[(uint64_t)n * transfer->inputs] = from[n];
+    }
+    if (count)
+        done(count);
+    return 0;
+}
+
+int transfer_jack_xrun(void *ignored)
+{
+    (void)ignored;
+    if (transfer != NULL)
+        COUNT(transfer->xruns, 1);
+    return 0;
+}
+
+void transfer_jack_shutdown(void *ignored)
+{
+    (void)ignored;
+    if (transfer != NULL)
+        SET(transfer->is_lost, 1);
+}
+
+int transfer_portaudio(const void *input, void *output, unsigned long frames,
+                       const struct portaudio_time *time, unsigned long flags, void *ignored)
+{
+    (void)time;
+    (void)ignored;
+    uint32_t count = wanted((uint32_t)frames);
+    if (flags & TROUBLE)
+        transfer_jack_xrun(NULL);
+    if (output != NULL) {
+        size_t frame = transfer->outputs * sizeof(float);
+        memset(output, 0, frames * frame);
+        if (count)
+            memcpy(output, transfer->play + transfer->position * transfer->outputs, count * frame);
+    }
+    if (count && input != NULL)
+        memcpy(transfer->record + transfer->position * transfer->inputs, input,
+               count * transfer->inputs * sizeof(float));
+    if (count)
+        done(count);
+    return CONTINUE;
+}

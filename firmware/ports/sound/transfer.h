@@ -1,0 +1,47 @@
+// SPDX-License-Identifier: MIT
+//
+// Samples from memory to the outputs of a sound device and from its inputs to memory, in its
+// callback: the measuring half of this library, without amplifiers.
+
+#ifndef TRANSFER_H
+#define TRANSFER_H
+
+#include <stdint.h>
+
+#include "sound.h"
+
+#define TRANSFER_PORTS_MAX 64
+
+// Frames are interleaved. Before and after, outputs are silent. position: frames done, written by
+// the callback; the memory is the device's from is_running = 1 until position is frames.
+struct transfer {
+    const float *play;
+    float *record;
+    uint64_t frames;
+    uint64_t position;
+    uint32_t outputs, inputs;
+    uint32_t is_running;
+    uint32_t gaps, xruns; // holes in the sample clock meanwhile; what the driver reports
+    uint32_t is_lost;
+};
+
+struct transfer_ports {
+    void *client;
+    void *outputs[TRANSFER_PORTS_MAX];
+    void *inputs[TRANSFER_PORTS_MAX];
+    void *(*buffer)(void *port, uint32_t frames);
+    uint32_t (*frame_time)(const void *client);
+};
+
+void transfer_use(struct transfer *transfer, const struct transfer_ports *ports);
+
+// JACK.
+int transfer_jack_process(uint32_t frames, void *ignored);
+int transfer_jack_xrun(void *ignored);
+void transfer_jack_shutdown(void *ignored);
+
+// PortAudio's callback, for interleaved floats.
+int transfer_portaudio(const void *input, void *output, unsigned long frames,
+                       const struct portaudio_time *time, unsigned long flags, void *ignored);
+
+#endif

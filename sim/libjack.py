@@ -1,0 +1,171 @@
+"""The library of JACK, through ctypes: a client of a running server, and the ports of others."""
+
+import ctypes
+import ctypes.util
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import LinkError
+from model.errors import InputError
+
+_AUDIO = b"32 bit float mono audio"
+IS_INPUT, IS_OUTPUT = 1, 2
+"""Flags of ports: that take samples, and that give them."""
+_IS_PHYSICAL, _IS_TERMINAL = 4, 16
+_NO_START_SERVER = 1
+_SERVER_FAILED = 0x10
+_LIBRARIES = ("jack", "libjack.so.0")
+
+_Pointer = ctypes.c_void_p
+_Text = ctypes.c_char_p
+_FUNCTIONS = {  # name: (result, arguments)
+    "jack_client_open": (_Pointer, (_Text, ctypes.c_int, _Pointer)),
+    "jack_client_close": (ctypes.c_int, (_Pointer,)),
+    "jack_activate": (ctypes.c_int, (_Pointer,)),
+    "jack_get_sample_rate": (ctypes.c_uint32, (_Pointer,)),
+    "jack_get_buffer_size": (ctypes.c_uint32, (_Pointer,)),
+    "jack_get_ports": (ctypes.POINTER(_Text), (_Pointer, _Text, _Text, ctypes.c_ulong)),
+    "jack_port_by_name": (_Pointer, (_Pointer, _Text)),
+    "jack_port_get_all_connections": (ctypes.POINTER(_Text), (_Pointer, _Pointer)),
+    "jack_port_get_buffer": (_Pointer, (_Pointer, ctypes.c_uint32)),
+    "jack_port_name": (_Text, (_Pointer,)),
+    "jack_port_register": (
+        _Pointer,
+        (_Pointer, _Text, _Text, ctypes.c_ulong, ctypes.c_ulong),
+    ),
+    "jack_connect": (ctypes.c_int, (_Pointer, _Text, _Text)),
+    "jack_free": (None, (_Pointer,)),
+    "jack_set_process_callback": (ctypes.c_int, (_Pointer, _Pointer, _Pointer)),
+    "jack_set_xrun_callback": (ctypes.c_int, (_Pointer, _Pointer, _Pointer)),
+    "jack_set_port_connect_callback": (ctypes.c_int, (_Pointer, _Pointer, _Pointer)),
+    "jack_on_shutdown": (None, (_Pointer, _Pointer, _Pointer)),
+    "jack_set_error_function": (None, (_Pointer,)),
+    "jack_set_info_function": (None, (_Pointer,)),
+}
+_SILENT = ctypes.CFUNCTYPE(None, _Text)(lambda _text: None)  # kept, since libjack calls it
+_PROCESS = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_uint32, _Pointer)
+_SHUTDOWN = ctypes.CFUNCTYPE(None, _Pointer)
+
+
+@cache
+def libjack() -> ctypes.CDLL:
+    """The loaded library; raises InputError where there is none."""
+    for name in _LIBRARIES:
+        try:
+            library = ctypes.CDLL(ctypes.util.find_library(name) or name)
+        except OSError:
+            continue
+        for function, (result, arguments) in _FUNCTIONS.items():
+            found = getattr(library, function)
+            found.restype, found.argtypes = result, arguments
+        library.jack_set_error_function(_SILENT)
+        library.jack_set_info_function(_SILENT)
+        return library
+    raise InputError("jack: libjack must be installed; Debian: apt install jackd2")
+
+
+class JackClient:
+    """A client of the running server; rate [Hz], block [frames]: the server's. Raises LinkError."""
+
+    def __init__(self, name: str) -> None:
+        status = ctypes.c_int()
+        client = libjack().jack_client_open(name.encode(), _NO_START_SERVER, ctypes.byref(status))
+        if not client:
+            is_down = status.value & _SERVER_FAILED
+            reason = "no server is running" if is_down else "it refused a client"
+            raise LinkError(
+                f"jack: {reason} (status {status.value:#x}); start one, as in jackd -d alsa "
+                "-r 48000 -p 128, by the same user; JACK_DEFAULT_SERVER names another than default"
+            )
+        self.pointer = int(client)
+        self.rate = int(libjack().jack_get_sample_rate(client))
+        self.block = int(libjack().jack_get_buffer_size(client))
+        self._callbacks: list[object] = []  # kept, since libjack calls them
+
+    def ports_of(self, other: str, flag: int) -> list[str]:
+        """Ports of a client by its name, or of the hardware (""), with IS_INPUT or IS_OUTPUT."""
+        flags = flag | (0 if other else _IS_PHYSICAL)
+        pattern = f"^{re.escape(other)}:".encode() if other else None
+        return _names(libjack().jack_get_ports(self.pointer, pattern, _AUDIO, flags))
+
+    def connected_to(self, port: str) -> list[str]:
+        """Ports that a port is connected to."""
+        found = libjack().jack_port_by_name(self.pointer, port.encode())
+        return _names(libjack().jack_port_get_all_connections(self.pointer, found))
+
+    def register(self, names: Iterable[str], flag: int) -> list[int]:
+        """Register ports of its own, with IS_INPUT or IS_OUTPUT; raises LinkError."""
+        ports = [
+            libjack().jack_port_register(
+                self.pointer, name.encode(), _AUDIO, flag | _IS_TERMINAL, 0
+            )
+            for name in names
+        ]
+        if None in ports:
+            raise LinkError("jack: the server has no more ports; start it with a larger -p (ports)")
+        return ports
+
+    def process(self, callback: Callable[[int], None], *, lost: Callable[[], None]) -> None:
+        """Let the server call with the frames of each block; lost: called when it has gone."""
+
+        def called(frames: int, _ignored: object) -> int:
+            callback(frames)
+            return 0
+
+        kept = _PROCESS(called), _SHUTDOWN(lambda _ignored: lost())
+        self._callbacks += kept
+        libjack().jack_set_process_callback(self.pointer, ctypes.cast(kept[0], _Pointer), None)
+        libjack().jack_on_shutdown(self.pointer, ctypes.cast(kept[1], _Pointer), None)
+
+    @staticmethod
+    def samples(port: int, frames: int) -> NDArray[np.float32]:
+        """The samples (frames,) of a port, in place; within a callback only."""
+        address = libjack().jack_port_get_buffer(port, frames)
+        pointer = ctypes.cast(address, ctypes.POINTER(ctypes.c_float))
+        return np.ctypeslib.as_array(pointer, (frames,))
+
+    def activate(self) -> None:
+        """Begin to be called; raises LinkError."""
+        if libjack().jack_activate(self.pointer):
+            raise LinkError("jack: the server did not activate the client")
+
+    def connect(self, source: str | int, destination: str | int) -> None:
+        """Connect two ports, by name or of its own; raises LinkError."""
+        one, other = (
+            port.encode() if isinstance(port, str) else libjack().jack_port_name(port)
+            for port in (source, destination)
+        )
+        if libjack().jack_connect(self.pointer, one, other):
+            theirs = source if isinstance(source, str) else destination
+            raise LinkError(f"jack: {theirs} could not be connected; it may have gone")
+
+    def close(self) -> None:
+        """Leave the server."""
+        libjack().jack_client_close(self.pointer)
+
+
+def jack_devices(flag: int) -> dict[str, int]:
+    """Clients of the server with such ports: their number, by what --device takes.
+
+    flag: IS_INPUT or IS_OUTPUT. Raises InputError, LinkError.
+    """
+    client = JackClient("era-list")
+    try:
+        ports = _names(libjack().jack_get_ports(client.pointer, None, _AUDIO, flag))
+    finally:
+        client.close()
+    return {f"jack:{name}": n for name, n in Counter(p.split(":")[0] for p in ports).items()}
+
+
+def _names(listed: "ctypes._Pointer[_Text]") -> list[str]:
+    names: list[str] = []
+    if ctypes.cast(listed, _Pointer).value is not None:  # null for none
+        while (name := listed[len(names)]) is not None:
+            names.append(name.decode())
+        libjack().jack_free(ctypes.cast(listed, _Pointer))
+    return names

@@ -1,0 +1,1 @@
+"""A plate measured through a sound card: orthogonal multisines out, accelerometers in."""

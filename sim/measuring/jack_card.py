@@ -1,0 +1,71 @@
+"""A sound card through JACK: the ports of the hardware, or of another client."""
+
+import ctypes
+
+from drivers.errors import LinkError
+from model.errors import InputError
+from sim.libjack import IS_INPUT, IS_OUTPUT, JackClient, libjack
+from sim.measuring.sound_card import Ports, SoundCard
+
+CLIENT = "era-measure"
+
+
+class JackCard(SoundCard):
+    """Ports of its own, each connected to the next one of a client; "": of the hardware."""
+
+    def __init__(self, other: str, *, outputs: int, inputs: int) -> None:
+        super().__init__(outputs=outputs, inputs=inputs)
+        self.name = f"jack:{other}" if other else "jack"
+        self._client = JackClient(CLIENT)
+        self._is_open = True
+        try:
+            self.rate = float(self._client.rate)
+            self._start(other, outputs, inputs)
+        except BaseException:
+            self.close()
+            raise
+
+    def _start(self, other: str, outputs: int, inputs: int) -> None:
+        takers = self._theirs(other, IS_INPUT, outputs, what="outputs")
+        givers = self._theirs(other, IS_OUTPUT, inputs, what="inputs")
+        for name in takers:
+            users = self._client.connected_to(name)
+            if users:
+                raise LinkError(
+                    f"--device {self.name}: busy, {users[0]} plays to {name}; end or disconnect it"
+                )
+        out = self._client.register((f"out_{n + 1}" for n in range(outputs)), IS_OUTPUT)
+        into = self._client.register((f"in_{n + 1}" for n in range(inputs)), IS_INPUT)
+        library, client = libjack(), self._client.pointer
+        ports = Ports(client=client)
+        ports.outputs[: len(out)], ports.inputs[: len(into)] = out, into
+        ports.buffer = ctypes.cast(library.jack_port_get_buffer, ctypes.c_void_p)
+        ports.frame_time = ctypes.cast(library.jack_last_frame_time, ctypes.c_void_p)
+        self.use(ports)
+        for name, set_callback in (
+            ("transfer_jack_process", library.jack_set_process_callback),
+            ("transfer_jack_xrun", library.jack_set_xrun_callback),
+            ("transfer_jack_shutdown", library.jack_on_shutdown),
+        ):
+            set_callback(client, self.address(name), None)
+        self._client.activate()
+        for port, taker in zip(out, takers, strict=True):
+            self._client.connect(port, taker)
+        for giver, port in zip(givers, into, strict=True):
+            self._client.connect(giver, port)
+
+    def _theirs(self, other: str, flag: int, count: int, *, what: str) -> list[str]:
+        """The first ports of the other client."""
+        found = self._client.ports_of(other, flag)
+        if len(found) < count:
+            raise InputError(
+                f"--device {self.name} must have {count} {what}, got {len(found)}"
+                + ("; list devices with era soft-amp --list" if not found else "")
+            )
+        return found[:count]
+
+    def close(self) -> None:
+        """Leave the server."""
+        if self._is_open:
+            self._is_open = False
+            self._client.close()

@@ -1,0 +1,153 @@
+"""The plate on a desk against closed forms, a direct solution, and SciPy's sampling."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from model.arrays import ComplexArray, FloatArray
+from model.errors import InputError
+from model.rig.file import example_rig_path, load_rig
+from model.rig.rig import Rig
+from model.structure.fingertip import fingertip_loads
+from model.vibration.direct import direct_responder
+from sim.desk.desk_plate import DeskPlate
+from sim.desk.lifted_blocks import LiftedBlocks, sampled
+from sim.desk.model_in_time import DeskModel
+from sim.desk.sensing import Converters
+from sim.desk.truth import Truth, draw_truth
+from sim.sensors.sensor_file import WiredSensor, read_sensors
+
+RATE = 48_000.0
+POINTS = np.array([[0.03, 0.05], [0.20, 0.11], [0.29, 0.20]])
+FREQUENCIES = np.array([61.0, 150.0, 233.0, 410.0])
+FINGERS = [(0.1, 0.1), (0.25, 0.06)]
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The paper's plate as its file has it."""
+    return load_rig(example_rig_path())
+
+
+@pytest.fixture(scope="module")
+def truth(rig: Rig) -> Truth:
+    """A plate that deviates from it, on a coarse mesh."""
+    return draw_truth(rig, seed=3, mesh="6x4 Q3")
+
+
+@pytest.fixture(scope="module")
+def model(truth: Truth) -> DeskModel:
+    """That plate, solved."""
+    return DeskModel(truth, POINTS)
+
+
+@pytest.mark.parametrize("places", [[], FINGERS])
+def test_model_agrees_with_the_direct_solution(
+    truth: Truth, model: DeskModel, places: list[tuple[float, float]]
+) -> None:
+    """Without and with fingers; what differs is damping, viscous here and hysteretic there."""
+    rig = truth.rig
+    fingers = fingertip_loads(rig.fingertip, places)
+    found = model.under(fingers).response(FREQUENCIES).swapaxes(1, 2)
+    direct = direct_responder(rig.plate, rig.mesh)
+    exact = direct(rig.eras, FREQUENCIES, POINTS, loads=[*rig.masses, *fingers])
+    # The actuator by its differential equation: gain w² / (w² - omega² + 2 i zeta w omega).
+    for number, actuator in enumerate(truth.actuators):
+        w, omega = 2 * np.pi * actuator.resonance, 2 * np.pi * FREQUENCIES
+        moved = actuator.gain * w**2 / (w**2 - omega**2 + 2j * actuator.ratio * w * omega)
+        exact[:, number] *= moved[:, None]
+    wrong = np.linalg.norm(found - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
+    assert wrong.max() < 0.005
+
+
+def test_blocks_are_scipys_samples_of_a_first_order_hold(model: DeskModel) -> None:
+    """Any input, by `cont2discrete` of the same matrices and its recursion, sample by sample."""
+    plate = model.under(fingertip_loads(load_rig(example_rig_path()).fingertip, FINGERS))
+    played = np.random.default_rng(0).standard_normal((64, 4))
+    nothing = np.zeros((len(plate.C), 4))
+    A, B, C, D, _ = signal.cont2discrete(
+        (plate.A, plate.B, plate.C, nothing), 1 / RATE, method="foh"
+    )
+    state, exact = np.zeros(len(A)), []
+    for sample in played:
+        exact.append(C @ state + D @ sample)
+        state = A @ state + B @ sample
+    found = LiftedBlocks(sampled(plate, rate=RATE)).advance(played)
+    np.testing.assert_allclose(found, exact, atol=1e-9 * np.abs(exact).max())
+
+
+def test_samples_in_steady_state_are_the_closed_form(truth: Truth, model: DeskModel) -> None:
+    """Plate, sensitivity, filter and delay, block after block; C (z - E)^-1 B + D by hand."""
+    sensors = [WiredSensor(f"P{n}", x, y, n + 1, 2e-3) for n, (x, y) in enumerate(POINTS)]
+    converters = Converters(delay=73, noise=0.0)
+    desk = DeskPlate(truth, sensors, rate=RATE, converters=converters, seed=1)
+    assert (desk.outputs, desk.inputs) == (5, 4)
+    played = np.zeros((48_000, 5))
+    times = np.arange(len(played)) / RATE
+    played[:, 2] = np.sin(2 * np.pi * 150 * times)
+    played[:, 4] = played[:, 2]
+    heard = np.concatenate([desk.advance(block) for block in np.split(played, 375)])
+    found = phasors(heard[-9600:], times[-9600:], 150.0)
+    (exact,) = sampled(model.under(), rate=RATE).response(np.array([150.0]))
+    late = converters.response(np.array([150.0]), rate=RATE)[0]
+    np.testing.assert_allclose(found[:3] / (2e-3 * late), exact[:, 2], rtol=0.01)
+    assert found[3] == pytest.approx(0.9 * late, rel=1e-6)
+
+
+def test_fingers_are_swapped_without_a_jump(truth: Truth, model: DeskModel) -> None:
+    """The vibration goes on where it was, and settles to that of the plate under fingers."""
+    sensors = [WiredSensor(f"P{n}", x, y, n + 1, 1e-3) for n, (x, y) in enumerate(POINTS)]
+    quiet = Converters(delay=0, noise=0.0)
+    desk = DeskPlate(truth, sensors, rate=RATE, converters=quiet, seed=1)
+    times = np.arange(48_000) / RATE
+    played = np.zeros((len(times), 5))
+    played[:, 0] = np.sin(2 * np.pi * 233 * times)
+    before = desk.advance(played[:9600])
+    desk.set_fingers(FINGERS)
+    after = desk.advance(played[9600:])
+    joined = np.concatenate([before[-48:], after[:48]])[:, :3]
+    steps = np.abs(np.diff(joined, n=2, axis=0)).max(axis=1)
+    # A contact mass that joins changes accelerations by a few percent, no more.
+    assert steps[46:49].max() < 0.1 * np.abs(joined).max()
+    loaded = model.under(fingertip_loads(truth.rig.fingertip, FINGERS))
+    (exact,) = sampled(loaded, rate=RATE).response(np.array([233.0]))
+    found = phasors(after[-9600:, :3], times[-9600:], 233.0)
+    late = quiet.response(np.array([233.0]), rate=RATE)[0]
+    np.testing.assert_allclose(found / (1e-3 * late), exact[:, 0], rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("sensor,x_m,y_m,input\nP1,0,0,1\n", ":1:"),
+        ("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.1,0.1,1,10\nP2,9,0.1,2,10\n", ":3:"),
+        ("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.1,0.1,1,10\nP2,0.2,0.1,1,10\n", ":3:"),
+        ("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.1,0.1,1,0\n", ":2:"),
+        ("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.1,x,1,10\n", ":2:"),
+    ],
+)
+def test_sensor_files_are_refused_with_their_line(
+    rig: Rig, tmp_path: Path, text: str, place: str
+) -> None:
+    """A missing column, off the plate, an input twice, no sensitivity, no number."""
+    path = tmp_path / "sensors.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=f"sensors.csv{place}"):
+        read_sensors(path, rig.plate)
+
+
+def test_sensitivity_is_in_full_scale(rig: Rig, tmp_path: Path) -> None:
+    """A charge of 5 pC/(m/s²), amplified by 2 mV/pC, at 4 V full scale: 2.5e-3 a m/s²."""
+    path = tmp_path / "sensors.csv"
+    path.write_text("sensor,x_m,y_m,input,mv_per_m_s2,gain,full_scale_v\nP1,0.1,0.2,3,5,2,4\n")
+    (sensor,) = read_sensors(path, rig.plate)
+    assert (sensor.name, sensor.x, sensor.y, sensor.input) == ("P1", 0.1, 0.2, 3)
+    assert sensor.sensitivity == pytest.approx(2.5e-3)
+
+
+def phasors(samples: FloatArray, times: FloatArray, frequency: float) -> ComplexArray:
+    """Complex amplitudes a of Im[a exp(i omega t)] over whole periods."""
+    turning = np.exp(-2j * np.pi * frequency * times)
+    return np.asarray(2j * (samples * turning[:, None]).mean(axis=0))

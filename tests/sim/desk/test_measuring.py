@@ -1,0 +1,168 @@
+"""A plate measured through a sound card in memory, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from desk_card import DeskCard
+from drivers.errors import LinkError
+from model.errors import InputError
+from model.rig.file import example_rig_path, load_rig
+from model.rig.rig import Rig
+from sim.desk.desk_plate import DeskPlate
+from sim.desk.model_in_time import DeskModel
+from sim.desk.sensing import Converters
+from sim.desk.truth import Truth, draw_truth
+from sim.measuring.loopback import latency
+from sim.measuring.measure import Desk, measure
+from sim.measuring.multisine import Multisine, default_frequencies
+from sim.measuring.stepped import check_by_steps
+from sim.sensors.sensor_file import WiredSensor
+
+RATE = 8_000.0
+DELAY = 73
+LEVEL = 0.3
+PLACES = ((0.03, 0.05), (0.20, 0.11), (0.29, 0.20))
+SENSORS = tuple(WiredSensor(f"P{n}", x, y, n, 2e-3) for n, (x, y) in enumerate(PLACES, start=1))
+FREQUENCIES = np.array([61.0, 151.0, 233.0, 311.0])
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The paper's plate as its file has it."""
+    return load_rig(example_rig_path())
+
+
+@pytest.fixture(scope="module")
+def truth(rig: Rig) -> Truth:
+    """A plate that deviates from it, on a coarse mesh."""
+    return draw_truth(rig, seed=3, mesh="6x4 Q3")
+
+
+def card(truth: Truth, *, noise: float = 0.0, **wires: object) -> DeskCard:
+    """A sound card in front of the plate at rest."""
+    converters = Converters(delay=DELAY, noise=noise)
+    plate = DeskPlate(truth, SENSORS, rate=RATE, converters=converters, seed=1)
+    return DeskCard(plate, rate=RATE, **wires)  # type: ignore[arg-type]
+
+
+def sines(desk: Desk, frequencies: np.ndarray = FREQUENCIES) -> Multisine:
+    """Multisines of all ERAs and of the loop-back."""
+    return Multisine(frequencies, len(desk.eras) + 1, RATE, LEVEL)
+
+
+def test_multisine_has_its_level_and_orthogonal_runs() -> None:
+    """No sample above the level in any run; at each line the runs form a unitary matrix."""
+    multisine = Multisine(default_frequencies(40, 500), 5, RATE, LEVEL)
+    runs = [multisine.signal(run, periods=2) for run in range(5)]
+    peaks = [np.abs(run).max() for run in runs]
+    assert 0.9 * LEVEL < max(peaks) <= LEVEL * (1 + 1e-9)
+    assert (multisine.frequencies % 2 == 1).all()
+    spectra = np.array([np.fft.rfft(run[4000:12000], axis=0) for run in runs])
+    for line in (41, 251, 499):
+        matrix = spectra[:, line] / np.abs(spectra[:, line])
+        np.testing.assert_allclose(matrix @ matrix.conj().T, 5 * np.eye(5), atol=1e-6)
+
+
+def test_measured_responses_are_those_of_the_plate(rig: Rig, truth: Truth) -> None:
+    """Against its own closed form: hidden delay and filter are taken out, and the delay is told.
+
+    What is left is the ringing of the start, 1 s before.
+    """
+    desk = Desk(rig, SENSORS)
+    found = measure(desk, card(truth), sines(desk))
+    model = DeskModel(truth, np.array(PLACES)).under()
+    strokes = np.array([era.stroke for era in rig.eras])
+    exact = model.response(FREQUENCIES).swapaxes(1, 2) / strokes[:, None]
+    loud = np.abs(exact) > 0.05 * np.abs(exact).max(axis=(1, 2), keepdims=True)
+    # The filter of inputs at 8 kHz has a ripple over this band, which the loop-back takes out too.
+    np.testing.assert_allclose(found.responses.values[loud], exact[loud], rtol=0.02)
+    assert found.responses.sensors == ("P1", "P2", "P3")
+    assert found.latency * RATE == pytest.approx(DELAY, abs=1)
+    assert (found.repeated, found.coherence.min() > 0.999) == (0, True)
+
+
+def test_stepped_tones_agree(rig: Rig, truth: Truth) -> None:
+    """Single tones of single ERAs give the responses that all ERAs gave at once."""
+    desk = Desk(rig, SENSORS)
+    sound = card(truth)
+    found = measure(desk, sound, sines(desk, np.array([61.0, 233.0])))
+    check = check_by_steps(desk, sound, found, level=LEVEL)
+    assert check.frequencies.tolist() == [61.0, 233.0]
+    assert check.level_db[0] < 0.1
+    assert check.phase_deg[0] < 1.0
+
+
+def test_lost_block_repeats_its_run(rig: Rig, truth: Truth) -> None:
+    """128 samples are missing in run 1, which nothing reports: it is played again."""
+    desk = Desk(rig, SENSORS)
+    sound = card(truth, lost=[1])
+    found = measure(desk, sound, sines(desk))
+    assert (found.repeated, sound.runs) == (1, 6)
+    again = measure(desk, card(truth), sines(desk))
+    difference = found.responses.values - again.responses.values
+    assert np.linalg.norm(difference) < 0.01 * np.linalg.norm(again.responses.values)
+
+
+def test_blocks_that_are_always_lost_are_refused(rig: Rig, truth: Truth) -> None:
+    """Three attempts, then no file."""
+    desk = Desk(rig, SENSORS)
+    with pytest.raises(LinkError, match="lost"):
+        measure(desk, card(truth, lost=range(99)), sines(desk))
+
+
+@pytest.mark.parametrize(
+    ("wires", "error", "cause"),
+    [
+        ({"on_inputs": [0, 3, 2, 1]}, InputError, "at input 2.*P2"),
+        ({"on_outputs": [0, 4, 2, 3, 1]}, InputError, "output 2 of ERA SE"),
+        ({"gain": 50.0}, InputError, "clipping"),
+        ({"gain": 0.0}, LinkError, "all inputs are silent"),
+        ({"on_inputs": [0, 1, 2, 2]}, InputError, "input 4 must bring back"),
+        ({"noise": 1.5}, LinkError, "coherence"),
+    ],
+)
+def test_wrong_desks_are_refused_with_their_cause(
+    rig: Rig, truth: Truth, wires: dict[str, object], error: type[Exception], cause: str
+) -> None:
+    """Inputs, outputs swapped; clipped; switched off; no cable for the loop-back; noise."""
+    desk = Desk(rig, SENSORS)
+    played = sines(desk)
+    if "noise" in wires:
+        played = replace(played, level=0.03)  # as loud as the noise, without clipping
+    with pytest.raises(error, match=cause):
+        measure(desk, card(truth, **wires), played)  # type: ignore[arg-type]
+
+
+def test_amplifier_that_is_off_is_named(rig: Rig, truth: Truth) -> None:
+    """An actuator without gain behind output 3, beside noise that any sensor has."""
+    off = list(truth.actuators)
+    off[2] = replace(off[2], gain=0.0)
+    desk = Desk(rig, SENSORS)
+    with pytest.raises(LinkError, match=r"output 3.*NE"):
+        measure(desk, card(replace(truth, actuators=tuple(off)), noise=5e-3), sines(desk))
+
+
+@pytest.mark.parametrize("level", [0.0, 1.5])
+def test_levels_beyond_the_rigs_limits_are_refused(rig: Rig, level: float) -> None:
+    """By the option that sets them."""
+    with pytest.raises(InputError, match="--level"):
+        Desk(rig, SENSORS).check(level)
+
+
+def test_frequencies_that_no_period_has_are_refused() -> None:
+    """Half a hertz is no line of a second; 4 kHz is beyond what 8 kHz carry."""
+    for frequency in (61.5, 3999.0):
+        with pytest.raises(InputError, match="frequencies"):
+            Multisine(np.array([frequency]), 5, RATE, LEVEL)
+
+
+def test_delay_follows_from_the_slope_of_phases() -> None:
+    """3.7 ms by hand; random phases are no delay."""
+    response = 0.4 * np.exp(-2j * np.pi * FREQUENCIES * 3.7e-3)
+    assert latency(response, FREQUENCIES) == pytest.approx(3.7e-3)
+    lines = default_frequencies(40, 500)
+    drawn = np.exp(2j * np.pi * np.random.default_rng(0).uniform(size=len(lines)))
+    with pytest.raises(LinkError, match="loop-back"):
+        latency(drawn, lines)

@@ -1,0 +1,50 @@
+"""A sound card in memory in front of a plate on the desk, with what can be wrong with its wires."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from model.arrays import Float32Array, FloatArray
+from sim.desk.desk_plate import DeskPlate
+from sim.measuring.sound_card import SoundCard
+
+BLOCK = 480
+
+
+class DeskCard(SoundCard):
+    """Samples of a plate, without time.
+
+    lost: runs in which a block is lost; on_outputs, on_inputs: order of the cables, by default as
+    they should be; gain: of all inputs.
+    """
+
+    def __init__(
+        self,
+        plate: DeskPlate,
+        *,
+        rate: float,
+        lost: Sequence[int] = (),
+        on_outputs: Sequence[int] | None = None,
+        on_inputs: Sequence[int] | None = None,
+        gain: float = 1.0,
+    ) -> None:
+        self._plate, self.rate, self.name, self.gaps = plate, rate, "memory", 0
+        self._lost, self._gain, self.runs = lost, gain, 0
+        self._on_outputs = range(plate.outputs) if on_outputs is None else on_outputs
+        self._on_inputs = range(plate.inputs) if on_inputs is None else on_inputs
+
+    def run(
+        self, played: FloatArray, *, progress: Callable[[int], None] = lambda _frames: None
+    ) -> Float32Array:
+        """Advance the plate by so many samples."""
+        blocks = np.split(played[:, self._on_outputs], range(BLOCK, len(played), BLOCK))
+        heard = np.concatenate([self._plate.advance(block) for block in blocks])
+        if self.runs in self._lost:
+            middle = round(2 * self.rate)  # a block in the middle is missing, and nothing says so
+            heard = np.concatenate([heard[:middle], heard[middle + 128 :], heard[-128:]])
+        self.runs += 1
+        progress(len(played))
+        return np.clip(self._gain * heard[:, self._on_inputs], -1, 1).astype(np.float32)
+
+    def close(self) -> None:
+        """Nothing is open."""

@@ -104,8 +104,8 @@ def check_coherence(
     if incoherent:
         raise LinkError(
             f"coherence must be at least {_COHERENT:g} in the median, got {', '.join(incoherent)}; "
-            "check how these sensors are mounted, their cables and mains hum, choose a higher --level or "
-            "more --periods, or delete their lines"
+            "check how these sensors are mounted, their cables and mains hum, choose a higher "
+            "--level or more --periods, or delete their lines"
         )
     moved = np.abs(found.values[:, columns]) / found.std[:, columns, None]
     for (name, at), each in zip(eras, np.median(moved, axis=0).max(axis=0), strict=False):

@@ -78,6 +78,14 @@ def sim(
             "Without an option the scheme of its url in the rig decides.",
         ),
     ] = None,
+    link: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[NAME=]PATH",
+            help="Link a path to the pseudo-terminal of an amplifier, of the first without a name; "
+            "repeatable.",
+        ),
+    ] = None,
     shared: Annotated[
         bool,
         typer.Option("--shared", help="Put all amplifiers on one line, at addresses 1, 2, ..."),
@@ -133,6 +141,7 @@ def sim(
         from sim.firmware.programs import find_firmware
         from sim.plant.imperfections import Imperfections, draw_imperfections
         from sim.process.simulation import Simulation
+        from sim.transport.links import links_by_amplifier
 
         defaults = Wire("serial", speed=speed, shared=shared, unpluggable=faults is not None)
         common = _common_wire(
@@ -176,6 +185,7 @@ def sim(
             record=record,
             until_eof=until_eof,
             firmware=programs,
+            links=links_by_amplifier(link or [], amplifiers=list(loaded.amplifiers)),
         )
         _run(simulation, virtual_time=virtual_time)
 

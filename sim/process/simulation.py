@@ -28,6 +28,7 @@ from sim.plant.imperfections import Imperfections
 from sim.plant.plant import SAMPLE_RATE
 from sim.process.virtual_time import SteppedLoop
 from sim.sensors.accelerometer import Accelerometer
+from sim.transport.links import linked_urls
 
 _VIEW_INTERVAL = 0.2  # s
 _NICE = 5  # beside firmware: its replies are due in milliseconds, while its samples can wait
@@ -40,7 +41,8 @@ class Simulation:
     faults: with times from when the URLs are printed; fingers: initial positions [m];
     imperfections: in what the bench differs from the rig; sample_rate [Hz]: of sensors and fingers;
     control: path of the control socket; record: file for the readings of the whole run; until_eof:
-    end with standard input; firmware: in the place of the simulated amplifiers.
+    end with standard input; firmware: in the place of the simulated amplifiers; links: to their
+    pseudo-terminals.
     """
 
     rig: Rig
@@ -54,6 +56,7 @@ class Simulation:
     record: Path | None = None
     until_eof: bool = False
     firmware: Firmware | None = None
+    links: Mapping[str, Path] = field(default_factory=dict)
 
 
 async def run_simulation(
@@ -112,6 +115,7 @@ async def _serve(
             context.urls = await _start_firmware(stack, bench, simulation.firmware)
         else:
             await _open_devices(stack, simulation, context)
+        context.urls = stack.enter_context(linked_urls(context.urls, simulation.links))
         if simulation.control is not None:
             await stack.enter_async_context(control_socket(context, simulation.control))
         for device in context.devices.values():

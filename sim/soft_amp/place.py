@@ -1,6 +1,5 @@
 """Where hosts reach a software amplifier: a terminal or a port, kept while it restarts."""
 
-import fcntl
 import os
 import socket
 import tty
@@ -11,6 +10,7 @@ from pathlib import Path
 
 from model.errors import InputError
 from sim.soft_amp.settings import Protocol
+from sim.transport.links import linked
 
 _LOOPBACK = "127.0.0.1"
 
@@ -43,42 +43,8 @@ def terminal_place(link: Path | None) -> Iterator[Place]:
         os.set_blocking(near, False)
         path = os.ttyname(far)
         if link is not None:
-            stack.enter_context(_lock(link))
-            _make_link(link, to=path)
-            stack.callback(_remove_link, link, to=path)
-        yield Place(f"serial://{path if link is None else link.absolute()}", terminal=near)
-
-
-@contextmanager
-def _lock(link: Path) -> Iterator[None]:
-    """Keep others from a link; a lock ends with its process, even a killed one."""
-    path = link.with_name(f".{link.name}.lock")
-    try:
-        with path.open("wb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            yield
-    except BlockingIOError:
-        raise InputError(
-            f"--link {link}: in use by another amplifier; choose another path"
-        ) from None
-    except OSError as problem:
-        raise InputError(f"--link {link}: cannot be made: {problem.strerror}") from None
-
-
-def _make_link(link: Path, *, to: str) -> None:
-    if not link.is_symlink() and link.exists():
-        raise InputError(f"--link {link}: exists and is no symbolic link; choose another path")
-    made = link.with_name(f".{link.name}.{os.getpid()}")
-    try:
-        made.symlink_to(to)
-        made.replace(link)
-    except OSError as problem:
-        raise InputError(f"--link {link}: cannot be made: {problem.strerror}") from None
-
-
-def _remove_link(link: Path, *, to: str) -> None:
-    if link.is_symlink() and str(link.readlink()) == to:  # not another's by now
-        link.unlink()
+            path = stack.enter_context(linked(link, to=path))
+        yield Place(f"serial://{path}", terminal=near)
 
 
 @contextmanager

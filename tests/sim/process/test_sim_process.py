@@ -42,15 +42,14 @@ async def wait(process: asyncio.subprocess.Process) -> tuple[int, str, str]:
 async def test_sim_serves_until_interrupted_or_eof(is_interrupted: bool) -> None:
     """It prints a URL, serves the amplifier, and exits with status 0 and no files left."""
     with tempfile.TemporaryDirectory() as folder:
-        control = Path(folder) / "control"
-        process = await start(
-            [str(example_rig_path()), "--serial", "--control", str(control), "--until-eof"]
-        )
+        control, link = Path(folder) / "control", Path(folder) / "amp"
+        options = ["--serial", "--link", str(link), "--control", str(control), "--until-eof"]
+        process = await start([str(example_rig_path()), *options])
         try:
             assert process.stdout is not None
             line = (await asyncio.wait_for(process.stdout.readline(), TIMEOUT)).decode()
-            assert line.startswith("main: serial:///dev/")
-            assert line.endswith("?baud=921600\n")
+            assert line == f"main: serial://{link}?baud=921600\n"
+            assert link.readlink().is_char_device()
             assert control.is_socket()
             tone = DriveCommand(2, 110.0, 0.25)
             async with playing(line.split()[1], tone, watchdog=2.0) as amplifier:
@@ -65,6 +64,7 @@ async def test_sim_serves_until_interrupted_or_eof(is_interrupted: bool) -> None
             ending = await wait(process)
         assert ending == (0, "", "")
         assert not control.exists()
+        assert not link.is_symlink()
 
 
 @pytest.mark.parametrize(
@@ -76,6 +76,9 @@ async def test_sim_serves_until_interrupted_or_eof(is_interrupted: bool) -> None
         ([str(example_rig_path()), "--serial", "--finger", "9,9"], 2, "finger"),
         ([str(example_rig_path()), "--serial", "--exact", "--seed", "1"], 2, "--seed"),
         ([str(example_rig_path()), "--serial", "--control", "/no/where"], 3, "/no/where"),
+        ([str(example_rig_path()), "--serial", "--link", "side=/tmp/x"], 2, "--link"),
+        ([str(example_rig_path()), "--serial", "--link", "/no/where"], 2, "/no/where"),
+        ([str(example_rig_path()), "--modbus-tcp", "0", "--link", "/tmp/x"], 2, "--link"),
     ],
 )
 def test_sim_refuses_bad_usage_in_one_line(

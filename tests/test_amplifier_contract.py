@@ -79,6 +79,10 @@ LONG = {
     ),
     *("kept_phase_onset", "loaded_while_playing", "clear_too_early", "arms_again", "fault_list"),
     *("invalid_frames", "invalid_frames_do_not_feed"),
+    *("readings_of_tones", "raw_samples", "disturbed_readings", "extreme_steps", "max_knots"),
+    *("levels_of_one_frequency", "levels_of_two_frequencies", "phases_of_every_channel"),
+    *("arming_ends_fades", "endings_amid_onsets", "no_room_changes_nothing", "max_valid_for"),
+    *("watchdog", "watchdog_skips_endings", "trips_amid_fades", "latch_wraps", "every_slot"),
 }
 """Checks that last long; over all wires they are run in virtual time."""
 

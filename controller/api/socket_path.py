@@ -10,9 +10,15 @@ from model.arguments import expect_path
 SYSTEM_SOCKET = Path("/run/era-haptics/daemon.sock")
 """The socket of the system service."""
 
+SOCKET_VARIABLE = "ERA_HAPTICS_SOCKET"
+"""The environment variable that names the socket of a daemon and of its clients."""
+
 
 def default_socket(environment: Mapping[str, str] = os.environ) -> Path:
-    """The socket of this user's daemon."""
+    """The socket of this user's daemon, unless its file or an option names another."""
+    named = environment.get(SOCKET_VARIABLE)
+    if named:
+        return Path(named)
     runtime = environment.get("XDG_RUNTIME_DIR")
     if runtime:
         return Path(runtime) / "era-haptics" / "daemon.sock"
@@ -23,10 +29,12 @@ def default_socket(environment: Mapping[str, str] = os.environ) -> Path:
 
 
 def find_socket(given: Path | str | None) -> Path:
-    """The socket to connect to: the given one, this user's, or else the system service's."""
+    """The socket to connect to: the given one, the environment's, this user's, or the service's."""
     if given is not None:
         return expect_path(given, what="path")
     own = default_socket()
+    if os.environ.get(SOCKET_VARIABLE):
+        return own
     return own if own.exists() or not _exists(SYSTEM_SOCKET) else SYSTEM_SOCKET
 
 

@@ -313,6 +313,16 @@ async def test_connect_names_the_problem_of_a_path(tmp_path: Path) -> None:
         await AsyncClient.connect("nosuch.sock")
 
 
+def test_clients_use_the_socket_of_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is taken whether or not a daemon is there; a given path goes first."""
+    monkeypatch.setenv("ERA_HAPTICS_SOCKET", str(tmp_path / "own.sock"))
+    monkeypatch.setattr("controller.api.socket_path.SYSTEM_SOCKET", tmp_path)  # exists
+    assert find_socket(None) == tmp_path / "own.sock"
+    assert find_socket("given.sock") == Path("given.sock")
+
+
 def test_find_socket_returns_the_system_socket_of_another_user(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

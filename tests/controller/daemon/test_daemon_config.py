@@ -209,8 +209,10 @@ def test_calibration_by_points_refuses(folder: Path, calibration: str, key: str)
     assert problems(written(folder, text)) == [(2, f"touch[0].calibration{key}")]
 
 
-def test_default_socket_is_in_runtime_folder_if_any() -> None:
-    """XDG_RUNTIME_DIR is used if it is set."""
+def test_default_socket_is_named_or_in_runtime_folder() -> None:
+    """ERA_HAPTICS_SOCKET names it; else XDG_RUNTIME_DIR is used if it is set."""
+    named = {"ERA_HAPTICS_SOCKET": "/a/b.sock", "XDG_RUNTIME_DIR": "/run/x"}
+    assert default_socket(named) == Path("/a/b.sock")
     assert default_socket({"XDG_RUNTIME_DIR": "/run/x"}) == Path("/run/x/era-haptics/daemon.sock")
     assert default_socket({}).name == "daemon.sock"
 

@@ -1,0 +1,84 @@
+"""The example client in JavaScript, under Node.js against a daemon on a serial line."""
+
+import asyncio
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+from daemon_bench import ENABLED, PATIENCE, READY, DaemonBench, ready_daemon, until_state
+from installed_program import installed_program
+
+BUTTON = Path(__file__).parents[2] / "examples" / "javascript" / "button.mjs"
+TARGET, QUIET = "0.08,0.06", "0.22,0.16"
+
+pytestmark = pytest.mark.real_time
+
+
+async def started(bench: DaemonBench | None, *places: str) -> asyncio.subprocess.Process:
+    """The program with fingers at places, at a daemon if there is one."""
+    socket = "nosuch.sock" if bench is None else str(bench.socket)
+    return await asyncio.create_subprocess_exec(
+        installed_program("node", "nodejs", package="nodejs"),
+        str(BUTTON),
+        *places,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+        env={**os.environ, "ERA_HAPTICS_SOCKET": socket},
+    )
+
+
+async def ended(process: asyncio.subprocess.Process) -> tuple[int | None, str, str]:
+    """Its exit status and both outputs."""
+    out, err = await asyncio.wait_for(process.communicate(), PATIENCE)
+    return process.returncode, out.decode(), err.decode()
+
+
+async def test_button_is_felt_and_disarmed(tmp_path: Path) -> None:
+    """It prints the contrast that the daemon promises, and leaves it disarmed."""
+    async with ready_daemon(tmp_path) as (bench, era):
+        await era.subscribe("pattern")
+        process = await started(bench, QUIET, TARGET)
+        promised = None
+        async for event in era.events():
+            if len(event.data["contacts"]) == 2:
+                promised = event.data["predicted_felt_contrast_db"]
+                break
+        status, out, err = await ended(process)
+        assert (status, err) == (0, "")
+        (shown,) = re.findall(r"felt contrast (\S+) dB", out)
+        assert float(shown) == pytest.approx(promised, abs=0.05)
+        assert await until_state(era, READY) == READY
+        assert not (await era.status()).contacts
+
+
+async def test_interrupt_stops_all_amplifiers(tmp_path: Path) -> None:
+    """Ctrl-C ends it after a stop, which stays latched."""
+    async with ready_daemon(tmp_path) as (bench, era):
+        process = await started(bench, QUIET, TARGET)
+        await until_state(era, ENABLED)
+        process.send_signal(2)
+        assert (await ended(process))[0] == 130
+        await until_state(era, "QUICK_STOP_ACTIVE")
+        assert not any(bench.far.device.status().levels)
+
+
+async def test_killed_client_lifts_its_fingers(tmp_path: Path) -> None:
+    """The daemon is silent once the connection has ended."""
+    async with ready_daemon(tmp_path) as (bench, era):
+        await era.subscribe("pattern", "silence")
+        process = await started(bench, QUIET, TARGET)
+        await anext(event async for event in era.events() if event.topic == "pattern")
+        process.kill()
+        await ended(process)
+        await anext(event async for event in era.events() if event.topic == "silence")
+        assert not (await era.status()).contacts
+
+
+async def test_without_a_daemon_it_says_so() -> None:
+    """One line on standard error and status 1."""
+    status, _, err = await ended(await started(None, TARGET))
+    assert status == 1
+    assert "nosuch.sock" in err
+    assert len(err.splitlines()) == 1

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from model.commands.next_line import next_line
-from model.commands.options import JsonOption, RigArgument, TableArgument
+from model.commands.options import JsonOption, TableArgument
 
 if TYPE_CHECKING:
     from model.table.verify import Verification
@@ -45,26 +45,75 @@ def show(
 
 def verify(
     table_file: TableArgument,
-    rig_file: RigArgument,
+    rig_file: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="RIG", help="Rig file; with --device its wiring, by default ERAs in order."
+        ),
+    ] = None,
+    device: Annotated[
+        str | None,
+        typer.Option(metavar="DEVICE", help="Measure instead, through this sound card."),
+    ] = None,
+    sensors_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--sensors", metavar="SENSORS.csv", help="Accelerometers at its inputs, as of measure."
+        ),
+    ] = None,
+    url: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="Amplifier that plays, in place of the sound card."),
+    ] = None,
+    level: Annotated[
+        float, typer.Option(help="Level of the loudest ERA with --device, 0..1 of its stroke.")
+    ] = 0.5,
+    picture: Annotated[
+        Path | None,
+        typer.Option(metavar="PROMISED.png", help="Draw promised and measured, with --device."),
+    ] = None,
     samples: Annotated[int, typer.Option(min=1, max=10_000, help="Answers to recompute.")] = 12,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the sample.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Recompute a sample by other methods.
+    """Recompute a sample by other methods, or measure it.
 
-    Use the direct solver and the plate in time; exit with 1 if a check fails.
+    Use the direct solver and the plate in time; with --device play patterns and compare what
+    accelerometers measure with what nine of ten plates promise. Exit with 1 if a check fails.
     """
-    from model.commands.progress import progress_bar
     from model.errors import InputError
     from model.files.replacing import begins_with
-    from model.rig.file import load_rig
-    from model.table.file import ZIP, load_table
-    from model.table.verify import verify_table
+    from model.table.file import ZIP
 
-    if begins_with(rig_file, ZIP) and not begins_with(table_file, ZIP):
+    if rig_file is not None and begins_with(rig_file, ZIP) and not begins_with(table_file, ZIP):
         raise InputError(
             f"the table must come before the rig: era table verify {rig_file} {table_file}"
         )
+    if device is not None:
+        from model.commands.table_measured_cli import verify_by_measuring
+        from model.table.table_check import CheckSettings
+
+        if sensors_file is None:
+            raise InputError("--sensors is missing: a file of the accelerometers at the inputs")
+        settings = CheckSettings(device, sensors_file, url, samples, seed, level)
+        verify_by_measuring(table_file, rig_file, settings, picture=picture, as_json=as_json)
+        return
+    for option, given in (("--sensors", sensors_file), ("--url", url), ("--picture", picture)):
+        if given is not None:
+            raise InputError(f"{option} is of a measurement; give --device too")
+    if rig_file is None:
+        raise InputError(f"the rig is missing: era table verify {table_file} RIG.yaml")
+    _verify_by_solving(table_file, rig_file, samples=samples, seed=seed, as_json=as_json)
+
+
+def _verify_by_solving(
+    table_file: Path, rig_file: Path, *, samples: int, seed: int, as_json: bool
+) -> None:
+    from model.commands.progress import progress_bar
+    from model.rig.file import load_rig
+    from model.table.file import load_table
+    from model.table.verify import verify_table
+
     rig = load_rig(rig_file)
     table = load_table(table_file, fingerprint=rig.fingerprint)
     started = time.perf_counter()

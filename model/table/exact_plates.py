@@ -19,7 +19,7 @@ from model.structure.dynamic_stiffness import attached_stiffness, dynamic_stiffn
 from model.structure.fingertip import FingertipLoad, fingertip_loads
 from model.structure.low_rank import coupled_forces
 from model.structure.modal_elasticity import ModalElasticity
-from model.table.question import Question
+from model.table.question import Point, Question
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes
@@ -88,6 +88,24 @@ def felt_on(
         table.threshold_at(rows),
         np.zeros(1, dtype=int),
         Fingertips(tips.fine_weights, np.array(question.gains)),
+    )
+
+
+def amplitudes_on(
+    table: LocalizationTable, points: Sequence[Point], excitation: Excitation, plates: Plates
+) -> tuple[FloatArray, FloatArray]:
+    """Frequencies (f,) [Hz] and amplitudes (f, points, d) [m/s²] where nothing touches the plate.
+
+    points [m]; plates: of as many contacts as points, whose loads count for nothing.
+    """
+    frequencies, bases = base_amplitudes(excitation, table.eras)
+    rows = np.searchsorted(table.frequencies, frequencies)
+    shapes = table.shapes_at(points)[:, None]
+    return frequencies, np.array(
+        [
+            np.abs(_response(table, shapes, (), row, base, plates))
+            for row, base in zip(rows, bases, strict=True)
+        ]
     )
 
 

@@ -7,14 +7,19 @@ from model.arrays import ComplexArray, FloatArray
 
 _MAX_DELAY = 0.1  # s; lines 10 Hz apart repeat then
 _STRAIGHT = 0.5  # rad
+_SILENT = 1e-5  # of full scale, rms
 _SAME = 1e-3  # of periods; a lost block makes them differ by 0.8
 
 
 def is_whole(periods: FloatArray, *, samples: int) -> bool:
-    """Whether all periods of the loop-back (n,) are alike: no block was lost between them."""
+    """Whether all periods of the loop-back (n,) are alike: no block was lost between them.
+
+    Not so where it is silent, which tells nothing.
+    """
     each = periods.reshape(-1, samples)
     size = np.linalg.norm(each[0])
-    return bool(np.linalg.norm(each - each[0], axis=1).max() <= _SAME * size)
+    differ = np.linalg.norm(each - each[0], axis=1).max()
+    return bool(size > _SILENT * np.sqrt(samples) and differ <= _SAME * size)
 
 
 def converters(response: ComplexArray) -> ComplexArray:

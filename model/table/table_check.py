@@ -1,0 +1,80 @@
+"""Checks of a table by what is measured, provided by packages that know the hardware.
+
+A check is an entry point of the group `era_haptics.table_checks` that leads to a `TableCheck`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from model.errors import InputError
+from model.rig.rig import Channel, Rig
+from model.table.promise_at_sensors import MeasuredVerification
+from model.table.table import LocalizationTable
+from registry.limits import GuardLimits
+from registry.plugins import Instance, PluginRegistry
+
+
+@dataclass(frozen=True)
+class CheckSettings:
+    """What `era table verify --device` was given.
+
+    sensors_file: of accelerometers; device: that records them and plays, unless url is an amplifier
+    that does; samples: promises to play; level: of the loudest ERA.
+    """
+
+    device: str
+    sensors_file: Path
+    url: str | None
+    samples: int
+    seed: int
+    level: float
+
+
+@runtime_checkable
+class TableCheck(Protocol):
+    """Plays promises of a table and measures them."""
+
+    def __call__(
+        self,
+        table: LocalizationTable,
+        rig: Rig,
+        settings: CheckSettings,
+        *,
+        progress: Callable[[int, int], None],
+    ) -> MeasuredVerification:
+        """Raises InputError, LinkError."""
+
+
+_CHECKS: PluginRegistry[TableCheck] = PluginRegistry(
+    "table check", "era_haptics.table_checks", Instance(TableCheck), error=InputError
+)
+
+
+def check_by_measuring(
+    table: LocalizationTable,
+    rig: Rig,
+    settings: CheckSettings,
+    *,
+    progress: Callable[[int, int], None],
+) -> MeasuredVerification:
+    """Measure promises by the sound card's check."""
+    return _CHECKS.find("sound")(table, rig, settings, progress=progress)
+
+
+def plain_rig(table: LocalizationTable) -> Rig:
+    """The rig of a table without wiring of its own: its ERAs on channels 0, 1, ... in order."""
+    low, high = (float(table.frequencies[end]) for end in (0, -1))
+    return Rig(
+        table.plate,
+        table.mesh,
+        table.eras,
+        {era.name: Channel("main", number) for number, era in enumerate(table.eras)},
+        {"main": "sim://"},
+        GuardLimits(low, high, 1.0),
+        masses=table.masses,
+        uncertainty=table.uncertainty,
+        fingertip=table.fingertip,
+        threshold=table.threshold,
+    )

@@ -1,0 +1,155 @@
+"""Promises of a table played and measured through a sound card."""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+
+import numpy as np
+
+from drivers.blocking import BlockingAmplifier
+from drivers.command import DriveCommand
+from drivers.errors import LinkError
+from model.arrays import FloatArray
+from model.rig.rig import Rig
+from model.table.promise_at_sensors import (
+    MeasuredVerification,
+    Promise,
+    measured_promise,
+    promises,
+)
+from model.table.table import LocalizationTable
+from model.table.table_check import CheckSettings
+from model.vibration.excitation import Excitation
+from sim.measuring.loopback import is_whole
+from sim.measuring.measure import Desk
+from sim.measuring.sound_card import SoundCard, open_card
+from sim.sensors.sensor_file import read_sensors
+
+_SETTLING = 1.5  # s; T60 of a plate with little damping, and an amplifier that starts later
+_WINDOW = 1.0  # s
+_RAMP = 0.04  # s
+_TRIES = 3
+_MARK = 1000.0  # Hz; of the loop-back, by which lost blocks show
+_MARK_LEVEL = 0.3
+
+Recorder = Callable[[Promise], FloatArray]
+"""Plays a promise, and returns samples (n, inputs) of the plate that has settled."""
+
+
+def check_table(
+    table: LocalizationTable,
+    rig: Rig,
+    settings: CheckSettings,
+    *,
+    progress: Callable[[int, int], None],
+) -> MeasuredVerification:
+    """Play promises and compare what accelerometers measured.
+
+    Raises InputError, LinkError; CommandError, CommandRefused of an amplifier.
+    """
+    sensors = read_sensors(settings.sensors_file, rig.plate)
+    desk = Desk(rig, sensors)
+    desk.check(settings.level)
+    places = {sensor.name: (sensor.x, sensor.y) for sensor in sensors}
+    found = []
+    with _recorder(desk, settings) as (card, record):
+        for promise in promises(
+            table, places, count=settings.samples, level=settings.level, seed=settings.seed
+        ):
+            heard = record(promise)
+            frequencies, amplitudes = _amplitudes(heard, promise, desk, card.rate)
+            found.append(measured_promise(table, promise, frequencies, amplitudes))
+            progress(len(found), settings.samples)
+    return MeasuredVerification(tuple(found))
+
+
+@contextmanager
+def _recorder(desk: Desk, settings: CheckSettings) -> Iterator[tuple[SoundCard, Recorder]]:
+    """An open card, and an amplifier where that plays."""
+    with ExitStack() as stack:
+        if settings.url is None:
+            card = open_card(settings.device, outputs=desk.output, inputs=desk.input)
+            stack.callback(card.close)
+            yield card, lambda promise: _by_card(card, desk, promise.pattern.excitation)
+            return
+        card = open_card(settings.device, outputs=0, inputs=desk.input)
+        stack.callback(card.close)
+        (name,) = {channel.amplifier for channel in desk.rig.wiring.values()}
+        amplifier = stack.enter_context(
+            BlockingAmplifier(
+                settings.url, limits=desk.rig.limits, voltage=desk.rig.voltage_of(name)
+            )
+        )
+        amplifier.arm()
+        thread = stack.enter_context(ThreadPoolExecutor(max_workers=1))
+
+        def by_amplifier(promise: Promise) -> FloatArray:
+            seconds = _SETTLING + _WINDOW
+            commands = commands_of(desk.rig, promise.pattern.excitation)
+            playing = thread.submit(
+                amplifier.play, commands, duration=seconds + _SETTLING, ramp=_RAMP
+            )
+            count = round(seconds * card.rate)
+            heard = card.run(np.zeros((count, 0)))
+            playing.result()
+            if card.gaps:
+                raise LinkError("blocks of sound were lost while a pattern played; verify again")
+            return heard[-round(_WINDOW * card.rate) :].astype(float)
+
+        yield card, by_amplifier
+
+
+def _by_card(card: SoundCard, desk: Desk, excitation: Excitation) -> FloatArray:
+    """Play an excitation from memory: a level is a sample, as of an amplifier of voltage."""
+    seconds = _SETTLING + _WINDOW + _RAMP
+    times = np.arange(round(seconds * card.rate)) / card.rate
+    sources = np.zeros((len(times), len(desk.eras) + 1))
+    for number, era in enumerate(desk.rig.eras):
+        if (tone := excitation.get(era.name)) is not None:
+            angle = 2 * np.pi * tone.frequency * times + tone.phase
+            sources[:, number] = tone.amplitude / era.stroke * np.sin(angle)
+    sources[:, -1] = _MARK_LEVEL * np.sin(2 * np.pi * _MARK * times)
+    ramp = np.sin(np.linspace(0, np.pi / 2, round(_RAMP * card.rate))) ** 2
+    sources[: len(ramp)] *= ramp[:, None]
+    sources[-len(ramp) :] *= ramp[::-1, None]
+    played = desk.on_outputs(sources)
+    start, count = (round(each * card.rate) for each in (_SETTLING, _WINDOW))
+    for _ in range(_TRIES):
+        heard = card.run(played)[start : start + count].astype(float)
+        if card.gaps == 0 and is_whole(heard[:, desk.input - 1], samples=count // 4):
+            return heard
+    raise LinkError(
+        f"blocks of sound were lost in {_TRIES} attempts, or no cable leads from output "
+        f"{desk.output} to input {desk.input}; check it, and end other programs"
+    )
+
+
+def commands_of(rig: Rig, excitation: Excitation) -> list[DriveCommand]:
+    """Commands of the channels of a rig's one amplifier."""
+    return [
+        DriveCommand(
+            rig.wiring[name].number,
+            tone.frequency,
+            tone.amplitude / rig.era(name).stroke,
+            float(np.degrees(tone.phase)),
+        )
+        for name, tone in excitation.items()
+    ]
+
+
+def _amplitudes(
+    heard: FloatArray, promise: Promise, desk: Desk, rate: float
+) -> tuple[FloatArray, FloatArray]:
+    """Frequencies (f,) [Hz] and amplitudes (f, sensors) [m/s²] at the sensors of a promise.
+
+    All tones are fitted together, since their frequencies need not fit into the window.
+    """
+    frequencies = np.unique([tone.frequency for tone in promise.pattern.excitation.values()])
+    by_name = {sensor.name: sensor for sensor in desk.sensors}
+    sensors = [by_name[name] for name in promise.sensors]
+    samples = heard[:, [sensor.input - 1 for sensor in sensors]]
+    angles = 2 * np.pi * np.outer(np.arange(len(samples)) / rate, frequencies)
+    basis = np.hstack([np.sin(angles), np.cos(angles)])
+    fitted, *_ = np.linalg.lstsq(basis, samples)
+    sizes = np.hypot(*np.split(fitted, 2))
+    return frequencies, sizes / np.abs([sensor.sensitivity for sensor in sensors])

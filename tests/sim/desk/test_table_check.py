@@ -1,0 +1,147 @@
+"""Promises of a table to accelerometers, played and measured on a plate in memory."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from desk_card import DeskCard
+from drivers.errors import LinkError
+from model.cli import app
+from model.errors import InputError
+from model.finger.perception import detection_threshold
+from model.rig.file import example_rig_path, load_rig
+from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
+from model.table.build import build_table
+from model.table.file import save_table
+from model.table.promise_at_sensors import Promise, promises
+from model.table.table import LocalizationTable
+from model.vibration.direct import direct_responder
+from model.vibration.peak import tone_amplitudes
+from sim.desk.desk_plate import DeskPlate
+from sim.desk.sensing import Converters
+from sim.desk.truth import Actuator, Truth, draw_truth
+from sim.measuring import table_check
+from sim.sensors.sensor_file import read_sensors
+
+RATE = 8_000.0
+LEVEL = 0.5
+PLACES = {"A": (0.04, 0.05), "B": (0.20, 0.11), "C": (0.28, 0.20), "D": (0.06, 0.19)}
+SENSORS = "sensor,x_m,y_m,input,mv_per_m_s2\n" + "".join(
+    f"{name},{x},{y},{number},1\n" for number, (name, (x, y)) in enumerate(PLACES.items(), start=1)
+)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The paper's plate, known exactly."""
+    return replace(load_rig(example_rig_path()), uncertainty=Uncertainty.none())
+
+
+@pytest.fixture(scope="module")
+def table(rig: Rig) -> LocalizationTable:
+    """Its table, of few frequencies."""
+    return build_table(rig, frequencies=np.array([110.0, 170.0, 230.0]), drive_mode="phased")
+
+
+def as_written(rig: Rig) -> Truth:
+    """The plate as its rig has it, its bases stiff up to high frequencies."""
+    return replace(draw_truth(rig, seed=1), rig=rig, actuators=(Actuator(3e3, 0.7, 1.0),) * 4)
+
+
+def felt_contrast(rig: Rig, promise: Promise) -> float:
+    """Felt contrast [dB] at the sensors of a promise, by the direct solver."""
+    points = np.array([PLACES[name] for name in promise.sensors])
+    respond = direct_responder(rig.plate, rig.mesh)
+    frequencies, found = tone_amplitudes(
+        promise.pattern.excitation, rig.eras, lambda f: respond(rig.eras, f, points)
+    )
+    felt = np.linalg.norm(found / detection_threshold(frequencies)[:, None], axis=0)
+    return float(20 * np.log10(felt[0] / felt[1:].max()))
+
+
+def measured_on(
+    truth: Truth,
+    table: LocalizationTable,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    *more: str,
+) -> tuple[int, dict[str, object]]:
+    """`era table verify --device` on a plate in memory: exit status and report."""
+    (folder / "sensors.csv").write_text(SENSORS)
+    save_table(table, folder / "t.npz")
+    sensors = read_sensors(folder / "sensors.csv", truth.rig.plate)
+
+    def opened(_device: str, **_counts: int) -> DeskCard:
+        converters = Converters(noise=5e-3)
+        return DeskCard(
+            DeskPlate(truth, sensors, rate=RATE, converters=converters, seed=1), rate=RATE
+        )
+
+    monkeypatch.setattr(table_check, "open_card", opened)
+    arguments = ["table", "verify", str(folder / "t.npz"), "--device", "memory", "--samples", "4"]
+    arguments += ["--sensors", str(folder / "sensors.csv"), "--json", *more]
+    result = CliRunner().invoke(app, arguments)
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, json.loads(result.stdout)
+
+
+def test_promises_of_a_known_plate_are_the_direct_solution(
+    rig: Rig, table: LocalizationTable
+) -> None:
+    """Where every parameter is exact, nine of ten plates and every other are this one."""
+    for promise in promises(table, PLACES, count=3, level=LEVEL, seed=0):
+        exact = min(felt_contrast(rig, promise), 25.0)  # deeper nulls show the error of the mesh
+        assert min(promise.contrast_db, 25.0) == pytest.approx(exact, abs=0.5)
+        assert min(promise.median_db, 25.0) == pytest.approx(exact, abs=0.5)
+        strokes = {era.name: era.stroke for era in rig.eras}
+        tones = promise.pattern.excitation.items()
+        assert max(t.amplitude / strokes[n] for n, t in tones) == pytest.approx(LEVEL)
+
+
+def test_contrast_that_is_measured_is_that_of_the_plate(
+    rig: Rig, table: LocalizationTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Played, recorded and fitted: what the direct solver says of the same patterns.
+
+    In time damping is viscous, and the direct solver's hysteretic, which moves nulls.
+    """
+    _, report = measured_on(as_written(rig), table, tmp_path, monkeypatch)
+    asked = list(promises(table, PLACES, count=4, level=LEVEL, seed=0))
+    rows = report["promises"]
+    assert isinstance(rows, list)
+    assert [len(row["quiet"]) for row in rows] == [1, 2, 3, 1]
+    for row, promise in zip(rows, asked, strict=True):
+        exact = min(felt_contrast(rig, promise), 25.0)
+        assert min(row["measured_felt_contrast_db"], 25.0) == pytest.approx(exact, abs=1.5)
+        assert row["measured_level_db_sl"] == pytest.approx(row["promised_level_db_sl"], abs=0.5)
+
+
+def test_plate_that_is_another_breaks_promises(
+    rig: Rig, table: LocalizationTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A plate built from the same drawing, not measured: exit status 1, with its picture."""
+    loose = replace(rig, uncertainty=Uncertainty())
+    picture = tmp_path / "p.png"
+    truth = draw_truth(loose, seed=3, mesh="6x4 Q3")
+    status, report = measured_on(truth, table, tmp_path, monkeypatch, "--picture", str(picture))
+    assert (status, report["passed"]) == (1, False)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_unplugged_loopback_and_missing_options_are_refused(
+    rig: Rig, table: LocalizationTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A silent loop-back cannot tell of lost blocks; a device without sensors tells nothing."""
+    save_table(table, tmp_path / "t.npz")
+    for options in (["--device", "jack"], ["--url", "sim://"], []):
+        result = CliRunner().invoke(app, ["table", "verify", str(tmp_path / "t.npz"), *options])
+        assert isinstance(result.exception, InputError)
+    monkeypatch.setattr(table_check, "_MARK_LEVEL", 0.0)
+    with pytest.raises(LinkError, match="output 5 to input 5"):
+        measured_on(as_written(rig), table, tmp_path, monkeypatch)

@@ -11,7 +11,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo firmware firmware-test test test-long lint format docs fuzz conformance-faults kill-test fault-test stop-test estimate-test soak bench bench-latency \
-	bench-localization bench-plant bench-promise bench-wires dist smoke smoke-lowest sbom licences clean
+	bench-localization bench-plant bench-promise bench-wires dist dist-platform smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
 demo: .venv/installed
@@ -115,6 +115,10 @@ dist: .venv/installed-release
 	rm -rf dist
 	$(BIN)/python -m build --outdir dist .
 
+# A wheel with the compiled engine of `era soft-amp`, for machines like this one without a compiler.
+dist-platform: .venv/installed-release
+	ERA_HAPTICS_ENGINE=1 $(BIN)/python -m build --wheel --outdir dist .
+
 # The wheel alone, in a clean environment for each of python3.11 to python3.14 that is found.
 # Others: make smoke SMOKE='--python /path/to/python3.13'
 smoke: dist
@@ -129,7 +133,7 @@ smoke-lowest: dist
 sbom: dist
 	for extras in '' '-extras'; do \
 		rm -rf out/clean && $(PYTHON) -m venv out/clean && \
-		out/clean/bin/python -m pip install -qq "$$(ls dist/*.whl)$${extras:+[gateway,cluster]}" && \
+		out/clean/bin/python -m pip install -qq "$$(ls dist/*.whl)$${extras:+[gateway,cluster,sound]}" && \
 		out/clean/bin/python -m pip uninstall -qq --yes pip setuptools && \
 		$(BIN)/cyclonedx-py environment --output-reproducible --validate \
 			-o dist/sbom$$extras.json out/clean || exit 1; \

@@ -1,5 +1,6 @@
 """What is built to be installed: the same every time, complete, nothing besides, and it works."""
 
+import os
 import re
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from configparser import ConfigParser
 from pathlib import Path
 
 import pytest
+from packaging.tags import platform_tags
 
 from installed_era import InstalledEra, try_first
 from licences import NOTES
@@ -22,10 +24,11 @@ PACKAGES = ("registry", "controller", "drivers", "era_haptics", "model", "sim")
 DATA = re.compile(r"\.(py|typed|yaml|csv|js|css|html|svg|service|rules|conf)$")
 
 
-def build(target: str, root: Path, folder: Path) -> Path:
+def build(target: str, root: Path, folder: Path, **environment: str) -> Path:
     """The wheel or the sdist of the sources in root."""
     command = [sys.executable, "-m", "hatchling", "build", "--target", target, "-d", str(folder)]
-    subprocess.run(command, cwd=root, capture_output=True, check=True)
+    more = {**os.environ, **environment}
+    subprocess.run(command, cwd=root, capture_output=True, check=True, env=more)
     return next(folder.glob("*.whl" if target == "wheel" else "*.tar.gz"))
 
 
@@ -105,6 +108,30 @@ def test_sdist_makes_the_same_wheel(wheel: Path, sdist: Path, tmp_path: Path) ->
     assert again.read_bytes() == wheel.read_bytes()
 
 
+def test_wheel_of_a_platform_brings_its_engine(wheel: Path, tmp_path: Path) -> None:
+    """It is tagged for the platform; its engine is loaded where there is no compiler."""
+    ours = build("wheel", ROOT, tmp_path, ERA_HAPTICS_ENGINE="1")
+    python, abi, platform = ours.stem.split("-")[-3:]
+    assert (python, abi) == ("py3", "none")
+    assert platform in set(platform_tags())
+    with zipfile.ZipFile(ours) as archive, zipfile.ZipFile(wheel) as plain:
+        assert set(archive.namelist()) - set(plain.namelist()) == {"sim/soft_amp/engine.so"}
+        archive.extractall(tmp_path / "installed")
+    done = subprocess.run(
+        [
+            *(sys.executable, "-c"),
+            "import ctypes; from sim.soft_amp.library import library as found; "
+            "ctypes.CDLL(str(found())); print(found())",
+        ],
+        env={"PYTHONPATH": str(tmp_path / "installed"), "PATH": "", "CC": "no-such-compiler"},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert Path(done.stdout.strip()) == tmp_path / "installed/sim/soft_amp/engine.so"
+
+
 def test_sdist_holds_what_is_needed_to_test_and_document_it(sdist: Path) -> None:
     """No caches and nothing built; tests, pages and examples are there."""
     with tarfile.open(sdist) as archive:
@@ -159,7 +186,7 @@ def test_licences_page_lists_every_dependency(wheel: Path) -> None:
     page = (ROOT / "docs" / "reference" / "licences.md").read_text(encoding="utf-8")
     told = dict(re.findall(r"^\| (\S+) \| \S+ \| ([^|]+) \|", page, re.MULTILINE))
     told = {re.sub(r"[-_.]+", "-", name).lower(): licence for name, licence in told.items()}
-    users = ("", "gateway", "cluster")
+    users = ("", "gateway", "cluster", "sound")
     needed = {
         re.sub(r"[-_.]+", "-", one.name).lower()
         for one in requirements(wheel)

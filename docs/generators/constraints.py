@@ -2,7 +2,7 @@
 
     python docs/generators/constraints.py > constraints.txt
 
-Without development tools: of the plain installation and of the extras `gateway` and `cluster`.
+Without development tools: of the plain installation and of the extras that users install.
 """
 
 import sys
@@ -10,6 +10,8 @@ from importlib.metadata import PackageNotFoundError, requires, version
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+EXTRAS = ("gateway", "cluster", "sound")
 
 
 def closure(name: str, *extras: str) -> dict[str, str]:
@@ -36,5 +38,5 @@ def closure(name: str, *extras: str) -> dict[str, str]:
 
 if __name__ == "__main__":
     sys.stdout.write("# Tested versions: pip install --constraint constraints.txt ...\n")
-    for name, number in closure("era-haptics", "gateway", "cluster").items():
+    for name, number in closure("era-haptics", *EXTRAS).items():
         sys.stdout.write(f"{name}=={number}\n")

@@ -1,4 +1,4 @@
-"""The engine as a library, compiled from its C sources at first use."""
+"""The engine as a library: of a wheel of this platform, or compiled at first use."""
 
 import hashlib
 import os
@@ -10,9 +10,10 @@ from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
-import platformdirs
-
 from model.errors import InputError
+
+ENGINE = "engine.so"
+"""The file of the library in a wheel of one platform."""
 
 _HERE = Path(__file__).parent
 _FOLDERS = (_HERE / "firmware", _HERE.parents[1] / "firmware")  # of a wheel, of a checkout
@@ -33,6 +34,10 @@ _TIMEOUT = 120.0  # s
 
 def library() -> Path:
     """The file of the library, compiled if there is none; raises InputError."""
+    if (_HERE / ENGINE).exists():
+        return _HERE / ENGINE
+    import platformdirs
+
     folder = _sources()
     try:
         kept = platformdirs.user_cache_path("era-haptics", appauthor=False)

@@ -81,7 +81,8 @@ def page(plain: Mapping[str, Any], extras: Mapping[str, Any]) -> str:
     others = [one for one in extras["components"] if one["name"] not in names]
     return (
         f"{TOP}\n## Plain installation\n\n{rows(first)}"
-        f"\n## Additional packages of the extras `gateway` and `cluster`\n\n{rows(others)}{BOTTOM}"
+        f"\n## Additional packages of the extras `gateway`, `cluster` and `sound`\n\n"
+        f"{rows(others)}{BOTTOM}"
     )
 
 

@@ -22,7 +22,7 @@ from model.identification.settled import Touched
 WINDOW: Final = 8
 _UNLIKELY_TOGETHER, _UNLIKELY_ALONE = 1e-7, 1e-8
 _ALONG = 30.0  # squared standard deviations, of a hundred directions in some thousand patterns
-_USUAL = 0.4  # of nis / count: a change adds more, without one there is less most of the time
+_DEFAULT_SHARE = 0.4  # of nis / count: a change adds more, without one there is less most of the time
 _PLACES = (9, 7)
 _KINDS = ("stiffness", "gain", "phase", "thickness")
 
@@ -83,7 +83,7 @@ class Alarm:
             return last[: int(np.argmax(along)) + 1][::-1]
         alone = stats.chi2.sf(squares[0], numbers[0]) < _UNLIKELY_ALONE
         if alone or np.any(stats.chi2.sf(squares, numbers) < _UNLIKELY_TOGETHER):
-            return last[: int(np.argmax(squares - _USUAL * numbers)) + 1][::-1]
+            return last[: int(np.argmax(squares - _DEFAULT_SHARE * numbers)) + 1][::-1]
         return None
 
     @staticmethod

@@ -22,7 +22,7 @@ from model.identification.settled import Touched
 WINDOW: Final = 8
 _UNLIKELY_TOGETHER, _UNLIKELY_ALONE = 1e-7, 1e-8
 _ALONG = 30.0  # squared standard deviations, of a hundred directions in some thousand patterns
-_DEFAULT_SHARE = 0.4  # of nis / count: a change adds more, without one there is less most of the time
+_DEFAULT_SHARE = 0.4  # of nis / count: a change adds more, without one there is mostly less
 _PLACES = (9, 7)
 _KINDS = ("stiffness", "gain", "phase", "thickness")
 

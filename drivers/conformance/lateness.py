@@ -73,13 +73,14 @@ class Lateness:
 
     def __init__(self, process: int | None = None) -> None:
         self._waits = ProcessorWaits(process)
-        self._waited = self._waits.total()
+        self._waited = 0.0
         self.worst = 0.0
         self._delays: deque[tuple[float, float]] = deque()
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
 
     def __enter__(self) -> "Lateness":
+        self._waited = self._waits.total()
         self._schedule()
         return self
 

@@ -7,6 +7,7 @@ import asyncio
 import logging
 import re
 from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ import dashboard_pictures
 import patient_daemon
 from chromium import Browser, Page, open_browser
 from controller.api.client import Client
+from controller.api.jsonrpc import RpcError
 from controller.effects.layout_kind import LAYOUT
 from daemon_bench import PATIENCE
 from dashboard_pictures import (
@@ -100,7 +102,8 @@ async def settled(page: Page, era: Client) -> None:
     async with asyncio.timeout(PATIENCE):
         while await page.evaluate(STATE) != READY or era.status().state != READY:
             if era.status().state in (STOPPED, "FAULT"):
-                era.clear()
+                with suppress(RpcError):  # refused while the stop is under way
+                    era.clear()
             await asyncio.sleep(0.1)
 
 

@@ -36,6 +36,7 @@ def touches(tmp_path):
     return read_touches(path)
 
 
+@pytest.mark.real_time
 def test_onset_contrast_matches_prediction(touches, monkeypatch):
     """Within 2 dB over the first 100 ms, and far above what the amplifier's own ramp would give."""
     wait_long(monkeypatch)

@@ -12,6 +12,7 @@ from model.commands.options import ExactOption, SeedOption, seed_of_plate
 from model.errors import InputError
 from sim.desk_plate_cli import desk_plate
 from sim.measure_cli import measure
+from sim.port_option import port_option
 from sim.soft_amp_cli import soft_amp
 from sim.witness_cli import witness
 
@@ -38,27 +39,11 @@ def sim(
     serial: Annotated[
         bool, typer.Option("--serial", help="Put each amplifier on a pseudo-terminal.")
     ] = False,
-    modbus_tcp: Annotated[
-        int | None,
-        typer.Option(
-            metavar="PORT",
-            help="Serve Modbus TCP on this loopback port; 0: any.",
-            min=0,
-            max=65535,
-        ),
-    ] = None,
+    modbus_tcp: Annotated[int | None, port_option("Modbus TCP")] = None,
     modbus_rtu: Annotated[
         bool, typer.Option("--modbus-rtu", help="Serve Modbus RTU on one pseudo-terminal.")
     ] = False,
-    socketcand: Annotated[
-        int | None,
-        typer.Option(
-            metavar="PORT",
-            help="Serve a CAN bus by socketcand on this loopback port; 0: any.",
-            min=0,
-            max=65535,
-        ),
-    ] = None,
+    socketcand: Annotated[int | None, port_option("a CAN bus by socketcand")] = None,
     slcan: Annotated[
         bool, typer.Option("--slcan", help="Serve a CAN bus behind a serial adapter (slcan).")
     ] = False,

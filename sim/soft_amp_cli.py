@@ -10,6 +10,7 @@ import typer
 
 from drivers.errors import LinkError
 from model.errors import InputError
+from sim.port_option import port_option
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -39,24 +40,8 @@ def soft_amp(
     serial: Annotated[
         bool, typer.Option("--serial", help="Serve the serial protocol on a pseudo-terminal.")
     ] = False,
-    tcp: Annotated[
-        int | None,
-        typer.Option(
-            metavar="PORT",
-            help="Serve the serial protocol on this loopback port; 0: any.",
-            min=0,
-            max=65535,
-        ),
-    ] = None,
-    modbus_tcp: Annotated[
-        int | None,
-        typer.Option(
-            metavar="PORT",
-            help="Serve Modbus TCP on this loopback port; 0: any.",
-            min=0,
-            max=65535,
-        ),
-    ] = None,
+    tcp: Annotated[int | None, port_option("the serial protocol")] = None,
+    modbus_tcp: Annotated[int | None, port_option("Modbus TCP")] = None,
     link: Annotated[
         Path | None,
         typer.Option(metavar="PATH", help="Link this path to the pseudo-terminal."),

@@ -2,9 +2,11 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from functools import partial
 
 from drivers import clock
 from drivers.conformance.bench import Bench
+from drivers.conformance.cases import settle
 from drivers.conformance.check import driving
 from drivers.conformance.curve import raised_cosine
 from drivers.conformance.findings import (
@@ -49,12 +51,15 @@ async def trips_amid_fades(bench: Bench) -> None:
         ]
     if not cases:
         raise NotApplicable("nothing that it plays ends later than its shortest watchdog")
-    for why, sets in cases:
+
+    async def trips(why: str, sets: list[Callable[[], SafeCommandSet]]) -> None:
         await bench.arm(bench.can.watchdog_min)
         for make in sets:
             await bench.apply(make())
         await expect_trip(bench, why=why)
-        await bench.rest()
+
+    for case in cases:
+        await settle(bench, partial(trips, *case))
 
 
 def _other_frequency(bench: Bench) -> float:

@@ -1,9 +1,13 @@
 """Checks of how a vibration ends: stop, disarm, valid_for; and of what is latched then."""
 
 import asyncio
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import TypeAlias
 
 from drivers import clock
 from drivers.conformance.bench import Bench
+from drivers.conformance.cases import settle
 from drivers.conformance.check import driving
 from drivers.conformance.curve import expect_curve, raised_cosine, samples_until
 from drivers.conformance.findings import expect
@@ -13,6 +17,7 @@ from drivers.protocol.messages import AmplifierState, Feature, Status
 
 _STATES = "wire-protocol.md#states"
 _SETS = "wire-protocol.md#sets-tokens-and-ramps"
+_Silence: TypeAlias = Callable[[float], Awaitable[Status]]
 _OFF = 0.01  # s; until state and high voltage follow silence
 
 
@@ -119,7 +124,21 @@ async def silence_never_later(bench: Bench) -> None:
     """It lets a further Stop or Disarm shorten the ramp to silence, never extend it."""
     amplifier, full = bench.amplifier, bench.can.ramp_max
     stop, disarm = amplifier.stop, amplifier.disarm
-    for first, start, then, after, share in (
+
+    async def silenced(
+        first: _Silence, start: float, then: _Silence, after: float, at: float
+    ) -> None:
+        await bench.arm()
+        await bench.play(1.0)
+        _, started = await bench.timed(first(start))
+        await bench.pause_until(started.latest + at * start)
+        _, second = await bench.timed(then(after))
+        due = min(started.latest + start, second.latest + after) - started.latest
+        what = f"silence after {start:g} s, then {after:g} s"
+        silent = await bench.time_of(is_silent, since=started, due=due, what=what)
+        bench.expect_time(what, silent, low=0.0, high=due + CYCLE)
+
+    for case in (
         (stop, full, stop, 0.0, 0.1),
         (stop, full / 4, stop, full, 0.1),
         (stop, full / 4, stop, full / 4, 0.15),
@@ -128,23 +147,15 @@ async def silence_never_later(bench: Bench) -> None:
         (disarm, full, stop, 0.0, 0.1),
         (stop, full / 4, disarm, full, 0.1),
     ):
-        await bench.arm()
-        await bench.play(1.0)
-        _, started = await bench.timed(first(start))
-        await bench.pause_until(started.latest + share * start)
-        _, second = await bench.timed(then(after))
-        due = min(started.latest + start, second.latest + after) - started.latest
-        what = f"silence after {start:g} s, then {after:g} s"
-        silent = await bench.time_of(is_silent, since=started, due=due, what=what)
-        bench.expect_time(what, silent, low=0.0, high=due + CYCLE)
-        await bench.rest()
+        await settle(bench, partial(silenced, *case))
 
 
 @driving("wire-protocol.md#sets-tokens-and-ramps")
 async def stop_ends_fades(bench: Bench) -> None:
     """It ends a fade that a set began, along the ramp of a Stop, if that is sooner."""
     full = bench.can.ramp_max
-    for set_ramp, stop_ramp_ in ((full, full / 8), (full / 4, full)):
+
+    async def ended(set_ramp: float, stop_ramp_: float) -> None:
         await bench.arm()
         await bench.play(1.0)
         started = await bench.play(ramp=set_ramp)
@@ -154,7 +165,9 @@ async def stop_ends_fades(bench: Bench) -> None:
         what = "silence of a fading set after a Stop"
         silent = await bench.time_of(is_silent, since=started, due=due, what=what)
         bench.expect_time(what, silent, low=0.0, high=due + CYCLE)
-        await bench.rest()
+
+    for ramps in ((full, full / 8), (full / 4, full)):
+        await settle(bench, partial(ended, *ramps))
 
 
 @driving("wire-protocol.md#disarm")

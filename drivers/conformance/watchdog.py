@@ -3,10 +3,12 @@
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Sequence
+from functools import partial
 
 from drivers import clock
 from drivers.amplifier import WATCHDOG
 from drivers.conformance.bench import Bench
+from drivers.conformance.cases import settle
 from drivers.conformance.check import driving
 from drivers.conformance.findings import expect
 from drivers.errors import CommandRefused, LinkTimeout
@@ -71,11 +73,14 @@ async def watchdog(bench: Bench) -> None:
 async def watchdog_times(bench: Bench) -> None:
     """It takes the watchdog that Arm gives, from the shortest to the longest."""
     bench.require(Feature.WATCHDOG)
-    for requested in (_ODD, WATCHDOG, bench.can.watchdog_max):
+
+    async def trips(requested: float) -> None:
         await bench.arm(requested)
         await bench.play(1.0)
         await expect_trip(bench, why=f"of {bench.watchdog:g} s")
-        await bench.rest()
+
+    for requested in (_ODD, WATCHDOG, bench.can.watchdog_max):
+        await settle(bench, partial(trips, requested))
 
 
 @driving(_PLACE)
@@ -151,14 +156,16 @@ _SEEN = 0.02  # s; that the watchdog runs down before a request that must not fi
 async def trips_amid_other_requests(bench: Bench) -> None:
     """It trips its watchdog in time while requests look or are refused."""
     bench.require(Feature.WATCHDOG)
-    for calls in ([("GetStatus", bench.amplifier.status)], _not_feeding(bench)):
+
+    async def trips(calls: list[Call]) -> None:
         await bench.arm(WATCHDOG)
         await bench.play(1.0)
-        await _call_until(
-            bench, [call for _, call in calls], bench.fed.latest + 0.8 * bench.watchdog
-        )
+        await _call_until(bench, calls, bench.fed.latest + 0.8 * bench.watchdog)
         await expect_trip(bench, why="amid requests that do not feed it")
-        await bench.rest()
+
+    looking: list[Call] = [bench.amplifier.status]
+    for calls in (looking, [call for _, call in _not_feeding(bench)]):
+        await settle(bench, partial(trips, calls))
 
 
 async def _call_until(bench: Bench, calls: Sequence[Call], end: float) -> None:

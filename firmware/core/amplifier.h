@@ -89,6 +89,11 @@ void amplifier_disarm(struct amplifier *amplifier, uint16_t ramp);
 void amplifier_stop(struct amplifier *amplifier, uint16_t ramp);
 struct verdict amplifier_clear(struct amplifier *amplifier, uint8_t latch);
 struct verdict amplifier_ping(struct amplifier *amplifier, uint16_t session);
+// Whether SetAddress may give a new address, 1 to `highest`; the line takes it, and the board keeps it.
+struct verdict amplifier_readdress(const struct amplifier *amplifier, uint16_t address,
+                                   uint8_t highest);
+// Whether a text without its length is this amplifier's serial number.
+bool amplifier_is_named(const struct amplifier *amplifier, const uint8_t *text, uint16_t length);
 struct verdict amplifier_stage(struct amplifier *amplifier, uint16_t session, const struct set *set);
 struct verdict amplifier_commit(struct amplifier *amplifier, uint16_t session, uint16_t token);
 struct verdict amplifier_apply(struct amplifier *amplifier, uint16_t session, const struct set *set);

@@ -40,6 +40,9 @@ enum fault board_fault(uint8_t *channel);
 // Who it is.
 
 const char *board_serial_number(void); // unique, at most 32 bytes of UTF-8; never changes
-uint8_t board_address(void);           // on serial and Modbus 1 to 247, on CAN 1 to 63
+// Of this amplifier on a line: on serial and Modbus 1 to 247, on CAN 1 to 63. 1 until one is stored.
+uint8_t board_address(enum line line);
+// Keep an address that a host has set, also without supply.
+void board_store_address(enum line line, uint8_t address);
 
 #endif

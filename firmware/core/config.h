@@ -22,7 +22,8 @@
 #define SAMPLE_RATE 16000 // per second and channel; a multiple of 1000
 #define SAMPLES_PER_MS (SAMPLE_RATE / 1000)
 
-#define FEATURES 0x013E // watchdog, staging, valid_for, phase, broadcast, interlock; it sends no events
+// Watchdog, staging, valid_for, phase, broadcast, interlock, address; it sends no events.
+#define FEATURES 0x093E
 
 #define FREQUENCY_MIN (20 * FREQUENCY_PER_HZ)
 #define FREQUENCY_MAX (2000 * FREQUENCY_PER_HZ) // at most a quarter of the sample rate

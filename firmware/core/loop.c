@@ -16,6 +16,7 @@ static struct rtu rtu;
 static struct can_node node;
 static struct slcan slcan;
 static uint32_t samples_to_measuring;
+static uint8_t stored[3]; // addresses, of each line
 
 // Of a longer time in which the processor could not make samples (a program or an emulator may stand
 // still) only this passes: the watchdog watches the host, not what held up the processor.
@@ -31,11 +32,13 @@ static void send_can(const struct can_frame *frame)
 
 void loop_init(void)
 {
+    for (int line = LINE_SERIAL; line <= LINE_CAN; line++)
+        stored[line] = board_address((enum line)line);
     amplifier_init(&amplifier, board_serial_number());
-    serial_init(&serial, &amplifier, board_address());
-    modbus_init(&modbus, &amplifier, board_address());
+    serial_init(&serial, &amplifier, stored[LINE_SERIAL]);
+    modbus_init(&modbus, &amplifier, stored[LINE_MODBUS]);
     rtu_init(&rtu, &modbus);
-    can_init(&node, &amplifier, board_address(), send_can);
+    can_init(&node, &amplifier, stored[LINE_CAN], send_can);
     slcan_init(&slcan, &node);
     board_high_voltage(false);
 }
@@ -69,6 +72,15 @@ static void send(enum line line, const uint8_t *reply, uint16_t length)
     board_high_voltage(amplifier.high_voltage);
     if (length > 0)
         board_write(line, reply, length);
+}
+
+// Keep an address that a host has set; its reply is on the way.
+static void store(enum line line, uint8_t address)
+{
+    if (stored[line] == address)
+        return;
+    stored[line] = address;
+    board_store_address(line, address);
 }
 
 static void serve_serial(void)
@@ -105,4 +117,7 @@ void loop_once(void)
     serve_serial();
     serve_modbus();
     serve_can();
+    store(LINE_SERIAL, serial.address);
+    store(LINE_MODBUS, modbus.unit);
+    store(LINE_CAN, node.next_number);
 }

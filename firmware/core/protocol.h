@@ -59,14 +59,17 @@ enum nak {
 #define PHASE_MIN (-18000)
 #define PHASE_MAX 17999
 #define PHASE_TURN 36000
+#define SERIAL_NUMBER_MAX 32 // bytes
 #define RAMP_MAX 1000
 #define VALID_FOR_MAX 60000
 #define STAGED_LIFE 1000    // ms until a staged set is forgotten
 #define SAFETY_RAMP 5       // ms; of the watchdog, of faults, and of what an Arm still finds playing
 #define ENVELOPE_SLOT_MAX 63
+#define ADDRESS_MAX 247     // on the serial line and Modbus
 
 // Features.
 #define FEATURE_EVENTS 0x0001
+#define FEATURE_ADDRESS 0x0800
 
 // Flags of Status.
 #define HIGH_VOLTAGE_ON 0x01

@@ -178,6 +178,22 @@ struct verdict amplifier_ping(struct amplifier *amplifier, uint16_t session)
     return ACCEPTED;
 }
 
+struct verdict amplifier_readdress(const struct amplifier *amplifier, uint16_t address,
+                                   uint8_t highest)
+{
+    if (!(FEATURES & FEATURE_ADDRESS))
+        return refused(NAK_UNKNOWN_TYPE);
+    if (address < 1 || address > highest)
+        return refused(NAK_BAD_VALUE);
+    return amplifier->state == SWITCH_ON_DISABLED ? ACCEPTED : refused(NAK_WRONG_STATE);
+}
+
+bool amplifier_is_named(const struct amplifier *amplifier, const uint8_t *text, uint16_t length)
+{
+    return length == strlen(amplifier->serial_number) &&
+           memcmp(text, amplifier->serial_number, length) == 0;
+}
+
 void amplifier_forces(struct amplifier *amplifier, int32_t forces[CHANNELS_MAX])
 {
     for (unsigned i = 0; i < CHANNELS; i++)

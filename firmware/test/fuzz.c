@@ -147,6 +147,13 @@ static uint8_t *put_envelope(uint8_t *at)
     return at;
 }
 
+// The serial number of the amplifier.
+static uint8_t *put_name(uint8_t *at)
+{
+    memcpy(at, "FUZZ-1", 6);
+    return at + 6;
+}
+
 static uint8_t *put_payload(uint8_t *at, uint8_t type)
 {
     switch (type) {
@@ -167,6 +174,8 @@ static uint8_t *put_payload(uint8_t *at, uint8_t type)
         return put_u16(at, some_session());
     case 13:
         return put_envelope(at);
+    case 15:
+        return put_name(put_u16(at, any(4) | 6 << 8));
     default:
         return at;
     }
@@ -176,7 +185,7 @@ static uint8_t *put_payload(uint8_t *at, uint8_t type)
 static uint8_t some_type(void)
 {
     static const uint8_t TYPES[] = {1, 2, 3, 3, 3, 4, 5, 5, 6, 6, 7, 7, 7, 7, 8, 9, 10, 11, 11,
-                                    12, 12, 13, 13, 14, 30, 31};
+                                    12, 12, 13, 13, 14, 15, 30, 31};
     return TYPES[any(sizeof TYPES)];
 }
 
@@ -221,9 +230,9 @@ static uint8_t *put_register(uint8_t *at, uint32_t value)
 static uint16_t put_block(uint8_t *at, uint16_t *address)
 {
     static const uint16_t WORDS[] = {15, 15, 15, 0, 2, 128, 1};
-    static const uint16_t FIRST[] = {2, 10, 12, 16, 16, 16, 102};
+    static const uint16_t FIRST[] = {2, 10, 12, 16, 16, 16, 102, 182};
     uint8_t *begin = at;
-    uint32_t block = any(7), token = some_token();
+    uint32_t block = any(8), token = some_token();
     *address = FIRST[block];
     switch (block) {
     case 0:
@@ -244,6 +253,11 @@ static uint16_t put_block(uint8_t *at, uint16_t *address)
             at = put_register(at, any(10001));
         break;
     }
+    case 7:
+        memset(at, 0, 34);
+        put_name(put_register(at, any(4)));
+        at += 34;
+        break;
     default:
         at = put_register(at, some_session());
         if (block == 5)
@@ -368,6 +382,7 @@ int main(int count, char **arguments)
             if (amplifier.state != OPERATION_ENABLED && any(4) == 0)
                 arm_again();
             uint16_t token = amplifier.active.token;
+            serial.address = modbus.unit = node.next_number = 1; // a SetAddress may have moved them
             if (codec == 0)
                 fuzz_serial(&serial);
             else if (codec == 1)

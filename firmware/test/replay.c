@@ -74,7 +74,7 @@ static void replay_line(void)
 void replay(void)
 {
     amplifier_init(&amplifier, board_serial_number());
-    serial_init(&serial, &amplifier, board_address());
+    serial_init(&serial, &amplifier, board_address(LINE_SERIAL));
     for (;;)
         replay_line();
 }

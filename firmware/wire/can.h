@@ -32,6 +32,7 @@ struct can_collection {
 };
 
 #define SDO_BUFFER 140
+#define NODE_MAX 63
 
 struct can_sdo {
     enum { SDO_IDLE, SDO_UPLOAD, SDO_DOWNLOAD } transfer;
@@ -44,7 +45,7 @@ struct can_sdo {
 
 struct can_node {
     struct amplifier *amplifier;
-    uint8_t number;
+    uint8_t number, next_number; // the next one from a reset on
     void (*send)(const struct can_frame *frame);
     enum nmt nmt;
     uint16_t heartbeat_interval; // ms; 0: none

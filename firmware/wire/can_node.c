@@ -28,6 +28,7 @@ void can_send(struct can_node *node, uint16_t function, uint64_t data, uint8_t l
 
 static void boot(struct can_node *node)
 {
+    node->number = node->next_number;
     node->nmt = NMT_PRE_OPERATIONAL;
     node->heartbeat_interval = HEARTBEAT_INTERVAL;
     node->heartbeat_at = node->amplifier->now;
@@ -43,7 +44,7 @@ void can_init(struct can_node *node, struct amplifier *amplifier, uint8_t number
 {
     memset(node, 0, sizeof *node);
     node->amplifier = amplifier;
-    node->number = number;
+    node->next_number = number;
     node->send = send;
     boot(node);
 }

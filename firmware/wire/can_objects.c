@@ -184,6 +184,8 @@ static uint32_t read_value(struct writer *writer, const struct can_node *node, u
     case 0x2032:
         write_u64(writer, can_levels(node, 0));
         return 0;
+    case 0x200E:
+        return FEATURES & FEATURE_ADDRESS ? WRITE_ONLY : NO_OBJECT;
     case 0x2100:
         return WRITE_ONLY;
     default:
@@ -244,6 +246,17 @@ static enum nak write_envelope(struct amplifier *amplifier, uint8_t slot, struct
     return amplifier_load(amplifier, slot, &envelope).nak;
 }
 
+static enum nak write_number(struct can_node *node, struct reader reader)
+{
+    uint8_t number = read_u8(&reader);
+    if (!amplifier_is_named(node->amplifier, reader.at, reader.left))
+        return NAK_BAD_VALUE;
+    enum nak nak = amplifier_readdress(node->amplifier, number, NODE_MAX).nak;
+    if (nak == NAK_NONE)
+        node->next_number = number;
+    return nak;
+}
+
 // Objects that stand for frames act like them, and like them only in operation.
 static uint32_t write_frame(struct can_node *node, uint16_t index, uint8_t sub, uint64_t frame)
 {
@@ -266,6 +279,7 @@ uint32_t can_write_object(struct can_node *node, const struct can_sdo *from)
     switch (from->index) {
     case 0x1016:
     case 0x1017:
+    case 0x200E:
     case 0x2020:
     case 0x2021:
     case 0x2022:
@@ -279,6 +293,8 @@ uint32_t can_write_object(struct can_node *node, const struct can_sdo *from)
     }
     if (!is_named)
         return NO_SUBINDEX;
+    if (from->index == 0x200E)
+        return abort_code(write_number(node, reader));
     if (from->index == 0x2100)
         return abort_code(write_envelope(node->amplifier, sub, reader));
     if (from->length != (from->index == 0x1016 ? 4 : from->index == 0x1017 ? 2 : 8))

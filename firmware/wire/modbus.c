@@ -191,11 +191,29 @@ static uint16_t identify_request(struct modbus *modbus, const uint8_t *pdu, uint
     return reply[6] > 0 ? at : exception(reply, IDENTIFY, ILLEGAL_ADDRESS);
 }
 
-// To all units: a Commit or a Stop is carried out, anything else ignored.
+// Take a unit number, from a write of the whole address block that names this amplifier.
+static void take_unit(struct modbus *modbus, const uint8_t *registers)
+{
+    uint8_t length = SERIAL_NUMBER_MAX; // without the zeros behind it
+    while (length > 0 && registers[1 + length] == 0)
+        length--;
+    uint16_t unit = u16_at(registers);
+    if (amplifier_is_named(modbus->amplifier, registers + 2, length) &&
+        amplifier_readdress(modbus->amplifier, unit, ADDRESS_MAX).nak == NAK_NONE)
+        modbus->unit = (uint8_t)unit;
+}
+
+// To all units: a Commit, Stop or SetAddress is carried out, anything else ignored.
 static void broadcast(struct modbus *modbus, const uint8_t *pdu, uint16_t length, uint8_t *reply)
 {
     uint16_t address = u16_at(pdu + 1), count = u16_at(pdu + 3);
     uint16_t first = SET_AT, fields = 2;
+    if (address == ADDRESS_AT || address == ADDRESS_AT - TAG_BEFORE) {
+        if (address + count == ADDRESS_AT + ADDRESS_FIELDS && pdu[5] == 2 * count &&
+            length == 6 + 2 * count)
+            take_unit(modbus, pdu + 6 + 2 * (ADDRESS_AT - address));
+        return;
+    }
     if (address == CONTROL_AT || address == CONTROL_AT - TAG_BEFORE) {
         uint16_t word = (uint16_t)(6 + 2 * (CONTROL_AT - address));
         if (length < word + 2 || u16_at(pdu + word) != 2)

@@ -14,6 +14,7 @@
 #define CONTROL_FIELDS 5
 #define SET_FIELDS (5 + 4 * 16)
 #define ENVELOPE_FIELDS (3 + 2 * ENVELOPE_KNOTS)
+#define ADDRESS_FIELDS (1 + SERIAL_NUMBER_MAX / 2)
 
 struct modbus {
     struct amplifier *amplifier;

@@ -16,6 +16,7 @@
 #define LOOK_AT 12 // a tag alone
 #define SET_AT 16
 #define ENVELOPE_AT 102
+#define ADDRESS_AT 182 // written by broadcast alone
 #define STATUS_AT 1002
 #define REFUSAL_AT 1034
 #define CAPABILITIES_AT 1352

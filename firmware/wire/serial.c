@@ -77,11 +77,14 @@ static uint16_t frame_received(struct serial *serial)
     struct reader payload = {request + HEADER, (uint16_t)(length - HEADER - 4), false};
     struct writer reply = {frame, HEADER, SERIAL_FRAME_MAX - 4, false};
     if (request[ADDRESS] == BROADCAST) {
-        serial_broadcast(serial->amplifier, request[TYPE], request[VERSION], &payload);
+        serial_broadcast(serial->amplifier, &serial->address, request[TYPE], request[VERSION],
+                         &payload);
         return 0;
     }
-    struct header header = serial_answer(serial->amplifier, request[TYPE], request[VERSION],
-                                         &payload, &reply);
+    struct header header = serial_answer(serial->amplifier, &serial->address, request[TYPE],
+                                         request[VERSION], &payload, &reply);
+    if (header.type == 0)
+        return 0;
     frame[TYPE] = header.type;
     frame[VERSION] = header.version;
     uint32_t crc = crc32_of(frame, reply.length);

@@ -7,7 +7,7 @@
 
 enum type {
     HELLO = 1, GET_CAPS, ARM, DISARM, STAGE, COMMIT, APPLY, STOP, GET_STATUS, GET_FAULTS, CLEAR,
-    PING, LOAD_ENVELOPE,
+    PING, LOAD_ENVELOPE, SET_ADDRESS = 15,
     NAK = 31
 };
 
@@ -145,6 +145,26 @@ static struct verdict load(struct amplifier *amplifier, struct reader *payload, 
     return verdict;
 }
 
+// Whether a SetAddress names another amplifier, or nothing that could be one.
+static bool is_for_another(const struct amplifier *amplifier, struct reader payload)
+{
+    read_u8(&payload); // address
+    uint16_t length = read_u8(&payload);
+    return payload.is_short || payload.left != length ||
+           !amplifier_is_named(amplifier, payload.at, length);
+}
+
+// Take an address from a SetAddress for this amplifier.
+static struct verdict take_address(const struct amplifier *amplifier, uint8_t *address,
+                                   struct reader *payload)
+{
+    uint8_t given = read_u8(payload);
+    struct verdict verdict = amplifier_readdress(amplifier, given, ADDRESS_MAX);
+    if (verdict.nak == NAK_NONE)
+        *address = given;
+    return verdict;
+}
+
 // Bytes of a request whose length is fixed; -1: of any length, -2: no such request.
 static int length_of(uint8_t type)
 {
@@ -153,11 +173,13 @@ static int length_of(uint8_t type)
         [APPLY] = -1, [STOP] = 2, [GET_STATUS] = 0, [GET_FAULTS] = 0, [CLEAR] = 1, [PING] = 2,
         [LOAD_ENVELOPE] = -1,
     };
+    if (type == SET_ADDRESS)
+        return FEATURES & FEATURE_ADDRESS ? -1 : -2;
     return type >= HELLO && type <= LOAD_ENVELOPE ? LENGTHS[type] : -2;
 }
 
-static struct verdict carry_out(struct amplifier *amplifier, uint8_t type, struct reader *payload,
-                                struct writer *reply)
+static struct verdict carry_out(struct amplifier *amplifier, uint8_t *address, uint8_t type,
+                                struct reader *payload, struct writer *reply)
 {
     struct verdict verdict = ACCEPTED;
     int length = length_of(type);
@@ -175,6 +197,10 @@ static struct verdict carry_out(struct amplifier *amplifier, uint8_t type, struc
         return ACCEPTED;
     case LOAD_ENVELOPE:
         return load(amplifier, payload, reply);
+    case SET_ADDRESS:
+        verdict = take_address(amplifier, address, payload);
+        write_u8(reply, *address);
+        return verdict;
     case STAGE:
     case APPLY:
         verdict = play(amplifier, type, payload);
@@ -206,10 +232,11 @@ static struct verdict carry_out(struct amplifier *amplifier, uint8_t type, struc
     return verdict;
 }
 
-struct header serial_answer(struct amplifier *amplifier, uint8_t type, uint8_t version,
-                            struct reader *payload, struct writer *reply)
+struct header serial_answer(struct amplifier *amplifier, uint8_t *address, uint8_t type,
+                            uint8_t version, struct reader *payload, struct writer *reply)
 {
     struct header header = {(uint8_t)(type | REPLY), PROTOCOL_VERSION};
+    const struct header none = {0, 0};
     struct verdict verdict = refused(NAK_UNSUPPORTED_VERSION);
     uint16_t start = reply->length;
     if (type == HELLO) { // the same in every version
@@ -217,8 +244,11 @@ struct header serial_answer(struct amplifier *amplifier, uint8_t type, uint8_t v
         header.version = 0;
         return header;
     }
+    if (version == PROTOCOL_VERSION && type == SET_ADDRESS && length_of(type) == -1 &&
+        is_for_another(amplifier, *payload))
+        return none;
     if (version == PROTOCOL_VERSION)
-        verdict = carry_out(amplifier, type, payload, reply);
+        verdict = carry_out(amplifier, address, type, payload, reply);
     if (verdict.nak != NAK_NONE) {
         reply->length = start;
         write_u8(reply, type);
@@ -231,9 +261,11 @@ struct header serial_answer(struct amplifier *amplifier, uint8_t type, uint8_t v
     return header;
 }
 
-void serial_broadcast(struct amplifier *amplifier, uint8_t type, uint8_t version,
+void serial_broadcast(struct amplifier *amplifier, uint8_t *address, uint8_t type, uint8_t version,
                       struct reader *payload)
 {
+    if (version == PROTOCOL_VERSION && type == SET_ADDRESS && !is_for_another(amplifier, *payload))
+        take_address(amplifier, address, payload);
     if (version != PROTOCOL_VERSION || payload->left != length_of(type))
         return;
     uint16_t first = read_u16(payload);

@@ -16,11 +16,13 @@ struct header {
 };
 
 // Carry out a request and append the payload of its reply; return type and version of the reply.
-struct header serial_answer(struct amplifier *amplifier, uint8_t type, uint8_t version,
-                            struct reader *payload, struct writer *reply);
+// Type 0: it is for another amplifier of this address, and there is no reply. SetAddress changes the
+// address.
+struct header serial_answer(struct amplifier *amplifier, uint8_t *address, uint8_t type,
+                            uint8_t version, struct reader *payload, struct writer *reply);
 
-// Carry out a Commit or Stop to every amplifier; ignore anything else.
-void serial_broadcast(struct amplifier *amplifier, uint8_t type, uint8_t version,
+// Carry out a Commit, Stop or SetAddress to every amplifier; ignore anything else.
+void serial_broadcast(struct amplifier *amplifier, uint8_t *address, uint8_t type, uint8_t version,
                       struct reader *payload);
 
 #endif

@@ -224,7 +224,15 @@ const char *board_serial_number(void)
     return "MPS2-1"; // a product reads the number of its processor
 }
 
-uint8_t board_address(void)
+// A product keeps them in its flash; here they last until a reset.
+static uint8_t addresses[LINES] = {1, 1, 1};
+
+uint8_t board_address(enum line line)
 {
-    return 1;
+    return addresses[line];
+}
+
+void board_store_address(enum line line, uint8_t address)
+{
+    addresses[line] = address;
 }

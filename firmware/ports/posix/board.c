@@ -25,6 +25,8 @@ static uint8_t received[LINES][512];
 static ssize_t received_length[LINES], received_at[LINES];
 static uint64_t heard_at[LINES];
 static const char *serial_number = "FW-1";
+static const char *addresses_path; // of the file that stands for memory without supply
+static uint8_t addresses[LINES] = {1, 1, 1};
 static bool ends_with_input;
 static bool is_high_voltage;
 static volatile sig_atomic_t is_interlock_open;
@@ -130,25 +132,51 @@ const char *board_serial_number(void)
     return serial_number;
 }
 
-uint8_t board_address(void)
+uint8_t board_address(enum line line)
 {
-    return 1;
+    return addresses[line];
+}
+
+void board_store_address(enum line line, uint8_t address)
+{
+    addresses[line] = address;
+    if (addresses_path == NULL)
+        return;
+    FILE *file = fopen(addresses_path, "wb");
+    if (file == NULL || fwrite(addresses, sizeof addresses, 1, file) != 1 || fclose(file) != 0)
+        perror(addresses_path);
+}
+
+static void load_addresses(const char *path)
+{
+    uint8_t kept[LINES];
+    FILE *file = fopen(path, "rb");
+    addresses_path = path;
+    if (file == NULL)
+        return; // none was set yet
+    if (fread(kept, sizeof kept, 1, file) == 1)
+        memcpy(addresses, kept, sizeof kept);
+    fclose(file);
 }
 
 static void usage(const char *program)
 {
     fprintf(stderr,
-            "usage: %s [--serial] [--modbus-rtu] [--modbus-tcp PORT] [--slcan]\n"
+            "usage: %s [--addresses FILE] [--serial] [--modbus-rtu] [--modbus-tcp PORT] [--slcan]\n"
             "       [--pipe] [--samples FILE] [--serial-number TEXT] [--until-eof]\n",
             program);
     exit(2);
 }
 
-static void open_line(enum line line, const char *scheme)
+// separator: what precedes the address in a URL.
+static void open_line(enum line line, const char *scheme, const char *separator)
 {
     const char *path;
     lines_in[line] = lines_out[line] = open_terminal(&path);
-    printf("%s%s\n", scheme, path);
+    printf("%s%s", scheme, path);
+    if (addresses[line] != 1 || line == LINE_CAN)
+        printf("%s%u", separator, addresses[line]);
+    printf("\n");
 }
 
 void board_open(int count, char **arguments)
@@ -156,16 +184,15 @@ void board_open(int count, char **arguments)
     for (int i = 1; i < count; i++) {
         const char *option = arguments[i], *value = i + 1 < count ? arguments[i + 1] : NULL;
         if (strcmp(option, "--serial") == 0) {
-            open_line(LINE_SERIAL, "serial://");
+            open_line(LINE_SERIAL, "serial://", "?address=");
         } else if (strcmp(option, "--modbus-rtu") == 0) {
-            open_line(LINE_MODBUS, "modbus+rtu://");
+            open_line(LINE_MODBUS, "modbus+rtu://", "#");
         } else if (strcmp(option, "--modbus-tcp") == 0 && value != NULL) {
             int port = atoi(arguments[++i]);
-            printf("modbus+tcp://127.0.0.1:%d/1\n", tcp_open((uint16_t)port));
+            port = tcp_open((uint16_t)port);
+            printf("modbus+tcp://127.0.0.1:%d/%u\n", port, addresses[LINE_MODBUS]);
         } else if (strcmp(option, "--slcan") == 0) {
-            const char *path;
-            lines_in[LINE_CAN] = lines_out[LINE_CAN] = open_terminal(&path);
-            printf("can+slcan://%s#1\n", path);
+            open_line(LINE_CAN, "can+slcan://", "#");
         } else if (strcmp(option, "--pipe") == 0) {
             lines_in[LINE_SERIAL] = STDIN_FILENO;
             lines_out[LINE_SERIAL] = STDOUT_FILENO;
@@ -175,6 +202,8 @@ void board_open(int count, char **arguments)
             samples_file = fopen(arguments[++i], "wb");
             if (samples_file == NULL)
                 fail(value);
+        } else if (strcmp(option, "--addresses") == 0 && value != NULL) {
+            load_addresses(arguments[++i]);
         } else if (strcmp(option, "--serial-number") == 0 && value != NULL && strlen(value) <= 32) {
             serial_number = arguments[++i];
         } else {
@@ -182,7 +211,7 @@ void board_open(int count, char **arguments)
         }
     }
     if (count == 1)
-        open_line(LINE_SERIAL, "serial://");
+        open_line(LINE_SERIAL, "serial://", "?address=");
     fflush(stdout);
     struct sigaction moves = {.sa_handler = move_interlock, .sa_flags = SA_RESTART};
     sigaction(SIGUSR1, &moves, NULL);

@@ -1,16 +1,22 @@
-"""An hour of a plate in service: it thins, a mount loosens and a sticker comes.
+"""Hours of plates in service: each thins, a mount loosens and a sticker comes.
 
-    python -m benchmarks.identification.hour [--plates 3] [--quiet]
+    python -m benchmarks.identification.hour [--hours 10] [--quiet] [--jobs 2] [--report]
 
-Hidden thin plates with form errors, identified at first; 300 patterns, the table's own answers at
-random touches of two to four fingers of unknown loads. Thickness falls by 1 % an hour, a mount
-loses 20 % after 20 minutes, a sticker of 3 g comes after 40. Printed are alarms, explanations and
-the contrast [dB] for one quiet finger: as identified and never updated, followed in service, and
-for the plate known. --quiet: without mount and sticker, for false alarms.
+Each hour is that of another hidden thin plate with form errors, identified at first; 300 patterns,
+the table's own answers at random touches of two to four fingers of unknown loads. Thickness falls
+by 1 % an hour, a mount loses 20 % after 20 minutes, a sticker of 3 g comes after 40. Printed are
+alarms, explanations and the contrast [dB] for one quiet finger: as identified and never updated,
+followed in service, and for the plate known. --quiet: without mount and sticker, for false alarms.
+With --report, docs/measured/identification.md is written as well.
 """
 
 import argparse
-from dataclasses import replace
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
 
 import numpy as np
 
@@ -19,11 +25,12 @@ from benchmarks.identification.hidden import LENGTH, WIDTH, draw, finger_stiffne
 from benchmarks.identification.plates import FREQUENCIES
 from benchmarks.identification.server import truth_of
 from benchmarks.identification.thin_plate import Mounted
+from benchmarks.page import write_parts
 from benchmarks.setting import RIG, random_contacts, use_one_thread
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.identification.forward import RestingFinger, Sensor
 from model.identification.identify import identify
-from model.identification.in_service import LivePlate
+from model.identification.in_service import LivePlate, Report
 from model.identification.measurement import Measurement
 from model.identification.settled import SettledPattern
 from model.rig.file import load_rig
@@ -31,6 +38,7 @@ from model.structure.fingertip import Fingertip
 from model.table.live_table import table_following
 from model.table.table import LocalizationTable
 
+PAGE = Path(__file__).parents[2] / "docs" / "measured" / "identification.md"
 MINUTES_BETWEEN = 0.2
 MOUNT_AT, STICKER_AT = 20.0, 40.0
 JUDGED_AT = (19.8, 23.0, 39.8, 43.0, 59.8)
@@ -40,22 +48,76 @@ _FOLLOWED_EVERY = 5  # patterns
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.identification.hour")
-    parser.add_argument("--plates", type=int, default=3)
+    parser.add_argument("--hours", type=int, default=10)
     parser.add_argument("--first", type=int, default=1, help="seed of the first plate")
     parser.add_argument("--quiet", action="store_true")
+    parser.add_argument("--jobs", type=int, default=2, help="hours at the same time")
+    parser.add_argument("--report", action="store_true")
     options = parser.parse_args()
     use_one_thread()
-    found: dict[tuple[float, str], list[float]] = {}
-    for seed in range(options.first, options.first + options.plates):
-        for key, values in _hour(seed, is_quiet=options.quiet).items():
-            found.setdefault(key, []).extend(values)
-    print("| minute | never updated | in service | plate known |\n|---|---|---|---|")
+    found = []
+    seeds = range(options.first, options.first + options.hours)
+    with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
+        for one in pool.map(partial(hour, is_quiet=options.quiet), seeds):
+            print("\n".join(one.said), flush=True)
+            found.append(one)
+    text = summary(found, is_quiet=options.quiet)
+    print(text)
+    if options.report:
+        run = f"python -m benchmarks.identification.hour --hours {options.hours}"
+        first = f" --first {options.first}" if options.first != 1 else ""
+        printed = f"Printed by `{run}{first}{' --quiet' * options.quiet} --report`."
+        part = "hours-quiet" if options.quiet else "hours"
+        write_parts(PAGE, {part: f"{printed}\n\n{text}"})
+
+
+@dataclass
+class Hour:
+    """What an hour gave: lines to print; alarms that no change was behind.
+
+    named: by change minutes until it was named right, None if it was not; contrasts [dB] by minute
+    and way.
+    """
+
+    said: list[str] = field(default_factory=list)
+    named: dict[str, float | None] = field(default_factory=dict)
+    false_alarms: int = 0
+    contrasts: dict[tuple[float, str], list[float]] = field(default_factory=dict)
+
+    def take(self, seed: int, minute: float, report: Report) -> None:
+        """Take what a pattern has shown."""
+        awaited = [name for name, at in self.named.items() if at is None]
+        if report.alarm:
+            self.said.append(f"plate {seed}, minute {minute:.1f}: alarm")
+            self.false_alarms += not awaited
+        if report.explanation:
+            self.said.append(f"plate {seed}, minute {minute:.1f}: {report.explanation}")
+            for name in awaited:
+                if report.explanation.name == name:
+                    began = MOUNT_AT if name.startswith("stiffness") else STICKER_AT
+                    self.named[name] = minute - began
+
+
+def summary(hours: Sequence[Hour], *, is_quiet: bool) -> str:
+    """Alarms and contrasts of some hours."""
+    false = sum(each.false_alarms for each in hours)
+    lines = [f"{len(hours)} hours, false alarms: {false}."]
+    for what, begin in () if is_quiet else (("mount", "stiffness"), ("sticker", "a mass")):
+        after = [at for each in hours for name, at in each.named.items() if name.startswith(begin)]
+        times = ", ".join("never" if at is None else f"{at:.1f}" for at in after)
+        lines += [f"Minutes until the {what} was named: {times}."]
+    lines += ["", "| minute | never updated | in service | plate known |", "|---|---|---|---|"]
     for minute in JUDGED_AT:
-        cells = [f"{np.median(found[minute, way]):.1f}" for way in ("frozen", "live", "known")]
-        print(f"| {minute:g} | {' | '.join(cells)} |")
+        cells = [
+            f"{np.median([c for each in hours for c in each.contrasts[minute, way]]):.1f}"
+            for way in ("frozen", "live", "known")
+        ]
+        lines.append(f"| {minute:g} | {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
-def _hour(seed: int, *, is_quiet: bool) -> dict[tuple[float, str], list[float]]:
+def hour(seed: int, *, is_quiet: bool) -> Hour:
+    """Play the hour of a plate."""
     rig, hidden = load_rig(RIG), draw("form", seed)
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
     values = hidden.measured(FREQUENCIES, np.random.default_rng([seed, 1]))
@@ -64,7 +126,7 @@ def _hour(seed: int, *, is_quiet: bool) -> dict[tuple[float, str], list[float]]:
     loaded = table_of(identified.rig, FREQUENCIES, loaded=True)
     weightless = table_of(identified.rig, FREQUENCIES, loaded=False)
     table, first, rng = loaded, mounted.plate, np.random.default_rng([seed, 2])
-    found: dict[tuple[float, str], list[float]] = {}
+    found = Hour()
     judged = list(JUDGED_AT)
     for number in range(300):
         minute = number * MINUTES_BETWEEN
@@ -72,9 +134,11 @@ def _hour(seed: int, *, is_quiet: bool) -> dict[tuple[float, str], list[float]]:
         if not is_quiet and np.isclose(minute, MOUNT_AT):
             loose = np.where(np.arange(4) == seed % 4, 0.8, 1.0)
             mounted = replace(mounted, stiffness=loose * mounted.stiffness)
+            found.named[f"stiffness {rig.eras[seed % 4].name}"] = None
         if not is_quiet and np.isclose(minute, STICKER_AT):
             sticker = [*(rng.uniform(0.1, 0.9, 2) * (LENGTH, WIDTH)), 3e-3]
             mounted = replace(mounted, masses=np.vstack([mounted.masses, sticker]))
+            found.named["a mass"] = None
         places = random_contacts(rng, int(rng.integers(2, 5)), (LENGTH, WIDTH), margin=0.013)
         frequency, bases = answer(table, places)
         bases = 0.2 * bases
@@ -86,10 +150,7 @@ def _hour(seed: int, *, is_quiet: bool) -> dict[tuple[float, str], list[float]]:
         measured = measured + 0.01 * np.abs(measured) * (noise[0] + 1j * noise[1])
         fingers = tuple(RestingFinger(x, y, Fingertip()) for x, y in places.tolist())
         report = live.take(SettledPattern(60 * minute, frequency, bases, measured, fingers))
-        if report.alarm:
-            print(f"plate {seed}, minute {minute:.1f}: alarm", flush=True)
-        if report.explanation:
-            print(f"plate {seed}, minute {minute:.1f}: {report.explanation}", flush=True)
+        found.take(seed, minute, report)
         if number % _FOLLOWED_EVERY == 0:
             table = table_following(loaded, live.rig)
         if judged and minute >= judged[0] - 1e-6:
@@ -99,7 +160,7 @@ def _hour(seed: int, *, is_quiet: bool) -> dict[tuple[float, str], list[float]]:
                 "live": table_following(weightless, replace(live.rig, fingertip=None)),
             }
             for way, contrasts in _judged(tables, mounted, seed).items():
-                found[at, way] = contrasts
+                found.contrasts[at, way] = contrasts
     return found
 
 

@@ -32,18 +32,20 @@ class Line:
         """Length of an element [m]."""
         return self.length / self.elements
 
-    def integrals(self) -> dict[tuple[int, int], Reals]:
-        """Integrals of derivative a of one function and b of another, by (a, b)."""
+    def integrals(self, start: float = 0.0, end: float = np.inf) -> dict[tuple[int, int], Reals]:
+        """Integrals of derivative a of one function and b of another, by (a, b).
+
+        start, end [m]: of the part over which they are taken.
+        """
         points, weights = np.polynomial.legendre.leggauss(4)
-        t, weights = (points + 1) / 2, weights / 2 * self.step
         size = 2 * (self.elements + 1)
-        found = {}
-        for a, b in ((0, 0), (1, 1), (2, 2), (2, 0)):
-            local = np.einsum("q,qi,qj->ij", weights, self._local(t, a), self._local(t, b))
-            total = np.zeros((size, size))
-            for e in range(self.elements):
+        found = {key: np.zeros((size, size)) for key in ((0, 0), (1, 1), (2, 2), (2, 0))}
+        for e in range(self.elements):
+            low, high = np.clip((np.array([start, end]) / self.step) - e, 0, 1)
+            t, own = low + (high - low) * (points + 1) / 2, weights / 2 * (high - low) * self.step
+            for (a, b), total in found.items():
+                local = np.einsum("q,qi,qj->ij", own, self._local(t, a), self._local(t, b))
                 total[2 * e : 2 * e + 4, 2 * e : 2 * e + 4] += local
-            found[a, b] = total
         return found
 
     def at(self, x: Reals) -> Reals:
@@ -66,7 +68,10 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class ThinPlate:
-    """A free plate: sides, thickness [m], E [Pa], rho [kg/m³], nu."""
+    """A free plate: sides, thickness [m], E [Pa], rho [kg/m³], nu.
+
+    soft: x from, to, y from, to [m] of a part that has lost a share of its rigidity, the last.
+    """
 
     length: float
     width: float
@@ -74,6 +79,7 @@ class ThinPlate:
     modulus: float
     density: float
     ratio: float
+    soft: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
     @cached_property
     def _lines(self) -> tuple[Line, Line]:
@@ -82,16 +88,24 @@ class ThinPlate:
     @cached_property
     def modes(self) -> tuple[Reals, Reals]:
         """Eigenvalues omega² (r,) [rad²/s²] and modes (size, r) of modal mass 1."""
-        x, y = (line.integrals() for line in self._lines)
-        nu = self.ratio
-        rigidity = self.modulus * self.thickness**3 / 12 / (1 - nu**2)
-        mixed = np.kron(x[2, 0], y[2, 0].T)
-        stiffness = np.kron(x[2, 2], y[0, 0]) + np.kron(x[0, 0], y[2, 2])
-        stiffness += nu * (mixed + mixed.T) + 2 * (1 - nu) * np.kron(x[1, 1], y[1, 1])
+        along, across = self._lines
+        x, y = along.integrals(), across.integrals()
+        rigidity = self.modulus * self.thickness**3 / 12 / (1 - self.ratio**2)
+        stiffness = self._bending(x, y)
+        if lost := self.soft[4]:
+            part = along.integrals(*self.soft[:2]), across.integrals(*self.soft[2:4])
+            stiffness = stiffness - lost * self._bending(*part)
         mass = self.density * self.thickness * np.kron(x[0, 0], y[0, 0])
         values, vectors = linalg.eigh(rigidity * stiffness, mass)
         values[:3] = 0.0
         return values, vectors
+
+    def _bending(self, x: dict[tuple[int, int], Reals], y: dict[tuple[int, int], Reals]) -> Reals:
+        """Stiffness at a rigidity of 1, by integrals along both sides."""
+        nu, mixed = self.ratio, np.kron(x[2, 0], y[2, 0].T)
+        stiffness = np.kron(x[2, 2], y[0, 0]) + np.kron(x[0, 0], y[2, 2])
+        twist = 2 * (1 - nu) * np.kron(x[1, 1], y[1, 1])
+        return np.asarray(stiffness + nu * (mixed + mixed.T) + twist)
 
     def thinned(self, factor: float) -> "ThinPlate":
         """The plate with its thickness times a factor, whose modes scale exactly."""

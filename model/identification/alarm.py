@@ -1,10 +1,10 @@
 """When a plate is no longer the one that is known: tests of the innovations of its patterns.
 
-One pattern that is unlikely, some of the last together, or some of the last along one change: a
-spring, a gain, the thickness, or a mass in one of many places. The last is the test of a
-generalised likelihood ratio, which finds what fingers and noise hide in the sum (M. Basseville,
-I. V. Nikiforov, Detection of Abrupt Changes, 1993, section 2.4.3). Slopes count for a pattern as
-it was known before it.
+Some of the last are unlikely together, or along one change: a spring, a gain, the thickness, or a
+mass in one of many places. The latter is the test of a generalised likelihood ratio, which finds
+what fingers and noise hide in the sum (M. Basseville, I. V. Nikiforov, Detection of Abrupt Changes,
+1993, section 2.4.3). One pattern alone raises no alarm, since a finger may be unlike any other, but
+no state is updated by it either.
 """
 
 from collections import deque
@@ -20,9 +20,11 @@ from model.identification.kalman import State, Updated
 from model.identification.settled import Touched
 
 WINDOW: Final = 8
-_UNLIKELY_TOGETHER, _UNLIKELY_ALONE = 1e-7, 1e-8
-_ALONG = 30.0  # squared standard deviations, of a hundred directions in some thousand patterns
+_UNLIKELY_TOGETHER, _UNLIKELY_ALONE, _UNLIKELY_REST = 1e-7, 1e-6, 1e-2
+_ALONG_REST = 8.0  # without the pattern that deviates most
+_ALONG = 22.0  # squared standard deviations, of a hundred directions in some thousand patterns
 _DEFAULT_SHARE = 0.4  # of nis / count: a change adds more, without one there is mostly less
+_REFERENCE = 0.4  # of nis / count: a change adds more, without one there is less most of the time
 _PLACES = (9, 7)
 _KINDS = ("stiffness", "gain", "phase", "thickness")
 
@@ -52,8 +54,9 @@ class Taken:
         space = touched.space
         own = np.flatnonzero(space.of(*_KINDS))
         plate = touched.touched.at(np.concatenate([found.state.x, found.fingers]))
-        by_mass = np.einsum("snp,n->sp", by_mass_at(plate, at)[0], touched.pattern.bases)
-        masses = np.concatenate([by_mass.real, by_mass.imag])
+        bases = touched.pattern.bases
+        by_mass = np.einsum("snp,n->sp", by_mass_at(plate, at)[0], bases)
+        _, masses = touched.as_numbers(plate.responses[0] @ bases, by_mass)
         columns = np.hstack([found.slopes[:, own], masses])
         slopes = columns.T @ (found.precision @ found.innovation)
         curvatures = (columns * (found.precision @ columns)).sum(axis=0)
@@ -68,6 +71,11 @@ class Alarm:
     def __init__(self) -> None:
         self._recent: deque[Taken] = deque(maxlen=WINDOW)
 
+    @property
+    def is_full(self) -> bool:
+        """Whether as many patterns as it looks at have come without an alarm."""
+        return len(self._recent) == WINDOW
+
     def clear(self) -> None:
         """Forget the patterns."""
         self._recent.clear()
@@ -76,26 +84,54 @@ class Alarm:
         """Take a pattern; those since the plate has changed, by the last, None if it has not."""
         self._recent.append(taken)
         last = list(self._recent)[::-1]
+        along, confirmed = self._along(last)
+        if confirmed.max() > _ALONG:
+            return last[: int(np.argmax(along)) + 1][::-1]
         squares = np.cumsum([each.nis for each in last])
         numbers = np.cumsum([each.count for each in last])
-        along = self._along(last)
-        if along.max() > _ALONG:
-            return last[: int(np.argmax(along)) + 1][::-1]
-        alone = stats.chi2.sf(squares[0], numbers[0]) < _UNLIKELY_ALONE
-        if alone or np.any(stats.chi2.sf(squares, numbers) < _UNLIKELY_TOGETHER):
-            return last[: int(np.argmax(squares - _DEFAULT_SHARE * numbers)) + 1][::-1]
+        largest = np.maximum.accumulate([each.nis for each in last])
+        unlikely = stats.chi2.sf(squares, numbers) < _UNLIKELY_TOGETHER
+        rest = (
+            stats.chi2.sf(squares - largest, np.maximum(numbers - taken.count, 1)) < _UNLIKELY_REST
+        )
+        if np.any(unlikely & rest):
+            return last[: int(np.argmax(squares - _REFERENCE * numbers)) + 1][::-1]
         return None
 
+    @property
+    def is_odd(self) -> bool:
+        """Whether the last pattern is unlikely on its own, as under a finger unlike any other."""
+        last = self._recent[-1]
+        is_unlikely = stats.chi2.sf(last.nis, last.count) < _UNLIKELY_ALONE
+        return bool(
+            is_unlikely or _squares(last.slopes, last.curvatures, last.masses).max() > _ALONG
+        )
+
     @staticmethod
-    def _along(last: list[Taken]) -> FloatArray:
-        """Most squared deviations along a direction, by the number of the last patterns."""
-        slopes = np.cumsum([each.slopes for each in last], axis=0)
-        curvatures = np.cumsum([each.curvatures for each in last], axis=0)
-        up = slopes.copy()
-        first = slopes.shape[1] - last[0].masses
-        up[:, first:] = np.maximum(up[:, first:], 0.0)
-        squares = np.divide(up**2, curvatures, out=np.zeros_like(up), where=curvatures > 0)
-        return np.asarray(squares.max(axis=1))
+    def _along(last: list[Taken]) -> tuple[FloatArray, FloatArray]:
+        """Most squared deviations along a direction, by the number of the last patterns.
+
+        Of any direction, and of those along which the rest deviates without any one of them.
+        """
+        slopes = np.array([each.slopes for each in last])
+        curvatures = np.array([each.curvatures for each in last])
+        masses, along, confirmed = last[0].masses, np.zeros(len(last)), np.zeros(len(last))
+        for number in range(len(last)):
+            own, weights = slopes[: number + 1], curvatures[: number + 1]
+            total, weight = own.sum(axis=0), weights.sum(axis=0)
+            rest = _squares(total - own, weight - weights, masses).min(axis=0)
+            squares = _squares(total, weight, masses)
+            along[number] = squares.max()
+            confirmed[number] = np.where(rest > _ALONG_REST, squares, 0.0).max()
+        return along, confirmed
+
+
+def _squares(slopes: FloatArray, curvatures: FloatArray, masses: int) -> FloatArray:
+    """Squared deviations along directions (..., d), of which the last can only be upwards."""
+    up = slopes.copy()
+    first = slopes.shape[-1] - masses
+    up[..., first:] = np.maximum(up[..., first:], 0.0)
+    return np.divide(up**2, curvatures, out=np.zeros_like(up), where=curvatures > 1e-12)
 
 
 def places_on(length: float, width: float) -> FloatArray:

@@ -147,9 +147,9 @@ class PlateAt:
     """The plate of a forward model for one vector of parameters x (p,), a attachments on it.
 
     values: of x; located: where all is; functions: of frequency; base (f, n): force of an ERA on
-    the plate per displacement of its base [N/m]; receptance T, of the plate with its attachments,
-    and left factor L (f, a, a); finger_slopes: by finger, derivatives of its dynamic stiffness by
-    its parts (f, 4).
+    the plate per displacement of its base [N/m]; stiffness (f, a): of what is attached; receptance
+    T, of the plate with its attachments, and left factor L (f, a, a); finger_slopes: by finger,
+    derivatives of its dynamic stiffness by its parts (f, 4).
     """
 
     def __init__(self, model: ForwardModel, x: FloatArray) -> None:
@@ -169,7 +169,7 @@ class PlateAt:
             *(load[:, None] for load, _ in loads),
             np.zeros((len(w), len(model.pads))),
         ]
-        Z = np.concatenate(held, axis=1)
+        self.stiffness = Z = np.concatenate(held, axis=1)
         A = combined(self.functions.receptance, self.located.products)
         self.left = np.linalg.inv(np.eye(Z.shape[1]) + A * Z[:, None])
         self.receptance = self.left @ A

@@ -4,7 +4,9 @@ The parameters of an identification drift; an update moves them together with th
 pattern, which are dropped afterwards. Where innovations are unlikely (`model.identification.alarm`)
 the state goes back to where they began, since an update smears a jump over all parameters, and is
 held until the patterns since then are explained together by one change
-(`model.identification.hypotheses`), or the plate counts as changed.
+(`model.identification.hypotheses`). A change of its parameters is followed; with a hand on it, a
+crack or a change that nothing explains the plate counts as changed, until patterns are those of the
+plate as it was.
 """
 
 import math
@@ -34,7 +36,7 @@ from model.structure.modal_elasticity import lowest_elastic
 
 _EARLY, _HELD = 4, 6  # patterns that are explained together, at first and at last
 _AFTER_ALARM = 2  # patterns before a change counts as unexplained
-_CERTAIN = 25.0  # of the cost: by how much an early explanation is better than any other
+_CERTAIN = 12.0  # of the cost: by how much an early explanation is better than any other
 _ITERATIONS = 3
 
 _NOT_STATED = (
@@ -57,9 +59,10 @@ DRIFT = {
 class Report:
     """What one pattern has shown.
 
-    nis: squared innovation in its covariance, of `count` numbers; alarm: whether it began one;
-    is_held: whether the state waits for an explanation; explanation: where one was found now;
-    fingers (k, 4): factors of FINGER_PARTS of each finger of the pattern, none while held.
+    nis: squared innovation in its covariance, of `count` numbers; alarm: whether it began one, none
+    while the plate counts as changed; is_held: whether the state waits for an explanation;
+    explanation: where one was found now; fingers (k, 4): factors of FINGER_PARTS of each finger of
+    the pattern, none while held.
     """
 
     nis: float
@@ -136,7 +139,7 @@ class LivePlate:
         self._held: list[Touched] = []
         self._since_alarm = 0
         self.has_changed = False
-        """Whether the plate has changed in a way that no hypothesis explains."""
+        """Whether the plate has changed in a way that its parameters do not follow."""
 
     @property
     def state(self) -> State:
@@ -171,15 +174,17 @@ class LivePlate:
         taken = Taken.of(touched, self._state, self._time, after, self._places)
         suspect = self._alarm.take(taken)
         if suspect is not None:
-            explanation = None
-            if self.can_update and not self.has_changed:
+            explanation, is_new = None, not self.has_changed
+            if self.can_update and is_new:
                 self._go_back(suspect)
                 explanation = self._explained(pattern.time).explanation
             self._alarm.clear()
             return Report(
-                after.nis, after.count, True, bool(self._held), explanation, np.zeros((0, 4))
+                after.nis, after.count, is_new, bool(self._held), explanation, np.zeros((0, 4))
             )
-        if self.can_update and not self.has_changed:
+        if self.has_changed and self._alarm.is_full:
+            self.has_changed = False
+        if self.can_update and not self.has_changed and not self._alarm.is_odd:
             self._state, self._time = after.state, pattern.time
             self._noise.take(after)
         fingers = np.exp(self._priors.finger * after.fingers.reshape(-1, len(FINGER_PARTS)))
@@ -195,13 +200,14 @@ class LivePlate:
         count, drifted = len(self._held), self._drifted(time)
         is_full = count >= _HELD and self._since_alarm >= _AFTER_ALARM
         found = explain(drifted, self._held) if count >= _EARLY else None
-        if is_full and found and not found.name and count > _HELD:
+        if is_full and found and not found.name:
             # The first of them may be from before the change.
-            found = explain(drifted, self._held[-_HELD:])
+            later = explain(drifted, self._held[-_EARLY:])
+            found = later if later.name else found
         if found is None or not (is_full or (found.name and found.lead > _CERTAIN)):
             return Report(np.nan, 0, False, True, None, np.zeros((0, 4)))
         self._held = []
-        if found.name:
+        if found.can_be_followed:
             self._state, self._time = found.state, time
         else:
             self.has_changed = True

@@ -7,10 +7,11 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import FloatArray
-from model.identification.settled import Touched, finger_count, finger_covariance
+from model.identification.settled import Measured, finger_count, finger_covariance
 
 _CONVERGED = 3e-3  # standard deviations
 _MAX_STEP = 1.5
+_BACK, _MIN_SHARE = 0.3, 0.01  # of a step that leads up
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +47,7 @@ class Updated:
 
 def update(
     before: State,
-    patterns: Sequence[Touched],
+    patterns: Sequence[Measured],
     *,
     iterations: int,
     start: FloatArray | None = None,
@@ -68,19 +69,36 @@ def update(
     at = centre.copy()
     if start is not None:
         at[: len(start)] = start
+    # From the state itself steps are short; from elsewhere they are taken back where they lead up.
+    weights = None if start is None else linalg.pinvh(prior)
+    best, reached, target, share = np.inf, at, at, 1.0
     for _ in range(iterations):
         predicted, H = _linearised(patterns, at, p, q)
+        cost = 0.0
+        if weights is not None:
+            moved = at - centre
+            cost = float((((values - predicted) / std) ** 2).sum() + moved @ weights @ moved)
+        if cost > best:
+            share *= _BACK
+            if share < _MIN_SHARE:
+                break
+            at = reached + share * (target - reached)
+            continue
+        best, reached = cost, at
         innovation = values - predicted - H @ (centre - at)
         gain = prior @ H.T
         S = linalg.cho_factor(H @ gain + np.diag(std**2))
         weighted = linalg.cho_solve(S, innovation)
-        moved = centre + gain @ weighted
-        moved[:p] = np.clip(moved[:p], space.lower, space.upper)
-        change = np.abs(moved - at).max()
+        target = centre + gain @ weighted
+        target[:p] = np.clip(target[:p], space.lower, space.upper)
+        change = np.abs(target - at).max()
         # What is loose moves far where a step's slopes no longer hold.
-        at = at + min(1.0, _MAX_STEP / max(change, 1e-12)) * (moved - at)
+        share = min(1.0, _MAX_STEP / max(change, 1e-12))
+        at = reached + share * (target - reached)
         if change < _CONVERGED:
             break
+    if weights is not None:
+        at = reached
     predicted, H = _linearised(patterns, at, p, q)
     gain = prior @ H.T
     inverse = linalg.inv(H @ gain + np.diag(std**2))
@@ -112,7 +130,7 @@ def update(
 
 
 def _linearised(
-    patterns: Sequence[Touched], at: FloatArray, p: int, q: int
+    patterns: Sequence[Measured], at: FloatArray, p: int, q: int
 ) -> tuple[FloatArray, FloatArray]:
     """Numbers of all patterns, and their derivatives by plate and fingers (m, p + q)."""
     predicted, rows, first = [], [], p

@@ -1,8 +1,9 @@
 """A table that learns its plate: settled patterns in, corrected answers out.
 
 Answers follow the plate as it is known after each pattern. From an alarm on they wait for its
-explanation, and where none is found they become those of the plate as last known, with errors as
-wide as those of a plate that nobody measured.
+explanation. Where the plate has changed in a way that its parameters do not follow they become
+those of the plate as last known, with errors as wide as those of a plate that nobody measured,
+until it is again as it was.
 """
 
 from dataclasses import dataclass, replace
@@ -60,7 +61,7 @@ class LearnedTable:
 
     @property
     def has_changed(self) -> bool:
-        """Whether the plate has changed in a way that nothing known explains."""
+        """Whether the plate has changed in a way that its parameters do not follow."""
         return self.live.has_changed
 
     def take(self, pattern: SettledPattern) -> Learned:

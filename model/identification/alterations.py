@@ -1,0 +1,281 @@
+"""What no parameter of a plate stands for: a hand that rests on it, and a crack.
+
+Both act on few coordinates of the plate, each a combination of its deflection at points about a
+place, by dynamic stiffnesses Z there. With T of the plate without them, between its attachments and
+those coordinates c, the receptance becomes
+
+    T' = T - T_c (1 + Z T_cc)^-1 Z T_c^T.
+
+A crack loses bending energy: over an area a, as far as none of its stiffness is left there, a plate
+of rigidity D loses a D / 2 ((k_xx + k_yy)² (1 + nu) / 2 + ((k_xx - k_yy)² / 2 + 2 k_xy²) (1 - nu)),
+k its curvatures, so that Z is -a D (1 + nu) and twice -a D (1 - nu). To first order that is the
+change of the modal stiffness (P. Cawley, R. D. Adams, The location of defects in structures from
+measurements of natural frequencies, J. Strain Analysis 14, 1979, 49-57); truncated modes are left
+out. Its direction is not modelled: cracks begin at edges, where only the moment along the edge is
+left.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.identification.derivatives import jacobian
+from model.identification.forward import PlateAt
+from model.identification.free_receptance import between, combined
+from model.identification.parameters import Space
+from model.identification.settled import SettledPattern, Touched
+from model.structure.plate import Plate
+
+_STEP = 1e-3  # m, of slopes by places
+_MIN_STENCIL = 0.004  # m
+_MIN_SIZE = 0.2  # to start from, of the usual one
+_LEAST = -6.0  # of logarithms
+
+
+class Alteration(ABC):
+    """A kind of what may have come; parameters (e,) are x, y in thirds of the sides, then its own.
+
+    own: names of its own parameters, logarithms; reference (e - 2,): those of an alteration
+    as large as the unit of the one that is looked for, which is the number lead of them;
+    is_of_modes: whether truncated modes are left out.
+    """
+
+    name: ClassVar[str]
+    own: ClassVar[tuple[str, ...]]
+    reference: ClassVar[FloatArray]
+    lead: ClassVar[int]
+    is_of_modes: ClassVar[bool] = False
+
+    @property
+    def size(self) -> int:
+        """Number of its parameters e."""
+        return 2 + len(self.own)
+
+    @abstractmethod
+    def stencil(self, plate: Plate, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Points (m, 2) [m] about a place [m], and its coordinates by their deflections (c, m)."""
+
+    @abstractmethod
+    def stiffness(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
+        """Z (c,) at omega [rad/s] for its own parameters (e - 2,)."""
+
+    @abstractmethod
+    def slopes(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
+        """Derivatives of Z (c,) by its own parameters, (c, e - 2)."""
+
+    @abstractmethod
+    def start(self, size: float) -> FloatArray:
+        """Its own parameters (e - 2,) for a size in units."""
+
+    @abstractmethod
+    def described(self, theta: FloatArray) -> str:
+        """What its own parameters say."""
+
+
+class Hand(Alteration):
+    """A hand, or a finger that no panel reports: a mass, a damper and a spring to the ground.
+
+    Its parameters are logarithms of them over usual ones of one to five fingertips: a hand without
+    damping would be a mass.
+    """
+
+    name = "a hand"
+    own = ("mass", "damping", "stiffness")
+    lead = 1
+    reference = np.zeros(3)
+    units: ClassVar[FloatArray] = np.array([1e-3, 5.0, 1000.0])  # kg, N s/m, N/m
+
+    def stencil(self, plate: Plate, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The place itself."""
+        return place[None], np.ones((1, 1))
+
+    def stiffness(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
+        """k + i omega c - omega² m."""
+        return np.asarray(self.slopes(plate, theta, omega).sum(axis=1))
+
+    def slopes(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
+        """Of logarithms: the parts themselves."""
+        mass, damping, spring = self.units * np.exp(theta)
+        return np.array([[-(omega**2) * mass, 1j * omega * damping, spring]])
+
+    def start(self, size: float) -> FloatArray:
+        """Damping of that size, all else as usual."""
+        return np.array([0.0, np.log(max(size, _MIN_SIZE)), 0.0])
+
+    def described(self, theta: FloatArray) -> str:
+        """Its damping."""
+        return f"{self.units[1] * np.exp(theta[1]):.2g} N s/m"
+
+
+class Crack(Alteration):
+    """A local loss of bending stiffness, by the logarithm of the area without any over 3 cm²."""
+
+    name = "a crack"
+    own = ("area",)
+    lead, is_of_modes = 0, True
+    reference = np.zeros(1)
+    unit: ClassVar[float] = 3e-4  # m²
+
+    def stencil(self, plate: Plate, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Curvatures by differences over some millimetres, moved inwards at edges."""
+        sides = np.array([plate.length, plate.width])
+        h = max(0.03 * sides.min(), _MIN_STENCIL)
+        middle = np.clip(place, h, sides - h)
+        steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)], dtype=float)
+        second = np.array([1, -2, 1]) / h**2
+        first, none = np.array([-1, 0, 1]) / (2 * h), np.array([0, 1, 0])
+        xx, yy, xy = np.outer(second, none), np.outer(none, second), np.outer(first, first)
+        coordinates = [(xx + yy) / np.sqrt(2), (xx - yy) / np.sqrt(2), np.sqrt(2) * xy]
+        return middle + h * steps, np.array([each.ravel() for each in coordinates])
+
+    def stiffness(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
+        """Less than none."""
+        return np.asarray(self.slopes(plate, theta, omega)[:, 0])
+
+    def slopes(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
+        """Of each of the three coordinates."""
+        nu = plate.material.nu
+        lost = (
+            self.unit
+            * np.exp(theta[0])
+            * plate.flexural_rigidity
+            * np.array([1 + nu, 1 - nu, 1 - nu])
+        )
+        return np.asarray(-lost[:, None], dtype=complex)
+
+    def start(self, size: float) -> FloatArray:
+        """That area."""
+        return np.array([np.log(max(size, _MIN_SIZE))])
+
+    def described(self, theta: FloatArray) -> str:
+        """The area."""
+        return f"{1e4 * self.unit * np.exp(theta[0]):.2g} cm² without bending stiffness"
+
+
+@dataclass(frozen=True, eq=False)
+class Altered:
+    """A pattern on a plate that is altered; its parameters come after those of the plate."""
+
+    touched: Touched
+    alteration: Alteration
+
+    @property
+    def pattern(self) -> SettledPattern:
+        """What was measured."""
+        return self.touched.pattern
+
+    @property
+    def std(self) -> FloatArray:
+        """Error of each number of the pattern, (2 s,)."""
+        return self.touched.std
+
+    @cached_property
+    def space(self) -> Space:
+        """The parameters of the plate, then those of the alteration."""
+        space, own = self.touched.space, self.alteration
+        edge, free = np.full(2, 1.5), np.full(own.size - 2, np.inf)
+        names = tuple(f"{each} of {own.name}" for each in ("x", "y", *own.own))
+        return replace(
+            space,
+            names=space.names + names,
+            std=np.concatenate([space.std, np.ones(own.size)]),
+            lower=np.concatenate([space.lower, -edge, np.full(own.size - 2, _LEAST)]),
+            upper=np.concatenate([space.upper, edge, free]),
+        )
+
+    @property
+    def _sides(self) -> FloatArray:
+        plate = self.touched.touched.rig.plate
+        return np.array([plate.length, plate.width])
+
+    def place(self, theta: FloatArray) -> FloatArray:
+        """Where parameters (e,) of the alteration have it [m]."""
+        return np.asarray(self._sides * (0.5 + theta[:2] / 3))
+
+    def parameters(self, place: FloatArray, own: FloatArray) -> FloatArray:
+        """Parameters (e,) of the alteration at a place [m]."""
+        return np.concatenate([3 * (place / self._sides - 0.5), own])
+
+    def predicted(self, x: FloatArray, fingers: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Numbers that the pattern is expected to give, and their derivatives (2 s, p + e + q).
+
+        Derivatives by plate and fingers are those without the alteration.
+        """
+        p = self.touched.space.size
+        plate = self.touched.touched.at(np.concatenate([x[:p], fingers]))
+        place, own, bases = self.place(x[p:]), x[p + 2 :], self.pattern.bases
+        here = AlteredPlate(plate, self.alteration, place, own)
+        values = here.responses @ bases
+        by_place = []
+        for axis in range(2):
+            step = np.zeros(2)
+            step[axis] = -_STEP if place[axis] > self._sides[axis] / 2 else _STEP
+            moved = AlteredPlate(plate, self.alteration, place + step, own).responses @ bases
+            by_place.append((moved - values) / step[axis] * self._sides[axis] / 3)
+        by_own = np.einsum("sne,n->se", here.by_own(own), bases)
+        J = np.einsum("snp,n->sp", jacobian(plate)[0], bases)
+        columns = np.column_stack([J[:, :p], *by_place, by_own, J[:, p:]])
+        return self.touched.as_numbers(values, columns)
+
+
+def scores(
+    touched: Touched, plate: PlateAt, alteration: Alteration, places: FloatArray
+) -> FloatArray:
+    """Numbers of a pattern (2 s, m) by an alteration of usual size at places (m, 2) [m]."""
+    stencils = [alteration.stencil(plate.model.rig.plate, place) for place in places]
+    points = np.concatenate([each for each, _ in stencils])
+    reach = plate.left[0] @ _receptance(plate, alteration, plate.located.footprints, points)
+    reach = reach.reshape(len(reach), len(places), -1)
+    coordinates = np.array([each for _, each in stencils])
+    columns = np.einsum("amk,mck->amc", reach, coordinates)
+    slopes = alteration.slopes(plate.model.rig.plate, alteration.reference, plate.model.omega[0])
+    n, observed, bases = plate.base.shape[1], plate.model.observed, touched.pattern.bases
+    left, right = columns[observed] * slopes[:, alteration.lead], columns[:n]
+    changes = -np.einsum("smc,nmc,sn,n->sm", left, right, plate.scale[0], bases)
+    return touched.as_numbers(plate.responses[0] @ bases, changes)[1]
+
+
+class AlteredPlate:
+    """A plate at one frequency that is altered at a place [m], by own parameters of its alteration.
+
+    responses: acceleration at each sensor per base displacement of each ERA (s, n) [1/s²].
+    """
+
+    def __init__(
+        self, plate: PlateAt, alteration: Alteration, place: FloatArray, own: FloatArray
+    ) -> None:
+        self._plate, self._alteration = plate, alteration
+        theory = plate.model.rig.plate
+        points, coordinates = alteration.stencil(theory, place)
+        Z = alteration.stiffness(theory, own, plate.model.omega[0])
+        A = _receptance(plate, alteration, plate.located.footprints, points) @ coordinates.T
+        within = coordinates @ _receptance(plate, alteration, points, points) @ coordinates.T
+        T = plate.left[0] @ A
+        within = within - A.T @ (plate.stiffness[0][:, None] * T)
+        self._columns = T @ np.linalg.inv(np.eye(len(Z)) + Z[:, None] * within)
+        n, observed = plate.base.shape[1], plate.model.observed
+        change = (self._columns[observed] * Z) @ T[:n].T
+        self.responses: ComplexArray = plate.responses[0] - plate.scale[0] * change
+
+    def by_own(self, own: FloatArray) -> ComplexArray:
+        """Derivatives of the responses by the alteration's own parameters, (s, n, e - 2)."""
+        plate, model = self._plate, self._plate.model
+        slopes = self._alteration.slopes(model.rig.plate, own, model.omega[0])
+        left, right = self._columns[model.observed], self._columns[: plate.base.shape[1]]
+        found = np.einsum("sc,ce,nc->sne", left, slopes, right)
+        return np.asarray(-plate.scale[0][..., None] * found)
+
+
+def _receptance(
+    plate: PlateAt, alteration: Alteration, points: FloatArray, others: FloatArray
+) -> ComplexArray:
+    """Of the free plate between points and others, (n, m), truncated modes included if need be."""
+    functions, free = plate.functions.receptance, plate.model.free
+    if alteration.is_of_modes:
+        shapes, other_shapes = free.modes.shapes_at(points), free.modes.shapes_at(others)
+        return np.asarray((shapes * functions[0, : shapes.shape[1]]) @ other_shapes.T)
+    return np.asarray(combined(functions, between(free.modes, points, others))[0])

@@ -1,0 +1,126 @@
+"""A hand that stays, a sticker and a crack: told apart on plates by another solver."""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import pytest
+
+from benchmarks.identification.hidden import Hidden, draw, finger_stiffness
+from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
+from model.identification.alterations import AlteredPlate, Crack, Hand
+from model.identification.forward import Sensor
+from model.identification.identify import Identification, identify
+from model.identification.in_service import LivePlate, Report
+from model.identification.measurement import Measurement
+from model.rig.file import example_rig_path, load_rig
+from settled_patterns import FREQUENCIES, settled_patterns
+
+HAND = np.array([0.25, 0.05])
+SOFT, LOST = (0.188, 0.211, 0.0, 0.069), 0.5  # m, and of its rigidity
+
+
+@dataclass(frozen=True, eq=False)
+class Rested(Mounted):
+    """A plate on which a hand of four fingertips rests that nobody reports."""
+
+    def accelerations(
+        self,
+        frequency: float,
+        points: Reals,
+        *,
+        fingers: Reals | None = None,
+        loads: Complexes | None = None,
+    ) -> Complexes:
+        """Those with the hand, too."""
+        hand = np.array([finger_stiffness(frequency, np.full(4, 4.0))])
+        if fingers is not None and loads is not None:
+            fingers, hand = np.vstack([fingers, HAND]), np.append(loads, hand)
+        return super().accelerations(frequency, points, fingers=fingers, loads=hand)
+
+
+@pytest.fixture(scope="module")
+def hidden() -> Hidden:
+    """A plate with places and a mass of its own."""
+    return draw("form", 1)
+
+
+@pytest.fixture(scope="module")
+def found(hidden: Hidden) -> Identification:
+    """The paper's rig identified on it."""
+    rig = load_rig(example_rig_path())
+    sensors = [Sensor(era.name, era.name) for era in rig.eras]
+    values = hidden.measured(FREQUENCIES, np.random.default_rng(1))
+    return identify(rig, Measurement.of(sensors, FREQUENCIES, values))
+
+
+@pytest.fixture(scope="module")
+def cracked(hidden: Hidden) -> Mounted:
+    """The plate with a patch of 2.3 by 6.9 cm at an edge that is half as stiff."""
+    return replace(hidden.mounted, plate=replace(hidden.mounted.plate, soft=(*SOFT, LOST)))
+
+
+def play(live: LivePlate, hidden: Hidden, plate: Mounted, *, count: int) -> list[Report]:
+    """Reports of patterns."""
+    return [live.take(each) for each in settled_patterns(hidden, plate, count=count, start=0)]
+
+
+def said(reports: list[Report]) -> str:
+    """The name of what was found first."""
+    return next(each.explanation.name for each in reports if each.explanation)
+
+
+def test_hand_that_stays_is_no_sticker_and_leaves_again(
+    hidden: Hidden, found: Identification
+) -> None:
+    """It is named where it rests, answers are cautious until it is gone; then service goes on."""
+    live = LivePlate(found)
+    own = {each.name: getattr(hidden.mounted, each.name) for each in fields(Mounted)}
+    rested = Rested(**own)
+    reports = play(live, hidden, rested, count=6)
+    assert said(reports) == "a hand"
+    (explanation,) = (each.explanation for each in reports if each.explanation)
+    x, y = (0.01 * float(each) for each in explanation.found.split(" at ")[1][:-3].split(", "))
+    assert (x, y) == pytest.approx(HAND, abs=0.01)
+    assert live.has_changed
+    play(live, hidden, hidden.mounted, count=9)
+    assert not live.has_changed
+
+
+def test_heavy_sticker_is_no_hand(hidden: Hidden, found: Identification) -> None:
+    """10 g where the hand was are a mass."""
+    sticker = np.array([*HAND, 10e-3])
+    plate = replace(hidden.mounted, masses=np.vstack([hidden.mounted.masses, sticker]))
+    assert said(play(LivePlate(found), hidden, plate, count=6)) == "a mass"
+
+
+def test_crack_is_named(hidden: Hidden, found: Identification, cracked: Mounted) -> None:
+    """A patch at an edge that has lost half of its stiffness is a crack."""
+    live = LivePlate(found)
+    reports = play(live, hidden, cracked, count=6)
+    assert said(reports) == "a crack"
+    assert live.has_changed
+
+
+@pytest.mark.parametrize(("kind", "error"), [("crack", 0.45), ("hand", 0.02)])
+def test_responses_change_as_on_finite_elements(
+    hidden: Hidden, found: Identification, cracked: Mounted, kind: str, error: float
+) -> None:
+    """Responses change as by a soft patch of that area, to a half of it, and as by a load there."""
+    mounted, model = hidden.mounted, found.fitted.problem.model
+    ours, true = [], []
+    for tone in np.linspace(60, 480, 15):
+        plate = model.with_frequencies(np.array([tone])).at(found.posterior.x)
+        before, w = mounted.accelerations(tone, mounted.at), 2 * np.pi * tone
+        if kind == "crack":
+            area = LOST * (SOFT[1] - SOFT[0]) * (SOFT[3] - SOFT[2])
+            middle = np.array([SOFT[0] + SOFT[1], SOFT[2] + SOFT[3]]) / 2
+            now = AlteredPlate(plate, Crack(), middle, np.log([area / Crack.unit]))
+            after = cracked.accelerations(tone, mounted.at)
+        else:
+            parts = np.array([1e-3, 8.0, 500.0])  # kg, N s/m, N/m
+            now = AlteredPlate(plate, Hand(), HAND, np.log(parts / Hand.units))
+            load = np.array([[-(w**2), 1j * w, 1]]) @ parts
+            after = mounted.accelerations(tone, mounted.at, fingers=HAND[None], loads=load)
+        ours.append(now.responses - plate.responses[0])
+        true.append(hidden.sensor_gain[:, None] * (after - before))
+    assert np.linalg.norm(np.subtract(ours, true)) < error * np.linalg.norm(true)

@@ -5,10 +5,12 @@ within the rig's uncertainty; the host reaches it over its amplifier only, in vi
 sixth touch is followed by one that answers as identified, in service and for the plate as it is
 play in turn.
 
-Warming: Young's modulus of aluminium falls by 0.036 GPa/K (J. L. Tallon, A. Wolfenden, Temperature
-dependence of the elastic constants of aluminum, J. Phys. Chem. Solids 40, 1979, 831-837). Mounts of
-rubber stiffen as their absolute temperature (L. R. G. Treloar, The Physics of Rubber Elasticity: G
-proportional to T).
+Warming: Young's modulus of aluminium falls by 0.037 GPa/K from 70.4 GPa at 293 K, the slope of the
+polynomial of NIST's cryogenic material properties for 6061-T6 (UNS A96061, 2 to 295 K, to 1 %).
+Mounts of rubber stiffen as their absolute temperature, by the entropy of its network (L. R. G.
+Treloar, The Physics of Rubber Elasticity), which is found to decide the stiffness of a preloaded
+rubber cylinder from -60 to 60 °C (J. Strain Analysis, doi:10.1243/030932402760074517, abstract).
+That none of it softens near a glass transition, and that the plate's thickness stays, is assumed.
 """
 
 import asyncio
@@ -44,7 +46,7 @@ from model.table.table import DEFAULT_FREQUENCIES, LocalizationTable
 from model.vibration.excitation import Excitation, Tone
 
 WARMING, AT = 15.0, 293.0  # K
-MODULUS_PER_KELVIN = -0.036 / 70  # relative
+MODULUS_PER_KELVIN = -0.0372 / 70.36  # relative
 WAYS = ("identified", "in service", "known")
 
 _STEP = 60.0  # s; between changes of the plate by its temperature

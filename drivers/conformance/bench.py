@@ -334,13 +334,14 @@ class Bench:
         found = f"{max(seen.earliest, 0.0) * 1e3:.1f} to {seen.latest * 1e3:.1f} ms"
         delayed = self.delayed_since(self._since)
         early, late = low * (1 - _DRIFT) - _SLACK, high * (1 + _DRIFT) + _SLACK
-        expect(
-            early <= seen.latest and seen.earliest <= late,
-            what,
-            expected=bounds,
-            seen=found,
-            is_certain=seen.latest < early - delayed or seen.earliest > late + delayed,
-        )
+        if seen.latest < early or seen.earliest > late:
+            raise ContractViolation(
+                what,
+                expected=bounds,
+                seen=found,
+                is_certain=seen.latest < early - delayed or seen.earliest > late + delayed,
+                is_explicable=delayed > 0,
+            )
         uncertain = max(coarse, 2 * self.exchange_time)
         if seen.earliest < early - uncertain or seen.latest > late + uncertain:
             raise Inconclusive(f"{what} must be {bounds}, and was within {found}")

@@ -114,8 +114,9 @@ class _Attempt:
             return self._is_disturbed
         if isinstance(self.finding, NotApplicable):
             return False
-        if isinstance(self.finding, ContractViolation) and self.finding.is_certain:
-            return False
+        if isinstance(self.finding, ContractViolation):
+            is_explicable = self._is_disturbed or self.finding.is_explicable
+            return is_explicable and not self.finding.is_certain
         return isinstance(self.finding, Inconclusive) or self._is_disturbed
 
     @property

@@ -51,7 +51,7 @@ static void measure(void)
     amplifier_measured(&amplifier, measured);
 }
 
-static void make_samples(void)
+void loop_samples(void)
 {
     int16_t samples[CHANNELS];
     uint32_t due = board_samples_due();
@@ -85,20 +85,27 @@ static void store(enum line line, uint8_t address)
 
 static void serve_serial(void)
 {
-    for (int byte = board_read(LINE_SERIAL); byte >= 0; byte = board_read(LINE_SERIAL))
+    for (int byte = board_read(LINE_SERIAL); byte >= 0; byte = board_read(LINE_SERIAL)) {
+        if (byte == 0) // the end of a frame
+            loop_samples();
         send(LINE_SERIAL, serial.reply, serial_byte(&serial, (uint8_t)byte));
+    }
 }
 
 static void serve_modbus(void)
 {
     for (int byte = board_read(LINE_MODBUS); byte >= 0; byte = board_read(LINE_MODBUS))
         rtu_byte(&rtu, (uint8_t)byte);
+    if (rtu.length > 0)
+        loop_samples();
     send(LINE_MODBUS, rtu.reply, rtu_silence(&rtu, board_silence(LINE_MODBUS)));
 }
 
 static void serve_can(void)
 {
     for (int byte = board_read(LINE_CAN); byte >= 0; byte = board_read(LINE_CAN)) {
+        if (byte == '\r')
+            loop_samples();
         const char *answer = slcan_byte(&slcan, (uint8_t)byte);
         if (answer != NULL)
             send(LINE_CAN, (const uint8_t *)answer, (uint16_t)strlen(answer));
@@ -113,7 +120,7 @@ struct modbus *loop_modbus(void)
 
 void loop_once(void)
 {
-    make_samples();
+    loop_samples();
     serve_serial();
     serve_modbus();
     serve_can();

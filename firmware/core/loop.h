@@ -11,6 +11,10 @@ void loop_init(void);
 // between two calls.
 void loop_once(void);
 
+// Make the samples that are due. Before a request is carried out, so that it takes effect when it
+// arrived, however long ago the loop made samples.
+void loop_samples(void);
+
 // For a board with Modbus on other lines than LINE_MODBUS.
 struct modbus *loop_modbus(void);
 

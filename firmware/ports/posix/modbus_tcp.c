@@ -4,6 +4,7 @@
 
 #include "modbus_tcp.h"
 #include "line.h"
+#include "loop.h"
 
 #include <errno.h>
 #include <fcntl.h>
@@ -90,6 +91,7 @@ static void take(struct modbus *modbus, struct host *host)
             return;
         }
         host->length = (uint16_t)(host->length + size);
+        loop_samples();
         take_frames(modbus, host);
     }
 }

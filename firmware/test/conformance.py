@@ -10,12 +10,10 @@ suite measures that, repeats the check, and calls it inconclusive if that does n
 import contextlib
 import json
 import os
-import re
 import shutil
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
@@ -30,7 +28,6 @@ ERA = Path(sys.executable).parent / "era"
 BOARD = ("qemu-system-arm", "-M", "mps2-an385", "-display", "none", "-monitor", "none", "-kernel")
 CAN_NODE = "?heartbeat=10000#1"  # the clock of an emulator is slow while it waits
 AT_ONCE = 2 * (os.cpu_count() or 1)
-QEMU_LOOKS = 1.5  # s; it looks once a second whether a host has opened its pseudo-terminals
 
 Place = Callable[[], AbstractContextManager[tuple[str, int]]]
 """Makes an amplifier for as long as a context lasts: its URL, and the number of its process."""
@@ -115,28 +112,18 @@ def program(wire: str) -> Iterator[tuple[str, int]]:
 
 @contextlib.contextmanager
 def emulator(scheme: str, uart: int) -> Iterator[tuple[str, int]]:
-    """The board, with a wire at one of its UARTs: over TCP, or slcan on a pseudo-terminal.
+    """The board, with a wire at one of its UARTs over TCP.
 
     Bytes of a pseudo-terminal are passed on by a thread of the kernel, which beside other load
     keeps them for up to some 100 ms, and not as a wait of the emulator.
     """
-    uarts = ["-serial", "null"] * uart
     with contextlib.ExitStack() as stack:
-        if scheme == "can+slcan":
-            process = started(stack, *uarts, "-serial", "pty")
-            assert process.stdout is not None
-            (path,) = re.findall(r"/dev/\S+", process.stdout.readline())
-            # Held open for QEMU; never as the controlling terminal of a session that this leads.
-            stack.callback(os.close, os.open(path, os.O_RDWR | os.O_NOCTTY))
-            time.sleep(QEMU_LOOKS)
-            url = f"{scheme}://{path}{CAN_NODE}"
-        else:
-            with socket.create_server(("127.0.0.1", 0)) as listening:
-                line = f"socket,id=line,fd={listening.fileno()},server=on,wait=off,nodelay=on"
-                options = ("-chardev", line, *uarts, "-serial", "chardev:line")
-                process = started(stack, *options, keeps=(listening.fileno(),))
-                url = f"{scheme}://127.0.0.1:{listening.getsockname()[1]}"
-        yield url, process.pid
+        with socket.create_server(("127.0.0.1", 0)) as listening:
+            line = f"socket,id=line,fd={listening.fileno()},server=on,wait=off,nodelay=on"
+            options = ("-chardev", line, *["-serial", "null"] * uart, "-serial", "chardev:line")
+            process = started(stack, *options, keeps=(listening.fileno(),))
+            url = f"{scheme}://127.0.0.1:{listening.getsockname()[1]}"
+        yield url + (CAN_NODE if scheme == "can+slcan" else ""), process.pid
 
 
 def started(

@@ -7,6 +7,7 @@ and fails permanently on invalid text, as slcan does. Their text is parsed here 
 
 import contextlib
 import errno
+import os
 import re
 import select
 import socket
@@ -231,15 +232,16 @@ class _Socketcand(_TextBus):
 
 
 class _Slcan(_TextBus, slcanBus):
-    """A serial adapter with exclusive use of its port."""
+    """A serial adapter with exclusive use of its port, or one behind a TCP port."""
 
     def __init__(self, url: CanBusUrl) -> None:
         self._reset()
         self._reader = SlcanReader()
         self._is_ended = False
+        self._is_remote = bool(url.host)
         slcanBus.__init__(
             self,
-            url.channel,
+            url.channel or f"socket://{url.host}:{url.port}",
             tty_baudrate=url.baud,
             bitrate=None if url.fd else url.bitrate,
             sleep_after_open=0.0,
@@ -247,7 +249,10 @@ class _Slcan(_TextBus, slcanBus):
         )
         try:
             self.serialPortOrig.write_timeout = 0  # where there is no descriptor
-            self.serialPortOrig.exclusive = True
+            if self._is_remote:
+                _send_at_once(self.serialPortOrig.fileno())
+            else:
+                self.serialPortOrig.exclusive = True
             if url.fd:
                 self.set_bitrate(url.bitrate, url.fd)
         except BaseException:
@@ -262,10 +267,13 @@ class _Slcan(_TextBus, slcanBus):
 
     def shutdown(self) -> None:
         """Close channel and port, also of a lost adapter."""
+        connection = getattr(self.serialPortOrig, "_socket", None)
         with contextlib.suppress(can.CanError, OSError):
             slcanBus.shutdown(self)
         with contextlib.suppress(OSError):
             self.serialPortOrig.close()
+        if connection is not None:  # pyserial leaves one open that the other side has closed
+            connection.close()
 
     def _text(self, frame: CanFrame) -> bytes:
         return slcan_line(frame)
@@ -279,9 +287,29 @@ class _Slcan(_TextBus, slcanBus):
 
     def _read_text(self, timeout: float | None) -> None:
         port = self.serialPortOrig
-        self._received(self._reader.feed(port.read(max(1, port.in_waiting))))
+        if self._is_remote:  # which pyserial would read byte by byte
+            data = _received_now(port.fileno())
+        else:
+            data = port.read(max(1, port.in_waiting))
+        self._received(self._reader.feed(data))
         if self._is_ended:
             raise can.CanOperationError("adapter is being closed")
+
+
+def _send_at_once(connection: int) -> None:
+    """Let a TCP connection send every frame without waiting for more."""
+    with socket.fromfd(connection, socket.AF_INET, socket.SOCK_STREAM) as same:
+        same.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+
+def _received_now(connection: int) -> bytes:
+    """Read what a connection has received, waiting shortly; CanOperationError if it is closed."""
+    if not select.select([connection], [], [], _SERIAL_TIMEOUT)[0]:
+        return b""
+    data = os.read(connection, _READ_MAX)
+    if not data:
+        raise can.CanOperationError("connection closed by the adapter's server")
+    return data
 
 
 def _message(frame: CanFrame) -> can.Message:

@@ -12,7 +12,8 @@ from drivers.errors import CommandError
 
 _FORMS = (
     "can+socketcan://can0#1, can+slcan:///dev/ttyACM0?bitrate=500000#1, "
-    "can+socketcand://HOST:PORT/can0#1 or can+INTERFACE://CHANNEL#1 with an interface of python-can"
+    "can+slcan://HOST:PORT#1, can+socketcand://HOST:PORT/can0#1 or "
+    "can+INTERFACE://CHANNEL#1 with an interface of python-can"
 )
 _OPTIONS = {  # lowest and highest
     "bitrate": (10_000, 1_000_000),
@@ -34,7 +35,7 @@ _ADAPTER_OPTIONS = {  # of python-can, passed on as they are: which of several a
 
 @dataclass(frozen=True)
 class CanBusUrl:
-    """A bus: interface as named by python-can, channel, host and port of a server.
+    """A bus: interface as named by python-can, channel, host and port of a server or an adapter.
 
     bitrate [bit/s]; fd: that of the data in CAN FD frames, 0 for classic frames only; baud of the
     adapter's serial port; options: of python-can, by name.
@@ -50,8 +51,8 @@ class CanBusUrl:
     options: tuple[tuple[str, str], ...] = ()
 
     def __str__(self) -> str:
-        where = f"{self.host}:{self.port}/" if self.host else ""
-        return f"can+{self.interface}://{where}{self.channel}"
+        where = f"{self.host}:{self.port}" if self.host else ""
+        return f"can+{self.interface}://{'/'.join(part for part in (where, self.channel) if part)}"
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,8 @@ class CanUrl:
         """Parse a URL; CommandError names the invalid part."""
         scheme, _, rest = url.partition("://")
         interface = scheme.lower().removeprefix("can+")
-        is_server = interface == "socketcand"
+        # An slcan adapter is a device, or behind a port of the network.
+        is_server = interface == "socketcand" or (interface == "slcan" and rest[:1] not in "/")
         # The names of some interfaces are no schemes for urlsplit.
         parts = split_url(f"can://{rest}", kind="a CAN", forms=_FORMS, has_port=is_server)
         adapter_options = _ADAPTER_OPTIONS.get(interface, ())
@@ -77,15 +79,16 @@ class CanUrl:
         match interface:
             case "socketcan":
                 channel, rest = parts.netloc, parts.path.strip("/")
-            case "slcan":
+            case "slcan" if not is_server:
                 channel, rest = device_of(unquote(parts.path)), parts.netloc
-            case "socketcand":
+            case "slcan" | "socketcand":
                 port = parts.port
                 channel, rest = parts.path.strip("/"), "" if port else "no port"
                 host = parts.hostname or ""
             case _:
                 channel, rest = device_of(unquote(parts.netloc + parts.path)), ""
-        if not channel.strip("/") or rest or (is_server and not host):
+        is_named = not channel if is_server and interface == "slcan" else channel.strip("/")
+        if not is_named or rest or (is_server and not host):
             raise CommandError(f"{url!r} must name the bus; use {_FORMS}")
         bus = CanBusUrl(
             interface=interface,

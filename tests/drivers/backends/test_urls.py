@@ -39,6 +39,10 @@ def bus(interface: str, channel: str, *, server: tuple[str, int] = ("", 0)) -> C
         (f"{RTU}://srv:4001#2", ModbusUrl(True, host="srv", port=4001, unit=2)),
         ("can+slcan:///dev/ttyACM0", CanUrl(bus("slcan", "/dev/ttyACM0"), 1, 0.05)),
         ("can+slcan:///COM7", CanUrl(bus("slcan", "COM7"), 1, 0.05)),
+        (
+            "can+slcan://10.0.0.7:4001#9",
+            CanUrl(bus("slcan", "", server=("10.0.0.7", 4001)), 9, 0.05),
+        ),
         ("can+socketcan://can0#63", CanUrl(bus("socketcan", "can0"), 63, 0.05)),
         (
             "can+socketcand://10.0.0.7:29536/can1?heartbeat=20#9",
@@ -61,6 +65,9 @@ def test_url_is_parsed(url: str, expected: SerialUrl | ModbusUrl | CanUrl) -> No
         ("serial://", "port"),
         ("hwgrep://", "pattern"),
         ("serial://host", "host and port"),
+        ("can+slcan://host#1", "bus"),
+        ("can+slcan://host:4001/x#1", "bus"),
+        ("can+slcan://#1", "bus"),
         ("serial://host:99999", "serial URL"),
         ("serial:///dev/x?baud=fast", "baud .*'fast'"),
         ("serial:///dev/x?baud=0", "baud .*'0'"),

@@ -82,6 +82,19 @@ def test_checks_after_a_short_loss_are_run(wire: str, coarse_rig: Rig) -> None:
     assert [one.result for one in report.results] == [Result.PASSED] * 3
 
 
+@pytest.mark.parametrize("wire", ALL)
+def test_checks_after_a_longer_loss_are_run_once_it_is_back(wire: str, coarse_rig: Rig) -> None:
+    """One that finds no link is inconclusive; the next finds it again."""
+    report = report_of(
+        wire, coarse_rig, lambda far: (unplugging(far, lasts=3.0), *named("identity", "disarm"))
+    )
+    assert [one.result for one in report.results] == [
+        Result.PASSED,
+        Result.INCONCLUSIVE,
+        Result.PASSED,
+    ]
+
+
 @pytest.mark.parametrize(("lasts", "result"), [(1.0, Result.PASSED), (1e9, Result.INCONCLUSIVE)])
 @pytest.mark.parametrize("wire", ALL)
 def test_check_is_repeated_once_the_link_is_back(

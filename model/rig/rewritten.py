@@ -20,7 +20,7 @@ _PER_LINE = 4
 # ruamel.yaml wraps long sequences anywhere, so rows replace placeholders in its text.
 _ROWS_OF = "rows-of-"
 _PLACEHOLDER = re.compile(
-    rf"^(?P<start>(?P<indent> *).*(gains|modes): ){_ROWS_OF}(?P<what>\d+|modes)", re.MULTILINE
+    rf"^(?P<start>(?P<indent> *).*(gains|modes):\s+){_ROWS_OF}(?P<what>\d+|modes)", re.MULTILINE
 )
 
 

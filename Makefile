@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware firmware-test test test-long lint format docs fuzz conformance-faults kill-test fault-test stop-test estimate-test soak bench bench-latency \
+.PHONY: demo firmware firmware-test test test-long lint format docs fuzz conformance-faults kill-test fault-test stop-test desk-test estimate-test soak bench bench-latency \
 	bench-localization bench-plant bench-promise bench-wires dist dist-platform smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -66,6 +66,12 @@ fault-test: .venv/installed-test
 # on their way; `make test` takes some hundreds. Others: make stop-test STOPS='--stops 100000'
 stop-test: .venv/installed-test
 	$(BIN)/python tests/support/stops.py $(STOPS)
+
+# A plate without hardware, measured, calibrated, played and verified by real processes through
+# JACK (jackd2): three minutes. Others: make desk-test DESK='--plates 10 --promises 20'
+desk-test: .venv/installed-test
+	.ci/install jackd2:jackd gcc:cc
+	$(BIN)/python -m benchmarks.desk --plates 1 --promises 10 --touches 4 $(DESK)
 
 # The whole chain in virtual time, thousands of seeds; `make test` takes twelve short ones.
 # Others: make soak SOAK='--hours 10 --wire serial', or one again: make soak SOAK='--seed 17'

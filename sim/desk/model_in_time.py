@@ -125,8 +125,12 @@ class DeskModel:
         return ModelInTime(A, B, self._at_points @ motion)
 
     def _structural(self, mass: FloatArray, stiffness: FloatArray) -> FloatArray:
-        """Viscous damping that loses at each resonance of the supported plate what eta does."""
+        """Viscous damping that loses at each resonance of the supported plate what eta does.
+
+        eta K_plate between modes j and k of the supported plate, over sqrt(omega_j omega_k).
+        """
         values, modes = linalg.eigh(stiffness, mass)
-        elastic = ((modes**2).T @ self._plate.omega**2) * self._truth.rig.plate.loss_factor
+        elastic = (modes.T * self._plate.omega**2) @ modes * self._truth.rig.plate.loss_factor
+        roots = values**0.25
         weighted = mass @ modes
-        return np.asarray((weighted * (elastic / np.sqrt(values))) @ weighted.T)
+        return np.asarray(weighted @ (elastic / np.outer(roots, roots)) @ weighted.T)

@@ -48,6 +48,7 @@ class Truth:
         """Its parameters, as those that `era calibrate` finds, for programs."""
         plate = self.rig.plate
         return {
+            "thickness_m": plate.thickness,
             "flexural_rigidity_n_m": plate.flexural_rigidity,
             "loss_factor": plate.loss_factor,
             "eras": {

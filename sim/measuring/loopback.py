@@ -6,6 +6,7 @@ from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
 
 _MAX_DELAY = 0.1  # s; lines 10 Hz apart repeat then
+_NEARLY = 0.95
 _STRAIGHT = 0.5  # rad
 _SILENT = 1e-5  # of full scale, rms
 _SAME = 1e-3  # of periods; a lost block makes them differ by 0.8
@@ -34,12 +35,17 @@ def converters(response: ComplexArray) -> ComplexArray:
 def latency(response: ComplexArray, frequencies: FloatArray) -> float:
     """Delay [s] of a response at frequencies [Hz], from 0 to 0.1 s, by the slope of its phase.
 
+    Lines d apart tell delays below 1 / d apart only.
+
     Raises LinkError where the phase is no straight line, so that nothing is known of the delay.
     """
     unit = response / np.abs(response)
     tried = np.arange(0, _MAX_DELAY, 0.1 / frequencies.max())
     alike = np.abs(np.exp(2j * np.pi * np.outer(tried, frequencies)) @ unit)
-    nearest = tried[alike.argmax()]
+    # Lines at equal distances have several such delays: the shortest is meant.
+    near = np.flatnonzero(alike > _NEARLY * alike.max())
+    first_group = near[near - near[0] == np.arange(len(near))]
+    nearest = tried[first_group[alike[first_group].argmax()]]
     rest = unit * np.exp(2j * np.pi * frequencies * nearest)
     phase = np.angle(rest / rest.mean())
     slope, first = np.polyfit(frequencies, phase, 1)

@@ -159,7 +159,10 @@ def test_frequencies_that_no_period_has_are_refused() -> None:
 
 
 def test_delay_follows_from_the_slope_of_phases() -> None:
-    """3.7 ms by hand; random phases are no delay."""
+    """3.7 ms by hand, also of lines at equal distances; random phases are no delay."""
+    evenly = np.arange(61.0, 500.0, 60.0)
+    late = np.exp(-2j * np.pi * evenly * 3.7e-3)
+    assert latency(late, evenly) == pytest.approx(3.7e-3)
     response = 0.4 * np.exp(-2j * np.pi * FREQUENCIES * 3.7e-3)
     assert latency(response, FREQUENCIES) == pytest.approx(3.7e-3)
     lines = default_frequencies(40, 500)

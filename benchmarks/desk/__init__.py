@@ -1,0 +1,1 @@
+"""A desk without hardware: measured, calibrated, played and verified, by real processes."""

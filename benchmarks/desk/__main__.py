@@ -1,0 +1,147 @@
+"""A desk without hardware: measured, calibrated, played and verified, on plates that deviate.
+
+    python -m benchmarks.desk [--plates 10] [--promises 20] [--touches 6] [--report]
+
+Everything runs in processes of its own on a JACK server of the dummy driver: `era desk-plate`,
+`era measure`, `era calibrate`, `era table build`, `era table verify --device`, `era soft-amp`,
+`era daemon`. Two minutes a plate on an idle machine. Exits with status 1 unless 85 to 95 % of all
+promises are kept; of fewer than a hundred, unless four of five are.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.desk.chain import KINDS, Outcome, chain
+from benchmarks.page import write_parts
+from benchmarks.setting import use_one_thread
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "measured" / "desk.md"
+RESULTS = ROOT / "out" / "desk.json"
+_MANY = 100
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.desk", description=__doc__)
+    parser.add_argument("--plates", type=int, default=10)
+    parser.add_argument("--promises", type=int, default=20, help="on each plate")
+    parser.add_argument("--touches", type=int, default=6, help="on each plate")
+    parser.add_argument("--seed", type=int, default=1, help="of the first plate")
+    parser.add_argument("--report", action="store_true", help=f"write {PAGE.relative_to(ROOT)}")
+    options = parser.parse_args()
+    use_one_thread()
+    found: list[Outcome] = []
+    for seed in range(options.seed, options.seed + options.plates):
+        found.append(chain(seed=seed, promises=options.promises, touched=options.touches))
+        print(summary(found[-1]), flush=True)
+        RESULTS.parent.mkdir(exist_ok=True)
+        RESULTS.write_text(json.dumps([each.as_json() for each in found]), "utf-8")
+        if options.report:
+            write_parts(PAGE, tables(found))
+    print("\n\n".join(tables(found).values()))
+    kept = [row["kept"] for each in found for row in each.promises]
+    share = float(np.mean(kept))
+    low, high = (0.85, 0.95) if len(kept) >= _MANY else (0.8, 1.0)
+    sys.exit(not low <= share <= high)
+
+
+def tables(found: Sequence[Outcome]) -> dict[str, str]:
+    """The parts of the page."""
+    return {
+        "values": values_table(found),
+        "promises": promises_table(found),
+        "touches": touches_table(found),
+        "times": times_table(found),
+    }
+
+
+def summary(found: Outcome) -> str:
+    kept = [row["kept"] for row in found.promises]
+    felt = [each.measured_db >= each.promised_db for each in found.touches]
+    return (
+        f"plate {found.seed}: measured in {found.measure_s:.0f} s, {sum(kept)} of {len(kept)} "
+        f"promises kept, {sum(felt)} of {len(felt)} touches at least as promised"
+    )
+
+
+def values_table(found: Sequence[Outcome]) -> str:
+    rows = [
+        "| value | error, median | largest | intervals of 95 % that hold the truth | values |",
+        "|---|---|---|---|---|",
+    ]
+    for kind in KINDS:
+        errors = [one for each in found for one in each.errors if one.kind == kind]
+        if errors:
+            sizes = 100 * np.abs([one.relative for one in errors])
+            held = np.mean(np.abs([one.in_standard_errors for one in errors]) < 1.96)
+            rows.append(
+                f"| {kind} | {np.median(sizes):.2f} % | {sizes.max():.2f} % | {100 * held:.0f} % "
+                f"| {len(errors)} |"
+            )
+    return "\n".join(rows)
+
+
+def promises_table(found: Sequence[Outcome]) -> str:
+    rows = [
+        "| quiet sensors | patterns | kept | promised / dB, median | measured / dB, median "
+        "| measured above promised / dB, 10 % and 90 % |",
+        "|---|---|---|---|---|---|",
+    ]
+    everything = [row for each in found for row in each.promises]
+    for name in ("1", "2", "3", "all"):
+        some = [row for row in everything if name in ("all", str(len(row["quiet"])))]
+        if some:
+            promised = np.array([row["promised_felt_contrast_db"] for row in some])
+            measured = np.array([row["measured_felt_contrast_db"] for row in some])
+            low, high = np.percentile(measured - promised, [10, 90])
+            rows.append(
+                f"| {name} | {len(some)} | {100 * np.mean([row['kept'] for row in some]):.0f} % "
+                f"| {np.median(promised):.1f} | {np.median(measured):.1f} | {low:.1f}, {high:.1f} |"
+            )
+    return "\n".join(rows)
+
+
+def touches_table(found: Sequence[Outcome]) -> str:
+    rows = [
+        "| fingers | touches | at least as promised | promised / dB, median "
+        "| measured / dB, median |",
+        "|---|---|---|---|---|",
+    ]
+    everything = [one for each in found for one in each.touches]
+    for fingers in sorted({one.fingers for one in everything}):
+        some = [one for one in everything if one.fingers == fingers]
+        kept = np.mean([one.measured_db >= one.promised_db for one in some])
+        promised, measured = (
+            np.median([getattr(one, key) for one in some]) for key in ("promised_db", "measured_db")
+        )
+        rows.append(
+            f"| {fingers} | {len(some)} | {100 * kept:.0f} % | {promised:.1f} | {measured:.1f} |"
+        )
+    return "\n".join(rows)
+
+
+def times_table(found: Sequence[Outcome]) -> str:
+    def span(values: Sequence[float], digits: int) -> str:
+        return f"{min(values):.{digits}f} to {max(values):.{digits}f}"
+
+    return "\n".join(
+        [
+            f"| plates | {len(found)} |",
+            "|---|---|",
+            f"| `era measure` / s | {span([each.measure_s for each in found], 0)} |",
+            f"| delay found / samples | {span([each.latency_samples for each in found], 2)} |",
+            f"| runs repeated for lost blocks | {sum(each.repeated for each in found)} |",
+            f"| lowest coherence | {min(each.coherence_min for each in found):.4f} |",
+            "| held-out sensors predicted within / % "
+            f"| {span([100 * each.held_out_error for each in found], 1)} |",
+        ]
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,136 @@
+"""A desk of real processes: jackd, a plate, and the commands that a user types."""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+ERA = Path(sys.executable).with_name("era")
+EXAMPLES = Path(__file__).parents[2] / "examples" / "desk"
+RATE, BLOCK = 48_000, 128
+_START = 60.0  # s; on a busy machine
+_END = 20.0  # s
+_COMMAND = 900.0  # s
+
+Place = tuple[float, float]
+
+
+class Desk:
+    """A running JACK server and its plate, in a folder with the example's rig and sensors."""
+
+    def __init__(self, folder: Path, environment: Mapping[str, str], plate: IO[str]) -> None:
+        self.folder, self.environment = folder, dict(environment)
+        self._plate = plate
+
+    def run(self, *arguments: object, status: int | None = 0) -> dict[str, Any]:
+        """Run an `era` command with --json; None: any exit status. Raises RuntimeError."""
+        done = subprocess.run(
+            [str(ERA), *map(str, arguments), "--json"],
+            capture_output=True,
+            text=True,
+            cwd=self.folder,
+            env=self.environment,
+            timeout=_COMMAND,
+            check=False,
+        )
+        if status is not None and done.returncode != status:
+            raise RuntimeError(
+                f"era {' '.join(map(str, arguments))}: status {done.returncode}: {done.stderr}"
+            )
+        found: dict[str, Any] = json.loads(done.stdout)
+        return found
+
+    def touch_plate(self, fingers: Sequence[Place]) -> None:
+        """Put fingers on the plate."""
+        self._plate.write(json.dumps({"fingers": list(fingers)}) + "\n")
+        self._plate.flush()
+
+    @property
+    def truth(self) -> dict[str, Any]:
+        """What the plate really is."""
+        found: dict[str, Any] = json.loads((self.folder / "truth.json").read_text("utf-8"))
+        return found
+
+
+@contextlib.contextmanager
+def desk(folder: Path, *, seed: int, mesh: str = "8x6 Q3") -> Iterator[Desk]:
+    """A desk with a plate of its own; seed: of its deviations."""
+    name = f"desk{os.getpid()}"
+    environment = os.environ | {
+        "JACK_DEFAULT_SERVER": name,
+        "JACK_NO_START_SERVER": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
+    link = folder / "amp"
+    text = (EXAMPLES / "rig.yaml").read_text("utf-8")
+    (folder / "rig.yaml").write_text(text.replace("/tmp/plate", str(link)), "utf-8")
+    (folder / "sensors.csv").write_text((EXAMPLES / "sensors.csv").read_text("utf-8"), "utf-8")
+    server = ["jackd", "-n", name, "-S", "-r", "-d", "dummy", "-p", str(BLOCK), "-r", str(RATE)]
+    plate = [ERA, "desk-plate", "rig.yaml", "--sensors", "sensors.csv", "--seed", seed]
+    plate += ["--mesh", mesh, "--truth", "truth.json", "--until-eof"]
+    with contextlib.ExitStack() as stack:
+        os.environ["JACK_DEFAULT_SERVER"] = name  # of clients in this process
+        log = stack.enter_context((folder / "desk.log").open("w"))
+        running(stack, server, folder, environment, log)
+        process = _plate(stack, plate, folder, environment, log)
+        assert process.stdin is not None
+        yield Desk(folder, environment, process.stdin)
+
+
+def _plate(
+    stack: contextlib.ExitStack,
+    command: Sequence[object],
+    folder: Path,
+    environment: Mapping[str, str],
+    log: IO[str],
+) -> "subprocess.Popen[str]":
+    """Start the plate as soon as the server is up."""
+    end = time.monotonic() + _START
+    while True:
+        process = running(stack, command, folder, environment, log)
+        assert process.stdout is not None
+        if process.stdout.readline():
+            return process
+        if time.monotonic() > end:
+            raise RuntimeError(f"no JACK server: {(folder / 'desk.log').read_text('utf-8')}")
+        time.sleep(0.2)
+
+
+def running(
+    stack: contextlib.ExitStack,
+    command: Sequence[object],
+    folder: Path,
+    environment: Mapping[str, str],
+    log: IO[str],
+) -> "subprocess.Popen[str]":
+    """A process that ends with the stack: at the end of its input, or terminated."""
+    process = stack.enter_context(
+        subprocess.Popen(
+            list(map(str, command)),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            cwd=folder,
+            env=environment,
+        )
+    )
+
+    def end() -> None:
+        assert process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.close()
+        if "--until-eof" not in command:
+            process.terminate()
+        try:
+            process.wait(_END)
+        except subprocess.TimeoutExpired:
+            process.kill()
+
+    stack.callback(end)
+    return process

@@ -1,0 +1,123 @@
+"""Touches felt on the desk: daemon and software amplifier play, accelerometers record."""
+
+import contextlib
+import csv
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.desk.session import ERA, Desk, Place, running
+from controller.api.client import Client
+from controller.api.client_protocol import Unreachable
+from controller.api.jsonrpc import RpcError
+from controller.api.methods import StatusResult
+from model.arrays import FloatArray
+from model.finger.perception import detection_threshold
+from sim.measuring.sound_card import open_card
+
+_START = 60.0  # s
+_REPEAT = 0.05  # s; a contact that is not confirmed is lifted
+_SETTLING, _WINDOW = 1.5, 1.0  # s
+
+
+@dataclass(frozen=True)
+class Touch:
+    """A touch among quiet fingers: felt contrast [dB] that the daemon promised, and measured."""
+
+    fingers: int
+    promised_db: float
+    predicted_db: float
+    measured_db: float
+
+
+def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
+    """Touch sets of sensors' places, the target first, with fingers that weigh on the plate."""
+    with (desk.folder / "sensors.csv").open() as lines:
+        rows = list(csv.DictReader(lines))
+    places = {row["sensor"]: (float(row["x_m"]), float(row["y_m"])) for row in rows}
+    inputs = {row["sensor"]: int(row["input"]) - 1 for row in rows}
+    socket = desk.folder / "era.sock"
+    config = "rig: calibrated.yaml\ntable: table.npz\nsocket: era.sock\nlevel_db_sl: 30\n"
+    (desk.folder / "daemon.yaml").write_text(config, "utf-8")
+    amplifier = [ERA, "soft-amp", "--device", "jack:desk", "--channels", 4]
+    amplifier += ["--link", desk.folder / "amp", "--until-eof"]
+    daemon = [ERA, "daemon", "daemon.yaml"]
+    found = []
+    with contextlib.ExitStack() as stack:
+        log = stack.enter_context((desk.folder / "touches.log").open("w"))
+        started = running(stack, amplifier, desk.folder, desk.environment, log)
+        assert started.stdout is not None
+        started.stdout.readline()
+        running(stack, daemon, desk.folder, desk.environment, log)
+        era = stack.enter_context(_client(socket))
+        _until_ready(era)
+        card = open_card("jack:desk", outputs=0, inputs=max(inputs.values()) + 1)
+        stack.callback(card.close)
+        stack.enter_context(era.armed("desk", lease_s=60))
+        for names in sets:
+            target, *quiet = (places[name] for name in names)
+            desk.touch_plate([target, *quiet])
+            status = _hold(era, [*quiet, target], _SETTLING)
+            heard = card.run(
+                np.zeros((round(_WINDOW * card.rate), 0)),
+                progress=lambda _done, held=(*quiet, target): era.touch(held),  # type: ignore[misc]
+            ).astype(float)
+            era.touch([])
+            assert status.robust_felt_contrast_db is not None
+            assert status.predicted_felt_contrast_db is not None
+            frequencies = np.unique([tone.frequency_hz for tone in status.drive.values()])
+            samples = heard[:, [inputs[name] for name in names]]
+            found.append(
+                Touch(
+                    len(names),
+                    status.robust_felt_contrast_db,
+                    status.predicted_felt_contrast_db,
+                    _contrast(samples, frequencies, card.rate),
+                )
+            )
+    return found
+
+
+def _client(socket: Path) -> Client:
+    end = time.monotonic() + _START
+    while True:
+        try:
+            return Client.connect(socket)
+        except (Unreachable, OSError):
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.1)
+
+
+def _until_ready(era: Client) -> None:
+    end = time.monotonic() + _START
+    while era.status().state != "READY_TO_SWITCH_ON":
+        if time.monotonic() > end:
+            raise RuntimeError(f"the daemon is not ready: {era.status().state}")
+        with contextlib.suppress(RpcError):
+            era.clear()
+        time.sleep(0.1)
+
+
+def _hold(era: Client, places: list[Place], seconds: float) -> StatusResult:
+    """Hold fingers, and return what plays in the end."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        era.touch(places)
+        time.sleep(_REPEAT)
+    status = era.status()
+    if not status.drive:
+        raise RuntimeError(f"nothing plays for fingers at {places}: {status.silence_reason}")
+    return status
+
+
+def _contrast(samples: FloatArray, frequencies: FloatArray, rate: float) -> float:
+    """Felt contrast [dB] of the first of samples (n, sensors) to the loudest other."""
+    angles = 2 * np.pi * np.outer(np.arange(len(samples)) / rate, frequencies)
+    basis = np.hstack([np.sin(angles), np.cos(angles)])
+    fitted = np.linalg.lstsq(basis, samples)[0]
+    sizes = np.hypot(*np.split(fitted, 2)) / detection_threshold(frequencies)[:, None]
+    target, *quiet = np.linalg.norm(sizes, axis=0)
+    return float(20 * np.log10(target / max(quiet)))

@@ -97,6 +97,7 @@ class SerialBackend(WireBackend):
         data = encode_frame(frame)
         self._last_reply, self._has_duplicate_responder = None, False
         self._send(line, data, request)
+        unexpected = self._counters.unexpected_frames
         pending = self._pending = _Pending(frame, asyncio.get_running_loop().create_future())
         on_line = self._times.exchange(len(data))
         try:
@@ -104,11 +105,14 @@ class SerialBackend(WireBackend):
         except LinkError:
             raise
         except TimeoutError:
-            remedy = (
-                "check flow control and the adapter: the port takes no bytes"
-                if line.is_blocked
-                else f"check that the amplifier is switched on and set to {self._url.baud} baud"
-            )
+            remedy = f"check that the amplifier is switched on and set to {self._url.baud} baud"
+            if line.is_blocked:
+                remedy = "check flow control and the adapter: the port takes no bytes"
+            elif self._counters.unexpected_frames > unexpected:
+                remedy = (
+                    f"other frames came, none with its sequence number {frame.sequence}: the "
+                    "replies are late, or do not repeat it"
+                )
             raise LinkTimeout(
                 f"no reply from address {self._url.address} on {self._url.port} within "
                 f"{timeout * 1e3:g} ms; {remedy}"

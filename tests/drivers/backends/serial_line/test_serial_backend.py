@@ -58,6 +58,18 @@ async def test_missing_reply_is_a_timeout(backend: SerialBackend, far_end: FarEn
         await backend.exchange(Ping(), timeout=SHORT)
 
 
+async def test_timeout_names_the_sequence_number_that_no_reply_had(
+    backend: SerialBackend, far_end: FarEnd
+) -> None:
+    """As of an amplifier that repeats only one byte of it."""
+    far_end.answer = lambda request, frame: encode_frame(
+        encode_reply(ARMED, replace(frame, sequence=frame.sequence ^ 0x0100))
+    )
+    with pytest.raises(LinkTimeout, match="sequence number") as caught:
+        await backend.exchange(Ping(), timeout=10 * SHORT)
+    assert str(far_end.frames[0].sequence) in str(caught.value)
+
+
 async def test_timeout_includes_the_time_on_a_slow_line(far_end: FarEnd) -> None:
     """At 300 baud a Ping and its reply take 2 s."""
     backend = SerialBackend(f"{far_end.url}?baud=300")

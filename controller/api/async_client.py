@@ -153,6 +153,10 @@ class AsyncClient:
         """Acknowledge a stop, or a fault whose cause is gone."""
         await self.call("clear", RequestedBy(), Empty)
 
+    async def forget(self) -> None:
+        """Discard what was learned of the plate; answers are those of the table as built."""
+        await self.call("forget", RequestedBy(), Empty)
+
     async def touch(
         self, positions: Sequence[tuple[float, float]], *, source: str = "python"
     ) -> None:

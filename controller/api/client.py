@@ -114,6 +114,10 @@ class Client:
         """Acknowledge a stop, or a fault whose cause is gone."""
         self._run(self._client.clear())
 
+    def forget(self) -> None:
+        """Discard what was learned of the plate; answers are those of the table as built."""
+        self._run(self._client.forget())
+
     def touch(self, positions: Sequence[tuple[float, float]], *, source: str = "python") -> None:
         """Report all fingers of a source, at x, y [m]; valid for 150 ms, so repeat it."""
         self._run(self._client.touch(positions, source=source))

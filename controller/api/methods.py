@@ -1,4 +1,4 @@
-"""The twelve methods of the API: parameters, results and the table `METHODS` of them.
+"""The thirteen methods of the API: parameters, results and the table `METHODS` of them.
 
 The server, the clients, the reference in docs/reference/api.md and the gateway's OpenAPI
 description all use this table.
@@ -22,6 +22,7 @@ from controller.api.schema import (
     Empty,
     GroupStateName,
     LatencySummary,
+    LearningSummary,
     Message,
     Name,
     PlayedTone,
@@ -88,6 +89,9 @@ class StatusResult(Message):
     amplifiers: list[AmplifierStatus]
     latency_ms: LatencySummary
     rejected_touches: dict[str, Count] = Field(description="number by reason")
+    learning: LearningSummary | None = Field(
+        None, description="of the plate while it plays; null where nothing is to be learned"
+    )
     uptime_s: float
 
 
@@ -201,6 +205,9 @@ METHODS: dict[str, Method] = {
         "amplifier is confirmed silent",
     ),
     "clear": Method(RequestedBy, Empty, "acknowledge a stop, or a fault whose cause is gone"),
+    "forget": Method(
+        RequestedBy, Empty, "discard what was learned of the plate; answers are those of the table"
+    ),
     "touch": Method(TouchParams, Empty, "report all fingers of a touch source of this client"),
     "effects": Method(Empty, EffectsResult, "list the effects"),
     "play": Method(PlayParams, Empty, "play an effect at a finger; only while armed"),

@@ -37,8 +37,29 @@ GroupStateName: TypeAlias = Literal["closed", "disarmed", "armed", "lost"]
 AmplifierClassName: TypeAlias = Literal["A", "B", "C"]
 """Class of an amplifier, by what it has."""
 
+LearningStateName: TypeAlias = Literal[
+    "off",
+    "starting",
+    "following",
+    "explaining",
+    "changed",
+    "only_alarms",
+    "restarting",
+    "failed",
+]
+"""What happens to what settled patterns show of the plate."""
+
 Topic: TypeAlias = Literal[
-    "state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "layout"
+    "state",
+    "contacts",
+    "pattern",
+    "silence",
+    "amplifiers",
+    "latency",
+    "log",
+    "link",
+    "layout",
+    "plate",
 ]
 
 _ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]+$"
@@ -212,6 +233,30 @@ class LatencySummary(Message):
     histogram: list[tuple[float, int]] = Field(
         description="[upper edge in ms, number above the previous edge and up to this one]; "
         "values above the last edge are counted in the last"
+    )
+
+
+class LearningSummary(Message):
+    """What is learned of the plate while it plays, and how often."""
+
+    state: LearningStateName
+    cause: str
+    remedy: str | None = Field(description="what to do about it; null if nothing")
+    robust: bool = Field(
+        description="whether answers are those of a plate that is not known: it has changed in an "
+        "unknown way, or there was no estimator for a minute"
+    )
+    readings: Count = Field(description="settled patterns that were measured")
+    estimates: Count = Field(description="of these, by the estimator")
+    discarded: Count = Field(
+        description="of these, not estimated, since the estimator ended or had too many"
+    )
+    corrections: Count = Field(description="of the answers to touches")
+    alarms: Count = Field(description="patterns that show another plate than the known one")
+    restarts: Count = Field(description="of the estimator")
+    last_estimate_s: float | None = Field(description="time since the last estimate")
+    latency_ms: LatencySummary = Field(
+        description="from the end of a measurement to the answers that follow it"
     )
 
 

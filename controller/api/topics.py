@@ -11,6 +11,7 @@ from controller.api.schema import (
     Count,
     DaemonStateName,
     LatencySummary,
+    LearningStateName,
     Message,
     PlayedTone,
     Topic,
@@ -99,6 +100,15 @@ class LinkEvent(Message):
     remedy: str | None
 
 
+class PlateEvent(Message):
+    """What is known of the plate has changed, or whether it is followed."""
+
+    state: LearningStateName
+    cause: str
+    remedy: str | None = Field(description="what to do about it; null if nothing")
+    robust: bool = Field(description="whether answers are those of a plate that is not known")
+
+
 class LayoutEvent(Message):
     """The surface layout was replaced; `effects` may have changed with it."""
 
@@ -122,6 +132,7 @@ TOPICS: dict[Topic, TopicData] = {
     "log": TopicData(LogEvent, "log records from level info, without those of `state` and `link`"),
     "link": TopicData(LinkEvent, "links to amplifiers that were degraded, lost or reopened"),
     "layout": TopicData(LayoutEvent, "the surface layout was replaced"),
+    "plate": TopicData(PlateEvent, "the plate has changed, or is followed otherwise"),
 }
 """Every topic, by name."""
 

@@ -1,4 +1,6 @@
-"""`era daemon` and its clients: `status`, `arm`, `disarm`, `stop`, `clear`, `touch`, `watch`."""
+"""`era daemon` and its clients: `status`, `arm`, `disarm`, `stop`, `clear`, `forget`,
+`touch`, `watch`.
+"""
 
 import json
 import re
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
     from controller.api.client import Client
     from controller.api.client_protocol import Notification
     from controller.api.methods import ArmResult, StatusResult
-    from controller.api.schema import RigSummary
+    from controller.api.schema import LearningSummary, RigSummary
 
 app = typer.Typer()
 
@@ -39,7 +41,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and no
 DASHBOARD = "127.0.0.1:8137"
 """Default address of the page, as of `era gateway`."""
 
-_DEFAULT_TOPICS = ["state", "contacts", "pattern", "silence", "link", "log"]
+_DEFAULT_TOPICS = ["state", "contacts", "pattern", "silence", "link", "log", "plate"]
 """Topics of `era watch`: all but amplifiers and latency, which are published without end."""
 
 _LEASE_CHECK_INTERVAL = 0.5  # s
@@ -150,6 +152,14 @@ def clear(socket: Socket = None, as_json: Json = False) -> None:
     """Acknowledge a stop, or a fault whose cause has gone. Stays disarmed."""
     with _client(socket) as era:
         era.clear()
+        _print_state(era, as_json=as_json)
+
+
+@app.command()
+def forget(socket: Socket = None, as_json: Json = False) -> None:
+    """Discard what was learned of the plate, and learn anew."""
+    with _client(socket) as era:
+        era.forget()
         _print_state(era, as_json=as_json)
 
 
@@ -279,6 +289,26 @@ def show_event(event: "Notification", *, ahead: float) -> str:
     return f"{at}  {event.topic:10s} {in_words(event.data)}{lost}"
 
 
+def _show_learning(learning: "LearningSummary") -> list[str]:
+    """Format what is learned of the plate."""
+    state = learning.state.replace("_", " ").upper() if learning.robust else learning.state
+    lines = [f"  plate {state.replace('_', ' ')}: {learning.cause}"]
+    if learning.robust:
+        lines.append("    answers are robust ones, of a plate that is not known")
+    if learning.remedy:
+        lines.append(f"    remedy: {learning.remedy}")
+    if learning.readings:
+        last = learning.last_estimate_s
+        ago = "" if last is None else f", last estimated {last:.0f} s ago"
+        took = learning.latency_ms.median
+        within = "" if took is None else f", median {took:.0f} ms after a measurement"
+        lines.append(
+            f"    {counted(learning.readings, 'pattern')} measured{ago}; "
+            f"{counted(learning.corrections, 'correction')} of answers{within}"
+        )
+    return lines
+
+
 def show_status(status: "StatusResult") -> str:
     """Format a status."""
     lines = [f"{status.state}: {status.cause}"]
@@ -313,6 +343,8 @@ def show_status(status: "StatusResult") -> str:
         lines.append("  silent: not armed; arm with era arm")
     if status.ramp_only_reason is not None:
         lines.append(f"  plain ramps: {status.ramp_only_reason}")
+    if status.learning is not None:
+        lines += _show_learning(status.learning)
     for era, tone in status.drive.items():
         lines.append(
             f"  ERA {era}: {tone.frequency_hz:g} Hz, level {tone.level:.3f}, {tone.phase_deg:g} deg"

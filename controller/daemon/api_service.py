@@ -43,6 +43,7 @@ from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches
 from controller.group.guards import is_known_unwatched
 from controller.group.quick_stops import QuickStops
+from controller.learning.learning import Learning
 from controller.loop.loop import Controller
 from drivers import clock
 from drivers.amplifier import WATCHDOG, Amplifier
@@ -75,6 +76,7 @@ class ApiService:
         publisher: EventPublisher,
         touches: ApiTouches,
         layout: ActiveLayout,
+        learning: Learning | None,
     ) -> None:
         self.longest_lease = config.section.longest_lease
         self._config = config
@@ -85,6 +87,7 @@ class ApiService:
         self._publisher = publisher
         self._touches = touches
         self._layout = layout
+        self._learning = learning
         self._lease = LeaseHolder()
         self._holders: set[Connection] = set()  # clients that armed or renewed the lease
         self._expiry: asyncio.TimerHandle | None = None
@@ -102,6 +105,7 @@ class ApiService:
             "disarm": self._disarm,
             "stop": self._stop,
             "clear": self._clear,
+            "forget": self._forget,
             "touch": self._touch,
             "effects": lambda client, params: self._layout.effects(),
             "play": self._play,
@@ -151,6 +155,7 @@ class ApiService:
             amplifiers=self._publisher.amplifiers(),
             latency_ms=self._publisher.latencies.summary(),
             rejected_touches=dict(self._controller.rejected_touches),
+            learning=self._publisher.learning_summary(),
             uptime_s=now - self._started,
         )
 
@@ -235,6 +240,17 @@ class ApiService:
             machine = self._supervisor.machine
         if machine.state is not DaemonState.READY_TO_SWITCH_ON:
             raise _wrong_state(machine)
+        return Empty()
+
+    async def _forget(self, client: Connection, params: RequestedBy) -> Empty:
+        if self._learning is None:
+            raise RpcError(
+                ErrorCode.WRONG_STATE,
+                "nothing is learned of the plate",
+                remedy="name a file in learn of the daemon's configuration",
+            )
+        await self._learning.forget()
+        _logger.info("plate: forgotten by %a", params.client or client.name)
         return Empty()
 
     async def _handle(self, event: DaemonEvent) -> None:

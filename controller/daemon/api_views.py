@@ -7,11 +7,14 @@ from controller.api.schema import (
     AmplifierClassName,
     AmplifierStatus,
     ContactStatus,
+    LatencySummary,
+    LearningSummary,
     LinkCounters,
     PlayedTone,
 )
-from controller.api.topics import ContactsEvent, PatternEvent, SilenceEvent
+from controller.api.topics import ContactsEvent, PatternEvent, PlateEvent, SilenceEvent
 from controller.daemon.message_recorder import RecordedBackend
+from controller.learning.learning_status import LearningStatus
 from controller.loop.observer import Applied, Silenced
 from controller.sources.contacts import Contact, ContactKey
 from drivers import clock
@@ -177,6 +180,36 @@ def _amplifier_status(
             refusals=statistics.refusals,
             round_trip_ms=None if round_trip is None else 1e3 * round_trip,
         ),
+    )
+
+
+def learning_summary(
+    status: LearningStatus, latencies: LatencySummary, *, now: float
+) -> LearningSummary:
+    """Describe what is learned of the plate at a time [s]."""
+    return LearningSummary(
+        state=status.state.value,
+        cause=status.cause,
+        remedy=status.remedy,
+        robust=status.are_robust,
+        readings=status.readings,
+        estimates=status.estimates,
+        discarded=status.discarded,
+        corrections=status.corrections,
+        alarms=status.alarms,
+        restarts=status.restarts,
+        last_estimate_s=None if status.last_at is None else max(0.0, now - status.last_at),
+        latency_ms=latencies,
+    )
+
+
+def plate_event(status: LearningStatus) -> PlateEvent:
+    """The event of topic `plate`."""
+    return PlateEvent(
+        state=status.state.value,
+        cause=status.cause,
+        remedy=status.remedy,
+        robust=status.are_robust,
     )
 
 

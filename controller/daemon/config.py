@@ -20,6 +20,7 @@ from model.config.document import ConfigError, Document, read_document
 from model.config.sections import Validation
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
+from model.identification.learned_file import load_learned
 from model.rig.file import rig_of
 from model.rig.rig import Rig
 from model.structure.support import check_supported
@@ -47,7 +48,8 @@ class DaemonConfig:
     """A validated configuration.
 
     rig_text: content of the rig's file; urls: by amplifier name; table: its file, or None to build
-    it or take it from the cache; layout: None for the same effect everywhere.
+    it or take it from the cache; learn: file of what is learned of the plate, None for nothing;
+    layout: None for the same effect everywhere.
     """
 
     source: Path
@@ -56,6 +58,7 @@ class DaemonConfig:
     rig_text: str
     urls: Mapping[str, str]
     table: Path | None
+    learn: Path | None
     layout: SurfaceLayout | None
     touch: tuple[TouchInput, ...]
     socket: Path
@@ -88,7 +91,9 @@ def daemon_config_of(document: Document) -> DaemonConfig:
     _check_serial_numbers(validation, rig)
     log_file = _file(document, "log", "file")
     dump_folder = _file(document, "dumps", "folder")
+    learn = _file(document, "learn")
     _check_folders(validation, log_file, dump_folder)
+    _check_learn(validation, learn)
     section = validation.finish()
     assert rig is not None  # noqa: S101  else a problem was reported
     return DaemonConfig(
@@ -98,6 +103,7 @@ def daemon_config_of(document: Document) -> DaemonConfig:
         rig_text=rig_text,
         urls=urls,
         table=table,
+        learn=learn,
         layout=layout,
         touch=touch,
         socket=_file(document, "socket") or default_socket(),
@@ -268,6 +274,19 @@ def _check_folders(
         existing = next(each for each in (dumps, *dumps.absolute().parents) if each.exists())
         if not existing.is_dir():
             validation.add(("dumps", "folder"), f"must be a folder, got the file {existing}")
+
+
+def _check_learn(validation: Validation[DaemonSection], file: Path | None) -> None:
+    """Refuse to learn into a file that is something else; its folder must exist."""
+    if file is None:
+        return
+    if not file.parent.is_dir():
+        validation.add(("learn",), f"folder not found: {file.parent}; create it")
+    elif file.exists():
+        try:
+            load_learned(file)
+        except InputError as error:
+            validation.add(("learn",), str(error))
 
 
 def _check_serial_numbers(validation: Validation[DaemonSection], rig: Rig | None) -> None:

@@ -95,6 +95,7 @@ class DaemonSection(Section):
     rig: File
     table: File | None = None
     mode: Annotated[str, AfterValidator(_mode)] | None = None
+    learn: File | None = None
     level_db_sl: LevelDbSl = STRONG_DB_SL
     touch_wait: Annotated[float, Quantity(TIME, at_least=0, at_most=MAX_TOUCH_WAIT)] = (
         MAX_LOADING_TIME

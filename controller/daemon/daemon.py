@@ -26,6 +26,7 @@ from controller.daemon.states import ENERGISED, DaemonState, StateMachine
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches, TouchInputs
 from controller.group.amplifier_group import GroupState
+from controller.learning.learning import Learning, observed
 from controller.loop.loop import Controller
 from controller.sources.touch import TouchFrame
 from drivers import clock
@@ -83,6 +84,7 @@ class Daemon:
                 lambda old, new: self._publisher.state_changed(old, new),
                 lambda old, new: manager.status(f"{new.state.value}: {new.cause}"),
                 self._dump_fault,
+                self._follow_state,
             ),
             link_changed=lambda *change: self._publisher.link_changed(*change),
             alive=lambda: manager.alive(clock.now()),
@@ -99,18 +101,34 @@ class Daemon:
             effect_of=self._layout.effect_of,
             layout=config.layout,
             ramp_only_reason=lambda: self._controller.ramp_only_reason,
+            learning=lambda: None if self._learning is None else self._learning.status,
         )
+        self._learning: Learning | None = None
+        timing = Timing(table)
         self._controller = Controller(
             config.rig,
             table,
             amplifiers=amplifiers,
-            observer=self._supervisor.observe(self._publisher.observer()),
+            observer=self._supervisor.observe(
+                observed(self._publisher.observer(), lambda: self._learning)
+            ),
             intent_source=self._layout,
-            timing=Timing(table),
+            timing=timing,
             drive_mode=config.section.mode,
             max_loading_time=config.section.touch_wait,
             is_supervised=config.section.supervised,
         )
+        if config.learn is not None:
+            self._learning = Learning(
+                config.rig,
+                table,
+                timing,
+                config.learn,
+                amplifiers=amplifiers,
+                controller=self._controller,
+                changed=self._publisher.plate_changed,
+                estimated=self._publisher.learning_latencies.add,
+            )
         self._touches = ApiTouches(config.rig.plate, self._deliver)
         self._inputs = TouchInputs(self._deliver, failed=self._input_failed)
         self._api = ApiService(
@@ -122,6 +140,7 @@ class Daemon:
             publisher=self._publisher,
             touches=self._touches,
             layout=self._layout,
+            learning=self._learning,
         )
         self._server = ApiServer(
             self._api.handlers(),
@@ -167,6 +186,11 @@ class Daemon:
             await self._close(running)
         if not running.cancelled():
             running.result()
+
+    @property
+    def learning(self) -> Learning | None:
+        """What learns the plate, if anything is to be learned."""
+        return self._learning
 
     def shut_down(self, cause: str) -> None:
         """Request an orderly shutdown."""
@@ -226,6 +250,8 @@ class Daemon:
                     task.cancel()
                     await asyncio.wait({task})
             self._log.listener = None
+            if self._learning is not None:
+                await self._learning.close()
             for step in (self._inputs.close(), self._children.close(), self._server.close()):
                 with contextlib.suppress(OSError):
                     await step
@@ -271,6 +297,15 @@ class Daemon:
         folder, dumps = self._config.dump_folder, self._config.section.dumps
         if is_fault and folder is not None and dumps is not None:
             self._dumps.write(folder, cause=new.cause, keep=dumps.keep)
+
+    def _follow_state(self, old: StateMachine, new: StateMachine) -> None:
+        """Learn of the plate from when all amplifiers are open."""
+        if self._learning is None:
+            return
+        if new.state is DaemonState.READY_TO_SWITCH_ON:
+            self._learning.open()
+        if new.state is not DaemonState.OPERATION_ENABLED:
+            self._learning.ended()
 
     def _request_reload(self) -> None:
         """Reopen the log and start a reload; requests during one are combined into one after it."""

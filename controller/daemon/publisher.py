@@ -6,21 +6,23 @@ import logging
 from collections.abc import Callable, Sequence
 
 from controller.api.hub import Hub
-from controller.api.schema import AmplifierStatus
+from controller.api.schema import AmplifierStatus, LearningSummary
 from controller.api.topics import (
     AmplifiersEvent,
     LatencyEvent,
     LayoutEvent,
     LinkEvent,
     LogEvent,
+    PlateEvent,
     SilenceEvent,
     StateEvent,
 )
-from controller.daemon.api_views import PlateView
+from controller.daemon.api_views import PlateView, learning_summary, plate_event
 from controller.daemon.latency import LatencyStatistics
 from controller.daemon.reconnect import LinkChange
 from controller.daemon.states import DaemonState, StateMachine
 from controller.effects.layout import SurfaceLayout
+from controller.learning.learning_status import LearningStatus
 from controller.loop.observer import Applied, Observer, Silenced
 from controller.sources.contacts import Change, Contact, ContactKey
 from drivers import clock
@@ -34,7 +36,8 @@ class EventPublisher:
     """Keeps the current state of the plate and publishes every change at `hub`.
 
     machine: the daemon's state machine; amplifiers: their statuses; effect_of: the effect that
-    plays for a contact; ramp_only_reason: why onsets are plain ramps; layout: the surface layout.
+    plays for a contact; ramp_only_reason: why onsets are plain ramps; layout: the surface layout;
+    learning: what is learned of the plate, None where nothing is to be.
     """
 
     def __init__(
@@ -45,9 +48,12 @@ class EventPublisher:
         effect_of: Callable[[ContactKey], str | None],
         ramp_only_reason: Callable[[], str | None],
         layout: SurfaceLayout | None,
+        learning: Callable[[], LearningStatus | None],
     ) -> None:
         self.view = PlateView(effect_of)
         self.latencies = LatencyStatistics()
+        self.learning_latencies = LatencyStatistics()
+        self._learning = learning
         self.amplifiers = amplifiers
         self._machine = machine
         self._layout = layout
@@ -64,6 +70,7 @@ class EventPublisher:
                     latency_ms=self.latencies.summary(), ramp_only_reason=ramp_only_reason()
                 ),
                 "layout": self.layout_event,
+                "plate": self._plate_event,
             },
             clock=clock.now,
         )
@@ -100,6 +107,10 @@ class EventPublisher:
         """Publish another surface layout; None for the same effect everywhere."""
         self._layout = layout
         self.hub.publish("layout", self.layout_event)
+
+    def plate_changed(self, status: LearningStatus) -> None:
+        """Publish what has happened to the plate, or to learning it."""
+        self.hub.publish("plate", lambda: plate_event(status))
 
     def link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
         """Publish that the link to amplifiers was degraded, lost, retried or opened again."""
@@ -139,6 +150,17 @@ class EventPublisher:
     def layout_event(self) -> LayoutEvent:
         """The surface layout as an event."""
         return LayoutEvent(layout=None if self._layout is None else self._layout.as_json())
+
+    def learning_summary(self) -> LearningSummary | None:
+        """What is learned of the plate; None where nothing is to be."""
+        status = self._learning()
+        if status is None:
+            return None
+        return learning_summary(status, self.learning_latencies.summary(), now=clock.now())
+
+    def _plate_event(self) -> PlateEvent | None:
+        status = self._learning()
+        return None if status is None else plate_event(status)
 
     def _state_event(self) -> StateEvent:
         now = self._machine()

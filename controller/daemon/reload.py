@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from controller.daemon.config import DaemonConfig
 
-DEFERRED = ("touch_wait", "socket", "log.file", "metrics", "dashboard")
+DEFERRED = ("learn", "touch_wait", "socket", "log.file", "metrics", "dashboard")
 """Keys that take effect at the next start."""
 
 BLOCKING = ("rig", "table", "mode", "serial_numbers", "supervised")
@@ -50,6 +50,7 @@ def changed_keys(old: DaemonConfig, new: DaemonConfig) -> list[str]:
     differs = {
         "rig": (old.rig_text, old.urls) != (new.rig_text, new.urls),
         "table": old.table != new.table,
+        "learn": old.learn != new.learn,
         "mode": old.section.mode != new.section.mode,
         "serial_numbers": old.section.serial_numbers != new.section.serial_numbers,
         "supervised": old.section.supervised != new.section.supervised,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from controller.diagnosis.common_start import start_together
 from controller.diagnosis.interleaved_tones import Interleaved, Step, interleaved
 from controller.diagnosis.plate_sensors import PlateSensor, PlateSensors, plate_sensors
 from controller.diagnosis.tone_player import TonePlayer
@@ -16,7 +17,7 @@ from drivers.amplifier import Amplifier
 from drivers.command import DriveCommand
 from drivers.errors import CommandError, CommandRefused
 from drivers.operation.watchdog import HEARTBEAT
-from drivers.protocol.messages import Feature, Reading, ReadingState
+from drivers.protocol.messages import Reading, ReadingState
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.identification.measurement import Measurement, Repeat
@@ -213,25 +214,13 @@ class PlateSelfMeasurement:
             heard = sensor.accelerations(readings[sensor.amplifier], frequencies)
             for era, frequency, acceleration in zip(eras, frequencies, heard, strict=True):
                 played[number[era]] = frequency
-                if self._starts_with(sensor.amplifier, rig.wiring[era].amplifier):
+                plays_it = self._amplifiers[rig.wiring[era].amplifier]
+                if start_together(self._amplifiers[sensor.amplifier], plays_it):
                     command = plays[era]
                     base = command.level * rig.era(era).stroke
                     turned = np.exp(-1j * math.radians(command.phase))
                     responses[row, number[era]] = acceleration * turned / base
         return _Heard(played, responses)
-
-    def _starts_with(self, one: str, other: str) -> bool:
-        """Whether phases of two amplifiers count from one moment: that of a broadcast commit."""
-        if one == other:
-            return True
-        pair = [self._amplifiers[name] for name in (one, other)]
-        buses = {each.bus for each in pair}
-        features = [each.capabilities.features for each in pair]
-        return (
-            len(buses) == 1
-            and None not in buses
-            and all({Feature.BROADCAST, Feature.STAGING} <= {*each} for each in features)
-        )
 
     async def _wait(self, seconds: float) -> None:
         """Wait [s], feeding the watchdogs."""

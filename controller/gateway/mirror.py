@@ -24,7 +24,7 @@ HELLO = "hello"
 """Topic of the gateway: the daemon's `hello` result, null while disconnected."""
 
 _STATEFUL = frozenset(
-    {"state", "contacts", "pattern", "silence", "amplifiers", "latency", "layout"}
+    {"state", "contacts", "pattern", "silence", "amplifiers", "latency", "layout", "plate"}
 )
 _NO_FIELD = bytes(8 + 4)  # no columns, no rows, no frequencies, scale 0
 

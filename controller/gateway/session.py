@@ -46,7 +46,8 @@ _ITERATIONS = 10  # of the event loop, in which the end of a connection is recei
 
 TRY_AGAIN_LATER, UNSUPPORTED_DATA = 1013, 1003  # close codes of RFC 6455 and its registry
 
-_ALL_SENT: frozenset[str] = frozenset({"state", "log", "link"})  # of other topics the latest alone
+# Of other topics the latest alone.
+_ALL_SENT: frozenset[str] = frozenset({"state", "log", "link", "plate"})
 _BUSY = RpcError(ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
 _session_numbers = itertools.count(1)
 _logger = logging.getLogger(__name__)

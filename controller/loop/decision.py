@@ -129,6 +129,12 @@ class Decider:
         """Capabilities of the amplifiers together."""
         return self._capabilities
 
+    def replace_answers(self, table: LocalizationTable, timing: Timing | None) -> None:
+        """Answer by another table of this plate from now on; what plays stays until it changes."""
+        self._table, self._timing = table, timing
+        self._selector.replace(table, None if timing is None else timing.levels)
+        self._builder.replace(timing)
+
     @property
     def contacts(self) -> tuple[Contact, ...]:
         """All contacts in order of arrival."""

@@ -131,6 +131,16 @@ class Controller:
         """Number of touches that could not be contacts, by reason."""
         return self._rejects.counts
 
+    def replace_answers(self, table: LocalizationTable, timing: Timing | None) -> None:
+        """Answer touches by another table of this plate from now on, in one step.
+
+        What plays stays until its contacts change. Prepared by the caller: nothing is computed
+        here.
+        """
+        self._table, self._timing = table, timing
+        if self._decider_if_open is not None:
+            self._decider_if_open.replace_answers(table, timing)
+
     async def open(self) -> None:
         """Open every amplifier, or none, and prepare what they can play; all stay disarmed.
 

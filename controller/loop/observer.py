@@ -20,7 +20,8 @@ class Applied:
     contacts: all, in order of arrival; targets: a prediction for each; quiet: quiet contacts;
     pattern: as it is played, with its ramp and envelopes; drive: what the amplifiers play, by ERA,
     without silent ones; latency [s]: from the touch frame to the last byte of the command on the
-    wire; time [s] of that byte; from_rest: whether the plate was at rest.
+    wire; time [s] of that byte; from_rest: whether the plate was at rest; settled_after [s]: when
+    its last fade or envelope has ended; lasts: whether it plays until its contacts change.
     """
 
     contacts: tuple[Contact, ...]
@@ -31,6 +32,8 @@ class Applied:
     latency: float
     time: float
     from_rest: bool = True
+    settled_after: float = 0.0
+    lasts: bool = True
     question: Question | None = field(default=None, repr=False)
     timing: Timing | None = field(default=None, repr=False, compare=False)
 
@@ -83,6 +86,8 @@ def applied_by(
         latency=sent_at - decision.triggered_at,
         time=sent_at,
         from_rest=decision.from_rest,
+        settled_after=0.0 if decision.sets is None else decision.sets.settled_after,
+        lasts=all(target.pulse is None for _, target in decision.selection.targets),
         question=decision.selection.question,
         timing=timing,
     )

@@ -81,6 +81,10 @@ class SetBuilder:
         self._fade_ramp = min(FADE_RAMP, self._ramp_max)
         self._token = random_token()
 
+    def replace(self, timing: Timing | None) -> None:
+        """Shape by another timing from now on."""
+        self._timing = timing
+
     def build_pattern(
         self,
         pattern: Pattern,

@@ -87,6 +87,10 @@ class Selector:
         self._levels = levels
         self._current = Selection((), (), None, None)
 
+    def replace(self, table: LocalizationTable, levels: EffectLevels | None) -> None:
+        """Answer by another table of this plate; the selection stays until its contacts change."""
+        self._table, self._levels = table, levels
+
     def select(
         self,
         contacts: Sequence[Contact],

@@ -14,7 +14,13 @@ from prometheus_client.core import (
 from prometheus_client.registry import Collector
 
 from controller.api.methods import StatusResult
-from controller.api.schema import AmplifierStatus, DaemonStateName, LatencySummary
+from controller.api.schema import (
+    AmplifierStatus,
+    DaemonStateName,
+    LatencySummary,
+    LearningStateName,
+    LearningSummary,
+)
 
 _LINK_COUNTS = {
     "frames_out": "Frames sent to an amplifier.",
@@ -85,6 +91,8 @@ def metrics_of(status: StatusResult) -> Iterator[Metric]:
         rejected.add_metric([reason], count)
     yield rejected
     yield _latency(status.latency_ms)
+    if status.learning is not None:
+        yield from _learning(status.learning)
     yield from _amplifiers(status.amplifiers)
 
 
@@ -92,7 +100,46 @@ def _gauge(name: str, text: str, value: float) -> Metric:
     return GaugeMetricFamily(name, text, value=value)
 
 
+def _learning(learning: LearningSummary) -> Iterator[Metric]:
+    """What is learned of the plate."""
+    state = GaugeMetricFamily(
+        "era_learning_state", "1 for what happens to measured patterns.", labels=["state"]
+    )
+    for name in get_args(LearningStateName):
+        state.add_metric([name], float(name == learning.state))
+    yield state
+    yield _gauge(
+        "era_robust_answers",
+        "Whether answers are those of a plate that is not known.",
+        float(learning.robust),
+    )
+    for name, text, count in (
+        ("readings", "Settled patterns that were measured.", learning.readings),
+        ("estimates", "Of these, by the estimator.", learning.estimates),
+        ("discarded_readings", "Of these, not estimated.", learning.discarded),
+        ("corrections", "Corrections of the answers.", learning.corrections),
+        ("plate_alarms", "Patterns that show another plate than known.", learning.alarms),
+        ("estimator_restarts", "Restarts of the estimator.", learning.restarts),
+    ):
+        yield CounterMetricFamily(f"era_{name}", text, value=count)
+    if learning.last_estimate_s is not None:
+        yield _gauge(
+            "era_estimate_age_seconds", "Time since the last estimate.", learning.last_estimate_s
+        )
+    yield _histogram(
+        "era_reading_to_answers_seconds",
+        "From the end of a measurement to the answers that follow it.",
+        learning.latency_ms,
+    )
+
+
 def _latency(latency: LatencySummary) -> Metric:
+    return _histogram(
+        "era_touch_to_wire_seconds", "From a touch to the last byte of the command.", latency
+    )
+
+
+def _histogram(name: str, text: str, latency: LatencySummary) -> Metric:
     """The histogram in seconds, without its unknown sum."""
     *edges, last = latency.histogram
     sums = accumulate(count for _, count in edges)
@@ -101,12 +148,7 @@ def _latency(latency: LatencySummary) -> Metric:
     ]
     # The last count includes values above the last edge.
     buckets.append(("+Inf", sum(count for _, count in edges) + float(last[1])))
-    return HistogramMetricFamily(
-        "era_touch_to_wire_seconds",
-        "From a touch to the last byte of the command.",
-        buckets=buckets,
-        sum_value=None,
-    )
+    return HistogramMetricFamily(name, text, buckets=buckets, sum_value=None)
 
 
 def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:

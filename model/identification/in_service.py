@@ -162,6 +162,10 @@ class LivePlate:
         """The rig that parameters count from."""
         return self._before
 
+    def known_since(self, time: float) -> None:
+        """Note that the state is that of a time [s], from which it has drifted since."""
+        self._time = time
+
     def take(self, pattern: SettledPattern) -> Report:
         """Take a settled pattern: update the state, or hold it and explain what happened."""
         touched = Touched.of(self._model, pattern, self._priors.finger, noise=self._noise.relative)

@@ -16,6 +16,10 @@ _TYPES = {"header": "|u1", "x": "<f8", "covariance": "<f8", "digest": "|u1"}
 _MAX_BYTES = 1 << 24
 
 
+class OtherPlate(InputError):
+    """A learned plate of another table, or of other parameters."""
+
+
 @dataclass(frozen=True, eq=False)
 class LearnedPlate:
     """A state of parameters by name, counted from a rig; table, base: fingerprints of both."""
@@ -47,10 +51,10 @@ def save_learned(learned: LearnedPlate, file: Path) -> None:
     )
 
 
-def load_learned(file: Path, *, table: str) -> LearnedPlate:
-    """Read a learned plate of a table by its fingerprint.
+def load_learned(file: Path, *, table: str | None = None) -> LearnedPlate:
+    """Read a learned plate of a table by its fingerprint, or of any.
 
-    Raises InputError for a damaged file, another version or another table.
+    Raises InputError for a damaged file or another version, OtherPlate for another table.
     """
     try:
         arrays = read_arrays(file, _TYPES, max_bytes=_MAX_BYTES)
@@ -67,8 +71,8 @@ def load_learned(file: Path, *, table: str) -> LearnedPlate:
     p = len(names)
     if version != _VERSION or x.shape != (p,) or covariance.shape != (p, p):
         raise InputError(f"{file}: version must be {_VERSION}; remove the file to learn anew")
-    if found.table != table:
-        raise InputError(
+    if table is not None and found.table != table:
+        raise OtherPlate(
             f"{file}: must be learned for this table, got one of another rig; remove the file to "
             "learn anew"
         )

@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
-from model.errors import InputError
 from model.identification.in_service import Known, LivePlate, Report, widest
-from model.identification.learned_file import LearnedPlate, load_learned, save_learned
+from model.identification.learned_file import LearnedPlate, OtherPlate, load_learned, save_learned
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig, physics_fingerprint
 from model.table.live_table import table_following
@@ -44,14 +43,15 @@ class LearnedTable:
     def resumed(cls, table: LocalizationTable, known: Known, *, file: Path) -> Self:
         """A table with what was learned of it before, if its file is there.
 
-        Raises InputError for a file of another table or of other parameters.
+        Raises InputError for a file that is none, OtherPlate for one of another table or of other
+        parameters.
         """
         if not file.exists():
             return cls(table, known, file=file)
         learned = load_learned(file, table=table.fingerprint)
         space = known.model.space
         if learned.names != space.names or learned.base != physics_fingerprint(known.before):
-            raise InputError(
+            raise OtherPlate(
                 f"{file}: parameters must be those of this rig and its sensors; remove the file to "
                 "learn anew"
             )

@@ -161,8 +161,11 @@ class LocalizationTable:
         )
         return choose_pattern(question, drive_mode, candidates)
 
-    def prepare(self, drive_mode: str | None = None) -> None:
-        """Compute ahead what the first query in a drive mode needs."""
+    def prepare(self, drive_mode: str | None = None, *, with_ringing: bool = True) -> None:
+        """Compute ahead what the first query in a drive mode needs.
+
+        with_ringing: of short effects, too, which takes three times as long as all else.
+        """
         centre = (self.plate.length / 2, self.plate.width / 2)
         for quiet in ((), ((0.0, 0.0),)):
             self.query(
@@ -170,8 +173,12 @@ class LocalizationTable:
             )
         if (drive_mode or self.drive_mode) != "switched":
             _ = self.onsets  # used only where several patterns are near the best
-            for duration in EFFECT_DURATIONS:
+            for duration in EFFECT_DURATIONS if with_ringing else ():
                 self._ringing(duration)
+
+    def inherit_ringing(self, other: "LocalizationTable") -> None:
+        """Take what is prepared of ringing from a table of nearly the same plate."""
+        self._ringings.update(other._ringings)
 
     def forms(self, question: Question) -> Forms:
         """Expected powers at the fingertips of a question, at all frequencies of the table."""

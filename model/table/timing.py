@@ -19,11 +19,18 @@ class Timing:
     levels: of vibrations of limited duration.
     """
 
-    def __init__(self, table: LocalizationTable) -> None:
+    def __init__(self, table: LocalizationTable, *, shaper: Shaper | None = None) -> None:
         self._table, self._eras = table, table.eras
         self.levels: EffectLevels | None = EffectLevels(table)
         variance = table.uncertainty.gain_variance
-        self._shaper = Shaper(table.in_time, gain_variance=variance)
+        self._shaper = shaper or Shaper(table.in_time, gain_variance=variance)
+
+    def following(self, table: LocalizationTable) -> "Timing":
+        """The timing of a table that has followed its plate, with envelopes as shaped for this one.
+
+        Nothing need be prepared anew.
+        """
+        return Timing(table, shaper=self._shaper)
 
     def prepare(self, frequencies: Iterable[float]) -> None:
         """Compute ahead what shaping needs at frequencies [Hz]."""

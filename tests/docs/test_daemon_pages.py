@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from controller.daemon.api_views import learning_summary
 from controller.daemon.config_sections import (
     CalibrationSection,
     DaemonSection,
@@ -13,6 +14,7 @@ from controller.daemon.config_sections import (
     LogSection,
     TouchSection,
 )
+from controller.learning.learning_status import LearningStatus
 from controller.metrics.collector import exposition
 from daemon_bench import running_daemon, until_state
 from model.config.sections import Section
@@ -63,7 +65,10 @@ async def test_every_metric_is_on_its_page(tmp_path: Path) -> None:
         "predicted_felt_contrast_db": 20.0,
         "predicted_level_db_sl": 20.0,
     }
-    touched = status.model_copy(update={**playing, "rejected_touches": {"off_plate": 1}})
+    learning = learning_summary(LearningStatus(last_at=1.0), status.latency_ms, now=2.0)
+    touched = status.model_copy(
+        update={**playing, "rejected_touches": {"off_plate": 1}, "learning": learning}
+    )
     served = []
     for family in text_string_to_metric_families(exposition(touched).decode()):
         name = family.name + ("_total" if family.type == "counter" else "")

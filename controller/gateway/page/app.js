@@ -6,7 +6,7 @@ import { Fingers } from "./fingers.js";
 import { fixed, PlateOverlay } from "./plate.js";
 import { addEvent, annotate, showAmplifiers, showEffects, showLatency, STATES, timeOfDay } from "./side.js";
 
-const TOPICS = ["hello", "state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "field"];
+const TOPICS = ["hello", "state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "plate", "field"];
 const LEASE_S = 5;
 const TOKEN_KEY = "era-haptics-token";
 const DISARMED = ["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"];
@@ -228,6 +228,12 @@ const HANDLERS = {
   latency({ latency_ms, ramp_only_reason }) {
     showLatency(at("latency-numbers"), at("latency"), latency_ms);
     at("plain").textContent = ramp_only_reason ? `Plain ramps instead of shaped onsets: ${ramp_only_reason}` : "";
+  },
+  plate({ state, cause, remedy, robust }) {
+    const isBad = robust || state === "failed" || state === "restarting";
+    at("known").textContent = `Plate ${state.replace("_", " ")}: ${cause}`;
+    at("known").classList.toggle("bad", isBad);
+    if (isBad || state === "explaining") addEvent(log, "warning", cause, remedy);
   },
   log({ level, message, cause, remedy }) {
     addEvent(log, level, cause ? `${message}: ${cause}` : message, remedy);

@@ -1,0 +1,59 @@
+"""The answers that the control loop gives, and their replacement in one step.
+
+A replacement is prepared before: by the estimator, and here, a frequency at a time, the onsets and
+endings, whose shapes are taken over from the answers before until then.
+"""
+
+import asyncio
+
+from controller.learning.messages import Answers
+from controller.loop.loop import Controller
+from model.errors import InputError
+from model.table.table import LocalizationTable
+from model.table.timing import Timing
+
+_PAUSE = 0.02  # s; between frequencies, which take a millisecond or two each
+
+
+class AnswersInUse:
+    """The answers of a controller; table, timing: of the rig as built, with which it starts."""
+
+    def __init__(
+        self, controller: Controller, table: LocalizationTable, timing: Timing | None
+    ) -> None:
+        self._controller = controller
+        self._base, self._base_timing = table, timing
+        self._fingerprint = table.fingerprint
+        self.table, self._timing = table, timing
+
+    def replace(self, answers: Answers) -> None:
+        """Answer by a corrected table from now on; raises InputError for one of another table."""
+        if answers.base != self._fingerprint:
+            raise InputError(
+                f"answers must be those of table {self._fingerprint}, got {answers.base}"
+            )
+        if not answers.is_complete:
+            answers.table.inherit_ringing(self.table)
+        timing = None if self._timing is None else self._timing.following(answers.table)
+        self._use(answers.table, timing)
+
+    def reset(self) -> None:
+        """Answer by the table as built from now on."""
+        self._use(self._base, self._base_timing)
+
+    async def shape_anew(self) -> None:
+        """Shape onsets and endings for the present table, while nothing is on its way."""
+        table = self.table
+        timing = None if self._timing is None else Timing(table)
+        if timing is None:
+            return
+        frequencies = table.frequencies.tolist()
+        while frequencies:
+            if not self._controller.is_preparing:
+                timing.prepare([frequencies.pop()])
+            await asyncio.sleep(_PAUSE)
+        self._use(self.table, timing.following(self.table))
+
+    def _use(self, table: LocalizationTable, timing: Timing | None) -> None:
+        self.table, self._timing = table, timing
+        self._controller.replace_answers(table, timing)

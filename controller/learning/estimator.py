@@ -1,0 +1,217 @@
+"""The estimator: settled patterns in, answers of the plate as it is known now out.
+
+    python -m controller.learning.estimator
+
+A process of its own, at a lower priority, so that the control loop does not wait for it. It reads
+messages from standard input and ends with it.
+"""
+
+import contextlib
+import os
+import pickle
+import select
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from controller.diagnosis.interleaved_tones import settling
+from controller.learning.messages import (
+    HEAD,
+    Answers,
+    Estimate,
+    Note,
+    Ready,
+    Refreshed,
+    Reply,
+    Request,
+    Start,
+    packed,
+)
+from model.errors import InputError
+from model.identification.in_service import Known
+from model.identification.learned_file import OtherPlate
+from model.identification.learned_table import LearnedTable
+from model.identification.settled import SettledPattern
+from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
+from model.table.live_table import table_following
+from model.table.table import LocalizationTable
+
+_NICE = 10  # above that of the daemon, whose loop comes first
+_SAVE_INTERVAL, _REFRESH_INTERVAL = 10.0, 60.0  # s
+_IDENTIFIED = 0.5  # of the thickness error of a plate that was not measured
+
+
+class Estimator:
+    """A table in service, and when it is kept and prepared whole; raises InputError.
+
+    now: the clock of both [s].
+    """
+
+    def __init__(self, start: Start, *, now: Callable[[], float] = time.monotonic) -> None:
+        self._start, self._now = start, now
+        self._base = start.table.fingerprint
+        self.only_alarms = why_only_alarms(start.rig)
+        known = Known.of_rig(start.rig, start.sensors)
+        if self.only_alarms:
+            known = replace(known, is_explained=False)
+        self.note = ""
+        try:
+            self._learned = LearnedTable.resumed(start.table, known, file=start.file)
+            if self._learned.current is not start.table:
+                age = max(time.time() - start.file.stat().st_mtime, 0.0)
+                self._learned.live.known_since(now() - age)
+        except OtherPlate as error:
+            self.note = str(error)
+            self._learned = LearnedTable(start.table, known, file=start.file)
+        self._saved_at = self._refreshed_at = now()
+        self._is_saved = self._is_refreshed = True
+
+    def ready(self) -> Ready:
+        """What it starts with."""
+        learned, table = self._learned, self._start.table
+        low, high = float(table.frequencies[0]), float(table.frequencies[-1])
+        is_resumed = learned.current is not table
+        return Ready(
+            settling(self._start.rig, (low, high)),
+            self.note,
+            self.only_alarms,
+            self._prepared(learned.current, whole=True) if is_resumed else None,
+            self._robust(),
+        )
+
+    def take(self, pattern: SettledPattern) -> Estimate:
+        """Take a pattern."""
+        found = self._learned.take(pattern)
+        report, table = found.report, found.table
+        if table is not None:
+            self._is_saved = self._is_refreshed = False
+        return Estimate(
+            pattern.time,
+            report.alarm,
+            report.is_held,
+            "" if report.explanation is None else str(report.explanation),
+            self._learned.has_changed,
+            None if table is None else self._prepared(table, whole=False),
+        )
+
+    @property
+    def next_chore(self) -> float | None:
+        """When [s] something is to be saved or prepared; None for never."""
+        moments = [
+            *(() if self._is_saved else (self._saved_at + _SAVE_INTERVAL,)),
+            *(() if self._is_refreshed else (self._refreshed_at + _REFRESH_INTERVAL,)),
+        ]
+        return min(moments, default=None)
+
+    def do_chore(self) -> Refreshed | Note | None:
+        """Save what was learned, or prepare answers whole, where that is due."""
+        now = self._now()
+        if not self._is_saved and now >= self._saved_at + _SAVE_INTERVAL:
+            return self.save()
+        if self._is_refreshed or now < self._refreshed_at + _REFRESH_INTERVAL:
+            return None
+        self._refreshed_at, self._is_refreshed = now, True
+        return Refreshed(self._prepared(self._learned.current, whole=True), self._robust())
+
+    def save(self) -> Note | None:
+        """Write what was learned; where that fails, say so, and try again later."""
+        self._saved_at = self._now()
+        try:
+            if not self._is_saved:
+                self._learned.save()
+        except OSError as error:
+            return Note(f"{self._start.file}: not written: {error}")
+        self._is_saved = True
+        return None
+
+    def _prepared(self, table: LocalizationTable, *, whole: bool) -> Answers:
+        # Of its own, not the one that the next correction starts from.
+        table = replace(table)
+        table.prepare(self._start.drive_mode, with_ringing=whole)
+        _ = table.in_time
+        return Answers(self._base, table, whole)
+
+    def _robust(self) -> Answers:
+        wide = table_following(self._start.table, self._learned.cautious_rig)
+        return self._prepared(wide, whole=False)
+
+
+def why_only_alarms(rig: Rig) -> str:
+    """Why patterns may not correct answers of a rig, or nothing.
+
+    Corrections of a plate that was never measured would put its form errors into other parameters.
+    """
+    stated, built = rig.uncertainty.thickness, Uncertainty().thickness
+    if not stated:
+        return "the rig's uncertainty takes its thickness as known exactly"
+    if stated > _IDENTIFIED * built:
+        return (
+            f"the rig's uncertainty of thickness must be at most {100 * _IDENTIFIED * built:g} %, "
+            f"that of a plate that was measured, got {100 * stated:g} %"
+        )
+    return ""
+
+
+def _main() -> None:
+    with contextlib.suppress(OSError):
+        os.nice(_NICE)
+    output = os.fdopen(os.dup(1), "wb", buffering=0)
+    os.dup2(2, 1)  # for what a plugin prints
+
+    def send(message: Reply) -> None:
+        left = memoryview(packed(message))
+        while left:
+            left = left[output.write(left) or 0 :]
+
+    start = _read()
+    if not isinstance(start, Start):
+        return
+    try:
+        estimator = Estimator(start)
+        send(estimator.ready())
+    except InputError as error:
+        send(Note(str(error), is_final=True))
+        return
+    try:
+        while True:
+            due = estimator.next_chore
+            if _has_input(None if due is None else max(0.0, due - time.monotonic())):
+                pattern = _read()
+                if not isinstance(pattern, SettledPattern):
+                    return
+                send(estimator.take(pattern))
+            elif (done := estimator.do_chore()) is not None:
+                send(done)
+    except BrokenPipeError:
+        return
+    finally:
+        estimator.save()
+
+
+def _has_input(timeout: float | None) -> bool:
+    return bool(select.select([0], [], [], timeout)[0])
+
+
+def _read() -> Request | None:
+    """The next request; None at the end of the input."""
+    head = _read_exactly(HEAD)
+    if head is None:
+        return None
+    content = _read_exactly(int.from_bytes(head, "big"))
+    request: Request | None = None if content is None else pickle.loads(content)  # noqa: S301  of our own program
+    return request
+
+
+def _read_exactly(count: int) -> bytes | None:
+    content = bytearray()
+    while len(content) < count:
+        piece = os.read(0, count - len(content))
+        if not piece:
+            return None
+        content += piece
+    return bytes(content)
+
+
+if __name__ == "__main__":
+    _main()

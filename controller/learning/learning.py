@@ -1,0 +1,319 @@
+"""The daemon's plate stays known: patterns that settle correct the answers to the next touches.
+
+    control loop -> pattern -> SettledReadings -> EstimatorProcess -> table -> control loop
+
+The control loop never waits for any of this, and stops do not pass through it. Answers are replaced
+in one step, whole and prepared. Without an estimator they stay as they were, for a while.
+"""
+
+import asyncio
+import logging
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from controller.diagnosis.common_start import check_common_start
+from controller.diagnosis.plate_sensors import PlateSensor, plate_sensors
+from controller.learning.answers_in_use import AnswersInUse
+from controller.learning.estimator_process import (
+    DEFAULT_TIMEOUTS,
+    EstimatorProcess,
+    EstimatorTimeouts,
+)
+from controller.learning.learning_status import LearningState, LearningStatus
+from controller.learning.messages import Answers, Estimate, Note, Ready, Refreshed, Start
+from controller.learning.settled_readings import SettledReadings
+from controller.loop.loop import Controller
+from controller.loop.observer import Applied, Observer, Silenced
+from controller.sources.contacts import Change, Contact
+from drivers import clock
+from drivers.amplifier import Amplifier
+from drivers.errors import CommandError, DriverError
+from model.identification.settled import SettledPattern
+from model.rig.rig import Rig
+from model.table.table import LocalizationTable
+from model.table.timing import Timing
+from registry.plugins import failure_text
+
+ROBUST_AFTER = 60.0
+"""Time [s] without an estimator after which answers no longer trust what was learned."""
+
+_CHANGED_REMEDY = (
+    "look for a loose mount, a crack or something on the plate; then identify it (era rig identify)"
+    ", or discard what was learned (era forget)"
+)
+_FAILED_REMEDY = "see the log above; era forget starts anew"
+
+_logger = logging.getLogger(__name__)
+
+
+class Learning:
+    """Learning of one plate, from `open` on, when all amplifiers are open, until `close`.
+
+    table, timing: of the rig as built; file: of what is learned; changed: called at each change of
+    state or cause; estimated: with the time [s] from the end of a reading to the answers that
+    follow it.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        table: LocalizationTable,
+        timing: Timing | None,
+        file: Path,
+        *,
+        amplifiers: Mapping[str, Amplifier],
+        controller: Controller,
+        changed: Callable[[LearningStatus], None] = lambda status: None,
+        estimated: Callable[[float], None] = lambda latency: None,
+        timeouts: EstimatorTimeouts = DEFAULT_TIMEOUTS,
+    ) -> None:
+        self.status = LearningStatus()
+        self._rig, self._base, self._file = rig, table, file
+        self._amplifiers, self._controller = amplifiers, controller
+        self._changed, self._estimated, self._timeouts = changed, estimated, timeouts
+        self._answers = AnswersInUse(controller, table, timing)
+        self._robust: Answers | None = None
+        self._sensors: Sequence[PlateSensor] = ()
+        self._readings: SettledReadings | None = None
+        self._estimator: EstimatorProcess | None = None
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._outage: asyncio.TimerHandle | None = None
+
+    @property
+    def estimator_pid(self) -> int | None:
+        """Process number of the estimator, if one runs."""
+        return None if self._estimator is None else self._estimator.pid
+
+    def contacts_changed(self, contacts: tuple[Contact, ...]) -> None:
+        """Follow the contacts on the plate."""
+        if self._readings is not None:
+            self._readings.contacts_changed(contacts)
+
+    def pattern_applied(self, applied: Applied) -> None:
+        """Follow a pattern that plays."""
+        if self._readings is not None:
+            self._readings.pattern_applied(applied)
+
+    def ended(self) -> None:
+        """Note that nothing plays any more."""
+        if self._readings is not None:
+            self._readings.ended()
+
+    def open(self) -> None:
+        """Start once the amplifiers are open; they are asked again after a failure."""
+        if self._estimator is None and "opening" not in self._tasks:
+            self._spawn("opening", self._open())
+
+    async def forget(self) -> None:
+        """Discard what was learned; answers are those of the table as built at once.
+
+        Raises CommandError where nothing is learned.
+        """
+        if self.status.state is LearningState.OFF:
+            raise CommandError(f"nothing is learned of the plate: {self.status.cause}")
+        await self._end("opening", "estimator", "readings", "shaping")
+        self._estimator, self._readings, self._robust = None, None, None
+        self._note_lost(waiting=0)
+        self._file.unlink(missing_ok=True)
+        self._reset()
+        self._start()
+
+    async def close(self) -> None:
+        """End the estimator, which keeps what it has learned."""
+        if self._outage is not None:
+            self._outage.cancel()
+        await self._end(*self._tasks)
+
+    async def _open(self) -> None:
+        """Ask the amplifiers for their sensors, and start an estimator where they have some."""
+        try:
+            check_common_start(self._amplifiers)
+            self._sensors = (await plate_sensors(self._rig, self._amplifiers)).used
+        except CommandError as error:
+            self._say(LearningState.OFF, str(error))
+            return
+        except DriverError as error:
+            _logger.info("plate: sensors not read: %s", error)
+            return
+        self._start()
+
+    def _start(self) -> None:
+        self._say(LearningState.STARTING, "the estimator is starting")
+        start = Start(
+            self._rig,
+            replace(self._base),  # without what is prepared in it
+            tuple(sensor.place for sensor in self._sensors),
+            self._controller.drive_mode,
+            self._file.absolute(),
+        )
+        self._estimator = EstimatorProcess(
+            start, received=self._received, failed=self._failed, timeouts=self._timeouts
+        )
+        self._spawn("estimator", self._estimator.run())
+
+    def _received(self, reply: Ready | Estimate | Refreshed | Note) -> None:
+        match reply:
+            case Ready():
+                self._ready(reply)
+            case Estimate():
+                self._take(reply)
+            case Refreshed():
+                self._robust = reply.robust
+                if not self.status.are_robust and self.status.state is LearningState.FOLLOWING:
+                    self._correct(reply.answers)
+            case Note():
+                _logger.warning("plate: %s", reply.text)
+
+    def _ready(self, ready: Ready) -> None:
+        if self._outage is not None:
+            self._outage.cancel()
+            self._outage = None
+        if ready.note:
+            _logger.warning("plate: learning anew: %s", ready.note)
+        self._robust = ready.robust
+        if ready.answers is not None:
+            self._correct(ready.answers)
+        elif self.status.are_robust:
+            self._reset()
+        if self._readings is None:
+            self._readings = SettledReadings(
+                self._rig,
+                self._amplifiers,
+                self._sensors,
+                settling=ready.settling,
+                take=self._hand,
+            )
+            self._spawn("readings", self._readings.run())
+        if ready.only_alarms:
+            self._say(
+                LearningState.ONLY_ALARMS,
+                f"answers stay as built: {ready.only_alarms}",
+                "identify the plate (era rig identify)",
+            )
+        else:
+            known = "what was learned before" if ready.answers else "the rig as built"
+            self._say(LearningState.FOLLOWING, f"the plate is followed from {known} on")
+
+    def _hand(self, pattern: SettledPattern) -> None:
+        is_taken = self._estimator is not None and self._estimator.hand(pattern)
+        self._count(readings=1, discarded=0 if is_taken else 1)
+
+    def _take(self, estimate: Estimate) -> None:
+        self.status = replace(self.status, last_at=clock.now())
+        self._count(estimates=1)
+        if estimate.alarm:
+            self._count(alarms=1)
+        if estimate.answers is not None:
+            self._correct(estimate.answers, are_robust=estimate.has_changed)
+            self._estimated(clock.now() - estimate.time)
+        if estimate.has_changed:
+            if estimate.explanation:
+                self._say(LearningState.CHANGED, estimate.explanation, _CHANGED_REMEDY)
+        elif estimate.explanation:
+            self._say(LearningState.FOLLOWING, f"the plate has changed: {estimate.explanation}")
+        elif estimate.is_held:
+            if self.status.state is not LearningState.EXPLAINING:
+                cause = "the plate is not as known; the next patterns tell what has changed"
+                self._say(LearningState.EXPLAINING, cause)
+        elif estimate.alarm:
+            cause = f"the plate is not as the rig says (alarm {self.status.alarms})"
+            self._say(self.status.state, cause, self.status.remedy)
+
+    def _reset(self) -> None:
+        self._answers.reset()
+        self.status = replace(self.status, are_robust=False)
+
+    def _correct(self, answers: Answers, *, are_robust: bool = False) -> None:
+        self._answers.replace(answers)
+        self.status = replace(self.status, are_robust=are_robust)
+        self._count(corrections=1)
+        if answers.is_complete:
+            self._spawn("shaping", self._answers.shape_anew())
+
+    def _note_lost(self, *, waiting: int) -> None:
+        """Count readings that will not be estimated, but for those that wait."""
+        status = self.status
+        lost = status.readings - status.estimates - status.discarded - waiting
+        self._count(discarded=max(lost, 0))
+
+    def _failed(self, reason: str, is_final: bool) -> None:
+        """Note that an estimator has ended."""
+        self._note_lost(waiting=0 if self._estimator is None else self._estimator.waiting)
+        if self._outage is None:
+            loop = asyncio.get_running_loop()
+            self._outage = loop.call_later(ROBUST_AFTER, self._answer_robustly)
+        if is_final:
+            self._say(LearningState.FAILED, f"estimator: {reason}", _FAILED_REMEDY)
+        else:
+            self._count(restarts=1)
+            self._say(LearningState.RESTARTING, f"estimator: {reason}; retrying")
+
+    def _answer_robustly(self) -> None:
+        """Trust what was learned no longer, since nobody watches the plate."""
+        if self._robust is None or self.status.are_robust:
+            return
+        self._correct(self._robust, are_robust=True)
+        _logger.warning("plate: no estimator for %g s, answers are robust ones", ROBUST_AFTER)
+        self._changed(self.status)
+
+    def _say(self, state: LearningState, cause: str, remedy: str | None = None) -> None:
+        """Note a state, and tell of it."""
+        self.status = replace(self.status, state=state, cause=cause, remedy=remedy)
+        level = logging.WARNING if state.is_bad else logging.INFO
+        _logger.log(level, "plate: %s: %s", state.value, cause, extra={"topic": "plate"})
+        self._changed(self.status)
+
+    def _count(self, **counts: int) -> None:
+        now = {key: getattr(self.status, key) + more for key, more in counts.items()}
+        self.status = replace(self.status, **now)
+
+    def _spawn(self, name: str, work: Coroutine[Any, Any, None]) -> None:
+        """Run work in the only task of a name; the daemon goes on if it fails."""
+        if name in self._tasks:
+            self._tasks[name].cancel()
+        task = asyncio.create_task(self._guarded(name, work), name=f"plate {name}")
+        self._tasks[name] = task
+        task.add_done_callback(
+            lambda done: self._tasks.pop(name) if self._tasks.get(name) is done else None
+        )
+
+    async def _guarded(self, name: str, work: Coroutine[Any, Any, None]) -> None:
+        try:
+            await work
+        except Exception as error:
+            _logger.exception("plate: %s failed", name)
+            self._say(LearningState.FAILED, failure_text(error), _FAILED_REMEDY)
+
+    async def _end(self, *names: str) -> None:
+        ending = [self._tasks[name] for name in names if name in self._tasks]
+        for task in ending:
+            task.cancel()
+        await asyncio.gather(*ending, return_exceptions=True)
+
+
+def observed(observer: Observer, learning: Callable[[], Learning | None]) -> Observer:
+    """An observer of the control loop that is called first, and then the learning, if any."""
+
+    def contacts_changed(contacts: tuple[Contact, ...], change: Change) -> None:
+        observer.contacts_changed(contacts, change)
+        if (learns := learning()) is not None:
+            learns.contacts_changed(contacts)
+
+    def pattern_applied(applied: Applied) -> None:
+        observer.pattern_applied(applied)
+        if (learns := learning()) is not None:
+            learns.pattern_applied(applied)
+
+    def silenced(silenced: Silenced) -> None:
+        observer.silenced(silenced)
+        if (learns := learning()) is not None:
+            learns.ended()
+
+    return replace(
+        observer,
+        contacts_changed=contacts_changed,
+        pattern_applied=pattern_applied,
+        silenced=silenced,
+    )

@@ -1,0 +1,105 @@
+"""Messages between the daemon and its estimator, in Python's pickle format.
+
+A message is its length, 8 bytes, and its pickle. Both sides are the same program, and nobody else
+has their pipes.
+"""
+
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+from model.identification.forward import Sensor
+from model.identification.settled import SettledPattern
+from model.rig.rig import Rig
+from model.table.table import LocalizationTable
+
+HEAD = 8
+"""Bytes of a message's length."""
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """What an estimator starts from.
+
+    table: of the rig as built, never changed; sensors: where readings are from; drive_mode: of the
+    questions that answers are prepared for; file: of what is learned.
+    """
+
+    rig: Rig
+    table: LocalizationTable
+    sensors: tuple[Sensor, ...]
+    drive_mode: str
+    file: Path
+
+
+@dataclass(frozen=True, eq=False)
+class Answers:
+    """A table in place of the one that it corrects, prepared for its first touch.
+
+    base: fingerprint of the table that it corrects; is_complete: whether the ringing of short
+    effects is that of this plate, too.
+    """
+
+    base: str
+    table: LocalizationTable
+    is_complete: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Ready:
+    """The estimator takes patterns.
+
+    settling [s]: until the plate has settled; note: why it starts anew although there is a file, or
+    nothing; only_alarms: why it does not correct answers, or nothing; answers: those of the plate
+    as learned before, None for the table as built; robust: for when the plate is not known.
+    """
+
+    settling: float
+    note: str
+    only_alarms: str
+    answers: Answers | None
+    robust: Answers
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What a pattern has shown.
+
+    time [s]: of the pattern; alarm: whether the plate is not as known; is_held: whether answers
+    wait for an explanation; explanation: what has changed, where that was found now; has_changed:
+    whether the plate has changed in a way that nothing known explains; answers: None for the same.
+    """
+
+    time: float
+    alarm: bool
+    is_held: bool
+    explanation: str
+    has_changed: bool
+    answers: Answers | None
+
+
+@dataclass(frozen=True, eq=False)
+class Refreshed:
+    """Answers prepared whole while nothing was to be done, and robust ones of that plate."""
+
+    answers: Answers
+    robust: Answers
+
+
+@dataclass(frozen=True)
+class Note:
+    """For the log; is_final: why the estimator cannot work."""
+
+    text: str
+    is_final: bool = False
+
+
+Request: TypeAlias = Start | SettledPattern
+Reply: TypeAlias = Ready | Estimate | Refreshed | Note
+
+
+def packed(message: Request | Reply) -> bytes:
+    """A message with its length."""
+    content = pickle.dumps(message, protocol=5)
+    return len(content).to_bytes(HEAD, "big") + content

@@ -1,0 +1,183 @@
+"""Reads the sensors of the plate once in every pattern that has settled.
+
+A pattern has settled some time after its last fade and after the last change of the contacts. What
+plays is never delayed for a reading: its requests go last on the line, and none is sent while
+contacts change. A renewal or an ending that is added disturbs a reading, which is then repeated.
+"""
+
+import asyncio
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from controller.diagnosis.plate_sensors import PlateSensor
+from controller.loop.observer import Applied
+from controller.sources.contacts import Contact
+from drivers import clock
+from drivers.amplifier import Amplifier
+from drivers.errors import DriverError
+from drivers.protocol.messages import Reading, ReadingState
+from model.identification.forward import RestingFinger
+from model.identification.settled import SettledPattern
+from model.rig.rig import Rig
+
+WINDOW = 0.2  # s; of a reading, as in an identification
+READINGS = 4  # of one pattern, at most, where others are disturbed
+_MOVED = 0.003  # m; a finger that has moved by less loads the plate as before
+_MARGIN = 0.002  # s; of the amplifiers' clocks
+_PERIODS = 1.01  # of a tone within a window, for frequencies as amplifiers round them
+_PAUSE_AFTER_FAILURE = 10.0  # s
+
+_logger = logging.getLogger(__name__)
+
+
+class SettledReadings:
+    """Follows what the control loop reports, and reads it.
+
+    sensors: of amplifiers, by name, that start together; settling [s]: of the plate; take: receives
+    each pattern with what was read of it, at the time [s] when the window ended.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        amplifiers: Mapping[str, Amplifier],
+        sensors: Sequence[PlateSensor],
+        *,
+        settling: float,
+        take: Callable[[SettledPattern], None],
+    ) -> None:
+        self._rig, self._amplifiers, self._sensors = rig, amplifiers, sensors
+        self._settling, self._take = settling, take
+        self._highest = min(sensor.frequency_max for sensor in sensors)
+        self._contacts: tuple[Contact, ...] = ()
+        self._settled_contacts: tuple[Contact, ...] = ()
+        self._playing: Applied | None = None
+        self._due = math.inf
+        self._change = asyncio.Event()
+        self.discarded = 0
+        """Readings that a change, an overload or the link has spoilt."""
+
+    def pattern_applied(self, applied: Applied) -> None:
+        """Follow a pattern that the amplifiers have confirmed, if it can be read."""
+        frequencies = {command.frequency for command in applied.drive.values()}
+        is_read = applied.lasts and len(frequencies) == 1 and max(frequencies) <= self._highest
+        self._playing = applied if is_read else None
+        self._contacts = applied.contacts
+        self._wait_for(applied.time + applied.settled_after)
+
+    def contacts_changed(self, contacts: tuple[Contact, ...]) -> None:
+        """Follow the contacts; where they load the plate otherwise it settles anew."""
+        self._contacts = contacts
+        if not _are_same(contacts, self._settled_contacts):
+            self._wait_for(clock.now())
+
+    def ended(self) -> None:
+        """Read no more of what played."""
+        self._playing, self._due = None, math.inf
+        self._change.set()
+
+    async def run(self) -> None:
+        """Read every pattern that settles, until cancelled."""
+        while True:
+            self._change.clear()
+            if await self._changes_by(self._due):
+                continue
+            applied, contacts = self._playing, self._contacts
+            self._due = math.inf
+            if applied is None:
+                continue
+            try:
+                await self._read(applied, contacts)
+            except DriverError as error:
+                self.discarded += 1
+                _logger.info("reading given up: %s", error)
+                await asyncio.sleep(_PAUSE_AFTER_FAILURE)
+
+    def _wait_for(self, since: float) -> None:
+        """Read a settling time after a moment [s] with the contacts of now."""
+        self._settled_contacts = self._contacts
+        self._due = math.inf if self._playing is None else since + self._settling
+        self._change.set()
+
+    async def _changes_by(self, moment: float) -> bool:
+        """Wait for a change until a moment [s]; whether there was one."""
+        timeout = None if math.isinf(moment) else max(0.0, moment - clock.now())
+        try:
+            async with asyncio.timeout(timeout):
+                await self._change.wait()
+        except TimeoutError:
+            return False
+        return True
+
+    async def _read(self, applied: Applied, contacts: tuple[Contact, ...]) -> None:
+        """Read a pattern until a reading was not disturbed; raises DriverError."""
+        (frequency,) = {command.frequency for command in applied.drive.values()}
+        for _ in range(READINGS):
+            readings, ended_at = await self._measure(frequency)
+            if self._change.is_set():
+                self.discarded += 1
+                return
+            if all(each.state is ReadingState.COMPLETE for each in readings.values()):
+                break
+        else:
+            self.discarded += 1
+            return
+        values = []
+        for sensor in self._sensors:
+            several = readings[sensor.amplifier].sensors
+            if sensor.number >= len(several) or several[sensor.number].is_overloaded:
+                self.discarded += 1
+                return
+            reading = readings[sensor.amplifier]
+            values.append(sensor.accelerations(reading, np.array([frequency]))[0])
+        tip = self._rig.fingertip
+        fingers = [RestingFinger(c.x, c.y, tip.scaled(c.load)) for c in contacts if tip is not None]
+        pattern = SettledPattern(
+            ended_at,
+            frequency,
+            np.array(
+                [
+                    applied.drive[era.name].phasor * era.stroke if era.name in applied.drive else 0j
+                    for era in self._rig.eras
+                ]
+            ),
+            np.array(values),
+            tuple(fingers),
+            has_phase=False,  # renewals and endings keep the phases of an earlier commit
+        )
+        self._take(pattern)
+
+    async def _measure(self, frequency: float) -> tuple[Mapping[str, Reading], float]:
+        """Read a tone [Hz] at all amplifiers; the readings, and when [s] their window ended.
+
+        Nothing is requested after a change meanwhile.
+        """
+        names = {sensor.amplifier for sensor in self._sensors}
+        amplifiers = {name: self._amplifiers[name] for name in sorted(names)}
+        window = max(WINDOW, _PERIODS / frequency)
+        started = {
+            name: await each.start_reading([frequency], window) for name, each in amplifiers.items()
+        }
+        end = clock.now() + max(each.left for each in started.values())
+        if await self._changes_by(end + _MARGIN):
+            return started, end
+        found = {
+            name: await each.finish_reading(replace(started[name], left=0.0))
+            for name, each in amplifiers.items()
+        }
+        return found, end
+
+
+def _are_same(contacts: tuple[Contact, ...], before: tuple[Contact, ...]) -> bool:
+    """Whether contacts load the plate as others did."""
+    then = {contact.key: contact for contact in before}
+    return len(contacts) == len(before) and all(
+        contact.key in then
+        and math.dist((contact.x, contact.y), (then[contact.key].x, then[contact.key].y)) <= _MOVED
+        and contact.load == then[contact.key].load
+        for contact in contacts
+    )

@@ -17,7 +17,7 @@ from model.arrays import FloatArray
 from model.finger.perception import detection_threshold
 from sim.measuring.sound_card import open_card
 
-_START = 60.0  # s
+_START = 180.0  # s; on a busy machine
 _REPEAT = 0.05  # s; a contact that is not confirmed is lifted
 _SETTLING, _WINDOW = 1.5, 1.0  # s
 

@@ -1,0 +1,1 @@
+"""How soon answers follow a measured pattern."""

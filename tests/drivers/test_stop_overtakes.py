@@ -306,3 +306,22 @@ def test_joining_amplifier_waits_for_a_pending_reply(line: str, coarse_rig: Rig)
             await asyncio.sleep(0.05)
 
     on_a_line(line, coarse_rig, use)
+
+
+def test_stop_precedes_a_reading_of_sensors(coarse_rig: Rig) -> None:
+    """At any moment of a measurement the stop follows the request that is on the line, if any."""
+
+    async def use(chain: Chain) -> None:
+        for moment in MOMENTS[::4]:
+            reading = asyncio.create_task(chain.east.measure([110.0], 0.02))
+            await asyncio.sleep(moment)
+            before = len(chain.asked)
+            await chain.east.stop()
+            after = [kind for _, kind in chain.kinds()[before:]]
+            late = 1 if after and after[0] != "Stop" else 0  # on the line at that moment
+            assert after[late] == "Stop", after
+            await asyncio.gather(reading, return_exceptions=True)
+            await chain.rearm()
+            chain.forget()
+
+    on_a_line("serial", coarse_rig, use)

@@ -8,7 +8,6 @@ messages from standard input and ends with it.
 
 import contextlib
 import os
-import pickle
 import select
 import time
 from collections.abc import Callable
@@ -26,6 +25,7 @@ from controller.learning.messages import (
     Request,
     Start,
     packed,
+    unpacked,
 )
 from model.errors import InputError
 from model.identification.in_service import Known
@@ -199,7 +199,7 @@ def _read() -> Request | None:
     if head is None:
         return None
     content = _read_exactly(int.from_bytes(head, "big"))
-    request: Request | None = None if content is None else pickle.loads(content)  # noqa: S301  of our own program
+    request: Request | None = None if content is None else unpacked(content)
     return request
 
 

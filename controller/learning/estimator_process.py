@@ -7,7 +7,6 @@ replaced after a growing pause, and after so many in a row without an answer no 
 import asyncio
 import contextlib
 import os
-import pickle
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from controller.learning.messages import (
     Request,
     Start,
     packed,
+    unpacked,
 )
 from drivers import clock
 from drivers.operation.pauses import Backoff
@@ -184,7 +184,7 @@ class EstimatorProcess:
             while True:
                 head = await process.stdout.readexactly(HEAD)
                 content = await process.stdout.readexactly(int.from_bytes(head, "big"))
-                reply: Reply = pickle.loads(content)  # noqa: S301  of our own process
+                reply: Reply = unpacked(content)
                 if isinstance(reply, Note) and reply.is_final:
                     self._refusal = reply.text
                 else:

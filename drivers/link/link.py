@@ -11,7 +11,7 @@ from typing import TypeVar, final
 from drivers import clock
 from drivers.backend import Backend
 from drivers.errors import FrameError, LinkDegraded, LinkError, LinkTimeout
-from drivers.line.priority import priority_of
+from drivers.line.priority import Priority, priority_of
 from drivers.line.sender import Retry, Sender, sender_of
 from drivers.link.refusals import PROTOCOL_VIOLATION, is_busy, refusal
 from drivers.protocol.definition import PROTOCOL
@@ -263,6 +263,10 @@ class _Attempts:
         try:
             reply = await link.backend.exchange(self._request, timeout=self._timeout)
         except LinkTimeout as problem:
+            if priority_of(self._request) is Priority.READING:  # its absence says nothing of others
+                if self._made > link._retries_allowed:
+                    raise
+                raise Retry from problem
             error = link._no_reply(problem)
             is_last_stop = isinstance(self._request, Stop) and self._made > RETRIES
             if error is not None and (is_last_stop or not isinstance(self._request, Stop)):

@@ -54,6 +54,16 @@ DRIFT = {
 }
 """By kind, how far a parameter walks in an hour, one standard deviation."""
 
+UNMEASURED = {
+    "thickness": Uncertainty().thickness,
+    "stiffness": Uncertainty().stiffness,
+    "damping_each": math.log(Uncertainty().damping),
+    "loss": math.log(Uncertainty().damping),
+    "gain": Uncertainty().gain,
+    "phase": math.radians(Uncertainty().phase_deg),
+}
+"""By kind, how uncertain a plate is that nobody measured: drift makes it no worse than that."""
+
 
 @dataclass(frozen=True, eq=False)
 class Report:
@@ -239,10 +249,13 @@ class LivePlate:
         if self._time is None:
             self._time = time
         space, variance = self.space, np.zeros(self.space.size)
+        before = np.diag(self._state.covariance)
         for kind, std in DRIFT.items():
-            known = space.std[space.groups[kind]]
-            drift = np.divide(std, known, out=np.zeros_like(known), where=known > 0)
-            variance[space.groups[kind]] = drift**2 * hours
+            group = space.groups[kind]
+            known = space.std[group]
+            scale = np.divide(1.0, known, out=np.zeros_like(known), where=known > 0)
+            room = np.maximum((UNMEASURED[kind] * scale) ** 2 - before[group], 0.0)
+            variance[group] = np.minimum((std * scale) ** 2 * hours, room)
         return State(self._state.x, self._state.covariance + np.diag(variance))
 
 

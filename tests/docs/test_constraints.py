@@ -12,10 +12,10 @@ FILE = Path(constraints.__file__).parents[2] / "constraints.txt"
 
 
 def test_constraints_pin_every_dependency_within_its_bounds() -> None:
-    """One tested version of each that a daemon with its dashboard requires, directly or not."""
+    """One tested version of each that the extras for users require, directly or not."""
     lines = [line for line in FILE.read_text("utf-8").splitlines() if not line.startswith("#")]
     pinned = dict(line.split("==") for line in lines)
-    assert constraints.closure("era-haptics", "gateway", "cluster").keys() == pinned.keys()
+    assert constraints.closure("era-haptics", *constraints.EXTRAS).keys() == pinned.keys()
     for text in requires("era-haptics") or ():
         required = Requirement(text)
         if required.marker is None or required.marker.evaluate({"extra": "gateway"}):

@@ -35,6 +35,8 @@ async def test_loose_mount_is_named_and_its_contrast_comes_back(tmp_path: Path) 
         assert found.corrections > 0
         assert found.latency_ms.count > 0
         assert await contrast(bench) > before + 3
+        while not bench.file.exists():  # written now and then
+            await bench.patterns(1)
     assert load_learned(bench.file).names
 
 

@@ -58,6 +58,7 @@ PARAMETERS: dict[str, dict[str, object]] = {
     "touch": {"source": "me", "touches": [{"id": 1, "x_m": 0.1, "y_m": 0.2}]},
     "effects": {},
     "play": {"effect": "tap", "x_m": 0.1, "y_m": 0.2},
+    "forget": {},
 }
 
 

@@ -1,11 +1,13 @@
 """Arming and clearing when the reply is lost: the repeated request does what the first did."""
 
+from unittest.mock import Mock
+
 import pytest
 
 from drivers import clock
 from drivers.amplifier import Amplifier
-from drivers.errors import CommandRefused
-from drivers.protocol.messages import AmplifierState, Arm, Clear, Request, Stop
+from drivers.errors import CommandRefused, LinkTimeout
+from drivers.protocol.messages import AmplifierState, Arm, Clear, GetSensors, Request, Stop
 from lossy_backend import Fate, LossyBackend
 from sim.amplifier.amplifier import SimulatedAmplifier
 from virtual_loop import in_virtual_time
@@ -70,4 +72,22 @@ async def test_second_arming_is_refused_and_keeps_the_first() -> None:
     with pytest.raises(CommandRefused, match="another host"):
         await amplifier.arm()
     assert amplifier.session == held
+    assert (await amplifier.heartbeat()).state is AmplifierState.OPERATION_ENABLED
+
+
+@in_virtual_time
+async def test_unanswered_reading_loses_no_link() -> None:
+    """An amplifier that states sensors and never tells of them is tried thrice, then played on."""
+    backend = LossyBackend(SimulatedAmplifier("main", channels=4))
+    backend.amplifier.attach(Mock())
+    amplifier = Amplifier(backend)
+    await amplifier.open()
+    await amplifier.arm()
+    backend.fate = lambda request: (
+        Fate.REQUEST_LOST if isinstance(request, GetSensors) else Fate.DELIVERED
+    )
+    for _ in range(2):
+        with pytest.raises(LinkTimeout):
+            await amplifier.sensors()
+    assert [type(one) for one in backend.sent].count(GetSensors) == 6
     assert (await amplifier.heartbeat()).state is AmplifierState.OPERATION_ENABLED

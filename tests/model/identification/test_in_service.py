@@ -57,6 +57,25 @@ def test_loosened_mount_is_named_and_followed(hidden: Hidden, found: Identificat
     assert not live.has_changed
 
 
+def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
+    found: Identification,
+) -> None:
+    """Thickness by 1 % more after an hour; after two weeks by 2 %, stiffness by 10 %."""
+    live = LivePlate(found)
+    live.known_since(0.0)
+    space = live.space
+
+    def known(kind: str, hours: float) -> float:
+        after = np.sqrt(np.diag(live._drifted(3600.0 * hours).covariance))
+        return float(np.max((space.std * after)[space.groups[kind]]))
+
+    begun = known("thickness", 0.0)
+    assert begun < 0.01
+    assert known("thickness", 1.0) == pytest.approx(np.hypot(begun, 0.01), rel=1e-6)
+    assert known("thickness", 336.0) == pytest.approx(0.02, rel=1e-6)
+    assert known("stiffness", 336.0) == pytest.approx(0.1, rel=1e-6)
+
+
 def test_sticker_is_named_in_its_place(hidden: Hidden, found: Identification) -> None:
     """3 g are named a mass within ten patterns, to 0.6 g and 1.5 cm."""
     live = LivePlate(found)

@@ -1,0 +1,22 @@
+"""Messages between a daemon and its estimator."""
+
+import pickle
+
+import pytest
+
+from controller.learning.messages import HEAD, Note, packed, unpacked
+from drivers.command import CommandSet, DriveCommand
+
+
+def test_message_has_its_length_before_it() -> None:
+    """Eight bytes, the largest first; then what it is made of again."""
+    message = packed(Note("the plate settles", is_final=True))
+    assert int.from_bytes(message[:HEAD], "big") == len(message) - HEAD
+    assert unpacked(message[HEAD:]) == Note("the plate settles", is_final=True)
+
+
+def test_no_command_comes_by_a_message() -> None:
+    """What an amplifier could play is refused, wherever it stands in it."""
+    command = CommandSet(1, (DriveCommand(0, 110.0, 1.0),), ramp=0.0, valid_for=0.0)
+    with pytest.raises(pickle.UnpicklingError, match="drivers"):
+        unpacked(pickle.dumps(Note([command])))  # type: ignore[arg-type]

@@ -12,6 +12,7 @@ import select
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 from controller.diagnosis.interleaved_tones import settling
 from controller.learning.messages import (
@@ -29,7 +30,6 @@ from controller.learning.messages import (
 )
 from model.errors import InputError
 from model.identification.in_service import Known
-from model.identification.learned_file import OtherPlate
 from model.identification.learned_table import LearnedTable
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig
@@ -61,8 +61,8 @@ class Estimator:
             if self._learned.current is not start.table:
                 age = max(time.time() - start.file.stat().st_mtime, 0.0)
                 self._learned.live.known_since(now() - age)
-        except OtherPlate as error:
-            self.note = str(error)
+        except InputError as error:
+            self.note = f"{error}; {_set_aside(start.file)}"
             self._learned = LearnedTable(start.table, known, file=start.file)
         self._saved_at = self._refreshed_at = now()
         self._is_saved = self._is_refreshed = True
@@ -78,10 +78,11 @@ class Estimator:
             self.only_alarms,
             self._prepared(learned.current, whole=True) if is_resumed else None,
             self._robust(),
+            learned.has_changed,
         )
 
     def take(self, pattern: SettledPattern) -> Estimate:
-        """Take a pattern."""
+        """Take a pattern; raises ValueError for one of no plate, and nothing is learned of it."""
         found = self._learned.take(pattern)
         report, table = found.report, found.table
         if table is not None:
@@ -93,6 +94,18 @@ class Estimator:
             "" if report.explanation is None else str(report.explanation),
             self._learned.has_changed,
             None if table is None else self._prepared(table, whole=False),
+        )
+
+    def nothing_of(self, pattern: SettledPattern) -> Estimate:
+        """The estimate of a pattern that has shown nothing."""
+        learned = self._learned
+        return Estimate(
+            pattern.time,
+            alarm=False,
+            is_held=False,
+            explanation="",
+            has_changed=learned.has_changed,
+            answers=None,
         )
 
     @property
@@ -153,6 +166,24 @@ def why_only_alarms(rig: Rig) -> str:
     return ""
 
 
+def replies(estimator: Estimator, pattern: SettledPattern) -> list[Reply]:
+    """What an estimator replies to a pattern: a note, too, where nothing can be learned of it."""
+    try:
+        return [estimator.take(pattern)]
+    except ValueError as error:  # InputError and LinAlgError are such
+        return [Note(f"a pattern is not used: {error}"), estimator.nothing_of(pattern)]
+
+
+def _set_aside(file: Path) -> str:
+    """Rename the file of another plate; what was done, or why not."""
+    old = file.with_name(f"{file.name}.old")
+    try:
+        file.replace(old)
+    except OSError as error:
+        return f"it could not be renamed and will be replaced: {error}"
+    return f"it is {old} now"
+
+
 def _main() -> None:
     with contextlib.suppress(OSError):
         os.nice(_NICE)
@@ -180,7 +211,8 @@ def _main() -> None:
                 pattern = _read()
                 if not isinstance(pattern, SettledPattern):
                     return
-                send(estimator.take(pattern))
+                for reply in replies(estimator, pattern):
+                    send(reply)
             elif (done := estimator.do_chore()) is not None:
                 send(done)
     except BrokenPipeError:

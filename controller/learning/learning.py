@@ -43,6 +43,8 @@ _CHANGED_REMEDY = (
     "look for a loose mount, a crack or something on the plate; then identify it (era rig identify)"
     ", or discard what was learned (era forget)"
 )
+_CHANGED_BEFORE = "the plate has changed, as found before, and is not yet again as it was"
+_UNUSUAL = (LearningState.CHANGED, LearningState.EXPLAINING, LearningState.FAILED)
 _FAILED_REMEDY = "see the log above; era forget starts anew"
 
 _logger = logging.getLogger(__name__)
@@ -75,6 +77,7 @@ class Learning:
         self._changed, self._estimated, self._timeouts = changed, estimated, timeouts
         self._answers = AnswersInUse(controller, table, timing)
         self._robust: Answers | None = None
+        self._only_alarms, self._is_held = "", False
         self._sensors: Sequence[PlateSensor] = ()
         self._readings: SettledReadings | None = None
         self._estimator: EstimatorProcess | None = None
@@ -109,16 +112,24 @@ class Learning:
     async def forget(self) -> None:
         """Discard what was learned; answers are those of the table as built at once.
 
-        Raises CommandError where nothing is learned.
+        Raises CommandError where nothing is learned, and where the file cannot be removed: then
+        what was learned is still followed.
         """
         if self.status.state is LearningState.OFF:
             raise CommandError(f"nothing is learned of the plate: {self.status.cause}")
         await self._end("opening", "estimator", "readings", "shaping")
         self._estimator, self._readings, self._robust = None, None, None
         self._note_lost(waiting=0)
-        self._file.unlink(missing_ok=True)
         self._reset()
-        self._start()
+        try:
+            self._file.unlink(missing_ok=True)
+        except OSError as error:
+            raise CommandError(
+                f"{self._file}: cannot be removed, and is still followed: {error}; make its folder "
+                "writable for the daemon, then repeat era forget"
+            ) from error
+        finally:
+            self._start()
 
     async def close(self) -> None:
         """End the estimator, which keeps what it has learned."""
@@ -161,7 +172,7 @@ class Learning:
                 self._take(reply)
             case Refreshed():
                 self._robust = reply.robust
-                if not self.status.are_robust and self.status.state is LearningState.FOLLOWING:
+                if not self.status.are_robust and not self._is_held:
                     self._correct(reply.answers)
             case Note():
                 _logger.warning("plate: %s", reply.text)
@@ -172,9 +183,10 @@ class Learning:
             self._outage = None
         if ready.note:
             _logger.warning("plate: learning anew: %s", ready.note)
-        self._robust = ready.robust
+        self._robust, self._is_held = ready.robust, False
+        self._only_alarms = ready.only_alarms
         if ready.answers is not None:
-            self._correct(ready.answers)
+            self._correct(ready.answers, are_robust=ready.has_changed)
         elif self.status.are_robust:
             self._reset()
         if self._readings is None:
@@ -186,15 +198,22 @@ class Learning:
                 take=self._hand,
             )
             self._spawn("readings", self._readings.run())
-        if ready.only_alarms:
+        if ready.has_changed:
+            self._say(LearningState.CHANGED, _CHANGED_BEFORE, _CHANGED_REMEDY)
+        else:
+            known = "what was learned before" if ready.answers else "the rig as built"
+            self._say_followed(f"the plate is followed from {known} on")
+
+    def _say_followed(self, cause: str) -> None:
+        """Say that the plate is as known, or only watched."""
+        if self._only_alarms:
             self._say(
                 LearningState.ONLY_ALARMS,
-                f"answers stay as built: {ready.only_alarms}",
+                f"answers stay as built: {self._only_alarms}",
                 "identify the plate (era rig identify)",
             )
         else:
-            known = "what was learned before" if ready.answers else "the rig as built"
-            self._say(LearningState.FOLLOWING, f"the plate is followed from {known} on")
+            self._say(LearningState.FOLLOWING, cause)
 
     def _hand(self, pattern: SettledPattern) -> None:
         is_taken = self._estimator is not None and self._estimator.hand(pattern)
@@ -202,6 +221,7 @@ class Learning:
 
     def _take(self, estimate: Estimate) -> None:
         self.status = replace(self.status, last_at=clock.now())
+        self._is_held = estimate.is_held
         self._count(estimates=1)
         if estimate.alarm:
             self._count(alarms=1)
@@ -209,8 +229,9 @@ class Learning:
             self._correct(estimate.answers, are_robust=estimate.has_changed)
             self._estimated(clock.now() - estimate.time)
         if estimate.has_changed:
-            if estimate.explanation:
-                self._say(LearningState.CHANGED, estimate.explanation, _CHANGED_REMEDY)
+            if estimate.explanation or self.status.state is not LearningState.CHANGED:
+                cause = estimate.explanation or _CHANGED_BEFORE
+                self._say(LearningState.CHANGED, cause, _CHANGED_REMEDY)
         elif estimate.explanation:
             self._say(LearningState.FOLLOWING, f"the plate has changed: {estimate.explanation}")
         elif estimate.is_held:
@@ -220,6 +241,8 @@ class Learning:
         elif estimate.alarm:
             cause = f"the plate is not as the rig says (alarm {self.status.alarms})"
             self._say(self.status.state, cause, self.status.remedy)
+        elif self.status.state in _UNUSUAL:
+            self._say_followed("the plate is again as it was")
 
     def _reset(self) -> None:
         self._answers.reset()

@@ -53,7 +53,8 @@ class Ready:
 
     settling [s]: until the plate has settled; note: why it starts anew although there is a file, or
     nothing; only_alarms: why it does not correct answers, or nothing; answers: those of the plate
-    as learned before, None for the table as built; robust: for when the plate is not known.
+    as learned before, None for the table as built; robust: for when the plate is not known;
+    has_changed: whether it had changed in a way that nothing known explains.
     """
 
     settling: float
@@ -61,6 +62,7 @@ class Ready:
     only_alarms: str
     answers: Answers | None
     robust: Answers
+    has_changed: bool
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from controller.loop.observer import Applied
 from controller.sources.contacts import Contact
 from drivers import clock
 from drivers.amplifier import Amplifier
-from drivers.errors import DriverError
+from drivers.errors import DriverError, Preempted
 from drivers.protocol.messages import Reading, ReadingState
 from model.identification.forward import RestingFinger
 from model.identification.settled import SettledPattern
@@ -92,6 +92,8 @@ class SettledReadings:
                 continue
             try:
                 await self._read(applied, contacts)
+            except Preempted:
+                self.discarded += 1  # what preempted it is read once it has settled
             except DriverError as error:
                 self.discarded += 1
                 _logger.info("reading given up: %s", error)
@@ -134,6 +136,10 @@ class SettledReadings:
                 return
             reading = readings[sensor.amplifier]
             values.append(sensor.accelerations(reading, np.array([frequency]))[0])
+        if not np.isfinite(values).all() or not np.any(values):  # no phase to turn others to
+            self.discarded += 1
+            _logger.info("reading given up: all sensors read nothing")
+            return
         tip = self._rig.fingertip
         fingers = [RestingFinger(c.x, c.y, tip.scaled(c.load)) for c in contacts if tip is not None]
         pattern = SettledPattern(

@@ -27,6 +27,7 @@ _UNLIKELY, _FAR_AHEAD, _ROUGHLY = 1e-4, 25.0, 4.0
 _SCANNED, _STARTS, _ALTERED_STARTS = (9, 7), 3, 2
 _ALTERATIONS: tuple[Alteration, ...] = (Hand(), Crack())
 _FIRST_ITERATIONS, _ALTERED_ITERATIONS, _ITERATIONS = 5, 10, 30
+BY_MASS = "a mass"
 _WITHIN_REACH = 300.0  # of the least cost
 _FOLLOWED = 3  # of the least cost after the first iterations
 
@@ -35,9 +36,10 @@ _FOLLOWED = 3  # of the least cost after the first iterations
 class Explanation:
     """What explains some patterns: its name, "" for nothing known, and the state it leads to.
 
-    change: of the parameter, in its unit; lead: by how much the next best costs more; resembles:
-    what explains most of it, though not enough; found: of a hand or a crack, where it is and how
-    large. No parameter of a plate stands for these, and the state is that before.
+    change: of the parameter, a mass in kg, others as the logarithm of a factor; lead: by how much
+    the next best costs more; resembles: what explains most of it, though not enough; found: of a
+    hand or a crack, where it is and how large. No parameter of a plate stands for these, and the
+    state is that before.
     """
 
     name: str
@@ -52,11 +54,18 @@ class Explanation:
         """Whether the state has taken up the change."""
         return bool(self.name) and not self.found
 
+    @property
+    def amount(self) -> str:
+        """The change with its unit."""
+        if self.name == BY_MASS:
+            return f"{1000 * self.change:+.3g} g"
+        return f"{100 * np.expm1(self.change):+.2g} %"
+
     def __str__(self) -> str:
         if self.found:
             return f"{self.name}, {self.found}"
         if self.name:
-            return f"{self.name} by {self.change:+.3g}"
+            return f"{self.name} by {self.amount}"
         return f"the plate has changed, most as if {self.resembles} had"
 
 
@@ -155,7 +164,7 @@ def _by_mass(before: State, patterns: Sequence[Touched]) -> list[_Tried]:
         start[mass] = size / space.std[mass]
         start[mass + 1 : mass + 3] = (place - sides / 2) / space.std[mass + 1 : mass + 3]
         after = update(wider, patterns, iterations=_FIRST_ITERATIONS, start=start)
-        found.append(_Tried("a mass", changed, wider, after))
+        found.append(_Tried(BY_MASS, changed, wider, after))
     return found
 
 

@@ -172,7 +172,12 @@ class LivePlate:
         """The rig that parameters count from."""
         return self._before
 
-    def known_since(self, time: float) -> None:
+    @property
+    def known_at(self) -> float | None:
+        """Time [s] of the state; None before the first pattern."""
+        return self._time
+
+    def known_since(self, time: float | None) -> None:
         """Note that the state is that of a time [s], from which it has drifted since."""
         self._time = time
 

@@ -22,12 +22,16 @@ class OtherPlate(InputError):
 
 @dataclass(frozen=True, eq=False)
 class LearnedPlate:
-    """A state of parameters by name, counted from a rig; table, base: fingerprints of both."""
+    """A state of parameters by name, counted from a rig; table, base: fingerprints of both.
+
+    has_changed: whether the plate has changed since in a way that its parameters do not follow.
+    """
 
     table: str
     base: str
     names: tuple[str, ...]
     state: State
+    has_changed: bool = False
 
 
 def save_learned(learned: LearnedPlate, file: Path) -> None:
@@ -37,6 +41,7 @@ def save_learned(learned: LearnedPlate, file: Path) -> None:
         "table": learned.table,
         "base": learned.base,
         "names": learned.names,
+        "has_changed": learned.has_changed,
     }
     text = json.dumps(header)
     x, covariance = learned.state.x, learned.state.covariance
@@ -63,7 +68,10 @@ def load_learned(file: Path, *, table: str | None = None) -> LearnedPlate:
             raise ValueError("digest must be that of the content")
         header = json.loads(text)
         version, names = header["version"], tuple(header["names"])
-        found = LearnedPlate(header["table"], header["base"], names, State(x, covariance))
+        has_changed = bool(header.get("has_changed", False))
+        found = LearnedPlate(
+            header["table"], header["base"], names, State(x, covariance), has_changed
+        )
     except (*UNREADABLE, KeyError, TypeError) as error:
         raise InputError(
             f"{file}: must be a learned plate: {error}; remove the file to learn anew"

@@ -10,6 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
+import numpy as np
+
+from model.errors import InputError
 from model.identification.in_service import Known, LivePlate, Report, widest
 from model.identification.learned_file import LearnedPlate, OtherPlate, load_learned, save_learned
 from model.identification.settled import SettledPattern
@@ -34,7 +37,7 @@ class LearnedTable:
     """
 
     def __init__(self, table: LocalizationTable, known: Known, *, file: Path | None = None) -> None:
-        self._table, self._file = table, file
+        self._table, self._known, self._file = table, known, file
         self.live = LivePlate(known)
         self.current = table
         """The table as corrected so far."""
@@ -56,7 +59,8 @@ class LearnedTable:
                 "learn anew"
             )
         resumed = cls(table, replace(known, state=learned.state), file=file)
-        resumed.current = table_following(table, resumed.live.rig)
+        resumed.live.has_changed = learned.has_changed
+        resumed.current = resumed._followed()
         return resumed
 
     @property
@@ -65,24 +69,46 @@ class LearnedTable:
         return self.live.has_changed
 
     def take(self, pattern: SettledPattern) -> Learned:
-        """Take a settled pattern, and correct the table by it."""
-        before, had_changed = self.live.state, self.has_changed
-        report = self.live.take(pattern)
-        if self.has_changed and not had_changed:
-            self.current = table_following(self._table, self.cautious_rig)
-        elif self.live.state is not before:
-            self.current = table_following(self._table, self.live.rig)
-        else:
-            return Learned(report, None)
+        """Take a settled pattern, and correct the table by it.
+
+        Raises InputError or another ValueError for a pattern that leads to no plate that a table
+        can follow; the state then is that before, and what was suspect of it is forgotten.
+        """
+        if not np.isfinite(pattern.values).all() or not np.any(pattern.values):
+            raise InputError("readings must be finite and not all 0, got others")
+        before, since, had_changed = self.live.state, self.live.known_at, self.has_changed
+        try:
+            report = self.live.take(pattern)
+            after = self.live.state
+            if not np.isfinite(after.x).all() or not np.isfinite(after.covariance).all():
+                raise InputError("parameters must be finite after a pattern, got others")
+            if after is before and self.has_changed == had_changed:
+                return Learned(report, None)
+            self.current = self._followed()
+        except Exception:
+            self.live = LivePlate(replace(self._known, state=before))
+            self.live.known_since(since)
+            self.live.has_changed = had_changed
+            raise
         return Learned(report, self.current)
 
+    def _followed(self) -> LocalizationTable:
+        """The table for the plate as it is known now."""
+        return table_following(
+            self._table, self.cautious_rig if self.has_changed else self.live.rig
+        )
+
     def save(self) -> None:
-        """Write what was learned, atomically; nothing of a plate that has changed unexplained."""
-        if self._file is None or self.has_changed:
+        """Write what was learned, atomically, and whether the plate has changed since."""
+        if self._file is None:
             return
         base = physics_fingerprint(self.live.before)
         learned = LearnedPlate(
-            self._table.fingerprint, base, self.live.space.names, self.live.state
+            self._table.fingerprint,
+            base,
+            self.live.space.names,
+            self.live.state,
+            self.has_changed,
         )
         save_learned(learned, self._file)
 

@@ -9,6 +9,7 @@ import pytest
 from benchmarks.identification.hidden import Hidden, draw
 from benchmarks.identification.thin_plate import Mounted
 from model.errors import InputError
+from model.identification import learned_table
 from model.identification.forward import Sensor
 from model.identification.identify import identify
 from model.identification.in_service import Known
@@ -102,7 +103,7 @@ def test_answers_wait_for_an_explanation(
 def test_unexplained_change_widens_the_errors_of_answers(
     hidden: Hidden, rig: Rig, table: LocalizationTable, tmp_path: Path
 ) -> None:
-    """Answers then are robust to the errors of a plate that was not measured, and none is kept."""
+    """Answers then are robust to the errors of a plate that was not measured, also when resumed."""
     file = tmp_path / "learned.npz"
     learned = LearnedTable(table, Known.of_rig(rig, sensors_of(rig)), file=file)
     for pattern in settled_patterns(hidden, hidden.mounted, count=12, start=0):
@@ -120,7 +121,31 @@ def test_unexplained_change_widens_the_errors_of_answers(
     wide, built = learned.current.uncertainty, Uncertainty()
     assert (wide.gain, wide.thickness, wide.damping) == (built.gain, built.thickness, built.damping)
     learned.save()
-    assert not file.exists()
+    resumed = LearnedTable.resumed(table, Known.of_rig(rig, sensors_of(rig)), file=file)
+    assert resumed.has_changed
+    assert resumed.current.uncertainty == wide
+
+
+def test_pattern_that_no_table_follows_leaves_the_state(
+    hidden: Hidden, rig: Rig, table: LocalizationTable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """State, answers and time are those before a refused pattern, and the next one is taken."""
+    learned = LearnedTable(table, Known.of_rig(rig, sensors_of(rig)))
+    first, second, third = settled_patterns(hidden, hidden.mounted, count=3, start=0)
+    learned.take(first)
+    state, current, since = learned.live.state, learned.current, learned.live.known_at
+
+    def refused(table: LocalizationTable, rig: Rig) -> LocalizationTable:
+        raise InputError("thickness must be within 10 %, got 20 %")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(learned_table, "table_following", refused)
+        with pytest.raises(InputError, match="thickness"):
+            learned.take(second)
+    assert learned.live.state is state
+    assert learned.live.known_at == since
+    assert learned.current is current
+    assert learned.take(third).table is not None
 
 
 def test_what_was_learned_is_resumed_for_its_table_only(
@@ -132,8 +157,15 @@ def test_what_was_learned_is_resumed_for_its_table_only(
     learned = LearnedTable.resumed(table, known, file=file)
     for pattern in settled_patterns(hidden, hidden.mounted, count=3, start=0):
         learned.take(pattern)
+    learned.live.has_changed = True
+    learned.save()
+    robust = LearnedTable.resumed(table, known, file=file)
+    assert robust.has_changed
+    assert robust.current.uncertainty.thickness == Uncertainty().thickness
+    learned.live.has_changed = False
     learned.save()
     again = LearnedTable.resumed(table, known, file=file)
+    assert not again.has_changed
     np.testing.assert_array_equal(again.live.state.covariance, learned.live.state.covariance)
     np.testing.assert_array_equal(
         again.current.unit_fields(POINTS), learned.current.unit_fields(POINTS)

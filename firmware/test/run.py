@@ -21,7 +21,7 @@ def main() -> None:
     """Run everything; the first failure ends it."""
     frames = 1_000_000 if "--long" in sys.argv else 20_000
     is_bare_metal = shutil.which("arm-none-eabi-gcc") and shutil.which("qemu-system-arm")
-    run("make", "-s", "-C", ROOT / "firmware", "all", OUT / "era-fuzz")
+    run("make", "-s", "-C", ROOT / "firmware", f"OUT={OUT}", "all", OUT / "era-fuzz")
     if "--no-tests" not in sys.argv:
         run(sys.executable, "-m", "pytest", "-q", *TESTS, cwd=ROOT)
     run(OUT / "era-fuzz", str(frames))

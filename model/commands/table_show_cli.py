@@ -48,7 +48,8 @@ def verify(
     rig_file: Annotated[
         Path | None,
         typer.Argument(
-            metavar="RIG", help="Rig file; with --device its wiring, by default ERAs in order."
+            metavar="RIG",
+            help="Rig file; with --device its wiring, by default ERAs in order; --url needs it.",
         ),
     ] = None,
     device: Annotated[
@@ -95,6 +96,11 @@ def verify(
 
         if sensors_file is None:
             raise InputError("--sensors is missing: a file of the accelerometers at the inputs")
+        if url is not None and rig_file is None:
+            raise InputError(
+                "the rig is missing, with limits and wiring of the amplifier at --url: "
+                f"era table verify {table_file} RIG.yaml --device {device} --url {url}"
+            )
         settings = CheckSettings(device, sensors_file, url, samples, seed, level)
         verify_by_measuring(table_file, rig_file, settings, picture=picture, as_json=as_json)
         return

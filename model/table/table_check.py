@@ -64,7 +64,11 @@ def check_by_measuring(
 
 
 def plain_rig(table: LocalizationTable) -> Rig:
-    """The rig of a table without wiring of its own: its ERAs on channels 0, 1, ... in order."""
+    """The rig of a table without wiring of its own: its ERAs on channels 0, 1, ... in order.
+
+    It has no limits but full stroke and the table's frequencies, so that no amplifier may be driven
+    by it.
+    """
     low, high = (float(table.frequencies[end]) for end in (0, -1))
     return Rig(
         table.plate,

@@ -8,10 +8,10 @@ from drivers.errors import LinkError
 from model.arrays import FloatArray
 from model.errors import InputError
 from sim.measuring.estimate import Estimate
+from sim.measuring.loopback import SILENT
 from sim.sensors.sensor_file import WiredSensor
 
 _FULL = 0.999  # of full scale
-_SILENT = 1e-5  # of full scale, rms
 _LOOPED = 0.05  # of a sample that a loop-back brings back at least
 _CROSSTALK = 0.02  # of it, that other outputs may
 _COHERENT = 0.9  # in the median over frequencies
@@ -19,33 +19,36 @@ _MOVED = 5.0  # times the noise, in the median over frequencies and the maximum 
 
 
 def check_levels(
-    recorded: FloatArray, sensors: Sequence[WiredSensor], *, loopback: int, output: int
+    recorded: FloatArray,
+    sensors: Sequence[WiredSensor],
+    *,
+    cable: tuple[int, int] | None = None,
 ) -> None:
-    """Raise InputError for clipped inputs, LinkError for silent ones, of one run (n, inputs)."""
+    """Raise InputError for clipped inputs, LinkError for silent ones, of one run (n, inputs).
+
+    cable: output and input of the loop-back, to be checked too.
+    """
     named = {sensor.input: f"sensor {sensor.name}" for sensor in sensors}
-    named[loopback] = "the loop-back"
+    if cable is not None:
+        named[cable[1]] = "the loop-back"
     clipped = [name for n, name in named.items() if np.abs(recorded[:, n - 1]).max() >= _FULL]
     if clipped:
         raise InputError(
             f"inputs must stay below full scale, got clipping of {', '.join(clipped)}; turn down "
             "the gain of the input, and its full_scale_v, or choose a lower --level"
         )
-    silent = [
-        f"{name} (input {n})"
-        for n, name in named.items()
-        if np.sqrt((recorded[:, n - 1] ** 2).mean()) < _SILENT
-    ]
+    silent = [n for n in named if np.sqrt((recorded[:, n - 1] ** 2).mean()) < SILENT]
     if len(silent) == len(named):
         raise LinkError(
             "all inputs are silent: check that --device is the one that is wired, its outputs and "
             "inputs not swapped, amplifier and sensor supply switched on"
         )
     if silent:
-        hint = f"; the loop-back is a cable from output {output} to input {loopback}"
-        raise LinkError(
-            f"silent: {', '.join(silent)}; check cables and the supply of sensors (IEPE)"
-            + (hint if np.sqrt((recorded[:, loopback - 1] ** 2).mean()) < _SILENT else "")
-        )
+        hint = ""
+        if cable is not None and cable[1] in silent:
+            hint = f"; the loop-back is a cable from output {cable[0]} to input {cable[1]}"
+        inputs = ", ".join(f"{named[n]} (input {n})" for n in silent)
+        raise LinkError(f"silent: {inputs}; check cables and the supply of sensors (IEPE){hint}")
 
 
 def check_wiring(

@@ -44,7 +44,6 @@ class JackCard(SoundCard):
         self.use(ports)
         for name, set_callback in (
             ("transfer_jack_process", library.jack_set_process_callback),
-            ("transfer_jack_xrun", library.jack_set_xrun_callback),
             ("transfer_jack_shutdown", library.jack_on_shutdown),
         ):
             set_callback(client, self.address(name), None)

@@ -5,10 +5,12 @@ import numpy as np
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
 
+SILENT = 1e-5
+"""Of full scale, rms: what an input without a signal stays below."""
+
 _MAX_DELAY = 0.1  # s; lines 10 Hz apart repeat then
 _NEARLY = 0.95
 _STRAIGHT = 0.5  # rad
-_SILENT = 1e-5  # of full scale, rms
 _SAME = 1e-3  # of periods; a lost block makes them differ by 0.8
 
 
@@ -20,7 +22,7 @@ def is_whole(periods: FloatArray, *, samples: int) -> bool:
     each = periods.reshape(-1, samples)
     size = np.linalg.norm(each[0])
     differ = np.linalg.norm(each - each[0], axis=1).max()
-    return bool(size > _SILENT * np.sqrt(samples) and differ <= _SAME * size)
+    return bool(size > SILENT * np.sqrt(samples) and differ <= _SAME * size)
 
 
 def converters(response: ComplexArray) -> ComplexArray:

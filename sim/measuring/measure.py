@@ -118,7 +118,7 @@ def measure(
                 ),
             )
             kept = _settled(heard.astype(float), multisine, periods)
-            check_levels(kept, desk.sensors, loopback=desk.input, output=desk.output)
+            check_levels(kept, desk.sensors, cable=(desk.output, desk.input))
             if card.gaps == 0 and is_whole(kept[:, desk.input - 1], samples=multisine.samples):
                 break
             is_lost = is_lost or attempt == _TRIES - 1

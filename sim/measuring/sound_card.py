@@ -34,13 +34,11 @@ class _Transfer(ctypes.Structure):
         ("inputs", ctypes.c_uint32),
         ("is_running", ctypes.c_uint32),
         ("gaps", ctypes.c_uint32),
-        ("xruns", ctypes.c_uint32),
         ("is_lost", ctypes.c_uint32),
     )
     position: int
     is_running: int
     gaps: int
-    xruns: int
     is_lost: int
 
 

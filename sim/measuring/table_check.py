@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 
 import numpy as np
 
 from drivers.blocking import BlockingAmplifier
 from drivers.command import DriveCommand
-from drivers.errors import LinkError
+from drivers.errors import DriverError, LinkError
 from model.arrays import FloatArray
 from model.rig.rig import Rig
 from model.table.promise_at_sensors import (
@@ -20,10 +20,11 @@ from model.table.promise_at_sensors import (
 from model.table.table import LocalizationTable
 from model.table.table_check import CheckSettings
 from model.vibration.excitation import Excitation
+from sim.measuring.checks import check_levels
 from sim.measuring.loopback import is_whole
 from sim.measuring.measure import Desk
 from sim.measuring.sound_card import SoundCard, open_card
-from sim.sensors.sensor_file import read_sensors
+from sim.sensors.sensor_file import WiredSensor, read_sensors
 
 _SETTLING = 1.5  # s; T60 of a plate with little damping, and an amplifier that starts later
 _WINDOW = 1.0  # s
@@ -45,7 +46,8 @@ def check_table(
 ) -> MeasuredVerification:
     """Play promises and compare what accelerometers measured.
 
-    Raises InputError, LinkError; CommandError, CommandRefused of an amplifier.
+    Raises InputError, LinkError, both also for sensors that are clipped or silent; CommandError,
+    CommandRefused of an amplifier.
     """
     sensors = read_sensors(settings.sensors_file, rig.plate)
     desk = Desk(rig, sensors)
@@ -57,6 +59,7 @@ def check_table(
             table, places, count=settings.samples, level=settings.level, seed=settings.seed
         ):
             heard = record(promise)
+            check_levels(heard, _sensors_of(promise, desk))
             frequencies, amplitudes = _amplitudes(heard, promise, desk, card.rate)
             found.append(measured_promise(table, promise, frequencies, amplitudes))
             progress(len(found), settings.samples)
@@ -86,12 +89,17 @@ def _recorder(desk: Desk, settings: CheckSettings) -> Iterator[tuple[SoundCard, 
         def by_amplifier(promise: Promise) -> FloatArray:
             seconds = _SETTLING + _WINDOW
             commands = commands_of(desk.rig, promise.pattern.excitation)
-            playing = thread.submit(
-                amplifier.play, commands, duration=seconds + _SETTLING, ramp=_RAMP
-            )
             count = round(seconds * card.rate)
-            heard = card.run(np.zeros((count, 0)))
-            playing.result()
+            try:
+                playing = thread.submit(
+                    amplifier.play, commands, duration=seconds + _SETTLING, ramp=_RAMP
+                )
+                heard = card.run(np.zeros((count, 0)))
+                playing.result()
+            except BaseException:  # leaving waits for the thread, which feeds the watchdog
+                with suppress(DriverError):
+                    amplifier.disarm()
+                raise
             if card.gaps:
                 raise LinkError("blocks of sound were lost while a pattern played; verify again")
             return heard[-round(_WINDOW * card.rate) :].astype(float)
@@ -137,6 +145,11 @@ def commands_of(rig: Rig, excitation: Excitation) -> list[DriveCommand]:
     ]
 
 
+def _sensors_of(promise: Promise, desk: Desk) -> list[WiredSensor]:
+    by_name = {sensor.name: sensor for sensor in desk.sensors}
+    return [by_name[name] for name in promise.sensors]
+
+
 def _amplitudes(
     heard: FloatArray, promise: Promise, desk: Desk, rate: float
 ) -> tuple[FloatArray, FloatArray]:
@@ -145,8 +158,7 @@ def _amplitudes(
     All tones are fitted together, since their frequencies need not fit into the window.
     """
     frequencies = np.unique([tone.frequency for tone in promise.pattern.excitation.values()])
-    by_name = {sensor.name: sensor for sensor in desk.sensors}
-    sensors = [by_name[name] for name in promise.sensors]
+    sensors = _sensors_of(promise, desk)
     samples = heard[:, [sensor.input - 1 for sensor in sensors]]
     angles = 2 * np.pi * np.outer(np.arange(len(samples)) / rate, frequencies)
     basis = np.hstack([np.sin(angles), np.cos(angles)])

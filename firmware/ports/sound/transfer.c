@@ -4,8 +4,8 @@
 
 #include <string.h>
 
-#define TROUBLE 0xf // underflow and overflow of input and output
-#define CONTINUE 0  // paContinue
+#define LOST 0xf   // paInputUnderflow, paInputOverflow, paOutputUnderflow, paOutputOverflow
+#define CONTINUE 0 // paContinue
 
 static struct transfer *transfer;
 static struct transfer_ports ports;
@@ -64,14 +64,6 @@ int transfer_jack_process(uint32_t frames, void *ignored)
     return 0;
 }
 
-int transfer_jack_xrun(void *ignored)
-{
-    (void)ignored;
-    if (transfer != NULL)
-        COUNT(transfer->xruns, 1);
-    return 0;
-}
-
 void transfer_jack_shutdown(void *ignored)
 {
     (void)ignored;
@@ -85,8 +77,8 @@ int transfer_portaudio(const void *input, void *output, unsigned long frames,
     (void)time;
     (void)ignored;
     uint32_t count = wanted((uint32_t)frames);
-    if (flags & TROUBLE)
-        transfer_jack_xrun(NULL);
+    if (count && (flags & LOST) && transfer->position)
+        COUNT(transfer->gaps, 1);
     if (output != NULL) {
         size_t frame = transfer->outputs * sizeof(float);
         memset(output, 0, frames * frame);

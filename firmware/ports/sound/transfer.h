@@ -21,7 +21,7 @@ struct transfer {
     uint64_t position;
     uint32_t outputs, inputs;
     uint32_t is_running;
-    uint32_t gaps, xruns; // holes in the sample clock meanwhile; what the driver reports
+    uint32_t gaps; // holes in the sample clock meanwhile, or blocks that the driver reports lost
     uint32_t is_lost;
 };
 
@@ -37,7 +37,6 @@ void transfer_use(struct transfer *transfer, const struct transfer_ports *ports)
 
 // JACK.
 int transfer_jack_process(uint32_t frames, void *ignored);
-int transfer_jack_xrun(void *ignored);
 void transfer_jack_shutdown(void *ignored);
 
 // PortAudio's callback, for interleaved floats.

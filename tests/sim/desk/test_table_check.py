@@ -1,6 +1,8 @@
 """Promises of a table to accelerometers, played and measured on a plate in memory."""
 
 import json
+import threading
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +11,11 @@ import pytest
 from typer.testing import CliRunner
 
 from desk_card import DeskCard
-from drivers.errors import LinkError
+from drivers.blocking import BlockingAmplifier
+from drivers.command import DriveCommand
+from drivers.errors import CommandRefused, LinkError
+from drivers.protocol.messages import Achieved
+from model.arrays import Float32Array, FloatArray
 from model.cli import app
 from model.errors import InputError
 from model.finger.perception import detection_threshold
@@ -20,12 +26,14 @@ from model.table.build import build_table
 from model.table.file import save_table
 from model.table.promise_at_sensors import Promise, promises
 from model.table.table import LocalizationTable
+from model.table.table_check import CheckSettings
 from model.vibration.direct import direct_responder
 from model.vibration.peak import tone_amplitudes
 from sim.desk.desk_plate import DeskPlate
 from sim.desk.sensing import Converters
 from sim.desk.truth import Actuator, Truth, draw_truth
 from sim.measuring import table_check
+from sim.measuring.sound_card import SoundCard
 from sim.sensors.sensor_file import read_sensors
 
 RATE = 8_000.0
@@ -70,6 +78,7 @@ def measured_on(
     folder: Path,
     monkeypatch: pytest.MonkeyPatch,
     *more: str,
+    card: type[DeskCard] = DeskCard,
 ) -> tuple[int, dict[str, object]]:
     """`era table verify --device` on a plate in memory: exit status and report."""
     (folder / "sensors.csv").write_text(SENSORS)
@@ -78,9 +87,7 @@ def measured_on(
 
     def opened(_device: str, **_counts: int) -> DeskCard:
         converters = Converters(noise=5e-3)
-        return DeskCard(
-            DeskPlate(truth, sensors, rate=RATE, converters=converters, seed=1), rate=RATE
-        )
+        return card(DeskPlate(truth, sensors, rate=RATE, converters=converters, seed=1), rate=RATE)
 
     monkeypatch.setattr(table_check, "open_card", opened)
     arguments = ["table", "verify", str(folder / "t.npz"), "--device", "memory", "--samples", "4"]
@@ -145,3 +152,100 @@ def test_unplugged_loopback_and_missing_options_are_refused(
     monkeypatch.setattr(table_check, "_MARK_LEVEL", 0.0)
     with pytest.raises(LinkError, match="output 5 to input 5"):
         measured_on(as_written(rig), table, tmp_path, monkeypatch)
+
+
+@pytest.mark.parametrize(
+    ("sensitivity", "error", "cause"),
+    [(0.0, LinkError, "silent: .*input 3"), (1e4, InputError, "clipping of sensor C")],
+)
+def test_dead_and_clipped_accelerometers_keep_no_promise(
+    rig: Rig,
+    table: LocalizationTable,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    sensitivity: float,
+    error: type[Exception],
+    cause: str,
+) -> None:
+    """Zeros at a quiet place would be a contrast without end, and clipping one that is too low."""
+
+    class WrongInput(DeskCard):
+        """Input 3, of C, is dead or too sensitive."""
+
+        def run(
+            self, played: FloatArray, *, progress: Callable[[int], None] = lambda _frames: None
+        ) -> Float32Array:
+            heard = super().run(played, progress=progress)
+            heard[:, 2] = np.clip(sensitivity * heard[:, 2], -1, 1)
+            return heard
+
+    with pytest.raises(error, match=cause):
+        measured_on(as_written(rig), table, tmp_path, monkeypatch, card=WrongInput)
+
+
+def test_amplifier_at_a_url_needs_a_rig(table: LocalizationTable, tmp_path: Path) -> None:
+    """A table has no limits of an amplifier, so that none is opened."""
+    save_table(table, tmp_path / "t.npz")
+    (tmp_path / "sensors.csv").write_text(SENSORS)
+    arguments = ["table", "verify", str(tmp_path / "t.npz"), "--device", "memory"]
+    arguments += ["--sensors", str(tmp_path / "sensors.csv"), "--url", "sim://"]
+    result = CliRunner().invoke(app, arguments)
+    assert isinstance(result.exception, InputError)
+    assert "rig is missing" in str(result.exception)
+
+
+@pytest.mark.parametrize("trouble", [KeyboardInterrupt, LinkError])
+def test_amplifier_is_disarmed_as_soon_as_the_card_ends(
+    rig: Rig,
+    table: LocalizationTable,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    trouble: type[BaseException],
+) -> None:
+    """Ctrl-C and a lost card end a vibration on its way, not four seconds later when it is over."""
+    playing, ended = threading.Event(), []
+
+    class Observed(BlockingAmplifier):
+        """Notes how what it plays ends."""
+
+        def apply(
+            self, commands: Sequence[DriveCommand], *, ramp: float = 0.02, valid_for: float = 0.0
+        ) -> Achieved:
+            achieved = super().apply(commands, ramp=ramp, valid_for=valid_for)
+            playing.set()
+            return achieved
+
+        def play(
+            self, commands: Sequence[DriveCommand], *, duration: float, ramp: float = 0.02
+        ) -> Achieved:
+            try:
+                achieved = super().play(commands, duration=duration, ramp=ramp)
+            except CommandRefused:
+                ended.append("disarmed")
+                raise
+            ended.append("played to its end")
+            return achieved
+
+    class EndingCard(SoundCard):
+        """Ends while the amplifier plays."""
+
+        def __init__(self) -> None:
+            self.rate = RATE
+
+        def run(
+            self, played: FloatArray, *, progress: Callable[[int], None] = lambda _frames: None
+        ) -> Float32Array:
+            assert playing.wait(10.0)
+            raise trouble
+
+        def close(self) -> None:
+            """Nothing is open."""
+
+    monkeypatch.setattr(table_check, "BlockingAmplifier", Observed)
+    monkeypatch.setattr(table_check, "open_card", lambda _device, **_counts: EndingCard())
+    (tmp_path / "sensors.csv").write_text(SENSORS)
+    url = f"sim://{example_rig_path()}"
+    settings = CheckSettings("memory", tmp_path / "sensors.csv", url, 1, 0, LEVEL)
+    with pytest.raises(trouble):
+        table_check.check_table(table, rig, settings, progress=lambda _done, _count: None)
+    assert ended == ["disarmed"]

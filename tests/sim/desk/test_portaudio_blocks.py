@@ -1,0 +1,70 @@
+"""Blocks that PortAudio reports lost, at the callback in C."""
+
+import ctypes
+
+import numpy as np
+import pytest
+
+from sim.measuring.sound_card import SoundCard
+
+FRAMES = 64
+# paInputUnderflow, paInputOverflow, paOutputUnderflow, paOutputOverflow of portaudio.h
+LOST = (0x1, 0x2, 0x4, 0x8)
+PRIMING = 0x10  # paPrimingOutput: nothing is lost
+
+
+class CallbackCard(SoundCard):
+    """Calls the callback as PortAudio does, with a number of flags for each block."""
+
+    def __init__(self, flags: list[int]) -> None:
+        super().__init__(outputs=1, inputs=1)
+        self._flags = flags
+        self.use()
+
+    def start(self, blocks: int) -> np.ndarray:
+        """Let blocks of zeros be moved to memory; returns that memory."""
+        found = np.zeros((blocks * FRAMES, 1), dtype=np.float32)
+        self._played = np.zeros_like(found)
+        self._transfer.play, self._transfer.record = self._played.ctypes.data, found.ctypes.data
+        self._transfer.frames, self._transfer.position = len(found), 0
+        self._transfer.is_running = 1
+        return found
+
+    def call(self) -> int:
+        """All blocks; returns the gaps that were counted."""
+        kind = ctypes.CFUNCTYPE(
+            ctypes.c_int,
+            ctypes.c_void_p,
+            ctypes.c_void_p,
+            ctypes.c_ulong,
+            ctypes.c_void_p,
+            ctypes.c_ulong,
+            ctypes.c_void_p,
+        )
+        callback = kind(self.address("transfer_portaudio"))
+        block = np.ones(FRAMES, dtype=np.float32)
+        out = np.zeros(FRAMES, dtype=np.float32)
+        for flags in self._flags:
+            assert callback(block.ctypes.data, out.ctypes.data, FRAMES, None, flags, None) == 0
+        return self._transfer.gaps
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+@pytest.mark.parametrize(
+    ("flags", "gaps"),
+    [
+        *(([0, flag, 0], 1) for flag in LOST),
+        ([0, LOST[0] | LOST[2], LOST[1]], 2),
+        ([0, PRIMING, 0], 0),
+        ([LOST[1], 0, 0], 0),  # before the first frame
+        ([0, 0, 0, LOST[1]], 0),  # after the last one
+    ],
+)
+def test_lost_blocks_are_gaps_while_something_plays(flags: list[int], gaps: int) -> None:
+    """Each block with a flag of a loss, from the second to the last, is one gap."""
+    card = CallbackCard(flags)
+    heard = card.start(3)
+    assert card.call() == gaps
+    assert heard.all()

@@ -36,7 +36,8 @@ test: .venv/installed-test
 # Whole programmes of which `make test` has a short form: every command of the pages typed from an
 # empty folder, conformance of the examples, an identified plate, the firmware on the plate.
 test-long: .venv/installed-test
-	$(BIN)/pytest -m long --numprocesses auto
+	$(BIN)/pytest -m 'long and not alone' --numprocesses auto
+	$(BIN)/pytest -m 'long and alone'
 
 lint: .venv/installed-test
 	$(BIN)/ruff check .

@@ -51,7 +51,7 @@ def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[] if name == SHORT else [pytest.mark.long])
+        pytest.param(name, marks=[] if name == SHORT else [pytest.mark.long, pytest.mark.alone])
         for name in [*NAMES, *WITH_CONFORMANCE]
     ],
 )

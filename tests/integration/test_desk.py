@@ -33,7 +33,7 @@ def plate(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
 
 @pytest.mark.parametrize(
     ("device", "late"),
-    [("jack:desk", 0), pytest.param("desk", 512, marks=pytest.mark.long)],
+    [("jack:desk", 0), pytest.param("desk", 512, marks=[pytest.mark.long, pytest.mark.alone])],
 )
 def test_measured_plate_is_the_one_on_the_desk(plate: Desk, device: str, late: int) -> None:
     """Through JACK or PortAudio and files, against the plate's closed form, and its hidden delay.
@@ -55,6 +55,7 @@ def test_measured_plate_is_the_one_on_the_desk(plate: Desk, device: str, late: i
 
 
 @pytest.mark.long
+@pytest.mark.alone
 def test_chain_from_measurement_to_touches_keeps_its_promises() -> None:
     """Values found are the plate's, promises are kept, and touches are felt where they are.
 

@@ -33,9 +33,8 @@ def find_socket(given: Path | str | None) -> Path:
     if given is not None:
         return expect_path(given, what="path")
     own = default_socket()
-    if os.environ.get(SOCKET_VARIABLE):
-        return own
-    return own if own.exists() or not _exists(SYSTEM_SOCKET) else SYSTEM_SOCKET
+    is_named = bool(os.environ.get(SOCKET_VARIABLE))
+    return own if is_named or own.exists() or not _exists(SYSTEM_SOCKET) else SYSTEM_SOCKET
 
 
 def _exists(path: Path) -> bool:

@@ -291,8 +291,8 @@ def show_event(event: "Notification", *, ahead: float) -> str:
 
 def _show_learning(learning: "LearningSummary") -> list[str]:
     """Format what is learned of the plate."""
-    state = learning.state.replace("_", " ").upper() if learning.robust else learning.state
-    lines = [f"  plate {state.replace('_', ' ')}: {learning.cause}"]
+    state = learning.state.replace("_", " ")
+    lines = [f"  plate {state.upper() if learning.robust else state}: {learning.cause}"]
     if learning.robust:
         lines.append("    answers are robust ones, of a plate that is not known")
     if learning.remedy:

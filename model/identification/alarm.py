@@ -23,9 +23,8 @@ WINDOW: Final = 8
 _UNLIKELY_TOGETHER, _UNLIKELY_ALONE, _UNLIKELY_REST = 1e-7, 1e-6, 1e-2
 _ALONG_REST = 8.0  # without the pattern that deviates most
 _ALONG = 22.0  # squared standard deviations, of a hundred directions in some thousand patterns
-_DEFAULT_SHARE = 0.4  # of nis / count: a change adds more, without one there is mostly less
 _REFERENCE = 0.4  # of nis / count: a change adds more, without one there is less most of the time
-_PLACES = (9, 7)
+_PLACES = (9, 7)  # along length and width
 _KINDS = ("stiffness", "gain", "phase", "thickness")
 
 

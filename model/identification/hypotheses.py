@@ -14,6 +14,7 @@ import numpy as np
 from scipy import linalg, stats
 
 from model.arrays import FloatArray
+from model.identification.alarm import places_on
 from model.identification.alterations import Alteration, Altered, Crack, Hand, scores
 from model.identification.derivatives import by_mass_at
 from model.identification.kalman import State, Updated, update
@@ -24,7 +25,7 @@ _SPRING, _THICKNESS, _GAIN, _PHASE = 0.3, 0.05, 0.3, 0.5  # of logarithms, and r
 _MASS = 5e-3
 _COST_OF_CHANGE = 4.0
 _UNLIKELY, _FAR_AHEAD, _ROUGHLY = 1e-4, 25.0, 4.0
-_SCANNED, _STARTS, _ALTERED_STARTS = (9, 7), 3, 2
+_STARTS, _ALTERED_STARTS = 3, 2
 _ALTERATIONS: tuple[Alteration, ...] = (Hand(), Crack())
 _FIRST_ITERATIONS, _ALTERED_ITERATIONS, _ITERATIONS = 5, 10, 30
 BY_MASS = "a mass"
@@ -193,9 +194,7 @@ def _scan(
 
     None: a mass [kg]; std: of sizes.
     """
-    sides = _sides(patterns)
-    axes = [side * (np.arange(n) + 0.5) / n for side, n in zip(sides, _SCANNED, strict=True)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    points = places_on(*_sides(patterns))
     slope, curvature = np.zeros(len(points)), np.zeros(len(points))
     for each in patterns:
         fingers = np.zeros(each.touched.space.size - len(before.x))

@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
@@ -53,18 +54,19 @@ def test_violation_fails_at_once(coarse_rig: Rig) -> None:
     assert row["place"] == "wire-protocol.md#watchdog"
 
 
+async def disturbed_at_first(tries: list[float], bench: Bench) -> None:
+    """Violate the contract amid a stall at the first of these tries."""
+    tries.append(clock.now())
+    if len(tries) == 1:
+        stall(0.05)
+        await bench.sample()
+        expect(False, "level", expected="0.2", seen="0.1")
+
+
 def test_violation_amid_a_stall_is_looked_at_again(coarse_rig: Rig) -> None:
     """The second attempt, undisturbed, passes."""
-    tries = []
-
-    async def steps(bench: Bench) -> None:
-        tries.append(clock.now())
-        if len(tries) == 1:
-            stall(0.05)
-            await bench.sample()
-            expect(False, "level", expected="0.2", seen="0.1")
-
-    found = result_of(steps, coarse_rig)
+    tries: list[float] = []
+    found = result_of(partial(disturbed_at_first, tries), coarse_rig)
     assert found.result is Result.PASSED
     assert found.attempts == 2
 
@@ -125,14 +127,10 @@ def test_level_of_driven_channels_is_as_given(level: float, coarse_rig: Rig) -> 
 
 def test_skip_after_a_failure_is_no_skip(coarse_rig: Rig) -> None:
     """An attempt that failed amid a stall is not forgotten by one that found nothing to check."""
-    tries = []
+    tries: list[float] = []
 
     async def steps(bench: Bench) -> None:
-        tries.append(clock.now())
-        if len(tries) == 1:
-            stall(0.05)
-            await bench.sample()
-            expect(False, "level", expected="0.2", seen="0.1")
+        await disturbed_at_first(tries, bench)
         raise NotApplicable("the wire is too slow")
 
     found = result_of(steps, coarse_rig)

@@ -6,6 +6,7 @@ replaced after a growing pause, and after so many in a row without an answer no 
 
 import asyncio
 import contextlib
+import logging
 import os
 import sys
 from collections.abc import Callable
@@ -26,6 +27,7 @@ from controller.learning.messages import (
 from drivers import clock
 from drivers.operation.pauses import Backoff
 from model.identification.settled import SettledPattern
+from registry.plugins import failure_text
 
 MAX_WAITING = 16
 """Patterns that wait for the estimator; newer ones are dropped."""
@@ -33,6 +35,8 @@ MAX_WAITING = 16
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _BUFFER = 1 << 22  # bytes; more than most messages have
 _CLOSE_TIMEOUT = 0.3  # s
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -154,7 +158,7 @@ class EstimatorProcess:
             finally:
                 getting.cancel()
             if not getting.done() or getting.cancelled():
-                return await _end_of(process)
+                return await _end_of(process, receiving)
             request, limit = getting.result(), self._timeouts.estimate
 
     async def _exchange(
@@ -174,7 +178,7 @@ class EstimatorProcess:
         if self._replied.done():
             return self._refusal
         if receiving.done():
-            return await _end_of(process)
+            return await _end_of(process, receiving)
         return f"no reply within {limit:g} s"
 
     async def _receive(self, process: asyncio.subprocess.Process) -> None:
@@ -195,8 +199,11 @@ class EstimatorProcess:
                         self._replied.set_result(None)
 
 
-async def _end_of(process: asyncio.subprocess.Process) -> str:
-    """How a process whose output has ended ended."""
+async def _end_of(process: asyncio.subprocess.Process, receiving: "asyncio.Task[None]") -> str:
+    """How a process ended whose replies have, or why the daemon could not take one."""
+    if receiving.done() and (error := receiving.exception()) is not None:
+        _logger.error("plate: a reply could not be taken", exc_info=error)
+        return f"a reply could not be taken: {failure_text(error)}"
     try:
         async with asyncio.timeout(_CLOSE_TIMEOUT):
             return f"exited with status {await process.wait()}"

@@ -39,6 +39,8 @@ from registry.plugins import failure_text
 ROBUST_AFTER = 60.0
 """Time [s] without an estimator after which answers no longer trust what was learned."""
 
+_PAUSE = 10.0  # s; before the sensors are asked, or read, again after a failure
+
 _CHANGED_REMEDY = (
     "look for a loose mount, a crack or something on the plate; then identify it (era rig identify)"
     ", or discard what was learned (era forget)"
@@ -138,17 +140,24 @@ class Learning:
         await self._end(*self._tasks)
 
     async def _open(self) -> None:
-        """Ask the amplifiers for their sensors, and start an estimator where they have some."""
-        try:
-            check_common_start(self._amplifiers)
-            self._sensors = (await plate_sensors(self._rig, self._amplifiers)).used
-        except CommandError as error:
-            self._say(LearningState.OFF, str(error))
-            return
-        except DriverError as error:
-            _logger.info("plate: sensors not read: %s", error)
-            return
-        self._start()
+        """Ask the amplifiers for their sensors until they tell; start an estimator if they have."""
+        while True:
+            try:
+                check_common_start(self._amplifiers)
+                self._sensors = (await plate_sensors(self._rig, self._amplifiers)).used
+            except CommandError as error:
+                self._say(LearningState.OFF, str(error))
+                return
+            except DriverError as error:
+                self._say(
+                    LearningState.OFF,
+                    f"sensors not read: {error}; asking again every {_PAUSE:g} s",
+                    "check the link and the supply of the amplifiers",
+                )
+                await asyncio.sleep(_PAUSE)
+            else:
+                self._start()
+                return
 
     def _start(self) -> None:
         self._say(LearningState.STARTING, "the estimator is starting")
@@ -178,9 +187,7 @@ class Learning:
                 _logger.warning("plate: %s", reply.text)
 
     def _ready(self, ready: Ready) -> None:
-        if self._outage is not None:
-            self._outage.cancel()
-            self._outage = None
+        self._end_outage()
         if ready.note:
             _logger.warning("plate: learning anew: %s", ready.note)
         self._robust, self._is_held = ready.robust, False
@@ -189,15 +196,8 @@ class Learning:
             self._correct(ready.answers, are_robust=ready.has_changed)
         elif self.status.are_robust:
             self._reset()
-        if self._readings is None:
-            self._readings = SettledReadings(
-                self._rig,
-                self._amplifiers,
-                self._sensors,
-                settling=ready.settling,
-                take=self._hand,
-            )
-            self._spawn("readings", self._readings.run())
+        if "readings" not in self._tasks:
+            self._spawn("readings", self._read(ready.settling))
         if ready.has_changed:
             self._say(LearningState.CHANGED, _CHANGED_BEFORE, _CHANGED_REMEDY)
         else:
@@ -222,6 +222,8 @@ class Learning:
     def _take(self, estimate: Estimate) -> None:
         self.status = replace(self.status, last_at=clock.now())
         self._is_held = estimate.is_held
+        if self._readings is not None:
+            self._end_outage()
         self._count(estimates=1)
         if estimate.alarm:
             self._count(alarms=1)
@@ -240,7 +242,7 @@ class Learning:
                 self._say(LearningState.EXPLAINING, cause)
         elif estimate.alarm:
             cause = f"the plate is not as the rig says (alarm {self.status.alarms})"
-            self._say(self.status.state, cause, self.status.remedy)
+            self._say(self.status.state, cause, self.status.remedy, is_alarm=True)
         elif self.status.state in _UNUSUAL:
             self._say_followed("the plate is again as it was")
 
@@ -264,27 +266,43 @@ class Learning:
     def _failed(self, reason: str, is_final: bool) -> None:
         """Note that an estimator has ended."""
         self._note_lost(waiting=0 if self._estimator is None else self._estimator.waiting)
-        if self._outage is None:
-            loop = asyncio.get_running_loop()
-            self._outage = loop.call_later(ROBUST_AFTER, self._answer_robustly)
+        self._await_outage()
         if is_final:
             self._say(LearningState.FAILED, f"estimator: {reason}", _FAILED_REMEDY)
         else:
             self._count(restarts=1)
             self._say(LearningState.RESTARTING, f"estimator: {reason}; retrying")
 
+    def _await_outage(self) -> None:
+        """Answer robustly after a while, unless the plate is watched again by then."""
+        if self._outage is None:
+            loop = asyncio.get_running_loop()
+            self._outage = loop.call_later(ROBUST_AFTER, self._answer_robustly)
+
+    def _end_outage(self) -> None:
+        if self._outage is not None:
+            self._outage.cancel()
+            self._outage = None
+
     def _answer_robustly(self) -> None:
         """Trust what was learned no longer, since nobody watches the plate."""
         if self._robust is None or self.status.are_robust:
             return
         self._correct(self._robust, are_robust=True)
-        _logger.warning("plate: no estimator for %g s, answers are robust ones", ROBUST_AFTER)
+        _logger.warning("plate: not watched for %g s, answers are robust ones", ROBUST_AFTER)
         self._changed(self.status)
 
-    def _say(self, state: LearningState, cause: str, remedy: str | None = None) -> None:
+    def _say(
+        self,
+        state: LearningState,
+        cause: str,
+        remedy: str | None = None,
+        *,
+        is_alarm: bool = False,
+    ) -> None:
         """Note a state, and tell of it."""
         self.status = replace(self.status, state=state, cause=cause, remedy=remedy)
-        level = logging.WARNING if state.is_bad else logging.INFO
+        level = logging.WARNING if state.is_bad or is_alarm else logging.INFO
         _logger.log(level, "plate: %s: %s", state.value, cause, extra={"topic": "plate"})
         self._changed(self.status)
 
@@ -308,6 +326,25 @@ class Learning:
         except Exception as error:
             _logger.exception("plate: %s failed", name)
             self._say(LearningState.FAILED, failure_text(error), _FAILED_REMEDY)
+
+    async def _read(self, settling: float) -> None:
+        """Read what settles; what fails is said, and started anew."""
+        while True:
+            self._readings = SettledReadings(
+                self._rig, self._amplifiers, self._sensors, settling=settling, take=self._hand
+            )
+            try:
+                await self._readings.run()
+            except Exception as error:
+                _logger.exception("plate: readings failed")
+                self._readings = None
+                self._say(
+                    LearningState.FAILED,
+                    f"readings: {failure_text(error)}; retrying every {_PAUSE:g} s",
+                    _FAILED_REMEDY,
+                )
+                self._await_outage()
+            await asyncio.sleep(_PAUSE)
 
     async def _end(self, *names: str) -> None:
         ending = [self._tasks[name] for name in names if name in self._tasks]

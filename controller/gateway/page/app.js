@@ -233,7 +233,7 @@ const HANDLERS = {
     const isBad = robust || state === "failed" || state === "restarting";
     at("known").textContent = `Plate ${state.replace("_", " ")}: ${cause}`;
     at("known").classList.toggle("bad", isBad);
-    if (isBad || state === "explaining") addEvent(log, "warning", cause, remedy);
+    if (isBad || state === "explaining" || cause.includes("(alarm ")) addEvent(log, "warning", cause, remedy);
   },
   log({ level, message, cause, remedy }) {
     addEvent(log, level, cause ? `${message}: ${cause}` : message, remedy);

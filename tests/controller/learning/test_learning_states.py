@@ -14,7 +14,7 @@ from controller.learning.learning import Learning
 from controller.learning.learning_status import LearningState
 from controller.learning.messages import Answers, Estimate, Ready, Refreshed, Reply, Start
 from controller.loop.loop import Controller
-from drivers.errors import CommandError
+from drivers.errors import CommandError, LinkError
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
 from paper_plate import make_paper_rig
@@ -188,4 +188,75 @@ async def test_file_that_cannot_be_removed_is_still_followed(
     estimators.reply(replace(READY, answers=answers()))
     assert learning.status.state is LearningState.FOLLOWING
     await asyncio.sleep(0.1)
+    await learning.close()
+
+
+@in_virtual_time
+async def test_readings_that_fail_are_started_anew(estimators: Estimators, tmp_path: Path) -> None:
+    """Failed with the cause at once; read again after a pause, and followed after an estimate."""
+    learning, _ = await opened(tmp_path)
+    estimators.reply(READY)
+    await asyncio.sleep(0.1)
+    before = Readings.count
+    Readings.ending.set()
+    await asyncio.sleep(0.1)
+    assert learning.status.state is LearningState.FAILED
+    assert "a sensor of no kind" in learning.status.cause
+    await asyncio.sleep(11.0)
+    assert Readings.count == before + 1
+    estimators.reply(QUIET)
+    assert learning.status.state is LearningState.FOLLOWING
+    await asyncio.sleep(61.0)
+    assert not learning.status.are_robust
+    await learning.close()
+
+
+@in_virtual_time
+async def test_readings_that_stay_away_make_answers_robust(
+    estimators: Estimators, tmp_path: Path
+) -> None:
+    """Nobody watches the plate: after a minute what was learned is not trusted."""
+    learning, _ = await opened(tmp_path)
+    estimators.reply(READY)
+    await asyncio.sleep(0.1)
+    Readings.ending.set()
+    await asyncio.sleep(61.0)
+    assert learning.status.are_robust
+    await learning.close()
+
+
+@in_virtual_time
+async def test_sensors_that_were_not_read_are_asked_for_again(
+    estimators: Estimators, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Off with the link's error and a remedy; the estimator starts once they reply."""
+    replying = module.plate_sensors
+
+    async def silent(*args: object) -> Any:
+        raise LinkError("no reply of A")
+
+    monkeypatch.setattr(module, "plate_sensors", silent)
+    learning, _ = await opened(tmp_path)
+    assert learning.status.state is LearningState.OFF
+    assert "no reply of A" in learning.status.cause
+    assert learning.status.remedy is not None
+    monkeypatch.setattr(module, "plate_sensors", replying)
+    await asyncio.sleep(11.0)
+    assert learning.status.state is LearningState.STARTING
+    await asyncio.sleep(0.1)
+    await learning.close()
+
+
+@in_virtual_time
+async def test_alarm_of_a_watched_plate_is_a_warning(
+    estimators: Estimators, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is all that such a plate can tell."""
+    learning, _ = await opened(tmp_path)
+    estimators.reply(replace(READY, only_alarms="never measured"))
+    await asyncio.sleep(0.1)
+    caplog.clear()
+    estimators.reply(replace(QUIET, alarm=True))
+    assert learning.status.state is LearningState.ONLY_ALARMS
+    assert [each.levelname for each in caplog.records] == ["WARNING"]
     await learning.close()

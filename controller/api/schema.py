@@ -251,6 +251,9 @@ class LearningSummary(Message):
     discarded: Count = Field(
         description="of these, not estimated, since the estimator ended or had too many"
     )
+    disturbed: Count = Field(
+        description="settled patterns whose measurement a change, an overload or the link spoilt"
+    )
     corrections: Count = Field(description="of the answers to touches")
     alarms: Count = Field(description="patterns that show another plate than the known one")
     restarts: Count = Field(description="of the estimator")

@@ -107,6 +107,7 @@ class PlateEvent(Message):
     cause: str
     remedy: str | None = Field(description="what to do about it; null if nothing")
     robust: bool = Field(description="whether answers are those of a plate that is not known")
+    alarms: Count = Field(description="patterns so far that show another plate than the known one")
 
 
 class LayoutEvent(Message):

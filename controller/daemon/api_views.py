@@ -195,6 +195,7 @@ def learning_summary(
         readings=status.readings,
         estimates=status.estimates,
         discarded=status.discarded,
+        disturbed=status.disturbed,
         corrections=status.corrections,
         alarms=status.alarms,
         restarts=status.restarts,
@@ -210,6 +211,7 @@ def plate_event(status: LearningStatus) -> PlateEvent:
         cause=status.cause,
         remedy=status.remedy,
         robust=status.are_robust,
+        alarms=status.alarms,
     )
 
 

@@ -20,7 +20,7 @@ from model.config.document import ConfigError, Document, read_document
 from model.config.sections import Validation
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
-from model.identification.learned_file import load_learned
+from model.identification.learned_file import was_learned
 from model.rig.file import rig_of
 from model.rig.rig import Rig
 from model.structure.support import check_supported
@@ -277,16 +277,22 @@ def _check_folders(
 
 
 def _check_learn(validation: Validation[DaemonSection], file: Path | None) -> None:
-    """Refuse to learn into a file that is something else; its folder must exist."""
+    """Refuse to learn into a file that is something else; its folder must exist.
+
+    A damaged file, or one of another version, is set aside by the estimator.
+    """
     if file is None:
         return
     if not file.parent.is_dir():
         validation.add(("learn",), f"folder not found: {file.parent}; create it")
-    elif file.exists():
-        try:
-            load_learned(file)
-        except InputError as error:
-            validation.add(("learn",), str(error))
+        return
+    try:
+        is_free = not file.exists() or was_learned(file)
+    except OSError as error:
+        validation.add(("learn",), f"{file}: {error.strerror}; make it readable for the daemon")
+        return
+    if not is_free:
+        validation.add(("learn",), f"{file}: must be a learned plate; give another name")
 
 
 def _check_serial_numbers(validation: Validation[DaemonSection], rig: Rig | None) -> None:

@@ -250,11 +250,11 @@ class Daemon:
                     task.cancel()
                     await asyncio.wait({task})
             self._log.listener = None
-            if self._learning is not None:
-                await self._learning.close()
-            for step in (self._inputs.close(), self._children.close(), self._server.close()):
-                with contextlib.suppress(OSError):
-                    await step
+            learning = () if self._learning is None else (self._learning.close(),)
+            closing = (self._inputs.close(), self._children.close(), self._server.close())
+            for found in await asyncio.gather(*learning, *closing, return_exceptions=True):
+                if isinstance(found, Exception) and not isinstance(found, OSError):
+                    _logger.error("closing failed", exc_info=found)
             self._publisher.hub.close()
 
     def _make_backends(self, config: DaemonConfig) -> dict[str, RecordedBackend]:

@@ -29,6 +29,7 @@ from controller.learning.messages import (
     unpacked,
 )
 from model.errors import InputError
+from model.files.array_file import remove_partial
 from model.identification.in_service import Known
 from model.identification.learned_table import LearnedTable
 from model.identification.settled import SettledPattern
@@ -56,6 +57,7 @@ class Estimator:
         if self.only_alarms:
             known = replace(known, is_explained=False)
         self.note = ""
+        remove_partial(start.file)
         try:
             self._learned = LearnedTable.resumed(start.table, known, file=start.file)
             if self._learned.current is not start.table:
@@ -66,6 +68,7 @@ class Estimator:
             self._learned = LearnedTable(start.table, known, file=start.file)
         self._saved_at = self._refreshed_at = now()
         self._is_saved = self._is_refreshed = True
+        self._save_error = ""
 
     def ready(self) -> Ready:
         """What it starts with."""
@@ -79,6 +82,7 @@ class Estimator:
             self._prepared(learned.current, whole=True) if is_resumed else None,
             self._robust(),
             learned.has_changed,
+            learned.change,
         )
 
     def take(self, pattern: SettledPattern) -> Estimate:
@@ -128,14 +132,16 @@ class Estimator:
         return Refreshed(self._prepared(self._learned.current, whole=True), self._robust())
 
     def save(self) -> Note | None:
-        """Write what was learned; where that fails, say so, and try again later."""
+        """Write what was learned; where that fails, say so once, and try again later."""
         self._saved_at = self._now()
         try:
             if not self._is_saved:
                 self._learned.save()
         except OSError as error:
-            return Note(f"{self._start.file}: not written: {error}")
-        self._is_saved = True
+            before, self._save_error = self._save_error, str(error)
+            is_new = self._save_error != before
+            return Note(f"{self._start.file}: not written: {error}") if is_new else None
+        self._is_saved, self._save_error = True, ""
         return None
 
     def _prepared(self, table: LocalizationTable, *, whole: bool) -> Answers:

@@ -199,7 +199,7 @@ class Learning:
         if "readings" not in self._tasks:
             self._spawn("readings", self._read(ready.settling))
         if ready.has_changed:
-            self._say(LearningState.CHANGED, _CHANGED_BEFORE, _CHANGED_REMEDY)
+            self._say(LearningState.CHANGED, ready.change or _CHANGED_BEFORE, _CHANGED_REMEDY)
         else:
             known = "what was learned before" if ready.answers else "the rig as built"
             self._say_followed(f"the plate is followed from {known} on")
@@ -331,7 +331,12 @@ class Learning:
         """Read what settles; what fails is said, and started anew."""
         while True:
             self._readings = SettledReadings(
-                self._rig, self._amplifiers, self._sensors, settling=settling, take=self._hand
+                self._rig,
+                self._amplifiers,
+                self._sensors,
+                settling=settling,
+                take=self._hand,
+                disturbed=lambda: self._count(disturbed=1),
             )
             try:
                 await self._readings.run()

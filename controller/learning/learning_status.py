@@ -27,7 +27,8 @@ class LearningStatus:
     """State of the learning and its cause, remedy if there is one, and counts since the start.
 
     readings: of settled patterns; estimates: of these, by the estimator; discarded: those that will
-    not be, since it ended or had too many; corrections: of the answers; alarms; restarts: of the
+    not be, since it ended or had too many; disturbed: readings that a change, an overload or the
+    link has spoilt; corrections: of the answers; alarms; restarts: of the
     estimator; are_robust: whether answers are those of a plate that is not known; last_at [s]: of
     the last estimate, None before the first.
     """
@@ -38,6 +39,7 @@ class LearningStatus:
     readings: int = 0
     estimates: int = 0
     discarded: int = 0
+    disturbed: int = 0
     corrections: int = 0
     alarms: int = 0
     restarts: int = 0

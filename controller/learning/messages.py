@@ -54,7 +54,8 @@ class Ready:
     settling [s]: until the plate has settled; note: why it starts anew although there is a file, or
     nothing; only_alarms: why it does not correct answers, or nothing; answers: those of the plate
     as learned before, None for the table as built; robust: for when the plate is not known;
-    has_changed: whether it had changed in a way that nothing known explains.
+    has_changed: whether it had changed in a way that nothing known explains; change: how, as found
+    then, or nothing.
     """
 
     settling: float
@@ -63,6 +64,7 @@ class Ready:
     answers: Answers | None
     robust: Answers
     has_changed: bool
+    change: str = ""
 
 
 @dataclass(frozen=True, eq=False)

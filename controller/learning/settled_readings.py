@@ -38,7 +38,8 @@ class SettledReadings:
     """Follows what the control loop reports, and reads it.
 
     sensors: of amplifiers, by name, that start together; settling [s]: of the plate; take: receives
-    each pattern with what was read of it, at the time [s] when the window ended.
+    each pattern with what was read of it, at the time [s] when the window ended; disturbed: called
+    for each reading that a change, an overload or the link has spoilt.
     """
 
     def __init__(
@@ -49,17 +50,16 @@ class SettledReadings:
         *,
         settling: float,
         take: Callable[[SettledPattern], None],
+        disturbed: Callable[[], None],
     ) -> None:
         self._rig, self._amplifiers, self._sensors = rig, amplifiers, sensors
-        self._settling, self._take = settling, take
+        self._settling, self._take, self._disturbed = settling, take, disturbed
         self._highest = min(sensor.frequency_max for sensor in sensors)
         self._contacts: tuple[Contact, ...] = ()
         self._settled_contacts: tuple[Contact, ...] = ()
         self._playing: Applied | None = None
         self._due = math.inf
         self._change = asyncio.Event()
-        self.discarded = 0
-        """Readings that a change, an overload or the link has spoilt."""
 
     def pattern_applied(self, applied: Applied) -> None:
         """Follow a pattern that the amplifiers have confirmed, if it can be read."""
@@ -93,9 +93,9 @@ class SettledReadings:
             try:
                 await self._read(applied, contacts)
             except Preempted:
-                self.discarded += 1  # what preempted it is read once it has settled
+                self._disturbed()  # what preempted it is read once it has settled
             except DriverError as error:
-                self.discarded += 1
+                self._disturbed()
                 _logger.info("reading given up: %s", error)
                 await asyncio.sleep(_PAUSE_AFTER_FAILURE)
 
@@ -121,23 +121,23 @@ class SettledReadings:
         for _ in range(READINGS):
             readings, ended_at = await self._measure(frequency)
             if self._change.is_set():
-                self.discarded += 1
+                self._disturbed()
                 return
             if all(each.state is ReadingState.COMPLETE for each in readings.values()):
                 break
         else:
-            self.discarded += 1
+            self._disturbed()
             return
         values = []
         for sensor in self._sensors:
             several = readings[sensor.amplifier].sensors
             if sensor.number >= len(several) or several[sensor.number].is_overloaded:
-                self.discarded += 1
+                self._disturbed()
                 return
             reading = readings[sensor.amplifier]
             values.append(sensor.accelerations(reading, np.array([frequency]))[0])
         if not np.isfinite(values).all() or not np.any(values):  # no phase to turn others to
-            self.discarded += 1
+            self._disturbed()
             _logger.info("reading given up: all sensors read nothing")
             return
         tip = self._rig.fingertip

@@ -117,6 +117,7 @@ def _learning(learning: LearningSummary) -> Iterator[Metric]:
         ("readings", "Settled patterns that were measured.", learning.readings),
         ("estimates", "Of these, by the estimator.", learning.estimates),
         ("discarded_readings", "Of these, not estimated.", learning.discarded),
+        ("disturbed_readings", "Begun, and spoilt by a change or the link.", learning.disturbed),
         ("corrections", "Corrections of the answers.", learning.corrections),
         ("plate_alarms", "Patterns that show another plate than known.", learning.alarms),
         ("estimator_restarts", "Restarts of the estimator.", learning.restarts),

@@ -4,6 +4,7 @@ Names, types and sizes must be those expected; nothing may be compressed or pick
 may declare more than the file holds.
 """
 
+import glob
 import hashlib
 import math
 import os
@@ -11,7 +12,7 @@ import tokenize
 import uuid
 import zipfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, TypeAlias
 
@@ -25,6 +26,7 @@ Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 UNREADABLE = (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError)
 """Errors of `read_arrays` for a file that is missing, damaged or unexpected."""
 
+_RANDOM = 12  # letters of a temporary name
 _ENCRYPTED = 0x1  # a flag of a zip member
 
 # numpy parses a header as Python text and does not turn all errors of that into ValueError.
@@ -37,7 +39,7 @@ def whole_or_nothing(path: Path) -> Iterator[IO[bytes]]:
 
     Raises OSError with the file's name, unless the block raised one with the name of another file.
     """
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}")
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:_RANDOM]}")
     try:
         with temporary.open("xb") as stream:
             yield stream
@@ -49,6 +51,13 @@ def whole_or_nothing(path: Path) -> Iterator[IO[bytes]]:
         if isinstance(error, OSError) and error.filename in (None, str(temporary), temporary):
             raise OSError(error.errno, error.strerror or str(error), str(path)) from error
         raise
+
+
+def remove_partial(path: Path) -> None:
+    """Remove what writers of a file left that were killed; nobody may be writing it."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.{'[0-9a-f]' * _RANDOM}"):
+        with suppress(OSError):
+            left.unlink()
 
 
 def write_arrays(path: Path, arrays: Arrays) -> None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,9 +10,10 @@ import numpy as np
 
 from model.errors import InputError
 from model.files.array_file import UNREADABLE, read_arrays, write_arrays
+from model.files.replacing import begins_with
 from model.identification.kalman import State
 
-_VERSION = 1
+_VERSION = 2
 _TYPES = {"header": "|u1", "x": "<f8", "covariance": "<f8", "digest": "|u1"}
 _MAX_BYTES = 1 << 24
 
@@ -24,7 +26,8 @@ class OtherPlate(InputError):
 class LearnedPlate:
     """A state of parameters by name, counted from a rig; table, base: fingerprints of both.
 
-    has_changed: whether the plate has changed since in a way that its parameters do not follow.
+    has_changed: whether the plate has changed since in a way that its parameters do not follow;
+    change: how, as found then, or nothing.
     """
 
     table: str
@@ -32,6 +35,7 @@ class LearnedPlate:
     names: tuple[str, ...]
     state: State
     has_changed: bool = False
+    change: str = ""
 
 
 def save_learned(learned: LearnedPlate, file: Path) -> None:
@@ -42,6 +46,7 @@ def save_learned(learned: LearnedPlate, file: Path) -> None:
         "base": learned.base,
         "names": learned.names,
         "has_changed": learned.has_changed,
+        "change": learned.change,
     }
     text = json.dumps(header)
     x, covariance = learned.state.x, learned.state.covariance
@@ -68,9 +73,13 @@ def load_learned(file: Path, *, table: str | None = None) -> LearnedPlate:
             raise ValueError("digest must be that of the content")
         header = json.loads(text)
         version, names = header["version"], tuple(header["names"])
-        has_changed = bool(header.get("has_changed", False))
         found = LearnedPlate(
-            header["table"], header["base"], names, State(x, covariance), has_changed
+            header["table"],
+            header["base"],
+            names,
+            State(x, covariance),
+            bool(header["has_changed"]),
+            str(header["change"]),
         )
     except (*UNREADABLE, KeyError, TypeError) as error:
         raise InputError(
@@ -85,6 +94,17 @@ def load_learned(file: Path, *, table: str | None = None) -> LearnedPlate:
             "learn anew"
         )
     return found
+
+
+def was_learned(file: Path) -> bool:
+    """Whether a file is a learned plate of any version, or may have been before it was damaged."""
+    if not begins_with(file, b"PK"):
+        return False
+    try:
+        with zipfile.ZipFile(file) as members:
+            return "covariance.npy" in members.namelist()
+    except zipfile.BadZipFile:
+        return True
 
 
 def _digest(text: str, x: np.ndarray, covariance: np.ndarray) -> bytes:

@@ -41,6 +41,8 @@ class LearnedTable:
         self.live = LivePlate(known)
         self.current = table
         """The table as corrected so far."""
+        self.change = ""
+        """How the plate has changed in a way that its parameters do not follow, as found then."""
 
     @classmethod
     def resumed(cls, table: LocalizationTable, known: Known, *, file: Path) -> Self:
@@ -59,7 +61,7 @@ class LearnedTable:
                 "learn anew"
             )
         resumed = cls(table, replace(known, state=learned.state), file=file)
-        resumed.live.has_changed = learned.has_changed
+        resumed.live.has_changed, resumed.change = learned.has_changed, learned.change
         resumed.current = resumed._followed()
         return resumed
 
@@ -77,18 +79,23 @@ class LearnedTable:
         if not np.isfinite(pattern.values).all() or not np.any(pattern.values):
             raise InputError("readings must be finite and not all 0, got others")
         before, since, had_changed = self.live.state, self.live.known_at, self.has_changed
+        change = self.change
         try:
             report = self.live.take(pattern)
             after = self.live.state
             if not np.isfinite(after.x).all() or not np.isfinite(after.covariance).all():
                 raise InputError("parameters must be finite after a pattern, got others")
+            if not self.has_changed:
+                self.change = ""
+            elif report.explanation is not None:
+                self.change = str(report.explanation)
             if after is before and self.has_changed == had_changed:
                 return Learned(report, None)
             self.current = self._followed()
         except Exception:
             self.live = LivePlate(replace(self._known, state=before))
             self.live.known_since(since)
-            self.live.has_changed = had_changed
+            self.live.has_changed, self.change = had_changed, change
             raise
         return Learned(report, self.current)
 
@@ -109,6 +116,7 @@ class LearnedTable:
             self.live.space.names,
             self.live.state,
             self.has_changed,
+            self.change,
         )
         save_learned(learned, self._file)
 

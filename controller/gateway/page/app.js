@@ -25,6 +25,7 @@ const log = at("log");
 let connection;
 let lease = null;  // until renewing is refused: the state may arrive later than the response to arm
 let state = null;
+let knownAlarms;  // of the plate; undefined before the first event of it
 let daemon;  // result of hello; undefined before the first, null while disconnected
 let failure = "unreachable";
 let lostSince = null;  // when the gateway, the daemon or a link to an amplifier was lost
@@ -229,11 +230,13 @@ const HANDLERS = {
     showLatency(at("latency-numbers"), at("latency"), latency_ms);
     at("plain").textContent = ramp_only_reason ? `Plain ramps instead of shaped onsets: ${ramp_only_reason}` : "";
   },
-  plate({ state, cause, remedy, robust }) {
+  plate({ state, cause, remedy, robust, alarms }) {
     const isBad = robust || state === "failed" || state === "restarting";
+    const isAlarm = alarms > knownAlarms;
+    knownAlarms = alarms;
     at("known").textContent = `Plate ${state.replace("_", " ")}: ${cause}`;
     at("known").classList.toggle("bad", isBad);
-    if (isBad || state === "explaining" || cause.includes("(alarm ")) addEvent(log, "warning", cause, remedy);
+    if (isBad || state === "explaining" || isAlarm) addEvent(log, "warning", cause, remedy);
   },
   log({ level, message, cause, remedy }) {
     addEvent(log, level, cause ? `${message}: ${cause}` : message, remedy);

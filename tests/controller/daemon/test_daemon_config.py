@@ -120,6 +120,9 @@ def test_config_reports_all_problems_at_once(folder: Path) -> None:
         ("rig.yaml", "log: {file: .}\n", [(2, "log.file")]),
         ("rig.yaml", "serial_numbers: {man: A1}\n", [(2, "serial_numbers.man")]),
         ("rig.yaml", 'touch: [{name: api, url: "tuio:3333"}]\n', [(2, "touch[0].name")]),
+        ("rig.yaml", "learn: rig.yaml\n", [(2, "learn")]),
+        ("rig.yaml", "learn: .\n", [(2, "learn")]),
+        ("rig.yaml", "learn: none/learned.npz\n", [(2, "learn")]),
         ("rig.yaml", "touch: 3\n", [(2, "touch")]),
         ("rig.yaml", "touch: [3]\n", [(2, "touch[0]")]),
     ],
@@ -127,6 +130,14 @@ def test_config_reports_all_problems_at_once(folder: Path) -> None:
 def test_config_refuses(folder: Path, rig: str, more: str, expected: list[tuple[int, str]]) -> None:
     """Impossible paths, unknown amplifiers, the reserved name of clients, and wrong shapes."""
     assert problems(written(folder, more, rig=rig)) == expected
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04cut"])
+def test_damaged_learned_file_starts_a_daemon(folder: Path, content: bytes) -> None:
+    """As after a loss of supply; the estimator sets it aside."""
+    (folder / "learned.npz").write_bytes(content)
+    config = load_daemon_config(written(folder, "learn: learned.npz\n"))
+    assert config.learn == folder / "learned.npz"
 
 
 @pytest.mark.parametrize(

@@ -3,10 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from controller.learning.estimator import Estimator, replies
 from controller.learning.messages import Estimate, Note, Start
 from model.identification.forward import Sensor
+from model.identification.learned_table import LearnedTable
 from model.identification.settled import SettledPattern
 from paper_plate import make_paper_rig
 from small_table import small_table
@@ -43,3 +45,35 @@ def test_damaged_file_is_set_aside(tmp_path: Path) -> None:
     assert (tmp_path / "learned.npz.old").read_bytes() == b"something else"
     assert "learned.npz.old" in found.note
     assert found.ready().answers is None
+
+
+def test_folder_without_room_is_noted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Attempts go on with each chore, and the next note is of another error."""
+    clock, errors = [0.0], [OSError(28, "No space left on device")]
+
+    def save(learned: LearnedTable) -> None:
+        raise errors[0]
+
+    rig = make_paper_rig(12, 9)
+    sensors = tuple(Sensor(era.name, era.name) for era in rig.eras)
+    start = Start(rig, small_table(), sensors, "switched", tmp_path / "learned.npz")
+    found = Estimator(start, now=lambda: clock[0])
+    monkeypatch.setattr(LearnedTable, "save", save)
+    monkeypatch.setattr(found, "_is_saved", False)
+    notes = []
+    for second in range(10, 60, 10):
+        clock[0] = float(second)
+        if second == 40:
+            errors[0] = OSError(30, "Read-only file system")
+        notes.append(found.do_chore())
+    assert [isinstance(note, Note) for note in notes] == [True, False, False, True, False]
+
+
+def test_files_of_writers_that_were_killed_are_removed(tmp_path: Path) -> None:
+    """Those of this file only."""
+    left, other = tmp_path / ".learned.npz.0123456789ab", tmp_path / ".learned.npz.old"
+    left.write_bytes(b"half")
+    other.write_bytes(b"somebody's")
+    estimator(tmp_path / "learned.npz")
+    assert not left.exists()
+    assert other.exists()

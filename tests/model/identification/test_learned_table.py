@@ -123,6 +123,7 @@ def test_unexplained_change_widens_the_errors_of_answers(
     learned.save()
     resumed = LearnedTable.resumed(table, Known.of_rig(rig, sensors_of(rig)), file=file)
     assert resumed.has_changed
+    assert resumed.change == learned.change != ""
     assert resumed.current.uncertainty == wide
 
 

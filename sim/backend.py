@@ -1,15 +1,17 @@
 """The backend of `sim://`: a simulated amplifier in this process.
 
-The plate deviates from the rig's within its uncertainty, as that of `era sim`. Each backend has a
-plate of its own; several amplifiers under one plate need `era sim`. Not modelled: transmission
-time.
+The plate deviates from the rig's within its uncertainty, as that of `era sim`. Amplifiers of a rig
+that name one control socket are under one plate; otherwise each backend has a plate of its own. Not
+modelled: transmission time.
 """
 
 import asyncio
 import contextlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from urllib.parse import parse_qsl, unquote
+from weakref import WeakValueDictionary
 
 from drivers import clock
 from drivers.backend import Backend
@@ -79,17 +81,15 @@ class SimulatedBackend(Backend):
         try:
             rig = load_rig(self._rig)
             name = self._select(tuple(rig.amplifiers))
-            bench = await asyncio.to_thread(self._bench_of, rig)
+            plate = self._plate()
+            bench = await plate.acquire(partial(self._bench_of, rig))
         except (InputError, OSError) as error:
             raise CommandError(f"{self._url}: {error}") from error
         async with contextlib.AsyncExitStack() as stack:
-            if self._control is not None:
-                await stack.enter_async_context(
-                    control_socket(SimulationContext(bench), self._control)
-                )
-            task = asyncio.create_task(keep_time(bench), name=f"simulated plate of {self._url}")
-            stack.push_async_callback(_cancel, task)
-            bench.amplifiers[name].listeners.append(self._forward)
+            stack.push_async_callback(plate.release)
+            listeners = bench.amplifiers[name].listeners
+            listeners.append(self._forward)
+            stack.callback(listeners.remove, self._forward)
             self._bench, self._name = bench, name
             self._open = stack.pop_all()
 
@@ -110,6 +110,16 @@ class SimulatedBackend(Backend):
         self._counters.frames_in += 1
         return self._bench.exchange(self._name, request, now=self._last_sent_at)
 
+    def _plate(self) -> "_Plate":
+        """The plate of this URL: that of open amplifiers of the same control, or a new one."""
+        if self._control is None:
+            return _Plate(None)
+        key = (self._rig.resolve(), self._control.resolve(), self._is_exact, self._seed)
+        found = _plates.get(key)
+        if found is None:
+            found = _plates[key] = _Plate(self._control)
+        return found
+
     def _bench_of(self, rig: Rig) -> Bench:
         imperfections = (
             Imperfections() if self._is_exact else draw_imperfections(rig, seed=self._seed)
@@ -126,6 +136,45 @@ class SimulatedBackend(Backend):
         if self._amplifier in names:
             return self._amplifier
         raise CommandError(f"{self._url}: amplifier=NAME must name one of {', '.join(names)}")
+
+
+class _Plate:
+    """A plate in time and its control, from the first amplifier opened to the last closed."""
+
+    def __init__(self, control: Path | None) -> None:
+        self._control = control
+        self._lock = asyncio.Lock()
+        self._users = 0
+        self._bench: Bench | None = None
+        self._running = contextlib.AsyncExitStack()
+
+    async def acquire(self, make: Callable[[], Bench]) -> Bench:
+        """Use the bench, made by the first user; raises what making it raises."""
+        async with self._lock:
+            if self._bench is None:
+                bench = await asyncio.to_thread(make)
+                async with contextlib.AsyncExitStack() as stack:
+                    if self._control is not None:
+                        context = SimulationContext(bench)
+                        await stack.enter_async_context(control_socket(context, self._control))
+                    task = asyncio.create_task(keep_time(bench), name="simulated plate")
+                    stack.push_async_callback(_cancel, task)
+                    self._running = stack.pop_all()
+                self._bench = bench
+            self._users += 1
+            return self._bench
+
+    async def release(self) -> None:
+        """End the use by one; the last one ends the simulation."""
+        async with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                self._bench = None
+                await self._running.aclose()
+
+
+_plates: WeakValueDictionary[tuple[Path, Path, bool, int], _Plate] = WeakValueDictionary()
+"""Plates with a control socket that an amplifier of this process uses."""
 
 
 async def _cancel(task: "asyncio.Task[None]") -> None:

@@ -32,6 +32,13 @@ def _controller() -> None:
 
 @app.command()
 def demo(
+    rig_file: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="RIG", help="Rig file; without one the paper's plate.", show_default=False
+        ),
+    ] = None,
+    *,
     wire: Annotated[
         str,
         typer.Option(
@@ -62,16 +69,16 @@ def demo(
 ) -> None:
     """Play recorded touches on a simulated plate; measure contrast.
 
-    The plate deviates from the table's within the rig's uncertainty, the same for the same --seed.
-    With --drift it is played for an hour of virtual time while it warms by 15 K, loosens a mount
-    and gains a sticker, and is identified in service.
+    The plate deviates from the table's within the rig's uncertainty, the same for the same --seed;
+    recorded places are shares of its size. With --drift it is played for an hour of virtual time
+    while it warms by 15 K, loosens a mount and gains a sticker, and is identified in service.
     """
     if drift:
         if wire not in ("serial", "sim") or touches is not None or exact or dashboard:
             raise InputError(
                 "--drift plays on wire sim; omit --wire, --touches, --exact, and --dashboard"
             )
-        _drift(out, seed=seed, as_json=as_json)
+        _drift(rig_file, out, seed=seed, as_json=as_json)
         return
     import asyncio
     import time
@@ -92,7 +99,7 @@ def demo(
         raise InputError("--dashboard takes its touches from the page; omit --touches and --json")
     drawn = seed_of_plate(exact=exact, seed=seed)
     recorded = read_touches(touches or example_touches_path())
-    rig_file = example_rig_path()
+    rig_file = rig_file or example_rig_path()
     rig = load_rig(rig_file)
     started = time.perf_counter()
     table, table_file = cached_table(rig)
@@ -138,7 +145,7 @@ def demo(
         print(next_line("era", "table", "show", table_file))
 
 
-def _drift(out: Path, *, seed: int | None, as_json: bool) -> None:
+def _drift(rig_file: Path | None, out: Path, *, seed: int | None, as_json: bool) -> None:
     import asyncio
 
     from controller.demo.drift import Event, run_drift
@@ -151,7 +158,7 @@ def _drift(out: Path, *, seed: int | None, as_json: bool) -> None:
             print(f"{event.time_s / 60:5.1f} min  {event.kind:11}  {event.text}", flush=True)
 
     with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
-        hour = runner.run(run_drift(example_rig_path(), seed=seed or 0, on_event=show))
+        hour = runner.run(run_drift(rig_file or example_rig_path(), seed=seed or 0, on_event=show))
     file = write_drift_picture(hour, out)
     if as_json:
         print(json.dumps({**hour.as_json(), "files": [str(file)]}))

@@ -4,6 +4,7 @@ import asyncio
 import json
 import os
 import tempfile
+from pathlib import Path
 
 import pytest
 
@@ -12,6 +13,7 @@ from drivers.errors import CommandError, LinkError
 from drivers.guard import Guard, GuardLimits
 from drivers.protocol.messages import Achieved, Apply, Arm, Capabilities, GetCaps, Stage, Status
 from model.rig.file import example_rig_path
+from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.backend import SimulatedBackend
 
 URL = f"sim://{example_rig_path()}"
@@ -41,6 +43,33 @@ async def test_sim_backend_plays_a_checked_set() -> None:
         finally:
             await backend.close()
         assert os.listdir(folder) == []  # noqa: PTH208 - a string is what there is
+
+
+async def test_sim_backends_of_one_control_are_under_one_plate(tmp_path: Path) -> None:
+    """The control sees both play; the plate lasts until the last one closes, and none is left."""
+    rig = write_rig(tmp_path / "rig.yaml", *TWO_AMPLIFIERS)
+    control = tmp_path / "control"
+    backends = [
+        SimulatedBackend(f"sim://{rig}?control={control}&amplifier={name}")
+        for name in ("main", "side")
+    ]
+    await asyncio.gather(*(backend.open() for backend in backends))
+    for backend in backends:
+        capabilities = await backend.exchange(GetCaps(), timeout=1)
+        assert isinstance(capabilities, Capabilities)
+        await backend.exchange(Arm(1.0), timeout=1)
+        safe = Guard(GuardLimits(40, 500, 1), capabilities).check(SET)
+        await backend.exchange(Apply(safe), timeout=1)
+    for playing in (["main", "side"], ["side"]):
+        reader, writer = await asyncio.open_unix_connection(control)
+        writer.write(b'{"op": "state"}\n')
+        amplifiers = json.loads(await reader.readline())["amplifiers"]
+        assert [amplifiers[name]["levels"] for name in playing] == [[0.5, 0]] * len(playing)
+        writer.close()
+        await writer.wait_closed()
+        await backends.pop(0).close()
+    assert not control.exists()
+    assert not [task for task in asyncio.all_tasks() if "simulated plate" in task.get_name()]
 
 
 async def test_sim_backend_advances_the_plate_while_open() -> None:

@@ -1,0 +1,89 @@
+"""Examples of eight, twelve and sixteen ERAs, from their files to fingertips in virtual time."""
+
+import asyncio
+import math
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import model
+from controller.demo.run import read_touches, run_demo
+from controller.demo.virtual_time import VirtualTimeLoop
+from controller.effects.layout_file import load_layout
+from controller.sources.capture import RecordedDatagram, write_capture
+from controller.sources.touch import Touch, TouchFrame
+from controller.sources.tuio import tuio_datagram
+from model.rig.file import load_rig
+from model.table.build import build_table
+
+EXAMPLES = Path(model.__file__).parents[1] / "examples"
+CHANNELS = {"eight_eras": [4, 4], "car_display": [4, 4, 4], "table": [4, 4, 4, 4]}
+SCHEDULE = ((1, 0.1, 0.9, 0.30, 0.35), (2, 0.15, 0.9, 0.80, 0.70))
+"""Fingers: id, down and up [s], place in TUIO's coordinates."""
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two fingers, the second of which shall feel it."""
+    datagrams = []
+    for number in range(50):
+        now = number / 50
+        touches = tuple(Touch(id, x, y) for id, down, up, x, y in SCHEDULE if down <= now < up)
+        frame = TouchFrame("test", now, touches)
+        datagrams.append(RecordedDatagram(now, tuio_datagram(frame, number + 1)))
+    path = tmp_path_factory.mktemp("touches") / "touches.tuio"
+    write_capture(path, datagrams)
+    return path
+
+
+@pytest.mark.parametrize("name", CHANNELS)
+def test_finger_feels_what_many_eras_promise(name: str, capture: Path) -> None:
+    """All ERAs on all amplifiers play, and the fingers feel at least the promised contrast.
+
+    On the first plate that is drawn, level within 3 dB; by fields of the plate in time.
+    """
+    file = EXAMPLES / f"{name}.yaml"
+    rig = load_rig(file)
+    counts = Counter(wire.amplifier for wire in rig.wiring.values())
+    assert [counts[amplifier] for amplifier in rig.amplifiers] == CHANNELS[name]
+    table = build_table(rig, frequencies=np.array([120.0, 160.0, 200.0]), drive_mode="phased")
+    with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
+        rows = runner.run(
+            run_demo(
+                file, table, wire="sim", touches=read_touches(capture), on_row=lambda row: None
+            )
+        )
+    row = rows[-1]
+    assert row.drive.keys() == {era.name for era in rig.eras}
+    x, y = SCHEDULE[1][3:]
+    assert row.targets_m == [pytest.approx((x * rig.plate.length, (1 - y) * rig.plate.width))]
+    assert row.steady
+    assert row.measured_felt_contrast_db is not None
+    assert row.robust_felt_contrast_db is not None
+    assert row.measured_felt_contrast_db >= row.robust_felt_contrast_db > 6
+    assert row.measured_level_db_sl == pytest.approx(row.predicted_level_db_sl, abs=3)
+
+
+@pytest.mark.parametrize("name", CHANNELS)
+def test_layout_lies_on_its_plate(name: str) -> None:
+    """Every control is where a finger can be, and no control covers the middle of another."""
+    plate = load_rig(EXAMPLES / f"{name}.yaml").plate
+    regions = load_layout(EXAMPLES / f"{name}_layout.yaml", plate).regions
+    assert len(regions) >= 6
+    for region in regions:
+        x, y = region.shape.centre
+        assert 0 < x < plate.length
+        assert 0 < y < plate.width
+        assert [each.name for each in regions if each.shape.contains(x, y)] == [region.name]
+
+
+@pytest.mark.parametrize(("name", "bounce"), [("car_display", 80.0), ("table", 46.0)])
+def test_plate_bounces_on_its_eras_where_the_file_says(name: str, bounce: float) -> None:
+    """By hand, sqrt(sum of stiffness / mass) / 2 pi, within a Hertz."""
+    rig = load_rig(EXAMPLES / f"{name}.yaml")
+    plate = rig.plate
+    kg = 2420 * plate.length * plate.width * plate.thickness + sum(e.bolt_mass for e in rig.eras)
+    stiffness = sum(era.stiffness for era in rig.eras)
+    assert math.sqrt(stiffness / kg) / (2 * math.pi) == pytest.approx(bounce, abs=1.0)

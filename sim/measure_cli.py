@@ -87,7 +87,7 @@ def measure(
             f"{limits[1]:g} Hz, got {lines.min():g} to {lines.max():g} Hz"
         )
     started = time.perf_counter()
-    card = open_card(device, outputs=desk.output, inputs=desk.input)
+    card = open_card(device, outputs=desk.output, inputs=desk.input, limit=level)
     check: Stepped | None = None
     try:
         multisine = Multisine(lines, len(desk.eras) + 1, card.rate, level, seed)

@@ -53,7 +53,7 @@ def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
         running(stack, daemon, desk.folder, desk.environment, log)
         era = stack.enter_context(_client(socket))
         _until_ready(era)
-        card = open_card("jack:desk", outputs=0, inputs=max(inputs.values()) + 1)
+        card = open_card("jack:desk", outputs=0, inputs=max(inputs.values()) + 1, limit=0)
         stack.callback(card.close)
         stack.enter_context(era.armed("desk", lease_s=60))
         for names in sets:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from model.counting import counted
+from model.errors import InputError
 
 if TYPE_CHECKING:
     from model.table.promise_at_sensors import MeasuredVerification
@@ -32,8 +33,13 @@ def verify_by_measuring(
     if picture is not None:
         check_picture(picture)
     if rig_file is None:
+        if settings.level is None:
+            raise InputError(
+                "limits must be known: give the rig too, or --level, which no output will exceed; "
+                "a table has none"
+            )
         table = load_table(table_file)
-        rig = plain_rig(table)
+        rig = plain_rig(table, level=settings.level)
     else:
         rig = load_rig(rig_file)
         table = load_table(table_file, fingerprint=rig.fingerprint)

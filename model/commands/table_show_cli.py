@@ -67,8 +67,13 @@ def verify(
         typer.Option(metavar="URL", help="Amplifier that plays, in place of the sound card."),
     ] = None,
     level: Annotated[
-        float, typer.Option(help="Level of the loudest ERA with --device, 0..1 of its stroke.")
-    ] = 0.5,
+        float | None,
+        typer.Option(
+            metavar="LEVEL",
+            help="Level of the loudest ERA with --device, 0..1 of its stroke: with a RIG half of "
+            "what its limits allow by default; without one to be stated, and the limit.",
+        ),
+    ] = None,
     picture: Annotated[
         Path | None,
         typer.Option(metavar="PROMISED.png", help="Draw promised and measured, with --device."),

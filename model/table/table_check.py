@@ -21,7 +21,8 @@ class CheckSettings:
     """What `era table verify --device` was given.
 
     sensors_file: of accelerometers; device: that records them and plays, unless url is an amplifier
-    that does; samples: promises to play; level: of the loudest ERA.
+    that does; samples: promises to play; level: of the loudest ERA, None: half of what the rig's
+    limits allow.
     """
 
     device: str
@@ -29,7 +30,7 @@ class CheckSettings:
     url: str | None
     samples: int
     seed: int
-    level: float
+    level: float | None
 
 
 @runtime_checkable
@@ -63,11 +64,10 @@ def check_by_measuring(
     return _CHECKS.find("sound")(table, rig, settings, progress=progress)
 
 
-def plain_rig(table: LocalizationTable) -> Rig:
+def plain_rig(table: LocalizationTable, *, level: float) -> Rig:
     """The rig of a table without wiring of its own: its ERAs on channels 0, 1, ... in order.
 
-    It has no limits but full stroke and the table's frequencies, so that no amplifier may be driven
-    by it.
+    level: its limit, which a table does not know; frequencies are those of the table.
     """
     low, high = (float(table.frequencies[end]) for end in (0, -1))
     return Rig(
@@ -76,7 +76,7 @@ def plain_rig(table: LocalizationTable) -> Rig:
         table.eras,
         {era.name: Channel("main", number) for number, era in enumerate(table.eras)},
         {"main": "sim://"},
-        GuardLimits(low, high, 1.0),
+        GuardLimits(low, high, level),
         masses=table.masses,
         uncertainty=table.uncertainty,
         fingertip=table.fingertip,

@@ -57,6 +57,12 @@ class Desk:
         found[:, [*(at - 1 for _, at in self.eras), self.output - 1]] = sources
         return found
 
+    @property
+    def highest(self) -> float:
+        """The highest level that the rig's limits allow on all ERAs at once."""
+        limits = self.rig.limits
+        return min(limits.level, float(np.sqrt(limits.power / len(self.rig.eras))), 1.0)
+
     def check(self, level: float) -> None:
         """Raise InputError for several amplifiers, and a level beyond the rig's limits."""
         rig = self.rig
@@ -64,12 +70,28 @@ class Desk:
             raise InputError(
                 "all ERAs must be on one sound card, got several amplifiers in the rig"
             )
-        highest = min(rig.limits.level, float(np.sqrt(rig.limits.power / len(rig.eras))), 1.0)
-        if not 0 < level <= highest:
+        if not 0 < level <= self.highest:
             raise InputError(
-                f"--level must be above 0 and at most {highest:.3g}, as the rig's limits allow, "
-                f"got {level:g}"
+                f"--level must be above 0 and at most {self.highest:.3g}, as the rig's limits "
+                f"allow, got {level:g}"
             )
+
+    def check_times(self, *, seconds: float, slew: float) -> None:
+        """Raise InputError for limits in time that samples from memory would not keep.
+
+        seconds: that are played without a pause; slew [1/s]: highest rise of a level.
+        """
+        limits = self.rig.limits
+        for key, is_kept, played in (
+            ("on_time", seconds <= limits.on_time, f"{seconds:.3g} s without a pause"),
+            ("duty", limits.duty >= 1, "one run after the other"),
+            ("slew", slew <= limits.slew, f"ramps of {slew:.3g} per second"),
+        ):
+            if not is_kept:
+                raise InputError(
+                    f"limits.{key} must allow what a sound card plays from memory, {played}, got "
+                    f"{getattr(limits, key):g}; check whether the ERAs bear it, and widen it"
+                )
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +128,7 @@ def measure(
     """
     runs = multisine.sources
     whole = _SETTLING / PERIOD + periods + _TAIL
+    desk.check_times(seconds=PERIOD * whole, slew=multisine.slew)
     total = round(1e3 * PERIOD * whole * runs)
     recorded, repeated, is_lost = [], 0, False
     for run in range(runs):

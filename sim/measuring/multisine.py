@@ -54,6 +54,11 @@ class Multisine:
             )
 
     @property
+    def slew(self) -> float:
+        """Highest rise [1/s] of the level, along the ramp at the start."""
+        return np.pi / 2 * self.level / _RAMP
+
+    @property
     def samples(self) -> int:
         """Samples of a period."""
         return round(self.rate * PERIOD)

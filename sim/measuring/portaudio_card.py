@@ -13,8 +13,8 @@ _BLOCK = 512  # frames; late samples are worse than a delay, which is measured
 class PortAudioCard(SoundCard):
     """One stream in both directions, of one device: two devices would have two clocks."""
 
-    def __init__(self, device: str, *, outputs: int, inputs: int) -> None:
-        super().__init__(outputs=outputs, inputs=inputs)
+    def __init__(self, device: str, *, outputs: int, inputs: int, limit: float) -> None:
+        super().__init__(outputs=outputs, inputs=inputs, limit=limit)
         library = sounddevice()
         number: int | str = int(device) if device.isdecimal() else device
         try:
@@ -31,7 +31,7 @@ class PortAudioCard(SoundCard):
         ):
             if offered < count:
                 raise InputError(f"--device {self.name} must have {count} {what}, got {offered}")
-        self.use()
+        given = self.given()
         ffi = library._ffi
         kind = "duplex" if outputs and inputs else "input" if inputs else "output"
         channels: Any = {"duplex": (inputs, outputs), "input": inputs, "output": outputs}[kind]
@@ -48,7 +48,7 @@ class PortAudioCard(SoundCard):
                 callback=ffi.cast("PaStreamCallback *", self.address("transfer_portaudio")),
                 clip_off=True,
                 dither_off=True,
-                userdata=ffi.NULL,
+                userdata=ffi.cast("void *", given),
             )
             self._stream.start()
         except library.PortAudioError as problem:

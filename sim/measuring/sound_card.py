@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 
 from drivers.errors import LinkError
-from model.arrays import Float32Array, FloatArray
+from model.arrays import Float32Array, FloatArray, IntArray
 from model.errors import InputError
 from sim.soft_amp.library import library
 
@@ -35,11 +35,17 @@ class _Transfer(ctypes.Structure):
         ("is_running", ctypes.c_uint32),
         ("gaps", ctypes.c_uint32),
         ("is_lost", ctypes.c_uint32),
+        ("has_next", ctypes.c_uint32),
+        ("next_frame", ctypes.c_uint32),
+        ("ports", ctypes.c_void_p),
+        ("arrivals", ctypes.c_void_p),
+        ("blocks", ctypes.c_uint64),
     )
     position: int
     is_running: int
     gaps: int
     is_lost: int
+    blocks: int
 
 
 class Ports(ctypes.Structure):
@@ -62,25 +68,26 @@ def _callbacks() -> ctypes.CDLL:
 class SoundCard(ABC):
     """An open device with some outputs and inputs, the first ones that it has.
 
-    name: of the device; rate [Hz]. Its stream runs until `close`, so that the delay through it
-    stays the same; one card at a time in a process.
+    name: of the device; rate [Hz]; limit: no sample played is larger, since nothing behind this
+    checks it. Its stream runs until `close`, so that the delay through it stays the same.
     """
 
     name: str
     rate: float
 
-    def __init__(self, *, outputs: int, inputs: int) -> None:
+    def __init__(self, *, outputs: int, inputs: int, limit: float) -> None:
         for what, count in (("outputs", outputs), ("inputs", inputs)):
             if count > MAX_PORTS:
                 raise InputError(f"{what} must be at most {MAX_PORTS}, got {count}")
         self._transfer = _Transfer(outputs=outputs, inputs=inputs)
+        self._limit = limit * (1 + 1e-6)  # of rounding
         self.gaps = 0
 
-    def use(self, ports: Ports | None = None) -> None:
-        """Set what the callbacks move."""
-        _callbacks().transfer_use(
-            ctypes.byref(self._transfer), None if ports is None else ctypes.byref(ports)
-        )
+    def given(self, ports: Ports | None = None) -> int:
+        """The address of what the callbacks are to be given; ports: those of JACK."""
+        self._ports = ports  # kept, since the callbacks use it
+        self._transfer.ports = None if ports is None else ctypes.addressof(ports)
+        return ctypes.addressof(self._transfer)
 
     @staticmethod
     def address(name: str) -> int:
@@ -95,18 +102,14 @@ class SoundCard(ABC):
         """Play samples (n, outputs), and return those recorded meanwhile (n, inputs).
 
         progress: called with the frames done. `gaps` counts holes in the sound. Raises LinkError
-        for a device that is gone or takes no samples.
+        for a device that is gone or takes no samples, ValueError for samples beyond the limit.
         """
         transfer = self._transfer
-        out = np.ascontiguousarray(played, dtype=np.float32)
-        found = np.zeros((len(out), transfer.inputs), dtype=np.float32)
-        transfer.play, transfer.record = out.ctypes.data, found.ctypes.data
-        transfer.frames, transfer.position = len(out), 0
         before = transfer.gaps
-        transfer.is_running = 1
+        found = self.begin(played)
         done, since = 0, time.monotonic()
         try:
-            while done < len(out):
+            while done < len(found):
                 time.sleep(_POLL)
                 if transfer.position != done:
                     done, since = transfer.position, time.monotonic()
@@ -114,9 +117,40 @@ class SoundCard(ABC):
                 elif transfer.is_lost or time.monotonic() - since > _STALLED:
                     raise LinkError(f"{self.name}: the device was lost, or takes no samples")
         finally:
-            if done < len(out):
+            if done < len(found):
                 self.close()  # the callback still has the memory
         self.gaps = transfer.gaps - before
+        return found
+
+    def begin(self, played: FloatArray) -> Float32Array:
+        """Play samples (n, outputs); return at once what is recorded meanwhile (n, inputs).
+
+        Raises ValueError for samples beyond the limit.
+        """
+        transfer = self._transfer
+        out = np.ascontiguousarray(played, dtype=np.float32)
+        if not (np.abs(out) <= self._limit).all():  # neither is what is no number
+            raise ValueError(f"samples must be at most {self._limit:g}, got {np.abs(out).max():g}")
+        found = np.zeros((len(out), transfer.inputs), dtype=np.float32)
+        self._memory = out, found  # kept, since the callback uses it
+        transfer.play, transfer.record = out.ctypes.data, found.ctypes.data
+        transfer.frames, transfer.position, transfer.blocks = len(out), 0, 0
+        transfer.is_running = 1
+        return found
+
+    @property
+    def position(self) -> int:
+        """Frames that were played and recorded since `begin`."""
+        return self._transfer.position
+
+    def note_arrivals(self, blocks: int) -> IntArray:
+        """Let the callback note when each block came [us of CLOCK_MONOTONIC]; returns its memory.
+
+        blocks: at most to come until the end.
+        """
+        found = np.zeros(blocks, dtype=np.int64)
+        self._arrivals = found  # kept, since the callback uses it
+        self._transfer.arrivals = found.ctypes.data
         return found
 
     @abstractmethod
@@ -124,16 +158,17 @@ class SoundCard(ABC):
         """Stop, and leave the device."""
 
 
-def open_card(device: str, *, outputs: int, inputs: int) -> SoundCard:
+def open_card(device: str, *, outputs: int, inputs: int, limit: float) -> SoundCard:
     """Open `jack`, `jack:CLIENT`, or a device of PortAudio by its name or number.
 
-    Raises InputError for one that does not suit; LinkError where it is busy or gone.
+    limit: of the samples played, in full scale. Raises InputError for a device that does not suit;
+    LinkError where it is busy or gone.
     """
     kind, _, name = device.partition(":")
     if kind == "jack":
         from sim.measuring.jack_card import JackCard
 
-        return JackCard(name, outputs=outputs, inputs=inputs)
+        return JackCard(name, outputs=outputs, inputs=inputs, limit=limit)
     from sim.measuring.portaudio_card import PortAudioCard
 
-    return PortAudioCard(device, outputs=outputs, inputs=inputs)
+    return PortAudioCard(device, outputs=outputs, inputs=inputs, limit=limit)

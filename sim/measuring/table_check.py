@@ -10,7 +10,9 @@ from drivers.blocking import BlockingAmplifier
 from drivers.command import DriveCommand
 from drivers.errors import DriverError, LinkError
 from model.arrays import FloatArray
+from model.errors import InputError
 from model.rig.rig import Rig
+from model.table.pattern import Pattern
 from model.table.promise_at_sensors import (
     MeasuredVerification,
     Promise,
@@ -29,6 +31,7 @@ from sim.sensors.sensor_file import WiredSensor, read_sensors
 _SETTLING = 1.5  # s; T60 of a plate with little damping, and an amplifier that starts later
 _WINDOW = 1.0  # s
 _RAMP = 0.04  # s
+_PLAYED = _SETTLING + _WINDOW + _RAMP  # s
 _TRIES = 3
 _MARK = 1000.0  # Hz; of the loop-back, by which lost blocks show
 _MARK_LEVEL = 0.3
@@ -51,13 +54,17 @@ def check_table(
     """
     sensors = read_sensors(settings.sensors_file, rig.plate)
     desk = Desk(rig, sensors)
-    desk.check(settings.level)
+    level = desk.highest / 2 if settings.level is None else settings.level
+    desk.check(level)
+    if settings.url is None:
+        desk.check_times(seconds=_PLAYED, slew=np.pi / 2 * level / _RAMP)
     places = {sensor.name: (sensor.x, sensor.y) for sensor in sensors}
     found = []
-    with _recorder(desk, settings) as (card, record):
+    with _recorder(desk, settings, level) as (card, record):
         for promise in promises(
-            table, places, count=settings.samples, level=settings.level, seed=settings.seed
+            table, places, count=settings.samples, level=level, seed=settings.seed
         ):
+            _check_frequencies(promise.pattern.excitation, rig)
             heard = record(promise)
             check_levels(heard, _sensors_of(promise, desk))
             frequencies, amplitudes = _amplitudes(heard, promise, desk, card.rate)
@@ -67,15 +74,17 @@ def check_table(
 
 
 @contextmanager
-def _recorder(desk: Desk, settings: CheckSettings) -> Iterator[tuple[SoundCard, Recorder]]:
-    """An open card, and an amplifier where that plays."""
+def _recorder(
+    desk: Desk, settings: CheckSettings, level: float
+) -> Iterator[tuple[SoundCard, Recorder]]:
+    """An open card, and an amplifier where that plays; level: no sample is larger."""
     with ExitStack() as stack:
         if settings.url is None:
-            card = open_card(settings.device, outputs=desk.output, inputs=desk.input)
+            card = open_card(settings.device, outputs=desk.output, inputs=desk.input, limit=level)
             stack.callback(card.close)
-            yield card, lambda promise: _by_card(card, desk, promise.pattern.excitation)
+            yield card, lambda promise: _by_card(card, desk, promise.pattern, level)
             return
-        card = open_card(settings.device, outputs=0, inputs=desk.input)
+        card = open_card(settings.device, outputs=0, inputs=desk.input, limit=0)
         stack.callback(card.close)
         (name,) = {channel.amplifier for channel in desk.rig.wiring.values()}
         amplifier = stack.enter_context(
@@ -107,16 +116,33 @@ def _recorder(desk: Desk, settings: CheckSettings) -> Iterator[tuple[SoundCard, 
         yield card, by_amplifier
 
 
-def _by_card(card: SoundCard, desk: Desk, excitation: Excitation) -> FloatArray:
-    """Play an excitation from memory: a level is a sample, as of an amplifier of voltage."""
-    seconds = _SETTLING + _WINDOW + _RAMP
-    times = np.arange(round(seconds * card.rate)) / card.rate
+def _check_frequencies(excitation: Excitation, rig: Rig) -> None:
+    """Raise InputError for tones outside of the rig's limits: a table may have been built of more.
+
+    An amplifier's guard refuses them, too.
+    """
+    low, high = rig.limits.frequency_min, rig.limits.frequency_max
+    for name, tone in excitation.items():
+        if not low <= tone.frequency <= high:
+            raise InputError(
+                f"frequencies must be within the rig's limits.frequency of {low:g} to {high:g} Hz, "
+                f"got {tone.frequency:g} Hz of ERA {name} in the table; build it again"
+            )
+
+
+def _by_card(card: SoundCard, desk: Desk, pattern: Pattern, level: float) -> FloatArray:
+    """Play a pattern from memory: a level is a sample, as of an amplifier of voltage.
+
+    level: that no output exceeds, the loop-back's included, since cables may be swapped.
+    """
+    excitation = pattern.excitation
+    times = np.arange(round(_PLAYED * card.rate)) / card.rate
     sources = np.zeros((len(times), len(desk.eras) + 1))
     for number, era in enumerate(desk.rig.eras):
         if (tone := excitation.get(era.name)) is not None:
             angle = 2 * np.pi * tone.frequency * times + tone.phase
             sources[:, number] = tone.amplitude / era.stroke * np.sin(angle)
-    sources[:, -1] = _MARK_LEVEL * np.sin(2 * np.pi * _MARK * times)
+    sources[:, -1] = min(_MARK_LEVEL, level) * np.sin(2 * np.pi * _MARK * times)
     ramp = np.sin(np.linspace(0, np.pi / 2, round(_RAMP * card.rate))) ** 2
     sources[: len(ramp)] *= ramp[:, None]
     sources[-len(ramp) :] *= ramp[::-1, None]

@@ -12,13 +12,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
-from model.arrays import FloatArray
+from drivers.errors import LinkError
+from model.arrays import Float32Array
 from preloaded import ERA
+from sim.libjack import JackClient
+from sim.measuring.jack_card import activate
+from sim.measuring.sound_card import SoundCard
 
 RATE = 48_000
 BLOCK = 128
 START = 20.0  # s
+LONGEST = 600  # s that a client captures
 AUDIBLE = 1e-6
 HOST = str(Path(__file__).with_name("steady_host.py"))
 
@@ -39,49 +45,46 @@ def jack_server(name: str) -> Iterator[dict[str, str]]:
         process.terminate()
 
 
-class Capture:
-    """A client of so many inputs; keeps every block with its arrival (monotonic, s)."""
+class Capture(SoundCard):
+    """A client of so many inputs; a callback in C keeps all samples, and when blocks came."""
 
     def __init__(self, name: str, channels: int, *, server: str) -> None:
-        import jack  # needs libjack
+        super().__init__(outputs=0, inputs=channels, limit=0)
+        self._client = _client(name, server)
+        activate(self, self._client, outputs=0, inputs=channels)
+        self._arrivals = self.note_arrivals(LONGEST * RATE // BLOCK)
+        self._samples = self.begin(np.zeros((LONGEST * RATE, 0)))
 
-        jack.set_error_function(lambda _text: None)
-        jack.set_info_function(lambda _text: None)
-        end = time.monotonic() + START
-        while True:
-            try:
-                self._client = jack.Client(name, servername=server, no_start_server=True)
-                break
-            except jack.JackOpenError:
-                if time.monotonic() > end:
-                    raise
-                time.sleep(0.02)  # until the server is up
-        self._ports = [self._client.inports.register(f"in_{n}") for n in range(channels)]
-        self._blocks: list[tuple[float, FloatArray]] = []
-        self._client.set_process_callback(self._take)
-        self._client.activate()
-
-    def _take(self, frames: int) -> None:
-        samples = np.stack([port.get_array() for port in self._ports], axis=1)
-        self._blocks.append((time.monotonic(), samples.copy()))
-
-    def samples(self, count: int) -> FloatArray:
+    def samples(self, count: int) -> Float32Array:
         """The last samples (count, channels)."""
-        blocks = self._blocks[-(count // BLOCK + 2) :]
-        return np.concatenate([block for _, block in blocks])[-count:]
+        return self._samples[self.position - count : self.position]
 
     def is_sounding(self) -> bool:
         """Whether the last block had sound."""
-        return bool(self._blocks) and bool(np.abs(self._blocks[-1][1]).max() > AUDIBLE)
+        return self.position > 0 and bool(np.abs(self.samples(BLOCK)).max() > AUDIBLE)
 
     def last_sound(self) -> float:
-        """When the last block with sound came."""
-        return next(when for when, block in self._blocks[::-1] if np.abs(block).max() > AUDIBLE)
+        """When the last block with sound came (monotonic, s)."""
+        loud = np.abs(self._samples[: self.position]).max(axis=1) > AUDIBLE
+        return 1e-6 * float(self._arrivals[np.flatnonzero(loud)[-1] // BLOCK])
 
     def close(self) -> None:
         """Leave the server."""
-        self._client.deactivate()
         self._client.close()
+
+
+def _client(name: str, server: str) -> JackClient:
+    """A client, as soon as the server is up."""
+    end = time.monotonic() + START
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JACK_DEFAULT_SERVER", server)
+        while True:
+            try:
+                return JackClient(name)
+            except LinkError:
+                if time.monotonic() > end:
+                    raise
+                time.sleep(0.02)
 
 
 class SoftAmp:

@@ -7,76 +7,66 @@
 #define LOST 0xf   // paInputUnderflow, paInputOverflow, paOutputUnderflow, paOutputOverflow
 #define CONTINUE 0 // paContinue
 
-static struct transfer *transfer;
-static struct transfer_ports ports;
-static uint32_t next_frame; // of JACK's clock
-static int has_next;
-
-void transfer_use(struct transfer *used, const struct transfer_ports *of)
-{
-    transfer = used;
-    if (of != NULL)
-        ports = *of;
-    has_next = 0;
-}
-
 // Frames of this block that are to be moved; 0 while nothing runs.
-static uint32_t wanted(uint32_t frames)
+static uint32_t wanted(const struct transfer *transfer, uint32_t frames)
 {
-    if (transfer == NULL || !GET(transfer->is_running))
+    if (!GET(transfer->is_running))
         return 0;
     uint64_t left = transfer->frames - transfer->position;
     return left < frames ? (uint32_t)left : frames;
 }
 
-static void done(uint32_t frames)
+static void done(struct transfer *transfer, uint32_t frames)
 {
+    if (transfer->arrivals != NULL)
+        transfer->arrivals[transfer->blocks] = engine_microseconds();
+    transfer->blocks++;
     uint64_t position = transfer->position + frames;
     if (position == transfer->frames)
         SET(transfer->is_running, 0);
     SET(transfer->position, position);
 }
 
-int transfer_jack_process(uint32_t frames, void *ignored)
+int transfer_jack_process(uint32_t frames, void *given)
 {
-    (void)ignored;
-    uint32_t count = wanted(frames);
-    uint32_t frame = ports.frame_time(ports.client);
-    if (count && has_next && frame != next_frame && transfer->position)
+    struct transfer *transfer = given;
+    const struct transfer_ports *ports = transfer->ports;
+    uint32_t count = wanted(transfer, frames);
+    uint32_t frame = ports->frame_time(ports->client);
+    if (count && transfer->has_next && frame != transfer->next_frame && transfer->position)
         COUNT(transfer->gaps, 1);
-    next_frame = frame + frames;
-    has_next = 1;
-    for (uint32_t i = 0; transfer != NULL && i < transfer->outputs; i++) {
-        float *to = ports.buffer(ports.outputs[i], frames);
+    transfer->next_frame = frame + frames;
+    transfer->has_next = 1;
+    for (uint32_t i = 0; i < transfer->outputs; i++) {
+        float *to = ports->buffer(ports->outputs[i], frames);
         memset(to, 0, frames * sizeof(float));
         const float *from = transfer->play + transfer->position * transfer->outputs + i;
         for (uint32_t n = 0; n < count; n++)
             to[n] = from[(uint64_t)n * transfer->outputs];
     }
     for (uint32_t i = 0; count && i < transfer->inputs; i++) {
-        const float *from = ports.buffer(ports.inputs[i], frames);
+        const float *from = ports->buffer(ports->inputs[i], frames);
         float *to = transfer->record + transfer->position * transfer->inputs + i;
         for (uint32_t n = 0; n < count; n++)
             to[(uint64_t)n * transfer->inputs] = from[n];
     }
     if (count)
-        done(count);
+        done(transfer, count);
     return 0;
 }
 
-void transfer_jack_shutdown(void *ignored)
+void transfer_jack_shutdown(void *given)
 {
-    (void)ignored;
-    if (transfer != NULL)
-        SET(transfer->is_lost, 1);
+    struct transfer *transfer = given;
+    SET(transfer->is_lost, 1);
 }
 
 int transfer_portaudio(const void *input, void *output, unsigned long frames,
-                       const struct portaudio_time *time, unsigned long flags, void *ignored)
+                       const struct portaudio_time *time, unsigned long flags, void *given)
 {
     (void)time;
-    (void)ignored;
-    uint32_t count = wanted((uint32_t)frames);
+    struct transfer *transfer = given;
+    uint32_t count = wanted(transfer, (uint32_t)frames);
     if (count && (flags & LOST) && transfer->position)
         COUNT(transfer->gaps, 1);
     if (output != NULL) {
@@ -89,6 +79,6 @@ int transfer_portaudio(const void *input, void *output, unsigned long frames,
         memcpy(transfer->record + transfer->position * transfer->inputs, input,
                count * transfer->inputs * sizeof(float));
     if (count)
-        done(count);
+        done(transfer, count);
     return CONTINUE;
 }

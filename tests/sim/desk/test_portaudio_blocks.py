@@ -17,18 +17,12 @@ class CallbackCard(SoundCard):
     """Calls the callback as PortAudio does, with a number of flags for each block."""
 
     def __init__(self, flags: list[int]) -> None:
-        super().__init__(outputs=1, inputs=1)
+        super().__init__(outputs=1, inputs=1, limit=1.0)
         self._flags = flags
-        self.use()
 
     def start(self, blocks: int) -> np.ndarray:
-        """Let blocks of zeros be moved to memory; returns that memory."""
-        found = np.zeros((blocks * FRAMES, 1), dtype=np.float32)
-        self._played = np.zeros_like(found)
-        self._transfer.play, self._transfer.record = self._played.ctypes.data, found.ctypes.data
-        self._transfer.frames, self._transfer.position = len(found), 0
-        self._transfer.is_running = 1
-        return found
+        """Let blocks of zeros be played; returns the memory that is recorded to."""
+        return self.begin(np.zeros((blocks * FRAMES, 1)))
 
     def call(self) -> int:
         """All blocks; returns the gaps that were counted."""
@@ -44,8 +38,9 @@ class CallbackCard(SoundCard):
         callback = kind(self.address("transfer_portaudio"))
         block = np.ones(FRAMES, dtype=np.float32)
         out = np.zeros(FRAMES, dtype=np.float32)
+        recorded, played, given = block.ctypes.data, out.ctypes.data, self.given()
         for flags in self._flags:
-            assert callback(block.ctypes.data, out.ctypes.data, FRAMES, None, flags, None) == 0
+            assert callback(recorded, played, FRAMES, None, flags, given) == 0
         return self._transfer.gaps
 
     def close(self) -> None:
@@ -68,3 +63,11 @@ def test_lost_blocks_are_gaps_while_something_plays(flags: list[int], gaps: int)
     heard = card.start(3)
     assert card.call() == gaps
     assert heard.all()
+
+
+@pytest.mark.parametrize("sample", [1.01, np.nan])
+def test_samples_beyond_the_limit_are_not_played(sample: float) -> None:
+    """The last check before a device; a sample that is no number would pass for none."""
+    card = CallbackCard([])
+    with pytest.raises(ValueError, match="at most 1"):
+        card.run(np.full((FRAMES, 1), sample))

@@ -91,7 +91,7 @@ def measured_on(
 
     monkeypatch.setattr(table_check, "open_card", opened)
     arguments = ["table", "verify", str(folder / "t.npz"), "--device", "memory", "--samples", "4"]
-    arguments += ["--sensors", str(folder / "sensors.csv"), "--json", *more]
+    arguments += ["--sensors", str(folder / "sensors.csv"), "--json", "--level", "0.5", *more]
     result = CliRunner().invoke(app, arguments)
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
@@ -192,6 +192,90 @@ def test_amplifier_at_a_url_needs_a_rig(table: LocalizationTable, tmp_path: Path
     result = CliRunner().invoke(app, arguments)
     assert isinstance(result.exception, InputError)
     assert "rig is missing" in str(result.exception)
+
+
+def test_card_without_a_limit_is_refused(table: LocalizationTable, tmp_path: Path) -> None:
+    """A table knows none: without a rig the level has to be stated, and nothing is opened."""
+    save_table(table, tmp_path / "t.npz")
+    (tmp_path / "sensors.csv").write_text(SENSORS)
+    arguments = ["table", "verify", str(tmp_path / "t.npz"), "--device", "memory"]
+    result = CliRunner().invoke(app, [*arguments, "--sensors", str(tmp_path / "sensors.csv")])
+    assert isinstance(result.exception, InputError)
+    assert "--level" in str(result.exception)
+
+
+@pytest.mark.parametrize(
+    ("limits", "level", "key"),
+    [
+        ({"level": 0.2}, 0.3, "--level"),
+        ({"power": 0.16}, 0.21, "--level"),  # of four ERAs, 0.2 each
+        ({"on_time": 2.0}, LEVEL, "on_time"),
+        ({"duty": 0.5}, LEVEL, "duty"),
+        ({"slew": 15.0}, LEVEL, "slew"),
+        ({"frequency_max": 100.0}, LEVEL, "frequency"),
+    ],
+)
+def test_limits_of_the_rig_hold_for_a_card(
+    rig: Rig,
+    table: LocalizationTable,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    limits: dict[str, float],
+    level: float,
+    key: str,
+) -> None:
+    """No guard is behind a card: each limit is checked before a sample is played."""
+
+    class SilentCard(SoundCard):
+        """Must not be played to."""
+
+        def __init__(self) -> None:
+            self.rate = RATE
+
+        def run(
+            self, played: FloatArray, *, progress: Callable[[int], None] = lambda _frames: None
+        ) -> Float32Array:
+            raise AssertionError
+
+        def close(self) -> None:
+            """Nothing is open."""
+
+    monkeypatch.setattr(table_check, "open_card", lambda _device, **_counts: SilentCard())
+    (tmp_path / "sensors.csv").write_text(SENSORS)
+    bounded = replace(rig, limits=replace(rig.limits, **limits))
+    settings = CheckSettings("memory", tmp_path / "sensors.csv", None, 1, 0, level)
+    with pytest.raises(InputError, match=key):
+        table_check.check_table(table, bounded, settings, progress=lambda _done, _count: None)
+
+
+def test_no_output_exceeds_half_of_what_the_rig_allows(
+    rig: Rig, table: LocalizationTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor does the loop-back's: 0.05 of a level of 0.1."""
+    played_to: list[float] = []
+
+    class NotedCard(DeskCard):
+        """Notes the largest sample of each output."""
+
+        def run(
+            self, played: FloatArray, *, progress: Callable[[int], None] = lambda _frames: None
+        ) -> Float32Array:
+            played_to.extend(np.abs(played).max(axis=0))
+            return super().run(played, progress=progress)
+
+    def opened(_device: str, *, limit: float, **_counts: int) -> DeskCard:
+        assert limit == pytest.approx(0.05)
+        plate = DeskPlate(as_written(rig), sensors, rate=RATE, converters=Converters(), seed=1)
+        return NotedCard(plate, rate=RATE)
+
+    monkeypatch.setattr(table_check, "open_card", opened)
+    (tmp_path / "sensors.csv").write_text(SENSORS)
+    sensors = read_sensors(tmp_path / "sensors.csv", rig.plate)
+    bounded = replace(rig, limits=replace(rig.limits, level=0.1))
+    settings = CheckSettings("memory", tmp_path / "sensors.csv", None, 1, 0, None)
+    table_check.check_table(table, bounded, settings, progress=lambda _done, _count: None)
+    assert max(played_to) == pytest.approx(0.05, rel=1e-3)
+    assert played_to[-1] == pytest.approx(0.05, rel=1e-3)
 
 
 @pytest.mark.parametrize("trouble", [KeyboardInterrupt, LinkError])

@@ -70,7 +70,7 @@ def desk_plate(
     rig = load_rig(rig_file)
     sensors = read_sensors(sensors_file, rig.plate)
     drawn = draw_truth(rig, seed=seed, mesh=mesh or MESH)
-    client = JackClient(name)
+    client = JackClient(name, is_only=True)
     try:
         converters = Converters(delay=delay, noise=noise)
         plate = DeskPlate(drawn, sensors, rate=client.rate, converters=converters, seed=seed)

@@ -17,8 +17,8 @@ _AUDIO = b"32 bit float mono audio"
 IS_INPUT, IS_OUTPUT = 1, 2
 """Flags of ports: that take samples, and that give them."""
 _IS_PHYSICAL, _IS_TERMINAL = 4, 16
-_NO_START_SERVER = 1
-_SERVER_FAILED = 0x10
+_NO_START_SERVER, _USE_EXACT_NAME = 1, 2
+_NAME_NOT_UNIQUE, _SERVER_FAILED = 0x04, 0x10
 _LIBRARIES = ("jack", "libjack.so.0")
 
 _Pointer = ctypes.c_void_p
@@ -70,12 +70,22 @@ def libjack() -> ctypes.CDLL:
 
 
 class JackClient:
-    """A client of the running server; rate [Hz], block [frames]: the server's. Raises LinkError."""
+    """A client of the running server; rate [Hz], block [frames]: the server's.
 
-    def __init__(self, name: str) -> None:
+    is_only: whether others find it by its name, which then must be free; otherwise the server may
+    add a number to it. Raises LinkError.
+    """
+
+    def __init__(self, name: str, *, is_only: bool = False) -> None:
         status = ctypes.c_int()
-        client = libjack().jack_client_open(name.encode(), _NO_START_SERVER, ctypes.byref(status))
+        options = _NO_START_SERVER | (_USE_EXACT_NAME if is_only else 0)
+        client = libjack().jack_client_open(name.encode(), options, ctypes.byref(status))
         if not client:
+            if status.value & _NAME_NOT_UNIQUE:
+                raise LinkError(
+                    f"jack: a client named {name} is connected already; end it, or choose another "
+                    "name"
+                )
             is_down = status.value & _SERVER_FAILED
             reason = "no server is running" if is_down else "it refused a client"
             raise LinkError(

@@ -1,6 +1,7 @@
 """A desk of real processes: jackd, a plate, and the commands that a user types."""
 
 import contextlib
+import itertools
 import json
 import os
 import subprocess
@@ -18,6 +19,8 @@ _END = 20.0  # s
 _COMMAND = 900.0  # s
 
 Place = tuple[float, float]
+
+_numbers = itertools.count()
 
 
 class Desk:
@@ -60,7 +63,7 @@ class Desk:
 @contextlib.contextmanager
 def desk(folder: Path, *, seed: int, mesh: str = "8x6 Q3") -> Iterator[Desk]:
     """A desk with a plate of its own; seed: of its deviations."""
-    name = f"desk{os.getpid()}"
+    name = f"desk{os.getpid()}-{next(_numbers)}"  # several plates may be on desks at once
     environment = os.environ | {
         "JACK_DEFAULT_SERVER": name,
         "JACK_NO_START_SERVER": "1",
@@ -74,12 +77,25 @@ def desk(folder: Path, *, seed: int, mesh: str = "8x6 Q3") -> Iterator[Desk]:
     plate = [ERA, "desk-plate", "rig.yaml", "--sensors", "sensors.csv", "--seed", seed]
     plate += ["--mesh", mesh, "--truth", "truth.json", "--until-eof"]
     with contextlib.ExitStack() as stack:
-        os.environ["JACK_DEFAULT_SERVER"] = name  # of clients in this process
+        stack.enter_context(_own_server(name))
         log = stack.enter_context((folder / "desk.log").open("w"))
         running(stack, server, folder, environment, log)
         process = _plate(stack, plate, folder, environment, log)
         assert process.stdin is not None
         yield Desk(folder, environment, process.stdin)
+
+
+@contextlib.contextmanager
+def _own_server(name: str) -> Iterator[None]:
+    """Let clients in this process use a server."""
+    before = os.environ.get("JACK_DEFAULT_SERVER")
+    os.environ["JACK_DEFAULT_SERVER"] = name
+    try:
+        yield
+    finally:
+        del os.environ["JACK_DEFAULT_SERVER"]
+        if before is not None:
+            os.environ["JACK_DEFAULT_SERVER"] = before
 
 
 def _plate(

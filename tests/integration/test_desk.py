@@ -1,13 +1,14 @@
 """The desk without hardware, its short form: real JACK server, plate and commands."""
 
 import shutil
+import subprocess
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
 from benchmarks.desk.chain import chain
-from benchmarks.desk.session import Desk, desk
+from benchmarks.desk.session import ERA, Desk, desk
 from model.calibration.responses import responses_of
 from model.calibration.responses_file import read_functions
 from model.rig.file import load_rig
@@ -52,6 +53,20 @@ def test_measured_plate_is_the_one_on_the_desk(plate: Desk, device: str, late: i
     exact = model.response(found.frequencies).swapaxes(1, 2) / rig.eras[0].stroke
     loud = np.abs(exact) > 0.2 * np.abs(exact).max(axis=(1, 2), keepdims=True)
     np.testing.assert_allclose(found.values[loud], exact[loud], rtol=0.03)
+
+
+def test_second_plate_of_a_name_is_refused(plate: Desk) -> None:
+    """It could not be told from the first, which would be measured in its place."""
+    done = subprocess.run(
+        [ERA, "desk-plate", "rig.yaml", "--sensors", "sensors.csv", "--mesh", MESH],
+        cwd=plate.folder,
+        env=plate.environment,
+        capture_output=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 3
+    assert not done.stdout
 
 
 @pytest.mark.long

@@ -14,8 +14,9 @@ BLOCK = 480
 class DeskCard(SoundCard):
     """Samples of a plate, without time.
 
-    lost: runs in which a block is lost; on_outputs, on_inputs: order of the cables, by default as
-    they should be; gain: of all inputs.
+    lost: runs in which a block is lost; late: runs in which samples come as late as if a block had
+    been lost before; reported: losses that the driver reports in each run; on_outputs,
+    on_inputs: order of the cables, by default as they should be; gain: of all inputs.
     """
 
     def __init__(
@@ -24,12 +25,14 @@ class DeskCard(SoundCard):
         *,
         rate: float,
         lost: Sequence[int] = (),
+        late: Sequence[int] = (),
+        reported: int = 0,
         on_outputs: Sequence[int] | None = None,
         on_inputs: Sequence[int] | None = None,
         gain: float = 1.0,
     ) -> None:
-        self._plate, self.rate, self.name, self.gaps = plate, rate, "memory", 0
-        self._lost, self._gain, self.runs = lost, gain, 0
+        self._plate, self.rate, self.name, self.gaps = plate, rate, "memory", reported
+        self._lost, self._late, self._gain, self.runs = lost, late, gain, 0
         self._on_outputs = range(plate.outputs) if on_outputs is None else on_outputs
         self._on_inputs = range(plate.inputs) if on_inputs is None else on_inputs
 
@@ -42,6 +45,8 @@ class DeskCard(SoundCard):
         if self.runs in self._lost:
             middle = round(2 * self.rate)  # a block in the middle is missing, and nothing says so
             heard = np.concatenate([heard[:middle], heard[middle + 128 :], heard[-128:]])
+        if self.runs in self._late:
+            heard = np.concatenate([np.zeros((128, heard.shape[1])), heard[:-128]])
         self.runs += 1
         progress(len(played))
         return np.clip(self._gain * heard[:, self._on_inputs], -1, 1).astype(np.float32)

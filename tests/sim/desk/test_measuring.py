@@ -105,6 +105,24 @@ def test_lost_block_repeats_its_run(rig: Rig, truth: Truth) -> None:
     assert np.linalg.norm(difference) < 0.01 * np.linalg.norm(again.responses.values)
 
 
+def test_delay_that_differs_between_runs_repeats_a_run(rig: Rig, truth: Truth) -> None:
+    """As where a block of inputs was lost between two; the runs would not be orthogonal."""
+    desk = Desk(rig, SENSORS)
+    found = measure(desk, card(truth, late=[2]), sines(desk))
+    again = measure(desk, card(truth), sines(desk))
+    difference = found.responses.values - again.responses.values
+    assert found.repeated == 1
+    assert np.linalg.norm(difference) < 0.01 * np.linalg.norm(again.responses.values)
+
+
+def test_losses_that_were_none_repeat_nothing(rig: Rig, truth: Truth) -> None:
+    """A driver reports them, as PortAudio over a synchronous server; the cable shows none."""
+    desk = Desk(rig, SENSORS)
+    sound = card(truth, reported=1)
+    assert measure(desk, sound, sines(desk)).repeated == 0
+    assert sound.runs == 5
+
+
 def test_blocks_that_are_always_lost_are_refused(rig: Rig, truth: Truth) -> None:
     """Three attempts, then no file."""
     desk = Desk(rig, SENSORS)

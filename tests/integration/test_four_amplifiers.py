@@ -1,0 +1,167 @@
+"""Sixteen ERAs on four amplifiers of four channels, on one bus and on four lines, in virtual time.
+
+The controller and its wires are the project's own; a table that always has the same pattern, in
+which every ERA plays, stands for the search.
+"""
+
+import asyncio
+import contextlib
+import math
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+import model
+from controller.group.amplifier_group import GroupState
+from controller.loop.loop import Controller
+from controller.sources.touch import Touch, TouchFrame
+from drivers.amplifier import Amplifier
+from drivers.errors import DriverError
+from drivers.registry import open_backend
+from memory_machine import live_in_memory
+from model.fem.mesh import Mesh
+from model.rig.file import load_rig
+from model.rig.rig import Rig
+from model.vibration.excitation import Tone
+from sim.bench.bench import Bench
+from sim.bench.simulated_device import SimulatedDevice
+from sim.far_ends.wires import Wire, open_wires
+from sim.faults.fault_window import FaultWindow
+from virtual_loop import in_virtual_time
+from witnessed_chain import OneTable
+
+NAMES = ("a", "b", "c", "d")
+BUSES = {
+    "serial": Wire("serial", speed=921_600, shared=True),
+    "modbus-rtu": Wire("modbus-rtu", speed=115_200),
+    "slcan": Wire("slcan", speed=500_000),
+}
+"""Wires that all four share."""
+LINES = {
+    "serial": dict.fromkeys(NAMES, Wire("serial", speed=921_600)),  # not shared: one line each
+    "mixed": {
+        "a": Wire("serial", speed=921_600),
+        "b": Wire("modbus-rtu", speed=115_200),
+        "c": Wire("slcan", speed=500_000),
+        "d": Wire("modbus-tcp"),
+    },
+}
+"""Four wires for four amplifiers."""
+ARRANGED = {
+    **{f"one bus, {kind}": dict.fromkeys(NAMES, wire) for kind, wire in BUSES.items()},
+    **{f"four lines, {kind}": wires for kind, wires in LINES.items()},
+}
+MAX_SKEW = 1e-3  # s; of several links, docs/reference/several-amplifiers.md
+OWN = 0.250 + 0.010  # s; an amplifier's watchdog and its ramp
+ALL = (
+    OWN + 0.050 + 3 * 0.030 + 0.010
+)  # s; and a heartbeat, a request sent three times, and its stop
+LEVEL = 0.2
+
+
+@dataclass
+class FourAmplifiers:
+    """An armed controller and what its amplifiers play."""
+
+    rig: Rig
+    bench: Bench
+    devices: Mapping[str, SimulatedDevice]
+    controller: Controller
+
+    async def hold(self, seconds: float) -> None:
+        """Rest one finger on the plate for a time [s]."""
+        loop = asyncio.get_running_loop()
+        end = loop.time() + seconds
+        while loop.time() < end:
+            self.controller.deliver(TouchFrame("test", loop.time(), (Touch(1, 0.3, 0.4),)))
+            await asyncio.sleep(1 / 60)
+
+    def levels(self) -> dict[str, tuple[float, ...]]:
+        """Level of each channel now, by amplifier."""
+        now = asyncio.get_running_loop().time()
+        self.bench.advance(now)
+        return {name: each.status(now).levels for name, each in self.bench.amplifiers.items()}
+
+    def starts(self) -> dict[str, set[float]]:
+        """When each amplifier began to play what it plays now [s]."""
+        self.levels()
+        return {
+            name: {
+                segment.start for output in each.outputs for segment in output if segment.is_lasting
+            }
+            for name, each in self.bench.amplifiers.items()
+        }
+
+
+@asynccontextmanager
+async def four_amplifiers(wires: Mapping[str, Wire]) -> AsyncIterator[FourAmplifiers]:
+    """The example's sixteen ERAs on a coarse mesh, armed."""
+    loop = asyncio.get_running_loop()
+    live_in_memory()
+    rig = load_rig(Path(model.__file__).parents[1] / "examples" / "table.yaml")
+    rig = replace(rig, mesh=Mesh(4, 4, rig.plate.length, rig.plate.width))
+    bench = Bench(rig, now=loop.time())
+    devices = {
+        name: SimulatedDevice(bench, name, address=number)
+        for number, name in enumerate(rig.amplifiers, 1)
+    }
+    table = OneTable(rig.plate)
+    table.alone = {
+        era.name: Tone(110.0, LEVEL * era.stroke, math.radians(10 * number))
+        for number, era in enumerate(rig.eras)
+    }
+    async with open_wires(wires, [*devices.values()]) as urls:
+        amplifiers = {name: Amplifier(open_backend(url)) for name, url in urls.items()}
+        controller = Controller(rig, table, amplifiers=amplifiers)
+        await controller.open()
+        running = asyncio.create_task(controller.run())
+        await controller.arm()
+        yield FourAmplifiers(rig, bench, devices, controller)
+        running.cancel()
+        with contextlib.suppress(asyncio.CancelledError, DriverError):
+            await running
+        with contextlib.suppress(DriverError):
+            await controller.close()
+        for device in devices.values():
+            device.close()
+
+
+@pytest.mark.parametrize("arranged", ARRANGED)
+@in_virtual_time
+async def test_sixteen_channels_of_four_amplifiers_start_together(arranged: str) -> None:
+    """Every channel plays its level; on one bus from one moment, on four lines within a ms."""
+    async with four_amplifiers(ARRANGED[arranged]) as four:
+        await four.hold(0.3)
+        levels = four.levels()
+        assert {name: len(each) for name, each in levels.items()} == dict.fromkeys(NAMES, 4)
+        for each in levels.values():
+            assert each == pytest.approx((LEVEL,) * 4, abs=1e-4)
+        starts = [start for each in four.starts().values() for start in each]
+        skew = max(starts) - min(starts)
+        assert skew <= (1e-9 if arranged.startswith("one bus") else MAX_SKEW)
+
+
+@pytest.mark.parametrize("lost", ["a", "c"])
+@pytest.mark.parametrize("arranged", ["one bus, serial", "one bus, slcan", "four lines, mixed"])
+@in_virtual_time
+async def test_loss_of_one_of_four_silences_all(arranged: str, lost: str) -> None:
+    """Whichever hangs is silent by its watchdog, the others once that has elapsed, and all stay so.
+
+    Until then the others play on: a set is not renewed, and an amplifier may only be late.
+    """
+    async with four_amplifiers(ARRANGED[arranged]) as four:
+        await four.hold(0.3)
+        assert all(level > 0 for each in four.levels().values() for level in each)
+        four.devices[lost].inject_fault(FaultWindow("hang"))
+        holding = asyncio.create_task(four.hold(0.6))
+        await asyncio.sleep(OWN)
+        assert not any(four.levels()[lost])
+        await asyncio.sleep(ALL - OWN)
+        assert not any(level for each in four.levels().values() for level in each)
+        assert four.controller.group_state is GroupState.LOST
+        four.devices[lost].recover()
+        await holding
+        assert not any(level for each in four.levels().values() for level in each)

@@ -1,4 +1,4 @@
 """A finger on the plate: contact area, load, detection thresholds and contrast."""
 
-MAX_CONTACTS = 10
-"""Ten fingers; more are a forearm, a spill or a broken panel."""
+MAX_CONTACTS = 20
+"""Two people with ten fingers each, or four with five; more are a forearm or a spill."""

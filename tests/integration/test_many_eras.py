@@ -17,6 +17,7 @@ from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
 from model.rig.file import load_rig
 from model.table.build import build_table
+from model.table.question import Question
 
 EXAMPLES = Path(model.__file__).parents[1] / "examples"
 CHANNELS = {"eight_eras": [4, 4], "car_display": [4, 4, 4], "table": [4, 4, 4, 4]}
@@ -64,6 +65,24 @@ def test_finger_feels_what_many_eras_promise(name: str, capture: Path) -> None:
     assert row.robust_felt_contrast_db is not None
     assert row.measured_felt_contrast_db >= row.robust_felt_contrast_db > 6
     assert row.measured_level_db_sl == pytest.approx(row.predicted_level_db_sl, abs=3)
+
+
+def test_table_answers_twenty_fingers() -> None:
+    """One target among nineteen quiet fingers has a pattern, of less contrast than beside one.
+
+    No drive does better at more quiet fingers.
+    """
+    table = build_table(load_rig(EXAMPLES / "table.yaml"), frequencies=np.array([120.0]))
+    places = [(x, y) for y in (0.1, 0.3, 0.5, 0.7) for x in (0.1, 0.35, 0.6, 0.85, 1.1)]
+    target, *quiet = places
+    found = []
+    for count in (1, 19):
+        question = Question((target,), tuple(quiet[:count]), drive_mode="phased")
+        found.append(table.query(question).robust_felt_contrast_db)
+    one, many = found
+    assert one is not None
+    assert many is not None
+    assert 0 < many < one
 
 
 @pytest.mark.parametrize("name", CHANNELS)

@@ -103,16 +103,16 @@ def test_tracker_rejects_duplicates() -> None:
     assert change.rejected == ("twice",)
 
 
-def test_tracker_accepts_ten_contacts() -> None:
-    """The eleventh contact is refused, the ten that came first stay, and it gets a place later."""
+def test_tracker_accepts_twenty_contacts() -> None:
+    """The 21st contact is refused, the twenty that came first stay, and it gets a place later."""
     tracker = ContactTracker(PLATE)
-    many = [(id, 0.5, 0.5) for id in range(11)]
+    many = [(id, 0.5, 0.5) for id in range(21)]
     change = tracker.update(frame(0.0, *many))
     assert change.rejected == ("too_many",)
     tracker.update(frame(0.01, *reversed(many)))
-    assert ids(tracker) == list(range(10))
+    assert ids(tracker) == list(range(20))
     tracker.update(frame(0.02, *many[1:]))
-    assert ids(tracker) == list(range(1, 11))
+    assert ids(tracker) == list(range(1, 21))
 
 
 def fingers(count: int) -> list[tuple[int, float, float]]:
@@ -126,44 +126,44 @@ def shares(tracker: ContactTracker) -> dict[str, int]:
 
 
 def test_origin_that_has_all_contacts_gives_way_to_another() -> None:
-    """Its newest contacts are lifted, one for each of the other's, until both have five.
+    """Its newest contacts are lifted, one for each of the other's, until both have ten.
 
     No frame of either takes any back; what one lifts the other may have.
     """
     tracker = ContactTracker(PLATE)
-    greedy = frame(0.0, *fingers(12), source="tuio:a", origin="x")
+    greedy = frame(0.0, *fingers(22), source="tuio:a", origin="x")
     tracker.update(greedy)
     change = tracker.update(frame(0.0, *fingers(1), source="tuio:b"))
-    assert [contact.key for contact in change.up] == [("tuio:a", 9)]
+    assert [contact.key for contact in change.up] == [("tuio:a", 19)]
     for _ in range(3):
-        tracker.update(frame(0.0, *fingers(9), source="tuio:b"))
+        tracker.update(frame(0.0, *fingers(19), source="tuio:b"))
         tracker.update(greedy)
-        assert shares(tracker) == {"tuio:a": 5, "tuio:b": 5}
+        assert shares(tracker) == {"tuio:a": 10, "tuio:b": 10}
     tracker.update(frame(0.0, *fingers(2), source="tuio:b"))
     tracker.update(greedy)
-    assert shares(tracker) == {"tuio:a": 8, "tuio:b": 2}
+    assert shares(tracker) == {"tuio:a": 18, "tuio:b": 2}
 
 
 def test_sources_of_one_origin_have_equal_shares() -> None:
-    """Two browsers behind one gateway: the one with ten fingers leaves five to the other."""
+    """Two browsers behind one gateway: the one with twenty fingers leaves ten to the other."""
     tracker = ContactTracker(PLATE)
-    tracker.update(frame(0.0, *fingers(10), source="api:1:a", origin="api:1"))
-    tracker.update(frame(0.0, *fingers(9), source="api:1:b", origin="api:1"))
-    assert shares(tracker) == {"api:1:a": 5, "api:1:b": 5}
+    tracker.update(frame(0.0, *fingers(20), source="api:1:a", origin="api:1"))
+    tracker.update(frame(0.0, *fingers(19), source="api:1:b", origin="api:1"))
+    assert shares(tracker) == {"api:1:a": 10, "api:1:b": 10}
 
 
 def test_origin_gains_nothing_by_many_sources() -> None:
-    """Ten names of one origin, or ten origins of one input, do not keep a panel out."""
+    """Twenty names of one origin, or origins of one input, do not keep a panel out."""
     for origin in ("one", None):
         tracker = ContactTracker(PLATE)
-        for number in range(10):
+        for number in range(20):
             tracker.update(frame(0.0, *fingers(1), source=f"tuio:{number}", origin=origin))
-        tracker.update(frame(0.0, *fingers(5), source="panel:evdev"))
-        assert shares(tracker)["panel:evdev"] == 5
-        tracker.update(frame(0.0, *fingers(9), source="tuio:other"))
-        expected = 2 if origin else 0  # all origins of the input have one contact each
+        tracker.update(frame(0.0, *fingers(10), source="panel:evdev"))
+        assert shares(tracker)["panel:evdev"] == 10
+        tracker.update(frame(0.0, *fingers(19), source="tuio:other"))
+        expected = 5 if origin else 0  # all origins of the input have one contact each
         assert shares(tracker).get("tuio:other", 0) == expected
-        assert shares(tracker)["panel:evdev"] == 5
+        assert shares(tracker)["panel:evdev"] == 10
         assert len(tracker.contacts) == MAX_CONTACTS
 
 

@@ -21,7 +21,7 @@ TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18),)
     "arguments",
     [
         {"targets": ()},
-        {"quiet": tuple((0.2, y / 50) for y in range(10))},
+        {"quiet": tuple((x, y / 50) for x in (0.2, 0.24) for y in range(10))},
         {"level_db_sl": math.nan},
         {"level_db_sl": 201.0},
         {"level_db_sl": -300.0},

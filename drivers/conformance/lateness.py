@@ -8,6 +8,7 @@ from collections import deque
 from pathlib import Path
 
 from drivers import clock
+from drivers.conformance.stolen_time import StolenTime
 
 _PERIOD = 0.002  # s
 _LISTED = 25  # periods between two looks for new threads
@@ -68,11 +69,12 @@ class Lateness:
 
     worst [s]: the largest delay of a timer.
     process: number of a process on this machine that is the amplifier; its threads are late while
-    they wait for a processor.
+    they wait for a processor, or one is taken from this machine.
     """
 
     def __init__(self, process: int | None = None) -> None:
         self._waits = ProcessorWaits(process)
+        self._stolen = None if process is None else StolenTime()
         self._waited = 0.0
         self.worst = 0.0
         self._delays: deque[tuple[float, float]] = deque()
@@ -80,14 +82,14 @@ class Lateness:
         self._due = 0.0
 
     def __enter__(self) -> "Lateness":
-        self._waited = self._waits.total()
+        self._waited = self._all_waits()
         self._schedule()
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        with self._waits:
+        with self._waits, self._stolen or contextlib.nullcontext():
             self._note()
 
     def since(self, time: float) -> float:
@@ -107,8 +109,11 @@ class Lateness:
         self._note()
         self._schedule()
 
+    def _all_waits(self) -> float:
+        return self._waits.total() + (0.0 if self._stolen is None else self._stolen.total())
+
     def _note(self) -> None:
-        before, self._waited = self._waited, self._waits.total()
+        before, self._waited = self._waited, self._all_waits()
         now = clock.now()
         waited, late = self._waited - before, now - self._due
         self.worst = max(self.worst, late, waited)

@@ -1,12 +1,16 @@
 """Delays of a process that is an amplifier."""
 
+import asyncio
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from drivers.conformance.lateness import ProcessorWaits
+from drivers.conformance.stolen_time import StolenTime
+from virtual_loop import in_virtual_time
 
 ENDLESS = """
 import os, sys
@@ -75,3 +79,31 @@ def test_threads_that_begin_later_count(rivals: "list[subprocess.Popen[bytes]]")
         while waits.total() < before + LEAST:
             pass
         process.kill()
+
+
+@in_virtual_time
+async def test_stalls_of_a_virtual_machine_count(tmp_path: Path) -> None:
+    """By the eighth number of /proc/stat, in ticks; what an amplifier makes up for does not."""
+    file, ticks = tmp_path / "stat", os.sysconf("SC_CLK_TCK")
+
+    def steal(total: float) -> None:
+        file.write_text(f"cpu  9 9 9 9 9 9 9 {100 + round(total * ticks)} 0 0\ncpu0 9 9 9 9\n")
+
+    steal(0.0)
+    with StolenTime(file) as stolen:
+        seen = []
+        for total in (0.01, 0.31, 0.32):
+            steal(total)
+            await asyncio.sleep(0.02)
+            seen.append(stolen.total())
+    assert seen == pytest.approx([0.0, 0.3, 0.3])
+
+
+@in_virtual_time
+async def test_machine_without_such_statistics_is_never_stalled(tmp_path: Path) -> None:
+    """Neither without the file nor with another content."""
+    (tmp_path / "short").write_text("cpu 1 2\n")
+    for name in ("none", "short"):
+        with StolenTime(tmp_path / name) as stolen:
+            await asyncio.sleep(0.02)
+            assert stolen.total() == 0.0

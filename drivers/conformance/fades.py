@@ -25,6 +25,7 @@ _SETS = "wire-protocol.md#sets-tokens-and-ramps"
 _COUNTED = 8  # voices that fit into a ramp, even where an exchange takes long
 _LOW = 10.0  # Hz; its period is long against the time of an exchange
 _CYCLE_ERROR = 0.12  # error of a phase, in turns, that still tells cases apart
+_MOST_ERROR, _TRIES = 1.5 * _CYCLE_ERROR, 5
 
 
 async def _followed(
@@ -221,19 +222,29 @@ async def phases(bench: Bench) -> None:
         raise MeasuredNotApplicable(
             "the wire is too slow to tell phases apart at its lowest frequency"
         )
-    found = [await _level_after(bench, case, frequency) for case in _TONES]
+    found = [await _well_timed(bench, case, frequency) for case in _TONES]
+    for case, (_, error) in zip(_TONES, found, strict=True):
+        if error > _MOST_ERROR:
+            raise Inconclusive(f"the time of a tone {case.name} is known to {error:.2f} turns")
     if all(level > 0.9 * bench.level for level, _ in found):
         raise MeasuredNotApplicable("its levels do not show that tones of one frequency interfere")
     for case, (level, error) in zip(_TONES, found, strict=True):
         allowed = bench.level * (math.pi * error + 0.02) + bench.tolerance
-        if error > 1.5 * _CYCLE_ERROR:
-            raise Inconclusive(f"the time of a tone {case.name} is known to {error:.2f} turns")
         expect(
             abs(level - case.amid * bench.level) <= allowed,
             f"level amid a ramp to a tone {case.name}",
             expected=f"{case.amid * bench.level:.3f} within {allowed:.3f}",
             seen=f"{level:.4f}",
         )
+
+
+async def _well_timed(bench: Bench, case: _FollowingTone, frequency: float) -> tuple[float, float]:
+    """Return the level amid the ramp to a tone, as soon as an attempt was not delayed."""
+    for _ in range(_TRIES):
+        level, error = await _level_after(bench, case, frequency)
+        if error <= _MOST_ERROR:
+            break
+    return level, error
 
 
 async def _level_after(bench: Bench, case: _FollowingTone, frequency: float) -> tuple[float, float]:

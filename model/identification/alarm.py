@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc
 
 from model.arrays import FloatArray
 from model.identification.derivatives import by_mass_at
@@ -65,7 +65,10 @@ class Taken:
 
 
 class Alarm:
-    """The last patterns of a plate, and whether they are those of the plate as known."""
+    """The last patterns of a plate, and whether they are those of the plate as known.
+
+    By chi² with `scipy.special`: `scipy.stats` takes a second to load.
+    """
 
     def __init__(self) -> None:
         self._recent: deque[Taken] = deque(maxlen=WINDOW)
@@ -89,10 +92,8 @@ class Alarm:
         squares = np.cumsum([each.nis for each in last])
         numbers = np.cumsum([each.count for each in last])
         largest = np.maximum.accumulate([each.nis for each in last])
-        unlikely = stats.chi2.sf(squares, numbers) < _UNLIKELY_TOGETHER
-        rest = (
-            stats.chi2.sf(squares - largest, np.maximum(numbers - taken.count, 1)) < _UNLIKELY_REST
-        )
+        unlikely = chdtrc(numbers, squares) < _UNLIKELY_TOGETHER
+        rest = chdtrc(np.maximum(numbers - taken.count, 1), squares - largest) < _UNLIKELY_REST
         if np.any(unlikely & rest):
             return last[: int(np.argmax(squares - _REFERENCE * numbers)) + 1][::-1]
         return None
@@ -101,7 +102,7 @@ class Alarm:
     def is_odd(self) -> bool:
         """Whether the last pattern is unlikely on its own, as under a finger unlike any other."""
         last = self._recent[-1]
-        is_unlikely = stats.chi2.sf(last.nis, last.count) < _UNLIKELY_ALONE
+        is_unlikely = chdtrc(last.count, last.nis) < _UNLIKELY_ALONE
         return bool(
             is_unlikely or _squares(last.slopes, last.curvatures, last.masses).max() > _ALONG
         )

@@ -1,4 +1,4 @@
-"""The firmware, built once."""
+"""The firmware's programs, each built once where a test needs it."""
 
 import shutil
 from pathlib import Path
@@ -9,16 +9,28 @@ from firmware_programs import build_firmware
 
 
 @pytest.fixture(scope="session")
-def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of its programs for this machine."""
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of its programs; skipped where there is nothing to build them with."""
     if not (shutil.which("cc") and shutil.which("make")):
         pytest.skip("needs a C compiler and make")
-    return build_firmware(tmp_path_factory.mktemp("firmware"))
+    return tmp_path_factory.mktemp("firmware")
 
 
 @pytest.fixture(scope="session")
-def bare_metal(firmware: Path) -> Path:
-    """The folder of its programs for a Cortex-M3, to be run in QEMU."""
+def firmware(compiled: Path) -> Path:
+    """That folder, with the amplifier."""
+    return build_firmware(compiled, "era-firmware")
+
+
+@pytest.fixture(scope="session")
+def replaying(compiled: Path) -> Path:
+    """That folder, with the program that plays scripts."""
+    return build_firmware(compiled, "era-replay")
+
+
+@pytest.fixture(scope="session")
+def bare_metal(replaying: Path) -> Path:
+    """That folder, with the same program for a Cortex-M3, too, to be run in QEMU."""
     if not (shutil.which("arm-none-eabi-gcc") and shutil.which("qemu-system-arm")):
         pytest.skip("needs gcc-arm-none-eabi and qemu-system-arm")
-    return firmware
+    return build_firmware(replaying, "mps2-replay.elf")

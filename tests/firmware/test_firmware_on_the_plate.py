@@ -75,13 +75,13 @@ def script_of(pattern: Pattern, rig: Rig) -> Script:
 
 
 @pytest.fixture(scope="module")
-def played(firmware: Path) -> Played:
+def played(replaying: Path) -> Played:
     """A pattern with a shaped onset and ending, played by the firmware."""
     rig, table = smooth_rig(), smooth_table()
     timing = Timing(table)
     pattern = timing.with_envelopes(QUESTION, table.query(QUESTION))
     pattern = timing.with_transient_measures(QUESTION, pattern)
-    samples, _ = replay(firmware, script_of(pattern, rig), END + AFTER)
+    samples, _ = replay(replaying, script_of(pattern, rig), END + AFTER)
     channels = [rig.wiring[era.name].number for era in rig.eras]
     bases = samples[round(COMMIT / 1000 * RATE) :, channels] * [era.stroke for era in rig.eras]
 

@@ -50,7 +50,7 @@ TOUCH_WAIT = 0.030  # s; the daemon's own
 SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcand": 500_000}
 """Default speeds of the wires that have one [bit/s]."""
 
-_POLL = 0.002  # s
+_POLL = 0.005  # s
 
 
 @dataclass(frozen=True)

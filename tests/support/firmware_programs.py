@@ -8,8 +8,9 @@ from pathlib import Path
 FIRMWARE = Path(__file__).parents[2] / "firmware"
 
 
-def build_firmware(folder: Path, *options: str, goal: str = "all") -> Path:
-    """Build programs for this machine into a folder, with options of make; return it."""
+def build_firmware(folder: Path, program: str, *options: str) -> Path:
+    """Build one of its programs into a folder, with options of make; return the folder."""
+    goal = folder / program
     subprocess.run(["make", "-s", "-C", FIRMWARE, f"OUT={folder}", *options, goal], check=True)
     return folder
 

@@ -53,8 +53,9 @@ LIES: dict[str, tuple[Callable[[], Lie], str]] = {
 }
 
 
-@pytest.mark.parametrize("moves", [False, True], ids=["rest", "touches"])
-@pytest.mark.parametrize("names", [ONE, TWO], ids=["one", "two"])
+@pytest.mark.parametrize(
+    ("names", "moves"), [(ONE, False), (TWO, True)], ids=["one-rest", "two-touches"]
+)
 @pytest.mark.parametrize("name", LIES)
 def test_lie_ends_in_fault_and_silence(name: str, names: tuple[str, ...], moves: bool) -> None:
     """Within about two heartbeats or sets, with its reason; all amplifiers are silent then."""
@@ -94,8 +95,9 @@ def test_dead_weak_channel_ends_in_fault(level: float, names: tuple[str, ...]) -
     run_virtual(main(), rng=random.Random(1))
 
 
-@pytest.mark.parametrize("shaped", [False, True], ids=["ramps", "envelopes"])
-@pytest.mark.parametrize("names", [ONE, TWO], ids=["one", "two"])
+@pytest.mark.parametrize(
+    ("names", "shaped"), [(ONE, False), (TWO, True)], ids=["one-ramps", "two-envelopes"]
+)
 @pytest.mark.parametrize("wire", WIRES)
 def test_honest_amplifiers_are_never_a_fault(
     wire: str, names: tuple[str, ...], shaped: bool

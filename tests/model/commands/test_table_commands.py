@@ -90,7 +90,7 @@ def test_build_resumes_when_it_was_ended(
 ) -> None:
     """Ctrl-C or a kill in the middle of two workers; the same command reuses finished parts."""
     path, folder = tmp_path / "t.npz", tmp_path / "t.npz.parts"
-    long = ["--mesh", "48x36", "--frequencies", "60:320:2"]
+    long = ["--mesh", "24x18", "--frequencies", "60:320:2"]
     with subprocess.Popen(
         [ERA, "table", "build", RIG, "-o", str(path), *long, "--workers", "2"],
         stderr=subprocess.PIPE,

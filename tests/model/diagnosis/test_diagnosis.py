@@ -108,7 +108,7 @@ def built(coarse_rig: Rig) -> tuple[np.ndarray, np.ndarray]:
     return places, respond(within_tolerance(coarse_rig, rng), places, rng)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_diagnose_passes_a_plate_within_tolerance_and_finds_a_swap(coarse_rig, seed):
     """No false alarm, and none missed, whichever two channels are exchanged."""
     rng = np.random.default_rng(1000 + seed)

@@ -58,6 +58,17 @@ SLOWEST = (
     "test_dashboard_losses.py",
     "test_live_demo.py",
     "test_daemon_process.py",
+    "test_soft_amp_sound.py",
+    "test_vanished_host.py",
+    "test_effects_felt.py",
+    "test_sound_amplifiers.py",
+    "test_in_service.py",
+    "test_identify.py",
+    "test_alterations.py",
+    "test_calibrate_on_the_bench.py",
+    "test_study_cli.py",
+    "test_consistency.py",
+    "test_layout_check.py",
 )
 """Run in this order before all others: one that started last would leave the other cores idle."""
 

@@ -54,5 +54,8 @@ def test_stops_report_a_planted_lie(monkeypatch: pytest.MonkeyPatch) -> None:
     """A stop that takes any status for silence is found out on some wire."""
     monkeypatch.setattr(silence, "is_stopped", lambda status: True)
     tally = Tally()
-    disturbed_stops(range(4 * len(WIRES)), tally=tally)
+    for seed in range(4 * len(WIRES)):
+        disturbed_stops([seed], tally=tally)
+        if tally.found:
+            break
     assert "confirmed silent, but" in "; ".join(tally.found)

@@ -47,10 +47,12 @@ def truths(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Truth]:
     """The rigs as they are meant, and their tables, asked without any of the chain."""
     folder = tmp_path_factory.mktemp("truth")
     made: dict[str, Truth] = {}
-    for name, changes in CHANGES.items():
+    for changes in dict.fromkeys(CHANGES.values()):
         rig = load_rig(write_rig(folder / "rig.yaml", *changes, mesh="auto"))
         table = build_table(rig, frequencies=np.arange(80.0, 321.0, 40.0), grid=Grid(4, 3))
-        made[name] = Truth(rig, table, STREAM)
+        made |= dict.fromkeys(
+            [name for name in CHANGES if CHANGES[name] == changes], Truth(rig, table, STREAM)
+        )
     return made
 
 

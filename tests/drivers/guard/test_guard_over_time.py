@@ -248,7 +248,7 @@ class Driver:
 @pytest.mark.parametrize("limits", LIMITS, ids=["slew", "power", "on", "duty", "rate", "all"])
 @given(voices=st.sampled_from([2, 3, 8]), script=st.lists(actions, min_size=12, max_size=40))
 @settings(
-    max_examples=15,
+    max_examples=10,
     deadline=None,
     phases=[Phase.explicit, Phase.reuse, Phase.generate],  # shrinking takes minutes
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],

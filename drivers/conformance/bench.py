@@ -74,6 +74,7 @@ class Bench:
         self.level = min(level, limits.level)
         self.exchange_time = 0.0  # s; the typical one of a status
         self.max_delay = 0.0  # s; of a reply, beyond the typical
+        self._late_replies: list[tuple[float, float]] = []
         self.fed = Interval(-math.inf, math.inf)  # when the watchdog was fed last
         self.watchdog = 0.0
         self._timeouts = amplifier.statistics.timeouts
@@ -185,8 +186,15 @@ class Bench:
         when = Interval(earliest, clock.now())
         if self.exchange_time:
             typical = 3 * self.exchange_time
-            self.max_delay = max(self.max_delay, when.latest - when.earliest - typical)
+            delay = when.latest - when.earliest - typical
+            self.max_delay = max(self.max_delay, delay)
+            if delay > 0:
+                self._late_replies.append((when.latest, delay))
         return result, when
+
+    def replies_late_since(self, time: float) -> float:
+        """How late [s] replies were since a time, together, beyond the typical."""
+        return math.fsum(delay for at, delay in self._late_replies if at >= time)
 
     async def arm(self, watchdog: float = LONG_WATCHDOG) -> Status:
         """Arm with a watchdog [s], or the nearest that is possible."""

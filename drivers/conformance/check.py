@@ -217,9 +217,15 @@ def _is_mute(attempt: _Attempt) -> bool:
 async def _attempt(check: Check, bench: Bench, process: int | None) -> _Attempt:
     """Run the steps once."""
     with Lateness(process) as lateness:
-        bench.delayed_since = lateness.since
+        bench.delayed_since = (
+            lateness.since
+            if process is None
+            # It may be blocked without waiting for a processor, as by a pseudo-terminal's worker.
+            else lambda time: lateness.since(time) + bench.replies_late_since(time)
+        )
         finding = await _finding(check, bench)
-    return _Attempt(finding, lateness.worst, bench.max_delay, bench.missed_replies)
+    late = lateness.worst if process is None else max(lateness.worst, bench.max_delay)
+    return _Attempt(finding, late, bench.max_delay, bench.missed_replies)
 
 
 async def _finding(check: Check, bench: Bench) -> Exception | None:

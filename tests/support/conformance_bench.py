@@ -16,13 +16,17 @@ from wires import WIRES, far_side, patient
 
 
 async def results_at(
-    url: str, checks: Sequence[Check] = CHECKS, *, level: float = LEVEL
+    url: str,
+    checks: Sequence[Check] = CHECKS,
+    *,
+    level: float = LEVEL,
+    process: int | None = None,
 ) -> list[CheckResult]:
-    """Results of checks on the amplifier at a URL, driven at a level."""
+    """Results of checks on the amplifier at a URL, a process perhaps, driven at a level."""
     amplifier, raw = Amplifier(open_backend(url)), raw_line(url)
     await amplifier.open()
     try:
-        return list(await run_checks(checks, amplifier, raw, level=level))
+        return list(await run_checks(checks, amplifier, raw, level=level, process=process))
     finally:
         await amplifier.close()
 
@@ -34,13 +38,14 @@ def results_on(
     *,
     seen: Seen | None = None,
     level: float = LEVEL,
+    process: int | None = None,
 ) -> list[CheckResult]:
     """Results of checks on the simulated amplifier of a rig; seen: observer of the bytes."""
 
     async def run() -> list[CheckResult]:
         live_in_memory()
         async with far_side(WIRES[wire], rig) as far:
-            return await results_at(patient(far.url), checks, level=level)
+            return await results_at(patient(far.url), checks, level=level, process=process)
 
     return run_virtual(run(), seen=seen)
 

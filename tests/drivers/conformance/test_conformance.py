@@ -1,6 +1,7 @@
 """Attempts and results of conformance checks: delays of this program do not count."""
 
 import asyncio
+import os
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from functools import partial
@@ -69,6 +70,27 @@ def test_violation_amid_a_stall_is_looked_at_again(coarse_rig: Rig) -> None:
     found = result_of(partial(disturbed_at_first, tries), coarse_rig)
     assert found.result is Result.PASSED
     assert found.attempts == 2
+
+
+@pytest.mark.parametrize(
+    ("process", "result"), [(None, Result.FAILED), (os.getpid(), Result.INCONCLUSIVE)]
+)
+def test_late_replies_of_a_process_are_its_own_delays(
+    process: int | None, result: Result, coarse_rig: Rig
+) -> None:
+    """It may have stood still, which an amplifier elsewhere must not."""
+    delays = []
+
+    async def steps(bench: Bench) -> None:
+        began = clock.now()
+        await bench.timed(asyncio.sleep(0.3))
+        delays.append(bench.delayed_since(began))
+        expect(False, "level", expected="0.2", seen="0.1", is_certain=not delays[-1])
+
+    check = Check("named", "does as told", ("wire-protocol.md#watchdog",), drives=True, run=steps)
+    (found,) = results_on("serial", coarse_rig, [check], process=process)
+    assert found.result is result
+    assert (max(delays) > 0.25) is (process is not None)
 
 
 @pytest.mark.parametrize("is_violation", [True, False])

@@ -25,7 +25,7 @@ _SETS = "wire-protocol.md#sets-tokens-and-ramps"
 _COUNTED = 8  # voices that fit into a ramp, even where an exchange takes long
 _LOW = 10.0  # Hz; its period is long against the time of an exchange
 _CYCLE_ERROR = 0.12  # error of a phase, in turns, that still tells cases apart
-_MOST_ERROR, _TRIES = 1.5 * _CYCLE_ERROR, 5
+_MAX_ERROR, _TRIES = 1.5 * _CYCLE_ERROR, 5
 
 
 async def _followed(
@@ -224,7 +224,7 @@ async def phases(bench: Bench) -> None:
         )
     found = [await _well_timed(bench, case, frequency) for case in _TONES]
     for case, (_, error) in zip(_TONES, found, strict=True):
-        if error > _MOST_ERROR:
+        if error > _MAX_ERROR:
             raise Inconclusive(f"the time of a tone {case.name} is known to {error:.2f} turns")
     if all(level > 0.9 * bench.level for level, _ in found):
         raise MeasuredNotApplicable("its levels do not show that tones of one frequency interfere")
@@ -242,7 +242,7 @@ async def _well_timed(bench: Bench, case: _FollowingTone, frequency: float) -> t
     """Return the level amid the ramp to a tone, as soon as an attempt was not delayed."""
     for _ in range(_TRIES):
         level, error = await _level_after(bench, case, frequency)
-        if error <= _MOST_ERROR:
+        if error <= _MAX_ERROR:
             break
     return level, error
 

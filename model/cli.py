@@ -1,9 +1,10 @@
-"""The model's share of the `era` command: calibrate, config, plate, figure, study, table."""
+"""The model's share of the `era` command."""
 
 import typer
 
 from model.commands.calibrate_cli import calibrate
 from model.commands.config_cli import config_app
+from model.commands.design_cli import design_app
 from model.commands.figure_cli import figure_app
 from model.commands.plate_cli import plate_app
 from model.commands.plate_conformance_cli import conformance
@@ -32,6 +33,7 @@ app = typer.Typer()
 app.command()(calibrate)
 app.add_typer(config_app, name="config")
 app.add_typer(plate_app, name="plate")
+app.add_typer(design_app)
 app.add_typer(figure_app)
 app.add_typer(study_app)
 app.add_typer(table_app, name="table")

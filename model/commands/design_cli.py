@@ -1,0 +1,164 @@
+"""`era design`: places of ERAs for the best robust felt contrast."""
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from model.commands.next_line import next_line
+from model.commands.options import FolderOption, JsonOption, MeshOption, RigArgument
+
+design_app = typer.Typer()
+
+
+@design_app.command()
+def design(
+    rig_file: RigArgument,
+    eras: Annotated[
+        int, typer.Option("--eras", min=1, max=32, help="Number of ERAs, kept ones included.")
+    ],
+    output: FolderOption,
+    keep: Annotated[
+        str, typer.Option(metavar="NAME,NAME", help="ERAs of the rig that stay where they are.")
+    ] = "",
+    where: Annotated[
+        str,
+        typer.Option(
+            metavar="edge|anywhere|FILE",
+            help="Where ERAs may stand: a picture of the plate, white there, or polygons in YAML.",
+        ),
+    ] = "edge",
+    contacts: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Contacts, or a surface layout; default: anywhere, 1 to 3 quiet fingers.",
+        ),
+    ] = None,
+    apart: Annotated[
+        str, typer.Option(metavar="LENGTH", help="Least distance of two ERAs.")
+    ] = "30 mm",
+    lowest: Annotated[
+        float, typer.Option(min=1.0, help="Least rigid-body frequency of the plate in Hz.")
+    ] = 20.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of contact sets and starts.")] = 0,
+    starts: Annotated[int, typer.Option(min=1, max=64, help="Number of starts.")] = 4,
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Local processes.")] = 2,
+    mesh: MeshOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find places of ERAs for the best robust felt contrast.
+
+    Resume an interrupted design.
+    """
+    from model.commands.progress import progress_bar
+    from model.config.document import read_document
+    from model.config.units import LENGTH, quantity
+    from model.design.area import area_of
+    from model.design.contacts import anywhere, load_contacts_file
+    from model.design.outcome import summary, write_design
+    from model.design.run import problem_digest, run_design
+    from model.design.search import DesignProblem
+    from model.errors import InputError
+    from model.rig.file import rig_of
+
+    document = read_document(rig_file)
+    rig = rig_of(document, mesh=mesh)
+    kept = tuple(name.strip() for name in keep.split(",") if name.strip())
+    own = [era.name for era in rig.eras]
+    for name in kept:
+        if name not in own:
+            raise InputError(f"--keep must be ERAs of the rig, {', '.join(own)}, got {name!r}")
+    if len(set(kept)) < len(kept) or len(kept) > eras:
+        raise InputError(
+            f"--keep must be at most {eras} different ERAs, as many as --eras, got {keep!r}"
+        )
+    try:
+        distance = quantity(apart, LENGTH)
+    except ValueError as error:
+        raise InputError(f"--apart {error}") from None
+    if not 0 < distance < max(rig.plate.length, rig.plate.width):
+        raise InputError(f"--apart must be above 0 and below the plate's length, got {apart}")
+    started = time.perf_counter()
+    problem = DesignProblem(
+        rig=rig,
+        count=eras,
+        kept=kept,
+        area=area_of(where, rig.plate),
+        contacts=anywhere(rig.plate)
+        if contacts is None
+        else load_contacts_file(contacts, rig.plate),
+        apart=distance,
+        lowest=lowest,
+        seed=seed,
+    )
+    output.mkdir(parents=True, exist_ok=True)
+    digest = problem_digest(problem, _text_of(where))
+    with progress_bar("starts") as update:
+        try:
+            found = run_design(
+                problem,
+                starts=starts,
+                workers=workers,
+                folder=output,
+                digest=digest,
+                progress=update,
+            )
+        except KeyboardInterrupt:
+            typer.echo(
+                f"era: interrupted; finished starts are in {output}; run the same command "
+                "to resume",
+                err=True,
+            )
+            raise
+    files = [str(path) for path in write_design(output, found, document.data)]
+    result = {**summary(found), "time_s": time.perf_counter() - started, "files": files}
+    if as_json:
+        print(json.dumps(result))
+        return
+    _show(result)
+    print("wrote")
+    for name in files:
+        print(f"  {name}")
+    print(
+        next_line("era", "table", "build", files[0], "-o", output / "table.npz", "--mode", "phased")
+    )
+
+
+def _text_of(where: str) -> str:
+    """What identifies an area: its name, or its file's content."""
+    path = Path(where)
+    return path.read_bytes().hex() if path.is_file() else where
+
+
+def _show(result: dict[str, Any]) -> None:
+    """Print places, contrast, starts, and what each ERA buys."""
+    print(
+        f"{len(result['eras'])} ERAs in {result['time_s']:.1f} s, {result['resumed']} starts kept"
+    )
+    print("name      x / mm   y / mm   dB per mm   load / N")
+    for name, era in result["eras"].items():
+        x, y = (1000 * each for each in era["at_m"])
+        print(
+            f"{name:8s} {x:7.1f}  {y:7.1f}   {era['sensitivity_db_per_mm']:9.3f}   "
+            f"{era['static_load_n']:8.2f}"
+        )
+    for title, key in (("this layout", "contrast_db"), ("the rig's own", "own_contrast_db")):
+        if result[key] is not None:
+            medians = " / ".join(
+                f"{value:.1f}" for name, value in result[key].items() if name != "mean"
+            )
+            quiet = " / ".join(name.split("_")[1] for name in result[key] if name != "mean")
+            print(
+                f"{title}: mean {result[key]['mean']:.1f} dB, median {medians} dB with {quiet} "
+                "quiet fingers"
+            )
+    print(
+        f"{len(result['starts_db'])} starts, the worst {result['gap_db']:.1f} dB behind; level "
+        f"reached in {100 * result['reached_share']:.0f} % of {result['sets']} sets"
+    )
+    counts = list(result["by_count_db"].items())
+    print("ERAs      " + "  ".join(f"{count:>5s}" for count, _ in counts))
+    print("mean / dB " + "  ".join(f"{value:5.1f}" for _, value in counts))

@@ -1,0 +1,230 @@
+"""Where ERAs may stand: along the edge, anywhere, in polygons, on the white of a picture."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, Strict
+
+from model.arrays import FloatArray
+from model.config.document import read_document
+from model.config.sections import Quantity, Section, Validation
+from model.config.units import LENGTH
+from model.errors import InputError
+from model.rig.sections import Identifier
+from model.structure.plate import Plate
+
+EDGE, ANYWHERE = "edge", "anywhere"
+"""Names of the areas that need no file."""
+
+PICTURES = (".png", ".jpg", ".jpeg")
+
+_ON_EDGE = 1e-9  # m
+_MAX_CANDIDATES = 2000
+
+Lengths = Annotated[float, Quantity(LENGTH, at_least=-10, at_most=10)]
+PointSection = Annotated[tuple[Lengths, Lengths], Strict(strict=False)]  # a list in the file
+PolygonSection = Annotated[list[PointSection], Field(min_length=3, max_length=64)]
+
+
+class Area(Protocol):
+    """A part of the plate."""
+
+    def candidates(self, spacing: float) -> FloatArray:
+        """Places [m] in it, (c, 2), about a spacing [m] apart."""
+
+    def contains(self, points: FloatArray) -> NDArray[np.bool_]:
+        """Whether points [m] (n, 2) are in it, (n,)."""
+
+    def moved(self, place: FloatArray, step: float) -> FloatArray:
+        """Places [m] in it, (m, 2), a step [m] from a place in it."""
+
+
+@dataclass(frozen=True)
+class Edge:
+    """The edge of a plate of a length and a width [m]."""
+
+    length: float
+    width: float
+
+    def candidates(self, spacing: float) -> FloatArray:
+        """Corners, and places between them."""
+        counts = [max(1, round(side / spacing)) for side in (self.length, self.width)] * 2
+        ends = np.cumsum([0.0, self.length, self.width, self.length, self.width])
+        at = [
+            np.linspace(start, end, count, endpoint=False)
+            for start, end, count in zip(ends[:-1], ends[1:], counts, strict=True)
+        ]
+        return self._at(np.concatenate(at))
+
+    def contains(self, points: FloatArray) -> NDArray[np.bool_]:
+        """Whether points are on the edge."""
+        gaps = np.minimum(np.abs(points), np.abs([self.length, self.width] - points))
+        return np.asarray((gaps <= _ON_EDGE).any(axis=1))
+
+    def moved(self, place: FloatArray, step: float) -> FloatArray:
+        """A step to and fro along the edge, around its corners."""
+        return self._at(self._along(place) + np.array([-step, step]))
+
+    def _at(self, along: FloatArray) -> FloatArray:
+        """Places (n, 2) a distance (n,) along the edge from the origin, x first."""
+        length, width = self.length, self.width
+        s = np.mod(along, 2 * (length + width))
+        x = np.clip(np.minimum(s, 2 * length + width - s), 0, length)
+        y = np.clip(np.minimum(s - length, 2 * (length + width) - s), 0, width)
+        return np.column_stack([x, y])
+
+    def _along(self, place: FloatArray) -> float:
+        x, y = place.tolist()
+        if y <= _ON_EDGE:
+            return float(x)
+        if x >= self.length - _ON_EDGE:
+            return float(self.length + y)
+        if y >= self.width - _ON_EDGE:
+            return float(2 * self.length + self.width - x)
+        return float(2 * (self.length + self.width) - y)
+
+
+@dataclass(frozen=True)
+class Within:
+    """A part of a plate of a length and a width [m], where a function of points (n, 2) is true."""
+
+    length: float
+    width: float
+    contains: Callable[[FloatArray], NDArray[np.bool_]]
+
+    def candidates(self, spacing: float) -> FloatArray:
+        """Places on a raster over the plate, edges included."""
+        x, y = (
+            np.linspace(0, side, max(1, round(side / spacing)) + 1)
+            for side in (self.length, self.width)
+        )
+        places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        return places[self.contains(places)]
+
+    def moved(self, place: FloatArray, step: float) -> FloatArray:
+        """A step along x and y, to and fro, no further than the plate's edges."""
+        steps = step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+        places = np.clip(place + steps, 0, [self.length, self.width])
+        is_other = (np.abs(places - place) > _ON_EDGE).any(axis=1)
+        return places[is_other & self.contains(places)]
+
+
+def area_of(where: str, plate: Plate) -> Area:
+    """The area of a name, a picture or a file of polygons.
+
+    Raises InputError for a picture that cannot be read and a file that is none.
+    """
+    length, width = plate.length, plate.width
+    if where == EDGE:
+        return Edge(length, width)
+    if where == ANYWHERE:
+        return Within(length, width, everywhere)
+    path = Path(where)
+    if path.suffix.lower() in PICTURES:
+        return Within(length, width, _Picture(_white(path), length, width))
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        raise InputError(
+            f"--where must be {EDGE}, {ANYWHERE}, a picture ({', '.join(PICTURES)}) or a .yaml "
+            f"file of polygons, got {where!r}"
+        )
+    validation = Validation(read_document(path), _PolygonsSection)
+    return Within(
+        length, width, _Polygons(tuple(map(_array, validation.finish().polygons.values())))
+    )
+
+
+def everywhere(points: FloatArray) -> NDArray[np.bool_]:
+    """True for every point (n, 2), (n,)."""
+    return np.ones(len(points), dtype=bool)
+
+
+def candidates_of(area: Area, plate: Plate, *, count: int) -> FloatArray:
+    """About a count of candidate places, (c, 2) [m].
+
+    Raises InputError for an area without any.
+    """
+    spacing = 2 * (plate.length + plate.width) / count
+    if not isinstance(area, Edge):
+        spacing = math.sqrt(plate.length * plate.width / count)
+    for _ in range(6):  # of a small area the raster is finer
+        places = area.candidates(spacing)
+        if len(places) >= count / 2:
+            return places
+        if plate.length * plate.width / spacing**2 > _MAX_CANDIDATES * 4:
+            break
+        spacing *= 0.7
+    if len(places) == 0:
+        raise InputError(
+            "--where must leave room for ERAs on the plate, got none; check that it is in metres, "
+            "from the plate's corner, and white where ERAs may stand"
+        )
+    return places
+
+
+def in_polygon(polygon: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
+    """Whether points (n, 2) are in a polygon (k, 2), its edges included; by crossings of a ray."""
+    x, y = points.T[:, :, None]
+    (x0, y0), (x1, y1) = polygon.T, np.roll(polygon, -1, axis=0).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = x < x0 + (y - y0) * (x1 - x0) / (y1 - y0)
+    inside = (((y0 > y) != (y1 > y)) & crossing).sum(axis=1) % 2 == 1
+    side = np.array([x1 - x0, y1 - y0])
+    share = ((x - x0) * side[0] + (y - y0) * side[1]) / np.maximum((side**2).sum(axis=0), 1e-30)
+    share = np.clip(share, 0, 1)
+    gap = np.hypot(x - x0 - share * side[0], y - y0 - share * side[1])
+    return np.asarray(inside | (gap.min(axis=1) <= _ON_EDGE))
+
+
+@dataclass(frozen=True, eq=False)
+class _Polygons:
+    """True in any of some polygons (k, 2)."""
+
+    polygons: Sequence[FloatArray]
+
+    def __call__(self, points: FloatArray) -> NDArray[np.bool_]:
+        inside = [in_polygon(each, points) for each in self.polygons]
+        return np.asarray(np.any(inside, axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    """Rows from the top, y = width, down; columns from x = 0."""
+
+    white: NDArray[np.bool_]
+    length: float
+    width: float
+
+    def __call__(self, points: FloatArray) -> NDArray[np.bool_]:
+        rows, columns = self.white.shape
+        column = np.minimum((points[:, 0] / self.length * columns).astype(int), columns - 1)
+        row = np.minimum(((1 - points[:, 1] / self.width) * rows).astype(int), rows - 1)
+        return np.asarray(self.white[row, column])
+
+
+class _PolygonsSection(Section):
+    """Polygons in which ERAs may stand, by name."""
+
+    polygons: Annotated[dict[Identifier, PolygonSection], Field(min_length=1, max_length=256)]
+
+
+def _array(polygon: Sequence[tuple[float, float]]) -> FloatArray:
+    return np.array(polygon, dtype=float)
+
+
+def _white(path: Path) -> NDArray[np.bool_]:
+    """Pixels of a picture brighter than half, (rows, columns)."""
+    from matplotlib.image import imread
+
+    try:
+        pixels = np.asarray(imread(path), dtype=float)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; check its name and folder") from error
+    except (OSError, ValueError, SyntaxError) as error:
+        raise InputError(f"{path}: cannot be read as a picture ({error})") from error
+    grey = pixels if pixels.ndim == 2 else pixels[..., :3].mean(axis=-1)
+    return np.asarray(grey > (127.5 if grey.max() > 1 else 0.5))

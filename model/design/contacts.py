@@ -1,0 +1,247 @@
+"""Contact sets for which a plate is designed: a target and some quiet fingers each."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, Strict
+
+from model.arrays import FloatArray, IntArray
+from model.config.document import Document, read_document
+from model.config.sections import Quantity, Section, Validation
+from model.config.units import LENGTH
+from model.design.area import PointSection, PolygonSection, everywhere, in_polygon
+from model.errors import InputError
+from model.finger import MAX_CONTACTS
+from model.rig.sections import Identifier
+from model.structure.plate import Plate
+
+DEFAULT_APART = 0.05
+"""Distance [m] between the fingers of a set."""
+
+DEFAULT_QUIET = (1, 3)
+"""Fewest and most quiet fingers."""
+
+_MAX_TRIES = 20_000
+_DRAWN_FOR_EACH = 8  # drawn for each place of a pool, of which the loneliest is taken
+
+Draw = Callable[[np.random.Generator, int], FloatArray]
+"""Draws places [m] (n, 2)."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContactRule:
+    """Distribution of contact sets: anywhere, in regions, or those given.
+
+    quiet: fewest and most quiet fingers; apart [m]: between fingers; draw: of places; given: sets
+    of contacts (fingers, 2) [m], target first, which replace all that; text: identifies the rule.
+    """
+
+    quiet: tuple[int, int]
+    apart: float
+    draw: Draw
+    given: tuple[FloatArray, ...] = ()
+    text: str = "anywhere"
+
+    def sets(self, count: int, *, seed: int) -> list[FloatArray]:
+        """Draw about a count of sets, as many for each number of quiet fingers.
+
+        Those given are taken in turn. Raises InputError where fingers find no room.
+        """
+        rng = np.random.default_rng(seed)
+        if self.given:
+            order = rng.permutation(len(self.given))
+            return [self.given[number] for number in order[:count]]
+        low, high = self.quiet
+        kinds = high - low + 1
+        return [self._one(rng, 1 + low + number % kinds) for number in range(count)]
+
+    def pooled_sets(self, fingers: int, *, seed: int) -> list[FloatArray]:
+        """Sets of a number of fingers only, spread out, each the target once for each number.
+
+        For what is computed once for each finger. Sets given are taken as they are, up to three for
+        each finger.
+        """
+        low, high = self.quiet
+        if self.given:
+            return self.sets(fingers * 3, seed=seed)
+        rng = np.random.default_rng(seed)
+        pool = self.draw(rng, 1)
+        while len(pool) < fingers:
+            drawn = self.draw(rng, _DRAWN_FOR_EACH)
+            gaps = np.linalg.norm(drawn[:, None] - pool, axis=-1).min(axis=1)
+            pool = np.vstack([pool, drawn[gaps.argmax()]])
+        return [
+            pool[self._others(rng, pool, target, quiet)]
+            for quiet in range(low, high + 1)
+            for target in range(fingers)
+        ]
+
+    def _others(
+        self, rng: np.random.Generator, pool: FloatArray, target: int, quiet: int
+    ) -> IntArray:
+        """Numbers of a target and quiet fingers of a pool that are far enough apart."""
+        for _ in range(_MAX_TRIES):
+            others = rng.choice(len(pool), quiet, replace=False)
+            numbers = np.concatenate([[target], others])
+            if self._is_apart(pool[numbers]):
+                return np.asarray(numbers)
+        raise self._no_room(quiet + 1)
+
+    def _one(self, rng: np.random.Generator, fingers: int) -> FloatArray:
+        for _ in range(_MAX_TRIES):
+            places = self.draw(rng, fingers)
+            if self._is_apart(places):
+                return places
+        raise self._no_room(fingers)
+
+    def _is_apart(self, places: FloatArray) -> bool:
+        gaps = np.linalg.norm(places[:, None] - places, axis=-1)
+        return bool(gaps[np.triu_indices(len(places), 1)].min() > self.apart)
+
+    def _no_room(self, fingers: int) -> InputError:
+        return InputError(
+            f"{fingers} fingers {1000 * self.apart:g} mm apart must find room in the regions of "
+            f"--contacts, got none in {_MAX_TRIES} draws; lower apart or quiet, or enlarge the "
+            "regions"
+        )
+
+
+def anywhere(plate: Plate) -> ContactRule:
+    """One to three quiet fingers and the target anywhere on a plate."""
+    whole = _Shape(np.zeros(2), np.array([plate.length, plate.width]), everywhere)
+    return ContactRule(DEFAULT_QUIET, DEFAULT_APART, _Drawn((whole,), plate))
+
+
+def load_contacts_file(path: Path, plate: Plate) -> ContactRule:
+    """Read the rule of a file: regions, as those of a surface layout, or sets.
+
+    Raises ConfigError for what is wrong in it.
+    """
+    document = read_document(path)
+    validation = Validation(document, _ContactsSection)
+    for name in validation.mapping(("regions",)):
+        region = validation.part(("regions", name), _RegionSection)
+        if region is not None and len(region.shapes) != 1:
+            validation.add(("regions", name), "must have one of rectangle, circle and polygon")
+    section = validation.finish()
+    given = tuple(np.array([each.target, *each.quiet]) for each in section.sets)
+    problems = _off_plate(document, given, plate)
+    if bool(section.sets) == bool(section.regions):
+        problems.append("must have regions or sets")
+    low, high = section.quiet
+    if not 1 <= low <= high < MAX_CONTACTS:
+        problems.append(
+            f"quiet must be two numbers from 1 to {MAX_CONTACTS - 1}, ascending, got {low}, {high}"
+        )
+    if problems:
+        raise InputError(f"{document.source}: {problems[0]}")
+    shapes = [_shape(region) for region in section.regions.values()]
+    return ContactRule((low, high), section.apart, _Drawn(shapes, plate), given, text=document.text)
+
+
+def _off_plate(document: Document, sets: Sequence[FloatArray], plate: Plate) -> list[str]:
+    return [
+        f"sets[{number}] must be on the plate, from (0, 0) to ({plate.length:g}, {plate.width:g}) "
+        f"m, got ({x:g}, {y:g}) m"
+        for number, contacts in enumerate(sets)
+        for x, y in contacts.tolist()
+        if not plate.contains(x, y)
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """A shape in a box from low to high [m], by a function of points."""
+
+    low: FloatArray
+    high: FloatArray
+    contains: Callable[[FloatArray], NDArray[np.bool_]]
+
+    def draw(self, rng: np.random.Generator, plate: Plate) -> FloatArray:
+        """A place [m] of the plate in it; raises InputError where there is none."""
+        for _ in range(_MAX_TRIES):
+            place = rng.uniform(self.low, self.high)
+            if plate.contains(*place.tolist()) and self.contains(place[None])[0]:
+                return np.asarray(place)
+        raise InputError("regions of --contacts must be on the plate, got one that is not")
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Draws each finger in one of some shapes, each as likely as another."""
+
+    shapes: Sequence[_Shape]
+    plate: Plate
+
+    def __call__(self, rng: np.random.Generator, count: int) -> FloatArray:
+        chosen = rng.integers(len(self.shapes), size=count)
+        return np.array([self.shapes[number].draw(rng, self.plate) for number in chosen])
+
+
+@dataclass(frozen=True, eq=False)
+class _Circle:
+    at: FloatArray
+    radius: float
+
+    def __call__(self, points: FloatArray) -> NDArray[np.bool_]:
+        return np.asarray(np.hypot(*(points - self.at).T) <= self.radius)
+
+
+class _RectangleSection(Section):
+    start: PointSection
+    end: PointSection
+
+
+class _CircleSection(Section):
+    at: PointSection
+    radius: Annotated[float, Quantity(LENGTH, above=0, at_most=10)]
+
+
+class _RegionSection(Section):
+    """A region; what it plays, in a surface layout, does not matter here."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    rectangle: _RectangleSection | None = None
+    circle: _CircleSection | None = None
+    polygon: PolygonSection | None = None
+
+    @property
+    def shapes(self) -> list[object]:
+        """Those given."""
+        return [each for each in (self.rectangle, self.circle, self.polygon) if each is not None]
+
+
+class _SetSection(Section):
+    target: PointSection
+    quiet: Annotated[list[PointSection], Field(min_length=1, max_length=MAX_CONTACTS - 1)]
+
+
+class _ContactsSection(Section):
+    """Contacts of a design. Effects and the like of a surface layout are passed over."""
+
+    quiet: Annotated[tuple[int, int], Strict(strict=False)] = DEFAULT_QUIET
+    apart: Annotated[float, Quantity(LENGTH, at_least=0.026, at_most=10)] = DEFAULT_APART
+    regions: Annotated[
+        dict[Identifier, _RegionSection], Field(max_length=256, default_factory=dict)
+    ]
+    sets: Annotated[list[_SetSection], Field(max_length=1000, default_factory=list)]
+    effects: Any = None
+    elsewhere: Any = None
+    most_at_once: Any = None
+
+
+def _shape(region: _RegionSection) -> _Shape:
+    if region.rectangle is not None:
+        corners = np.array([region.rectangle.start, region.rectangle.end])
+        return _Shape(corners.min(axis=0), corners.max(axis=0), everywhere)
+    if region.circle is not None:
+        at, radius = np.array(region.circle.at), region.circle.radius
+        return _Shape(at - radius, at + radius, _Circle(at, radius))
+    polygon = np.array(region.polygon, dtype=float)
+    return _Shape(polygon.min(axis=0), polygon.max(axis=0), partial(in_polygon, polygon))

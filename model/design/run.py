@@ -1,0 +1,196 @@
+"""Running a design: several starts on processes, their layouts judged, finished ones kept."""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from model.arrays import FloatArray
+from model.design.judge import JUDGED_SETS, Judged, judge
+from model.design.search import CANDIDATES, DesignProblem, Found, LayoutSearch
+from model.design.support import MIN_SUPPORTING
+from model.files.array_file import Arrays
+from model.files.kept_arrays import keep_arrays, kept_arrays
+from model.processes import on_processes
+from model.version import NUMERICS_VERSION
+
+SENSITIVITY_STEP = 0.005
+"""Step [m] of an ERA by which the sensitivity to its place is measured."""
+
+_JUDGED_SEED = 0x5EED  # added to the seed of a design, whose own sets are others
+_TYPES = {"positions": "<f8", "scores": "<f8", "counts": "<i8", "quiet": "<i8", "answers": "<f8"}
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedLayout:
+    """A layout that was found, and what it gives on fresh contact sets."""
+
+    found: Found
+    judged: Judged
+
+    @property
+    def count(self) -> int:
+        """Number of ERAs."""
+        return len(self.found.positions)
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Result of a design.
+
+    starts: the layout of each start; best: of these; by_count: the best found for each number of
+    ERAs; sensitivities (n,): change of the score [dB/m] with the place of each ERA of the best;
+    own: the rig's own layout, None if it does not support the plate; resumed_count: of starts.
+    """
+
+    problem: DesignProblem
+    starts: tuple[JudgedLayout, ...]
+    best: JudgedLayout
+    by_count: dict[int, JudgedLayout]
+    sensitivities: FloatArray
+    own: Judged | None
+    sets: list[FloatArray]
+    resumed_count: int
+
+    @property
+    def gap_db(self) -> float:
+        """How far the worst start is behind the best [dB]."""
+        return self.best.judged.mean_db - min(each.judged.mean_db for each in self.starts)
+
+
+def problem_digest(problem: DesignProblem, where: str) -> str:
+    """SHA-256 over all that the layouts of a problem depend on; where: text of its area."""
+    parts = [
+        problem.rig.fingerprint,
+        problem.rig.mesh.to_dict(),
+        list(problem.kept),
+        [problem.rig.limits.frequency_min, problem.rig.limits.frequency_max],
+        where,
+        problem.contacts.text,
+        problem.apart,
+        problem.lowest,
+        problem.count,
+        problem.seed,
+        [NUMERICS_VERSION, JUDGED_SETS, *CANDIDATES.values()],
+    ]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def run_design(
+    problem: DesignProblem,
+    *,
+    starts: int,
+    workers: int,
+    folder: Path,
+    digest: str,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Design:
+    """Search from several starts and judge what they find.
+
+    The first start adds one ERA after the other and so gives a layout for each number; the others
+    begin at random. Finished ones are in files of the folder. Raises InputError for an area without
+    room, and where no layout supports the plate.
+    """
+    texts = {number: f"{digest} {number}" for number in range(starts)}
+    paths = {number: folder / f"start-{number}-{digest[:12]}.npz" for number in texts}
+    kept = {number: kept_arrays(path, texts[number], _TYPES) for number, path in paths.items()}
+    done: dict[int, Arrays] = {number: found for number, found in kept.items() if found is not None}
+    resumed_count = len(done)
+    progress(len(done), starts)
+    missing = {number: number for number in texts if number not in done}
+    for number, arrays in on_processes(
+        min(workers, max(1, len(missing))), _start, problem, missing
+    ):
+        keep_arrays(paths[number], texts[number], arrays)
+        done[number] = arrays
+        progress(len(done), starts)
+    layouts = {number: list(_layouts(done[number])) for number in texts}
+    found = [each for group in layouts.values() for each in group]
+    finals = tuple(group[-1] for group in layouts.values())
+    best = max(finals, key=lambda each: each.judged.mean_db)
+    search = LayoutSearch(problem)
+    sets = judged_sets(problem)
+    further = _one_more(search, best, sets)
+    by_count: dict[int, JudgedLayout] = {}
+    for each in [*found, *further]:
+        known = by_count.get(each.count)
+        if known is None or each.judged.mean_db > known.judged.mean_db:
+            by_count[each.count] = each
+    return Design(
+        problem,
+        finals,
+        best,
+        dict(sorted(by_count.items())),
+        search.sensitivities(best.found.positions, step=SENSITIVITY_STEP),
+        _own(problem, sets),
+        sets,
+        resumed_count,
+    )
+
+
+def judged_sets(problem: DesignProblem) -> list[FloatArray]:
+    """Fresh contact sets."""
+    return problem.contacts.sets(JUDGED_SETS, seed=problem.seed + _JUDGED_SEED)
+
+
+def _start(problem: DesignProblem, number: int) -> Arrays:
+    """Layouts of one start, the last of the wanted number of ERAs."""
+    search = LayoutSearch(problem)
+    if number == 0:
+        found = list(_path(search))
+    else:
+        layout = search.random_layout(np.random.default_rng([problem.seed, number]))
+        found = [search.refine(search.exchange(layout))]
+    found = [each for each in found if len(each.positions) == problem.count or each.score_db > 0]
+    sets = judged_sets(problem)
+    judged = [judge(problem.rig_with(each.positions), sets) for each in found]
+    return {
+        "positions": np.vstack([each.positions for each in found]),
+        "scores": np.array([each.score_db for each in found]),
+        "counts": np.array([len(each.positions) for each in found]),
+        "quiet": judged[0].quiet,
+        "answers": np.array([[each.contrast_db, each.level_db_sl] for each in judged]),
+    }
+
+
+def _path(search: LayoutSearch) -> Iterator[Found]:
+    """Layouts of ever more ERAs, from those kept or as few as support the plate."""
+    layout = search.kept_layout()
+    while len(layout) < search.problem.count:
+        layout = search.add(layout)
+        if len(layout) + search.supports >= MIN_SUPPORTING:
+            layout = search.exchange(layout, sweeps=1 + (len(layout) == search.problem.count))
+            yield search.refine(layout)
+    if len(layout) == len(search.kept_layout()):
+        yield search.refine(layout)
+
+
+def _one_more(
+    search: LayoutSearch, best: JudgedLayout, sets: list[FloatArray]
+) -> list[JudgedLayout]:
+    """The best layout with one ERA more."""
+    found = search.one_more(best.found.positions)
+    if found is None:
+        return []
+    return [JudgedLayout(found, judge(search.problem.rig_with(found.positions), sets))]
+
+
+def _layouts(arrays: Arrays) -> Iterator[JudgedLayout]:
+    ends = np.cumsum(arrays["counts"])
+    parts = np.split(arrays["positions"], ends[:-1])
+    for positions, score, (contrast, level) in zip(
+        parts, arrays["scores"].tolist(), arrays["answers"], strict=True
+    ):
+        yield JudgedLayout(Found(positions, score), Judged(arrays["quiet"], contrast, level))
+
+
+def _own(problem: DesignProblem, sets: list[FloatArray]) -> Judged | None:
+    from model.structure.support import support_problem
+
+    rig = problem.rig
+    if support_problem(rig.plate, rig.eras, loads=rig.masses) is not None:
+        return None
+    return judge(rig, sets)

@@ -108,6 +108,15 @@ class JackClient:
         found = libjack().jack_port_by_name(self.pointer, port.encode())
         return _names(libjack().jack_port_get_all_connections(self.pointer, found))
 
+    def check_free(self, ports: Iterable[str], *, device: str) -> None:
+        """Raise LinkError for a port that another program plays to: both would add up."""
+        for port in ports:
+            users = self.connected_to(port)
+            if users:
+                raise LinkError(
+                    f"--device {device}: busy, {users[0]} plays to {port}; end or disconnect it"
+                )
+
     def register(self, names: Iterable[str], flag: int) -> list[int]:
         """Register ports of its own, with IS_INPUT or IS_OUTPUT; raises LinkError."""
         ports = [
@@ -157,6 +166,15 @@ class JackClient:
     def close(self) -> None:
         """Leave the server."""
         libjack().jack_client_close(self.pointer)
+
+
+def check_free(other: str, channels: int) -> None:
+    """Raise LinkError where another program plays to one of the first ports of a client."""
+    client = JackClient("era-check")
+    try:
+        client.check_free(client.ports_of(other, IS_INPUT)[:channels], device=other)
+    finally:
+        client.close()
 
 
 def jack_devices(flag: int) -> dict[str, int]:

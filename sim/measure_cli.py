@@ -67,6 +67,7 @@ def measure(
     from model.config.points import parse_frequencies
     from model.files.replacing import check_ending, check_place
     from model.rig.file import load_rig
+    from sim.measuring.live_plot import live_plot
     from sim.measuring.measure import Desk
     from sim.measuring.measure import measure as measured_by
     from sim.measuring.multisine import Multisine, default_frequencies
@@ -91,8 +92,10 @@ def measure(
     check: Stepped | None = None
     try:
         multisine = Multisine(lines, len(desk.eras) + 1, card.rate, level, seed)
-        with progress_bar("ms") as progress:
-            found = measured_by(desk, card, multisine, periods=periods, progress=progress)
+        with live_plot(multisine, desk.sensors) as (progress, show):
+            found = measured_by(
+                desk, card, multisine, periods=periods, progress=progress, show=show
+            )
         if stepped:
             with progress_bar("tones") as progress:
                 check = check_by_steps(desk, card, found, level=level, progress=progress)

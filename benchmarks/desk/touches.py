@@ -51,8 +51,8 @@ def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
         assert started.stdout is not None
         started.stdout.readline()
         running(stack, daemon, desk.folder, desk.environment, log)
-        era = stack.enter_context(_client(socket))
-        _until_ready(era)
+        era = stack.enter_context(connected(socket))
+        until_ready(era)
         card = open_card("jack:desk", outputs=0, inputs=max(inputs.values()) + 1, limit=0)
         stack.callback(card.close)
         stack.enter_context(era.armed("desk", lease_s=60))
@@ -80,7 +80,8 @@ def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
     return found
 
 
-def _client(socket: Path) -> Client:
+def connected(socket: Path) -> Client:
+    """A client of the daemon, as soon as it serves."""
     end = time.monotonic() + _START
     while True:
         try:
@@ -91,7 +92,8 @@ def _client(socket: Path) -> Client:
             time.sleep(0.1)
 
 
-def _until_ready(era: Client) -> None:
+def until_ready(era: Client) -> None:
+    """Acknowledge what is left of before, until it can be armed."""
     end = time.monotonic() + _START
     while era.status().state != "READY_TO_SWITCH_ON":
         if time.monotonic() > end:

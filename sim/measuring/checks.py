@@ -7,8 +7,10 @@ import numpy as np
 from drivers.errors import LinkError
 from model.arrays import FloatArray
 from model.errors import InputError
+from sim.measuring.clocks import drift
 from sim.measuring.estimate import Estimate
 from sim.measuring.loopback import SILENT
+from sim.measuring.multisine import Multisine
 from sim.sensors.sensor_file import WiredSensor
 
 _FULL = 0.999  # of full scale
@@ -90,6 +92,28 @@ def check_wiring(
         raise InputError(
             f"the loop-back must be output {output} alone, got {others.max():.2g} of output {at} "
             f"of ERA {name} too; check mixers and monitoring of the sound card"
+        )
+
+
+def check_clocks(
+    multisine: Multisine,
+    recorded: Sequence[FloatArray],
+    sensors: Sequence[WiredSensor],
+    *,
+    loopback: int,
+) -> None:
+    """Raise InputError for inputs with another clock than the outputs'; runs (n, inputs) each."""
+    named = {loopback: "the loop-back"} | {s.input: f"sensor {s.name}" for s in sensors}
+    drifts = {n: drift(multisine, [each[:, n - 1] for each in recorded]) for n in named}
+    found = [
+        f"{1e6 * each.relative:.0f} millionths at {named[n]} (input {n})"
+        for n, each in drifts.items()
+        if each.is_certain
+    ]
+    if found:
+        raise InputError(
+            f"inputs must have the clock of the outputs, got a drift of {', '.join(found)}; use "
+            "one sound card, or clock all of them by one (word clock, ADAT)"
         )
 
 

@@ -2,7 +2,6 @@
 
 import ctypes
 
-from drivers.errors import LinkError
 from model.errors import InputError
 from sim.libjack import IS_INPUT, IS_OUTPUT, JackClient, libjack
 from sim.measuring.sound_card import Ports, SoundCard
@@ -49,12 +48,7 @@ class JackCard(SoundCard):
     def _start(self, other: str, outputs: int, inputs: int) -> None:
         takers = self._theirs(other, IS_INPUT, outputs, what="outputs")
         givers = self._theirs(other, IS_OUTPUT, inputs, what="inputs")
-        for name in takers:
-            users = self._client.connected_to(name)
-            if users:
-                raise LinkError(
-                    f"--device {self.name}: busy, {users[0]} plays to {name}; end or disconnect it"
-                )
+        self._client.check_free(takers, device=self.name)
         out, into = activate(self, self._client, outputs=outputs, inputs=inputs)
         for port, taker in zip(out, takers, strict=True):
             self._client.connect(port, taker)

@@ -10,8 +10,9 @@ from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.errors import InputError
 from model.rig.rig import Rig
-from sim.measuring.checks import check_coherence, check_levels, check_wiring
+from sim.measuring.checks import check_clocks, check_coherence, check_levels, check_wiring
 from sim.measuring.estimate import Estimate, estimate
+from sim.measuring.live_plot import Show
 from sim.measuring.loopback import converters, gain_of, is_as_late, is_whole, latency
 from sim.measuring.multisine import PERIOD, Multisine
 from sim.measuring.sound_card import SoundCard
@@ -119,10 +120,12 @@ def measure(
     *,
     periods: int = 2,
     progress: Progress = lambda done, total: None,
+    show: Show = lambda recorded: None,
 ) -> Measured:
     """Play all runs of a multisine and estimate the responses.
 
-    periods: of each run that are analysed. progress: called with the milliseconds done and all.
+    periods: of each run that are analysed. progress: called with the milliseconds done and all;
+    show: with the runs recorded so far, after each.
     Raises InputError, LinkError for what is clipped, silent, swapped, incoherent, or lost three
     times.
     """
@@ -155,10 +158,13 @@ def measure(
             repeated += 1
         recorded.append(kept)
         gains.append(gain)
+        show(recorded)
     progress(total, total)
     found = estimate(multisine, recorded)
-    # Another signal than the loop-back's looks like lost blocks; that is the cause to be told.
+    # Another signal than the loop-back's, or another clock, looks like lost blocks; that is the
+    # cause to be told.
     check_wiring(found, desk.sensors, desk.eras, loopback=desk.input, output=desk.output)
+    check_clocks(multisine, recorded, desk.sensors, loopback=desk.input)
     if is_lost:
         raise LinkError(
             f"blocks of sound were lost in {_TRIES} attempts of a run; end other programs, give "

@@ -5,7 +5,7 @@ from typing import Any
 from drivers.errors import LinkError
 from model.errors import InputError
 from sim.measuring.sound_card import SoundCard
-from sim.soft_amp.portaudio import sounddevice
+from sim.soft_amp.portaudio import check_free, sounddevice
 
 _BLOCK = 512  # frames; late samples are worse than a delay, which is measured
 
@@ -31,6 +31,8 @@ class PortAudioCard(SoundCard):
         ):
             if offered < count:
                 raise InputError(f"--device {self.name} must have {count} {what}, got {offered}")
+        if outputs:
+            check_free(library, found, outputs)
         given = self.given()
         ffi = library._ffi
         kind = "duplex" if outputs and inputs else "input" if inputs else "output"

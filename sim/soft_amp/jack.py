@@ -2,7 +2,6 @@
 
 import ctypes
 
-from drivers.errors import LinkError
 from model.errors import InputError
 from sim.libjack import IS_INPUT, IS_OUTPUT, JackClient, libjack
 from sim.soft_amp.engine import Engine, JackCalls
@@ -57,12 +56,7 @@ class JackOutput:
                 f"{settings.channels}"
             )
         self._inputs = inputs[: settings.channels]
-        for name in self._inputs:
-            users = self._client.connected_to(name)
-            if users:
-                raise LinkError(
-                    f"--device {self.name}: busy, {users[0]} plays to {name}; end or disconnect it"
-                )
+        self._client.check_free(self._inputs, device=self.name)
         names = [f"out_{n}" for n in range(1, settings.channels + 1)]
         self._ports = self._client.register(names, IS_OUTPUT)
 

@@ -2,11 +2,13 @@
 
 import os
 import resource
+from collections.abc import Mapping
 from types import ModuleType
 from typing import Any
 
 from drivers.errors import LinkError
 from model.errors import InputError
+from sim import libjack
 from sim.soft_amp.engine import Engine
 from sim.soft_amp.settings import Settings, check_rate
 
@@ -27,6 +29,15 @@ def sounddevice() -> ModuleType:
             "PortAudio: its library must be installed; Debian: apt install libportaudio2"
         ) from None
     return library  # type: ignore[no-any-return]
+
+
+def check_free(library: ModuleType, device: Mapping[str, Any], channels: int) -> None:
+    """Raise LinkError for a device of PortAudio over JACK that another program plays to.
+
+    Other drivers refuse the second program themselves; JACK adds up what both play.
+    """
+    if "JACK" in library.query_hostapis(device["hostapi"])["name"]:
+        libjack.check_free(device["name"], channels)
 
 
 def portaudio_devices() -> list[tuple[int, str, int, float]]:
@@ -79,6 +90,7 @@ class PortAudioOutput:
                 f"--channels must be at most {device['max_output_channels']}, those of "
                 f"{self.name}, got {settings.channels}"
             )
+        check_free(self._library, device, settings.channels)
         self.rate = check_rate(settings.rate or device["default_samplerate"], what=self.name)
         self.block = settings.block or (_WITH_PRIORITY if may_be_realtime() else _WITHOUT)
         try:

@@ -1,6 +1,7 @@
 """A sound card in memory in front of a plate on the desk, with what can be wrong with its wires."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
@@ -16,7 +17,8 @@ class DeskCard(SoundCard):
 
     lost: runs in which a block is lost; late: runs in which samples come as late as if a block had
     been lost before; reported: losses that the driver reports in each run; on_outputs,
-    on_inputs: order of the cables, by default as they should be; gain: of all inputs.
+    on_inputs: order of the cables, by default as they should be; gain: of all inputs;
+    drifts: of the clocks of some inputs, relative.
     """
 
     def __init__(
@@ -30,9 +32,11 @@ class DeskCard(SoundCard):
         on_outputs: Sequence[int] | None = None,
         on_inputs: Sequence[int] | None = None,
         gain: float = 1.0,
+        drifts: Mapping[int, float] = MappingProxyType({}),
     ) -> None:
         self._plate, self.rate, self.name, self.gaps = plate, rate, "memory", reported
         self._lost, self._late, self._gain, self.runs = lost, late, gain, 0
+        self._drifts = drifts
         self._on_outputs = range(plate.outputs) if on_outputs is None else on_outputs
         self._on_inputs = range(plate.inputs) if on_inputs is None else on_inputs
 
@@ -48,6 +52,10 @@ class DeskCard(SoundCard):
         if self.runs in self._late:
             heard = np.concatenate([np.zeros((128, heard.shape[1])), heard[:-128]])
         self.runs += 1
+        samples = np.arange(len(heard), dtype=float)
+        for number, drift in self._drifts.items():
+            column = heard[:, number - 1]
+            heard[:, number - 1] = np.interp(samples * (1 + drift), samples, column)
         progress(len(played))
         return np.clip(self._gain * heard[:, self._on_inputs], -1, 1).astype(np.float32)
 

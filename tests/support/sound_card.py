@@ -8,83 +8,55 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from drivers.errors import LinkError
-from model.arrays import Float32Array
+from benchmarks.desk.capture import Capture
 from preloaded import ERA
-from sim.libjack import JackClient
-from sim.measuring.jack_card import activate
-from sim.measuring.sound_card import SoundCard
 
 RATE = 48_000
 BLOCK = 128
 START = 20.0  # s
-LONGEST = 600  # s that a client captures
-AUDIBLE = 1e-6
 HOST = str(Path(__file__).with_name("steady_host.py"))
 
 
+@dataclass(frozen=True)
+class JackServer:
+    """A running server; environment: of its clients."""
+
+    process: "subprocess.Popen[bytes]"
+    environment: dict[str, str]
+
+
 @contextlib.contextmanager
-def jack_server(name: str) -> Iterator[dict[str, str]]:
-    """A server of its own; yields the environment of its clients."""
+def jack_server(
+    name: str, *, rate: int = RATE, inputs: int = 2, outputs: int = 2
+) -> Iterator[JackServer]:
+    """A server of its own."""
     environment = os.environ | {"JACK_DEFAULT_SERVER": name, "JACK_NO_START_SERVER": "1"}
     priority = ["-R", "-P10"] if os.geteuid() == 0 else ["-r"]
-    dummy = ["-d", "dummy", "-p", str(BLOCK), "-r", str(RATE), "-C", "2", "-P", "2"]
+    dummy = ["-d", "dummy", "-p", str(BLOCK), "-r", str(rate)]
+    dummy += ["-C", str(inputs), "-P", str(outputs)]
     with subprocess.Popen(
         ["jackd", "-n", name, *priority, *dummy],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         env=environment,
     ) as process:
-        yield environment
-        process.terminate()
+        try:
+            yield JackServer(process, environment)
+        finally:
+            process.terminate()
 
 
-class Capture(SoundCard):
-    """A client of so many inputs; a callback in C keeps all samples, and when blocks came."""
-
-    def __init__(self, name: str, channels: int, *, server: str) -> None:
-        super().__init__(outputs=0, inputs=channels, limit=0)
-        self._client = _client(name, server)
-        activate(self, self._client, outputs=0, inputs=channels)
-        self._arrivals = self.note_arrivals(LONGEST * RATE // BLOCK)
-        self._samples = self.begin(np.zeros((LONGEST * RATE, 0)))
-
-    def samples(self, count: int) -> Float32Array:
-        """The last samples (count, channels)."""
-        return self._samples[self.position - count : self.position]
-
-    def is_sounding(self) -> bool:
-        """Whether the last block had sound."""
-        return self.position > 0 and bool(np.abs(self.samples(BLOCK)).max() > AUDIBLE)
-
-    def last_sound(self) -> float:
-        """When the last block with sound came (monotonic, s)."""
-        loud = np.abs(self._samples[: self.position]).max(axis=1) > AUDIBLE
-        return 1e-6 * float(self._arrivals[np.flatnonzero(loud)[-1] // BLOCK])
-
-    def close(self) -> None:
-        """Leave the server."""
-        self._client.close()
-
-
-def _client(name: str, server: str) -> JackClient:
-    """A client, as soon as the server is up."""
-    end = time.monotonic() + START
+def capture_on(server: str, name: str, channels: int) -> Capture:
+    """A client of a server that captures, as soon as that is up."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("JACK_DEFAULT_SERVER", server)
-        while True:
-            try:
-                return JackClient(name)
-            except LinkError:
-                if time.monotonic() > end:
-                    raise
-                time.sleep(0.02)
+        return Capture(name, channels)
 
 
 class SoftAmp:

@@ -139,12 +139,15 @@ def test_blocks_that_are_always_lost_are_refused(rig: Rig, truth: Truth) -> None
         ({"gain": 0.0}, LinkError, "all inputs are silent"),
         ({"on_inputs": [0, 1, 2, 2]}, InputError, "input 4 must bring back"),
         ({"noise": 1.5}, LinkError, "coherence"),
+        ({"drifts": {4: 50e-6}}, InputError, r"clock.* 50 millionths at the loop-back"),
+        ({"drifts": dict.fromkeys((1, 2, 3, 4), -9e-6)}, InputError, r"clock.* -9 .*loop-back"),
+        ({"drifts": {2: 20e-6}}, InputError, r"clock.* 20 millionths at sensor P2 \(input 2\)"),
     ],
 )
 def test_wrong_desks_are_refused_with_their_cause(
     rig: Rig, truth: Truth, wires: dict[str, object], error: type[Exception], cause: str
 ) -> None:
-    """Inputs, outputs swapped; clipped; switched off; no cable for the loop-back; noise."""
+    """Inputs, outputs swapped; clipped; off; no cable for the loop-back; noise; two clocks."""
     desk = Desk(rig, SENSORS)
     played = sines(desk)
     if "noise" in wires:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.desk.capture import Capture
 from drivers.amplifier import Amplifier
 from drivers.errors import LinkError
 from drivers.protocol.messages import AmplifierState, Fault, Feature
@@ -18,7 +19,7 @@ from drivers.registry import open_backend
 from model.errors import InputError
 from sim.soft_amp.output import open_output
 from sim.soft_amp.settings import Protocol, Settings
-from sound_card import BLOCK, RATE, Capture, SoftAmp, conformance, host, jack_server, until
+from sound_card import BLOCK, RATE, SoftAmp, capture_on, conformance, host, jack_server, until
 
 pytestmark = [
     pytest.mark.real_time,
@@ -36,9 +37,9 @@ SILENCE = 0.05  # s; what the command promises once it is killed
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Capture, dict[str, str]]]:
     """A client that captures, and the environment in which its server is found."""
     name = f"era{os.getpid()}"
-    with jack_server(name) as environment:
-        capture = Capture("card", CHANNELS, server=name)
-        yield capture, environment
+    with jack_server(name) as server:
+        capture = capture_on(name, "card", CHANNELS)
+        yield capture, server.environment
         capture.close()
 
 
@@ -139,7 +140,7 @@ def test_busy_device_is_refused(
 
 def test_all_of_it_killed_is_silent(sound: tuple[Capture, dict[str, str]], tmp_path: Path) -> None:
     """The process that plays dies with the one that watches it; here through PortAudio."""
-    capture = Capture("other", 2, server=sound[1]["JACK_DEFAULT_SERVER"])
+    capture = capture_on(sound[1]["JACK_DEFAULT_SERVER"], "other", 2)
     options = ("--device", "other", "--channels", "2", "--tcp", "0", "--law", "square")
     soft_amp = SoftAmp(*options, environment=sound[1], log=tmp_path / "log")
     with host(soft_amp.url, 2):

@@ -42,11 +42,15 @@ def rig_text(design: Design, data: Mapping[str, Value]) -> str:
     assert isinstance(amplifiers, dict)  # noqa: S101
     like = next((era.name for era in rig.eras if era.name not in problem.kept), rig.eras[0].name)
     channels = iter(_free_channels(rig, problem.kept, count=problem.count))
-    eras: dict[str, Value] = {name: before[name] for name in rig.supports}
+    eras: dict[str, Value] = {}
+    mounts = rig.masses[len(rig.masses) - len(rig.supports) :]
+    for name, mount in zip(rig.supports, mounts, strict=True):
+        eras[name] = deepcopy(before[name])
+        _set_damping(eras[name], mount.damping)
     used = {}
     for era in problem.eras(design.best.found.positions):
         if era.name in problem.kept:
-            eras[era.name] = before[era.name]
+            eras[era.name] = deepcopy(before[era.name])
             _set_damping(eras[era.name], era.damping)
             continue
         section = deepcopy(before[like])  # no aliases in a file

@@ -12,6 +12,7 @@ from model.arrays import FloatArray
 from model.design.judge import JUDGED_SETS, Judged, judge
 from model.design.search import CANDIDATES, DesignProblem, Found, LayoutSearch
 from model.design.support import MIN_SUPPORTING
+from model.errors import InputError
 from model.files.array_file import Arrays
 from model.files.kept_arrays import keep_arrays, kept_arrays
 from model.processes import on_processes
@@ -144,7 +145,13 @@ def _start(problem: DesignProblem, number: int) -> Arrays:
     else:
         layout = search.random_layout(np.random.default_rng([problem.seed, number]))
         found = [search.refine(search.exchange(layout))]
-    found = [each for each in found if len(each.positions) == problem.count or each.score_db > 0]
+    found = [each for each in found if each.is_supported]
+    if not found or len(found[-1].positions) < problem.count:
+        raise InputError(
+            f"the plate must be supported by {problem.count} ERAs with its lowest rigid-body "
+            f"frequency at least {problem.lowest:g} Hz and weight on each of them, got no such "
+            "layout; add ERAs or stiffer ones, widen --where, or lower --lowest"
+        )
     sets = judged_sets(problem)
     judged = [judge(problem.rig_with(each.positions), sets) for each in found]
     return {

@@ -83,6 +83,11 @@ class Found:
     positions: FloatArray
     score_db: float
 
+    @property
+    def is_supported(self) -> bool:
+        """Whether it supports the plate."""
+        return self.score_db > _UNSUPPORTED
+
 
 class LayoutSearch:
     """Searches layouts of one problem; scores are of contact sets drawn by its seed."""
@@ -102,6 +107,11 @@ class LayoutSearch:
         self.spacing = _spacing(self._candidates)
         kept = np.array([[era.x, era.y] for era in problem.kept_eras]).reshape(-1, 2)
         self._k = len(kept)
+        if problem.count + self.supports < MIN_SUPPORTING:
+            raise InputError(
+                f"--eras must be at least {MIN_SUPPORTING - self.supports} to support the plate, "
+                f"got {problem.count}"
+            )
         self._places = self._plate.places(np.vstack([kept, self._candidates]))
         self._mounts: dict[int, Mounts] = {}
         self._known: dict[tuple[int, ...], float] = {}

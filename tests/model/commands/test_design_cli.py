@@ -64,9 +64,11 @@ def test_design_writes_a_rig_that_loads_and_resumes(small, tmp_path: Path) -> No
         ("--contacts", "nowhere.yaml"),
         ("--apart", "2 kg"),
         ("--apart", "5 m"),
+        ("--eras", "2"),
+        ("--lowest", "5000", "--starts", "1"),
     ],
 )
-def test_design_refuses_what_makes_no_design(tmp_path: Path, arguments) -> None:
-    """One error for an unknown ERA, one kept twice, missing files and an odd distance."""
+def test_design_refuses_what_makes_no_design(small, tmp_path: Path, arguments) -> None:
+    """One error each, of ERAs, files, distances and support."""
     result = design("--eras", "4", "-o", str(tmp_path), *arguments)
     assert isinstance(result.exception, InputError)

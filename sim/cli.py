@@ -10,6 +10,7 @@ import typer
 from drivers.errors import LinkError
 from model.commands.options import ExactOption, SeedOption, seed_of_plate
 from model.errors import InputError
+from sim.benchmark_cli import benchmark_app
 from sim.desk_plate_cli import desk_plate
 from sim.measure_cli import measure
 from sim.port_option import port_option
@@ -28,6 +29,7 @@ app.command()(witness)
 app.command("soft-amp")(soft_amp)
 app.command("desk-plate")(desk_plate)
 app.command()(measure)
+app.add_typer(benchmark_app, name="benchmark")
 
 EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2, LinkError: 3}
 """Exit status by class of error."""

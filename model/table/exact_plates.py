@@ -8,7 +8,7 @@ less than 1e-3 over 2 %.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -89,6 +89,24 @@ def felt_on(
         np.zeros(1, dtype=int),
         Fingertips(tips.fine_weights, np.array(question.gains)),
     )
+
+
+def fields_on(
+    table: LocalizationTable, question: Question, row: int, plates: Plates
+) -> ComplexArray:
+    """Acceleration [m/s²] of each ERA alone at full stroke on plates, (d, points, eras).
+
+    At the points of `read_fingertips` of a question, finger by finger, at a row of the table's
+    frequencies; without the deviation of discretisation.
+    """
+    tips = table.read_fingertips(question.contacts)
+    fingers = fingertip_loads(table.fingertip, question.contacts, question.loads)
+    exact = replace(plates, deviation=np.zeros_like(plates.deviation))
+    bases = np.diag([complex(era.stroke) for era in table.eras])
+    each = [
+        _response(table, tips.fine.astype(float), fingers, row, base, exact).T for base in bases
+    ]
+    return np.stack(each, axis=-1)
 
 
 def amplitudes_on(

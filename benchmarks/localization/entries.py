@@ -1,0 +1,231 @@
+"""Entries of the contrast benchmark: other methods, this program's, and an optimum in hindsight.
+
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.localization.entries -o DIR [--methods random,paper]
+
+Writes a file for each method, for `era benchmark score`. All but the paper's drive every ERA at one
+frequency of the table's 47, the one where the method itself does best on the plate as modelled:
+
+- random: any frequency, levels and phases
+- time-reversal: each ERA by the conjugate of its field at the target
+- inverse-filter: least squares for 1 at the target and 0 at the others, Tikhonov's 1e-3
+- paper: one or two ERAs at full stroke, each at any frequency, the best as modelled
+- era-haptics: `era.query`, mode phased
+- hindsight: climbed on the very plates that judge, at the four frequencies of best promise
+"""
+
+import argparse
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.promise.optimum import optimum
+from model.arrays import ComplexArray, FloatArray
+from model.errors import InputError
+from model.rig.uncertainty import Uncertainty
+from model.table.build import build_table
+from model.table.exact_plates import Plates, draw_plates, fields_on
+from model.table.question import Question
+from model.table.table import LocalizationTable
+from model.vibration.excitation import Excitation, Tone
+from sim.contrast_benchmark.data_set import VERSION, ContactSet, DataSet, data_set
+
+TIKHONOV = 1e-3
+"""Share of the largest eigenvalue that is added to all."""
+
+FREQUENCIES_IN_HINDSIGHT = 4
+
+
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """A contact set on its plate, and the fields (f, points, eras) as modelled."""
+
+    found: DataSet
+    table: LocalizationTable
+    contacts: ContactSet
+    question: Question
+    rng: np.random.Generator
+
+    @property
+    def fields(self) -> ComplexArray:
+        """Fields of each ERA alone at full stroke, (f, points, eras)."""
+        n, k = len(self.table.eras), len(self.contacts.contacts)
+        one = draw_plates(self.rng, Uncertainty.none(), count=1, era_count=n, contact_count=k)
+        rows = range(len(self.table.frequencies))
+        return np.array([fields_on(self.table, self.question, row, one)[0] for row in rows])
+
+    @property
+    def weights(self) -> FloatArray:
+        """Of the points in the mean over the target, 0 at the others, (points,)."""
+        weights = self.table.read_fingertips(self.question.contacts).fine_weights.astype(float)
+        weights[1:] = 0
+        return weights.ravel()
+
+    @property
+    def is_target(self) -> NDArray[np.bool_]:
+        """Whether a point is under the target, (points,)."""
+        tips = self.table.read_fingertips(self.question.contacts).fine_weights
+        return np.repeat(np.arange(len(tips)) == 0, tips.shape[1])
+
+    def excitation(self, frequency: float, weights: ComplexArray) -> Excitation:
+        """Weights (eras,), the largest at full stroke."""
+        weights = weights / np.abs(weights).max()
+        return {
+            era.name: Tone.from_phasor(frequency, complex(era.stroke * weight))
+            for era, weight in zip(self.table.eras, weights, strict=True)
+        }
+
+    def best(self, weights: ComplexArray) -> Excitation:
+        """Of weights (f, eras), those of the best contrast as modelled."""
+        size = np.abs(np.einsum("fpe,fe->fp", self.fields, weights))
+        contrast = (size @ self.weights) / size[:, ~self.is_target].max(axis=1)
+        row = int(contrast.argmax())
+        return self.excitation(float(self.table.frequencies[row]), weights[row])
+
+
+def _random(case: _Case) -> Excitation:
+    n = len(case.table.eras)
+    weights = case.rng.uniform(0, 1, n) * np.exp(2j * np.pi * case.rng.uniform(0, 1, n))
+    return case.excitation(float(case.rng.choice(case.table.frequencies)), weights)
+
+
+def _time_reversal(case: _Case) -> Excitation:
+    conjugate: ComplexArray = case.fields.conj()
+    return case.best(case.weights @ conjugate)
+
+
+def _inverse_filter(case: _Case) -> Excitation:
+    fields, wanted = case.fields, case.is_target.astype(float)
+    adjoint = fields.conj().swapaxes(1, 2)
+    forms = adjoint @ fields
+    largest = np.linalg.eigvalsh(forms)[:, -1]
+    forms += TIKHONOV * largest[:, None, None] * np.eye(forms.shape[-1])
+    weights = np.linalg.solve(forms, adjoint @ wanted[:, None])[:, :, 0]
+    return case.best(weights.astype(np.complex128))
+
+
+def _paper(case: _Case) -> Excitation:
+    known = replace(case.table, uncertainty=Uncertainty.none())
+    found = known.query(replace(case.question, drive_mode="switched")).excitation
+    strokes = {era.name: era.stroke for era in case.table.eras}
+    return {name: replace(tone, amplitude=strokes[name]) for name, tone in found.items()}
+
+
+def _ours(case: _Case) -> Excitation:
+    return case.table.query(replace(case.question, drive_mode="phased")).excitation
+
+
+@dataclass(frozen=True, eq=False)
+class _HeldOut:
+    """What `optimum` climbs: the fingers of a set on the plates that judge."""
+
+    case: _Case
+    finger: FloatArray
+    weights: FloatArray
+    finger_count: int
+
+    def accelerations(self, frequency: float, plates: "_Drawn") -> ComplexArray:
+        """Fields (m, points, eras)."""
+        row = int(np.searchsorted(self.case.table.frequencies, frequency))
+        return fields_on(self.case.table, self.case.question, row, plates.plates)
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    plates: Plates
+
+    def first(self, count: int) -> "_Drawn":
+        """The first of them."""
+        return _Drawn(Plates(**{key: value[:count] for key, value in vars(self.plates).items()}))
+
+
+def _hindsight(case: _Case) -> Excitation:
+    table, k = case.table, len(case.contacts.contacts)
+    promised = []
+    for frequency in table.frequencies.tolist():
+        asked = replace(case.question, drive_mode="phased", frequencies=(frequency, frequency))
+        try:
+            promised.append(table.query(asked).robust_felt_contrast_db or -math.inf)
+        except InputError:
+            promised.append(-math.inf)
+    rows = np.sort(np.argsort(promised)[-FREQUENCIES_IN_HINDSIGHT:])
+    plates = draw_plates(
+        np.random.default_rng([case.found.seed, case.contacts.number]),
+        table.uncertainty,
+        count=case.found.draws,
+        era_count=len(table.eras),
+        contact_count=k,
+    )
+    points = len(case.weights) // k
+    fingers = _HeldOut(case, np.repeat(np.arange(k), points), case.weights, k)
+    least = 10 ** (case.found.level_db_sl / 20) * table.threshold_at(rows)
+    drive = optimum(
+        cast("Any", fingers),  # what it uses of them
+        table.frequencies[rows],
+        cast("Any", _Drawn(plates)),
+        percentile=10,
+        least=np.asarray(least, dtype=float),
+    )
+    return case.excitation(drive.frequency, drive.weights)
+
+
+METHODS: Mapping[str, Callable[[_Case], Excitation]] = {
+    "random": _random,
+    "time-reversal": _time_reversal,
+    "inverse-filter": _inverse_filter,
+    "paper": _paper,
+    "era-haptics": _ours,
+    "hindsight": _hindsight,
+}
+
+
+def entry(name: str, plates: list[str]) -> dict[str, object]:
+    """The entry of a method on plates of the data set."""
+    found, patterns = data_set(), {}
+    for plate in plates:
+        table = build_table(found.plates[plate].rig, drive_mode="phased")
+        strokes = {era.name: era.stroke for era in table.eras}
+        for contacts in found.plates[plate].sets:
+            question = contacts.question(level_db_sl=found.level_db_sl)
+            rng = np.random.default_rng([5, contacts.number])
+            try:
+                tones = METHODS[name](_Case(found, table, contacts, question, rng))
+            except InputError:
+                continue
+            patterns[contacts.name] = {
+                era: [
+                    tone.frequency,
+                    round(min(1.0, tone.amplitude / strokes[era]), 6),
+                    round(math.degrees(tone.phase), 3),
+                ]
+                for era, tone in tones.items()
+            }
+    return {
+        "benchmark": "era-localization",
+        "version": VERSION,
+        "name": name,
+        "patterns": patterns,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.localization.entries")
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--methods", default=",".join(METHODS))
+    parser.add_argument("--plates", default=",".join(data_set().plates))
+    options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    for name in options.methods.split(","):
+        file = options.output / f"{name}.json"
+        document = entry(name, options.plates.split(","))
+        file.write_text(json.dumps(document) + "\n", encoding="utf-8")
+        print(f"wrote {file}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The benchmark of felt contrast: a data set that others can answer, and its scorer."""

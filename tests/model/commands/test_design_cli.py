@@ -21,7 +21,8 @@ def small(monkeypatch):
     monkeypatch.setitem(search.CANDIDATES, True, 12)
     monkeypatch.setattr(search, "SEARCH_FINGERS", 6)
     monkeypatch.setattr(search, "SEARCH_FREQUENCIES", 3)
-    monkeypatch.setattr(run, "JUDGED_SETS", 9)
+    monkeypatch.setattr(search, "FINEST_STEP", 0.02)
+    monkeypatch.setattr(run, "JUDGED_SETS", 3)
 
 
 def design(*arguments: str):
@@ -31,7 +32,7 @@ def design(*arguments: str):
 
 def test_design_writes_a_rig_that_loads_and_resumes(small, tmp_path: Path) -> None:
     """Five ERAs, one kept: channels are distinct, pictures there, and a second run takes over."""
-    arguments = ("--eras", "5", "--keep", "NE", "--starts", "2", "-o", str(tmp_path), "--json")
+    arguments = ("--eras", "5", "--keep", "NE", "--starts", "1", "-o", str(tmp_path), "--json")
     result = design(*arguments)
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
@@ -51,7 +52,7 @@ def test_design_writes_a_rig_that_loads_and_resumes(small, tmp_path: Path) -> No
     assert list(found["by_count_db"]) == ["3", "4", "5", "6"]
     assert found["resumed"] == 0
     again = json.loads(design(*arguments).stdout)
-    assert again["resumed"] == 2
+    assert again["resumed"] == 1
     assert again["eras"] == found["eras"]
 
 

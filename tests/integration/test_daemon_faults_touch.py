@@ -101,7 +101,7 @@ async def test_few_of_a_flood_of_touches_become_sets(tmp_path: Path) -> None:
 
 
 async def test_invalid_touches_are_counted_and_not_played(tmp_path: Path) -> None:
-    """NaN, infinite, off the plate, more than ten; an invalid place ends a valid contact."""
+    """NaN, infinite, off the plate, more than twenty; an invalid place ends a valid contact."""
     async with touched(tmp_path) as test:
         await armed(test.era)
         begin = time.monotonic()
@@ -112,7 +112,7 @@ async def test_invalid_touches_are_counted_and_not_played(tmp_path: Path) -> Non
         await test.counted(not_finite=6, off_plate=6)
         assert not test.journal.raising_since(begin)
         assert not (await test.era.status()).contacts
-        test.send(*(Touch(id, 0.05 + 0.06 * id, 0.5) for id in range(14)))
+        test.send(*(Touch(id, 0.02 + 0.04 * id, 0.5) for id in range(24)))
         await test.counted(not_finite=6, off_plate=6, too_many=4)
         test.send()
         await test.silence()

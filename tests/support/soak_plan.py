@@ -257,7 +257,8 @@ def _malformed(
         case 2:
             touches = (*touches, *touches)
         case 3:
-            touches = tuple((n, rng.random(), rng.random()) for n in range(25))
+            drawn = [(n, rng.random(), rng.random()) for n in range(15)]
+            touches = (*drawn, *((n, n / 25, 0.5) for n in range(15, 25)))
         case 4:
             stamp = rng.choice((math.nan, 5.0, -5.0))
         case _:

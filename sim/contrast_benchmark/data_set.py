@@ -6,13 +6,13 @@ One JSON file, `localization-1.json` beside this module, written by
 
 import hashlib
 import json
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from model.rig.file import load_rig
+from model.config.document import parse_document
+from model.rig.file import rig_of
 from model.rig.rig import Rig
 from model.table.question import Point, Question
 
@@ -78,10 +78,7 @@ def data_set() -> DataSet:
         for key, contacts in plate["sets"].items():
             sets.append(ContactSet(key, number, tuple((x, y) for x, y in contacts)))
             number += 1
-        with tempfile.TemporaryDirectory(prefix="era-") as folder:
-            file = Path(folder) / f"{name}.yaml"
-            file.write_text(plate["rig"], encoding="utf-8")
-            rig = load_rig(file)
+        rig = rig_of(parse_document(f"{name}.yaml", plate["rig"]))
         plates[name] = BenchmarkPlate(name, rig, plate["rig"], sets)
     held_out = document["held_out"]
     return DataSet(

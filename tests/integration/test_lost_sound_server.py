@@ -12,6 +12,7 @@ import pytest
 from controller.api.async_client import AsyncClient
 from daemon_bench import PATIENCE, PLACE, READY, daemon_at, holding, until, until_state
 from daemon_process import ready
+from patient_daemon import wait_long
 from sound_card import SoftAmp, capture_on, jack_server
 
 pytestmark = [
@@ -29,11 +30,14 @@ OF_VOLTAGE = (
 SERVER_BACK = 20.0  # s
 
 
-async def test_lost_server_is_a_fault_and_comes_back_disarmed(tmp_path: Path) -> None:
+async def test_lost_server_is_a_fault_and_comes_back_disarmed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The daemon is in fault or has lost it; once the server is back, the device opens, and waits.
 
     For arm, although the finger has never left.
     """
+    wait_long(monkeypatch)
     name = f"gone{os.getpid()}"
     with jack_server(name, outputs=CHANNELS) as server:
         capture_on(name, "looking", 1).close()  # once the server is up

@@ -35,13 +35,13 @@ class JackServer:
 def jack_server(
     name: str, *, rate: int = RATE, inputs: int = 2, outputs: int = 2
 ) -> Iterator[JackServer]:
-    """A server of its own."""
+    """A server of its own; synchronous: a machine that stalls delays samples and loses none."""
     environment = os.environ | {"JACK_DEFAULT_SERVER": name, "JACK_NO_START_SERVER": "1"}
     priority = ["-R", "-P10"] if os.geteuid() == 0 else ["-r"]
     dummy = ["-d", "dummy", "-p", str(BLOCK), "-r", str(rate)]
     dummy += ["-C", str(inputs), "-P", str(outputs)]
     with subprocess.Popen(
-        ["jackd", "-n", name, *priority, *dummy],
+        ["jackd", "-n", name, "-S", *priority, *dummy],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         env=environment,

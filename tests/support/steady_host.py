@@ -2,7 +2,8 @@
 
     python tests/support/steady_host.py URL CHANNELS
 
-Each channel is 30 degrees ahead of the one before. It prints `armed`.
+Each channel is 30 degrees ahead of the one before. It prints `armed`. The amplifier waits for it as
+long as the protocol allows, since a busy machine may hold it up.
 """
 
 import sys
@@ -10,6 +11,7 @@ import sys
 from drivers.blocking import BlockingAmplifier
 from drivers.command import DriveCommand
 from drivers.guard import GuardLimits
+from patient_daemon import WATCHDOG
 from registry.voltage import VoltageDrive
 
 FLAT = VoltageDrive(response=((30.0, 1.0, 0.0), (2000.0, 1.0, 0.0)), frequencies=(40.0, 1000.0))
@@ -21,7 +23,7 @@ def main(url: str, channels: int) -> None:
     """Acknowledge a fault, arm and play."""
     with BlockingAmplifier(url, limits=LIMITS, voltage=dict.fromkeys(range(channels), FLAT)) as amp:
         amp.clear()
-        amp.arm()
+        amp.arm(WATCHDOG)
         sys.stdout.write("armed\n")
         sys.stdout.flush()
         tones = [

@@ -17,6 +17,7 @@ from drivers.errors import LinkError
 from drivers.protocol.messages import AmplifierState, Fault, Feature
 from drivers.registry import open_backend
 from model.errors import InputError
+from patient_daemon import WATCHDOG
 from sim.soft_amp.output import open_output
 from sim.soft_amp.settings import Protocol, Settings
 from sound_card import BLOCK, RATE, SoftAmp, capture_on, conformance, host, jack_server, until
@@ -68,10 +69,10 @@ def test_samples_are_those_of_the_page(sound: tuple[Capture, dict[str, str]], am
         np.testing.assert_allclose(20 * np.log10(np.abs(amplitudes) / 0.5), 0, atol=0.1)
         steps = np.degrees(np.angle(amplitudes[1:] / amplitudes[:-1]))
         np.testing.assert_allclose(steps, 30, atol=0.1)
-        playing.kill()  # its watchdog is 250 ms, the fade 5 ms
+        playing.kill()
         killed = time.monotonic()
         until(lambda: not capture.is_sounding())
-        assert capture.last_sound() - killed < 0.25 + SILENCE
+        assert capture.last_sound() - killed < WATCHDOG + SILENCE
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])

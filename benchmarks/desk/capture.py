@@ -39,7 +39,11 @@ class Capture(SoundCard):
 
     def last_sound(self) -> float:
         """When the last block with sound came (monotonic, s)."""
-        return 1e-6 * float(self._times[self._loud(0)[-1] // self.block])
+        return 1e-6 * float(self._times[(self.end_of_sound() - 1) // self.block])
+
+    def end_of_sound(self) -> int:
+        """The position after the last sample with sound."""
+        return int(self._loud(0)[-1]) + 1
 
     def first_sound(self, since: int) -> float:
         """When the first sample with sound from a position on was played (monotonic, s)."""

@@ -22,6 +22,7 @@ from daemon_process import (
 )
 from drivers.protocol.messages import AmplifierState
 from model.table.file import save_table
+from patient_daemon import PROGRAM
 
 pytestmark = pytest.mark.real_time
 
@@ -30,7 +31,7 @@ async def test_second_daemon_is_refused_while_first_plays_on(tmp_path: Path) -> 
     """Exit status 2 with the process id of the first; at another socket it waits for the link."""
     async with (
         far_end(tmp_path) as far,
-        daemon_process(tmp_path, far) as daemon,
+        daemon_process(tmp_path, far, program=PROGRAM) as daemon,
         playing(daemon) as era,
     ):
         status, _, err = await run_era("daemon", tmp_path / "daemon.yaml")

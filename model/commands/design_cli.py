@@ -2,13 +2,19 @@
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from model.commands.next_line import next_line
 from model.commands.options import FolderOption, JsonOption, MeshOption, RigArgument
+
+if TYPE_CHECKING:
+    from model.config.units import Dimension
+
+MAX_STIFFNESSES = 8
 
 design_app = typer.Typer()
 
@@ -43,9 +49,28 @@ def design(
     lowest: Annotated[
         float, typer.Option(min=1.0, help="Least rigid-body frequency of the plate in Hz.")
     ] = 20.0,
+    stiffness: Annotated[
+        str,
+        typer.Option(
+            metavar="STIFFNESS,...",
+            help="Stiffnesses of which new ERAs get the best; default: that of the rig's.",
+        ),
+    ] = "",
+    worth: Annotated[
+        float,
+        typer.Option(
+            metavar="DB", min=0.0, help="Fewer ERAs, if a further one buys less contrast than this."
+        ),
+    ] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of contact sets and starts.")] = 0,
     starts: Annotated[int, typer.Option(min=1, max=64, help="Number of starts.")] = 4,
-    workers: Annotated[int, typer.Option(min=1, max=256, help="Local processes.")] = 2,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=256, help="Local processes; default: 2.")
+    ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler."),
+    ] = None,
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -53,17 +78,20 @@ def design(
 
     Resume an interrupted design.
     """
+    from model.cluster import Cluster
     from model.commands.progress import progress_bar
     from model.config.document import read_document
-    from model.config.units import LENGTH, quantity
+    from model.config.units import LENGTH
     from model.design.area import area_of
     from model.design.contacts import anywhere, load_contacts_file
     from model.design.outcome import summary, write_design
-    from model.design.run import problem_digest, run_design
+    from model.design.run import Design, run_design, worthwhile_count
     from model.design.search import DesignProblem
     from model.errors import InputError
     from model.rig.file import rig_of
 
+    if cluster is not None and workers is not None:
+        raise InputError("only one of --workers and --cluster can be given")
     document = read_document(rig_file)
     rig = rig_of(document, mesh=mesh)
     kept = tuple(name.strip() for name in keep.split(",") if name.strip())
@@ -75,10 +103,7 @@ def design(
         raise InputError(
             f"--keep must be at most {eras} different ERAs, as many as --eras, got {keep!r}"
         )
-    try:
-        distance = quantity(apart, LENGTH)
-    except ValueError as error:
-        raise InputError(f"--apart {error}") from None
+    distance = _quantity(apart, LENGTH, "--apart")
     if not 0 < distance < max(rig.plate.length, rig.plate.width):
         raise InputError(f"--apart must be above 0 and below the plate's length, got {apart}")
     started = time.perf_counter()
@@ -94,25 +119,32 @@ def design(
         lowest=lowest,
         seed=seed,
     )
+    problems = [replace(problem, stiffness=each) for each in _stiffnesses(stiffness)] or [problem]
     output.mkdir(parents=True, exist_ok=True)
-    digest = problem_digest(problem, _text_of(where))
-    with progress_bar("starts") as update:
-        try:
-            found = run_design(
-                problem,
+
+    def search(problems: list[DesignProblem], *, starts: int) -> Design:
+        with progress_bar("starts") as update:
+            return run_design(
+                problems,
+                where=_text_of(where),
                 starts=starts,
-                workers=workers,
                 folder=output,
-                digest=digest,
+                workers=workers or 2,
+                cluster=None if cluster is None else Cluster(cluster),
                 progress=update,
             )
-        except KeyboardInterrupt:
-            typer.echo(
-                f"era: interrupted; finished starts are in {output}; run the same command "
-                "to resume",
-                err=True,
-            )
-            raise
+
+    try:
+        if worth > 0:  # by the first start, which has a layout for each number
+            fewer = worthwhile_count(search(problems, starts=1), worth)
+            problems = [replace(each, count=fewer) for each in problems]
+        found = search(problems, starts=starts)
+    except KeyboardInterrupt:
+        typer.echo(
+            f"era: interrupted; finished starts are in {output}; run the same command to resume",
+            err=True,
+        )
+        raise
     files = [str(path) for path in write_design(output, found, document.data)]
     result = {**summary(found), "time_s": time.perf_counter() - started, "files": files}
     if as_json:
@@ -125,6 +157,34 @@ def design(
     print(
         next_line("era", "table", "build", files[0], "-o", output / "table.npz", "--mode", "phased")
     )
+
+
+def _quantity(text: str, dimension: "Dimension", option: str) -> float:
+    """The value of an option in its SI unit."""
+    from model.config.units import quantity
+    from model.errors import InputError
+
+    try:
+        return quantity(text, dimension)
+    except ValueError as error:
+        raise InputError(f"{option} {error}") from None
+
+
+def _stiffnesses(text: str) -> list[float]:
+    """Stiffnesses [N/m] of a list with commas, ascending."""
+    from model.config.units import STIFFNESS
+    from model.errors import InputError
+
+    found = [_quantity(each, STIFFNESS, "--stiffness") for each in text.split(",") if each.strip()]
+    if (
+        any(each <= 0 for each in found)
+        or len(set(found)) < len(found)
+        or len(found) > MAX_STIFFNESSES
+    ):
+        raise InputError(
+            f"--stiffness must be at most {MAX_STIFFNESSES} different values above 0, got {text!r}"
+        )
+    return sorted(found)
 
 
 def _text_of(where: str) -> str:
@@ -159,6 +219,8 @@ def _show(result: dict[str, Any]) -> None:
         f"{len(result['starts_db'])} starts, the worst {result['gap_db']:.1f} dB behind; level "
         f"reached in {100 * result['reached_share']:.0f} % of {result['sets']} sets"
     )
+    for stiffness, value in result["by_stiffness_db"].items():
+        print(f"ERAs of {stiffness} N/m: mean {value:.1f} dB")
     counts = list(result["by_count_db"].items())
     print("ERAs      " + "  ".join(f"{count:>5s}" for count, _ in counts))
     print("mean / dB " + "  ".join(f"{value:5.1f}" for _, value in counts))

@@ -40,7 +40,7 @@ def rig_text(design: Design, data: Mapping[str, Value]) -> str:
     before, amplifiers = data["eras"], data["amplifiers"]
     assert isinstance(before, dict)  # noqa: S101  the rig was read from this data
     assert isinstance(amplifiers, dict)  # noqa: S101
-    like = next((era.name for era in rig.eras if era.name not in problem.kept), rig.eras[0].name)
+    like = problem.like.name
     channels = iter(_free_channels(rig, problem.kept, count=problem.count))
     eras: dict[str, Value] = {}
     mounts = rig.masses[len(rig.masses) - len(rig.supports) :]
@@ -61,6 +61,7 @@ def rig_text(design: Design, data: Mapping[str, Value]) -> str:
             "at": [round(era.x, 6), round(era.y, 6)],
             "amplifier": channel.amplifier,
             "channel": channel.number,
+            **({} if problem.stiffness is None else {"stiffness": problem.stiffness}),
         }
         _set_damping(section, era.damping)
         eras[era.name] = section
@@ -98,6 +99,9 @@ def summary(design: Design) -> dict[str, Any]:
         "starts_db": [each.judged.mean_db for each in design.starts],
         "gap_db": design.gap_db,
         "by_count_db": {str(n): each.judged.mean_db for n, each in design.by_count.items()},
+        "by_stiffness_db": {
+            f"{stiffness:g}": each.judged.mean_db for stiffness, each in design.by_stiffness.items()
+        },
         "lowest_rigid_body_hz": lowest,
         "sets": len(design.sets),
         "resumed": design.resumed_count,

@@ -2,13 +2,15 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain, product
 from pathlib import Path
 
 import numpy as np
 
 from model.arrays import FloatArray
+from model.cluster import Cluster
 from model.design.judge import JUDGED_SETS, Judged, judge
 from model.design.search import CANDIDATES, DesignProblem, Found, LayoutSearch
 from model.design.support import MIN_SUPPORTING
@@ -42,15 +44,18 @@ class JudgedLayout:
 class Design:
     """Result of a design.
 
-    starts: the layout of each start; best: of these; by_count: the best found for each number of
-    ERAs; sensitivities (n,): change of the score [dB/m] with the place of each ERA of the best;
-    own: the rig's own layout, None if it does not support the plate; resumed_count: of starts.
+    problem: the one with the best answers; starts: the layout of each of its starts; best: of
+    these; by_count: the best found for each number of ERAs; by_stiffness: the best for each
+    stiffness [N/m] tried; sensitivities (n,): change of the score [dB/m] with the place of each
+    ERA of the best; own: the rig's own layout, None if it does not support the plate;
+    resumed_count: of starts.
     """
 
     problem: DesignProblem
     starts: tuple[JudgedLayout, ...]
     best: JudgedLayout
     by_count: dict[int, JudgedLayout]
+    by_stiffness: dict[float, JudgedLayout]
     sensitivities: FloatArray
     own: Judged | None
     sets: list[FloatArray]
@@ -75,56 +80,73 @@ def problem_digest(problem: DesignProblem, where: str) -> str:
         problem.lowest,
         problem.count,
         problem.seed,
+        problem.stiffness,
         [NUMERICS_VERSION, JUDGED_SETS, *CANDIDATES.values()],
     ]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
 def run_design(
-    problem: DesignProblem,
+    problems: Sequence[DesignProblem],
     *,
+    where: str,
     starts: int,
-    workers: int,
     folder: Path,
-    digest: str,
+    workers: int = 1,
+    cluster: Cluster | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Design:
-    """Search from several starts and judge what they find.
+    """Search from several starts and judge what they find, for problems of different stiffness.
 
     The first start adds one ERA after the other and so gives a layout for each number; the others
-    begin at random. Finished ones are in files of the folder. Raises InputError for an area without
-    room, and where no layout supports the plate.
+    begin at random. Finished ones are in files of the folder; where: text of the problems' area;
+    cluster: in place of so many workers on this machine.
+    Raises InputError for an area without room, and where no layout supports the plate.
     """
-    texts = {number: f"{digest} {number}" for number in range(starts)}
-    paths = {number: folder / f"start-{number}-{digest[:12]}.npz" for number in texts}
+    digests = [problem_digest(problem, where) for problem in problems]
+    tasks = {
+        number: (problem, start)
+        for number, (problem, start) in enumerate(product(range(len(problems)), range(starts)))
+    }
+    texts = {number: f"{digests[one]} {start}" for number, (one, start) in tasks.items()}
+    paths = {
+        number: folder / f"start-{start}-{digests[one][:12]}.npz"
+        for number, (one, start) in tasks.items()
+    }
     kept = {number: kept_arrays(path, texts[number], _TYPES) for number, path in paths.items()}
     done: dict[int, Arrays] = {number: found for number, found in kept.items() if found is not None}
     resumed_count = len(done)
-    progress(len(done), starts)
-    missing = {number: number for number in texts if number not in done}
-    for number, arrays in on_processes(
-        min(workers, max(1, len(missing))), _start, problem, missing
+    progress(len(done), len(tasks))
+    missing = {number: task for number, task in tasks.items() if number not in done}
+    processes = min(workers, max(1, len(missing)))
+    for number, arrays in (
+        on_processes(processes, _start, problems, missing)
+        if cluster is None
+        else cluster.solve(_as_they_are, problems, _start, missing)
     ):
         keep_arrays(paths[number], texts[number], arrays)
         done[number] = arrays
-        progress(len(done), starts)
-    layouts = {number: list(_layouts(done[number])) for number in texts}
-    found = [each for group in layouts.values() for each in group]
-    finals = tuple(group[-1] for group in layouts.values())
-    best = max(finals, key=lambda each: each.judged.mean_db)
+        progress(len(done), len(tasks))
+    found = [
+        [list(_layouts(done[number])) for number in tasks if tasks[number][0] == one]
+        for one in range(len(problems))
+    ]
+    bests = [max((path[-1] for path in each), key=_mean) for each in found]
+    chosen = max(range(len(problems)), key=lambda one: _mean(bests[one]))
+    problem, best = problems[chosen], bests[chosen]
     search = LayoutSearch(problem)
     sets = judged_sets(problem)
-    further = _one_more(search, best, sets)
     by_count: dict[int, JudgedLayout] = {}
-    for each in [*found, *further]:
-        known = by_count.get(each.count)
-        if known is None or each.judged.mean_db > known.judged.mean_db:
-            by_count[each.count] = each
+    for layout in [*chain(*found[chosen]), *_one_more(search, best, sets)]:
+        known = by_count.get(layout.count)
+        if known is None or _mean(layout) > _mean(known):
+            by_count[layout.count] = layout
     return Design(
         problem,
-        finals,
+        tuple(path[-1] for path in found[chosen]),
         best,
         dict(sorted(by_count.items())),
+        {each.stiffness: one for each, one in zip(problems, bests, strict=True) if each.stiffness},
         search.sensitivities(best.found.positions, step=SENSITIVITY_STEP),
         _own(problem, sets),
         sets,
@@ -132,13 +154,31 @@ def run_design(
     )
 
 
+def worthwhile_count(design: Design, worth: float) -> int:
+    """The number of ERAs up to which each further one buys at least so much contrast [dB]."""
+    means = {count: _mean(layout) for count, layout in design.by_count.items()}
+    for count in sorted(means):
+        if count >= design.problem.count or means.get(count + 1, 0.0) - means[count] < worth:
+            return count
+    return design.problem.count
+
+
+def _mean(layout: JudgedLayout) -> float:
+    return layout.judged.mean_db
+
+
 def judged_sets(problem: DesignProblem) -> list[FloatArray]:
     """Fresh contact sets."""
     return problem.contacts.sets(JUDGED_SETS, seed=problem.seed + _JUDGED_SEED)
 
 
-def _start(problem: DesignProblem, number: int) -> Arrays:
-    """Layouts of one start, the last of the wanted number of ERAs."""
+def _as_they_are(problems: Sequence[DesignProblem]) -> Sequence[DesignProblem]:
+    return problems
+
+
+def _start(problems: Sequence[DesignProblem], task: tuple[int, int]) -> Arrays:
+    """Layouts of one start of one problem, the last of the wanted number of ERAs."""
+    problem, number = problems[task[0]], task[1]
     search = LayoutSearch(problem)
     if number == 0:
         found = list(_path(search))

@@ -41,7 +41,8 @@ class DesignProblem:
     """What is sought.
 
     kept: ERAs of the rig that stay, by name; count: of all ERAs; apart [m]: least distance of two;
-    lowest [Hz]: least rigid-body frequency.
+    lowest [Hz]: least rigid-body frequency; stiffness [N/m]: of ERAs that do not stay, None: that
+    of the rig's.
     """
 
     rig: Rig
@@ -52,19 +53,26 @@ class DesignProblem:
     apart: float
     lowest: float
     seed: int
+    stiffness: float | None = None
 
     @property
     def kept_eras(self) -> tuple[Era, ...]:
         """ERAs that stay."""
         return tuple(self.rig.era(name) for name in self.kept)
 
+    @property
+    def like(self) -> Era:
+        """The rig's ERA like which those are that do not stay."""
+        return next((era for era in self.rig.eras if era.name not in self.kept), self.rig.eras[0])
+
     def eras(self, positions: FloatArray) -> tuple[Era, ...]:
         """ERAs at positions [m] (n, 2): those kept, and more like the first of the others.
 
         Named E1, E2, ... by names that no kept ERA has.
         """
-        kept = self.kept_eras
-        like = next((era for era in self.rig.eras if era.name not in self.kept), self.rig.eras[0])
+        kept, like = self.kept_eras, self.like
+        if self.stiffness is not None:
+            like = replace(like, stiffness=self.stiffness)
         names = (name for number in range(1, 999) if (name := f"E{number}") not in self.kept)
         return kept + tuple(
             replace(like, name=next(names), x=float(x), y=float(y))

@@ -3,7 +3,9 @@
 import json
 from pathlib import Path
 
+import dask
 import pytest
+from distributed import LocalCluster
 from typer.testing import CliRunner
 
 from model.cli import app
@@ -27,7 +29,9 @@ def small(monkeypatch):
 
 def design(*arguments: str):
     """Run `era design` in this process."""
-    return CliRunner().invoke(app, ["design", RIG, "--workers", "1", *arguments])
+    return CliRunner().invoke(
+        app, ["design", RIG, *(() if "--cluster" in arguments else ("--workers", "1")), *arguments]
+    )
 
 
 def test_design_writes_a_rig_that_loads_and_resumes(small, tmp_path: Path) -> None:
@@ -56,6 +60,46 @@ def test_design_writes_a_rig_that_loads_and_resumes(small, tmp_path: Path) -> No
     assert again["eras"] == found["eras"]
 
 
+def test_the_best_of_several_stiffnesses_is_written(small, tmp_path: Path) -> None:
+    """Two are designed; the rig has the one whose layout has more contrast, at new ERAs alone."""
+    arguments = ("--eras", "4", "--keep", "NE", "--starts", "1", "-o", str(tmp_path), "--json")
+    result = design(*arguments, "--stiffness", "8 kN/m,30 kN/m")
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    by_stiffness = found["by_stiffness_db"]
+    assert set(by_stiffness) == {"8000", "30000"}
+    assert found["contrast_db"]["mean"] == max(by_stiffness.values())
+    best = float(max(by_stiffness, key=by_stiffness.get))
+    rig = load_rig(tmp_path / "rig.yaml")
+    assert {era.name: era.stiffness for era in rig.eras if era.name != "NE"} == {
+        era.name: best for era in rig.eras if era.name != "NE"
+    }
+    assert rig.era("NE").stiffness == load_rig(RIG).era("NE").stiffness
+
+
+def test_eras_that_buy_too_little_are_left_out(small, tmp_path: Path) -> None:
+    """Of at most six, where no ERA beyond those that support the plate buys 40 dB."""
+    result = design("--eras", "6", "--worth", "40", "--starts", "1", "-o", str(tmp_path), "--json")
+    assert result.exit_code == 0, result.output
+    assert len(json.loads(result.stdout)["eras"]) == 3
+
+
+@pytest.mark.long
+def test_a_cluster_finds_what_processes_find(tmp_path: Path) -> None:
+    """Three ERAs from two starts on a Dask worker of its own, at the same places."""
+    arguments = ["design", RIG, "--eras", "3", "--starts", "2", "--json"]
+    here = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "here")])
+    with (
+        dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as running,
+    ):
+        address = running.scheduler_address
+        there = CliRunner().invoke(
+            app, [*arguments, "-o", str(tmp_path / "there"), "--cluster", address]
+        )
+    assert json.loads(there.stdout)["eras"] == json.loads(here.stdout)["eras"]
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -67,6 +111,10 @@ def test_design_writes_a_rig_that_loads_and_resumes(small, tmp_path: Path) -> No
         ("--apart", "5 m"),
         ("--eras", "2"),
         ("--lowest", "5000", "--starts", "1"),
+        ("--cluster", "127.0.0.1"),
+        ("--stiffness", "2 kg"),
+        ("--stiffness", "17 kN/m,17000"),
+        ("--stiffness", "0"),
     ],
 )
 def test_design_refuses_what_makes_no_design(small, tmp_path: Path, arguments) -> None:

@@ -9,8 +9,8 @@ import dask
 import pytest
 from distributed import Client, LocalCluster
 
+from model import cluster
 from model.errors import InputError
-from model.studies import workers
 from model.studies.workers import on_cluster, on_processes
 from studies import chunks_of, same_to_the_bit, small_study
 
@@ -67,7 +67,7 @@ def test_cluster_replaces_killed_workers(address):
 def test_cluster_refuses_workers_with_other_code(address, monkeypatch):
     """A study made by other code than the workers have is not mixed with theirs."""
     problem, cases = small_study(layouts=4)
-    monkeypatch.setattr(workers, "code_version", lambda: OTHER)
+    monkeypatch.setattr(cluster, "code_version", lambda: OTHER)
     with pytest.raises(InputError, match="same era-haptics"):
         dict(on_cluster(address)(problem, chunks_of(cases, 4)))
 
@@ -85,9 +85,7 @@ def test_cluster_without_workers_is_refused():
 def test_cluster_gives_up_on_a_chunk_that_kills_its_workers(address, monkeypatch):
     """A chunk that ends whichever worker takes it, as one does for which memory is too short."""
     problem, cases = small_study(layouts=4)
-    monkeypatch.setattr(
-        workers, "_solve_on_cluster", lambda *_: os.kill(os.getpid(), signal.SIGKILL)
-    )
+    monkeypatch.setattr(cluster, "_run_same_code", lambda *_: os.kill(os.getpid(), signal.SIGKILL))
     with Client(address, set_as_default=False) as client:
         client.run_on_scheduler(_allow_failures, 0)
     with pytest.raises(InputError, match="memory"):
@@ -108,7 +106,7 @@ def test_cluster_without_dask_names_the_extra(monkeypatch):
 
 def test_cluster_without_scheduler_is_refused(monkeypatch):
     """Nothing listens at the address: the error says so, and how to start one."""
-    monkeypatch.setattr(workers, "_CONNECT_TIMEOUT", 0.2)
+    monkeypatch.setattr(cluster, "_CONNECT_TIMEOUT", 0.2)
     problem, cases = small_study(layouts=4)
     with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:1 "):
         dict(on_cluster("tcp://127.0.0.1:1")(problem, chunks_of(cases, 4)))
@@ -122,9 +120,6 @@ def test_on_cluster_refuses_an_invalid_address(text):
 
 
 def test_every_worker_checks_its_code():
-    """A worker that joins later, with other code, is refused like the one that solves the plate."""
-    problem, cases = small_study(layouts=4)
+    """Nothing is called on a worker that joins later, with other code."""
     with pytest.raises(InputError, match="same era-haptics"):
-        workers._solve_plate(OTHER, problem)
-    with pytest.raises(InputError, match="same era-haptics"):
-        workers._solve_on_cluster(OTHER, (problem.solve(), problem.rig.eras), cases)
+        cluster._run_same_code(OTHER, pytest.fail, "called")

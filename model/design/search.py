@@ -103,6 +103,11 @@ class LayoutSearch:
     def __init__(self, problem: DesignProblem) -> None:
         """Solve the plate for all candidates; raises InputError for an area without room."""
         self.problem = problem
+        if problem.count + self.supports < MIN_SUPPORTING:
+            raise InputError(
+                f"--eras must be at least {MIN_SUPPORTING - self.supports} to support the plate, "
+                f"got {problem.count}"
+            )
         rig = problem.rig
         every = default_drive_frequencies(rig.limits)
         chosen = np.linspace(0, len(every) - 1, min(len(every), SEARCH_FREQUENCIES)).round()
@@ -115,11 +120,6 @@ class LayoutSearch:
         self.spacing = _spacing(self._candidates)
         kept = np.array([[era.x, era.y] for era in problem.kept_eras]).reshape(-1, 2)
         self._k = len(kept)
-        if problem.count + self.supports < MIN_SUPPORTING:
-            raise InputError(
-                f"--eras must be at least {MIN_SUPPORTING - self.supports} to support the plate, "
-                f"got {problem.count}"
-            )
         self._places = self._plate.places(np.vstack([kept, self._candidates]))
         self._mounts: dict[int, Mounts] = {}
         self._known: dict[tuple[int, ...], float] = {}

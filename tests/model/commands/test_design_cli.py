@@ -29,9 +29,7 @@ def small(monkeypatch):
 
 def design(*arguments: str):
     """Run `era design` in this process."""
-    return CliRunner().invoke(
-        app, ["design", RIG, *(() if "--cluster" in arguments else ("--workers", "1")), *arguments]
-    )
+    return CliRunner().invoke(app, ["design", RIG, "--workers", "1", *arguments])
 
 
 def test_design_writes_a_rig_that_loads_and_resumes(small, tmp_path: Path) -> None:
@@ -100,24 +98,7 @@ def test_a_cluster_finds_what_processes_find(tmp_path: Path) -> None:
     assert json.loads(there.stdout)["eras"] == json.loads(here.stdout)["eras"]
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("--keep", "XX"),
-        ("--keep", "NE,NE"),
-        ("--where", "nowhere.png"),
-        ("--contacts", "nowhere.yaml"),
-        ("--apart", "2 kg"),
-        ("--apart", "5 m"),
-        ("--eras", "2"),
-        ("--lowest", "5000", "--starts", "1"),
-        ("--cluster", "127.0.0.1"),
-        ("--stiffness", "2 kg"),
-        ("--stiffness", "17 kN/m,17000"),
-        ("--stiffness", "0"),
-    ],
-)
-def test_design_refuses_what_makes_no_design(small, tmp_path: Path, arguments) -> None:
-    """One error each, of ERAs, files, distances and support."""
-    result = design("--eras", "4", "-o", str(tmp_path), *arguments)
+def test_a_plate_that_sags_is_no_design(small, tmp_path: Path) -> None:
+    """No layout has its lowest rigid-body frequency above a bound out of reach."""
+    result = design("--eras", "4", "--lowest", "5000", "--starts", "1", "-o", str(tmp_path))
     assert isinstance(result.exception, InputError)

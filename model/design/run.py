@@ -208,7 +208,7 @@ def _path(search: LayoutSearch) -> Iterator[Found]:
     layout = search.kept_layout()
     while len(layout) < search.problem.count:
         layout = search.add(layout)
-        if len(layout) + search.supports >= MIN_SUPPORTING:
+        if len(layout) + search.problem.supports >= MIN_SUPPORTING:
             layout = search.exchange(layout, sweeps=1 + (len(layout) == search.problem.count))
             yield search.refine(layout)
     if len(layout) == len(search.kept_layout()):

@@ -42,7 +42,7 @@ class DesignProblem:
 
     kept: ERAs of the rig that stay, by name; count: of all ERAs; apart [m]: least distance of two;
     lowest [Hz]: least rigid-body frequency; stiffness [N/m]: of ERAs that do not stay, None: that
-    of the rig's.
+    of the rig's. Raises InputError for fewer ERAs than can support the plate.
     """
 
     rig: Rig
@@ -54,6 +54,19 @@ class DesignProblem:
     lowest: float
     seed: int
     stiffness: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the number of ERAs."""
+        if self.count + self.supports < MIN_SUPPORTING:
+            raise InputError(
+                f"--eras must be at least {MIN_SUPPORTING - self.supports} to support the plate, "
+                f"got {self.count}"
+            )
+
+    @property
+    def supports(self) -> int:
+        """Mounts beside the ERAs."""
+        return sum(load.stiffness > 0 for load in self.rig.masses)
 
     @property
     def kept_eras(self) -> tuple[Era, ...]:
@@ -103,11 +116,6 @@ class LayoutSearch:
     def __init__(self, problem: DesignProblem) -> None:
         """Solve the plate for all candidates; raises InputError for an area without room."""
         self.problem = problem
-        if problem.count + self.supports < MIN_SUPPORTING:
-            raise InputError(
-                f"--eras must be at least {MIN_SUPPORTING - self.supports} to support the plate, "
-                f"got {problem.count}"
-            )
         rig = problem.rig
         every = default_drive_frequencies(rig.limits)
         chosen = np.linspace(0, len(every) - 1, min(len(every), SEARCH_FREQUENCIES)).round()
@@ -123,11 +131,6 @@ class LayoutSearch:
         self._places = self._plate.places(np.vstack([kept, self._candidates]))
         self._mounts: dict[int, Mounts] = {}
         self._known: dict[tuple[int, ...], float] = {}
-
-    @property
-    def supports(self) -> int:
-        """Mounts beside the ERAs."""
-        return sum(load.stiffness > 0 for load in self.problem.rig.masses)
 
     def kept_layout(self) -> tuple[int, ...]:
         """Only what is kept, as numbers of places."""
@@ -250,7 +253,7 @@ class LayoutSearch:
 
     def _value_at(self, places: Places, chosen: Iterable[int]) -> float:
         numbers = np.asarray(chosen)
-        if len(numbers) + self.supports >= MIN_SUPPORTING:
+        if len(numbers) + self.problem.supports >= MIN_SUPPORTING:
             shortfall = self._rule.shortfall(self.problem.eras(places.at[numbers]))
             if shortfall > 0:
                 return _UNSUPPORTED * (1 + shortfall)

@@ -6,7 +6,7 @@ Every change is a cross-fade along a raised cosine, whose two gains add up to on
 import cmath
 import math
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TypeAlias
 
@@ -68,7 +68,8 @@ class FadingTone:
         """
         if self.silent_from <= time + ramp:
             return self
-        return replace(self, start=time, ramp=ramp, gain_from=self.gain(time), gain_to=0.0)
+        gain = self.gain(time)
+        return FadingTone(self.frequency, self.full, self.origin, time, ramp, gain, 0.0)
 
     def terms(self, *, stroke: float) -> tuple[Term, ...]:
         """Base motion of an ERA with this stroke [m] whose channel plays it."""

@@ -34,24 +34,27 @@ _MAX_CACHED_SOLUTIONS = 1024  # unit solutions that are kept, some kilobytes eac
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ParticularSolution:
-    """The particular solution q(t) = Im[(b0 + b1 tau) exp(i omega tau)], tau = t - term.start.
+class ForcedVibration:
+    """The particular solution q(t) = Im sum over n of (b0 + b1 tau) exp(i omega tau).
 
-    b0, b1: (r,).
+    tau = t - time [s]; omegas (n,) [rad/s], each once; b0, b1 (n, r), b1 None for 0.
     """
 
-    term: Term
+    time: float
+    omegas: FloatArray
     b0: ComplexArray
-    b1: ComplexArray
+    b1: ComplexArray | None
 
     def state(self, time: float) -> FloatArray:
         """Displacement and velocity (2 r,) at a time [s]."""
-        tau = time - self.term.start
-        phase_factor = np.exp(1j * self.term.omega * tau)
-        q = self.b0 + self.b1 * tau
-        return np.concatenate(
-            [q * phase_factor, (self.b1 + 1j * self.term.omega * q) * phase_factor]
-        ).imag
+        tau = time - self.time
+        phase_factor = np.exp(1j * self.omegas * tau)
+        q = phase_factor @ self.b0
+        v = (1j * self.omegas * phase_factor) @ self.b0
+        if self.b1 is not None:
+            q += (tau * phase_factor) @ self.b1
+            v += ((1 + 1j * self.omegas * tau) * phase_factor) @ self.b1
+        return np.concatenate([q, v]).imag
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,17 +88,29 @@ class PlateInTime:
         """Displacement of the reduced coordinates in each eigenvector, (r, 2 r)."""
         return self.vectors[: len(self.vectors) // 2]
 
-    def particular_solutions(self, era: int, terms: Sequence[Term]) -> list[ParticularSolution]:
-        """Particular solutions for terms of one ERA's base, one each."""
-        solutions = []
-        for term in terms:
-            constant, linear = self._unit_solutions(era, term.omega)
-            solutions.append(
-                ParticularSolution(term, constant * term.c0 + linear * term.c1, constant * term.c1)
-                if term.c1
-                else ParticularSolution(term, constant * term.c0, np.zeros_like(constant))
-            )
-        return solutions
+    def driven(self, terms: Sequence[tuple[int, Term]], time: float) -> ForcedVibration:
+        """Particular solution for terms of the ERAs' bases, each with its ERA, from a time [s].
+
+        Terms of one frequency are one there, so that its samples cost what its frequencies do.
+        """
+        ordered = sorted(terms, key=lambda each: each[1].omega)
+        r = len(self.displacement)
+        if not ordered:
+            return ForcedVibration(time, np.zeros(0), np.zeros((0, r), dtype=complex), None)
+        solved = [self._unit_solutions(era, term.omega) for era, term in ordered]
+        omegas = np.array([term.omega for _, term in ordered])
+        c0, c1 = np.array([(term.c0, term.c1) for _, term in ordered]).T
+        tau = time - np.array([term.start for _, term in ordered])
+        phase_factor = np.exp(1j * omegas * tau)
+        starts = np.flatnonzero(np.diff(omegas, prepend=np.nan))
+        constant = np.array([each for each, _ in solved])
+        b0 = constant * (phase_factor * (c0 + c1 * tau))[:, None]
+        b1 = None
+        if c1.any():
+            rate = (phase_factor * c1)[:, None]
+            b0 += np.array([each for _, each in solved]) * rate
+            b1 = np.add.reduceat(constant * rate, starts)
+        return ForcedVibration(time, omegas[starts], np.add.reduceat(b0, starts), b1)
 
     def _unit_solutions(self, era: int, omega: float) -> tuple[ComplexArray, ComplexArray]:
         """b0 (r,) each for a base that moves with c0 = 1 m, and with c1 = 1 m/s."""

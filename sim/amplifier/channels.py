@@ -83,6 +83,8 @@ class Channels:
 
     def without_room(self, playable: PlayableSet, time: float) -> int | None:
         """The first channel on which a set would be a voice too many; None to play it."""
+        if all(len(playing) < self._voices for playing in self._outputs):
+            return None  # a set adds one at most
         after = self._outputs_after(playable, time)
         return next((channel for channel, output in after if len(output) > self._voices), None)
 

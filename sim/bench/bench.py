@@ -96,6 +96,8 @@ class Bench:
             amplifier.attach(sensing)
         # By ERA: the output of its channel, the output that moves the base, and the changes between
         # them that are delayed, each with its time [s].
+        wired = [rig.wiring[era.name] for era in rig.eras]
+        self._wired = [(channel.amplifier, channel.number) for channel in wired]
         self._commanded: list[Output] = [()] * len(rig.eras)
         self._applied_outputs: list[Output] = [()] * len(rig.eras)
         self._delayed: list[deque[tuple[float, Output]]] = [deque() for _ in rig.eras]
@@ -244,13 +246,13 @@ class Bench:
 
     def _update_plant(self) -> None:
         """Pass changed outputs of the channels on to the plant, after their delay."""
-        for index, era in enumerate(self.rig.eras):
-            channel = self.rig.wiring[era.name]
-            playing = self.amplifiers[channel.amplifier].outputs[channel.number]
+        outputs = {name: amplifier.outputs for name, amplifier in self.amplifiers.items()}
+        for index, (amplifier, number) in enumerate(self._wired):
+            playing = outputs[amplifier][number]
             waiting = self._delayed[index]
             if playing is not self._commanded[index]:
                 self._commanded[index] = playing
-                delay = self.imperfections.delay(channel.amplifier)
+                delay = self.imperfections.delay(amplifier)
                 waiting.append((self.time + delay, delayed(playing, delay)))
             while waiting and waiting[0][0] <= self.time:
                 _, playing = waiting.popleft()

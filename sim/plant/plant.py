@@ -9,13 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.reduction.reduced_plate import ReducedPlate
 from model.structure.actuator import Era
 from model.structure.fingertip import FingertipLoad
 from model.structure.point_load import PointLoad
 from model.transients.base_motion import Term
-from model.transients.time_response import ParticularSolution
+from model.transients.time_response import ForcedVibration
 from sim.plant.loaded_plates import BLOCK, LoadedPlate, LoadedPlateCache, carried_state
 
 SAMPLE_RATE = 10_000.0
@@ -45,7 +45,13 @@ class Plant:
         self._current: LoadedPlate = self._plates.under((), time=time)
         self._contacts: Mapping[str, FingertipLoad] = {}
         self._free = np.zeros(len(self._current.plate.decay), dtype=complex)
-        self._particular: list[list[ParticularSolution]] = [[] for _ in eras]
+        # Terms of each ERA's base that have not ended; those set at the present time, by ERA.
+        self._terms: list[list[Term]] = [[] for _ in eras]
+        self._set: dict[int, list[Term]] = {}
+        self._moments: list[float] = []  # starts and ends of terms, ascending
+        self._forced = self._current.plate.driven((), time)
+        self._sampled: _Sampled | None = None  # until the drive or the contacts change
+        self._free_at: tuple[FloatArray, ComplexArray] | None = None  # until the contacts change
 
     @property
     def reduced(self) -> ReducedPlate:
@@ -78,18 +84,7 @@ class Plant:
 
     def set_input(self, era: int, terms: Sequence[Term]) -> None:
         """Set the base motion of an ERA from now on; terms may start later."""
-        # Unchanged terms continue; only the others are exchanged.
-        known = {solution.term: solution for solution in self._particular[era]}
-        wanted = _united([term for term in terms if term.end > self.time])
-        new = self._current.plate.particular_solutions(
-            era, [term for term in wanted if term not in known]
-        )
-        gone = [solution for term, solution in known.items() if term not in wanted]
-        self._particular[era] = [
-            *(solution for term, solution in known.items() if term in wanted),
-            *new,
-        ]
-        self._exchange(self._active_of(gone), self._active_of(new))
+        self._set[era] = _united([term for term in terms if term.end > self.time])
 
     def set_contacts(self, contacts: Mapping[str, FingertipLoad]) -> None:
         """Replace the contacts, by id of the finger; a new finger's phalanx is at rest.
@@ -103,14 +98,10 @@ class Plant:
         state = np.concatenate(self._state())
         self._current = self._plates.under(tuple(contacts.values()), time=self.time)
         self._contacts = dict(contacts)
-        self._particular = [
-            self._current.plate.particular_solutions(era, [solution.term for solution in solutions])
-            for era, solutions in enumerate(self._particular)
-        ]
         remainder = carried_state(state, before, (self._current, contacts))
-        for solution in self._active():
-            remainder = remainder - solution.state(self.time)
-        self._free = self._current.plate.to_free @ remainder
+        self._forced = self._current.plate.driven(self._active(), self.time)
+        self._free = self._current.plate.to_free @ (remainder - self._forced.state(self.time))
+        self._sampled = self._free_at = None
 
     def advance(
         self, to_time: float, *, sample_rate: float, shapes: FloatArray
@@ -120,6 +111,7 @@ class Plant:
         shapes (p, r): of `reduced` at the points. Samples lie on the grid k / sample_rate [Hz],
         after the present time up to and including to_time.
         """
+        self._apply_inputs()
         first = np.floor(self.time * sample_rate) + 1
         last = np.floor(to_time * sample_rate)
         times = np.arange(first, last + 1) / sample_rate
@@ -141,50 +133,52 @@ class Plant:
         """Advance to a time [s] without sampling."""
         if to_time <= self.time:
             return
+        self._apply_inputs()
         for boundary in self._boundaries(to_time):
             self._cross_boundary(boundary)
         self._propagate_free(to_time)
 
     def _state(self) -> tuple[FloatArray, FloatArray]:
         """Displacement and velocity of all coordinates, the phalanges' last."""
-        x = (self._current.plate.free_state @ self._free).real
-        for solution in self._active():
-            x = x + solution.state(self.time)
+        self._apply_inputs()
+        x = (self._current.plate.free_state @ self._free).real + self._forced.state(self.time)
         r = len(x) // 2
         return x[:r], x[r:]
 
-    def _active(self) -> list[ParticularSolution]:
-        return [
-            solution for solutions in self._particular for solution in self._active_of(solutions)
-        ]
+    def _apply_inputs(self) -> None:
+        """Exchange the terms that were set at the present time, of all ERAs at once."""
+        if not self._set:
+            return
+        changes = self._set
+        self._set = {}
+        if any(self._terms[era] != wanted for era, wanted in changes.items()):
+            for era, wanted in changes.items():
+                self._terms[era] = wanted
+            self._exchange()
 
-    def _active_of(self, solutions: Sequence[ParticularSolution]) -> list[ParticularSolution]:
+    def _active(self) -> list[tuple[int, Term]]:
+        """The terms that move the bases at present, each with its ERA."""
+        now = self.time
         return [
-            solution
-            for solution in solutions
-            if solution.term.start <= self.time < solution.term.end
+            (era, term)
+            for era, terms in enumerate(self._terms)
+            for term in terms
+            if term.start <= now < term.end
         ]
 
     def _boundaries(self, to_time: float) -> list[float]:
-        moments = {
-            moment
-            for solutions in self._particular
-            for solution in solutions
-            for moment in (solution.term.start, solution.term.end)
-        }
-        return sorted(moment for moment in moments if self.time < moment <= to_time)
+        return [moment for moment in self._moments if self.time < moment <= to_time]
 
-    def _exchange(
-        self, before: Sequence[ParticularSolution], after: Sequence[ParticularSolution]
-    ) -> None:
-        """Replace particular solutions; displacement and velocity stay continuous."""
-        if before or after:
-            jump = np.zeros(self._current.plate.free_state.shape[0])
-            for solution in before:
-                jump += solution.state(self.time)
-            for solution in after:
-                jump -= solution.state(self.time)
-            self._free = self._free + self._current.plate.to_free @ jump
+    def _exchange(self) -> None:
+        """Let the terms of the present time drive; displacement and velocity stay continuous."""
+        before = self._forced.state(self.time)
+        self._forced = self._current.plate.driven(self._active(), self.time)
+        jump = before - self._forced.state(self.time)
+        self._free = self._free + self._current.plate.to_free @ jump
+        self._moments = sorted(
+            {moment for terms in self._terms for each in terms for moment in (each.start, each.end)}
+        )
+        self._sampled = None
 
     def _propagate_free(self, to_time: float) -> None:
         self._free = self._free * np.exp(self._current.plate.decay * (to_time - self.time))
@@ -193,17 +187,9 @@ class Plant:
 
     def _cross_boundary(self, boundary: float) -> None:
         """Advance to a time at which terms start or end."""
-        before = self._active()
         self._propagate_free(boundary)
-        after = self._active()
-        self._exchange(
-            [solution for solution in before if solution not in after],
-            [solution for solution in after if solution not in before],
-        )
-        self._particular = [
-            [solution for solution in solutions if solution.term.end > boundary]
-            for solutions in self._particular
-        ]
+        self._terms = [[each for each in terms if each.end > boundary] for terms in self._terms]
+        self._exchange()
 
     def _sample(
         self, times: FloatArray, out: FloatArray, sample_rate: float, points: FloatArray
@@ -214,21 +200,25 @@ class Plant:
         """
         if not len(times):
             return
-        decay = self._current.plate.decay
-        free = self._free * np.exp(decay * (times[0] - self.time))
-        modal = ((points @ self._current.plate.free_acceleration) * free).T
+        plate = self._current.plate
+        sampled = self._sampled
+        if sampled is None or not np.array_equal(sampled.points, points):
+            if self._free_at is None or not np.array_equal(self._free_at[0], points):
+                self._free_at = points, points @ plate.free_acceleration
+            sampled = self._sampled = _Sampled(*self._free_at, self._forced)
+        free = self._free * np.exp(plate.decay * (times[0] - self.time))
+        modal = (sampled.by_free * free).T
         table = self._current.exponentials(sample_rate)
-        forced = _ForcedResponse(self._active(), points)
         for start in range(0, len(times), BLOCK):
             block = times[start : start + BLOCK]
             into = out[start : start + BLOCK]
             if start:
-                modal = modal * np.exp(decay * (BLOCK / sample_rate))[:, None]
+                modal = modal * np.exp(plate.decay * (BLOCK / sample_rate))[:, None]
             if modal.any():
                 np.matmul(table[: len(block)], np.vstack([modal.real, modal.imag]), out=into)
             else:
                 into[:] = 0
-            forced.add(block, into)
+            sampled.add_forced(block, into)
 
 
 def _united(terms: Sequence[Term]) -> list[Term]:
@@ -244,28 +234,32 @@ def _united(terms: Sequence[Term]) -> list[Term]:
     return list(united.values())
 
 
-class _ForcedResponse:
-    """Forced accelerations at points of shapes (q, r)."""
+class _Sampled:
+    """Accelerations at points of shapes (q, r) while the drive stays.
 
-    def __init__(self, active: Sequence[ParticularSolution], points: FloatArray) -> None:
-        self._starts = np.array([solution.term.start for solution in active])
-        self._omegas = np.array([solution.term.omega for solution in active])
-        r = points.shape[1]
-        b0 = np.array([solution.b0 for solution in active]).reshape(-1, r)
-        b1 = np.array([solution.b1 for solution in active]).reshape(-1, r)
-        s = 1j * self._omegas[:, None]
-        constant = (s**2 * b0 + 2 * s * b1) @ points.T
+    by_free: (q, m), of each free vibration.
+    """
+
+    def __init__(self, points: FloatArray, by_free: ComplexArray, forced: ForcedVibration) -> None:
+        self.points, self.by_free = points, by_free
+        self._time, self._omegas = forced.time, forced.omegas
+        s = 1j * forced.omegas[:, None]
+        constant = s**2 * forced.b0
+        self._growth: FloatArray | None = None
+        if forced.b1 is not None:
+            constant += 2 * s * forced.b1
+            growth = (s**2 * forced.b1) @ points.T
+            self._growth = np.vstack([growth.imag, growth.real])
+        constant = constant @ points.T
         self._constant = np.vstack([constant.imag, constant.real])
-        growth = (s**2 * b1) @ points.T
-        self._growth = np.vstack([growth.imag, growth.real]) if b1.any() else None
 
-    def add(self, times: FloatArray, out: FloatArray) -> None:
-        """Add the response at times (n,) [s] to out (n, q)."""
+    def add_forced(self, times: FloatArray, out: FloatArray) -> None:
+        """Add the forced response at times (n,) [s] to out (n, q)."""
         if not len(self._omegas):
             return
-        tau = times[:, None] - self._starts
-        angle = self._omegas * tau
+        tau = (times - self._time)[:, None]
+        angle = tau * self._omegas
         phase_factor = np.hstack([np.cos(angle), np.sin(angle)])
         out += phase_factor @ self._constant
         if self._growth is not None:
-            out += (phase_factor * np.hstack([tau, tau])) @ self._growth
+            out += (phase_factor * tau) @ self._growth

@@ -4,7 +4,7 @@ import logging
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -42,8 +42,6 @@ def on_processes(
     if count == 1:
         yield from ((number, solve(shared, task)) for number, task in tasks.items())
         return
-    for variable in _THREAD_COUNTS:
-        os.environ.setdefault(variable, "1")  # read by numpy when a new process loads it
     pending = dict(tasks)
     for _ in range(_MAX_POOLS):
         try:
@@ -59,18 +57,58 @@ def on_processes(
     )
 
 
+@contextmanager
+def process_pool(
+    count: int, solve: Callable[[Shared, Task], Result], shared: Shared
+) -> Iterator[Callable[[Sequence[Task]], Iterator[Result]]]:
+    """A function that solves tasks on processes, and yields the results in the order of tasks.
+
+    count, solve, shared: as for `on_processes`. Raises InputError if a process dies.
+    """
+    pool = _started_pool(count, solve, shared)
+
+    def solve_all(tasks: Sequence[Task]) -> Iterator[Result]:
+        try:
+            with _interrupts_blocked():
+                found = [pool.submit(_run, task) for task in tasks]
+            for future in found:
+                yield future.result()
+        except BrokenProcessPool:
+            raise InputError("a worker process died; perhaps it was short of memory") from None
+
+    try:
+        yield solve_all
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def processor_count() -> int:
+    """Number of processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _started_pool(
+    count: int, solve: Callable[[Shared, Task], Result], shared: Shared
+) -> ProcessPoolExecutor:
+    for variable in _THREAD_COUNTS:
+        os.environ.setdefault(variable, "1")  # read by numpy when a new process loads it
+    return ProcessPoolExecutor(
+        count,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_start_worker,
+        initargs=(solve, shared),
+    )
+
+
 def _solve_in_pool(
     count: int,
     solve: Callable[[Shared, Task], Result],
     shared: Shared,
     tasks: Mapping[int, Task],
 ) -> Iterator[tuple[int, Result]]:
-    pool = ProcessPoolExecutor(
-        min(count, len(tasks)) or 1,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_start_worker,
-        initargs=(solve, shared),
-    )
+    pool = _started_pool(min(count, len(tasks)) or 1, solve, shared)
     try:
         with _interrupts_blocked():
             numbers = {pool.submit(_run, task): number for number, task in tasks.items()}

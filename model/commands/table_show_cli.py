@@ -23,15 +23,17 @@ def show(
     """Show levels, weak cells, contrast and origin of a table."""
     from model.commands.progress import progress_bar
     from model.table.file import load_table
+    from model.table.many_answers import ask_on_processes
     from model.table.summary import summarize
     from model.table.weak_cells import find_weak_cells
 
     table = load_table(table_file)
     started = time.perf_counter()
-    with progress_bar("cells") as progress:
-        cells = find_weak_cells(table, progress=progress)
-    with progress_bar("contact sets") as progress:
-        summary = summarize(table, cells, progress=progress)
+    with ask_on_processes(table) as ask:
+        with progress_bar("cells") as progress:
+            cells = find_weak_cells(table, ask=ask, progress=progress)
+        with progress_bar("contact sets") as progress:
+            summary = summarize(table, cells, ask=ask, progress=progress)
     elapsed = time.perf_counter() - started
     if as_json:
         print(json.dumps(summary | {"map": cells.as_json()}))

@@ -1,15 +1,15 @@
 """Summary of a table: levels, dead zones, weak cells, contrast, origin."""
 
-import contextlib
 from collections.abc import Callable
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from model.arrays import FloatArray, IntArray
 from model.drive_modes.sources import all_combinations
-from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, highest_measured
+from model.table.many_answers import Ask, Contrasts, ask_here
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.table.weak_cells import WeakCells, are_apart
@@ -25,13 +25,15 @@ def summarize(
     table: LocalizationTable,
     weak: WeakCells,
     *,
+    ask: Ask | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> dict[str, Any]:
     """Summarize a table; felt contrast [dB]: median and tenth percentile over random contact sets.
 
     Robust contrasts are those of nine of ten plates, the others those of the plate as modelled.
 
-    progress: called with the number of finished sets and the total.
+    ask: answers the questions, in this process by default; progress: called with the number of
+    finished sets and the total.
     """
     available = table.available_level_db_sl
     known = np.isfinite(weak.tenth_db) | np.isneginf(weak.tenth_db)
@@ -53,7 +55,7 @@ def summarize(
     }
     rng = np.random.default_rng(0)
     for others in (1, 2, 3):
-        found = contrast_distribution(table, others=others, rng=rng, progress=progress)
+        found = contrast_distribution(table, others=others, rng=rng, ask=ask, progress=progress)
         for kind, contrasts in zip(("robust_felt", "felt"), found, strict=True):
             for name, percentile in (("median", 50), ("tenth_percentile", 10)):
                 value = float(np.percentile(contrasts, percentile)) if len(contrasts) else None
@@ -73,28 +75,32 @@ def contrast_distribution(
     *,
     others: int,
     rng: np.random.Generator,
+    ask: Ask | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> FloatArray:
     """Robust and nominal felt contrast [dB] of random contact sets, (2, up to CONTACT_SETS).
 
-    Sets with an unreachable target are left out, and all on a plate too small for them. progress:
-    as for `summarize`, which takes one, two and three others in turn.
+    Sets with an unreachable target are left out, and all on a plate too small for them. ask and
+    progress: as for `summarize`, which takes one, two and three others in turn.
     """
     size = np.array([table.plate.length, table.plate.width])
-    contrasts: list[tuple[float | None, float | None]] = []
+    ask = ask or ask_here(table)
+    contrasts: list[Contrasts] = []
     tried = 0
-    for _ in range(50 * CONTACT_SETS):
-        contacts = rng.uniform(0, size, (others + 1, 2))
-        if not are_apart(contacts):
-            continue
-        tried += 1
-        target, *quiet = [(float(x), float(y)) for x, y in contacts]
-        with contextlib.suppress(InputError):
-            found = table.query(Question((target,), tuple(quiet)))
-            contrasts.append((found.robust_felt_contrast_db, found.felt_contrast_db))
-        progress((others - 1) * CONTACT_SETS + len(contrasts), 3 * CONTACT_SETS)
-        if len(contrasts) == CONTACT_SETS or tried == 2 * CONTACT_SETS:
+    drawn = (rng.uniform(0, size, (others + 1, 2)) for _ in range(50 * CONTACT_SETS))
+    apart = filter(are_apart, drawn)
+    while count := min(CONTACT_SETS - len(contrasts), 2 * CONTACT_SETS - tried):
+        questions = []
+        for contacts in islice(apart, count):
+            target, *quiet = [(float(x), float(y)) for x, y in contacts]
+            questions.append(Question((target,), tuple(quiet)))
+        if not questions:
             break
+        tried += len(questions)
+        for found in ask(questions):
+            if found is not None:
+                contrasts.append(found)
+            progress((others - 1) * CONTACT_SETS + len(contrasts), 3 * CONTACT_SETS)
     return np.array(contrasts, dtype=float).reshape(-1, 2).T
 
 

@@ -8,15 +8,16 @@ finger is then at its threshold. It is *weak* if more than one other finger in t
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import FloatArray
-from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL
+from model.table.many_answers import Ask, ask_here
 from model.table.question import Question
 from model.table.table import LocalizationTable
 
@@ -85,11 +86,13 @@ def map_grid(table: LocalizationTable) -> Grid:
 def find_weak_cells(
     table: LocalizationTable,
     *,
+    ask: Ask | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> WeakCells:
     """Query the table for each cell of `map_grid` in its default drive mode.
 
-    progress: called with the number of finished cells and the total.
+    ask: answers the questions, in this process by default; progress: called with the number of
+    finished cells and the total.
     """
     grid = map_grid(table)
     centres = grid.centres(table.plate)
@@ -100,9 +103,13 @@ def find_weak_cells(
     mirrored = np.abs(drawn - [[0, 0], [1, 0], [0, 1], [1, 1]])
     places = size * mirrored.reshape(-1, 2)
     found = np.full((2, len(centres)), np.nan)
-    for cell, centre in enumerate(centres):
-        far = np.linalg.norm(places - centre, axis=1) >= MIN_DISTANCE
-        contrasts = [_contrast(table, centre, other) for other in places[far]]
+    asked = [_questions(centre, places) for centre in centres]
+    answers = (ask or ask_here(table))([question for some in asked for question in some])
+    for cell, questions in enumerate(asked):
+        # -inf where the level is not reached.
+        contrasts = [
+            -np.inf if each is None else each[0] for each in islice(answers, len(questions))
+        ]
         if contrasts:
             # A sample with -inf cannot be interpolated.
             found[:, cell] = np.percentile(contrasts, [50, 10], method="inverted_cdf")
@@ -121,15 +128,14 @@ def text_map(weak: WeakCells) -> Iterator[str]:
         ).rstrip()
 
 
-def _contrast(table: LocalizationTable, target: FloatArray, other: FloatArray) -> float:
-    """Robust felt contrast [dB] at the wanted level; -inf where that is not reached."""
-    at, quiet = ((float(x), float(y)) for x, y in (target, other))
-    question = Question((at,), (quiet,), level_db_sl=WANTED_LEVEL_DB_SL)
-    try:
-        contrast = table.query(question).robust_felt_contrast_db
-    except InputError:
-        return -np.inf
-    return -np.inf if contrast is None else contrast
+def _questions(target: FloatArray, places: FloatArray) -> list[Question]:
+    """At the wanted level at a target [m], for each other finger at a distance."""
+    far = np.linalg.norm(places - target, axis=1) >= MIN_DISTANCE
+    at = (float(target[0]), float(target[1]))
+    return [
+        Question((at,), ((float(x), float(y)),), level_db_sl=WANTED_LEVEL_DB_SL)
+        for x, y in places[far]
+    ]
 
 
 def _finite(values: FloatArray) -> list[float | None]:

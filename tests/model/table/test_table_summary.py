@@ -1,5 +1,6 @@
 """Summary of a table, and its map of weak cells."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,6 +10,7 @@ import pytest
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.table.build import build_table
+from model.table.many_answers import ask_on_processes
 from model.table.summary import contrast_distribution, similar_share, summarize
 from model.table.weak_cells import WeakCells, find_weak_cells, map_grid, text_map
 from paper_plate import make_paper_rig
@@ -40,7 +42,7 @@ def test_weak_cells_of_a_symmetric_plate_are_symmetric(table):
     assert np.ptp(weak.median_db) > 0.5
 
 
-def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table, monkeypatch):
+def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
     """Half of a cell's contrasts are below its median, a tenth below the other.
 
     Other fingers are in each of 4 by 4 fields, at least 5 cm from the cell.
@@ -49,14 +51,15 @@ def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table, monk
     drawn: dict[tuple[float, float], list[float]] = {}
     tried = set()
 
-    def at_random(table, target, other):
-        assert np.linalg.norm(target - other) >= 0.05
-        tried.add(tuple(other))
-        drawn.setdefault(tuple(target), []).append(float(rng.uniform(0, 30)))
-        return drawn[tuple(target)][-1]
+    def at_random(questions):
+        for question in questions:
+            (target,), (other,) = question.targets, question.quiet
+            assert math.dist(target, other) >= 0.05
+            tried.add(other)
+            drawn.setdefault(target, []).append(float(rng.uniform(0, 30)))
+            yield drawn[target][-1], None
 
-    monkeypatch.setattr("model.table.weak_cells._contrast", at_random)
-    weak = find_weak_cells(table)
+    weak = find_weak_cells(table, ask=at_random)
     assert len(drawn) == len(weak.centres) == 12
     for values, share in ((weak.median_db, 0.5), (weak.tenth_db, 0.1)):
         for value, contrasts in zip(values, drawn.values(), strict=True):
@@ -67,6 +70,17 @@ def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table, monk
         *np.array(sorted(tried)).T, bins=(4, 4), range=[(0, side) for side in size]
     )
     assert (counts == 1).all()
+
+
+def test_summary_is_the_same_on_processes(table, monkeypatch):
+    """Questions are drawn and counted in the same order, whoever answers them."""
+    monkeypatch.setattr("model.table.summary.CONTACT_SETS", 20)
+    with ask_on_processes(table, 2) as ask:
+        weak = find_weak_cells(table, ask=ask)
+        summary = summarize(table, weak, ask=ask)
+    here = find_weak_cells(table)
+    np.testing.assert_array_equal(weak.median_db, here.median_db)
+    assert summary == summarize(table, here)
 
 
 def test_map_grid_is_coarser_than_a_fine_grid(table):
@@ -116,7 +130,7 @@ def test_summary_counts_levels_and_shares(table, monkeypatch):
     """Levels from 12 dB SL count as felt; shares are of the cells for which there is a value."""
     asked = []
 
-    def one_to_hundred(table, *, others, rng, progress):
+    def one_to_hundred(table, *, others, rng, ask, progress):
         asked.append(others)
         return np.array([np.arange(101.0), np.arange(101.0) + 5])
 

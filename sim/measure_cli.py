@@ -9,7 +9,6 @@ import typer
 
 from model.commands.next_line import next_line
 from model.commands.options import JsonOption, RigArgument
-from model.errors import InputError
 
 if TYPE_CHECKING:
     from sim.measuring.measure import Measured
@@ -67,8 +66,8 @@ def measure(
     from model.config.points import parse_frequencies
     from model.files.replacing import check_ending, check_place
     from model.rig.file import load_rig
+    from sim.measuring.desk import Desk
     from sim.measuring.live_plot import live_plot
-    from sim.measuring.measure import Desk
     from sim.measuring.measure import measure as measured_by
     from sim.measuring.multisine import Multisine, default_frequencies
     from sim.measuring.sound_card import open_card
@@ -82,11 +81,7 @@ def measure(
     desk.check(level)
     limits = rig.limits.frequency_min, rig.limits.frequency_max
     lines = parse_frequencies(frequencies) if frequencies else default_frequencies(*limits)
-    if lines.min() < limits[0] or lines.max() > limits[1]:
-        raise InputError(
-            f"--frequencies must be within the rig's limits.frequency of {limits[0]:g} to "
-            f"{limits[1]:g} Hz, got {lines.min():g} to {lines.max():g} Hz"
-        )
+    desk.check_frequencies(lines)
     started = time.perf_counter()
     card = open_card(device, outputs=desk.output, inputs=desk.input, limit=level)
     check: Stepped | None = None

@@ -11,7 +11,6 @@ from model.identification.forward import Sensor
 from model.identification.identify import Identification
 from model.identification.parameters import space_of
 from model.identification.posterior import THEORY, relevant
-from model.identification.priors import Priors
 
 _WITHIN = 1.96
 _REGION = 5.991  # of two normal numbers
@@ -64,10 +63,9 @@ def fields_held(
     points = _PLACES * [plate.length, plate.width]
     pads = [Sensor(f"point {n}", x=x, y=y) for n, (x, y) in enumerate(points.tolist())]
     sensors = [*model.sensors, *pads]
-    priors = Priors.of(found.before.uncertainty)
     count = len(found.posterior.space.indices("mode_shifts"))
     names = [sensor.name for sensor in sensors]
-    space = space_of(found.before, names, priors, masses=model.mass_count, mode_count=count)
+    space = space_of(found.before, names, found.priors, masses=model.mass_count, mode_count=count)
     own = [space.index(name) for name in found.posterior.space.names]
     x, covariance = np.zeros(space.size), np.zeros((space.size, space.size))
     x[own] = found.posterior.x

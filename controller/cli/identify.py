@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,8 +15,8 @@ from model.counting import counted
 from model.errors import InputError
 
 if TYPE_CHECKING:
-    from controller.diagnosis.plate_measurement import PlateMeasurement
     from model.config.document import Document
+    from model.identification.measured_plate import DeviceSettings, MeasuredPlate
     from model.rig.rig import Rig
 
 REFUSED = 1
@@ -39,12 +39,43 @@ def identify(
     level: Annotated[
         float | None,
         typer.Option(
-            help="Level of every tone; default: 0.1 of full stroke, or less if limits ask for it."
+            help="Level of every tone, by default 0.1 of full stroke; by a sound card the largest "
+            "sample of each output, by default 0.3; less if limits ask for it."
         ),
     ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Play every tone on one ERA only: a third of the time.")
     ] = False,
+    device: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DEVICE",
+            help="Sound card that plays and records instead: jack, jack:CLIENT, or a device of "
+            "PortAudio.",
+        ),
+    ] = None,
+    sensors_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--sensors", metavar="SENSORS.csv", help="Accelerometers at the sound card's inputs."
+        ),
+    ] = None,
+    frequencies: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LO:HI:STEP",
+            help="Whole frequencies in Hz that a sound card plays; default: odd ones, 10 apart.",
+        ),
+    ] = None,
+    periods: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Seconds of each run of a sound card that count; default: 2.",
+            min=2,
+            max=60,
+        ),
+    ] = None,
     untouched: Annotated[
         bool,
         typer.Option(
@@ -52,25 +83,52 @@ def identify(
         ),
     ] = False,
     seed: Annotated[
-        int, typer.Option(metavar="N", help="Draw other fingers for the expected contrast.", min=0)
+        int,
+        typer.Option(
+            metavar="N",
+            help="Draw other fingers for the expected contrast, and a sound card's phases.",
+            min=0,
+        ),
     ] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Identify the plate in place by its own ERAs.
 
     Write its rig with what is left uncertain. Every ERA plays small tones of its own at the same
-    time, the amplifiers' sensors listen. Exit status 1, and no rig is written, where the model does
-    not explain what they heard.
+    time, the amplifiers' sensors listen. With --device a sound card plays multisines and records
+    accelerometers, as era measure does, with its loop-back cable. Exit status 1, and no rig is
+    written, where the model does not explain what they heard.
     """
     import time
 
+    from model.config.points import parse_frequencies
     from model.files.array_file import whole_or_nothing
     from model.files.replacing import check_ending, check_place
     from model.identification import identification_report
     from model.identification.identified_text import identified_text
     from model.identification.identify import identify as fit
+    from model.identification.measured_plate import DeviceSettings
     from model.identification.promise import expected_contrast
 
+    settings: DeviceSettings | None = None
+    if device is None:
+        only = {"--sensors": sensors_file, "--frequencies": frequencies, "--periods": periods}
+        _refuse(only, rule="needs --device")
+    else:
+        _refuse(
+            {"--url": url, "--quick": quick or None},
+            rule="is for amplifiers, leave it out beside --device",
+        )
+        if sensors_file is None:
+            raise InputError("--device needs --sensors, a file of the accelerometers")
+        settings = DeviceSettings(
+            device,
+            sensors_file,
+            parse_frequencies(frequencies) if frequencies else None,
+            level,
+            periods or 2,
+            seed,
+        )
     check_place(output, example="rig2.yaml")
     check_ending(output, ".yaml", ".yml", what="a rig file")
     with _rig_of(rig_file) as (document, rig):
@@ -79,7 +137,10 @@ def identify(
             if output.resolve() == taken.resolve():
                 raise InputError(f"--output must differ from {taken}; choose another name")
         _require_untouched(is_known=untouched, has_terminal=not as_json)
-        measured = _measured(rig, url or [], level=level, is_quick=quick, is_shown=not as_json)
+        if settings is not None:
+            measured = _measured_by_device(rig, settings, is_shown=not as_json)
+        else:
+            measured = _measured(rig, url or [], level=level, is_quick=quick, is_shown=not as_json)
     started = time.perf_counter()
     try:
         found = fit(rig, measured.measurement, seed=seed)
@@ -89,7 +150,7 @@ def identify(
     expected = expected_contrast(found)
     rows = [
         _head(rig, measured),
-        *measured.sensors.unused,
+        *measured.notes,
         *identification_report.parameter_rows(found),
         *identification_report.fit_rows(found),
         *identification_report.contrast_rows(expected),
@@ -158,7 +219,7 @@ def _require_untouched(*, is_known: bool, has_terminal: bool) -> None:
 
 def _measured(
     rig: "Rig", urls: list[str], *, level: float | None, is_quick: bool, is_shown: bool
-) -> "PlateMeasurement":
+) -> "MeasuredPlate":
     """Measure by the rig's amplifiers, with a progress bar on a terminal."""
     import asyncio
     from contextlib import ExitStack
@@ -171,7 +232,7 @@ def _measured(
 
     at = urls_of(rig, urls)
 
-    async def measure() -> "PlateMeasurement":
+    async def measure() -> "MeasuredPlate":
         with ExitStack() as shown:
             on_step = shown.enter_context(progress_bar("steps")) if is_shown else _ignore
             amplifiers = {
@@ -180,18 +241,39 @@ def _measured(
                 )
                 for name in rig.amplifiers
             }
-            return await PlateSelfMeasurement(
+            found = await PlateSelfMeasurement(
                 rig, amplifiers, level=level, is_quick=is_quick, on_step=on_step
             ).run()
+            return found.as_measured
 
     return asyncio.run(measure())
+
+
+def _measured_by_device(
+    rig: "Rig", settings: "DeviceSettings", *, is_shown: bool
+) -> "MeasuredPlate":
+    """Measure by a sound card, with a progress bar on a terminal."""
+    from contextlib import nullcontext
+
+    from model.commands.progress import progress_bar
+    from model.identification.measured_plate import measure_by_device
+
+    with progress_bar("ms") if is_shown else nullcontext(_ignore) as progress:
+        return measure_by_device(rig, settings, progress=progress)
+
+
+def _refuse(given: Mapping[str, object], *, rule: str) -> None:
+    """Raise InputError for options that say nothing to what measures."""
+    for name, value in given.items():
+        if value is not None:
+            raise InputError(f"{name} {rule}")
 
 
 def _ignore(done: int, of: int) -> None:
     """Show nothing."""
 
 
-def _head(rig: "Rig", measured: "PlateMeasurement") -> str:
+def _head(rig: "Rig", measured: "MeasuredPlate") -> str:
     """What was measured, in one line."""
     measurement = measured.measurement
     low, high = measurement.tones[0], measurement.tones[-1]
@@ -203,25 +285,15 @@ def _head(rig: "Rig", measured: "PlateMeasurement") -> str:
     )
 
 
-def _as_json(measured: "PlateMeasurement") -> dict[str, object]:
+def _as_json(measured: "MeasuredPlate") -> dict[str, object]:
     """How it was measured, for programs."""
     measurement = measured.measurement
     return {
-        "sensors": [
-            {
-                "amplifier": sensor.amplifier,
-                "sensor": sensor.number,
-                "era": sensor.place.era or None,
-                "x_m": None if sensor.place.era else sensor.place.x,
-                "y_m": None if sensor.place.era else sensor.place.y,
-            }
-            for sensor in measured.sensors.used
-        ],
-        "sensors_unused": list(measured.sensors.unused),
+        "sensors": list(measured.sensors),
+        "sensors_unused": list(measured.notes),
         "frequencies_hz": measurement.tones.tolist(),
         "level": measured.level,
         "responses": len(measurement.values),
-        "settling_s": measured.tones.settling,
-        "window_s": measured.tones.window,
         "measure_time_s": measured.duration,
+        **measured.details,
     }

@@ -20,6 +20,7 @@ from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import Reading, ReadingState
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
+from model.identification.measured_plate import MeasuredPlate
 from model.identification.measurement import Measurement, Repeat
 from model.rig.rig import Rig
 from model.vibration.excitation import Tone
@@ -43,6 +44,28 @@ class PlateMeasurement:
     level: float
     tones: Interleaved
     duration: float
+
+    @property
+    def as_measured(self) -> MeasuredPlate:
+        """For its identification."""
+        sensors = tuple(
+            {
+                "amplifier": sensor.amplifier,
+                "sensor": sensor.number,
+                "era": sensor.place.era or None,
+                "x_m": None if sensor.place.era else sensor.place.x,
+                "y_m": None if sensor.place.era else sensor.place.y,
+            }
+            for sensor in self.sensors.used
+        )
+        return MeasuredPlate(
+            self.measurement,
+            self.level,
+            self.duration,
+            sensors,
+            notes=tuple(self.sensors.unused),
+            details={"settling_s": self.tones.settling, "window_s": self.tones.window},
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -119,9 +119,13 @@ def _by_gains(plate: PlateAt) -> Columns:
     Y = plate.responses
     by_drive = Y[..., None] * np.eye(Y.shape[2])
     by_sensor = Y[..., None] * np.eye(Y.shape[1])[:, None]
+    f = 1e-3 * plate.model.frequencies[:, None]
+    by_inertia, by_drag = f**2 * plate.lag, -1j * f * plate.lag
     return {
         "gain": by_drive,
         "phase": 1j * by_drive,
+        "inertia": by_drive * by_inertia[:, None, None],
+        "drag": by_drive * by_drag[:, None, None],
         "sensor_gain": by_sensor,
         "sensor_phase": 1j * by_sensor,
     }

@@ -175,9 +175,14 @@ class PlateAt:
         self.receptance = self.left @ A
 
     @cached_property
+    def lag(self) -> ComplexArray:
+        """Motion of each drive relative to a slow one (f, n)."""
+        return self.values.lag(self.model.frequencies)
+
+    @cached_property
     def scale(self) -> ComplexArray:
         """What turns T at sensors and ERAs into responses, (f, s, n)."""
-        drive = self.base * self.values.drive_gains * self.model.drive_gains
+        drive = self.base * self.values.drive_gains * self.model.drive_gains * self.lag
         drive *= -(self.model.omega**2)[:, None]
         return np.asarray(self.values.sensor_gains[:, None] * drive[:, None])
 

@@ -18,6 +18,8 @@ _UNITS = {
     "bolt_mass": (1e3, "g", "g"),
     "place": (1e3, "mm", "mm"),
     "loss_exponent": (1.0, "", ""),
+    "inertia": (1.0, "/kHz²", "1/kHz^2"),
+    "drag": (1.0, "/kHz", "1/kHz"),
 }
 _PERCENT = (100.0, "%", "percent")
 _MASS_UNITS = (_UNITS["bolt_mass"], _UNITS["place"], _UNITS["place"])

@@ -13,6 +13,7 @@ from model.structure.plate import LOSS_FREQUENCY, Plate
 from model.structure.point_load import PointLoad
 
 _LEAST_MASS = 1e-5  # kg; less is none
+_GAIN_STEP = 10.0  # Hz, of a drive that lags; linear between them is right to a thousandth
 
 
 def plate_with(plate: Plate, values: Values) -> Plate:
@@ -41,7 +42,7 @@ def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
             stiffness=float(values.stiffness[number]),
             damping=float(values.damping[number]),
             bolt_mass=float(max(values.bolt_mass[number], 0.0)),
-            gains=_gains(era, complex(values.drive_gains[number])),
+            gains=_gains(era, rig, values, number),
         )
         for number, era in enumerate(rig.eras)
     )
@@ -65,8 +66,18 @@ def additional_masses(values: Values) -> Sequence[PointLoad]:
     ]
 
 
-def _gains(era: Era, factor: complex) -> tuple[Gain, ...]:
-    """Measured gains times a factor; of an ERA without any the factor at all frequencies."""
+def _gains(era: Era, rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
+    """Measured gains times what was identified; of an ERA without any at one frequency.
+
+    Over the rig's frequencies where the drive lags.
+    """
     before = era.gains or ((LOSS_FREQUENCY, 1.0, 0.0),)
-    size, phase = float(abs(factor)), float(np.angle(factor))
-    return tuple((f, magnitude * size, turned + phase) for f, magnitude, turned in before)
+    if values.inertia[number] or values.drag[number]:
+        low, high = rig.limits.frequency_min, rig.limits.frequency_max
+        count = 1 + int(np.ceil((high - low) / _GAIN_STEP))
+        before = tuple((float(f), 1.0, 0.0) for f in np.linspace(low, high, count))
+    factors = values.drive_gains[number] * values.lag(np.array([f for f, *_ in before]))[:, number]
+    return tuple(
+        (f, magnitude * float(abs(factor)), turned + float(np.angle(factor)))
+        for (f, magnitude, turned), factor in zip(before, factors.tolist(), strict=True)
+    )

@@ -53,6 +53,12 @@ class Identification:
         """Whether the model explains the measurement, so that answers may rely on it."""
         return self.chi2 <= MAX_CHI2
 
+    @property
+    def priors(self) -> Priors:
+        """What was known of the parameters before."""
+        lag = self.fitted.problem.measurement.drives_lag
+        return Priors.of(self.before.uncertainty, drives_lag=lag)
+
     def draws(self, count: int) -> list[Rig]:
         """Rigs within the posterior distribution, with the uncertainty of fingers and drives."""
         space = self.posterior.space
@@ -91,7 +97,10 @@ def identify(
     """
     _check(rig, measurement)
     setting = Setting(
-        rig, solved_for(rig, float(measurement.tones[-1])), Priors.of(rig.uncertainty), measurement
+        rig,
+        solved_for(rig, float(measurement.tones[-1])),
+        Priors.of(rig.uncertainty, drives_lag=measurement.drives_lag),
+        measurement,
     )
     fitted = fit_in_stages(setting)
     values = Values.of(rig, fitted.space, fitted.best.x)

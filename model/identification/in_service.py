@@ -281,7 +281,7 @@ def _with_spare_mass(found: Identification) -> ForwardModel:
     space = space_of(
         found.before,
         [sensor.name for sensor in model.sensors],
-        Priors.of(found.before.uncertainty),
+        found.priors,
         masses=model.mass_count + 1,
         mode_count=len(found.posterior.space.indices("mode_shifts")),
     )

@@ -23,7 +23,10 @@ _FLOOR = 0.1  # of a sensor's rms: where its error no longer falls with the resp
 
 @dataclass(frozen=True, eq=False)
 class Repeat:
-    """One tone of an ERA measured twice: frequency [Hz], responses at all sensors (s,) [1/s²]."""
+    """One tone measured twice: frequency [Hz], responses at all sensors (s,) [1/s²].
+
+    era: name of the one that played it, or of several that did together.
+    """
 
     era: str
     frequency: float
@@ -39,7 +42,9 @@ class Measurement:
     at (n,): number of the sensor; values (n,): acceleration per base displacement at full gain
     [1/s²], phases as exp(+i omega t); std (n,): of the real and of the imaginary part. half_level:
     tones repeated at half the level, per base displacement as well; at_end: the first tones, played
-    last again; of both those that are loud beside noise, which nothing is allowed for.
+    last again; of both those that are loud beside noise, which nothing is allowed for. drives_lag:
+    whether bases follow what was played with an unknown lag, as actuators do behind an amplifier of
+    voltage.
     """
 
     sensors: tuple[Sensor, ...]
@@ -50,6 +55,7 @@ class Measurement:
     std: FloatArray
     half_level: tuple[Repeat, ...] = ()
     at_end: tuple[Repeat, ...] = ()
+    drives_lag: bool = False
 
     def __post_init__(self) -> None:
         """Refuse values that are not finite, without an error or of different count."""

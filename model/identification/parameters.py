@@ -96,6 +96,10 @@ def space_of(
     add("loss_exponent", ["loss exponent"], priors.loss_exponent * lossy, lower=low, upper=high)
     add("gain", [f"gain {name}" for name in eras], priors.gain)
     add("phase", [f"phase {name}" for name in eras], priors.phase)
+    for kind in ("inertia", "drag"):
+        # A measured gain has them in it.
+        lagging = [0.0 if era.gains else getattr(priors, kind) for era in rig.eras]
+        add(kind, [f"{kind} of drive {name}" for name in eras], lagging, lower=0.0)
     add("sensor_gain", [f"gain of sensor {name}" for name in sensors], priors.sensor_gain)
     add("sensor_phase", [f"phase of sensor {name}" for name in sensors], priors.sensor_phase)
     least = [-era.bolt_mass / (priors.bolt_mass or 1.0) for era in rig.eras]

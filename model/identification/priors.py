@@ -15,6 +15,7 @@ _PLACE = 1.5e-3
 _MASS = 2e-3
 _MODE_SHIFT, _MODE_LOSS = 0.01, 0.5
 _FINGER = 0.5
+_INERTIA, _DRAG = 1 / 0.7**2, 1 / 0.7  # of a resonance at 700 Hz with a damping ratio of 0.5
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class Priors:
     mode_loss, of the loss factor of a mode; finger, of each group of a finger's load.
     loss_exponent: of the loss factor's power of frequency; phase, sensor_phase [rad]; bolt_mass,
     mass [kg]; place [m]: of an ERA, on each axis; mass_place: of a mass, relative to the sides of
-    the plate.
+    the plate. inertia [1/kHz²], drag [1/kHz]: of a drive (`Values.lag`).
     """
 
     thickness: float
@@ -47,12 +48,15 @@ class Priors:
     mode_shift: float
     mode_loss: float
     finger: float
+    inertia: float = 0.0
+    drag: float = 0.0
 
     @classmethod
-    def of(cls, uncertainty: Uncertainty) -> Self:
+    def of(cls, uncertainty: Uncertainty, *, drives_lag: bool = False) -> Self:
         """Those that a rig states, and usual ones of all that it does not state.
 
         A modulus is known where the thickness is, the damping of each ERA where that of all is.
+        drives_lag: whether bases follow what is played with a lag that nothing states.
         """
         damping = math.log(uncertainty.damping)
         return cls(
@@ -74,4 +78,6 @@ class Priors:
             mode_shift=_MODE_SHIFT,
             mode_loss=_MODE_LOSS if damping else 0.0,
             finger=_FINGER,
+            inertia=_INERTIA if drives_lag else 0.0,
+            drag=_DRAG if drives_lag else 0.0,
         )

@@ -38,6 +38,8 @@ SIMPLE = (
     "loss",
     "gain",
     "phase",
+    "inertia",
+    "drag",
     "sensor_gain",
     "sensor_phase",
 )

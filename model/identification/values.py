@@ -18,7 +18,8 @@ class Values:
     damping [N s/m], bolt_mass [kg] (n,) and places (n, 2) [m] of the ERAs; masses (m, 3): kg and x,
     y [m]; mode_shifts, mode_losses: logarithms of the factors of the lowest modes' eigenvalues and
     loss factors beside the rig's; drive_gains (n,), sensor_gains (s,): complex, those of the drives
-    beside the rig's; fingers (k, 4): logarithms of FINGER_PARTS.
+    beside the rig's; fingers (k, 4): logarithms of FINGER_PARTS; inertia [1/kHz²], drag [1/kHz]
+    (n,): of the drives, by which they lag.
     """
 
     thickness: float
@@ -35,6 +36,8 @@ class Values:
     drive_gains: ComplexArray
     sensor_gains: ComplexArray
     fingers: FloatArray
+    inertia: FloatArray
+    drag: FloatArray
 
     @classmethod
     def of(cls, rig: Rig, space: Space, x: FloatArray) -> Self:
@@ -64,4 +67,15 @@ class Values:
             drive_gains=np.exp(own("gain") + 1j * own("phase")),
             sensor_gains=np.exp(own("sensor_gain") + 1j * own("sensor_phase")),
             fingers=own("fingers").reshape(-1, 4),
+            inertia=own("inertia"),
+            drag=own("drag"),
         )
+
+    def lag(self, frequencies: FloatArray) -> ComplexArray:
+        """Motion of each drive at frequencies (f,) [Hz] relative to a slow one, (f, n).
+
+        1 / (1 - inertia f² + i drag f), f in kilohertz: of an actuator with a resonance at
+        1 / sqrt(inertia) and a damping ratio of drag / (2 sqrt(inertia)).
+        """
+        f = 1e-3 * np.asarray(frequencies)[:, None]
+        return np.asarray(1 / (1 - self.inertia * f**2 + 1j * self.drag * f))

@@ -7,8 +7,9 @@ import numpy as np
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
+from sim.measuring.desk import Desk
 from sim.measuring.loopback import is_whole
-from sim.measuring.measure import Desk, Measured, Progress, responses_of_samples
+from sim.measuring.measure import Measured, Progress, responses_of_samples
 from sim.measuring.multisine import PERIOD
 from sim.measuring.sound_card import SoundCard
 

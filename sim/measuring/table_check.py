@@ -23,8 +23,8 @@ from model.table.table import LocalizationTable
 from model.table.table_check import CheckSettings
 from model.vibration.excitation import Excitation
 from sim.measuring.checks import check_levels
+from sim.measuring.desk import Desk
 from sim.measuring.loopback import is_whole
-from sim.measuring.measure import Desk
 from sim.measuring.sound_card import SoundCard, open_card
 from sim.sensors.sensor_file import WiredSensor, read_sensors
 

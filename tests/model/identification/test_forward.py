@@ -38,7 +38,8 @@ def model(rig: Rig) -> ForwardModel:
     """That plate with sensors at its ERAs and elsewhere, an additional mass and a finger."""
     sensors = [*(Sensor(era.name, era.name) for era in rig.eras), PAD]
     names = [sensor.name for sensor in sensors]
-    space = space_of(rig, names, Priors.of(rig.uncertainty), masses=1, fingers=1)
+    priors = Priors.of(rig.uncertainty, drives_lag=True)
+    space = space_of(rig, names, priors, masses=1, fingers=1)
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
     return ForwardModel(rig, sensors, FREQUENCIES, space, free, [FINGER])
 
@@ -47,7 +48,10 @@ def somewhere(space: Space, seed: int) -> FloatArray:
     """Parameters that all differ from the rig's, within their bounds."""
     x = 0.5 * np.random.default_rng(seed).standard_normal(space.size)
     x[space.groups["masses"].start] = 1.0
-    return np.clip(inwards(space, x * space.uncertain, by=0.6), space.lower, space.upper)
+    lag = space.of("inertia", "drag")
+    x[lag] = np.abs(x[lag])
+    x = np.clip(x * space.uncertain, space.lower, space.upper)
+    return inwards(space, x, by=0.6)
 
 
 def direct(rig: Rig, loads: list[Load]) -> ComplexArray:
@@ -73,7 +77,7 @@ def test_deviating_rig_is_solved_without_solving_it_again(rig: Rig, model: Forwa
     space = model.space
     x = somewhere(space, 1)
     x[space.of("thickness", "mode_shifts", "mode_losses", "sensor_gain", "sensor_phase")] = 0
-    x[space.of("gain", "phase", "fingers")] = 0
+    x[space.of("gain", "phase", "inertia", "drag", "fingers")] = 0
     values = model.at(x).values
     eras = tuple(
         replace(era, stiffness=k, damping=c, bolt_mass=m, x=place[0], y=place[1])
@@ -111,6 +115,17 @@ def test_derivatives_are_the_slopes_of_the_responses(model: ForwardModel) -> Non
         slope = (sides[0] - sides[1]) / (2 * step)
         error = np.abs(found[..., number] - slope).max() / np.abs(slope).max()
         assert error < 1e-4, name
+
+
+def test_drive_lags_as_an_actuator_with_a_resonance(model: ForwardModel) -> None:
+    """By hand: at its resonance of 500 Hz, with a damping ratio of 0.3, 1 / (2 i 0.3) times."""
+    space, x = model.space, np.zeros(model.space.size)
+    for name, value in (("inertia of drive SE", 4.0), ("drag of drive SE", 1.2)):
+        x[space.index(name)] = value / space.std[space.index(name)]
+    at_resonance = model.with_frequencies(np.array([500.0]))
+    lagging, rigid = (at_resonance.at(each).responses[0] for each in (x, np.zeros(space.size)))
+    np.testing.assert_allclose(lagging[:, 1], rigid[:, 1] / 0.6j)
+    np.testing.assert_allclose(lagging[:, [0, 2, 3]], rigid[:, [0, 2, 3]])
 
 
 def test_mass_anywhere_changes_responses_as_derived(rig: Rig, model: ForwardModel) -> None:

@@ -14,8 +14,9 @@ from sim.desk.desk_plate import DeskPlate
 from sim.desk.model_in_time import DeskModel
 from sim.desk.sensing import Converters
 from sim.desk.truth import Truth, draw_truth
+from sim.measuring.desk import Desk
 from sim.measuring.loopback import latency
-from sim.measuring.measure import Desk, measure
+from sim.measuring.measure import measure
 from sim.measuring.multisine import Multisine, default_frequencies
 from sim.measuring.stepped import check_by_steps
 from sim.sensors.sensor_file import WiredSensor

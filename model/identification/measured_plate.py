@@ -1,0 +1,69 @@
+"""A plate measured for its identification, and who measures it.
+
+The controller measures by a rig's amplifiers. Others are entry points of the group
+`era_haptics.plate_measurements` that lead to a `PlateMeasurer`.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from model.arrays import FloatArray
+from model.errors import InputError
+from model.identification.measurement import Measurement
+from model.rig.rig import Rig
+from registry.plugins import Instance, PluginRegistry
+
+Progress = Callable[[int, int], None]
+"""Called with what is done and all."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPlate:
+    """A measurement with how it came about.
+
+    level: of what played, 0..1 of full stroke; duration [s]; sensors: the ones used, for programs;
+    notes: lines for people; details: keys and values for programs.
+    """
+
+    measurement: Measurement
+    level: float
+    duration: float
+    sensors: tuple[Mapping[str, object], ...]
+    notes: tuple[str, ...]
+    details: Mapping[str, object]
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceSettings:
+    """What `era rig identify --device` was given.
+
+    sensors_file: of accelerometers; device: that plays and records; frequencies (f,) [Hz], level:
+    None for the usual ones; periods: seconds of each run that count; seed: of the phases.
+    """
+
+    device: str
+    sensors_file: Path
+    frequencies: FloatArray | None
+    level: float | None
+    periods: int
+    seed: int
+
+
+@runtime_checkable
+class PlateMeasurer(Protocol):
+    """Plays on all ERAs of a rig and measures its plate."""
+
+    def __call__(self, rig: Rig, settings: DeviceSettings, *, progress: Progress) -> MeasuredPlate:
+        """Raises InputError, LinkError."""
+
+
+_MEASURERS: PluginRegistry[PlateMeasurer] = PluginRegistry(
+    "plate measurement", "era_haptics.plate_measurements", Instance(PlateMeasurer), error=InputError
+)
+
+
+def measure_by_device(rig: Rig, settings: DeviceSettings, *, progress: Progress) -> MeasuredPlate:
+    """Measure a plate by a sound card."""
+    return _MEASURERS.find("sound")(rig, settings, progress=progress)

@@ -1,0 +1,143 @@
+"""A plate measured through a sound card for its identification: multisines, some of them again."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from model.arrays import FloatArray
+from model.identification.forward import Sensor
+from model.identification.measured_plate import DeviceSettings, MeasuredPlate, Progress
+from model.identification.measurement import Measurement, Repeat
+from model.rig.rig import Rig
+from sim.measuring.desk import Desk
+from sim.measuring.loopback import converters
+from sim.measuring.measure import Measured, measure
+from sim.measuring.multisine import Multisine, default_frequencies
+from sim.measuring.run import Run, blocks_lost, play_run, run_time, spectrum
+from sim.measuring.sound_card import SoundCard, open_card
+from sim.sensors.sensor_file import read_sensors
+
+LEVEL = 0.3
+"""Usual largest sample of each output."""
+
+_REPEATED = 1  # the run: phases differ between ERAs, so that modes of every symmetry vibrate
+_COMPARED = 2  # lines of it
+
+
+def measure_plate(rig: Rig, settings: DeviceSettings, *, progress: Progress) -> MeasuredPlate:
+    """Measure through a sound card, which plays and records.
+
+    Raises InputError, LinkError, as `era measure` does.
+    """
+    desk = Desk(rig, read_sensors(settings.sensors_file, rig.plate))
+    level = min(LEVEL, desk.highest) if settings.level is None else settings.level
+    desk.check(level)
+    limits = rig.limits
+    lines = settings.frequencies
+    if lines is None:
+        lines = default_frequencies(limits.frequency_min, limits.frequency_max)
+    desk.check_frequencies(lines)
+    card = open_card(settings.device, outputs=desk.output, inputs=desk.input, limit=level)
+    try:
+        multisine = Multisine(lines, len(desk.eras) + 1, card.rate, level, settings.seed)
+        return measure_through(desk, card, multisine, periods=settings.periods, progress=progress)
+    finally:
+        card.close()
+
+
+def measure_through(
+    desk: Desk, card: SoundCard, multisine: Multisine, *, periods: int, progress: Progress
+) -> MeasuredPlate:
+    """All runs; then one of them at half the level, and at the whole one again."""
+    started = time.monotonic()
+    own = 1e3 * run_time(periods)
+    total = round((multisine.sources + 2) * own)
+    found = measure(
+        desk,
+        card,
+        multisine,
+        periods=periods,
+        progress=lambda done, _total: progress(done, total),
+    )
+    repeats = []
+    for number, factor in enumerate((0.5, 1.0)):
+        before = round((multisine.sources + number) * own)
+        again = replace(multisine, level=factor * multisine.level)
+        run = play_run(
+            desk,
+            card,
+            again,
+            _REPEATED,
+            periods=periods,
+            before=found.converters,
+            progress=lambda seconds, before=before: progress(  # type: ignore[misc]
+                before + round(1e3 * seconds), total
+            ),
+        )
+        if not run.is_whole:
+            raise blocks_lost()
+        repeats.append(_repeats(desk, found, again, run))
+    progress(total, total)
+    measurement = replace(
+        _measurement(desk, found),
+        half_level=repeats[0],
+        at_end=repeats[1],
+        drives_lag=True,
+    )
+    return MeasuredPlate(
+        measurement,
+        multisine.level,
+        time.monotonic() - started,
+        sensors=tuple(_sensors(desk, found)),
+        notes=(),
+        details={"latency_s": found.latency, "repeated_runs": found.repeated},
+    )
+
+
+def _measurement(desk: Desk, found: Measured) -> Measurement:
+    """Responses with the usual error of readings and the noise beside it."""
+    responses = found.responses
+    values = responses.values.swapaxes(1, 2)  # (f, sensors, eras)
+    plain = Measurement.of(
+        [Sensor(sensor.name, x=sensor.x, y=sensor.y) for sensor in desk.sensors],
+        responses.frequencies,
+        values,
+    )
+    rms = np.sqrt((np.abs(values) ** 2).mean(axis=(0, 2)))
+    noise = (found.std * rms)[plain.rows, plain.at] / np.sqrt(2)  # of each part
+    return replace(plain, std=np.hypot(plain.std, noise))
+
+
+def _repeats(desk: Desk, found: Measured, multisine: Multisine, run: Run) -> tuple[Repeat, ...]:
+    """The loudest lines of a run and what the responses make of them, all ERAs together."""
+    columns = [sensor.input - 1 for sensor in desk.sensors]
+    strokes = np.array([era.stroke for era in desk.rig.eras])
+    bases = multisine.played(_REPEATED)[:, : len(strokes)] * strokes  # (f, eras)
+    first = np.einsum("fes,fe->fs", found.responses.values, bases)
+    sensitivity = np.array([sensor.sensitivity for sensor in desk.sensors])
+    heard = spectrum(run, multisine)[:, columns] / sensitivity
+    again = heard / converters(found.converters)[:, None]
+    size = np.linalg.norm(bases, axis=1, keepdims=True)
+    first, again = first / size, again / size
+    names = ", ".join(name for name, _ in desk.eras)
+    loudest = np.argsort(-np.linalg.norm(first, axis=1))[:_COMPARED]
+    return tuple(
+        Repeat(names, float(multisine.frequencies[n]), first[n], again[n]) for n in loudest
+    )
+
+
+def _sensors(desk: Desk, found: Measured) -> list[Mapping[str, object]]:
+    """The sensors, for programs."""
+    lowest: FloatArray = found.coherence.min(axis=0)
+    return [
+        {
+            "sensor": sensor.name,
+            "input": sensor.input,
+            "x_m": sensor.x,
+            "y_m": sensor.y,
+            "coherence_min": float(coherence),
+        }
+        for sensor, coherence in zip(desk.sensors, lowest, strict=True)
+    ]

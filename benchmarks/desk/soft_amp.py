@@ -63,6 +63,15 @@ def main() -> None:
     parser.add_argument("--report", action="store_true", help=f"write {PAGE.relative_to(ROOT)}")
     options = parser.parse_args()
     use_one_thread()
+    if options.report and not PAGE.exists():
+        parser.error(f"--report writes parts of {PAGE}, which must exist")
+
+    def write(name: str, part: str) -> None:
+        """Write what was measured at once: another part may fail later."""
+        print(part, flush=True)
+        if options.report:
+            write_parts(PAGE, {name: part})
+
     with tempfile.TemporaryDirectory(prefix="soft-amp") as name:
         folder = Path(name)
         _table(folder)
@@ -78,12 +87,9 @@ def main() -> None:
                 f"| {block} | {len(found)} | {median:.1f} | {late:.1f} | {found.max():.1f} |"
             )
             print(rows[-1], flush=True)
-        parts = {"touches": "\n".join(rows), "silence": silences(folder)}
-        print(parts["silence"], flush=True)
-        parts["underruns"] = underruns(folder, options.load)
-        print(parts["underruns"], flush=True)
-    if options.report:
-        write_parts(PAGE, parts)
+        write("touches", "\n".join(rows))
+        write("silence", silences(folder))
+        write("underruns", underruns(folder, options.load))
 
 
 def _table(folder: Path) -> None:

@@ -1,22 +1,28 @@
 """A desk without hardware: measured, calibrated, played and verified, on plates that deviate.
 
     python -m benchmarks.desk [--plates 10] [--promises 20] [--touches 6] [--report]
+    python -m benchmarks.desk --identify-only [--plates 10] [--report]
 
 Everything runs in processes of its own on a JACK server of the dummy driver: `era desk-plate`,
 `era measure`, `era calibrate`, `era table build`, `era table verify --device`, `era soft-amp`,
-`era daemon`. Two minutes a plate on an idle machine. Exits with status 1 unless 85 to 95 % of all
-promises are kept; of fewer than a hundred, unless four of five are.
+`era daemon`, `era rig identify --device`. Three minutes a plate on an idle machine. Exits with
+status 1 unless 85 to 95 % of all promises are kept; of fewer than a hundred, unless four of five
+are.
 """
 
 import argparse
 import json
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.desk.chain import KINDS, Outcome, chain
+from benchmarks.desk.chain import Outcome, chain
+from benchmarks.desk.errors import errors_table
+from benchmarks.desk.identified import Identified, identify
+from benchmarks.desk.session import desk
 from benchmarks.page import write_parts
 from benchmarks.setting import use_one_thread
 
@@ -33,8 +39,12 @@ def main() -> None:
     parser.add_argument("--touches", type=int, default=6, help="on each plate")
     parser.add_argument("--seed", type=int, default=1, help="of the first plate")
     parser.add_argument("--report", action="store_true", help=f"write {PAGE.relative_to(ROOT)}")
+    parser.add_argument("--identify-only", action="store_true", help="nothing but identify")
     options = parser.parse_args()
     use_one_thread()
+    if options.identify_only:
+        identify_only(range(options.seed, options.seed + options.plates), options.report)
+        return
     found: list[Outcome] = []
     for seed in range(options.seed, options.seed + options.plates):
         found.append(chain(seed=seed, promises=options.promises, touched=options.touches))
@@ -50,10 +60,52 @@ def main() -> None:
     sys.exit(not low <= share <= high)
 
 
+def identify_only(seeds: Sequence[int], is_reported: bool) -> None:
+    """Identify plates, and write their part of the page if wanted."""
+    found: list[Identified] = []
+    for seed in seeds:
+        with tempfile.TemporaryDirectory(prefix="desk") as name, desk(Path(name), seed=seed) as one:
+            found.append(identify(one, seed=seed))
+        print(f"plate {seed}: chi² {found[-1].chi2:.2f}", flush=True)
+        if is_reported:
+            write_parts(PAGE, {"identified": identified_tables(found)})
+    print(identified_tables(found))
+
+
+def identified_tables(found: Sequence[Identified]) -> str:
+    """Errors of what was identified, and what else came of it."""
+    chi2, held, measured, solved = (
+        [getattr(each, key) for each in found]
+        for key in ("chi2", "held_out_error", "measure_s", "solve_s")
+    )
+    rows = [
+        "",
+        f"| plates | {len(found)} |",
+        "|---|---|",
+        f"| chi² | {min(chi2):.2f} to {max(chi2):.2f} |",
+        f"| tones left out predicted within / % | {100 * max(held):.1f} |",
+        f"| measured in / s | {min(measured):.0f} to {max(measured):.0f} |",
+        f"| computed in / s | {min(solved):.0f} to {max(solved):.0f} |",
+    ]
+    for quiet in (1, 2, 3):
+        before, after, promised = (
+            np.median(
+                [row[key] for each in found for row in each.contrasts if row["quiet"] == quiet]
+            )
+            for key in ("before_db", "after_db", "promised_db")
+        )
+        rows.append(
+            f"| contrast with {quiet} quiet / dB, medians | as written {before:.1f}, identified "
+            f"{after:.1f}, promised {promised:.1f} |"
+        )
+    return "\n".join([errors_table([one for each in found for one in each.errors]), *rows])
+
+
 def tables(found: Sequence[Outcome]) -> dict[str, str]:
     """The parts of the page."""
     return {
-        "values": values_table(found),
+        "values": errors_table([one for each in found for one in each.errors]),
+        "identified": identified_tables([each.identified for each in found]),
         "promises": promises_table(found),
         "touches": touches_table(found),
         "times": times_table(found),
@@ -67,23 +119,6 @@ def summary(found: Outcome) -> str:
         f"plate {found.seed}: measured in {found.measure_s:.0f} s, {sum(kept)} of {len(kept)} "
         f"promises kept, {sum(felt)} of {len(felt)} touches at least as promised"
     )
-
-
-def values_table(found: Sequence[Outcome]) -> str:
-    rows = [
-        "| value | error, median | largest | intervals of 95 % that hold the truth | values |",
-        "|---|---|---|---|---|",
-    ]
-    for kind in KINDS:
-        errors = [one for each in found for one in each.errors if one.kind == kind]
-        if errors:
-            sizes = 100 * np.abs([one.relative for one in errors])
-            held = np.mean(np.abs([one.in_standard_errors for one in errors]) < 1.96)
-            rows.append(
-                f"| {kind} | {np.median(sizes):.2f} % | {sizes.max():.2f} % | {100 * held:.0f} % "
-                f"| {len(errors)} |"
-            )
-    return "\n".join(rows)
 
 
 def promises_table(found: Sequence[Outcome]) -> str:

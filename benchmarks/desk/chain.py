@@ -8,27 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.desk.errors import Error
+from benchmarks.desk.identified import Identified, identify
 from benchmarks.desk.session import Desk, desk
 from benchmarks.desk.touches import Touch, touches
-
-KINDS = ("rigidity", "loss_factor", "stiffness", "damping", "bolt_mass")
-
-
-@dataclass(frozen=True)
-class Error:
-    """A fitted value relative to the truth, bolts to the plate's share; in standard errors too.
-
-    Both relative to the plate's mass, which no response shows.
-    """
-
-    kind: str
-    relative: float
-    in_standard_errors: float
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one plate: times [s], coherence, errors of values, promises and touches."""
+    """Of one plate: times [s], coherence, errors of values, promises and touches.
+
+    errors: of what was calibrated; identified: by `era rig identify`.
+    """
 
     seed: int
     measure_s: float
@@ -39,26 +30,17 @@ class Outcome:
     errors: tuple[Error, ...]
     promises: tuple[dict[str, Any], ...]
     touches: tuple[Touch, ...]
+    identified: Identified
 
     def as_json(self) -> dict[str, Any]:
         """For a file of results."""
         return asdict(self)
 
-    @classmethod
-    def from_json(cls, values: dict[str, Any]) -> "Outcome":
-        """The outcome of such a file."""
-        made = {
-            "errors": tuple(Error(**each) for each in values["errors"]),
-            "promises": tuple(values["promises"]),
-            "touches": tuple(Touch(**each) for each in values["touches"]),
-        }
-        return cls(**(values | made))
-
 
 def chain(
     *, seed: int, promises: int, touched: int, frequencies: str | None = None, mode: str = "phased"
 ) -> Outcome:
-    """Measure, calibrate, build a table, verify promises and touch; raises RuntimeError."""
+    """Measure, calibrate, build a table, verify promises, touch, identify; raises RuntimeError."""
     with tempfile.TemporaryDirectory(prefix="desk") as name, desk(Path(name), seed=seed) as plate:
         more = [] if frequencies is None else ["--frequencies", frequencies]
         measured = plate.run(
@@ -85,6 +67,7 @@ def chain(
             errors=tuple(_errors(plate, fitted)),
             promises=tuple(verified["promises"]),
             touches=tuple(felt),
+            identified=identify(plate, seed=seed),
         )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.desk.chain import chain
+from benchmarks.desk.identified import identified_errors
 from benchmarks.desk.session import ERA, Desk, desk
 from model.calibration.responses import responses_of
 from model.calibration.responses_file import read_functions
@@ -55,6 +56,22 @@ def test_measured_plate_is_the_one_on_the_desk(plate: Desk, device: str, late: i
     np.testing.assert_allclose(found.values[loud], exact[loud], rtol=0.03)
 
 
+@pytest.mark.long
+@pytest.mark.alone
+def test_identified_plate_is_the_one_on_the_desk(plate: Desk) -> None:
+    """Few tones, through JACK and the command: what drives the plate, its springs, its places."""
+    plate.run(
+        "rig", "identify", "rig.yaml", "--device", "jack:desk", "--sensors", "sensors.csv",
+        "-o", "identified.yaml", "--frequencies", "61:481:60", "--yes",
+    )  # fmt: skip
+    rig = load_rig(plate.folder / "identified.yaml")
+    limits = {"stiffness": 0.03, "place": 5e-4, "gain": 0.02, "phase": np.radians(2)}
+    errors = [e for e in identified_errors(rig, plate.truth) if e.kind in limits]
+    assert len(errors) == 16
+    for error in errors:
+        assert abs(error.relative) < limits[error.kind], error
+
+
 def test_second_plate_of_a_name_is_refused(plate: Desk) -> None:
     """It could not be told from the first, which would be measured in its place."""
     done = subprocess.run(
@@ -84,5 +101,8 @@ def test_chain_from_measurement_to_touches_keeps_its_promises() -> None:
     for row in found.promises:
         assert row["measured_level_db_sl"] == pytest.approx(row["promised_level_db_sl"], abs=1)
         assert row["measured_felt_contrast_db"] > row["promised_felt_contrast_db"] - 6
+    for error in found.identified.errors:
+        limit = 1e-3 if error.kind == "place" else 0.1
+        assert abs(error.relative) < limit, error
     assert len(found.touches) == 2
     assert all(touch.measured_db > 6 for touch in found.touches)

@@ -142,7 +142,8 @@ def _draw_start(axes: Axes, rig: Rig, truth: Truth, excitation: Excitation) -> N
     axes.set_xlabel("time / ms")
     axes.set_ylabel("acceleration / m/s²")
     axes.grid(alpha=0.2)
-    axes.legend(loc="upper left", fontsize=9)
+    axes.margins(y=0.2)
+    axes.legend(loc="upper left", ncols=2, fontsize=9)
 
 
 def _played(rig: Rig, outputs: int, excitation: Excitation) -> FloatArray:

@@ -40,7 +40,7 @@ class Outcome:
 def chain(
     *, seed: int, promises: int, touched: int, frequencies: str | None = None, mode: str = "phased"
 ) -> Outcome:
-    """Measure, calibrate, build a table, verify promises, touch, identify; raises RuntimeError."""
+    """Measure, calibrate, build a table, verify promises, identify, touch; raises RuntimeError."""
     with tempfile.TemporaryDirectory(prefix="desk") as name, desk(Path(name), seed=seed) as plate:
         more = [] if frequencies is None else ["--frequencies", frequencies]
         measured = plate.run(
@@ -55,6 +55,7 @@ def chain(
             "table", "verify", "table.npz", "calibrated.yaml", "--device", "jack:desk",
             "--sensors", "sensors.csv", "--samples", promises, "--seed", seed, status=None,
         )  # fmt: skip
+        found = identify(plate, seed=seed)  # before fingers weigh on the plate
         felt = touches(plate, _sets(touched, seed)) if touched else []
         sensors = measured["sensors"].values()
         return Outcome(
@@ -67,7 +68,7 @@ def chain(
             errors=tuple(_errors(plate, fitted)),
             promises=tuple(verified["promises"]),
             touches=tuple(felt),
-            identified=identify(plate, seed=seed),
+            identified=found,
         )
 
 

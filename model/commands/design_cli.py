@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from model.commands.next_line import next_line
-from model.commands.options import FolderOption, JsonOption, MeshOption, RigArgument
+from model.commands.options import (
+    ContactsOption,
+    FolderOption,
+    JsonOption,
+    LowestOption,
+    MeshOption,
+    RigArgument,
+)
 
 if TYPE_CHECKING:
     from model.config.units import Dimension
@@ -36,19 +43,11 @@ def design(
             help="Where ERAs may stand: a picture of the plate, white there, or polygons in YAML.",
         ),
     ] = "edge",
-    contacts: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Contacts, or a surface layout; default: anywhere, 1 to 3 quiet fingers.",
-        ),
-    ] = None,
+    contacts: ContactsOption = None,
     apart: Annotated[
         str, typer.Option(metavar="LENGTH", help="Least distance of two ERAs.")
     ] = "30 mm",
-    lowest: Annotated[
-        float, typer.Option(min=1.0, help="Least rigid-body frequency of the plate in Hz.")
-    ] = 20.0,
+    lowest: LowestOption = 20.0,
     stiffness: Annotated[
         str,
         typer.Option(
@@ -83,7 +82,7 @@ def design(
     from model.config.document import read_document
     from model.config.units import LENGTH
     from model.design.area import area_of
-    from model.design.contacts import anywhere, load_contacts_file
+    from model.design.contacts import contact_rule
     from model.design.outcome import summary, write_design
     from model.design.run import Design, run_design, worthwhile_count
     from model.design.search import DesignProblem
@@ -112,9 +111,7 @@ def design(
         count=eras,
         kept=kept,
         area=area_of(where, rig.plate),
-        contacts=anywhere(rig.plate)
-        if contacts is None
-        else load_contacts_file(contacts, rig.plate),
+        contacts=contact_rule(contacts, rig.plate),
         apart=distance,
         lowest=lowest,
         seed=seed,

@@ -17,6 +17,16 @@ FolderOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write into.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+ContactsOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Contacts, or a surface layout; default: anywhere, 1 to 3 quiet fingers.",
+    ),
+]
+LowestOption = Annotated[
+    float, typer.Option(min=1.0, help="Least rigid-body frequency of the plate in Hz.")
+]
 ExactOption = Annotated[
     bool, typer.Option("--exact", help="Simulate the rig's own plate, with no deviation.")
 ]

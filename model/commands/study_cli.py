@@ -8,7 +8,14 @@ from typing import Annotated, Any
 import typer
 
 from model.commands.next_line import next_line
-from model.commands.options import FolderOption, JsonOption, MeshOption, RigArgument
+from model.commands.options import (
+    ContactsOption,
+    FolderOption,
+    JsonOption,
+    LowestOption,
+    MeshOption,
+    RigArgument,
+)
 from model.counting import counted
 
 study_app = typer.Typer()
@@ -43,11 +50,19 @@ def study(
     output: FolderOption,
     layouts: Annotated[int, typer.Option(min=1, help="Number of layouts.")] = 200,
     active: Annotated[
-        Driven, typer.Option(help="Rank by the best single ERA, the best pair, or all ERAs.")
+        Driven, typer.Option(help="Loudness of the best single ERA, the best pair, or all ERAs.")
     ] = Driven.TWO,
     frequencies: Annotated[
-        str, typer.Option(metavar="LO:HI:STEP", help="Frequencies in Hz, both ends included.")
+        str,
+        typer.Option(
+            metavar="LO:HI:STEP", help="Frequencies of loudness in Hz, both ends included."
+        ),
     ] = "60:320:10",
+    contacts: ContactsOption = None,
+    lowest: LowestOption = 20.0,
+    finalists: Annotated[
+        int, typer.Option(min=1, max=1000, help="Layouts judged by their tables' answers.")
+    ] = 5,
     candidates: Annotated[
         str, typer.Option(metavar="NXxNY", help="Candidate places, edges included.")
     ] = "13x13",
@@ -60,21 +75,24 @@ def study(
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Rank layouts of ERAs by vibration.
+    """Rank layouts of ERAs by robust felt contrast.
 
     Resume an interrupted study.
     """
     from model.commands.progress import progress_bar
     from model.config.document import read_document
     from model.config.points import parse_frequencies, parse_pair
+    from model.design.contacts import contact_rule
     from model.errors import InputError
     from model.rig.file import rig_of
+    from model.studies.finalists import judge_finalists
     from model.studies.finished import FinishedCases
     from model.studies.kinds import STUDIES
     from model.studies.outcome import ranking_summary, write_outcome
-    from model.studies.ranking import check_supported_cases, rank
+    from model.studies.ranking import score_order
     from model.studies.run import run_study
     from model.studies.solve import DRIVES, study_problem
+    from model.studies.supported import check_supported_cases, support_of
     from model.studies.workers import on_cluster, on_processes, useful_processes
 
     document = read_document(rig_file)
@@ -85,8 +103,11 @@ def study(
     cases = STUDIES[what](
         rig, layouts=layouts, seed=seed, raster=parse_pair(candidates, what="--candidates")
     )
-    check_supported_cases(rig, cases)
-    problem = study_problem(rig, cases, parse_frequencies(frequencies))
+    check_supported_cases(support_of(rig, cases, lowest=lowest))
+    rule = contact_rule(contacts, rig.plate)
+    problem = study_problem(
+        rig, cases, parse_frequencies(frequencies), contacts=rule, lowest=lowest
+    )
     output.mkdir(parents=True, exist_ok=True)
     finished = FinishedCases(output, problem.digest)
     done = 0
@@ -116,7 +137,11 @@ def study(
                 err=True,
             )
             raise
-    ranking = rank(rig, cases, run.results, drive=DRIVES.index(active))
+    scored = score_order(rig, cases, run.results, drive=DRIVES.index(active), lowest=lowest)
+    with progress_bar("finalists") as update:
+        ranking = judge_finalists(
+            rig, scored, contacts=rule, finalists=finalists, workers=workers, progress=update
+        )
     files = [
         str(path) for path in write_outcome(output, what, rig, data=document.data, ranking=ranking)
     ]
@@ -149,21 +174,39 @@ def _show(summary: dict[str, Any]) -> None:
 
     print(
         f"{counted(summary['cases'], 'case')} in {summary['time_s']:.1f} s "
-        f"({summary['from_cache']} from an earlier run), mesh {summary['mesh_name']}, "
-        f"{counted(len(summary['drive_frequencies_hz']), 'frequency', plural='frequencies')}"
+        f"({summary['from_cache']} from an earlier run), mesh {summary['mesh_name']}"
     )
-    print(f"ranked by the median over the plate, {summary['driven']} driven")
-    print("rank  layout                        stiffness   lowest   median  highest    unfelt")
-    for case in summary["ranking"]:
-        lowest, median, highest = (
-            case[f"{name}_m_s2"] / G for name in ("minimum", "median", "maximum")
-        )
-        stiffness = max(case["stiffness_n_m"].values()) / 1000
-        print(
-            f"{case['rank']:4d}  {case['layout']:28s} {stiffness:6.4g} kN/m {lowest:6.1f} g "
-            f"{median:6.1f} g {highest:6.1f} g {100 * case['unfelt_share']:7.2f} %"
-            f"{'' if case['supported'] else '  not supported'}"
-        )
+    print(f"not supported: {summary['tipping']} tip over, {summary['too_low']} have too low a mode")
     recommended = summary["recommended"]
-    why = "" if recommended["rank"] == 1 else ", fewest and softest within a tenth of the best"
-    print(f"Recommended{why}: {recommended['words']}")
+    kinds = [key for key in recommended["contrast_db"] if key != "mean"]
+    quiet = " / ".join(key.split("_")[1] for key in kinds)
+    print(
+        f"ranked by robust felt contrast, mean over {quiet} quiet fingers: "
+        f"{summary['judged']} finalists by answers to {summary['sets']} contact sets, others as "
+        "expected"
+    )
+    print(f"loudness: median over the plate, {summary['driven']} driven")
+    print("rank  layout                        stiffness  contrast  expected  loudness   unfelt")
+    for case in summary["ranking"]:
+        stiffness = max(case["stiffness_n_m"].values()) / 1000
+        contrast = case["contrast_db"] and case["contrast_db"]["mean"]
+        loudness = case["median_m_s2"] and case["median_m_s2"] / G
+        unfelt = case["unfelt_share"] and 100 * case["unfelt_share"]
+        print(
+            f"{case['rank']:4d}  {case['layout']:28s} {stiffness:6.4g} kN/m "
+            f"{_cell(contrast, 'dB', 1)}  {_cell(case['expected_contrast_db'], 'dB', 1)}  "
+            f"{_cell(loudness, 'g', 1)}  {_cell(unfelt, '%', 2)}"
+            f"{'' if case['supported'] else '  ' + case['support_problem']}"
+        )
+    why = "" if recommended["rank"] == 1 else ", fewest and softest within 1 dB of the best"
+    medians = " / ".join(f"{recommended['contrast_db'][key]:.1f}" for key in kinds)
+    print(
+        f"Recommended{why}: {recommended['words']} Contrast: mean "
+        f"{recommended['contrast_db']['mean']:.1f} dB, median {medians} dB with {quiet} quiet "
+        f"fingers; level reached in {100 * recommended['reached_share']:.0f} % of the sets."
+    )
+
+
+def _cell(value: float | None, unit: str, digits: int) -> str:
+    """A number with its unit, right-aligned; a dash for none."""
+    return f"{'-' if value is None else f'{value:.{digits}f} {unit}':>8s}"

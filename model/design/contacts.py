@@ -117,6 +117,11 @@ def anywhere(plate: Plate) -> ContactRule:
     return ContactRule(DEFAULT_QUIET, DEFAULT_APART, _Drawn((whole,), plate))
 
 
+def contact_rule(path: Path | None, plate: Plate) -> ContactRule:
+    """The rule of a file, or `anywhere` for None; raises ConfigError for what is wrong in it."""
+    return anywhere(plate) if path is None else load_contacts_file(path, plate)
+
+
 def load_contacts_file(path: Path, plate: Plate) -> ContactRule:
     """Read the rule of a file: regions, as those of a surface layout, or sets.
 

@@ -16,6 +16,9 @@ from model.table.table import LocalizationTable
 JUDGED_SETS = 200
 """Contact sets by which layouts are judged, other than those of the search."""
 
+JUDGED_SEED = 0x5EED
+"""Added to the seed of a search, whose own sets are others."""
+
 _LEVEL_MARGIN = 0.1  # dB
 
 
@@ -43,6 +46,11 @@ class Judged:
     def median_db(self, quiet: int) -> float:
         """Median contrast with a number of quiet fingers."""
         return float(np.median(self.contrast_db[self.quiet == quiet]))
+
+    @property
+    def summary(self) -> dict[str, float]:
+        """Mean and medians [dB] for JSON."""
+        return {"mean": self.mean_db} | {f"median_{k}_quiet": self.median_db(k) for k in self.kinds}
 
     @property
     def reached_share(self) -> float:

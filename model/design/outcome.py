@@ -93,8 +93,8 @@ def summary(design: Design) -> dict[str, Any]:
             }
             for era, sensitivity, load in zip(eras, design.sensitivities, loads, strict=False)
         },
-        "contrast_db": _contrast(best.judged),
-        "own_contrast_db": None if design.own is None else _contrast(design.own),
+        "contrast_db": best.judged.summary,
+        "own_contrast_db": None if design.own is None else design.own.summary,
         "reached_share": best.judged.reached_share,
         "starts_db": [each.judged.mean_db for each in design.starts],
         "gap_db": design.gap_db,
@@ -106,11 +106,6 @@ def summary(design: Design) -> dict[str, Any]:
         "sets": len(design.sets),
         "resumed": design.resumed_count,
     }
-
-
-def _contrast(judged: Any) -> dict[str, float]:
-    medians = {f"median_{k}_quiet": judged.median_db(k) for k in judged.kinds}
-    return {"mean": judged.mean_db, **medians}
 
 
 def _set_damping(section: Value, damping: float) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.cluster import Cluster
-from model.design.judge import JUDGED_SETS, Judged, judge
+from model.design.judge import JUDGED_SEED, JUDGED_SETS, Judged, judge
 from model.design.search import CANDIDATES, DesignProblem, Found, LayoutSearch
 from model.design.support import MIN_SUPPORTING
 from model.errors import InputError
@@ -23,7 +23,6 @@ from model.version import NUMERICS_VERSION
 SENSITIVITY_STEP = 0.005
 """Step [m] of an ERA by which the sensitivity to its place is measured."""
 
-_JUDGED_SEED = 0x5EED  # added to the seed of a design, whose own sets are others
 _TYPES = {"positions": "<f8", "scores": "<f8", "counts": "<i8", "quiet": "<i8", "answers": "<f8"}
 
 
@@ -169,7 +168,7 @@ def _mean(layout: JudgedLayout) -> float:
 
 def judged_sets(problem: DesignProblem) -> list[FloatArray]:
     """Fresh contact sets."""
-    return problem.contacts.sets(JUDGED_SETS, seed=problem.seed + _JUDGED_SEED)
+    return problem.contacts.sets(JUDGED_SETS, seed=problem.seed + JUDGED_SEED)
 
 
 def _as_they_are(problems: Sequence[DesignProblem]) -> Sequence[DesignProblem]:

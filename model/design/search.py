@@ -110,6 +110,13 @@ class Found:
         return self.score_db > _UNSUPPORTED
 
 
+def search_frequencies(rig: Rig) -> FloatArray:
+    """Frequencies [Hz] of the scores of a rig's layouts, some of those of its tables, (f,)."""
+    every = default_drive_frequencies(rig.limits)
+    chosen = np.linspace(0, len(every) - 1, min(len(every), SEARCH_FREQUENCIES)).round()
+    return np.asarray(every[chosen.astype(int)])
+
+
 class LayoutSearch:
     """Searches layouts of one problem; scores are of contact sets drawn by its seed."""
 
@@ -117,10 +124,8 @@ class LayoutSearch:
         """Solve the plate for all candidates; raises InputError for an area without room."""
         self.problem = problem
         rig = problem.rig
-        every = default_drive_frequencies(rig.limits)
-        chosen = np.linspace(0, len(every) - 1, min(len(every), SEARCH_FREQUENCIES)).round()
         sets = problem.contacts.pooled_sets(SEARCH_FINGERS, seed=problem.seed)
-        self._plate = DesignPlate(rig, every[chosen.astype(int)], sets)
+        self._plate = DesignPlate(rig, search_frequencies(rig), sets)
         self._scorer = Scorer(self._plate)
         self._rule = SupportRule(rig, problem.lowest)
         is_area = isinstance(problem.area, Within)

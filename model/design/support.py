@@ -8,12 +8,16 @@ import numpy as np
 from model.arrays import FloatArray
 from model.rig.rig import Rig
 from model.structure.actuator import Era
+from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 from model.structure.support import rigid_body_frequencies
 
 GRAVITY = 9.81  # m/s²
 DEFAULT_LOWEST = 20.0
 """Lowest natural frequency [Hz] of the plate on its ERAs: it sags by 0.6 mm under its weight."""
+
+ROUNDING = 1e-9
+"""Share of the mean load below which a pull is none: an ERA may carry nothing."""
 
 MIN_SUPPORTING = 3
 """ERAs, and other mounts, that can support a plate."""
@@ -36,27 +40,32 @@ class SupportRule:
         if frequency < 1e-3:
             return 2.0
         loads = static_loads(self.rig, eras)
-        even = float(loads.mean())
-        pulled = max(0.0, -float(loads.min() / even))
-        return max(0.0, 1 - frequency / self.lowest) + pulled
+        pulled = -float(loads.min() / loads.mean())
+        return max(0.0, 1 - frequency / self.lowest) + (pulled if pulled > ROUNDING else 0.0)
 
 
 def static_loads(rig: Rig, eras: Sequence[Era]) -> FloatArray:
-    """Weight [N] on each ERA, and then on each spring among the masses, of the rigid plate.
+    """Weight [N] on each ERA, and then on each spring among the masses, of the rigid plate."""
+    attached = [*map(PointLoad.of_era, eras), *rig.masses]
+    places = np.array([[each.x, each.y] for each in attached])
+    stiffness = np.array([each.stiffness for each in attached])
+    mass = np.array([each.mass for each in attached])
+    return static_loads_of(rig.plate, places, stiffness, mass)[stiffness > 0]
 
-    Sinking w = q0 + q1 (x - L/2) + q2 (y - W/2) with K q = sum of weights p, reactions k p' q.
+
+def static_loads_of(
+    plate: Plate, places: FloatArray, stiffness: FloatArray, mass: FloatArray
+) -> FloatArray:
+    """Weight [N] on each spring, (..., n), of the rigid plates of many layouts at once.
+
+    places [m] (..., n, 2), stiffness [N/m] and mass [kg] (..., n) of what is attached, of which at
+    least three springs are not in one line. Sinking w = q0 + q1 (x - L/2) + q2 (y - W/2) with
+    K q = sum of weights p, reactions k p' q.
     """
-    springs = [*map(PointLoad.of_era, eras), *(load for load in rig.masses if load.stiffness > 0)]
-    plate = rig.plate
-
-    def basis(at: Sequence[PointLoad]) -> FloatArray:
-        places = np.array([[each.x, each.y] for each in at]).reshape(-1, 2)
-        return np.column_stack([np.ones(len(at)), places / [plate.length, plate.width] - 0.5])
-
-    p = basis(springs)
-    stiffness = np.array([each.stiffness for each in springs])
-    masses = [*map(PointLoad.of_era, eras), *rig.masses]
-    weights = GRAVITY * np.array([each.mass for each in masses])
-    weight = GRAVITY * plate.mass * np.array([1.0, 0.0, 0.0]) + weights @ basis(masses)
-    q = np.linalg.lstsq((p.T * stiffness) @ p, weight, rcond=None)[0]
-    return np.asarray(stiffness * (p @ q))
+    tilts = places / [plate.length, plate.width] - 0.5
+    p = np.concatenate([np.ones_like(tilts[..., :1]), tilts], axis=-1)
+    K = (p * stiffness[..., None]).swapaxes(-1, -2) @ p
+    weight = GRAVITY * (p * mass[..., None]).sum(axis=-2)
+    weight[..., 0] += GRAVITY * plate.mass
+    q = np.linalg.solve(K, weight[..., None])
+    return np.asarray(stiffness * (p @ q)[..., 0])

@@ -1,4 +1,4 @@
-"""Box plots of peak acceleration, each with its layout above it."""
+"""Box plots, each with its layout above it."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -10,7 +10,6 @@ from matplotlib.patches import Rectangle
 from model.arrays import FloatArray
 from model.figures.drawing import ACTIVE_COLOR, RESTING_COLOR
 from model.structure.plate import Plate
-from model.vibration.peak import G
 
 BOX_COLOR = "#9ecae1"
 
@@ -19,7 +18,7 @@ BOX_COLOR = "#9ecae1"
 class LayoutBox:
     """One box: label, positions of the ERAs (n, 2) [m], and indices of the active ones.
 
-    five: minimum, quartiles and maximum of cumulative peak acceleration [m/s²].
+    five: minimum, quartiles and maximum.
     """
 
     label: str
@@ -29,21 +28,21 @@ class LayoutBox:
 
 
 def layout_boxes_figure(
-    plate: Plate, boxes: Sequence[LayoutBox], *, title: str, logarithmic: bool = False
+    plate: Plate, boxes: Sequence[LayoutBox], *, title: str, label: str, over: str
 ) -> Figure:
-    """Boxes side by side in g, whiskers to minimum and maximum; red ERAs are active."""
+    """Boxes side by side, whiskers to minimum and maximum; red ERAs are active.
+
+    label: of the axis; over: what the distribution is over, such as the plate.
+    """
     figure = Figure(figsize=(max(6, 1.4 * len(boxes)), 6), layout="constrained")
     upper, lower = figure.subfigures(2, 1, height_ratios=(1, 4), squeeze=False)[:, 0]
     for axes, box in zip(upper.subplots(1, len(boxes), squeeze=False)[0], boxes, strict=True):
         _draw_layout(axes, plate, box)
     axes = lower.subplots()
     _draw_boxes(axes, boxes)
-    if logarithmic:
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter("{x:g}")
-    else:
-        axes.set_ylim(bottom=0)
-    axes.set_title("boxes: quartiles over the plate; whiskers: minimum and maximum", fontsize=10)
+    axes.set_ylabel(label)
+    axes.set_ylim(bottom=min(0, axes.get_ylim()[0]))
+    axes.set_title(f"boxes: quartiles over {over}; whiskers: minimum and maximum", fontsize=10)
     figure.suptitle(title)
     return figure
 
@@ -64,7 +63,7 @@ def _draw_boxes(axes: Axes, boxes: Sequence[LayoutBox]) -> None:
     keys = ("whislo", "q1", "med", "q3", "whishi")
     axes.bxp(
         [
-            {"label": box.label, "fliers": [], **dict(zip(keys, box.five / G, strict=True))}
+            {"label": box.label, "fliers": [], **dict(zip(keys, box.five, strict=True))}
             for box in boxes
         ],
         widths=0.6,
@@ -75,4 +74,3 @@ def _draw_boxes(axes: Axes, boxes: Sequence[LayoutBox]) -> None:
     )
     axes.grid(axis="y", color="0.9")
     axes.set_axisbelow(True)
-    axes.set_ylabel("cumulative peak acceleration / g")

@@ -126,10 +126,14 @@ def _draw(plate: Plate, best: list[_Drive], *, title: str) -> Figure:
             drive.layout.name.replace(" ", "\n"),
             drive.layout.positions(plate),
             drive.active,
-            drive.statistics[:5],
+            drive.statistics[:5] / G,
         )
         for drive in best
     ]
     return layout_boxes_figure(
-        plate, boxes, title=f"{title}: peak accelerations added up over 27 frequencies"
+        plate,
+        boxes,
+        title=f"{title}: peak accelerations added up over 27 frequencies",
+        label="cumulative peak acceleration / g",
+        over="the plate",
     )

@@ -2,11 +2,15 @@
 
 import hashlib
 import time
+import zipfile
+from contextlib import suppress
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from model.errors import InputError
 from model.files.kept_arrays import keep_arrays, kept_arrays
 from model.studies.cases import Cases
 from model.studies.solve import CaseResults, empty_results
@@ -14,7 +18,11 @@ from model.studies.solve import CaseResults, empty_results
 SAVE_INTERVAL = 5.0  # s; a kill loses no more, and large studies are not held up by writing
 
 _DIGEST_SIZE = 16
-_TYPES = {"cases": "|u1", "statistics": "<f8", "active": "<u8"}
+_TYPES = {"cases": "|u1", "expected_db": "<f8", "statistics": "<f8", "active": "<u8"}
+_EARLIER = {"cases", "statistics", "active", "sha256"}
+
+
+_Row: TypeAlias = tuple[float, NDArray[np.float64], NDArray[np.uint64]]
 
 
 class FinishedCases:
@@ -25,15 +33,21 @@ class FinishedCases:
     """
 
     def __init__(self, folder: Path, problem_digest: str) -> None:
-        """problem_digest: of `StudyProblem.digest`; the file's name has its beginning."""
+        """problem_digest: of `StudyProblem.digest`; the file's name has its beginning.
+
+        Raises InputError for a folder with a file of a version that knew no contrast.
+        """
+        _refuse_earlier(folder)
         self.path = folder / f"finished-{problem_digest[:16]}.npz"
         self._problem_digest = problem_digest
-        self._rows: dict[bytes, tuple[NDArray[np.float64], NDArray[np.uint64]]] = {}
+        self._rows: dict[bytes, _Row] = {}
         self._saved_at = -np.inf
         arrays = kept_arrays(self.path, problem_digest, _TYPES)
         if arrays is not None:
             keys = [row.tobytes() for row in arrays["cases"]]
-            rows = zip(arrays["statistics"], arrays["active"], strict=True)
+            rows = zip(
+                arrays["expected_db"].tolist(), arrays["statistics"], arrays["active"], strict=True
+            )
             self._rows = dict(zip(keys, rows, strict=True))
 
     def find(self, cases: Cases) -> tuple[NDArray[np.bool_], CaseResults]:
@@ -44,13 +58,18 @@ class FinishedCases:
             row = self._rows.get(_digest(cases, case))
             if row is not None:
                 done[case] = True
-                results.statistics[case], results.active[case] = row
+                results.expected_db[case] = row[0]
+                results.statistics[case], results.active[case] = row[1:]
         return done, results
 
     def add(self, cases: Cases, results: CaseResults) -> None:
         """Add results, and save them unless that was done within the last SAVE_INTERVAL."""
         for case in range(len(cases)):
-            row = (results.statistics[case], results.active[case])
+            row = (
+                float(results.expected_db[case]),
+                results.statistics[case],
+                results.active[case],
+            )
             self._rows[_digest(cases, case)] = row
         if time.monotonic() >= self._saved_at + SAVE_INTERVAL:
             self.save()
@@ -59,11 +78,27 @@ class FinishedCases:
         """Write the file; it is whole or not there. Raises OSError if it cannot be written."""
         if not self._rows:
             return
-        statistics, active = zip(*self._rows.values(), strict=True)
+        expected, statistics, active = zip(*self._rows.values(), strict=True)
         keys = np.frombuffer(b"".join(self._rows), dtype=np.uint8).reshape(-1, _DIGEST_SIZE)
-        arrays = {"cases": keys, "statistics": np.array(statistics), "active": np.array(active)}
+        arrays = {
+            "cases": keys,
+            "expected_db": np.array(expected),
+            "statistics": np.array(statistics),
+            "active": np.array(active),
+        }
         keep_arrays(self.path, self._problem_digest, arrays)
         self._saved_at = time.monotonic()
+
+
+def _refuse_earlier(folder: Path) -> None:
+    for path in sorted(folder.glob("finished-*.npz")):
+        with suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+            names = {name.removesuffix(".npy") for name in archive.namelist()}
+            if names == _EARLIER:
+                raise InputError(
+                    f"{path}: finished layouts must have an expected contrast, got a file of an "
+                    "earlier version; delete it or choose another folder"
+                )
 
 
 def _digest(cases: Cases, case: int) -> bytes:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from model.arrays import FloatArray
 from model.config.document import Value
 from model.figures import save_figure
 from model.files.array_file import whole_or_nothing
@@ -41,14 +42,20 @@ def write_outcome(
 
 def ranking_summary(rig: Rig, ranking: Ranking) -> dict[str, Any]:
     """The start of the ranking, the rig's own layout, and the recommended case."""
+    scored = ranking.scored
     ranks = {int(case): rank for rank, case in enumerate(ranking.order, start=1)}
     shown = [int(case) for case in ranking.order[:MAX_SHOWN]]
-    if ranking.own is not None and ranking.own not in shown:
-        shown.append(ranking.own)
+    if scored.own is not None and scored.own not in shown:
+        shown.append(scored.own)
     best = ranking.recommended
+    support = scored.support
     return {
-        "ranked_by": "median_m_s2",
-        "driven": DRIVE_NAMES[DRIVES[ranking.drive]],
+        "ranked_by": "contrast_db",
+        "judged": len(ranking.judged),
+        "sets": len(ranking.judged[best].contrast_db),
+        "tipping": int(support.is_tipping.sum()),
+        "too_low": int((~support.is_supported & ~support.is_tipping).sum()),
+        "driven": DRIVE_NAMES[DRIVES[scored.drive]],
         "ranking": [{"rank": ranks[case], **case_summary(rig, ranking, case)} for case in shown],
         "recommended": {
             "words": in_words(rig, ranking, best),
@@ -59,31 +66,41 @@ def ranking_summary(rig: Rig, ranking: Ranking) -> dict[str, Any]:
 
 
 def case_summary(rig: Rig, ranking: Ranking, case: int) -> dict[str, object]:
-    """One case for JSON: places of its ERAs, which are driven, and statistics."""
+    """One case for JSON: places of its ERAs, its contrast, and its loudness with who is driven."""
+    scored, results = ranking.scored, ranking.results
     eras = ranking.cases.eras_of(case, rig.eras)
-    driven = ranking.results.active_eras(case, ranking.drive)
-    statistics = ranking.results.statistics[case, ranking.drive]
+    judged = ranking.judged.get(case)
+    loudness = results.statistics[case, scored.drive]
     return {
         "layout": ranking.cases.names[case],
-        "supported": bool(ranking.supported[case]),
+        "supported": bool(scored.support.is_supported[case]),
+        "support_problem": scored.support.problem(case),
+        "lowest_rigid_body_hz": float(scored.support.lowest_hz[case]),
         "at_m": {era.name: [era.x, era.y] for era in eras},
         "stiffness_n_m": {era.name: era.stiffness for era in eras},
-        "active": [eras[era].name for era in driven],
+        "contrast_db": None if judged is None else judged.summary,
+        "reached_share": None if judged is None else judged.reached_share,
+        "expected_contrast_db": _number(results.expected_db[case]),
+        "active": [eras[era].name for era in results.active_eras(case, scored.drive)],
         **{
-            f"{name.replace(' ', '_')}_m_s2": float(value)
-            for name, value in zip(STATISTICS[:-1], statistics[:-1], strict=True)
+            f"{name.replace(' ', '_')}_m_s2": _number(value)
+            for name, value in zip(STATISTICS[:-1], loudness[:-1], strict=True)
         },
-        "unfelt_share": float(statistics[-1]),
+        "unfelt_share": _number(loudness[-1]),
     }
 
 
 def all_columns(ranking: Ranking) -> Columns:
     """Columns with a row for each case and drive."""
-    cases, results = ranking.cases, ranking.results
+    cases, results, support = ranking.cases, ranking.results, ranking.scored.support
     at = [
         " ".join(f"({x:.6g};{y:.6g})" for x, y in cases.positions_of(case).tolist())
         for case in range(len(cases))
     ]
+    contrast, ranks = np.full(len(cases), np.nan), np.empty(len(cases), dtype=int)
+    ranks[ranking.order] = np.arange(1, len(cases) + 1)
+    for case, judged in ranking.judged.items():
+        contrast[case] = judged.mean_db
     rows, drives = np.nonzero(~np.isnan(results.statistics[..., 0]))
     pairs = list(zip(rows.tolist(), drives.tolist(), strict=True))
     columns: dict[str, Column] = {
@@ -91,6 +108,11 @@ def all_columns(ranking: Ranking) -> Columns:
         "eras": era_counts(cases)[rows],
         "stiffness_factor": cases.stiffness_factors[rows],
         "at_m": [at[case] for case in rows],
+        "rank": ranks[rows],
+        "contrast_db": _texts(contrast[rows]),
+        "expected_contrast_db": _texts(results.expected_db[rows]),
+        "supported": ["yes" if support.is_supported[case] else "no" for case in rows],
+        "lowest_rigid_body_hz": support.lowest_hz[rows],
         "driven": [DRIVES[drive] for drive in drives],
         "active": [
             "+".join(str(era + 1) for era in results.active_eras(case, drive))
@@ -98,11 +120,17 @@ def all_columns(ranking: Ranking) -> Columns:
         ],
     }
     statistics = results.statistics[rows, drives]
-    return (
-        columns
-        | {
-            f"{name.replace(' ', '_')}{'' if name == STATISTICS[-1] else '_m_s2'}": statistics[:, k]
-            for k, name in enumerate(STATISTICS)
-        }
-        | {"supported": ["yes" if ranking.supported[case] else "no" for case in rows]}
-    )
+    return columns | {
+        f"{name.replace(' ', '_')}{'' if name == STATISTICS[-1] else '_m_s2'}": statistics[:, k]
+        for k, name in enumerate(STATISTICS)
+    }
+
+
+def _number(value: float) -> float | None:
+    """A number for JSON, None for NaN."""
+    return None if np.isnan(value) else float(value)
+
+
+def _texts(values: FloatArray) -> list[str]:
+    """Numbers for CSV, nothing for NaN."""
+    return ["" if np.isnan(value) else f"{value:.6g}" for value in values]

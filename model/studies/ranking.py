@@ -1,41 +1,109 @@
-"""Ranking of the cases of a study, and the recommended one."""
+"""Ranking of the cases of a study by robust felt contrast, and the recommended one."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.arrays import FloatArray, IntArray
-from model.counting import counted
-from model.errors import InputError
+from model.design.judge import Judged
 from model.rig.rig import Rig
-from model.structure.support import MIN_RIGID_BODY_FREQUENCY, rigid_body_frequencies_of
 from model.studies.cases import OWN, VACANT, Cases
-from model.studies.solve import EQUAL, CaseResults
+from model.studies.solve import CaseResults
+from model.studies.supported import Support, support_of
 from model.vibration.activation import MEDIAN
 
-GOOD_ENOUGH = 0.9
-"""Share of the best median at which fewer or softer ERAs are recommended."""
+GOOD_ENOUGH_DB = 1.0
+"""Contrast [dB] that fewer or softer ERAs may be behind the best and still be recommended."""
 
 
-@dataclass(frozen=True)
-class Ranking:
-    """Cases by the median over the plate under a drive, the best first.
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """Cases in the order of their expected contrast; those that do not support the plate last.
 
-    drive: number in DRIVES; order (n,): cases that have ERAs enough for it; supported (n,):
-    whether the ERAs of each case support the plate.
+    drive: number in DRIVES, of loudness; order (n,): of all cases.
     """
 
     cases: Cases
     results: CaseResults
     drive: int
+    support: Support
     order: IntArray
-    supported: NDArray[np.bool_]
 
     @property
-    def medians(self) -> FloatArray:
-        """Median cumulative peak acceleration [m/s²] of each case, NaN for too few ERAs."""
-        return np.asarray(self.results.statistics[:, self.drive, MEDIAN])
+    def supported_order(self) -> IntArray:
+        """The cases that support the plate, in order."""
+        return self.order[: int(self.support.is_supported.sum())]
+
+    @property
+    def own(self) -> int | None:
+        """The rig's own layout, if it is among the cases."""
+        for case in self.order:
+            if self.cases.names[case] == OWN and self.cases.stiffness_factors[case] == 1:
+                return int(case)
+        return None
+
+    @property
+    def middle(self) -> int:
+        """The case in the middle of those that support the plate."""
+        return int(self.supported_order[len(self.supported_order) // 2])
+
+    @property
+    def worst(self) -> int:
+        """The last case that supports the plate."""
+        return int(self.supported_order[-1])
+
+    def finalists(self, count: int, *, groups: Iterable[FloatArray | IntArray] = ()) -> list[int]:
+        """Cases to be judged by their tables' answers, in order.
+
+        The first of the order, so many; the first of each value of each group (n,), such as the
+        number of ERAs; the rig's own, the middle and the worst. All of them support the plate.
+        """
+        chosen = {int(case) for case in self.supported_order[:count]}
+        for values in groups:
+            chosen |= set(first_of(self.supported_order, values).values())
+        if self.own is not None and self.support.is_supported[self.own]:
+            chosen.add(self.own)
+        chosen |= {self.middle, self.worst}
+        return [int(case) for case in self.order if int(case) in chosen]
+
+
+def score_order(
+    rig: Rig, cases: Cases, results: CaseResults, *, drive: int, lowest: float
+) -> Scored:
+    """Order cases of a rig by expected contrast; those that do not support it by loudness.
+
+    lowest [Hz]: least rigid-body frequency of a case that supports the plate.
+    """
+    support = support_of(rig, cases, lowest=lowest)
+    medians = np.nan_to_num(results.statistics[:, drive, MEDIAN])
+    values = np.where(support.is_supported, results.expected_db, medians)
+    order = np.lexsort((-values, ~support.is_supported))
+    return Scored(cases, results, drive, support, order)
+
+
+@dataclass(frozen=True, eq=False)
+class Ranking:
+    """Cases by robust felt contrast, the best first.
+
+    judged: answers of the finalists, by case; head: how many of them lead the order, by the mean
+    contrast of their answers. The others follow by expected contrast.
+    """
+
+    scored: Scored
+    judged: Mapping[int, Judged]
+    order: IntArray
+    head: int
+
+    @property
+    def cases(self) -> Cases:
+        """The cases."""
+        return self.scored.cases
+
+    @property
+    def results(self) -> CaseResults:
+        """Results of the cases."""
+        return self.scored.results
 
     @property
     def best(self) -> int:
@@ -43,81 +111,41 @@ class Ranking:
         return int(self.order[0])
 
     @property
-    def middle(self) -> int:
-        """The case in the middle of the ranking."""
-        return int(self.order[len(self.order) // 2])
-
-    @property
-    def worst(self) -> int:
-        """The last case."""
-        return int(self.order[-1])
-
-    @property
-    def own(self) -> int | None:
-        """The rig's own layout, if it is among the ranked cases."""
-        for case in self.order:
-            if self.cases.names[case] == OWN and self.cases.stiffness_factors[case] == 1:
-                return int(case)
-        return None
-
-    @property
     def recommended(self) -> int:
-        """The case with fewest and softest ERAs among those that reach GOOD_ENOUGH of the best.
+        """The judged case with fewest, then softest ERAs within GOOD_ENOUGH_DB of the best.
 
-        In a study of placement that is the best case. Cases that do not support the plate are
-        passed over.
+        In a study of placement that is the best.
         """
-        counts = era_counts(self.cases)
-        order = self.order[self.supported[self.order]]
-        good = [
-            int(case)
-            for case in order
-            if self.medians[case] >= GOOD_ENOUGH * self.medians[order[0]]
-        ]
-        return min(good, key=lambda case: (counts[case], self.cases.stiffness_factors[case]))
+        counts, factors = era_counts(self.cases), self.cases.stiffness_factors
+        least = self.judged[self.best].mean_db - GOOD_ENOUGH_DB
+        good = [case for case, answers in self.judged.items() if answers.mean_db >= least]
+        return min(good, key=lambda case: (counts[case], factors[case], -self.judged[case].mean_db))
 
     def best_by(self, values: FloatArray | IntArray) -> dict[float, int]:
-        """The best case for each distinct value (n,), such as the number of ERAs; ascending."""
-        best: dict[float, int] = {}
-        for case in self.order:
-            best.setdefault(float(values[case]), int(case))
-        return dict(sorted(best.items()))
+        """The best case for each distinct value (n,) of those that support the plate."""
+        supported = self.scored.support.is_supported
+        return first_of(self.order[supported[self.order]], values)
 
 
-def rank(rig: Rig, cases: Cases, results: CaseResults, *, drive: int) -> Ranking:
-    """Rank cases of a rig by the median; those with too few ERAs for the drive are skipped."""
-    medians = results.statistics[:, drive, MEDIAN]
-    ranked = np.flatnonzero(~np.isnan(medians))
-    falling = ranked[np.argsort(-medians[ranked], kind="stable")]
-    # Cases equal by symmetry, each nearly as good as the one before, stay in their order.
-    steps = medians[falling[1:]] < (1 - EQUAL) * medians[falling[:-1]]
-    groups = np.concatenate([[0], np.cumsum(steps)])[: len(falling)]
-    order = falling[np.lexsort((falling, groups))]
-    return Ranking(cases, results, drive, order, are_supported(rig, cases))
+def rank(scored: Scored, judged: Mapping[int, Judged], *, finalists: int) -> Ranking:
+    """Rank cases: judged ones first that are not behind the worst of the first finalists.
+
+    judged: answers by case, those of the first finalists among them.
+    """
+    first = [int(case) for case in scored.supported_order[:finalists]]
+    least = min(judged[case].mean_db for case in first)
+    head = [case for case, answers in judged.items() if answers.mean_db >= least]
+    head.sort(key=lambda case: -judged[case].mean_db)
+    rest = scored.order[~np.isin(scored.order, head)]
+    return Ranking(scored, judged, np.array([*head, *rest.tolist()]), len(head))
 
 
-def are_supported(rig: Rig, cases: Cases) -> NDArray[np.bool_]:
-    """Which cases have ERAs that support the plate, (n,)."""
-    mounts = cases.mounts(rig.eras)
-    at = cases.positions[cases.places]  # of VACANT any, without stiffness and mass
-    loads = [[load.x, load.y, load.stiffness, load.mass] for load in rig.masses]
-    attached = np.concatenate([at, mounts[:, :, [0, 2]]], axis=2)
-    carried = np.array(loads, dtype=float).reshape(-1, 4)
-    carried = np.broadcast_to(carried, (len(cases), *carried.shape))
-    attached = np.concatenate([attached, carried], axis=1)
-    lowest = rigid_body_frequencies_of(
-        rig.plate, attached[..., :2], attached[..., 2], attached[..., 3]
-    )[:, 0]
-    return np.asarray(lowest >= MIN_RIGID_BODY_FREQUENCY)
-
-
-def check_supported_cases(rig: Rig, cases: Cases) -> None:
-    """Raise InputError if no case supports the plate, so that none could be recommended."""
-    if not are_supported(rig, cases).any():
-        raise InputError(
-            f"none of {counted(len(cases), 'layout')} supports the plate; give the rig at least "
-            "three ERAs, stiff enough, or allow more --layouts"
-        )
+def first_of(order: IntArray, values: FloatArray | IntArray) -> dict[float, int]:
+    """The first case of an order for each distinct value (n,); values ascending."""
+    first: dict[float, int] = {}
+    for case in order:
+        first.setdefault(float(values[case]), int(case))
+    return dict(sorted(first.items()))
 
 
 def era_counts(cases: Cases) -> IntArray:

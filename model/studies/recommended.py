@@ -11,14 +11,13 @@ from model.studies.ranking import Ranking
 
 
 def in_words(rig: Rig, ranking: Ranking, case: int) -> str:
-    """One case in words: places and stiffness of the ERAs, and which to drive."""
+    """One case in words: places and stiffness of the ERAs."""
     eras = ranking.cases.eras_of(case, rig.eras)
     places = "; ".join(f"{era.name} {place_in_words(era.x, era.y, rig.plate)}" for era in eras)
-    driven = [eras[era].name for era in ranking.results.active_eras(case, ranking.drive)]
     stiffness = sorted({era.stiffness for era in eras})
     of_stiffness = " and ".join(f"{value / 1000:.4g}" for value in stiffness)
     count = "one ERA" if len(eras) == 1 else f"{len(eras)} ERAs"
-    return f"{count} of {of_stiffness} kN/m: {places}. Strongest driven: {', '.join(driven)}."
+    return f"{count} of {of_stiffness} kN/m: {places}."
 
 
 def place_in_words(x: float, y: float, plate: Plate) -> str:

@@ -10,8 +10,8 @@ from model.studies.finished import FinishedCases
 from model.studies.solve import CaseResults, StudyProblem, empty_results
 from model.studies.workers import Workers
 
-# A twentieth of a second of work; to hand one over takes a cluster's scheduler milliseconds.
-CHUNK = 256
+# About half a second of work; to hand one over takes a cluster's scheduler milliseconds.
+CHUNK = 128
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,7 @@ def run_study(
     chunks = {number: cases.take(part) for number, part in parts.items()}
     try:
         for number, solved in workers(problem, chunks) if chunks else ():
+            results.expected_db[parts[number]] = solved.expected_db
             results.statistics[parts[number]] = solved.statistics
             results.active[parts[number]] = solved.active
             if finished is not None:

@@ -1,4 +1,4 @@
-"""Statistics of the cases of a study, solved by its workers."""
+"""Expected contrast and loudness of the cases of a study, solved by its workers."""
 
 import hashlib
 import json
@@ -8,14 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, FloatArray, IntArray
+from model.design.contacts import ContactRule
+from model.design.places import DesignPlate, Places
+from model.design.score import Mounts, Scorer
+from model.design.search import SEARCH_FINGERS, search_frequencies
+from model.design.support import DEFAULT_LOWEST
 from model.errors import InputError
 from model.fem.plate_mesh import check_frequencies
 from model.finger.perception import check_has_threshold
 from model.rig.rig import Rig
-from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import full_strokes
 from model.studies.cases import VACANT, Cases, all_alike
 from model.studies.receptances import Receptances, solve_receptances
+from model.studies.supported import support_of
 from model.version import NUMERICS_VERSION
 from model.vibration.activation import (
     MEDIAN,
@@ -32,20 +37,27 @@ DRIVES = ("1", "2", "all")
 EQUAL = 1e-5
 """Statistics that differ by less than this share are equal but for rounding."""
 
+SETS_SEED = 0
+"""Seed of the contact sets of every study, so that studies compare."""
+
 DRIVE_NAMES = {"1": "best single ERA", "2": "best pair of ERAs", "all": "all ERAs"}
 
 
 @dataclass(frozen=True)
 class StudyProblem:
-    """Inputs of the statistics of all cases.
+    """Inputs of what is known of all cases.
 
-    positions (c, 2) [m]: possible places of ERAs; frequencies (f,) [Hz]. Raises InputError for
-    frequencies without data on thresholds.
+    positions (c, 2) [m]: possible places of ERAs; frequencies (f,) [Hz]: of loudness; sets: contact
+    sets (fingers, 2) [m] of expected contrast, target first; lowest [Hz]: least rigid-body
+    frequency of a case that supports the plate. Raises InputError for frequencies without data on
+    thresholds.
     """
 
     rig: Rig
     positions: FloatArray
     frequencies: FloatArray
+    sets: tuple[FloatArray, ...]
+    lowest: float
 
     def __post_init__(self) -> None:
         """Refuse frequencies at which nothing is known of what is felt."""
@@ -62,23 +74,42 @@ class StudyProblem:
         """SHA-256 over all but the positions, which are part of the cases."""
         digest = hashlib.sha256()
         mesh = json.dumps(self.rig.mesh.to_dict(), sort_keys=True)
-        for text in (self.rig.fingerprint, mesh, NUMERICS_VERSION):
+        for text in (self.rig.fingerprint, mesh, NUMERICS_VERSION, self.lowest):
             digest.update(f"{text}\n".encode())
-        digest.update(self.frequencies.tobytes())
+        for numbers in (self.frequencies, search_frequencies(self.rig), *self.sets):
+            digest.update(numbers.tobytes())
         return digest.hexdigest()
 
-    def solve(self) -> Receptances:
+    def solve(self) -> "SolvedStudy":
         """Solve the plate, once for all cases; raises InputError as `solve_receptances` does."""
-        return solve_receptances(self.rig, self.positions, self.points, self.frequencies)
+        receptances = solve_receptances(self.rig, self.positions, self.points, self.frequencies)
+        plate = DesignPlate(self.rig, search_frequencies(self.rig), self.sets)
+        return SolvedStudy(
+            self.rig, receptances, plate.places(self.positions), Scorer(plate), self.lowest
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedStudy:
+    """The plate of a study, solved for all positions: for loudness, and places for contrast."""
+
+    rig: Rig
+    receptances: Receptances
+    places: Places
+    scorer: Scorer
+    lowest: float
 
 
 @dataclass(frozen=True)
 class CaseResults:
-    """Statistics (n, 3, 6) of n cases, a row for each of DRIVES; NaN for too few ERAs.
+    """Results of n cases.
 
-    active: (n, 3), bit k set where ERA k of the case is driven.
+    expected_db (n,): expected contrast as `era design` scores it, NaN where the plate is not
+    supported; statistics (n, 3, 6): of loudness, a row for each of DRIVES, NaN for too few ERAs;
+    active (n, 3): bit k set where ERA k of the case is driven for it.
     """
 
+    expected_db: FloatArray
     statistics: FloatArray
     active: NDArray[np.uint64]
 
@@ -91,22 +122,32 @@ class CaseResults:
 def empty_results(count: int) -> CaseResults:
     """Results to be filled in for a number of cases."""
     return CaseResults(
+        np.full(count, np.nan),
         np.full((count, len(DRIVES), len(STATISTICS)), np.nan),
         np.zeros((count, len(DRIVES)), dtype=np.uint64),
     )
 
 
-def study_problem(rig: Rig, cases: Cases, frequencies: FloatArray) -> StudyProblem:
+def study_problem(
+    rig: Rig,
+    cases: Cases,
+    frequencies: FloatArray,
+    *,
+    contacts: ContactRule,
+    lowest: float = DEFAULT_LOWEST,
+) -> StudyProblem:
     """The problem of a study; raises InputError for frequencies (f,) [Hz] out of range."""
     if len(frequencies) == 0:
         raise InputError("frequencies of a study must be at least one, got none")
     check_frequencies(rig.plate, rig.mesh, frequencies)
-    return StudyProblem(rig, cases.positions, frequencies)
+    sets = tuple(contacts.pooled_sets(SEARCH_FINGERS, seed=SETS_SEED))
+    return StudyProblem(rig, cases.positions, frequencies, sets, lowest)
 
 
-def solve_cases(receptances: Receptances, eras: tuple[Era, ...], cases: Cases) -> CaseResults:
+def solve_cases(solved: SolvedStudy, cases: Cases) -> CaseResults:
     """Solve cases with ERAs like those of the rig; none depends on another."""
     results = empty_results(len(cases))
+    receptances, eras = solved.receptances, solved.rig.eras
     mounts, counts = cases.mounts(eras), (cases.places != VACANT).sum(axis=1)
     omega = 2 * np.pi * receptances.frequencies
     for count in np.unique(counts).tolist():
@@ -115,7 +156,20 @@ def solve_cases(receptances: Receptances, eras: tuple[Era, ...], cases: Cases) -
         places = cases.places[rows, :count].astype(np.int64)
         forces = receptances.forces(places, mounts[rows, :count], full_strokes(driven, omega))
         _solve_layouts(receptances, rows, places, forces, results)
+    _score(solved, cases, results)
     return results
+
+
+def _score(solved: SolvedStudy, cases: Cases, results: CaseResults) -> None:
+    """Fill in the expected contrast of cases that support the plate."""
+    support = support_of(solved.rig, cases, lowest=solved.lowest)
+    mounts: dict[tuple[int, float], Mounts] = {}  # of one kind of case they are the same anywhere
+    for case in np.flatnonzero(support.is_supported).tolist():
+        chosen = cases.places_of(case)
+        kind = len(chosen), float(cases.stiffness_factors[case])
+        if kind not in mounts:
+            mounts[kind] = solved.scorer.mounts(cases.eras_of(case, solved.rig.eras))
+        results.expected_db[case] = solved.scorer.mean(solved.places, chosen, mounts[kind])
 
 
 def _solve_layouts(

@@ -26,7 +26,8 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.calibrate: {"rig": RIG, "measured": "measured.csv"},
     era.study: {
         "rig": RIG, "what": "count", "layouts": 9, "active": "1", "frequencies": [60],
-        "candidates": (7, 5), "seed": 0, "workers": 1,
+        "contacts": "contacts.yaml", "lowest": 20.0, "finalists": 1, "candidates": (7, 5),
+        "seed": 0, "workers": 1,
     },
     era.SolvedPlate: {"rig": RIG, "seed": 1},
     PLATE.map: {"drive": DRIVE, "raster": (3, 3)},

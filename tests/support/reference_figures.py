@@ -50,7 +50,7 @@ def reference_figures() -> dict[str, list[float]]:
         "table_shapes": np.linalg.norm(table.shapes[:, :8], axis=0),
     }
     study, cases = small_study(layouts=8)
-    results = solve_cases(study.solve(), study.rig.eras, cases)
+    results = solve_cases(study.solve(), cases)
     figures["study_medians"] = results.statistics[:, :, MEDIAN].ravel()
     timing = Timing(table)
     for drive_mode in DRIVE_MODES:

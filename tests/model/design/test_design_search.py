@@ -7,6 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from dense_contrast import GAINS, dense_score
 from model.design import search as search_module
 from model.design.area import Edge, Within, area_of, candidates_of, everywhere
 from model.design.contacts import ContactRule, anywhere
@@ -16,14 +17,9 @@ from model.design.score import Scorer
 from model.design.search import DesignProblem, LayoutSearch
 from model.design.support import SupportRule, static_loads
 from model.errors import InputError
-from model.finger.disc import FIVE_POINTS
-from model.finger.fingertip import fingertips_on
 from model.rig.file import example_rig_path, load_rig
-from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era
-from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 
-GAINS = Uncertainty(0.05, 5.0, 0.0, 0.0, 1.0, 0.0)
 FREQUENCIES = np.array([90.0, 170.0, 260.0])
 
 
@@ -31,45 +27,6 @@ FREQUENCIES = np.array([90.0, 170.0, 260.0])
 def rig():
     """The paper's plate."""
     return load_rig(example_rig_path())
-
-
-def dense_score(rig, places, sets, frequencies):
-    """Mean score [dB] by the definition: one dense system for each set, frequency and finger.
-
-    With errors of the gains only; the best weights are an eigenvector.
-    """
-    from model.reduction.free_plate import solve_free_plate
-
-    plate = rig.plate
-    free = solve_free_plate(plate, rig.mesh, frequency_max=float(frequencies.max()))
-    eras = [replace(rig.eras[0], name=str(n), x=x, y=y) for n, (x, y) in enumerate(places)]
-    omega = 2 * np.pi * frequencies
-    z, force = attached_stiffness(eras, (), omega), drive_forces(eras, omega)
-    tip = rig.fingertip.dynamic_stiffness(omega)
-    sigma2, found = rig.uncertainty.gain_variance, []
-    for contacts in sets:
-        best = []
-        tips, weights = fingertips_on(
-            contacts, length=plate.length, width=plate.width, rule=FIVE_POINTS
-        )
-        for row in range(len(frequencies)):
-            fields = []
-            for finger, points in zip(contacts, tips, strict=True):
-                at = np.vstack([places, finger])
-                between, to = free.receptances(at, points, frequencies[row : row + 1])
-                stiffness = np.diag([*z[row], tip[row]])
-                applied = np.vstack([np.diag(force[row]), np.zeros(len(places))])
-                forces = np.linalg.solve(np.eye(len(at)) + stiffness @ between[0], applied)
-                fields.append(-(omega[row] ** 2) * to[0].T @ forces)
-            target = weights[0] @ fields[0]
-            quiet = np.sqrt(weights[1])[:, None] * fields[1]
-            R = quiet.conj().T @ quiet
-            R += sigma2 * np.diag((np.abs(quiet) ** 2).sum(axis=0))
-            # Largest |h w|² / w^H R w is the one eigenvalue of R^-1 h* h^T.
-            values = np.linalg.eigvals(np.linalg.solve(R, np.outer(target.conj(), target)))
-            best.append(10 * np.log10(np.abs(values).max()))
-        found.append(max(best))
-    return float(np.mean(found))
 
 
 def test_search_finds_the_best_of_all_layouts_on_a_coarse_raster(monkeypatch) -> None:

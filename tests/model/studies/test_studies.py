@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from model.design.contacts import anywhere
 from model.errors import InputError
 from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
+from model.files.kept_arrays import keep_arrays
 from model.structure.actuator import Era
 from model.structure.point_load import PointLoad
 from model.studies import solve
 from model.studies.finished import FinishedCases
-from model.studies.kinds import count_cases, placement_cases, stiffness_cases
-from model.studies.outcome import ranking_summary
-from model.studies.ranking import check_supported_cases, era_counts, rank
+from model.studies.kinds import count_cases, placement_cases
 from model.studies.run import CHUNK, run_study
 from model.studies.solve import DRIVES, CaseResults, solve_cases, study_problem
 from model.studies.workers import on_processes, useful_processes
@@ -36,7 +36,7 @@ def study():
 def results(study):
     """All cases solved in this process, without a cache."""
     problem, cases = study
-    return solve_cases(problem.solve(), problem.rig.eras, cases)
+    return solve_cases(problem.solve(), cases)
 
 
 def median_peak(acceleration, active):
@@ -87,10 +87,10 @@ def test_acceleration_of_unequal_eras_equals_the_direct_solve():
     )
     rig = replace(paper, eras=eras)
     cases = placement_cases(rig, layouts=12, seed=0, raster=(7, 5))
-    problem = study_problem(rig, cases, FREQUENCIES)
+    problem = study_problem(rig, cases, FREQUENCIES, contacts=anywhere(rig.plate))
     placed = cases.eras_of(9, eras)
     direct = direct_acceleration(assemble(rig.plate, rig.mesh), placed, FREQUENCIES, problem.points)
-    fast = problem.solve().acceleration(cases.places_of(9), placed)
+    fast = problem.solve().receptances.acceleration(cases.places_of(9), placed)
     np.testing.assert_allclose(fast, direct, rtol=1e-4, atol=1e-4 * np.abs(direct).max())
 
 
@@ -108,9 +108,9 @@ def test_statistics_include_point_masses(study):
     problem, cases = study
     mass = PointLoad(0.1, 0.08, mass=0.05)
     loaded = replace(problem.rig, masses=(mass,))
-    carried = study_problem(loaded, cases, FREQUENCIES)
+    carried = study_problem(loaded, cases, FREQUENCIES, contacts=anywhere(loaded.plate))
     assert carried.digest != problem.digest
-    solved = solve_cases(carried.solve(), loaded.eras, cases.take(range(8, 9)))
+    solved = solve_cases(carried.solve(), cases.take(range(8, 9)))
     direct = direct_acceleration(
         assemble(loaded.plate, loaded.mesh),
         cases.eras_of(8, loaded.eras),
@@ -126,14 +126,13 @@ def test_pairs_are_skipped_for_one_era_and_all_for_two():
     """A lone ERA has no pair; of two ERAs the pair is all."""
     rig = make_paper_rig(12, 9)
     cases = count_cases(rig, layouts=6, seed=0, raster=(7, 5))
-    problem = study_problem(rig, cases, FREQUENCIES)
-    results = solve_cases(problem.solve(), rig.eras, cases)
+    problem = study_problem(rig, cases, FREQUENCIES, contacts=anywhere(rig.plate))
+    results = solve_cases(problem.solve(), cases)
     by_drive = dict(zip(DRIVES, results.statistics.transpose(1, 0, 2), strict=True))
     assert np.isnan(by_drive["2"][0]).all()
     np.testing.assert_array_equal(by_drive["all"][0], by_drive["1"][0])
     np.testing.assert_array_equal(by_drive["all"][1], by_drive["2"][1])
-    pairs = rank(problem.rig, cases, results, drive=DRIVES.index("2"))
-    assert sorted(era_counts(cases)[pairs.order]) == [2, 3, 4, 5, 6]
+    assert np.isfinite(results.statistics[1:, DRIVES.index("2")]).all()
 
 
 def test_run_study_orders_chunks_and_counts_progress(study, results, tmp_path):
@@ -205,11 +204,13 @@ def test_finished_cases_ignore_and_log_a_damaged_file(study, results, tmp_path, 
 @pytest.mark.parametrize(
     "change",
     [
+        {"lowest": 21.0},
+        {"sets": (np.array([[0.1, 0.1], [0.2, 0.1]]),)},
         {"frequencies": np.array([60.0, 110.0, 170.0, 251.0])},
         {"rig": make_paper_rig(14, 9)},
         {"rig": make_paper_rig(12, 9, damping_ratio=0.06)},
     ],
-    ids=["frequencies", "mesh", "ERAs"],
+    ids=["lowest mode", "contact sets", "frequencies", "mesh", "ERAs"],
 )
 def test_finished_cases_of_another_problem_are_not_used(
     study, results, tmp_path, monkeypatch, change
@@ -228,12 +229,25 @@ def test_finished_cases_of_another_problem_are_not_used(
     assert not FinishedCases(tmp_path, other).find(cases)[0].any()
 
 
+def test_finished_cases_of_a_version_without_contrast_are_refused(tmp_path):
+    """A folder with statistics only is named once, whatever the problem; damage is passed over."""
+    rows = {"cases": np.zeros((1, 16), dtype=np.uint8), "statistics": np.ones((1, 3, 6))}
+    path = tmp_path / "finished-0123456789abcdef.npz"
+    keep_arrays(path, "a", rows | {"active": np.zeros((1, 3), dtype=np.uint64)})
+    with pytest.raises(InputError, match=path.name):
+        FinishedCases(tmp_path, "b" * 64)
+    path.write_bytes(b"PK")
+    FinishedCases(tmp_path, "b" * 64)
+
+
 def test_finished_cases_are_found_by_layout_and_stiffness(study, results, tmp_path):
     """The same layouts of a longer list are found again, others or stiffer ones are not."""
     problem, cases = study
     first = cases.take(range(4))
     finished = FinishedCases(tmp_path, problem.digest)
-    finished.add(first, CaseResults(results.statistics[:4], results.active[:4]))
+    finished.add(
+        first, CaseResults(results.expected_db[:4], results.statistics[:4], results.active[:4])
+    )
     longer = placement_cases(problem.rig, layouts=900, seed=0, raster=(7, 5))
     done, found = finished.find(longer.take(range(1, 6)))
     assert done.tolist() == [True, True, True, False, False]
@@ -258,78 +272,20 @@ def test_on_processes_replaces_workers_that_die(study, results, caplog):
     assert "died" in caplog.text
 
 
-def test_rank_orders_by_median(study, results):
-    """The best is first, the worst last, and the rig has its place between."""
-    problem, cases = study
-    ranking = rank(problem.rig, cases, results, drive=DRIVES.index("2"))
-    medians = results.statistics[:, 1, MEDIAN]
-    assert ranking.best == medians.argmax()
-    assert ranking.worst == medians.argmin()
-    assert medians[ranking.middle] == pytest.approx(np.median(medians), rel=0.01)
-    assert ranking.own == 0
-    assert ranking.recommended == ranking.best
-
-
-def test_ranking_summary_includes_the_own_rig(study):
-    """Ten cases are listed and, where it is not among them, the rig's own with its rank."""
-    problem, cases = study
-    part = cases.take(range(0, 30))
-    statistics = np.ones((30, 3, 6))
-    statistics[:, 1, MEDIAN] = np.arange(30)  # the first one, the rig's, comes last
-    results = CaseResults(statistics, np.ones((30, 3), dtype=np.uint64))
-    cases = ranking_summary(problem.rig, rank(problem.rig, part, results, drive=1))["ranking"]
-    assert [case["rank"] for case in cases] == [*range(1, 11), 30]
-    assert cases[-1]["layout"] == "own"
-
-
-def test_rank_marks_unsupported_layouts_and_recommends_a_supported_one() -> None:
-    """One or two ERAs are ranked, and the best layout of three or more is recommended."""
-    rig = make_paper_rig(12, 9)
-    cases = count_cases(rig, layouts=6, seed=0, raster=(7, 5))
-    statistics = np.zeros((6, 3, 6))
-    statistics[:, 1, MEDIAN] = [6, 5, 4, 3, 2, 1]
-    results = CaseResults(statistics, np.zeros((6, 3), dtype=np.uint64))
-    ranking = rank(rig, cases, results, drive=1)
-    assert not ranking.supported[:2].any()
-    assert ranking.supported[3]
-    assert ranking.best == 0
-    assert ranking.supported[ranking.recommended]
-    summary = ranking_summary(rig, ranking)
-    assert [case["supported"] for case in summary["ranking"]] == ranking.supported.tolist()
-
-
-def test_check_supported_cases_refuses_a_study_without_any() -> None:
-    """One and two ERAs tip over; with a case of three the study has something to recommend."""
-    rig = make_paper_rig(12, 9)
-    cases = count_cases(rig, layouts=6, seed=0, raster=(7, 5))
-    check_supported_cases(rig, cases)
-    with pytest.raises(InputError):
-        check_supported_cases(rig, cases.take(range(0, 2)))
-
-
-def test_rank_recommends_the_softest_of_nearly_equal_eras():
-    """Among those within a tenth of the best median the fewest ERAs, then the softest, count."""
-    rig = make_paper_rig(12, 9)
-    cases = stiffness_cases(rig, layouts=1, seed=0, raster=(7, 5))
-    statistics = np.zeros((9, 3, 6))
-    statistics[:, 1, MEDIAN] = [1, 2, 3, 8, 9.1, 9.5, 10, 9.9, 9.8]
-    results = CaseResults(statistics, np.zeros((9, 3), dtype=np.uint64))
-    ranking = rank(rig, cases, results, drive=1)
-    assert (ranking.best, ranking.recommended) == (6, 4)
-    assert ranking.best_by(cases.stiffness_factors) == {2.0**k: k + 4 for k in range(-4, 5)}
-
-
 @pytest.mark.parametrize("frequencies", [[], [0.0], [-60.0], [np.nan], [60.0, 5000.0]])
 def test_study_problem_refuses_invalid_frequencies(study, frequencies):
     """No frequency, zero, NaN, and more than the mesh carries are refused."""
     problem, cases = study
     with pytest.raises(InputError, match=r"frequenc|Hz"):
-        study_problem(problem.rig, cases, np.array(frequencies))
+        study_problem(
+            problem.rig, cases, np.array(frequencies), contacts=anywhere(problem.rig.plate)
+        )
 
 
 def test_study_problem_too_large_for_memory_is_refused(study):
     """3600 places at 27 frequencies: 27 x 3600 x (3600 + 432) complex numbers are 6.3 GB."""
     problem, _ = study
     cases = placement_cases(problem.rig, layouts=10, seed=0, raster=(60, 60))
+    frequencies = np.arange(60.0, 321.0, 10.0)
     with pytest.raises(InputError, match=r"6\.3 GB; take fewer --candidates"):
-        study_problem(problem.rig, cases, np.arange(60.0, 321.0, 10.0)).solve()
+        replace(problem, positions=cases.positions, frequencies=frequencies).solve()

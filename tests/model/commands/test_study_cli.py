@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -15,6 +16,7 @@ from model.config.editing import data_text
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.studies import finalists, solve
+from model.table import table
 
 RUNNER = CliRunner()
 RIG = str(example_rig_path())
@@ -25,7 +27,8 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 @pytest.fixture(autouse=True)
 def few_sets(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Contrast of few contact sets."""
+    """Contrast of few contact sets and frequencies."""
+    monkeypatch.setattr(table, "DEFAULT_FREQUENCIES", np.array([60.0, 110.0, 180.0, 250.0]))
     monkeypatch.setattr(finalists, "JUDGED_SETS", 3)
     monkeypatch.setattr(solve, "SEARCH_FINGERS", 6)
 

@@ -125,16 +125,17 @@ def test_study_orders_layouts_as_an_independent_optimiser_does(rig, monkeypatch)
     assert evenly > both > corners + 4
 
 
-def test_support_of_cases_is_that_of_a_design(rig) -> None:
-    """Layouts of one to six ERAs, soft ones too, are supported where a design says so."""
-    soft = replace(rig, eras=tuple(replace(era, stiffness=1500.0) for era in rig.eras))
-    cases = count_cases(soft, layouts=60, seed=3, raster=(7, 5))
-    found = support_of(soft, cases, lowest=25.0)
-    rule = SupportRule(soft, 25.0)
-    shortfalls = [rule.shortfall(cases.eras_of(case, soft.eras)) for case in range(len(cases))]
+@pytest.mark.parametrize(("stiffness", "lowest"), [(1500.0, 25.0), (17000.0, 5.0)])
+def test_support_of_cases_is_that_of_a_design(rig, stiffness, lowest) -> None:
+    """Layouts of one to six ERAs, soft and stiff, are supported where a design says so."""
+    some = replace(rig, eras=tuple(replace(era, stiffness=stiffness) for era in rig.eras))
+    cases = count_cases(some, layouts=60, seed=3, raster=(7, 5))
+    found = support_of(some, cases, lowest=lowest)
+    rule = SupportRule(some, lowest)
+    shortfalls = [rule.shortfall(cases.eras_of(case, some.eras)) for case in range(len(cases))]
     assert found.is_supported.tolist() == [each == 0 for each in shortfalls]
     problems = {found.problem(case) for case in range(len(cases))}
-    assert {None, "tips over"} < problems
+    assert {None, "tips over"} <= problems
 
 
 def test_check_supported_cases_refuses_a_study_without_any(rig) -> None:

@@ -27,9 +27,11 @@ firmware-test: .venv/installed-test
 	.ci/install gcc-arm-none-eabi:arm-none-eabi-gcc libnewlib-arm-none-eabi: qemu-system-arm:qemu-system-arm
 	$(BIN)/python firmware/test/run.py $(FIRMWARE)
 
-# What needs the processors; what plays in real time; what loads the processors itself.
+# What needs the processors, which a third of the time waits for processes: one worker more than
+# there are; what plays in real time; what loads the processors itself.
+WORKERS = $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
 test: .venv/installed-test
-	$(BIN)/pytest -m 'not real_time and not alone and not long' --numprocesses auto --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest -m 'not real_time and not alone and not long' --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 	$(BIN)/pytest -m 'real_time and not alone and not long' --numprocesses 3 --dist loadfile --no-loadscope-reorder
 	$(BIN)/pytest -m 'alone and not long'
 

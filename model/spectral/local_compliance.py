@@ -50,7 +50,9 @@ _DIRECTIONS = (np.arange(32) + 0.5) * np.pi / 64
 _COS2, _SIN2 = np.cos(_DIRECTIONS) ** 2, np.sin(_DIRECTIONS) ** 2
 _UNCERTAIN = 0.2  # share by which it may be higher: twice its error, for the estimate of errors
 _ON_FOOT = 0.5  # least share of a point's that is taken for a disc, which an edge may cut
-_FAR = 12.0  # k d beyond which forces share no unresolved wave
+# k d beyond which forces share no unresolved wave: the fourth zero of `_decay`. What they share
+# fades towards it, since a field that ends in a step or a kink cannot be interpolated.
+_FAR = 13.603179753989906
 
 # Gauss points of ln t, t = 1 to 100, for integrals over dt / t: footprints leave little beyond.
 _POINTS, _WEIGHTS = leggauss(48)
@@ -102,6 +104,7 @@ def compliance_between(plate: Plate, own: Unresolved, other: Unresolved) -> Floa
         share, decades = _on_discs(*footprints)
         decade = np.sqrt(own.decade[i] * other.decade[j])[on_discs]
         result[i[on_discs], j[on_discs]] = bending[on_discs] * share + decade * decades
+    result[i, j] *= 1 - (k * d / _FAR) ** 4
     return result
 
 

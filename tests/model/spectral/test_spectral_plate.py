@@ -141,6 +141,20 @@ def test_modes_are_those_of_a_full_eigen_solution(plate, degrees, frequency):
     np.testing.assert_allclose(found, np.sort(expected[expected < frequency]), rtol=1e-5, atol=0.1)
 
 
+def test_local_compliance_is_smooth_over_the_plate():
+    """Along a line from a force over the whole plate a step of 1 mm changes no slope by much.
+
+    The field of a force is continuous but at the force: a term that ended in a step failed the
+    verification of tables, whose raster interpolates it.
+    """
+    plate = Plate(1.2, 0.8, 0.004, GLASS)
+    at = np.array([[0.45, 0.1]])
+    line = at + np.outer(np.arange(0.01, 0.7, 0.001), [1.0, 0.3])
+    found = local_compliance(plate, (19, 15), at, line)[0]
+    bend = np.abs(np.diff(found, 2))
+    assert bend[15:].max() < 2e-3 * local_compliance(plate, (19, 15), at, at)[0, 0]
+
+
 def test_static_vectors_carry_the_local_compliance():
     """Pushed slowly at an ERA, a reduced plate moves there by the plate's whole receptance."""
     mesh = SpectralMesh(12, 9, PAPER.length, PAPER.width)

@@ -2,7 +2,7 @@
 
 import json
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +19,9 @@ from model.commands.options import (
 )
 
 if TYPE_CHECKING:
+    from model.config.document import Value
     from model.config.units import Dimension
+    from model.rig.uncertainty import Uncertainty
 
 MAX_STIFFNESSES = 8
 
@@ -48,6 +50,13 @@ def design(
         str, typer.Option(metavar="LENGTH", help="Least distance of two ERAs.")
     ] = "30 mm",
     lowest: LowestOption = 20.0,
+    uncertainty: Annotated[
+        str,
+        typer.Option(
+            metavar="KEY=VALUE,...",
+            help="Parameters of the rig's uncertainty, e.g. gain=0.01,phase_deg=1; default: rig.",
+        ),
+    ] = "",
     stiffness: Annotated[
         str,
         typer.Option(
@@ -93,6 +102,11 @@ def design(
         raise InputError("only one of --workers and --cluster can be given")
     document = read_document(rig_file)
     rig = rig_of(document, mesh=mesh)
+    if uncertainty:
+        document = replace(
+            document, data={**document.data, "uncertainty": _changed(rig.uncertainty, uncertainty)}
+        )
+        rig = rig_of(document, mesh=mesh)
     kept = tuple(name.strip() for name in keep.split(",") if name.strip())
     own = [era.name for era in rig.eras]
     for name in kept:
@@ -154,6 +168,21 @@ def design(
     print(
         next_line("era", "table", "build", files[0], "-o", output / "table.npz", "--mode", "phased")
     )
+
+
+def _changed(before: "Uncertainty", text: str) -> dict[str, "Value"]:
+    """The section of an uncertainty in which KEY=VALUE,... are replaced."""
+    from model.errors import InputError
+
+    section: dict[str, Value] = asdict(before)
+    for each in text.split(","):
+        key, equals, value = each.partition("=")
+        if not equals or key.strip() not in section:
+            raise InputError(
+                f"--uncertainty must be KEY=VALUE,... of {', '.join(section)}, got {text[:80]!r}"
+            )
+        section[key.strip()] = value.strip()
+    return section
 
 
 def _quantity(text: str, dimension: "Dimension", option: str) -> float:

@@ -13,6 +13,7 @@ from model.config.document import read_document
 from model.design import run, search
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
+from model.rig.uncertainty import Uncertainty
 
 RIG = str(example_rig_path())
 
@@ -73,6 +74,19 @@ def test_the_best_of_several_stiffnesses_is_written(small, tmp_path: Path) -> No
         era.name: best for era in rig.eras if era.name != "NE"
     }
     assert rig.era("NE").stiffness == load_rig(RIG).era("NE").stiffness
+
+
+def test_a_design_for_better_drives_says_so_in_its_rig(small, tmp_path: Path) -> None:
+    """Drives good to 1 %, all else as in the rig's file; more contrast than without."""
+    arguments = ("--eras", "4", "--starts", "1", "--json", "-o")
+    usual = design(*arguments, str(tmp_path / "usual"))
+    known = "gain=0.01, phase_deg=1, thickness=0.1 %, damping=1.05, fingertip=0.1"
+    better = design(*arguments, str(tmp_path / "better"), "--uncertainty", known)
+    assert better.exit_code == 0, better.output
+    rig = load_rig(tmp_path / "better" / "rig.yaml")
+    assert rig.uncertainty == Uncertainty(0.01, 1.0, 0.001, 0.1, 1.05, 0.1)
+    means = [json.loads(each.stdout)["contrast_db"]["mean"] for each in (usual, better)]
+    assert means[1] > means[0] + 3
 
 
 def test_eras_that_buy_too_little_are_left_out(small, tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ firmware-test: .venv/installed-test
 WORKERS = $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
 test: .venv/installed-test
 	$(BIN)/pytest -m 'not real_time and not alone and not long' --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
-	$(BIN)/pytest -m 'real_time and not alone and not long' --numprocesses 3 --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest -m 'real_time and not alone and not long' --numprocesses 2 --dist loadfile --no-loadscope-reorder
 	$(BIN)/pytest -m 'alone and not long'
 
 # Whole programmes of which `make test` has a short form: every command of the pages typed from an

@@ -10,6 +10,7 @@ import typer
 
 from model.commands.next_line import next_line
 from model.commands.options import (
+    ClusterOption,
     ContactsOption,
     FolderOption,
     JsonOption,
@@ -75,10 +76,7 @@ def design(
     workers: Annotated[
         int | None, typer.Option(min=1, max=256, help="Local processes; default: 2.")
     ] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler."),
-    ] = None,
+    cluster: ClusterOption = None,
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -27,6 +27,9 @@ ContactsOption = Annotated[
 LowestOption = Annotated[
     float, typer.Option(min=1.0, help="Least rigid-body frequency of the plate in Hz.")
 ]
+ClusterOption = Annotated[
+    str | None, typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler.")
+]
 ExactOption = Annotated[
     bool, typer.Option("--exact", help="Simulate the rig's own plate, with no deviation.")
 ]

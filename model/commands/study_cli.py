@@ -9,6 +9,7 @@ import typer
 
 from model.commands.next_line import next_line
 from model.commands.options import (
+    ClusterOption,
     ContactsOption,
     FolderOption,
     JsonOption,
@@ -68,10 +69,7 @@ def study(
     ] = "13x13",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random layouts.")] = 0,
     workers: Annotated[int, typer.Option(min=1, max=256, help="Local processes, at most.")] = 1,
-    cluster: Annotated[
-        str | None,
-        typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler."),
-    ] = None,
+    cluster: ClusterOption = None,
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -14,9 +14,13 @@ from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.conformance import CHECKS, Check, Result, raw_line, run_check
 from drivers.protocol.messages import AmplifierState, Apply, LoadEnvelope, Stage
 from drivers.registry import open_backend
+from long_form import shortly
 from wires import PROCESS_WIRES, patient
 
 PAPER_PLATE = Path(drivers.__file__).parent.parent / "examples" / "paper_plate.yaml"
+SHORT_WIRES = ("sim", "serial", "modbus+tcp", "can+socketcand")
+"""The others pass in `make test` in virtual time (test_sound_amplifiers.py)."""
+
 REPLY_TIMEOUT = 2.0  # s; on a busy machine a far end may be late, and is not wrong for it
 
 
@@ -30,7 +34,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(scope="module", params=["sim", *PROCESS_WIRES])
+@pytest.fixture(scope="module", params=shortly(["sim", *PROCESS_WIRES], SHORT_WIRES))
 def url(request: pytest.FixtureRequest, rig: Path) -> Iterator[str]:
     """An amplifier of the paper's rig behind each kind of wire, as a process where it has one."""
     if request.param == "sim":

@@ -32,8 +32,9 @@ from soak_plan import (
     TouchSequence,
 )
 
-SEEDS = (1, 61, 65, 168, 248, *range(2, 9))
-"""The first five have every fault, wire, gesture and operator action; `make soak` has thousands."""
+SEEDS = (1, 61, 65, 168, 248, 8)
+"""The first five have every fault, wire, gesture and operator action, in the last a touch must be
+felt; `make soak` has thousands."""
 SOAK = Path(__file__).parent / "support" / "soak.py"
 
 
@@ -48,7 +49,7 @@ def test_soak_short_seeds_break_no_rule() -> None:
     assert broken == {}
     assert all(totals[f"fault {fault}"] for fault in (*FRAME_FAULTS, *AMPLIFIER_FAULTS))
     assert all(totals[f"on {kind}"] for kind in KINDS)
-    assert totals["patterns"] > 10 * len(SEEDS)
+    assert totals["patterns"] > 5 * len(SEEDS)
     assert totals["touches that must be felt"]
     assert totals["links lost"]
 
@@ -58,6 +59,7 @@ def digests() -> dict[str, str]:
     return {wire: run_plan(held(wire=wire)).digest for wire in ("serial", "slcan")}
 
 
+@pytest.mark.long
 def test_soak_trace_is_the_same_in_every_process() -> None:
     """Neither hash seeds nor earlier runs change a byte of it; another seed does."""
     here = digests()

@@ -24,7 +24,7 @@ def _unlogged() -> Iterator[None]:
 def test_stop_is_true_while_frames_are_lost_late_and_doubled() -> None:
     """On every wire and in every scene: what is confirmed silent is silent, and stays so."""
     tally = Tally()
-    disturbed_stops(range(8 * len(WIRES)), tally=tally)
+    disturbed_stops(range(4 * len(WIRES)), tally=tally)
     assert tally.found == []
     for wire in WIRES:
         assert tally.counts[wire, "confirmed_silent"] > tally.counts[wire, "stops"] / 4
@@ -37,7 +37,7 @@ def test_stop_is_true_while_frames_are_lost_late_and_doubled() -> None:
 def test_stop_is_true_with_an_exception_on_its_way() -> None:
     """Raised at any line of drivers or controller that runs while all is being stopped."""
     tally = Tally()
-    stops_with_exceptions(range(6 * len(WIRES)), tally=tally)
+    stops_with_exceptions(range(4 * len(WIRES)), tally=tally)
     assert tally.found == []
     assert tally.total("confirmed_silent") > tally.total("stops") / 4
 
@@ -45,7 +45,7 @@ def test_stop_is_true_with_an_exception_on_its_way() -> None:
 def test_amp_stop_is_true_after_a_killed_host() -> None:
     """`era amp stop` with a faulty wire, for amplifiers that a killed host has left playing."""
     tally = Tally()
-    stops_by_command(range(4 * len(WIRES)), tally=tally)
+    stops_by_command(range(2 * len(WIRES)), tally=tally)
     assert tally.found == []
     assert tally.total("confirmed_silent") > tally.total("stops") / 3
 

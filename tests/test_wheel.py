@@ -98,6 +98,7 @@ def test_entry_points_lead_into_the_wheel(wheel: Path) -> None:
     ] == []
 
 
+@pytest.mark.long
 def test_sdist_makes_the_same_wheel(wheel: Path, sdist: Path, tmp_path: Path) -> None:
     """Byte for byte, so a distribution's build equals the published one."""
     with tarfile.open(sdist) as archive:
@@ -108,6 +109,7 @@ def test_sdist_makes_the_same_wheel(wheel: Path, sdist: Path, tmp_path: Path) ->
     assert again.read_bytes() == wheel.read_bytes()
 
 
+@pytest.mark.long
 def test_wheel_of_a_platform_brings_its_engine(wheel: Path, tmp_path: Path) -> None:
     """It is tagged for the platform; its engine is loaded where there is no compiler."""
     ours = build("wheel", ROOT, tmp_path, ERA_HAPTICS_ENGINE="1")

@@ -34,15 +34,17 @@ def project_gains(
     without values is NaN.
     """
     values = np.where(weight > 0, values, 0)
-    inner = (weight**2 * model.conj() * values).sum(axis=-1)
-    power = (np.abs(weight * model) ** 2).sum(axis=-1)
+    squares = weight**2
+    inner = np.einsum("...s,...s->...", model, squares * values.conj()).conj()
+    power = np.einsum("...s,...s->...", model.real**2 + model.imag**2, squares)
     if expected is None:
         gains = np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan)
     else:
         expected = expected[..., None, :]
         precision = 1 / (tolerance * expected) ** 2
-        magnitude = (np.abs(inner) + precision * expected) / (power + precision)
-        gains = magnitude * np.exp(1j * np.angle(inner))
+        size = np.abs(inner)
+        magnitude = (size + precision * expected) / (power + precision)
+        gains = magnitude * np.where(size > 0, inner / np.where(size > 0, size, 1), 1)
     residual = weight * (values - np.nan_to_num(gains)[..., None] * model)
     return gains, residual
 

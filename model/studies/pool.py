@@ -1,7 +1,7 @@
 """Pool of distinct layouts for a study: the rig's own, named ones, random ones on a raster."""
 
 import math
-from itertools import combinations, permutations
+from itertools import combinations, islice, permutations
 
 import numpy as np
 
@@ -22,6 +22,7 @@ class LayoutPool:
 
     def __init__(self, rig: Rig, raster: tuple[int, int]) -> None:
         self._rig = rig
+        self._in_order = not all_alike(rig.eras)
         plate = rig.plate
         self._candidates = candidate_places(*raster) * [plate.length, plate.width]
         self._positions = [tuple(position) for position in self._candidates.tolist()]
@@ -41,8 +42,8 @@ class LayoutPool:
             numbers = tuple(self._number(position) for position in positions)
             known.setdefault(self._key(numbers), (name, numbers))
         drawn = self._draw(era_count, wanted, rng)
-        extra = [row for row in drawn if self._key(tuple(row.tolist())) not in known]
-        extra = extra[: wanted - len(known)]
+        new = (row for row in drawn if self._key(tuple(row.tolist())) not in known)
+        extra = list(islice(new, wanted - len(known)))
         self._names += [name for name, _ in known.values()]
         self._names += [f"{era_count}-{number:06d}" for number in range(1, len(extra) + 1)]
         self._places += [np.array(numbers, dtype=np.int32) for _, numbers in known.values()]
@@ -67,12 +68,12 @@ class LayoutPool:
 
     def _key(self, numbers: tuple[int, ...]) -> tuple[int, ...]:
         """Identity of a layout: equal ERAs may change places."""
-        return tuple(sorted(numbers)) if all_alike(self._rig.eras) else numbers
+        return numbers if self._in_order else tuple(sorted(numbers))
 
     def _draw(self, era_count: int, wanted: int, rng: np.random.Generator) -> list[Numbers]:
         """Distinct random layouts, at least as many as wanted unless there are fewer."""
         count = len(self._candidates)
-        in_order = not all_alike(self._rig.eras)
+        in_order = self._in_order
         possible = math.perm(count, era_count) if in_order else math.comb(count, era_count)
         if possible <= _MAX_ENUMERATED:
             choose = permutations if in_order else combinations

@@ -75,8 +75,12 @@ class TableProblem:
     @property
     def reference_mesh(self) -> PlateMesh:
         """Finer mesh for the discretisation error."""
-        highest = self.rig.limits.frequency_max
-        return finer_mesh(self.rig.plate, self.rig.mesh, frequency_max=highest)
+        return finer_mesh(
+            self.rig.plate,
+            self.rig.mesh,
+            frequency_max=self.rig.limits.frequency_max,
+            stiffness=max(era.stiffness for era in self.rig.eras),
+        )
 
     @cached_property
     def digest(self) -> str:

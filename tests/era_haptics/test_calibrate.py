@@ -28,6 +28,7 @@ def test_calibrate_refuses_what_is_no_rig() -> None:
         era.calibrate("rig.yaml", MEASURED)  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 def test_calibrate_finds_the_values_of_the_example() -> None:
     """Loss factor 0.013 and SW at 19.04 kN/m, as examples/make_measured.py has them."""
     found = era.calibrate(era.load_rig(era.example_rig_path()), MEASURED)

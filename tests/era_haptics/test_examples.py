@@ -88,6 +88,7 @@ def test_hmi_engineer_example_feels_what_was_predicted() -> None:
     assert "daemon ended with status 0" in said
 
 
+@pytest.mark.long
 def test_amplifier_vendor_example_passes_reading_checks() -> None:
     """Its frame is that of the wire page, it gets a reply, and no check fails."""
     said = run("amplifier_vendor.py")

@@ -53,8 +53,8 @@ def test_unknown_name_lists_the_known_ones() -> None:
     [
         ("Client", "scipy matplotlib sim pymodbus"),
         ("load_rig", "matplotlib sim controller"),
-        ("SolvedPlate", "matplotlib controller"),
-        ("draw_map", "matplotlib.pyplot"),
+        pytest.param("SolvedPlate", "matplotlib controller", marks=pytest.mark.long),
+        pytest.param("draw_map", "matplotlib.pyplot", marks=pytest.mark.long),
         ("plugins.backends", "model controller sim numpy scipy pymodbus can serial"),
         ("plugins.touch_sources", "sim numpy scipy matplotlib pythonosc"),
         ("plugins.effects", "sim scipy matplotlib drivers.backend"),

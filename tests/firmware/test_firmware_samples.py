@@ -81,6 +81,7 @@ def square_law(replaying: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return build_firmware(folder, "era-replay", "CFLAGS=-O2 -DSQUARE_LAW=1")
 
 
+@pytest.mark.long
 def test_square_of_voltages_is_the_summed_force(replaying: Path, square_law: Path) -> None:
     """With the square law two tones that cross-fade have neither harmonics nor beats.
 
@@ -107,6 +108,7 @@ def test_square_of_voltages_is_the_summed_force(replaying: Path, square_law: Pat
     ],
     ids=["disarmed", "stopped", "fault"],
 )
+@pytest.mark.long
 def test_bias_is_there_only_under_high_voltage(
     square_law: Path, watchdog_ms: int, last: tuple[int, bytes]
 ) -> None:

@@ -64,12 +64,22 @@ THICKER = (("thickness: 1.5 mm", "thickness: 2 mm"),)
         ((), "modbus-rtu", ["WIRING WELL"]),
         (
             SWAPPED,
-            "socketcand",
+            "modbus-tcp",
             ["SWAPPED: channel 0 of amplifier main (ERA SW in the rig) drives "],
         ),
-        (DEAD, "modbus-tcp", ["DEAD: channel 1 of amplifier main (ERA SE in the rig)"]),
+        pytest.param(
+            DEAD,
+            "socketcand",
+            ["DEAD: channel 1 of amplifier main (ERA SE in the rig)"],
+            marks=pytest.mark.long,
+        ),
         (INVERTED, "serial", ["INVERTED: channel 2 of amplifier main (ERA NE in the rig)"]),
-        (THICKER, "serial", ["PLATE: the rig does not match", "  plate.thickness "]),
+        pytest.param(
+            THICKER,
+            "serial",
+            ["PLATE: the rig does not match", "  plate.thickness "],
+            marks=pytest.mark.long,
+        ),
     ],
 )
 async def test_each_fault_is_detected_and_named(

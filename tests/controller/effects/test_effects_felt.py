@@ -16,6 +16,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.ramp import Ramp
 from controller.effects.region import Region
 from controller.effects.shapes import Circle, Rectangle
+from long_form import in_turn, shortly
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from paper_table import smooth_rig
@@ -95,8 +96,7 @@ def test_notches_of_a_slider_are_alike(band: tuple[float, float], played: set[fl
     assert levels == pytest.approx([18.0] * 10, abs=2.0)
 
 
-@pytest.mark.parametrize("wire", WIRES)
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(("name", "wire"), in_turn(CASES, [*WIRES]))
 def test_effect_is_felt_as_promised_and_alike_at_every_press(name: str, wire: str) -> None:
     """Within 3 dB of what layout and report promise, all presses within 2 dB, on the plate."""
     case = CASES[name]
@@ -108,7 +108,7 @@ def test_effect_is_felt_as_promised_and_alike_at_every_press(name: str, wire: st
     assert max(levels) - min(levels) <= 2.0
 
 
-@pytest.mark.parametrize("wire", WIRES)
+@pytest.mark.parametrize("wire", shortly(WIRES, ["serial"]))
 def test_no_effect_starts_more_than_10_ms_later_than_along_a_plain_ramp(wire: str) -> None:
     """The slowest press by default, against the slowest without shaped onsets."""
     shaped = pressed(CASES["buzz"], wire)

@@ -97,8 +97,12 @@ def answers() -> Answers:
     return Answers(table.fingerprint, replace(table), is_complete=False)
 
 
-READY = Ready(0.2, "", "", None, answers(), has_changed=False)
 QUIET = Estimate(0.0, alarm=False, is_held=False, explanation="", has_changed=False, answers=None)
+
+
+def ready() -> Ready:
+    """Of an estimator that knows the plate."""
+    return Ready(0.2, "", "", None, answers(), has_changed=False)
 
 
 async def opened(folder: Path) -> tuple[Learning, Taking]:
@@ -123,7 +127,7 @@ async def test_plate_that_had_changed_stays_so_over_a_restart(
 ) -> None:
     """Ready with the flag: changed and robust, until an estimate says that it is as it was."""
     learning, _ = await opened(tmp_path)
-    estimators.reply(replace(READY, answers=answers(), has_changed=True))
+    estimators.reply(replace(ready(), answers=answers(), has_changed=True))
     assert learning.status.state is LearningState.CHANGED
     assert learning.status.are_robust
     estimators.reply(replace(QUIET, has_changed=True))
@@ -142,7 +146,7 @@ async def test_refreshed_answers_are_taken_again_after_a_change(
 ) -> None:
     """Not while patterns are held or answers are robust, and as soon as neither is so."""
     learning, taking = await opened(tmp_path)
-    estimators.reply(READY)
+    estimators.reply(ready())
     refreshed = Refreshed(answers(), answers())
     estimators.reply(replace(QUIET, alarm=True, is_held=True))
     estimators.reply(refreshed)
@@ -163,7 +167,7 @@ async def test_watched_plate_is_only_watched_after_a_failure(
 ) -> None:
     """Held, then quiet: the state is again that of a plate that was not measured."""
     learning, _ = await opened(tmp_path)
-    estimators.reply(replace(READY, only_alarms="never measured"))
+    estimators.reply(replace(ready(), only_alarms="never measured"))
     assert learning.status.state is LearningState.ONLY_ALARMS
     estimators.reply(replace(QUIET, is_held=True))
     estimators.reply(QUIET)
@@ -178,14 +182,14 @@ async def test_file_that_cannot_be_removed_is_still_followed(
 ) -> None:
     """`forget` names the file, and another estimator starts from it."""
     learning, _ = await opened(tmp_path)
-    estimators.reply(READY)
+    estimators.reply(ready())
     await asyncio.sleep(0.1)
     (tmp_path / "learned.npz").mkdir()
     with pytest.raises(CommandError, match=r"learned\.npz"):
         await learning.forget()
     assert estimators.count == 2
     assert learning.status.state is LearningState.STARTING
-    estimators.reply(replace(READY, answers=answers()))
+    estimators.reply(replace(ready(), answers=answers()))
     assert learning.status.state is LearningState.FOLLOWING
     await asyncio.sleep(0.1)
     await learning.close()
@@ -195,7 +199,7 @@ async def test_file_that_cannot_be_removed_is_still_followed(
 async def test_readings_that_fail_are_started_anew(estimators: Estimators, tmp_path: Path) -> None:
     """Failed with the cause at once; read again after a pause, and followed after an estimate."""
     learning, _ = await opened(tmp_path)
-    estimators.reply(READY)
+    estimators.reply(ready())
     await asyncio.sleep(0.1)
     before = Readings.count
     Readings.ending.set()
@@ -217,7 +221,7 @@ async def test_readings_that_stay_away_make_answers_robust(
 ) -> None:
     """Nobody watches the plate: after a minute what was learned is not trusted."""
     learning, _ = await opened(tmp_path)
-    estimators.reply(READY)
+    estimators.reply(ready())
     await asyncio.sleep(0.1)
     Readings.ending.set()
     await asyncio.sleep(61.0)
@@ -253,7 +257,7 @@ async def test_alarm_of_a_watched_plate_is_a_warning(
 ) -> None:
     """It is all that such a plate can tell."""
     learning, _ = await opened(tmp_path)
-    estimators.reply(replace(READY, only_alarms="never measured"))
+    estimators.reply(replace(ready(), only_alarms="never measured"))
     await asyncio.sleep(0.1)
     caplog.clear()
     estimators.reply(replace(QUIET, alarm=True))

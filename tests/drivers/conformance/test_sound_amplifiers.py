@@ -6,6 +6,7 @@ import pytest
 
 from conformance_bench import results_on
 from drivers.conformance import CHECKS, Result
+from long_form import shortly
 from model.rig.rig import Rig
 from planted_faults import ALL
 from witness_config import witness_of_one
@@ -27,7 +28,7 @@ BROKEN_BY_CONFORMANCE = {"enabled", "limits", "token", "credit", "stop", "voices
 """Rules for hosts that it breaks on purpose."""
 
 
-@pytest.mark.parametrize("wire", ALL)
+@pytest.mark.parametrize("wire", shortly(ALL, ["modbus+rtu", "can+slcan"]))
 def test_sound_amplifier_passes_and_breaks_no_rule(wire: str, coarse_rig: Rig) -> None:
     """In half a minute of traffic; skipped are checks for which there is nothing to check."""
     witness = witness_of_one(KINDS[wire])

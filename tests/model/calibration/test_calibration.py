@@ -163,6 +163,7 @@ def test_calibrate_estimates_all_scales_when_requested(rig, truth):
     assert scales["P12"] == pytest.approx(1.0, abs=0.005)
 
 
+@pytest.mark.long
 def test_calibrate_refuses_a_plate_of_another_size(rig):
     """A plate twice as thick and 9 mm shorter: its length is refused, whatever the values."""
     plate = replace(rig.plate, thickness=0.003, length=0.296)

@@ -3,9 +3,7 @@
 import json
 from pathlib import Path
 
-import dask
 import pytest
-from distributed import LocalCluster
 from typer.testing import CliRunner
 
 from model.cli import app
@@ -76,6 +74,7 @@ def test_the_best_of_several_stiffnesses_is_written(small, tmp_path: Path) -> No
     assert rig.era("NE").stiffness == load_rig(RIG).era("NE").stiffness
 
 
+@pytest.mark.long
 def test_a_design_for_better_drives_says_so_in_its_rig(small, tmp_path: Path) -> None:
     """Drives good to 1 %, all else as in the rig's file; more contrast than without."""
     arguments = ("--eras", "4", "--starts", "1", "--json", "-o")
@@ -89,6 +88,7 @@ def test_a_design_for_better_drives_says_so_in_its_rig(small, tmp_path: Path) ->
     assert means[1] > means[0] + 3
 
 
+@pytest.mark.long
 def test_eras_that_buy_too_little_are_left_out(small, tmp_path: Path) -> None:
     """Of at most four, where no ERA beyond those that support the plate buys 40 dB."""
     result = design("--eras", "4", "--worth", "40", "--starts", "1", "-o", str(tmp_path), "--json")
@@ -99,6 +99,9 @@ def test_eras_that_buy_too_little_are_left_out(small, tmp_path: Path) -> None:
 @pytest.mark.long
 def test_a_cluster_finds_what_processes_find(tmp_path: Path) -> None:
     """Three ERAs from two starts on a Dask worker of its own, at the same places."""
+    import dask  # takes a second
+    from distributed import LocalCluster
+
     arguments = ["design", RIG, "--eras", "3", "--starts", "2", "--json"]
     here = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "here")])
     with (

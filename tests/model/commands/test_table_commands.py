@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,9 @@ from typer.testing import CliRunner
 
 from model.cli import app
 from model.errors import InputError
+from model.figures import table_pictures
 from model.rig.file import example_rig_path
+from model.table import summary
 from model.table.file import load_table, save_table
 from model.table.pattern_choice import UnreachableLevel
 
@@ -40,6 +43,15 @@ def as_json(*arguments: str | Path) -> dict[str, Any]:
     """The one object that it prints."""
     answer: dict[str, Any] = json.loads(table(*arguments, "--json").stdout)
     return answer
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_sets() -> Iterator[None]:
+    """Distributions of few contact sets."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(summary, "CONTACT_SETS", 12)
+        patch.setattr(table_pictures, "CONTACT_SETS", 12)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +95,11 @@ def test_build_notes_a_coarse_mesh_and_what_is_taken_as_none(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("ending", "status"), [(signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)]
+    ("ending", "status"),
+    [
+        pytest.param(signal.SIGINT, 130, marks=pytest.mark.long),
+        (signal.SIGKILL, -signal.SIGKILL),
+    ],
 )
 def test_build_resumes_when_it_was_ended(
     tmp_path: Path, ending: signal.Signals, status: int

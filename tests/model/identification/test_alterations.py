@@ -69,6 +69,7 @@ def said(reports: list[Report]) -> str:
     return next(each.explanation.name for each in reports if each.explanation)
 
 
+@pytest.mark.long
 def test_hand_that_stays_is_no_sticker_and_leaves_again(
     hidden: Hidden, found: Identification
 ) -> None:
@@ -93,6 +94,7 @@ def test_heavy_sticker_is_no_hand(hidden: Hidden, found: Identification) -> None
     assert said(play(LivePlate(found), hidden, plate, count=6)) == "a mass"
 
 
+@pytest.mark.long
 def test_crack_is_named(hidden: Hidden, found: Identification) -> None:
     """A patch of 2.3 by 6.9 cm at an edge that has lost half of its stiffness is a crack."""
     live = LivePlate(found)

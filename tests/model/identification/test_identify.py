@@ -70,7 +70,12 @@ def test_identified_rig_states_less_uncertainty_but_for_fingers(found: Identific
 
 
 @pytest.mark.parametrize(
-    "factors", [np.full(4, 1 / 9.80665), np.full(4, -1.0), np.array([1.0, 1.0, -1.0, 1.0])]
+    "factors",
+    [
+        pytest.param(np.full(4, 1 / 9.80665), marks=pytest.mark.long),
+        np.full(4, -1.0),
+        np.array([1.0, 1.0, -1.0, 1.0]),
+    ],
 )
 def test_other_units_and_signs_are_refused(
     rig: Rig, measurement: Measurement, factors: FloatArray
@@ -159,6 +164,7 @@ def test_plate_that_is_not_linear_or_drifts_is_refused(
             repeated.check()
 
 
+@pytest.mark.long
 def test_plate_of_another_kind_is_not_explained(rig: Rig, measurement: Measurement) -> None:
     """A sensor whose phases are conjugated leaves chi² beyond what promises anything."""
     wrong = np.where(measurement.at == 2, measurement.values.conj(), measurement.values)

@@ -76,6 +76,7 @@ def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
     assert known("stiffness", 336.0) == pytest.approx(0.1, rel=1e-6)
 
 
+@pytest.mark.long
 def test_sticker_is_named_in_its_place(hidden: Hidden, found: Identification) -> None:
     """3 g are named a mass within ten patterns, to 0.6 g and 1.5 cm."""
     live = LivePlate(found)

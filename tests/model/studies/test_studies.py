@@ -256,6 +256,7 @@ def test_finished_cases_are_found_by_layout_and_stiffness(study, results, tmp_pa
     assert finished.find(stiffer)[0].tolist() == [True, True, True, False]
 
 
+@pytest.mark.long
 def test_on_processes_replaces_workers_that_die(study, results, caplog):
     """When all workers are killed after the first chunk, all results come, with a warning."""
     problem, cases = study

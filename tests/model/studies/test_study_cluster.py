@@ -1,13 +1,14 @@
-"""A study on a real Dask cluster of two worker processes."""
+"""A study on a real Dask cluster of two worker processes.
+
+Dask, which takes a second to load, is loaded by those tests that run.
+"""
 
 import os
 import signal
 import sys
 from collections.abc import Iterator
 
-import dask
 import pytest
-from distributed import Client, LocalCluster
 
 from model import cluster
 from model.errors import InputError
@@ -23,6 +24,9 @@ def address() -> Iterator[str]:
 
     Forked off a process that has loaded Dask: loading takes each a second.
     """
+    import dask
+    from distributed import LocalCluster
+
     with (
         dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
         LocalCluster(
@@ -34,10 +38,13 @@ def address() -> Iterator[str]:
 
 def worker_pids(address: str) -> list[int]:
     """Process numbers of the cluster's workers."""
+    from distributed import Client
+
     with Client(address, set_as_default=False) as client:
         return list(client.run(os.getpid).values())
 
 
+@pytest.mark.long
 def test_cluster_equals_one_process_bit_for_bit(address):
     """Two worker processes and this process agree in every bit of every chunk."""
     assert len(set(worker_pids(address)) - {os.getpid()}) == 2
@@ -47,6 +54,7 @@ def test_cluster_equals_one_process_bit_for_bit(address):
     assert same_to_the_bit(there, dict(on_processes(1)(problem, chunks)))
 
 
+@pytest.mark.long
 def test_cluster_replaces_killed_workers(address):
     """Both workers killed when the first chunk is there: the rest comes all the same, bit by bit.
 
@@ -64,6 +72,7 @@ def test_cluster_replaces_killed_workers(address):
     assert not set(before) & set(worker_pids(address))
 
 
+@pytest.mark.long
 def test_cluster_refuses_workers_with_other_code(address, monkeypatch):
     """A study made by other code than the workers have is not mixed with theirs."""
     problem, cases = small_study(layouts=4)
@@ -74,6 +83,8 @@ def test_cluster_refuses_workers_with_other_code(address, monkeypatch):
 
 def test_cluster_without_workers_is_refused():
     """Waiting for ever for a worker to come is no answer."""
+    from distributed import LocalCluster
+
     problem, cases = small_study(layouts=4)
     with (
         LocalCluster(n_workers=0, dashboard_address=":0") as empty,
@@ -82,8 +93,11 @@ def test_cluster_without_workers_is_refused():
         dict(on_cluster(empty.scheduler_address)(problem, chunks_of(cases, 4)))
 
 
+@pytest.mark.long
 def test_cluster_gives_up_on_a_chunk_that_kills_its_workers(address, monkeypatch):
     """A chunk that ends whichever worker takes it, as one does for which memory is too short."""
+    from distributed import Client
+
     problem, cases = small_study(layouts=4)
     monkeypatch.setattr(cluster, "_run_same_code", lambda *_: os.kill(os.getpid(), signal.SIGKILL))
     with Client(address, set_as_default=False) as client:

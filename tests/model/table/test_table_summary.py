@@ -72,6 +72,7 @@ def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
     assert (counts == 1).all()
 
 
+@pytest.mark.long
 def test_summary_is_the_same_on_processes(table, monkeypatch):
     """Questions are drawn and counted in the same order, whoever answers them."""
     monkeypatch.setattr("model.table.summary.CONTACT_SETS", 20)

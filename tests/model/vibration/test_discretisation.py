@@ -4,13 +4,18 @@ import numpy as np
 import pytest
 
 from error_estimates import CASES, MAX_RATIO, judge
+from long_form import shortly
 from model.fem.mesh import Mesh
 from model.reduction.free_plate import solve_free_plate
-from model.vibration.discretisation import estimate_error, finer_mesh, reference_mesh
+from model.spectral.mesh import SpectralMesh
+from model.vibration.discretisation import estimate_error, finer_mesh
 from paper_plate import LENGTH, WIDTH, make_paper_rig
 
 
-@pytest.mark.parametrize("name", ["the paper's", "thick, 10 mm", "5:1", "telephone"])
+@pytest.mark.parametrize(
+    "name",
+    shortly(["the paper's", "thick, 10 mm", "5:1", "telephone"], ["the paper's", "thick, 10 mm"]),
+)
 def test_error_is_within_the_estimate_and_the_accuracy(name):
     """Wherever it is above 0.25 %: at most 1.4 times the estimate, and 1 % on mesh auto.
 
@@ -23,14 +28,15 @@ def test_error_is_within_the_estimate_and_the_accuracy(name):
     assert max(each.error for each in judged if each.added == 0) < 0.01
 
 
-def test_estimate_on_elements_is_the_change_on_the_reference_mesh():
-    """For each ERA and frequency, as a convergence study finds it."""
+def test_estimate_on_elements_is_the_change_on_accurate_elements():
+    """For each ERA and frequency, though it is estimated by polynomials over the plate."""
     rig = make_paper_rig(24, 18)
     frequencies = np.array([60.0, 110.0])
     points = np.random.default_rng(0).uniform(0, [LENGTH, WIDTH], (20, 2))
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=120.0)
-    finer = finer_mesh(rig.plate, rig.mesh, frequency_max=120.0)
-    assert finer == reference_mesh(rig.plate, frequency_max=120.0)
+    stiffest = max(era.stiffness for era in rig.eras)
+    finer = finer_mesh(rig.plate, rig.mesh, frequency_max=120.0, stiffness=stiffest)
+    assert isinstance(finer, SpectralMesh)
     found = estimate_error(free, finer, rig.eras, frequencies, points)
     exact = solve_free_plate(rig.plate, Mesh.accurate(rig.plate, frequency_max=500.0))
     own, true = (each.acceleration(rig.eras, frequencies, points) for each in (free, exact))

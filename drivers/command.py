@@ -40,7 +40,7 @@ class DriveCommand:
     @property
     def phasor(self) -> complex:
         """Complex amplitude in full strokes, level exp(i phase)."""
-        return Knot(self.level, self.phase).phasor
+        return cmath.rect(self.level, math.radians(self.phase))
 
 
 @dataclass(frozen=True, slots=True)

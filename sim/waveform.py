@@ -174,8 +174,10 @@ def fade_to(
     amplitude in full strokes, 0 for silence. Its phase counts from `time`; with keep_phase, from
     the origin of a lasting tone of the same frequency.
     """
-    faded = (tone.fade_out(time, ramp=ramp) for tone in playing)
-    fading = tuple(tone for tone in faded if tone.silent_from > time)
+    fading: Output = ()
+    if ramp > 0:
+        sounding = [tone for tone in playing if tone.silent_from > time]
+        fading = tuple([tone.fade_out(time, ramp=ramp) for tone in sounding])
     if amplitude == 0:
         return fading
     origin = time

@@ -116,6 +116,7 @@ class Rigs:
                         reply = bench.exchange(name, Apply(wanted), now=now)
                         assert isinstance(reply, Achieved)
                 bench.advance(now + case.step)
+            bench.fingers.felt(begin, bench.time)  # to the last sample
 
         go_on(0.5)
         return go_on

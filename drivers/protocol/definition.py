@@ -83,7 +83,7 @@ class WireQuantity:
 
     def quantise(self, value: float) -> float:
         """Return the value [unit] that arrives when this one is sent."""
-        return self.from_wire(self.to_wire(value))
+        return self.to_wire(value) / self.per_unit
 
 
 @dataclass(frozen=True)

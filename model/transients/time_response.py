@@ -28,7 +28,7 @@ from model.reduction.modal_matrices import Reduced, modal_matrices
 from model.structure.actuator import Era
 from model.structure.fingertip import FingertipLoad
 from model.structure.point_load import PointLoad, footprints_of
-from model.transients.base_motion import Term
+from model.transients.base_motion import BaseMotions
 
 _MAX_CACHED_SOLUTIONS = 1024  # unit solutions that are kept, some kilobytes each
 
@@ -88,45 +88,38 @@ class PlateInTime:
         """Displacement of the reduced coordinates in each eigenvector, (r, 2 r)."""
         return self.vectors[: len(self.vectors) // 2]
 
-    def driven(self, terms: Sequence[tuple[int, Term]], time: float) -> ForcedVibration:
-        """Particular solution for terms of the ERAs' bases, each with its ERA, from a time [s].
+    def driven(self, motions: BaseMotions, time: float) -> ForcedVibration:
+        """Particular solution for the terms that move the ERAs' bases at a time [s], from then on.
 
         Terms of one frequency are one there, so that its samples cost what its frequencies do.
         """
-        ordered = sorted(terms, key=lambda each: each[1].omega)
-        r = len(self.displacement)
-        if not ordered:
-            return ForcedVibration(time, np.zeros(0), np.zeros((0, r), dtype=complex), None)
-        solved = [self._unit_solutions(era, term.omega) for era, term in ordered]
-        omegas = np.array([term.omega for _, term in ordered])
-        c0, c1 = np.array([(term.c0, term.c1) for _, term in ordered]).T
-        tau = time - np.array([term.start for _, term in ordered])
+        active = motions.active(time)
+        omegas = motions.omega[active]
+        if not len(active):
+            return ForcedVibration(
+                time, omegas, np.zeros((0, len(self.displacement)), dtype=complex), None
+            )
+        solutions = self._unit_solutions
+        rows = solutions.rows(motions.keys)[active]
+        constant = solutions.constant[rows]
+        tau = time - motions.start[active]
         phase_factor = np.exp(1j * omegas * tau)
-        starts = np.flatnonzero(np.diff(omegas, prepend=np.nan))
-        constant = np.array([each for each, _ in solved])
-        b0 = constant * (phase_factor * (c0 + c1 * tau))[:, None]
+        c0, c1 = motions.c0[active], motions.c1[active]
+        starts = np.flatnonzero(np.concatenate([[True], omegas[1:] != omegas[:-1]]))
         b1 = None
         if c1.any():
             rate = (phase_factor * c1)[:, None]
-            b0 += np.array([each for _, each in solved]) * rate
+            b0 = constant * (phase_factor * (c0 + c1 * tau))[:, None]
+            b0 += solutions.linear[rows] * rate
             b1 = np.add.reduceat(constant * rate, starts)
+        else:
+            constant *= (phase_factor * c0)[:, None]
+            b0 = constant
         return ForcedVibration(time, omegas[starts], np.add.reduceat(b0, starts), b1)
 
-    def _unit_solutions(self, era: int, omega: float) -> tuple[ComplexArray, ComplexArray]:
-        """b0 (r,) each for a base that moves with c0 = 1 m, and with c1 = 1 m/s."""
-        key = (era, omega)
-        if key not in self._solved:
-            a0, _ = self.particular([era] * 2, np.full(2, 1j * omega), [1.0, 0.0], [0.0, 1.0])
-            constant, linear = a0 @ self.displacement.T
-            if len(self._solved) >= _MAX_CACHED_SOLUTIONS:
-                self._solved.clear()
-            self._solved[key] = constant, linear
-        return self._solved[key]
-
     @cached_property
-    def _solved(self) -> dict[tuple[int, float], tuple[ComplexArray, ComplexArray]]:
-        # A table and its ramps have few frequencies.
-        return {}
+    def _unit_solutions(self) -> "_UnitSolutions":
+        return _UnitSolutions(self)
 
     def particular(
         self,
@@ -187,6 +180,50 @@ class PlateInTime:
     def to_free(self) -> ComplexArray:
         """z of a free vibration with a displacement and velocity is to_free @ those, (m, 2 r)."""
         return self.inverse[self._half]
+
+
+class _UnitSolutions:
+    """Particular solutions for bases of one ERA at one frequency, kept since tables have few.
+
+    constant, linear (n, r): b0 for a base that moves with c0 = 1 m, and with c1 = 1 m/s.
+    """
+
+    def __init__(self, plate: PlateInTime) -> None:
+        self._plate = plate
+        self._rows: dict[tuple[int, float], int] = {}
+        # Those asked for last: a drive is solved again where one of its terms starts or ends.
+        self._keys: Sequence[tuple[int, float]] = ()
+        self._found = np.zeros(0, dtype=np.intp)
+        self._empty = np.zeros((0, len(plate.displacement)), dtype=complex)
+        self.constant = self.linear = self._empty
+
+    def rows(self, keys: Sequence[tuple[int, float]]) -> NDArray[np.intp]:
+        """Rows (k,) of solutions by ERA and omega [rad/s]."""
+        if keys is not self._keys:
+            try:
+                found = [self._rows[key] for key in keys]
+            except KeyError:
+                self._solve(keys)
+                found = [self._rows[key] for key in keys]
+            self._keys, self._found = keys, np.array(found)
+        return self._found
+
+    def _solve(self, keys: Sequence[tuple[int, float]]) -> None:
+        missing = list(dict.fromkeys(key for key in keys if key not in self._rows))
+        if len(self._rows) + len(missing) > _MAX_CACHED_SOLUTIONS:
+            self._rows, self.constant, self.linear = {}, self._empty, self._empty
+            missing = list(dict.fromkeys(keys))
+        count = len(missing)
+        a0, _ = self._plate.particular(
+            [era for era, _ in missing] * 2,
+            np.array([1j * omega for _, omega in missing] * 2),
+            np.repeat([1.0, 0.0], count),
+            np.repeat([0.0, 1.0], count),
+        )
+        solved = a0 @ self._plate.displacement.T
+        self._rows |= {key: len(self._rows) + number for number, key in enumerate(missing)}
+        self.constant = np.concatenate([self.constant, solved[:count]])
+        self.linear = np.concatenate([self.linear, solved[count:]])
 
 
 def plate_in_time(

@@ -75,8 +75,10 @@ FEATURES = (
     | Feature.ELECTRICAL
     | Feature.ADDRESS
 )
+_ENDING = (AmplifierState.SWITCHED_ON, AmplifierState.FAULT_REACTION_ACTIVE)
 _LATCHED = (AmplifierState.QUICK_STOP_ACTIVE, AmplifierState.FAULT)
 _FEEDING_REQUESTS = (Arm, Ping, Stage, Commit, Apply)  # with the session that is held
+_STAGING_REQUESTS = (Stage, Commit)
 
 SensorRequest: TypeAlias = GetSensors | Measure | GetReading | GetBlock
 
@@ -185,6 +187,11 @@ class SimulatedAmplifier:
             self._overtemperature_from,
         )
 
+    @property
+    def is_derated(self) -> bool:
+        """Whether its levels are reduced, until a tick finds it cool again."""
+        return self._is_derated
+
     def tick(self, now: float) -> None:
         """Process the events due by now, in order."""
         while (moment := self.next_event) <= now:
@@ -208,7 +215,7 @@ class SimulatedAmplifier:
         """Reply to a request at a time [s]; a Nak means that nothing was applied."""
         self.tick(now)
         following = next_state(self.state, type(request))
-        if isinstance(request, Stage | Commit) and Feature.STAGING not in self._features:
+        if isinstance(request, _STAGING_REQUESTS) and Feature.STAGING not in self._features:
             return Nak(NakCode.UNKNOWN_TYPE)
         if following is None:
             return Nak(NakCode.WRONG_STATE)
@@ -427,8 +434,7 @@ class SimulatedAmplifier:
 
     @property
     def _silence_reached(self) -> float:
-        ending = (AmplifierState.SWITCHED_ON, AmplifierState.FAULT_REACTION_ACTIVE)
-        return self._silent_from if self.state in ending else math.inf
+        return self._silent_from if self.state in _ENDING else math.inf
 
     @property
     def _overtemperature_from(self) -> float:

@@ -66,10 +66,7 @@ class Channels:
     @property
     def load(self) -> float:
         """Mean squared settled level of the channels."""
-        levels = [
-            sum(abs(tone.settled_amplitude) for tone in output if tone.is_lasting)
-            for output in self._outputs
-        ]
+        levels = [sum([abs(tone.settled_amplitude) for tone in output]) for output in self._outputs]
         return sum(level**2 for level in levels) / max(len(levels), 1)
 
     def levels(self, time: float) -> tuple[float, ...]:
@@ -99,7 +96,7 @@ class Channels:
         commands = {command.channel: command for command in playable.commands}
         ramp = playable.command_set.ramp
         for channel, playing in enumerate(self._outputs):
-            command = commands.get(channel, DriveCommand(channel, 0.0, 0.0))
+            command = commands.get(channel) or DriveCommand(channel, 0.0, 0.0)
             onset, ending = playable.onsets.get(channel), self._endings.get(channel)
             if onset is not None:
                 output = _shaped(playing, time, command, onset, ramp)

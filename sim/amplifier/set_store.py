@@ -6,7 +6,15 @@ from dataclasses import replace
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError
 from drivers.protocol.definition import PROTOCOL, WireQuantity, is_newer_token
-from drivers.protocol.messages import Achieved, Capabilities, Feature, Loaded, Nak, NakCode
+from drivers.protocol.messages import (
+    Achieved,
+    Capabilities,
+    ChannelLimits,
+    Feature,
+    Loaded,
+    Nak,
+    NakCode,
+)
 from sim.amplifier.channels import PlayableSet
 
 _Q = PROTOCOL.quantities
@@ -113,9 +121,14 @@ def _quantised_set(wanted: CommandSet, capabilities: Capabilities) -> CommandSet
     for channel in channels:
         if not 0 <= channel < capabilities.channels or channels.count(channel) > 1:
             raise RefusedSet(NakCode.BAD_CHANNEL, channel)
+    limits = capabilities.limits_of_channels
+    has_phase = Feature.PHASE in capabilities.features
     return CommandSet(
         token=wanted.token,
-        commands=tuple(_quantised(command, capabilities) for command in wanted.commands),
+        commands=tuple(
+            _quantised(command, limits[command.channel], has_phase=has_phase)
+            for command in wanted.commands
+        ),
         ramp=_in_steps(_Q.ramp, wanted.ramp),
         valid_for=_in_steps(_Q.valid_for, wanted.valid_for),
     )
@@ -138,20 +151,17 @@ def _quantised_envelope(wanted: Envelope, capabilities: Capabilities) -> Envelop
     return Envelope(wanted.slot, step, knots)
 
 
-def _quantised(command: DriveCommand, capabilities: Capabilities) -> DriveCommand:
-    has_phase = Feature.PHASE in capabilities.features
+def _quantised(command: DriveCommand, limits: ChannelLimits, *, has_phase: bool) -> DriveCommand:
     phase = command.phase if has_phase else _ANY_PHASE * command.channel
-    played = replace(
-        command,
-        frequency=_in_steps(_Q.frequency, command.frequency, channel=command.channel),
-        level=_in_steps(_Q.level, command.level, channel=command.channel),
-        phase=_in_steps(_Q.phase, phase, channel=command.channel),
-    )
-    limits = capabilities.limits_of_channels[command.channel]
-    is_playable = limits.frequency_min <= played.frequency <= limits.frequency_max
-    if played.level > limits.level_max or (played.level > 0 and not is_playable):
+    frequency = _in_steps(_Q.frequency, command.frequency, channel=command.channel)
+    level = _in_steps(_Q.level, command.level, channel=command.channel)
+    phase = _in_steps(_Q.phase, phase, channel=command.channel)
+    is_playable = limits.frequency_min <= frequency <= limits.frequency_max
+    if level > limits.level_max or (level > 0 and not is_playable):
         raise RefusedSet(NakCode.BAD_VALUE, command.channel)
-    return played
+    if (frequency, level, phase) == (command.frequency, command.level, command.phase):
+        return command
+    return replace(command, frequency=frequency, level=level, phase=phase)
 
 
 def _in_steps(quantity: WireQuantity, value: float, *, channel: int | None = None) -> float:

@@ -34,9 +34,10 @@ from sim.plant.fingers import KEPT, Fingers, Position, Record
 from sim.plant.imperfections import Imperfections, PlateErrors, delayed, draw_noise, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
 from sim.plant.voltage import moved_by_voltage
-from sim.waveform import Output, ToneSegment
+from sim.waveform import Output
 
 _TICK = 0.01  # s; of `keep_time`
+_MAX_BEHIND = 0.1  # s; of the plate behind the amplifiers, once time goes on
 _MAX_STEP = 1.0  # s; sampled at once
 _MAX_SHAPES = 16  # sets of points
 
@@ -73,11 +74,12 @@ class Bench:
         self.rig = rig
         self.sample_rate = sample_rate
         self.imperfections = imperfections
-        self.probes: list[Probe] = []
+        self._probes: list[Probe] = []
         self._time = now
-        # Advanced only where its drive changes or its motion is sampled.
+        # Behind the amplifiers, and advanced in few large steps: nothing acts back on them.
         self._plant = _plant_of(imperfections.plate.realised(rig), now)
-        self.fingers = Fingers(self._plant.reduced)
+        self._sampled_until = now  # up to when [s] fingers and probes have samples
+        self._fingers = Fingers(self._plant.reduced)
         self.observers: frozenset[str] = frozenset()  # fingers without weight
         self.loads: Mapping[str, float] = {}  # by finger, relative to the rig's fingertip
         self.amplifiers: Mapping[str, SimulatedAmplifier] = {
@@ -94,32 +96,63 @@ class Bench:
         ]
         for amplifier, sensing in zip(self.amplifiers.values(), self._sensing, strict=True):
             amplifier.attach(sensing)
-        # By ERA: the output of its channel, the output that moves the base, and the changes between
-        # them that are delayed, each with its time [s].
-        wired = [rig.wiring[era.name] for era in rig.eras]
-        self._wired = [(channel.amplifier, channel.number) for channel in wired]
-        self._commanded: list[Output] = [()] * len(rig.eras)
-        self._applied_outputs: list[Output] = [()] * len(rig.eras)
-        self._delayed: list[deque[tuple[float, Output]]] = [deque() for _ in rig.eras]
+        # By amplifier: its ERAs and their channels, the outputs of its channels, and the changes of
+        # outputs that move the bases of ERAs, each with its time [s], after the amplifier's delay.
+        self._wired: dict[str, list[tuple[int, int]]] = {name: [] for name in rig.amplifiers}
+        for index, era in enumerate(rig.eras):
+            channel = rig.wiring[era.name]
+            self._wired[channel.amplifier].append((index, channel.number))
+        self._commanded: dict[str, tuple[Output, ...]] = {
+            name: tuple(amplifier.outputs) for name, amplifier in self.amplifiers.items()
+        }
+        self._delayed: dict[str, deque[tuple[float, int, Output]]] = {
+            name: deque() for name in rig.amplifiers
+        }
+        self._applied_outputs: list[Output] = [()] * len(rig.eras)  # by ERA
+        self._errors = [imperfections.errors_of(era.name, rig) for era in rig.eras]
         self._noise = [draw_noise(seed=imperfections.seed, number=n) for n in range(len(rig.eras))]
         self._shapes_at = lru_cache(_MAX_SHAPES)(
             lambda points: self._plant.reduced.at(np.frombuffer(points).reshape(-1, 2))
         )
-        # Tones that were played, with the index of their ERA and the time of their end [s].
-        self._played: deque[tuple[int, ToneSegment, float]] = deque()
+        # Outputs that moved a base, with the index of the ERA and the time of their end [s].
+        self._played: deque[tuple[int, Output, float]] = deque()
 
     @property
     def time(self) -> float:
         """The present time [s]."""
         return self._time
 
+    @property
+    def fingers(self) -> Fingers:
+        """The fingers, with what they have felt up to the present time."""
+        self._sample_plate()
+        return self._fingers
+
+    @property
+    def probes(self) -> list[Probe]:
+        """The listeners beside the fingers, which have all samples up to the present time."""
+        self._sample_plate()
+        return self._probes
+
     def advance(self, now: float) -> None:
         """Advance to a time [s]; each event happens at its own time."""
-        if now - self.time > KEPT and not self.probes:  # older samples are not kept
-            self._advance_amplifiers(now - KEPT, is_sampled=False)
-        while now - self.time > _MAX_STEP:
-            self._advance_amplifiers(self.time + _MAX_STEP, is_sampled=True)
-        self._advance_amplifiers(now, is_sampled=True)
+        self._advance(now)
+        if self._time - self._sampled_until >= _MAX_BEHIND:
+            self._sample_plate()
+
+    def _advance(self, now: float) -> None:
+        """Advance the amplifiers to a time [s], and the plate with them if probes listen."""
+        if now - self._time > KEPT and not self._probes:  # older samples are not kept
+            self._sample_plate()
+            self._advance_amplifiers(now - KEPT)
+            self._sampled_until = self._time
+            self._plant.skip(self._time)
+        while now - self._time > _MAX_STEP:
+            self._advance_amplifiers(self._time + _MAX_STEP)
+            self._sample_plate()
+        self._advance_amplifiers(now)
+        if self._probes or self._time - self._sampled_until > _MAX_STEP:
+            self._sample_plate()
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Reduced shapes (p, r) at points (p, 2) [m].
@@ -130,9 +163,9 @@ class Bench:
 
     def exchange(self, amplifier: str, request: Request, *, now: float) -> Reply:
         """The reply of an amplifier to a request at a time [s]."""
-        now = max(now, self.time)
-        self.advance(now)
-        reply = self.amplifiers[amplifier].handle(request, now)
+        if now > self._time:
+            self._advance(now)
+        reply = self.amplifiers[amplifier].handle(request, self._time)
         self._update_plant()
         return reply
 
@@ -149,14 +182,14 @@ class Bench:
         observers: fingers without weight; loads: of the others relative to the rig's fingertip, 1
         where left out.
         """
-        self.fingers.check(positions)
+        self._fingers.check(positions)
         check_loads(loads.values())
         self.advance(now)
+        self._sample_plate()
         self.observers = frozenset(observers) & positions.keys()
         self.loads = {name: load for name, load in loads.items() if name in positions}
         fingertip = self.rig.fingertip
         if fingertip is not None:
-            self._plant.skip(self._time)
             before = self._plant.reduced
             self._plant.set_contacts(
                 {
@@ -172,7 +205,7 @@ class Bench:
             )
             if self._plant.reduced is not before:
                 self._shapes_at.cache_clear()
-        self.fingers.place(positions, reduced=self._plant.reduced)
+        self._fingers.place(positions, reduced=self._plant.reduced)
 
     def change_plate(self, errors: PlateErrors, *, now: float) -> None:
         """Replace plate and ERAs by those of these errors, at rest; what plays drives them on.
@@ -180,6 +213,7 @@ class Bench:
         Raises InputError for ERAs that do not support the plate, which changes nothing.
         """
         self.advance(now)
+        self._sample_plate()
         plant = _plant_of(errors.realised(self.rig), self._time)
         plant.set_contacts(self._plant.contacts)
         for index, playing in enumerate(self._applied_outputs):
@@ -187,7 +221,7 @@ class Bench:
         self.imperfections = replace(self.imperfections, plate=errors)
         self._plant = plant
         self._shapes_at.cache_clear()
-        self.fingers.place(self.fingers.layout.positions, reduced=plant.reduced)
+        self._fingers.place(self._fingers.layout.positions, reduced=plant.reduced)
         for sensing in self._sensing:
             sensing.changed(self._time)
 
@@ -201,8 +235,8 @@ class Bench:
 
     def forget_reader(self, reader: ToneReader) -> None:
         """Pass no more samples on to a reader."""
-        if reader in self.probes:
-            self.probes.remove(reader)
+        if reader in self._probes:
+            self._probes.remove(reader)
 
     def records(self, since: float, until: float) -> tuple[dict[str, Record], list[float]]:
         """The record of each finger in a window of the last ten seconds [s], by id.
@@ -216,55 +250,61 @@ class Bench:
         records, frequencies = self.records(since, until)
         return {name: measure_vibration(record, frequencies) for name, record in records.items()}
 
-    def _advance_amplifiers(self, to_time: float, *, is_sampled: bool) -> None:
+    def _advance_amplifiers(self, to_time: float) -> None:
+        amplifiers = self.amplifiers.values()
         while True:
-            moment = min((a.next_event for a in self.amplifiers.values()), default=to_time)
-            moment = min(moment, *(waiting[0][0] for waiting in self._delayed if waiting), to_time)
-            self._move_plant(moment, is_sampled=is_sampled)
-            for amplifier in self.amplifiers.values():
-                amplifier.tick(moment)
+            events = [amplifier.next_event for amplifier in amplifiers]
+            changes = [waiting[0][0] for waiting in self._delayed.values() if waiting]
+            moment = min([*events, *changes, to_time])
+            self._time = max(self._time, moment)
+            for amplifier, event in zip(amplifiers, events, strict=True):
+                if event <= moment or amplifier.is_derated:
+                    amplifier.tick(moment)
             self._update_plant()
             if moment >= to_time:
                 return
 
-    def _move_plant(self, to_time: float, *, is_sampled: bool) -> None:
-        if to_time <= self.time:
+    def _sample_plate(self) -> None:
+        """Advance the plate to the present time, sampled if there are fingers or probes."""
+        if self._sampled_until >= self._time:
             return
-        since, self._time = self._time, to_time
-        if not (is_sampled and (self.fingers.layout.positions or self.probes)):
+        self._sampled_until = self._time  # first, since probes look at the fingers
+        layout, probes = self._fingers.layout, tuple(self._probes)
+        if not (layout.positions or probes):
+            self._plant.skip(self._time)
             return
-        self._plant.skip(since)
-        probes = tuple(self.probes)
-        shapes = [self.fingers.layout.shapes, *(probe.shapes for probe in probes)]
+        shapes = [layout.shapes, *(probe.shapes for probe in probes)]
         times, accelerations = self._plant.advance(
-            to_time, sample_rate=self.sample_rate, shapes=np.concatenate(shapes)
+            self._time, sample_rate=self.sample_rate, shapes=np.concatenate(shapes)
         )
-        parts = np.split(accelerations, np.cumsum([len(shapes) for shapes in shapes])[:-1], axis=1)
-        self.fingers.record(times, parts[0])
+        parts = np.split(accelerations, np.cumsum([len(each) for each in shapes])[:-1], axis=1)
+        self._fingers.record(times, parts[0])
         for probe, part in zip(probes, parts[1:], strict=True):
             probe.record(times, part)
 
     def _update_plant(self) -> None:
         """Pass changed outputs of the channels on to the plant, after their delay."""
-        outputs = {name: amplifier.outputs for name, amplifier in self.amplifiers.items()}
-        for index, (amplifier, number) in enumerate(self._wired):
-            playing = outputs[amplifier][number]
-            waiting = self._delayed[index]
-            if playing is not self._commanded[index]:
-                self._commanded[index] = playing
-                delay = self.imperfections.delay(amplifier)
-                waiting.append((self.time + delay, delayed(playing, delay)))
-            while waiting and waiting[0][0] <= self.time:
-                _, playing = waiting.popleft()
-                before = self._applied_outputs[index]
-                self._plant.skip(self._time)
-                self._plant.set_input(index, self._motion(index, playing))
-                self._played.extend(
-                    (index, tone, self.time) for tone in before if tone not in playing
-                )
-                self._applied_outputs[index] = playing
-        while self._played and self._played[0][2] < self.time - KEPT:
+        for name, amplifier in self.amplifiers.items():
+            outputs, commanded = tuple(amplifier.outputs), self._commanded[name]
+            waiting = self._delayed[name]
+            if outputs != commanded:
+                self._commanded[name] = outputs
+                delay = self.imperfections.delay(name)
+                for index, number in self._wired[name]:
+                    if outputs[number] is not commanded[number]:
+                        playing = delayed(outputs[number], delay)
+                        waiting.append((self._time + delay, index, playing))
+            while waiting and waiting[0][0] <= self._time:
+                _, index, playing = waiting.popleft()
+                self._apply(index, playing)
+        while self._played and self._played[0][2] < self._time - KEPT:
             self._played.popleft()
+
+    def _apply(self, index: int, playing: Output) -> None:
+        """Let an output move the base of an ERA from now on."""
+        self._plant.set_input(index, self._motion(index, playing), since=self._time)
+        self._played.append((index, self._applied_outputs[index], self._time))
+        self._applied_outputs[index] = playing
 
     def _motion(self, index: int, playing: Output) -> list[Term]:
         """The base motion of an ERA by the output of its channel, imperfections included."""
@@ -274,17 +314,21 @@ class Bench:
         terms = [term for tone in playing for term in tone.terms(stroke=stroke)]
         if drive is not None:
             terms = moved_by_voltage(terms, drive, stroke=era.stroke)
-        errors = self.imperfections.errors_of(era.name, self.rig)
+        errors = self._errors[index]
         terms = realised(terms, errors)
         if errors.noise and playing:
             end = max(tone.silent_from for tone in playing)
             rms = errors.noise * era.stroke
-            terms += self._noise[index].terms(rms, start=self.time, end=end)
+            terms += self._noise[index].terms(rms, start=self._time, end=end)
         return terms
 
     def _frequencies(self, since: float, until: float) -> list[float]:
         """The frequencies [Hz] at which bases were moved by commands in a window."""
-        ended = [(index, tone, min(end, tone.silent_from)) for index, tone, end in self._played]
+        ended = [
+            (index, tone, min(end, tone.silent_from))
+            for index, output, end in self._played
+            for tone in output
+        ]
         present = [
             (index, tone, tone.silent_from)
             for index, output in enumerate(self._applied_outputs)

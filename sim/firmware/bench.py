@@ -84,15 +84,19 @@ class FirmwareBench(Bench):
         times: FloatArray = self._start + np.arange(self._count + 0.5, last) / RATE
         self._count, self._time = last, float(times[-1])
         bases = levels * self._gains * [era.stroke for era in self.rig.eras]
-        shapes = [self.fingers.layout.shapes, *(probe.shapes for probe in self.probes)]
+        shapes = [self._fingers.layout.shapes, *(probe.shapes for probe in self._probes)]
         felt = self._sampled.advance(bases, shapes=np.concatenate(shapes))
         parts = np.split(felt, np.cumsum([len(each) for each in shapes])[:-1], axis=1)
-        self.fingers.record(times, parts[0])
-        for probe, part in zip(self.probes, parts[1:], strict=True):
+        self._fingers.record(times, parts[0])
+        for probe, part in zip(self._probes, parts[1:], strict=True):
             probe.record(times, part)
         self._recent.append((float(times[0]), levels))
         while self._recent[0][0] < self._time - KEPT:
             self._recent.popleft()
+
+    def _sample_plate(self) -> None:
+        """Let the plate that lends its coordinates go on; the samples' is sampled as they come."""
+        self._plant.skip(self._time)
 
     def _frequencies(self, since: float, until: float) -> list[float]:
         """The frequencies [Hz] that the samples of a window consist of."""

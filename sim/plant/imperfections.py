@@ -205,7 +205,7 @@ def realised(terms: Sequence[Term], errors: ChannelErrors) -> list[Term]:
     if (errors.gain, errors.phase) == (1.0, 0.0):
         return list(terms)
     factor = errors.factor
-    return [replace(term, c0=factor * term.c0, c1=factor * term.c1) for term in terms]
+    return [term._replace(c0=factor * term.c0, c1=factor * term.c1) for term in terms]
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from model.transients.time_response import PlateInTime, plate_in_time
 Footprint: TypeAlias = tuple[float, float, float]
 """x, y, radius [m]."""
 
-BLOCK = 256  # samples per table of exponentials
+BLOCK = 512  # samples per table of exponentials; a power of 2
 
 # s; a point keeps its static vectors for so long after a lift, ten times as long as their motion
 # takes to decay.
@@ -43,7 +43,12 @@ class LoadedPlate:
     def exponentials(self, sample_rate: float) -> FloatArray:
         """Re and -Im of exp(eigenvalue k / sample_rate [Hz]), k up to a block, (BLOCK, 2 m)."""
         if sample_rate not in self._tables:
-            grid = np.exp(np.outer(np.arange(BLOCK) / sample_rate, self.plate.decay))
+            grid = np.ones((BLOCK, len(self.plate.decay)), dtype=complex)
+            done = 1
+            while done < BLOCK:  # doubled, since an exponential costs ten products
+                ahead = np.exp(self.plate.decay * (done / sample_rate))
+                np.multiply(grid[:done], ahead, out=grid[done : 2 * done])
+                done *= 2
             self._tables.clear()
             self._tables[sample_rate] = np.hstack([grid.real, -grid.imag])
         return self._tables[sample_rate]

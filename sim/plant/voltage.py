@@ -8,7 +8,6 @@ it does to stiffness, and how a base yields to the plate.
 
 import cmath
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from itertools import combinations_with_replacement, pairwise
 
 from model.transients.base_motion import Term
@@ -23,7 +22,7 @@ def moved_by_voltage(voltage: Sequence[Term], drive: VoltageDrive, *, stroke: fl
     if drive.law is Law.QUADRATIC:
         terms = [*_scaled(voltage, 2 * drive.bias), *_square_of(voltage)]
     return [
-        replace(term, c0=gain * term.c0, c1=gain * term.c1)
+        term._replace(c0=gain * term.c0, c1=gain * term.c1)
         for term in terms
         for gain in (stroke * drive.at(term.omega / (2 * cmath.pi)),)
         if term.c0 or term.c1
@@ -31,7 +30,7 @@ def moved_by_voltage(voltage: Sequence[Term], drive: VoltageDrive, *, stroke: fl
 
 
 def _scaled(terms: Iterable[Term], factor: float) -> Iterator[Term]:
-    return (replace(term, c0=factor * term.c0, c1=factor * term.c1) for term in terms)
+    return (term._replace(c0=factor * term.c0, c1=factor * term.c1) for term in terms)
 
 
 def _square_of(terms: Sequence[Term]) -> Iterator[Term]:

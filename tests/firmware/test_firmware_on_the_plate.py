@@ -2,7 +2,7 @@
 
 import cmath
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -117,10 +117,9 @@ def motion(pattern: Pattern, rig: Rig) -> list[list[Term]]:
     onsets, endings = shaped(pattern.onset, rig.eras), shaped(pattern.ending, rig.eras)
     whole = []
     for onset, ending in zip(onsets, endings, strict=True):
-        before = [replace(term, end=min(term.end, end), omega=on_the_wire(term)) for term in onset]
+        before = [term._replace(end=min(term.end, end), omega=on_the_wire(term)) for term in onset]
         after = [
-            replace(
-                term,
+            term._replace(
                 start=term.start + end,
                 end=term.end + end,
                 omega=on_the_wire(term),

@@ -3,7 +3,7 @@
 import cmath
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -71,7 +71,7 @@ def faded_base(
         return cmath.rect(amplitude, omega * time + phase)
 
     up = fade(at(rise[0]), omega=omega, start=rise[0], ramp=rise[1] - rise[0], gains=(0, 1))
-    up = (*up[:-1], replace(up[-1], end=fall[0]))
+    up = (*up[:-1], up[-1]._replace(end=fall[0]))
     down = fade(at(fall[0]), omega=omega, start=fall[0], ramp=fall[1] - fall[0], gains=(1, 0))
     return Base(motion, (*up, *down))
 

@@ -17,7 +17,7 @@ from model.rig.rig import Rig
 from model.structure.point_load import footprints_of
 from model.table.build import build_table
 from model.table.file import load_table, save_table
-from model.transients.base_motion import Term
+from model.transients.base_motion import BaseMotions, Term
 from model.transients.time_response import plate_in_time
 
 GAINS = ((100.0, 0.9, 0.2), (200.0, 1.3, -0.4))
@@ -73,7 +73,7 @@ def test_particular_solution_is_the_same_for_negative_frequency(
     reduced = reduce_plate(coarse_rig.plate, coarse_rig.mesh, footprints_of(coarse_rig.eras))
     plate, omega, c = plate_in_time(reduced, uneven.eras), 2 * math.pi * 150.0, 6e-5 + 3e-5j
     tones = Term(0.0, math.inf, omega, c), Term(0.0, math.inf, -omega, -c.conjugate())
-    expected, back = (plate.driven([(1, tone)], 0.0).state(0.0123) for tone in tones)
+    expected, back = (plate.driven(BaseMotions([(), (tone,)]), 0.0).state(0.0123) for tone in tones)
     np.testing.assert_allclose(back, expected, atol=1e-9 * np.abs(expected).max())
 
 

@@ -8,6 +8,7 @@ import pytest
 from bench_driving import keep_alive, play
 from drivers.command import DriveCommand
 from drivers.protocol.messages import Arm, Fault
+from model.arrays import FloatArray
 from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
 from model.finger.fingertip import fingertip_points
@@ -74,6 +75,53 @@ def test_bench_watchdog_silences_at_its_time(coarse_rig: Rig) -> None:
     )
     driven = late.felt(START + 0.25, START + 0.35)["a"].peak.max()
     assert late.felt(START + 1.9, START + 2.1)["a"].peak.max() < 0.02 * driven
+
+
+class Listener:
+    """A probe at one point that keeps what it is given."""
+
+    def __init__(self, bench: Bench) -> None:
+        self.shapes = bench.shapes_at(np.array([[0.1, 0.1]]))
+        self.times: list[float] = []
+        self.accelerations: list[float] = []
+
+    def record(self, times: FloatArray, accelerations: FloatArray) -> None:
+        """Keep samples."""
+        self.times += times.tolist()
+        self.accelerations += accelerations[:, 0].tolist()
+
+
+def test_bench_record_is_independent_of_when_it_is_read(coarse_rig: Rig) -> None:
+    """Read every 3 ms, or once at the end: the same samples of a finger; a probe gets its own."""
+    records, listeners = [], []
+    for is_read in (True, False):
+        bench = Bench(coarse_rig, now=START)
+        bench.place_fingers({"a": (0.1, 0.1)}, now=START)
+        bench.exchange("main", Arm(2.0), now=START)
+        for step in range(1, 101):
+            now = START + 0.003 * step
+            if step in (20, 45, 70):  # at 20 abruptly
+                tone = DriveCommand(step % 4, 100.0 + step, 1.0)
+                play(bench, tone, now=now, token=step, ramp=0.001 * (step - 20))
+            bench.advance(now)
+            if step == 60:
+                listener = Listener(bench)
+                bench.probes.append(listener)
+            if is_read:
+                bench.records(START, now)
+        records.append(bench.records(START, bench.time)[0]["a"])
+        listeners.append(listener)
+    read, unread = records
+    np.testing.assert_array_equal(unread.times, read.times)
+    np.testing.assert_allclose(np.diff(read.times), 1e-4, rtol=1e-4)
+    peak = np.abs(read.accelerations).max()
+    np.testing.assert_allclose(unread.accelerations, read.accelerations, atol=1e-6 * peak)
+    for listener in listeners:
+        count = len(listener.times)
+        np.testing.assert_array_equal(listener.times, read.times[-count:])
+        assert START + 0.18 < listener.times[0] < START + 0.1803
+        centre = read.accelerations[-count:, 0]
+        np.testing.assert_allclose(listener.accelerations, centre, atol=1e-6 * peak)
 
 
 def test_bench_frequencies_of_a_window(coarse_rig: Rig) -> None:

@@ -1,7 +1,10 @@
 """The plate in time, against the frequency domain, a stepping solver and conservation laws."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
+from scipy.signal import lsim
 
 from model.arrays import ComplexArray
 from model.errors import InputError
@@ -133,6 +136,63 @@ def test_plant_transient_agrees_with_runge_kutta() -> None:
     )
     expected = stepped @ small.at(MESH.nodes).T
     np.testing.assert_allclose(felt[:-1], expected, atol=2e-6 * np.abs(expected).max())
+
+
+def knotted(knots: list[tuple[float, float]]) -> list[Term]:
+    """Terms of a base that moves along straight lines through (time [s], displacement [m])."""
+    return [
+        Term(start, end, 0.0, 1j * y0, 1j * (y1 - y0) / (end - start))
+        for (start, y0), (end, y1) in pairwise(knots)
+    ]
+
+
+def test_plant_scheduled_inputs_agree_with_a_linear_system() -> None:
+    """Set ahead and advanced at once, or set in time and advanced sample by sample: as lsim has it.
+
+    It is exact for bases that move along straight lines and act by springs alone.
+    """
+    small = reduce_plate(
+        PLATE, Mesh(8, 6, PLATE.length, PLATE.width), np.array(CORNERS), frequency_max=100.0
+    )
+    on_springs = eras(damping=0.0)
+    rate, turns, end = 2000.0, 0.0105, 0.04
+    first = knotted([(0.0, 0.0), (0.02, STROKE)])
+    then = knotted([(turns, turns / 0.02 * STROKE), (0.015, -STROKE), (0.025, 0.0)])
+    other = knotted([(0.005, 0.0), (0.0105, STROKE), (0.03, 0.0)])
+    points = small.at(MESH.nodes[::7])
+
+    ahead = Plant(small, on_springs)
+    ahead.set_input(0, first)
+    ahead.set_input(0, then, since=turns)
+    ahead.set_input(2, other, since=0.001)
+    times, at_once = ahead.advance(end, sample_rate=rate, shapes=points)
+
+    in_time, pieces = Plant(small, on_springs), []
+    in_time.set_input(0, first)
+    for moment in times:
+        pieces.append(in_time.advance(moment, sample_rate=rate, shapes=points)[1])
+        if moment == 0.001:
+            in_time.set_input(2, other)
+        if moment == turns:
+            in_time.set_input(0, then)
+
+    M, C, K = modal_matrices(small, on_springs)
+    inverse, r = np.linalg.inv(M), len(M)
+    by_base = inverse @ (small.at(np.array(CORNERS)) * 17000.0).T[:, [0, 2]]
+    A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
+    B = np.vstack([np.zeros((r, 2)), by_base])
+    C_points, D_points = points @ A[r:], points @ by_base
+    grid = np.concatenate([[0.0], times])
+    bases = STROKE * np.column_stack(
+        [
+            np.interp(grid, [0.0, turns, 0.015, 0.025], [0.0, turns / 0.02, -1.0, 0.0]),
+            np.interp(grid, [0.005, 0.0105, 0.03], [0.0, 1.0, 0.0]),
+        ]
+    )
+    _, expected, _ = lsim((A, B, C_points, D_points), bases, grid)
+    peak = np.abs(expected).max()
+    np.testing.assert_allclose(at_once, expected[1:], atol=1e-9 * peak)
+    np.testing.assert_allclose(np.concatenate(pieces), expected[1:], atol=1e-9 * peak)
 
 
 def test_plant_structural_damping_is_passive(reduced: ReducedPlate) -> None:

@@ -176,8 +176,8 @@ def fade_to(
     """
     fading: Output = ()
     if ramp > 0:
-        sounding = [tone for tone in playing if tone.silent_from > time]
-        fading = tuple([tone.fade_out(time, ramp=ramp) for tone in sounding])
+        audible = [tone for tone in playing if tone.silent_from > time]
+        fading = tuple([tone.fade_out(time, ramp=ramp) for tone in audible])
     if amplitude == 0:
         return fading
     origin = time

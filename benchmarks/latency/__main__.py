@@ -1,13 +1,15 @@
 """Latency from a touch datagram to the last byte of the command on the wire.
 
-    python -m benchmarks.latency [--seconds 100] [--seed 1] [--report | --check WIRE]
+    python -m benchmarks.latency [--seconds S] [--seed 1] [--report | --check WIRE]
+    python -m benchmarks.latency --many [RIG ...] [--seconds S] [--seed 1]
 
 The daemon, the amplifier, the panel and programs that load the machine are separate processes
 (`benchmarks.latency.run`). It takes eleven minutes on an otherwise idle machine; a trial run with
 --seconds 2 takes one. A disturbed case is repeated once; if that fails, too, the others follow.
 
 --report: write docs/measured/latency.md and its picture. --check: measure taps at 100 Hz only, over
-`tcp` or a `pty`, and print the result as JSON.
+`tcp` or a `pty`, and print the result as JSON. --many: four to sixteen ERAs on one to four
+amplifiers, each on a line of its own, idle and loaded, in eight minutes.
 """
 
 import argparse
@@ -23,17 +25,20 @@ from pathlib import Path
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.latency", description=__doc__)
     parser.add_argument(
-        "--seconds", type=float, default=100.0, help="duration of the longest cases"
+        "--seconds", type=float, help="duration of the longest cases, by default 100, or 20 of many"
     )
     parser.add_argument("--seed", type=int, default=1)
     purpose = parser.add_mutually_exclusive_group()
     purpose.add_argument("--report", action="store_true")
     purpose.add_argument("--check", choices=("tcp", "pty"))
+    purpose.add_argument("--many", nargs="*", metavar="RIG")
     options = parser.parse_args()
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"  # before numpy loads: with two threads the daemon would compete
 
+    from benchmarks.latency import many
     from benchmarks.latency.report import (
+        DEFAULT_SECONDS,
         as_json,
         cases,
         check_case,
@@ -46,27 +51,39 @@ def main() -> None:
     from model.table.file import save_table
     from model.table.table_cache import cached_table
 
+    if options.many is not None:
+        if unknown := set(options.many) - set(many.RIGS):
+            parser.error(f"rigs must be of {', '.join(many.RIGS)}, got {', '.join(unknown)}")
+        with tempfile.TemporaryDirectory() as folder:
+            many.measure_many(
+                Path(folder),
+                seconds=options.seconds or many.DEFAULT_SECONDS,
+                seed=options.seed,
+                rigs=tuple(options.many) or many.RIGS,
+            )
+        return
+    seconds = options.seconds or DEFAULT_SECONDS
     table, _ = cached_table(load_rig(example_rig_path()))
     found: list[Found | Failed] = []
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "table.npz"
         save_table(table, file)
         if options.check:
-            checked = check_case(options.check, options.seconds, options.seed)
+            checked = check_case(options.check, seconds, options.seed)
             one = attempt(checked, partial(measure, checked, file, table), attempts=1)
             if isinstance(one, Failed):
                 sys.exit(f"no figures: {'; then: '.join(one.why)}")
             print(json.dumps(as_json(one)))
             return
         begun = time.monotonic()
-        for case in cases(options.seconds, options.seed):
+        for case in cases(seconds, options.seed):
             found.append(attempt(case, partial(measure, case, file, table)))
             print(lines(found[-1:], first=len(found) == 1), flush=True)
         print(flooded_lines(found))
         minutes = (time.monotonic() - begun) / 60
         print(f"{minutes:.1f} minutes")
     if options.report:
-        write_report(found, seconds=options.seconds, seed=options.seed, minutes=minutes)
+        write_report(found, seconds=seconds, seed=options.seed, minutes=minutes)
     failed = [each for each in found if isinstance(each, Failed)]
     if failed:
         sys.exit(f"no figures of {len(failed)} of {len(found)} cases: leave the machine alone")

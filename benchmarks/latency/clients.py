@@ -1,6 +1,6 @@
 """Programs of the latency benchmark: a panel, clients that flood, and CPU load.
 
-    python -m benchmarks.latency.clients panel RIG PORT KIND COUNT RATE SEED FILE
+    python -m benchmarks.latency.clients panel RIG PORT FILE KIND COUNT RATE SEED [REPEATS_AFTER]
     python -m benchmarks.latency.clients flood SOCKET RIG RATE
     python -m benchmarks.latency.clients flooder KIND SOCKET
     python -m benchmarks.latency.clients stopper SOCKET COUNT FILE
@@ -29,8 +29,8 @@ from model.rig.file import load_rig
 BATCH = 10  # messages of the flood at a time
 
 
-def panel(rig: str, port: str, kind: str, count: str, rate: str, seed: str, file: str) -> None:
-    work = Work(kind, int(count), float(rate), int(seed))
+def panel(rig: str, port: str, file: str, kind: str, count: str, rate: str, *others: str) -> None:
+    work = Work(kind, int(count), float(rate), *map(int, others))
     ready = list(datagrams(work, load_rig(Path(rig)).plate))
     sent = np.zeros(len(ready), dtype=np.int64)
     line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

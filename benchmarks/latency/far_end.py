@@ -1,10 +1,11 @@
-"""The far end of the latency benchmark: a simulated amplifier on a wire, and a clock.
+"""The far end of the latency benchmark: simulated amplifiers, a wire to each, and a clock.
 
     python -m benchmarks.latency.far_end RIG FILE WIRE
 
-WIRE: `pty`, a pseudo-terminal, or `tcp`, as to a serial server. Prints the URL. On SIGUSR1 it
-writes a JSON line for each Apply frame, with arrival on CLOCK_MONOTONIC, number and payload, and
-prints "written". There is no plate.
+WIRE: `pty`, a pseudo-terminal, or `tcp`, as to a serial server. Prints the URLs of the amplifiers
+in the order of the rig. On SIGUSR1 it writes a JSON line for each Apply, Stage and Commit frame,
+with arrival on CLOCK_MONOTONIC, amplifier, type, number and payload, and prints "written". There
+is no plate.
 """
 
 import asyncio
@@ -23,6 +24,8 @@ from drivers.protocol.definition import PROTOCOL
 from model.rig.file import load_rig
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.transport.pseudo_terminal import make_terminal
+
+SETS = tuple(PROTOCOL.types[name] for name in ("apply", "stage", "commit"))
 
 
 class Wire(asyncio.Protocol):
@@ -54,29 +57,33 @@ class Wire(asyncio.Protocol):
         self._on_data(data)
 
 
-async def main() -> None:
-    rig = load_rig(Path(sys.argv[1]))
-    (name,) = rig.amplifiers
+async def open_amplifier(name: str, kind: str, seen: list[tuple[int, str, Frame]]) -> str:
+    """Serve an amplifier on a wire of a kind, note its sets, and return its URL."""
     amplifier = SimulatedAmplifier(name, channels=4)
     reader = FrameReader()
-    seen: list[tuple[int, Frame]] = []
 
     def arrived(data: bytes) -> None:
         now = time.monotonic_ns()
         for frame in reader.feed(data):
-            if frame.kind == PROTOCOL.types["apply"]:
-                seen.append((now, frame))
+            if frame.kind in SETS:
+                seen.append((now, name, frame))
             amplifier.tick(now * 1e-9)
             reply = amplifier.handle(decode_request(frame), now * 1e-9)
             wire.write(encode_frame(encode_reply(reply, frame)))
 
     wire = Wire(arrived)
-    url = await (wire.open_terminal() if sys.argv[3] == "pty" else wire.open_server())
+    return await (wire.open_terminal() if kind == "pty" else wire.open_server())
+
+
+async def main() -> None:
+    seen: list[tuple[int, str, Frame]] = []
+    names = load_rig(Path(sys.argv[1])).amplifiers
+    urls = [await open_amplifier(name, sys.argv[3], seen) for name in names]
 
     def write() -> None:
         with Path(sys.argv[2]).open("w", encoding="utf-8") as stream:
-            for when, frame in seen:
-                line = json.dumps([when, frame.sequence, frame.payload.hex()])
+            for when, name, frame in seen:
+                line = json.dumps([when, name, frame.kind, frame.sequence, frame.payload.hex()])
                 stream.write(f"{line}\n")
         print("written", flush=True)
 
@@ -84,7 +91,7 @@ async def main() -> None:
     gc.collect()
     gc.freeze()
     gc.disable()  # nothing becomes garbage
-    print(url, flush=True)
+    print(*urls, flush=True)
     await asyncio.Event().wait()
 
 

@@ -4,7 +4,7 @@ The table is queried offline for each touch; a command that plays the result bel
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,32 +17,57 @@ from controller.loop.selection import MOVE_TOLERANCE, Selector
 from controller.sources.contacts import Contact, ContactKey
 from drivers.codec.serial_line.exchanges import decode_request
 from drivers.codec.serial_line.frame import Frame
-from drivers.command import DriveCommand
-from drivers.protocol.messages import Apply
+from drivers.command import CommandSet, DriveCommand
+from drivers.protocol.messages import Apply, Commit, Stage
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 
 MAX_AGE = 0.5  # s; of the touch of a command
+_Tones = Mapping[tuple[str, int], tuple[float, complex]]
 _TOLERANCE = (1e-4, 2e-3)  # absolute in full strokes, relative to the level
 
 
 @dataclass(frozen=True)
 class Command:
-    """A set at the far end: arrival [s], number of its frame, token and commands."""
+    """A set at the far end: arrival of its last byte [s], number of that frame, token, commands.
+
+    commands: with the amplifier of each.
+    """
 
     time: float
     sequence: int
     token: int
-    commands: tuple[DriveCommand, ...]
+    commands: tuple[tuple[str, DriveCommand], ...]
 
-    @classmethod
-    def read(cls, line: Sequence[int | str], kind: int) -> "Command":
-        """Read a line of the far end; kind: of the frame."""
-        when, sequence, payload = line
-        request = decode_request(Frame(kind, 1, int(sequence), bytes.fromhex(str(payload))))
-        assert isinstance(request, Apply)
-        wanted = request.command_set
-        return cls(int(when) * 1e-9, int(sequence), wanted.token, wanted.commands)
+
+def read_commands(
+    lines: Iterable[Sequence[int | str]], amplifiers: Collection[str]
+) -> Iterator[Command]:
+    """Read the lines of the far end: a set plays once the last amplifier has it, and its commit.
+
+    Stages are of no moment by themselves. A frame that is repeated counts when it first came.
+    """
+    staged: dict[tuple[str, int], tuple[DriveCommand, ...]] = {}
+    played: dict[int, dict[str, tuple[DriveCommand, ...]]] = {}
+    for when, name, kind, sequence, payload in lines:
+        amplifier, number = str(name), int(sequence)
+        request = decode_request(Frame(int(kind), 1, number, bytes.fromhex(str(payload))))
+        match request:
+            case Stage(command_set=wanted):
+                staged[amplifier, wanted.token] = wanted.commands
+                continue
+            case Commit(token=token):
+                commands = staged[amplifier, token]
+            case Apply(command_set=wanted):
+                token, commands = wanted.token, wanted.commands
+            case _:
+                raise AssertionError(f"{type(request).__name__} is no set")
+        several = played.setdefault(token, {})
+        several.setdefault(amplifier, commands)
+        if several.keys() == set(amplifiers):
+            del played[token]
+            all_of_them = tuple((name, each) for name in several for each in several[name])
+            yield Command(int(when) * 1e-9, number, token, all_of_them)
 
 
 @dataclass(frozen=True)
@@ -125,7 +150,7 @@ class Expected:
         if flooded is not None:
             length, width = rig.plate.length, rig.plate.width
             self._others.append((FLOODING[0] * length + flooded, FLOODING[1] * width))
-        self._known: dict[int, Mapping[int, tuple[float, complex]]] = {}
+        self._known: dict[tuple[float, float], _Tones] = {}
 
     def error(self, touch: int, command: Command) -> float:
         """Distance of a command from the one expected for a touch; up to 1 it matches."""
@@ -133,8 +158,8 @@ class Expected:
         absolute, relative = _TOLERANCE
         loudest = max((abs(amplitude) for _, amplitude in expected.values()), default=0.0)
         most = 0.0
-        for played in command.commands:
-            frequency, amplitude = expected.get(played.channel, (played.frequency, 0j))
+        for amplifier, played in command.commands:
+            frequency, amplitude = expected.get((amplifier, played.channel), (played.frequency, 0j))
             if played.level > 0 and abs(played.frequency - frequency) > 0.01:
                 return math.inf
             difference = abs(played.phasor - amplitude)
@@ -151,29 +176,26 @@ class Expected:
                 return number
         return touch
 
-    def _expected(self, touch: int) -> Mapping[int, tuple[float, complex]]:
-        """Frequency [Hz] and complex level by channel."""
-        if touch not in self._known:
+    def _expected(self, touch: int) -> _Tones:
+        """Frequency [Hz] and complex level by amplifier and channel."""
+        place = self._places[touch]
+        if place not in self._known:
             contacts = [
                 Contact(ContactKey("bench", number), x, y, since=float(number))
-                for number, (x, y) in enumerate([*self._others, self._places[touch]])
+                for number, (x, y) in enumerate([*self._others, place])
             ]
             intent = BuzzNewestContact().intent(contacts, 0.0)
             pattern = Selector(self._table).select(contacts, intent, self._capabilities).pattern
-            commands: Sequence[DriveCommand] = ()
+            sets: Mapping[str, CommandSet] = {}
             if pattern is not None:
                 sets = route(pattern.excitation, self._rig, token=1, ramp=pattern.ramp)
-                ((_, only),) = sets.items()
-                commands = only.commands
-            self._known[touch] = {
-                each.channel: (
-                    each.frequency,
-                    each.phasor,
-                )
-                for each in commands
+            self._known[place] = {
+                (name, each.channel): (each.frequency, each.phasor)
+                for name, one in sets.items()
+                for each in one.commands
                 if each.level > 0
             }
-        return self._known[touch]
+        return self._known[place]
 
     def _on_plate(self, x: float, y: float) -> tuple[float, float]:
         """Position on the plate [m] after transfer in single precision."""

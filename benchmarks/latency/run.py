@@ -7,21 +7,20 @@ import socket
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.latency.machine import Others
-from benchmarks.latency.match import Command, Expected, Matched, match
+from benchmarks.latency.match import Command, Expected, Matched, match, read_commands
 from benchmarks.latency.programs import ERA, TIMEOUT, Ended, Program, Rank, module
 from benchmarks.latency.touches import WANDERS, Work
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.api.schema import LatencySummary
 from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
-from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Capabilities
 from drivers.protocol.wire_times import WireTimes
 from model.rig.file import example_rig_path, load_rig
@@ -37,14 +36,15 @@ STOPS = 300  # measured per case with flooders
 _SETTLE = 1.0  # s
 
 DAEMON: Sequence[object] = (ERA, "daemon")
-"""The command that is measured, without its file."""
+"""The command that is measured, without its file, unless a case has its own."""
 
 
 @dataclass(frozen=True)
 class Case:
     """A case: touches; whether the machine is loaded; touch_wait [ms] of the daemon, None for the
     baseline; wire: `tcp` or `pty`; flooders: kind of those that run meanwhile, of
-    `benchmarks.latency.clients.FLOODS`, after which stops are measured."""
+    `benchmarks.latency.clients.FLOODS`, after which stops are measured; rig: its file; unmeasured:
+    number of touches at the beginning; daemon: its command, without its file."""
 
     name: str
     work: Work
@@ -52,6 +52,9 @@ class Case:
     touch_wait: float | None
     wire: str = "tcp"
     flooders: str | None = None
+    rig: Path = field(default_factory=example_rig_path)
+    unmeasured: int = 0
+    daemon: Sequence[object] | None = None
 
 
 @dataclass(frozen=True)
@@ -117,24 +120,24 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
     with tempfile.TemporaryDirectory(prefix="era-latency-") as name, contextlib.ExitStack() as all_:
         folder = Path(name)
         rig_file, seen, sent_file = folder / "rig.yaml", folder / "seen.jsonl", folder / "sent.npy"
-        rig_file.write_text(example_rig_path().read_text("utf-8"), "utf-8")
+        rig_file.write_text(case.rig.read_text("utf-8"), "utf-8")
         far = Program(all_, *module("far_end"), rig_file, seen, case.wire, rank=Rank.DEVICE)
-        url = far.line()
+        urls = far.line().split()
         path = folder / "socket"
         daemon: Client | None = None
         if case.touch_wait is None:
-            plain = Program(all_, *module("plain"), rig_file, url, path, rank=Rank.SERVICE)
+            plain = Program(all_, *module("plain"), rig_file, *urls, path, rank=Rank.SERVICE)
             port, tested = int(plain.line()), plain
         else:
             port = _free_port()
-            config = _daemon_file(folder, url, table_file, port, case.touch_wait)
-            tested = Program(all_, *DAEMON, config, rank=Rank.SERVICE)
+            config = _daemon_file(folder, urls, table_file, port, case.touch_wait)
+            tested = Program(all_, *(case.daemon or DAEMON), config, rank=Rank.SERVICE)
             daemon = _client(all_, path, tested)
             all_.enter_context(daemon.armed("latency"))
         panel = Program(
             all_,
-            *(*module("clients"), "panel", rig_file, port),
-            *(case.work.kind, case.work.count, case.work.rate, case.work.seed, sent_file),
+            *(*module("clients"), "panel", rig_file, port, sent_file),
+            *(each for each in astuple(case.work) if each is not None),
             rank=Rank.DEVICE,
         )
         panel.line()
@@ -152,8 +155,9 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
             programs += [Program(all_, *module("clients"), "work") for _ in range(WORKERS)]
         time.sleep(_SETTLE)
         others = Others(lambda: sum(program.computed() for program in programs))
-        computed = -tested.computed()
         panel.tell("go")
+        time.sleep(case.unmeasured / case.work.rate)
+        computed = -tested.computed()
         panel.line()
         computed += tested.computed()
         busy = others.processors()
@@ -178,10 +182,8 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
         far.finish()
         rig = load_rig(rig_file)
         sent = np.load(sent_file) * 1e-9
-        commands = [
-            Command.read(json.loads(line), PROTOCOL.types["apply"])
-            for line in seen.read_text("utf-8").splitlines()
-        ]
+        read = map(json.loads, seen.read_text("utf-8").splitlines())
+        commands = list(read_commands(read, rig.amplifiers))
     matched = _matched(case, commands, sent, rig, table)
     is_urgent = all(program.is_urgent for program in programs)
     return Found(case, matched, own, len(sent), computed, busy, is_urgent, stops)
@@ -194,8 +196,9 @@ def _matched(
     rig: Rig,
     table: LocalizationTable,
 ) -> Matched:
-    """Match the commands from the first touch on."""
-    since = [each for each in commands if sent[0] <= each.time <= sent[-1] + LAST]
+    """Match the commands from the first touch on that is measured."""
+    begin = sent[case.unmeasured]
+    since = [each for each in commands if begin <= each.time <= sent[-1] + LAST]
     if case.touch_wait is None:
         return match(
             since,
@@ -213,7 +216,7 @@ def _matched(
     vibrating = [
         each
         for each in since
-        if id(each) not in repeated and any(command.level > 0 for command in each.commands)
+        if id(each) not in repeated and any(command.level > 0 for _, command in each.commands)
     ]
     return match(vibrating, sent, *(each.error for each in expected), first=expected[0].first)
 
@@ -226,9 +229,14 @@ def _capabilities(rig: Rig, touch_wait: float) -> PlaybackCapabilities:
     return playback_capabilities(rig, opened, max_loading_time=touch_wait * 1e-3)
 
 
-def _daemon_file(folder: Path, url: str, table: Path, port: int, touch_wait: float) -> Path:
+def _daemon_file(
+    folder: Path, urls: Sequence[str], table: Path, port: int, touch_wait: float
+) -> Path:
     rig = folder / "rig.yaml"
-    rig.write_text(rig.read_text("utf-8").replace('"sim://"', f'"{url}"'), "utf-8")
+    text = rig.read_text("utf-8")
+    for url in urls:
+        text = text.replace('"sim://"', f'"{url}"', 1)
+    rig.write_text(text, "utf-8")
     path = folder / "daemon.yaml"
     path.write_text(
         f"rig: rig.yaml\nsocket: socket\ntable: {table}\ntouch_wait: {touch_wait:g} ms\n"

@@ -9,12 +9,17 @@ import numpy as np
 import pytest
 
 from benchmarks.latency.machine import busy_ticks
-from benchmarks.latency.match import Command, Matched, match
+from benchmarks.latency.match import Command, Matched, match, read_commands
 from benchmarks.latency.programs import Ended
 from benchmarks.latency.report import DOCS, HEAD_CELLS, cases, flooded_lines, report, write_report
 from benchmarks.latency.run import Case, Disturbed, Failed, Found, attempt
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.schema import LatencySummary
+from drivers.codec.serial_line.exchanges import encode_request
+from drivers.command import CommandSet, DriveCommand
+from drivers.guard import Guard, GuardLimits, SafeCommandSet
+from drivers.protocol.messages import Apply, Commit, Request, Stage
+from sim.amplifier.amplifier import capabilities
 
 CASES = cases(0.01, 1)
 
@@ -144,3 +149,38 @@ def test_match_falls_back_to_the_touch_without_the_flood() -> None:
     assert matched.touch.tolist() == [1, 2]
     assert matched.newest == pytest.approx([0.0005, 0.001])
     assert matched.unmatched == 1
+
+
+def safe(token: int, level: float) -> SafeCommandSet:
+    """A set of one channel that a guard has checked."""
+    commands = (DriveCommand(0, 100.0, level),)
+    asked = CommandSet(token, commands, ramp=0.02, valid_for=0.0)
+    return Guard(
+        GuardLimits(frequency_min=40.0, frequency_max=500.0, level=1.0), capabilities(4)
+    ).check(asked)
+
+
+def line(milliseconds: int, amplifier: str, request: Request) -> tuple[int | str, ...]:
+    """What the far end writes of a request."""
+    frame = encode_request(request, address=1, sequence=milliseconds)
+    return (milliseconds * 1_000_000, amplifier, frame.kind, frame.sequence, frame.payload.hex())
+
+
+def test_set_of_two_amplifiers_plays_at_the_commit_of_the_second() -> None:
+    """Stages have no moment, nor has a repeated commit; silence needs no stage."""
+    lines = [
+        line(1, "a", Stage(safe(5, 0.5))),
+        line(2, "b", Stage(safe(5, 0.25))),
+        line(3, "a", Commit(5)),
+        line(4, "a", Commit(5)),
+        line(6, "b", Commit(5)),
+        line(7, "b", Apply(safe(7, 0.0))),
+        line(9, "a", Apply(safe(7, 0.0))),
+    ]
+    first, second = read_commands(lines, ("a", "b"))
+    assert (first.time, first.token, first.sequence) == (pytest.approx(0.006), 5, 6)
+    assert [(name, each.level) for name, each in first.commands] == [
+        ("a", pytest.approx(0.5, abs=1e-4)),
+        ("b", pytest.approx(0.25, abs=1e-4)),
+    ]
+    assert (second.time, second.token) == (pytest.approx(0.009), 7)

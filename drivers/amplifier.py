@@ -4,7 +4,7 @@ import asyncio
 import logging
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import final
 
 from drivers import clock, trace
@@ -16,7 +16,7 @@ from drivers.errors import (
     LinkError,
     Preempted,
 )
-from drivers.guard import SafeCommandSet, SafeEnvelope, require_safe
+from drivers.guard import SafeCommandSet, SafeEnvelope, require_safe, require_safe_set
 from drivers.guard.recorder import PlayRecorder
 from drivers.line.sender import SUPERSEDED
 from drivers.link.link import REPLY_TIMEOUT, Link, ReplyT
@@ -304,7 +304,7 @@ class Amplifier(SensorClient):
         Of several sets the newest goes on; the others raise Preempted, as a set does if silence, a
         stop or a disarm comes.
         """
-        require_safe(Apply(safe, self.session))
+        require_safe_set(safe)
         interval = (self._watchdog or WATCHDOG) / _FEEDS_PER_WATCHDOG
         await self._pacing.wait_for_room(safe, self.heartbeat, interval=interval)
 
@@ -402,8 +402,7 @@ class Amplifier(SensorClient):
         self._stop_count += 1
         self._pacing.supersede()
         request = Stop(ramp=self._ramp(ramp))
-        with _errors_logged_for_stop(request):
-            self._recorder.sending(request)
+        _note(request, self._recorder.sending)
         await self._link.broadcast(request)
 
     async def set_address(self, address: int, serial_number: str) -> None:
@@ -431,14 +430,15 @@ class Amplifier(SensorClient):
         timeout: float | None = None,
     ) -> ReplyT:
         require_safe(request)
-        feeding = nullcontext() if isinstance(request, _NOT_FEEDING) else self._feeding()
-        with _errors_logged_for_stop(request):
-            self._recorder.sending(request)
+        _note(request, self._recorder.sending)
         started_at = clock.now()
         outcome: object = "cancelled"
         try:
-            with feeding:
+            if isinstance(request, _NOT_FEEDING):
                 reply = await self._link.request(request, expect=expect, timeout=timeout)
+            else:
+                with self._feeding():
+                    reply = await self._link.request(request, expect=expect, timeout=timeout)
             outcome = reply
         except DriverError as error:
             outcome = error
@@ -446,10 +446,8 @@ class Amplifier(SensorClient):
         finally:
             self._recorder.left(request)
             self._pacing.notice()
-            with _errors_logged_for_stop(request):
-                trace.request(request, outcome, clock.now() - started_at)
-        with _errors_logged_for_stop(request):
-            self._recorder.replied(request, reply)
+            _note(request, trace.request, outcome, clock.now() - started_at)
+        _note(request, self._recorder.replied, reply)
         return reply
 
     @contextmanager
@@ -483,14 +481,13 @@ class Amplifier(SensorClient):
         return min(ramp, max_ramp) if ramp > 0 else 0.0
 
 
-@contextmanager
-def _errors_logged_for_stop(request: Request) -> Iterator[None]:
-    """Log errors in the block instead of raising them if the request is a Stop or Disarm.
+def _note(request: Request, record: Callable[..., object], *details: object) -> None:
+    """Call `record` with a request; of a Stop or Disarm, log its error instead of raising it.
 
     Bookkeeping must not prevent it.
     """
     try:
-        yield
+        record(request, *details)
     except Exception:
         if not isinstance(request, Stop | Disarm):
             raise

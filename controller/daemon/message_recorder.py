@@ -1,11 +1,10 @@
 """A ring buffer of the last messages of all links, for fault dumps."""
 
+import logging
 from collections import deque
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
-from controller.daemon.deferred_calls import call_guarded
 from drivers import clock
 from drivers.backend import Backend
 from drivers.errors import LinkError
@@ -14,6 +13,8 @@ from drivers.protocol.wire_times import WireTimes
 from drivers.statistics import WireCounters
 
 MAX_RECORDS = 400  # over all links: the last seconds under load, ten seconds at rest
+
+_logger = logging.getLogger(__name__)
 
 
 class MessageRecord(NamedTuple):
@@ -57,7 +58,10 @@ class RecordedBackend(Backend):
 
     def _record(self, direction: str, message: object) -> None:
         """Record a message; a stop depends on no record."""
-        call_guarded(partial(self._recorder.add, self._name, direction, message))
+        try:
+            self._recorder.add(self._name, direction, message)
+        except Exception:
+            _logger.exception("recorder failed")
 
     async def open(self) -> None:
         """Open the backend."""

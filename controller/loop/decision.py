@@ -212,14 +212,15 @@ class Decider:
 
         sent_at [s]: when the last byte of the commit was sent; pulses start with it.
         """
-        self._playing = replace(self._playing, confirmed_commands=commands)
         decision = self._playing.decision
         if decision is None or decision.sets is None or decision.pattern is None:
+            self._playing = replace(self._playing, confirmed_commands=commands)
             return
         for _, target in decision.selection.targets:
             if target.pulse is not None and target.pulse.started_at is None:
                 target.pulse.started_at = now if sent_at is None else sent_at
-        self._note_validity(decision.sets, decision.selection, now)
+        validity = self._validity(decision.sets, decision.selection, now)
+        self._playing = replace(self._playing, confirmed_commands=commands, validity=validity)
         if decision.adds_endings_only:
             self._playing = replace(self._playing, has_endings=True)
         elif self._capabilities_at(now).envelope_support.endings and self._timing is not None:
@@ -243,7 +244,8 @@ class Decider:
     def confirm_renewal(self, sets: SafeSets, *, now: float) -> None:
         """Note that the amplifiers have accepted the sets of a renewal."""
         if self._playing.decision is not None:
-            self._note_validity(sets, self._playing.decision.selection, now)
+            validity = self._validity(sets, self._playing.decision.selection, now)
+            self._playing = replace(self._playing, validity=validity)
 
     def without_onset(self, decision: Decision) -> Decision | None:
         """Return the last decision along its plain ramp, since its onset was not loaded in time.
@@ -415,11 +417,10 @@ class Decider:
         end = last_end(decision.selection)
         return end if end <= now else None
 
-    def _note_validity(self, sets: SafeSets, selection: Selection, now: float) -> None:
-        """Note how long sets committed by now [s] last."""
+    def _validity(self, sets: SafeSets, selection: Selection, now: float) -> Validity:
+        """Return how long sets committed by now [s] last."""
         until = self._confirmed_until(selection)
-        validity = Validity.started(sets.valid_for, confirmed_until=until, now=now)
-        self._playing = replace(self._playing, validity=validity)
+        return Validity.started(sets.valid_for, confirmed_until=until, now=now)
 
     def _note(self, change: Change, time: float) -> None:
         """Note when the first change since the last decision arrived."""

@@ -1,7 +1,6 @@
 """The control loop: decide, send what changed, then feed the amplifiers' watchdogs."""
 
 import asyncio
-import contextlib
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -285,16 +284,24 @@ class Controller:
         self._report_change(change)
 
     def _schedule_expiry(self) -> None:
-        """Check for expired sources when the next one times out."""
+        """Check for expired sources when the next one times out.
+
+        A timer that is due before stays: nothing is set anew for every frame of a source.
+        """
+        due = self._decider.next_expiry
+        if due is None or self.group_state is not GroupState.ARMED:
+            due = math.inf
         if self._expiry is not None:
+            if self._expiry.when() <= due < math.inf:
+                return
             self._expiry.cancel()
             self._expiry = None
-        due = self._decider.next_expiry
-        if due is not None and self.group_state is GroupState.ARMED:
+        if due < math.inf:
             pause = max(0.0, due - clock.now())
             self._expiry = asyncio.get_running_loop().call_later(pause, self._expire)
 
     def _expire(self) -> None:
+        self._expiry = None
         self._follow(self._decider.expire(clock.now()))
 
     async def _execute(self, decision: Decision, *, load_until: float) -> bool:
@@ -375,15 +382,20 @@ class Controller:
 
     async def _wait_for_event(self) -> None:
         """Wait for a change, a heartbeat, the timeout of a source or the expiry of an intent."""
+        if self._wake.is_set():
+            return
         now = clock.now()
-        moments = [now + IDLE_INTERVAL]
-        if self._decider.due is not None:
-            moments.append(self._decider.due)
+        until, due = now + IDLE_INTERVAL, self._decider.due
+        if due is not None:
+            until = min(until, due)
         if self.group_state is GroupState.ARMED:
-            moments.append(self._heartbeat_due)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(max(0.0, min(moments) - now)):
-                await self._wake.wait()
+            until = min(until, self._heartbeat_due)
+        pause = max(0.0, until - now)
+        timer = asyncio.get_running_loop().call_later(pause, self._wake.set)
+        try:
+            await self._wake.wait()
+        finally:
+            timer.cancel()
 
     def _report_change(self, change: Change) -> None:
         if change:

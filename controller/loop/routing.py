@@ -6,6 +6,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from operator import attrgetter
 
 from controller.loop.envelopes import ending_slots, onset_slots
 from drivers.command import CommandSet, DriveCommand
@@ -13,7 +14,9 @@ from drivers.protocol.messages import Achieved
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.transients.envelope import Envelopes
-from model.vibration.excitation import Excitation
+from model.vibration.excitation import Excitation, Tone
+
+_CHANNEL = attrgetter("channel")
 
 
 def route(
@@ -24,6 +27,7 @@ def route(
     ramp: float,
     playing: Mapping[str, DriveCommand] | None = None,
     onset: Envelopes | None = None,
+    valid_for: float = 0.0,
 ) -> dict[str, CommandSet]:
     """Return a command set for every amplifier of the rig, by name, all under one token.
 
@@ -31,8 +35,9 @@ def route(
     (-180, 180], level 0 for an ERA that is not driven. ramp [s]: lengthened to the rig's slew
     limit, on all amplifiers alike. playing: what each ERA plays now (`commands_by_era`); a
     frequency keeps its phase if all its ERAs play it already. onset: envelopes in the slots of
-    `controller.loop.envelopes`; one may lead an ERA that is not driven to silence. All other limits
-    belong to the guard. Raises InputError for an ERA that the rig does not have.
+    `controller.loop.envelopes`; one may lead an ERA that is not driven to silence. valid_for [s]:
+    of the sets. All other limits belong to the guard. Raises InputError for an ERA that the rig
+    does not have.
     """
     unknown = sorted(excitation.keys() - rig.wiring.keys())
     if unknown:
@@ -41,7 +46,11 @@ def route(
             "rig"
         )
     restarted = _restarted(excitation, playing or {})
-    drive = {name: _drive(excitation, rig, name, restarted=restarted) for name in rig.wiring}
+    strokes = {era.name: era.stroke for era in rig.eras}
+    drive = {
+        name: _drive(excitation.get(name), rig, channel.number, strokes[name], restarted=restarted)
+        for name, channel in rig.wiring.items()
+    }
     if onset:
         slots = onset_slots(rig)
         for name, envelope in onset.items():
@@ -49,7 +58,7 @@ def route(
     max_rise = max((_rise(drive[name], (playing or {}).get(name)) for name in drive), default=0.0)
     min_ramp = max_rise / rig.limits.slew
     ramp = min_ramp if min_ramp > ramp else ramp  # the guard refuses NaN
-    return _sets(drive, rig, token=token, ramp=ramp)
+    return _sets(drive, rig, token=token, ramp=ramp, valid_for=valid_for)
 
 
 def _rise(command: DriveCommand, before: DriveCommand | None) -> float:
@@ -112,7 +121,12 @@ def route_to_silence(rig: Rig, *, token: int, ramp: float) -> dict[str, CommandS
 
 
 def _sets(
-    drive: Mapping[str, DriveCommand], rig: Rig, *, token: int, ramp: float
+    drive: Mapping[str, DriveCommand],
+    rig: Rig,
+    *,
+    token: int,
+    ramp: float,
+    valid_for: float = 0.0,
 ) -> dict[str, CommandSet]:
     """Return the command set of every amplifier, by name, from the command of every ERA."""
     wired: dict[str, list[DriveCommand]] = {name: [] for name in rig.amplifiers}
@@ -121,9 +135,9 @@ def _sets(
     return {
         name: CommandSet(
             token=token,
-            commands=tuple(sorted(commands, key=lambda command: command.channel)),
+            commands=tuple(sorted(commands, key=_CHANNEL)),
             ramp=ramp,
-            valid_for=0.0,
+            valid_for=valid_for,
         )
         for name, commands in wired.items()
     }
@@ -141,16 +155,16 @@ def _restarted(excitation: Excitation, playing: Mapping[str, DriveCommand]) -> s
     }
 
 
-def _drive(excitation: Excitation, rig: Rig, name: str, *, restarted: set[float]) -> DriveCommand:
-    """Return the command of the channel of one ERA."""
-    number = rig.wiring[name].number
-    tone = excitation.get(name)
+def _drive(
+    tone: Tone | None, rig: Rig, number: int, stroke: float, *, restarted: set[float]
+) -> DriveCommand:
+    """Return the command of a channel for the tone of its ERA, of a stroke [m]."""
     if tone is None:
         return _silent(number, rig)
     return DriveCommand(
         channel=number,
         frequency=tone.frequency,
-        level=tone.amplitude / rig.era(name).stroke,
+        level=tone.amplitude / stroke,
         phase=_wrapped_degrees(tone.phase),
         keep_phase=tone.frequency not in restarted,
     )

@@ -59,7 +59,7 @@ class SafeSets:
     @property
     def room_from(self) -> float:
         """When [s] every channel that they drive has a voice for them; see `PlayRecord`."""
-        return max(safe.record.room_from(safe) for safe in self.sets.values())
+        return max([safe.record.room_from(safe) for safe in self.sets.values()])
 
     @property
     def settled_after(self) -> float:
@@ -120,7 +120,8 @@ class SetBuilder:
         self, pattern: Pattern, *, playing: Mapping[str, DriveCommand], valid_for: float
     ) -> tuple[SafeSets, Pattern]:
         """Build the sets of a pattern along its ramp; raises CommandRefused."""
-        routed = self._routed(replace(pattern, onset=None), playing, valid_for)
+        plain = pattern if pattern.onset is None else replace(pattern, onset=None)
+        routed = self._routed(plain, playing, valid_for)
         # Every guard sees its set, so that all refusals are reported at once.
         checked = {
             name: guard.check_or_silence(routed[name], ramp=FADE_RAMP)
@@ -216,15 +217,15 @@ class SetBuilder:
         self, pattern: Pattern, playing: Mapping[str, DriveCommand], valid_for: float
     ) -> dict[str, CommandSet]:
         """Route a pattern to the rig's channels under the next token."""
-        sets = route(
+        return route(
             pattern.excitation,
             self._rig,
             token=self._next_token(),
             ramp=min(pattern.ramp, self._ramp_max),
             playing=playing,
             onset=pattern.onset,
+            valid_for=valid_for,
         )
-        return _with_valid_for(sets, valid_for)
 
     def _checked(self, sets: Mapping[str, CommandSet]) -> dict[str, SafeCommandSet]:
         """Check every set by its guard; raises CommandRefused."""

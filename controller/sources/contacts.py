@@ -62,6 +62,9 @@ class Change:
         return bool(self.down or self.moved or self.pressed or self.up)
 
 
+_UNCHANGED = Change()
+
+
 @dataclass(frozen=True, slots=True)
 class _Source:
     """A source with contacts: the time [s] of its last frame, and its origin."""
@@ -142,12 +145,14 @@ class ContactTracker:
         """Lift the contacts of all sources that have timed out at now [s]."""
         # Same expression as next_expiry, so both round alike. Frames dated in the future are
         # treated as received now.
-        expired = {name for name, source in self._sources.items() if source.expiry <= now}
-        up = self._lift(key for key in self._contacts if key.source in expired)
-        self._forget_sources()
+        expired = [name for name, source in self._sources.items() if source.expiry <= now]
+        up = self._lift(key for key in self._contacts if key.source in expired) if expired else ()
+        if expired:
+            self._forget_sources()
         for name, source in self._sources.items():
-            self._sources[name] = replace(source, received=min(source.received, now))
-        return Change(up=up)
+            if source.received > now:
+                self._sources[name] = replace(source, received=now)
+        return Change(up=up) if up else _UNCHANGED
 
     def _contact(
         self, key: ContactKey, touch: Touch, known: Contact | None, time: float

@@ -1,7 +1,7 @@
 """Waiting for a reply, with allowance for delays of this process."""
 
 import asyncio
-from typing import TypeVar
+from typing import Any, TypeVar, final
 
 DUPLICATE_WAIT = 0.02  # s; for a second amplifier of the same address to reply
 _LATE = 0.005  # s; a timer later than this means that this process was delayed
@@ -10,28 +10,52 @@ _GRACE = 0.010  # s; for data received but not read yet, here or in a reader thr
 _T = TypeVar("_T")
 
 
-async def reply_within(reply: "asyncio.Future[_T]", timeout: float) -> _T:
-    """Return the reply; TimeoutError if it does not arrive within the timeout [s].
+@final
+class ReplyTimer:
+    """The timeouts of the replies on one line, under one timer.
 
-    A reply that arrived in time counts even if this process was delayed and reads it late.
+    Nearly every reply comes long before its timeout. So the timer is left as it is until then, and
+    only set again if a reply is still awaited.
     """
-    loop = asyncio.get_running_loop()
-    due = loop.time() + timeout
 
-    def give_up() -> None:
-        if not reply.done():
-            reply.set_exception(TimeoutError())
+    def __init__(self) -> None:
+        self._due: dict[asyncio.Future[Any], float] = {}  # s; of the awaited replies
+        self._delayed: set[asyncio.Future[Any]] = set()  # those that were granted _GRACE
+        self._timer: asyncio.TimerHandle | None = None
 
-    def expire() -> None:
-        if loop.time() - due > _LATE:
-            loop.call_later(_GRACE, give_up)
-        else:
-            give_up()
+    async def wait(self, reply: "asyncio.Future[_T]", timeout: float) -> _T:
+        """Return the reply; TimeoutError if it does not arrive within the timeout [s].
 
-    timer = loop.call_at(due, expire)
-    try:
-        return await reply
-    finally:
-        timer.cancel()
-        if reply.done() and not reply.cancelled():
-            reply.exception()  # it counts as retrieved where this wait was cancelled
+        A reply that arrived in time counts even if this process was delayed and reads it late.
+        """
+        due = self._due[reply] = asyncio.get_running_loop().time() + timeout
+        if self._timer is None or self._timer.when() > due:
+            self._set(due)
+        try:
+            return await reply
+        finally:
+            del self._due[reply]
+            self._delayed.discard(reply)
+            if reply.done() and not reply.cancelled():
+                reply.exception()  # it counts as retrieved where this wait was cancelled
+
+    def _set(self, due: float) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = asyncio.get_running_loop().call_at(due, self._expire, due)
+
+    def _expire(self, scheduled: float) -> None:
+        """Give up the replies that are due by a scheduled time [s]."""
+        self._timer = None
+        now = asyncio.get_running_loop().time()
+        for reply, due in [*self._due.items()]:
+            if due > max(now, scheduled) or reply.done():
+                continue
+            if now - due > _LATE and reply not in self._delayed:
+                self._delayed.add(reply)
+                self._due[reply] = now + _GRACE
+            else:
+                reply.set_exception(TimeoutError())
+        left = [due for reply, due in self._due.items() if not reply.done()]
+        if left:
+            self._set(min(left))

@@ -5,9 +5,9 @@ an amplifier's Nak.
 """
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from enum import IntEnum
-from typing import Any, TypeVar
+from typing import Any, TypeVar, final
 
 from drivers.errors import CommandError, FrameError
 from drivers.protocol.definition import PROTOCOL, WireQuantity
@@ -16,6 +16,7 @@ from drivers.protocol.messages import NakCode, Status
 _CHANNEL = PROTOCOL.quantities.channel
 _NO_CHANNEL = 255
 _STATUS_FLAGS = PROTOCOL.status_flags
+_KNOWN_FLAGS = sum(1 << bit for bit in _STATUS_FLAGS.values())
 _TEXT_MAX = 32
 _BAD_VALUE = NakCode.BAD_VALUE
 _REAL_MAX = (2 - 2**-23) * 2.0**127  # of IEEE 754 binary32
@@ -23,6 +24,22 @@ _LAYOUTS = {code: struct.Struct("<" + code) for code in "BHIh"}
 _REAL = struct.Struct("<f")
 
 EnumT = TypeVar("EnumT", bound=IntEnum)
+
+
+@final
+class Row:
+    """Quantities that follow each other in a payload."""
+
+    def __init__(self, *quantities: WireQuantity) -> None:
+        self.quantities = quantities
+        self._layout = struct.Struct("<" + "".join(each.struct_code for each in quantities))
+        self.size = self._layout.size
+        self.unpack_from = self._layout.unpack_from
+
+    def pack(self, *values: float) -> bytes:
+        """Pack values in their units; CommandError for one out of range."""
+        encoded = [each.to_wire(value) for each, value in zip(self.quantities, values, strict=True)]
+        return self._layout.pack(*encoded)
 
 
 class Malformed(FrameError):
@@ -44,9 +61,29 @@ class Cursor:
     def integer(self, quantity: WireQuantity) -> int:
         """Read an integer."""
         value = self._raw(quantity.struct_code)
-        if not quantity.holds(value):
+        if not quantity.minimum <= value <= quantity.maximum:
             raise _out_of_range(quantity, value)
         return value
+
+    def integers(self, row: Row) -> Sequence[int]:
+        """Read the integers of a row."""
+        end = self._at + row.size
+        if end > len(self._payload):  # raises for the first that is missing or out of range
+            return [self.integer(quantity) for quantity in row.quantities]
+        values: tuple[int, ...] = row.unpack_from(self._payload, self._at)
+        self._at = end
+        for quantity, value in zip(row.quantities, values, strict=True):
+            if not quantity.minimum <= value <= quantity.maximum:
+                raise _out_of_range(quantity, value)
+        return values
+
+    def numbers(self, row: Row) -> list[float]:
+        """Read the values of a row in their units."""
+        integers = self.integers(row)
+        return [
+            value / quantity.per_unit
+            for quantity, value in zip(row.quantities, integers, strict=True)
+        ]
 
     def number(self, quantity: WireQuantity) -> float:
         """Read a value in its unit."""
@@ -106,6 +143,10 @@ class Cursor:
         """Read a number of type f32, which must be finite and not negative."""
         (value,) = _REAL.unpack(self._take(_REAL.size))
         return checked_real(value)
+
+    def rest(self) -> bytes:
+        """Read all that is left."""
+        return self._take(len(self._payload) - self._at)
 
     def end(self) -> None:
         """Require the end of the payload."""
@@ -190,7 +231,7 @@ def status_flags(status: Status) -> int:
 def flags_of(flags: int) -> dict[str, Any]:
     """Return the fields of a status that its flags give."""
     known = {name: bool(flags >> bit & 1) for name, bit in _STATUS_FLAGS.items()}
-    return {**known, "other_flags": flags & ~sum(1 << bit for bit in _STATUS_FLAGS.values())}
+    return {**known, "other_flags": flags & ~_KNOWN_FLAGS}
 
 
 def versions_of(mask: int) -> tuple[int, ...]:

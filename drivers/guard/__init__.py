@@ -13,7 +13,7 @@ from drivers.guard.limits import (
     LEVEL_CEILING,
     limits_in_force,
 )
-from drivers.guard.required import require_safe
+from drivers.guard.required import require_safe, require_safe_set
 from registry.limits import GuardLimits
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "SafeEnvelope",
     "limits_in_force",
     "require_safe",
+    "require_safe_set",
     "safe_voltage_envelope",
     "safe_voltages",
 ]

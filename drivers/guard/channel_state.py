@@ -13,6 +13,7 @@ from itertools import pairwise
 from drivers.command import DriveCommand, Envelope
 
 _FAR = math.inf
+_NOTHING: frozenset[float] = frozenset()
 _ROUNDING = 1e-9  # of full stroke; sums of floats
 
 
@@ -24,7 +25,7 @@ class Interval:
     latest: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # frozen, each takes three times as long to make, and every set makes many
 class ChannelState:
     """Playback of a channel since a commit, at first silence: a lasting tone over fading ones.
 
@@ -80,7 +81,8 @@ class ChannelState:
         start, end = self._elapsed(when)
         # An envelope to silence ends by itself.
         length = math.inf if self.is_shaped and self.path[-1] == 0 else self.valid_for
-        if start >= self.valid_for + self.ending_time and start >= self.settled_after:
+        settled_after = self.settled_after
+        if start >= settled_after and start >= self.valid_for + self.ending_time:
             return 0.0
         last = min(end, length)
         first = min(start, last)
@@ -89,13 +91,11 @@ class ChannelState:
         else:
             kept = self.fading_at(first) if self.fading_may_hold else 0.0
             both = abs(self.path[0]) + (0.0 if self.fading_may_hold else self.fading)
-            fractions = (self._progress(first), self._progress(last))
-            highest = max(
-                (1 - fraction) * both + fraction * abs(self.path[-1]) for fraction in fractions
-            )
-            highest += kept
+            reached = abs(self.path[-1])
+            fraction = self._progress(last if reached > both else first)
+            highest = (1 - fraction) * both + fraction * reached + kept
         if self.ending is not None and end > self.valid_for:
-            interrupted = abs(self.path[0]) if last < self.settled_after else 0.0  # fades by itself
+            interrupted = abs(self.path[0]) if last < settled_after else 0.0  # fades by itself
             highest = max(highest, self._highest_knot + interrupted + self.fading_at(last))
         return highest
 
@@ -164,11 +164,16 @@ class ChannelState:
 
     def frequencies_at(self, when: Interval) -> frozenset[float]:
         """Frequencies [Hz] of all tones that may play within an interval."""
+        return self.bounds(when)[1]
+
+    def bounds(self, when: Interval) -> tuple[float, frozenset[float]]:
+        """Upper bound of the level within an interval, and frequencies [Hz] of what may play."""
+        high = self.high(when)
         start, _ = self._elapsed(when)
-        found = set(self.frequencies) if self.fading_at(start) > 0 else set()
-        if self.high(when) > 0:
-            found.add(self.frequency)
-        return frozenset(found)
+        found = _NOTHING
+        if self.frequencies and self.fading_at(start) > 0:
+            found = self.frequencies
+        return high, found | {self.frequency} if high > 0 else found
 
     @property
     def envelope_slope(self) -> float:
@@ -180,8 +185,9 @@ class ChannelState:
 
     def _elapsed(self, when: Interval) -> tuple[float, float]:
         """Shortest and longest time [s] since the commit."""
-        shortest = max(0.0, when.earliest - self.commit.latest)
-        return shortest, max(shortest, when.latest - self.commit.earliest)
+        commit = self.commit
+        shortest = max(0.0, when.earliest - commit.latest)
+        return shortest, max(shortest, when.latest - commit.earliest)
 
     def _progress(self, elapsed: float) -> float:
         return _raised_cosine(elapsed, self.step)
@@ -219,6 +225,9 @@ def steepest_rise(amplitudes: Sequence[complex]) -> float:
 
     On the straight line from a to b the magnitude rises fastest at b, by |b| - |a| cos(angle).
     """
+    if len(amplitudes) == 2:  # along a ramp
+        a, b = amplitudes
+        return abs(b) - (a * b.conjugate()).real / abs(b) if b else 0.0
     rises = (abs(b) - (a * b.conjugate()).real / abs(b) for a, b in pairwise(amplitudes) if b != 0)
     return max(rises, default=0.0)
 
@@ -250,7 +259,7 @@ def state_after(
         continues = state.lasting_range(commit)
     low, high, phase_factor = continues or (0.0, 0.0, 1 + 0j)
     if continues is None:
-        fading, others = state.high(commit), state.frequencies_at(commit)
+        fading, others = state.bounds(commit)
     else:
         fading = state.fading_at(max(0.0, commit.earliest - state.commit.latest))
         others = state.frequencies if fading > 0 else frozenset()
@@ -264,8 +273,8 @@ def state_after(
         and not (continues and state.is_settled(commit))
     )
     if is_unknown:
-        low, high = 0.0, state.high(commit)
-        fading, others = high, state.frequencies_at(commit)
+        low, (high, others) = 0.0, state.bounds(commit)
+        fading = high
         phase_factor = _phase_factor((*_phasors(shape), target)[0])  # the highest sum
     fading_slope = 0.0 if state.is_settled(commit) else state.fading_slope
     fading_may_hold = state.may_be_ending(commit)
@@ -278,7 +287,9 @@ def state_after(
     frequency = state.frequency if falls_silent else command.frequency
     step = shape.step if shape is not None else ramp
     following_knots = (*_phasors(shape), target)
-    rise = max(steepest_rise((phase_factor * m, *following_knots)) for m in (low, high))
+    rise = steepest_rise((phase_factor * high, *following_knots))
+    if low != high:
+        rise = max(rise, steepest_rise((phase_factor * low, *following_knots)))
     interferes = any(following_knots) and frequency in others
     if interferes:
         rise += fading
@@ -331,7 +342,7 @@ def _raised_cosine(elapsed: float, ramp: float) -> float:
 
 
 def _phasors(envelope: Envelope | None) -> tuple[complex, ...]:
-    return tuple(knot.phasor for knot in envelope.knots) if envelope is not None else ()
+    return () if envelope is None else tuple(knot.phasor for knot in envelope.knots)
 
 
 def _phase_factor(amplitude: complex) -> complex:

@@ -195,11 +195,12 @@ class Guard:
         It is checked as the wire rounds it, ramps upward. valid_for is shortened to the on-time and
         duty that are left; a set that is sent later is checked again then.
         """
-        check_set(command_set, self._context)
+        context = self._context
+        check_set(command_set, context)
         rounded = rounded_set(
             command_set, idle_frequency=self._idle_frequency, ramp_max=self.ramp_max
         )
-        check_power(rounded, self._context)
+        check_power(rounded, context)
         remaining = self._record.check(rounded, ramp=rounded.ramp)
         valid_for = rounded.valid_for
         if vibrates(rounded) and remaining != float("inf"):

@@ -27,6 +27,8 @@ _ARRIVAL = 0.03  # s; in which a request arrives that has no reply, as the host'
 _SILENT = ChannelState()
 _NO_FREQUENCY = _SILENT.frequency
 
+_NO_ENVELOPE: tuple[None] = (None,)
+
 States = tuple[ChannelState, ...]
 
 
@@ -92,20 +94,16 @@ class PlayRecord:
         room: silence, one that ends the others at once, or one that was sent before.
         """
         token = command_set.token
-        is_sent = token == self._confirmed_token or any(
-            sent.command_set.token == token for sent in self._pending
-        )
-        if is_sent or command_set.ramp == 0:
+        if token == self._confirmed_token or command_set.ramp == 0 or self._is_pending(token):
             return -math.inf
-        voices = self._voices_after(self._pending, self._clock())
-        return max(
-            (
-                voices[command.channel].room_from(self._max_voices)
-                for command in command_set.commands
-                if command.level > 0 or command.onset
-            ),
-            default=-math.inf,
-        )
+        voices = self._voices
+        if self._pending:
+            voices = self._voices_after(self._pending, self._clock())
+        room_from = -math.inf
+        for command in command_set.commands:
+            if command.level > 0 or command.onset:
+                room_from = max(room_from, voices[command.channel].room_from(self._max_voices))
+        return room_from
 
     def fade_left(self) -> float:
         """Return the longest time [s] in which a silent set sent now may fade."""
@@ -117,9 +115,7 @@ class PlayRecord:
         Raises CommandRefused if sets sent since its check forbid it.
         """
         self.last_token = token = command_set.token
-        if token == self._confirmed_token or any(
-            sent.command_set.token == token for sent in self._pending
-        ):
+        if token == self._confirmed_token or self._is_pending(token):
             return
         now = self._clock()
         if vibrates(command_set):
@@ -223,6 +219,10 @@ class PlayRecord:
         if envelope.knots:
             self.slots[envelope.slot] = (envelope,)
 
+    def _is_pending(self, token: int) -> bool:
+        """Whether the set of this token was sent and not confirmed."""
+        return any(sent.command_set.token == token for sent in self._pending)
+
     def _check_transition(self, command_set: CommandSet, now: float) -> None:
         if not self._needs_states(command_set):
             return  # along one ramp no level exceeds both the old and the new one
@@ -286,15 +286,14 @@ class PlayRecord:
 
     def _is_shaped(self, command_set: CommandSet) -> bool:
         """Whether a channel may follow an envelope during this set or at its end."""
-        return (
-            any(command.onset or command.ending for command in command_set.commands)
-            or any(
-                state.ending or state.is_shaped or state.fading_may_hold
-                for state in self._confirmed
-            )
-            or any(
-                command.ending for sent in self._pending for command in sent.command_set.commands
-            )
+        for command in command_set.commands:
+            if command.onset or command.ending:
+                return True
+        for state in self._confirmed:
+            if state.ending or state.is_shaped or state.fading_may_hold:
+                return True
+        return bool(self._pending) and any(
+            command.ending for sent in self._pending for command in sent.command_set.commands
         )
 
     def _states(self, pending: Sequence[_Sent], when: Interval) -> States:
@@ -321,31 +320,35 @@ class PlayRecord:
         """Return the voices once a set plays, since a time [s] at the latest."""
         requested = sent.command_set
         commands = {command.channel: command for command in requested.commands}
-        each = (commands.get(n, DriveCommand(n, 0.0, 0.0)) for n in range(len(voices)))
-        return tuple(
-            before.after(
-                command,
-                Interval(min(sent.sent_at, latest), latest),
-                ramp=requested.ramp,
-                valid_for=requested.valid_for,
-                onset=self._maximum(command.onset),
-                ending=self._maximum(command.ending),
+        commit = Interval(min(sent.sent_at, latest), latest)
+        following = []
+        for channel, before in enumerate(voices):
+            command = commands.get(channel) or DriveCommand(channel, 0.0, 0.0)
+            following.append(
+                before.after(
+                    command,
+                    commit,
+                    ramp=requested.ramp,
+                    valid_for=requested.valid_for,
+                    onset=self._maximum(command.onset),
+                    ending=self._maximum(command.ending),
+                )
             )
-            for before, command in zip(voices, each, strict=True)
-        )
+        return tuple(following)
 
     def _maximum(self, slot: int) -> float:
-        """Return the longest duration [s] of an envelope that a slot may hold."""
+        """Return the longest duration [s] of an envelope that a slot may hold; 0 for no slot."""
+        if not slot:
+            return 0.0
         return max(map(duration, self.slots.get(slot, ())), default=0.0)
 
     def _fade(self, command_set: CommandSet, ramp: float) -> float:
         """Return the longest time [s] from the end of a set until silence."""
-        endings = [
-            duration(envelope)
-            for command in command_set.commands
-            for envelope in self.slots.get(command.ending, ())
-        ]
-        return max([ramp, *endings])
+        fade = ramp
+        for command in command_set.commands:
+            if command.ending:
+                fade = max(fade, self._maximum(command.ending))
+        return fade
 
     def _silent_at(self, command_set: CommandSet, now: float) -> float:
         """Return the latest time [s] at which a confirmed set is silent."""
@@ -387,26 +390,25 @@ def states_after(
 ) -> tuple[States, list[float]]:
     """Return the states after a set, and the steepest rise [1/s] of each channel."""
     commands = {command.channel: command for command in command_set.commands}
+    ramp, valid_for = command_set.ramp, command_set.valid_for
     following, slopes = [], []
     for channel, state in enumerate(states):
         command = commands.get(channel) or DriveCommand(channel, 0.0, 0.0)
         # A slot may hold one of several envelopes while one is being loaded.
         several = [
             state_after(
-                state,
-                command,
-                when,
-                ramp=command_set.ramp,
-                valid_for=command_set.valid_for,
-                onset=onset,
-                ending=ending,
+                state, command, when, ramp=ramp, valid_for=valid_for, onset=onset, ending=ending
             )
-            for onset in slots.get(command.onset) or (None,)
-            for ending in slots.get(command.ending) or (None,)
+            for onset in slots.get(command.onset) or _NO_ENVELOPE
+            for ending in slots.get(command.ending) or _NO_ENVELOPE
         ]
-        after = [one for one, _ in several]
-        following.append(after[0] if len(after) == 1 else union_of(after, when))
-        slopes.append(max(slope for _, slope in several))
+        if len(several) == 1:
+            ((after, slope),) = several
+        else:
+            after = union_of([one for one, _ in several], when)
+            slope = max(slope for _, slope in several)
+        following.append(after)
+        slopes.append(slope)
     return tuple(following), slopes
 
 
@@ -414,18 +416,21 @@ def _upper_bounds_after(states: States, command_set: CommandSet, when: Interval)
     """Return states after a set of ramps, with upper bounds of its levels only."""
     tones = {command.channel: command for command in command_set.commands}
     ramp, valid_for = command_set.ramp, command_set.valid_for or math.inf
-    return tuple(
-        ChannelState(
-            frequency=tones[channel].frequency if channel in tones else 0.0,
-            path=(0j, complex(tones[channel].level if channel in tones else 0.0)),
-            step=ramp,
-            commit=when,
-            fading=state.high(when),
-            fade=ramp,
-            valid_for=valid_for,
+    bounds = []
+    for channel, state in enumerate(states):
+        tone = tones.get(channel)
+        bounds.append(
+            ChannelState(
+                frequency=tone.frequency if tone else 0.0,
+                path=(0j, complex(tone.level if tone else 0.0)),
+                step=ramp,
+                commit=when,
+                fading=state.high(when),
+                fade=ramp,
+                valid_for=valid_for,
+            )
         )
-        for channel, state in enumerate(states)
-    )
+    return tuple(bounds)
 
 
 def _played(sent: _Sent) -> CommandSet:

@@ -26,7 +26,7 @@ class PlayRecorder:
     """Tells every guard about requests and replies; guards are known by their sets."""
 
     def __init__(self) -> None:
-        self._records: weakref.WeakSet[PlayRecord] = weakref.WeakSet()
+        self._references: list[weakref.ref[PlayRecord]] = []
 
     def sending(self, request: Request) -> None:
         """Record a request that is about to be sent.
@@ -35,10 +35,10 @@ class PlayRecorder:
         """
         match request:
             case Apply(command_set=SafeCommandSet() as safe):
-                self._records.add(safe.record)
+                self._add(safe.record)
                 safe.record.send(safe)
             case Stage(command_set=SafeCommandSet() as safe):
-                self._records.add(safe.record)
+                self._add(safe.record)
                 safe.record.stage(safe)
             case Commit(token=token):
                 for record in self._records:
@@ -46,6 +46,16 @@ class PlayRecorder:
             case Stop() | Disarm() | Arm():
                 for record in self._records:
                     record.silence_sent()
+
+    @property
+    def _records(self) -> list[PlayRecord]:
+        """The records that still exist."""
+        return [record for each in self._references if (record := each()) is not None]
+
+    def _add(self, record: PlayRecord) -> None:
+        records = self._records
+        if not any(each is record for each in records):
+            self._references = [weakref.ref(each) for each in (*records, record)]
 
     def left(self, request: Request) -> None:
         """Record that a request is not pending any more, with or without its reply."""

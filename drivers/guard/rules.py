@@ -71,7 +71,8 @@ def check_envelope(envelope: Envelope, context: GuardContext) -> None:
 
 def is_finite(value: object) -> bool:
     """Whether a value is a finite real number."""
-    return isinstance(value, Real) and math.isfinite(value)
+    # An exact float needs no look at its abstract classes.
+    return (type(value) is float or isinstance(value, Real)) and math.isfinite(value)
 
 
 def is_token(value: object) -> bool:
@@ -81,7 +82,7 @@ def is_token(value: object) -> bool:
 
 
 def _is_integer(value: object, *, low: int, high: int) -> bool:
-    return isinstance(value, Integral) and low <= int(value) <= high
+    return (type(value) is int or isinstance(value, Integral)) and low <= int(value) <= high
 
 
 def _check_token(command_set: CommandSet, context: GuardContext) -> None:
@@ -115,8 +116,11 @@ def _check_channels(command_set: CommandSet, context: GuardContext) -> None:
 
 def _check_finite(command_set: CommandSet, context: GuardContext) -> None:
     for command in command_set.commands:
-        for name in ("frequency", "level", "phase"):
-            value = getattr(command, name)
+        for name, value in (
+            ("frequency", command.frequency),
+            ("level", command.level),
+            ("phase", command.phase),
+        ):
             if not is_finite(value):
                 raise _refused(command, name, f"must be a finite number, got {value!r}")
 
@@ -142,8 +146,7 @@ def _check_frequencies(command_set: CommandSet, context: GuardContext) -> None:
 def _check_slots(command_set: CommandSet, context: GuardContext) -> None:
     slots = context.capabilities.envelope_slots
     for command in command_set.commands:
-        for name in ("onset", "ending"):
-            slot = getattr(command, name)
+        for name, slot in (("onset", command.onset), ("ending", command.ending)):
             if not _is_integer(slot, low=0, high=slots):
                 raise _refused(
                     command, name, f"must be slot 0 (no envelope) to {slots}, got {slot!r}"
@@ -158,6 +161,8 @@ def check_power(command_set: CommandSet, context: GuardContext) -> None:
     """Raise CommandRefused if the highest levels of all channels together exceed the power."""
 
     def peak_level(command: DriveCommand) -> float:
+        if not (command.onset or command.ending):
+            return command.level
         envelopes = [
             one for slot in (command.onset, command.ending) if slot for one in context.slots[slot]
         ]

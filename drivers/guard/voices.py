@@ -8,11 +8,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
+from operator import itemgetter
 from typing import NamedTuple
 
 from drivers.command import DriveCommand
 from drivers.guard.channel_state import Interval
 
+_END = itemgetter(0)
 LAG = 0.002
 """Longest time [s] by which playback lags behind a commit, by the protocol."""
 
@@ -70,15 +72,19 @@ class Voices:
         for lasts_until, lasting, fading in self.voices:
             under_way = max(fading, lasting) if lasts_until <= commit.latest else fading
             # No ending cuts a fade short.
-            ends = [under_way if has_ending else min(under_way, faded)]
-            ends += [faded] if lasts_until > commit.earliest else []
-            voices.append(Voice(fading=max(ends)))
+            end = under_way if has_ending else min(under_way, faded)
+            if lasts_until > commit.earliest:
+                end = max(end, faded)
+            voices.append(Voice(fading=end))
         if is_driven:
             lasts_until = commit.latest + (valid_for or math.inf)
             onset_end = commit.latest + onset if command.level == 0 else -math.inf
             voices.append(Voice(lasts_until, lasts_until + max(ramp, ending), onset_end))
-        left = [voice for voice in voices if voice.end > commit.latest]
-        return Voices(tuple(sorted(left, key=lambda voice: voice.end, reverse=True)), ending)
+        left = [(voice.end, voice) for voice in voices]
+        left = [each for each in left if each[0] > commit.latest]
+        if len(left) > 1:
+            left.sort(key=_END, reverse=True)
+        return Voices(tuple([voice for _, voice in left]), ending)
 
 
 def latest_of(several: Sequence[Voices]) -> Voices:

@@ -146,7 +146,7 @@ class PlausibilityCheck:
         if problem or level_problem:
             self._contradictions += 1
             self._was_about_level = problem is None
-        elif self._shows_levels(when) or not self._was_about_level:
+        elif not self._was_about_level or self._shows_levels(when):
             self._contradictions = 0
         problem = problem or level_problem
         self._raise_if_fault(self._contradictions, problem)
@@ -205,6 +205,8 @@ class PlausibilityCheck:
         )
 
     def _achieved_problems(self, requested: SafeCommandSet, achieved: Achieved) -> Iterator[str]:
+        if (achieved.token, achieved.commands) == (requested.token, requested.commands):
+            return  # to the step
         if achieved.token != requested.token:
             yield f"token achieved must be {requested.token}, got {achieved.token}"
         commands = {command.channel: command for command in requested.commands}

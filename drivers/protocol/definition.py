@@ -38,7 +38,7 @@ class WireQuantity:
         """Format character of `struct`."""
         return _STRUCT_CODES[self.wire]
 
-    @property
+    @cached_property
     def step(self) -> float:
         """Resolution on the wire, in the unit."""
         return 1 / self.per_unit

@@ -4,7 +4,7 @@ import asyncio
 from dataclasses import dataclass
 
 from drivers.backends.hardware import number_below
-from drivers.backends.waiting import reply_within
+from drivers.backends.waiting import ReplyTimer
 from drivers.codec.can_bus.replies import CanReply
 from drivers.codec.can_bus.requests import SEQUENCE_MAX, PdoRequest, action_of
 from drivers.errors import LinkError
@@ -27,6 +27,7 @@ class PendingRequests:
         # A random start, so that a reply to an earlier run does not match.
         self._sequence = number_below(SEQUENCE_MAX)
         self._pending: dict[int, _Pending] = {}
+        self._timer = ReplyTimer()
 
     def next_sequence(self) -> int:
         """Return the next sequence number: 1..255, then 1 again."""
@@ -43,7 +44,7 @@ class PendingRequests:
         can_reply: asyncio.Future[CanReply] = asyncio.get_running_loop().create_future()
         self._pending[sequence] = pending = _Pending(action_of(request), token, can_reply)
         try:
-            return await reply_within(can_reply, timeout)
+            return await self._timer.wait(can_reply, timeout)
         finally:
             if self._pending.get(sequence) is pending:
                 del self._pending[sequence]

@@ -13,7 +13,7 @@ from drivers.backends.hardware import Port
 from drivers.backends.modbus.stream import open_stream
 from drivers.backends.shared_line import SharedLine, shared_line
 from drivers.backends.urls.modbus import ModbusUrl
-from drivers.backends.waiting import reply_within
+from drivers.backends.waiting import ReplyTimer
 from drivers.codec.modbus.adu import ModbusResponse, RequestAdu, ResponseReader, build_adu
 from drivers.codec.modbus.exchanges import Read, Write
 from drivers.codec.modbus.timing import ModbusTimes
@@ -46,6 +46,7 @@ class ModbusLine(SharedLine[Port]):
         self._request: RequestAdu | None = None
         self._accept: Callable[[ModbusResponse], bool] = _any
         self._response: asyncio.Future[ModbusResponse] | None = None
+        self._timer = ReplyTimer()
         # Time at which a serial line is free, at the latest if a response is pending.
         self._free_from = 0.0
         self._is_response_pending = False
@@ -91,7 +92,7 @@ class ModbusLine(SharedLine[Port]):
             self._response = asyncio.get_running_loop().create_future()
             self._is_response_pending = True
             self._free_from = self._last_sent_at + on_line + _REACTION
-            return await reply_within(self._response, max(timeout, on_line + _REACTION))
+            return await self._timer.wait(self._response, max(timeout, on_line + _REACTION))
         except LinkError:
             raise
         except TimeoutError:

@@ -11,7 +11,7 @@ from drivers import clock, trace
 from drivers.backends.hardware import number_below
 from drivers.backends.serial_line.line import SerialLine, serial_line
 from drivers.backends.urls.serial_line import SerialUrl
-from drivers.backends.waiting import DUPLICATE_WAIT, reply_within
+from drivers.backends.waiting import DUPLICATE_WAIT, ReplyTimer
 from drivers.backends.wire_backend import WireBackend
 from drivers.codec.serial_line.exchanges import decode_event, decode_reply, encode_request, is_event
 from drivers.codec.serial_line.frame import Frame, encode_frame
@@ -41,6 +41,7 @@ class SerialBackend(WireBackend):
         self._times = SerialTimes(self._url.baud)
         self._line: SerialLine | None = None
         self._pending: _Pending | None = None
+        self._timer = ReplyTimer()
         # A random start, so that a reply to an earlier run does not match.
         self._sequence = number_below(1 << 16)
         self._last_reply: Frame | None = None  # the reply to the last request, if received
@@ -101,7 +102,8 @@ class SerialBackend(WireBackend):
         pending = self._pending = _Pending(frame, asyncio.get_running_loop().create_future())
         on_line = self._times.exchange(len(data))
         try:
-            reply = await reply_within(pending.reply, max(timeout, on_line + PROTOCOL.reaction))
+            extended = max(timeout, on_line + PROTOCOL.reaction)
+            reply = await self._timer.wait(pending.reply, extended)
         except LinkError:
             raise
         except TimeoutError:

@@ -4,10 +4,12 @@ Unpacking yields values in range or raises Malformed.
 """
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 from drivers.codec.payload import (
     Cursor,
+    Row,
     flags_of,
     pack,
     pack_optional_channel,
@@ -32,6 +34,8 @@ from drivers.protocol.messages import (
 )
 
 _Q = PROTOCOL.quantities
+_MEASURED = Row(_Q.temperature, _Q.watchdog_left, _Q.voltage)
+_LATCH = Row(_Q.latch, _Q.channel_count)
 _CAPABILITIES: Mapping[str, WireQuantity] = {  # in the order of the payload; the limits follow
     "channels": _Q.channel_count,
     "frequency_min": _Q.frequency,
@@ -100,18 +104,18 @@ def unpack_capabilities(cursor: Cursor) -> Capabilities:
     return Capabilities(**values, channel_limits=limits)
 
 
+@lru_cache
+def _levels(channels: int) -> Row:
+    return Row(*(_Q.level,) * channels)
+
+
 def pack_status(status: Status) -> bytes:
     """Pack a status."""
     head = bytes([status.state, status.fault]) + pack((_Q.active_token, status.token))
     head += bytes([status_flags(status)])
-    head += pack(
-        (_Q.temperature, status.temperature),
-        (_Q.watchdog_left, status.watchdog_left),
-        (_Q.voltage, status.voltage),
-        (_Q.latch, status.latch),
-        (_Q.channel_count, len(status.levels)),
-    )
-    return head + b"".join(pack((_Q.level, level)) for level in status.levels)
+    head += _MEASURED.pack(status.temperature, status.watchdog_left, status.voltage)
+    head += _LATCH.pack(status.latch, len(status.levels))
+    return head + _levels(len(status.levels)).pack(*status.levels)
 
 
 def unpack_status(cursor: Cursor) -> Status:
@@ -120,11 +124,8 @@ def unpack_status(cursor: Cursor) -> Status:
     fault = cursor.one_of(Fault)
     token = cursor.integer(_Q.active_token)
     flags = flags_of(cursor.byte())
-    temperature = cursor.number(_Q.temperature)
-    watchdog_left = cursor.number(_Q.watchdog_left)
-    voltage = cursor.number(_Q.voltage)
-    latch = cursor.integer(_Q.latch)
-    channels = cursor.integer(_Q.channel_count)
+    temperature, watchdog_left, voltage = cursor.numbers(_MEASURED)
+    latch, channels = cursor.integers(_LATCH)
     return Status(
         state=state,
         fault=fault,
@@ -133,7 +134,7 @@ def unpack_status(cursor: Cursor) -> Status:
         watchdog_left=watchdog_left,
         voltage=voltage,
         latch=latch,
-        levels=tuple(cursor.number(_Q.level) for _ in range(channels)),
+        levels=tuple(cursor.numbers(_levels(channels))),
         **flags,
     )
 

@@ -3,7 +3,9 @@
 Unpacking yields plain values in range or raises Malformed.
 """
 
-from drivers.codec.payload import Cursor, Malformed, pack
+from functools import lru_cache
+
+from drivers.codec.payload import Cursor, Malformed, Row, pack
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Achieved, NakCode
@@ -12,6 +14,10 @@ _Q = PROTOCOL.quantities
 _KEEP_PHASE = 0x01
 _SKIP_ENDING = 0x02
 _ENVELOPES = 0x04  # onset and ending follow the command
+_SET = Row(_Q.token, _Q.ramp, _Q.valid_for)
+_TONE = Row(_Q.frequency, _Q.level, _Q.phase)
+_SLOTS = Row(_Q.envelope_slot, _Q.envelope_slot)
+_KNOT = Row(_Q.level, _Q.phase)
 
 
 def _pack_commands(commands: tuple[DriveCommand, ...]) -> bytes:
@@ -22,17 +28,9 @@ def _pack_commands(commands: tuple[DriveCommand, ...]) -> bytes:
         flags |= _SKIP_ENDING if command.skip_ending else 0
         flags |= _ENVELOPES if is_shaped else 0
         packed += [pack((_Q.channel, command.channel)), bytes([flags])]
-        packed.append(
-            pack(
-                (_Q.frequency, command.frequency),
-                (_Q.level, command.level),
-                (_Q.phase, command.phase),
-            )
-        )
+        packed.append(_TONE.pack(command.frequency, command.level, command.phase))
         if is_shaped:
-            packed.append(
-                pack((_Q.envelope_slot, command.onset), (_Q.envelope_slot, command.ending))
-            )
+            packed.append(_SLOTS.pack(command.onset, command.ending))
     return b"".join(packed)
 
 
@@ -42,14 +40,13 @@ def _unpack_commands(cursor: Cursor) -> tuple[DriveCommand, ...]:
     for _ in range(cursor.integer(_Q.channel_count)):
         channel = cursor.integer(_Q.channel)
         flags = cursor.flags(_KEEP_PHASE | _SKIP_ENDING | _ENVELOPES)
-        frequency, level, phase = map(cursor.number, (_Q.frequency, _Q.level, _Q.phase))
+        frequency, level, phase = cursor.numbers(_TONE)
         if channel in seen:
             raise Malformed(
                 f"channel {channel} occurs twice", code=NakCode.BAD_CHANNEL, channel=channel
             )
         seen.add(channel)
-        onset = cursor.integer(_Q.envelope_slot) if flags & _ENVELOPES else 0
-        ending = cursor.integer(_Q.envelope_slot) if flags & _ENVELOPES else 0
+        onset, ending = cursor.integers(_SLOTS) if flags & _ENVELOPES else (0, 0)
         commands.append(
             DriveCommand(
                 channel=channel,
@@ -67,11 +64,7 @@ def _unpack_commands(cursor: Cursor) -> tuple[DriveCommand, ...]:
 
 def pack_set(command_set: CommandSet) -> bytes:
     """Pack a set."""
-    times = pack(
-        (_Q.token, command_set.token),
-        (_Q.ramp, command_set.ramp),
-        (_Q.valid_for, command_set.valid_for),
-    )
+    times = _SET.pack(command_set.token, command_set.ramp, command_set.valid_for)
     return times + _pack_commands(command_set.commands)
 
 
@@ -86,9 +79,7 @@ def pack_envelope(envelope: Envelope) -> bytes:
     """Pack an envelope."""
     head = pack((_Q.envelope_slot, envelope.slot), (_Q.envelope_step, envelope.step))
     head += pack((_Q.envelope_knots, len(envelope.knots)))
-    return head + b"".join(
-        pack((_Q.level, knot.level), (_Q.phase, knot.phase)) for knot in envelope.knots
-    )
+    return head + b"".join(_KNOT.pack(knot.level, knot.phase) for knot in envelope.knots)
 
 
 def unpack_envelope(cursor: Cursor) -> Envelope:
@@ -96,9 +87,7 @@ def unpack_envelope(cursor: Cursor) -> Envelope:
     slot = cursor.integer(_Q.envelope_slot)
     step = cursor.number(_Q.envelope_step)
     count = cursor.integer(_Q.envelope_knots)
-    knots = tuple(
-        Knot(level=cursor.number(_Q.level), phase=cursor.number(_Q.phase)) for _ in range(count)
-    )
+    knots = tuple(Knot(*cursor.numbers(_KNOT)) for _ in range(count))
     return Envelope(slot=slot, step=step, knots=knots)
 
 
@@ -108,5 +97,10 @@ def pack_achieved(achieved: Achieved) -> bytes:
 
 
 def unpack_achieved(cursor: Cursor) -> Achieved:
-    """Unpack an achieved set."""
-    return Achieved(token=cursor.integer(_Q.token), commands=_unpack_commands(cursor))
+    """Unpack an achieved set; ignores what follows it."""
+    return Achieved(token=cursor.integer(_Q.token), commands=_commands_in(cursor.rest()))
+
+
+@lru_cache(maxsize=64)  # replies to a stage, its commit and renewals repeat them
+def _commands_in(packed: bytes) -> tuple[DriveCommand, ...]:
+    return _unpack_commands(Cursor(packed))

@@ -6,18 +6,18 @@ import time
 
 import pytest
 
-from drivers.backends.waiting import reply_within
+from drivers.backends.waiting import ReplyTimer
 
 
-async def test_reply_within_returns_a_reply_or_times_out() -> None:
+async def test_wait_returns_a_reply_or_times_out() -> None:
     """A missing reply is a TimeoutError and ends the future."""
     loop = asyncio.get_running_loop()
     there: asyncio.Future[str] = loop.create_future()
     there.set_result("here")
-    assert await reply_within(there, 60.0) == "here"
+    assert await ReplyTimer().wait(there, 60.0) == "here"
     missing: asyncio.Future[str] = loop.create_future()
     with pytest.raises(TimeoutError):
-        await reply_within(missing, 0.001)
+        await ReplyTimer().wait(missing, 0.001)
     assert missing.done()
 
 
@@ -28,7 +28,7 @@ async def test_reply_counts_when_the_process_was_delayed() -> None:
     reading, writing = os.pipe()
     loop.add_reader(reading, lambda: reply.set_result(os.read(reading, 16)))
     try:
-        waiting = asyncio.create_task(reply_within(reply, 0.002))
+        waiting = asyncio.create_task(ReplyTimer().wait(reply, 0.002))
         await asyncio.sleep(0)
         os.write(writing, b"here")
         time.sleep(0.004)  # noqa: ASYNC251  the process is held up, past the time
@@ -43,7 +43,7 @@ async def test_reply_counts_when_the_reader_thread_was_delayed() -> None:
     """A reply posted a little later is in time."""
     loop = asyncio.get_running_loop()
     reply: asyncio.Future[str] = loop.create_future()
-    waiting = asyncio.create_task(reply_within(reply, 0.002))
+    waiting = asyncio.create_task(ReplyTimer().wait(reply, 0.002))
     await asyncio.sleep(0)
     time.sleep(0.02)  # noqa: ASYNC251  held up
     # As a thread posts that runs once the process runs again: after the timer has been seen.
@@ -54,9 +54,29 @@ async def test_reply_counts_when_the_reader_thread_was_delayed() -> None:
 async def test_cancelled_wait_ends_at_once() -> None:
     """Cancelling ends the wait and the future."""
     reply: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-    waiting = asyncio.create_task(reply_within(reply, 60.0))
+    waiting = asyncio.create_task(ReplyTimer().wait(reply, 60.0))
     await asyncio.sleep(0)
     waiting.cancel()
     with pytest.raises(asyncio.CancelledError):
         await waiting
     assert reply.cancelled()
+
+
+async def test_timer_of_an_earlier_reply_does_not_end_a_later_one() -> None:
+    """Every reply has its own time, whichever was awaited first: each ends when it is due."""
+    loop = asyncio.get_running_loop()
+    timer, begin = ReplyTimer(), loop.time()
+    there: asyncio.Future[str] = loop.create_future()
+    there.set_result("here")
+    await timer.wait(there, 0.005)
+    ended: dict[float, float] = {}
+
+    async def wait(timeout: float) -> None:
+        reply: asyncio.Future[str] = loop.create_future()
+        with pytest.raises(TimeoutError):
+            await timer.wait(reply, timeout)
+        ended[timeout] = loop.time() - begin
+
+    await asyncio.gather(wait(0.03), wait(0.01))
+    assert list(ended) == [0.01, 0.03]
+    assert all(after >= timeout for timeout, after in ended.items())

@@ -139,6 +139,12 @@ def pytest_sessionfinish() -> None:
     gc.freeze()
 
 
+@pytest.fixture
+def plain_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures laid out in a moment, for commands that write some beside what is tested."""
+    monkeypatch.setattr("matplotlib.figure.Figure.set_layout_engine", lambda *_, **__: None)
+
+
 @pytest.fixture(scope="session")
 def coarse_rig() -> Rig:
     """The paper's own mesh, 12x9."""

@@ -7,15 +7,19 @@ from drivers.amplifier import Amplifier
 from drivers.backends.urls.address import with_address
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout
 from drivers.registry import open_backend
+from memory_machine import live_in_memory
 from model.rig.rig import Rig
+from virtual_loop import in_virtual_time
 from wires import SHARED_WIRES, far_side, on_two_amplifiers, patient
 
 NEW = 9
 
 
 @pytest.mark.parametrize("wire", SHARED_WIRES)
+@in_virtual_time
 async def test_amplifier_takes_another_address(wire: str, coarse_rig: Rig) -> None:
     """It replies there, nobody where it was, and the other amplifier where it is."""
+    live_in_memory()
     async with far_side(SHARED_WIRES[wire], on_two_amplifiers(coarse_rig)) as far:
         east, west = (patient(far.urls[name]) for name in ("east", "west"))
         moved = await set_address(east, NEW, None)
@@ -27,8 +31,10 @@ async def test_amplifier_takes_another_address(wire: str, coarse_rig: Rig) -> No
 
 
 @pytest.mark.parametrize("wire", ["serial", "modbus+tcp", "modbus+rtu"])
+@in_virtual_time
 async def test_two_of_one_address_are_told_apart(wire: str, coarse_rig: Rig) -> None:
     """One of the serial number moves, whatever the other replies."""
+    live_in_memory()
     async with far_side(SHARED_WIRES[wire], on_two_amplifiers(coarse_rig)) as far:
         east, west = far.urls["east"], far.urls["west"]
         moved = await set_address(east, NEW, "SIM-east")
@@ -40,8 +46,10 @@ async def test_two_of_one_address_are_told_apart(wire: str, coarse_rig: Rig) -> 
             await set_address(back["url"], 20, "SIM-nobody")
 
 
+@in_virtual_time
 async def test_two_at_one_serial_address_are_refused_until_one_moves(coarse_rig: Rig) -> None:
     """As they come from the factory."""
+    live_in_memory()
     async with far_side(SHARED_WIRES["serial"], on_two_amplifiers(coarse_rig)) as far:
         east, west = far.urls["east"], far.urls["west"]
         amplifier = Amplifier(open_backend(east))

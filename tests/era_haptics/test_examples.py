@@ -76,7 +76,8 @@ def test_researcher_example_reproduces_the_paper(
     assert pictures == ["map.png", "pattern.png", "ramp.png", "shaped.png"]
 
 
-@pytest.mark.real_time
+@pytest.mark.long
+@pytest.mark.alone
 @pytest.mark.usefixtures("cache")
 def test_hmi_engineer_example_feels_what_was_predicted() -> None:
     """The contrast on the plate in time is the predicted one, and the daemon ends with status 0."""

@@ -274,7 +274,7 @@ def test_shorter_stop_ends_sooner_and_a_longer_one_changes_nothing(replaying: Pa
     assert np.abs(samples[:, 0] - gain * tone(t, 150, 0.8)).max() < TOLERANCE
 
 
-@pytest.mark.real_time
+@pytest.mark.long
 def test_cortex_m3_makes_the_same_samples_bit_for_bit(bare_metal: Path) -> None:
     """Of a script with fades, envelopes, a brake, valid_for and a stop."""
     script: Script = [

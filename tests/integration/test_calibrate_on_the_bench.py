@@ -24,6 +24,8 @@ from perturbed_plate import FREQUENCIES, perturbed
 from sim.sensors.accelerometer import Accelerometer, scanning_grid
 from sim.sensors.stepped_sine import record_responses
 
+pytestmark = pytest.mark.usefixtures("plain_pictures")
+
 MESH = "16x12"
 SENSOR = Accelerometer("", 0, 0, noise_density=5e-3, reach=200.0, resolution=1e-3)
 

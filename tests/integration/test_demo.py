@@ -113,7 +113,9 @@ def demo(environment, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.real_time
-@pytest.mark.parametrize("wire", ["serial", "can"])
+@pytest.mark.parametrize(
+    "wire", [pytest.param("serial", marks=[pytest.mark.long, pytest.mark.alone]), "can"]
+)
 def test_demo_contacts_feel_the_prediction(wire, capture, demo):
     """Each touch has its row; level within 3 dB of the promise, contrast at least the promised.
 

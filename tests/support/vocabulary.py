@@ -100,6 +100,9 @@ ALLOWED = {
 """Identifiers in which the word has its ordinary meaning, and which."""
 
 
+_IDENTIFIER = re.compile(r"[^\W\d]\w*")  # also in comments: for which files need be parsed
+
+
 def retired_identifiers() -> Iterator[str]:
     """Yield `path:line: identifier, use ...` for each definition that has a retired word."""
     for package in PACKAGES:
@@ -107,7 +110,10 @@ def retired_identifiers() -> Iterator[str]:
             file = path.relative_to(ROOT).as_posix()
             if file.startswith(ALLOWED_FILES):
                 continue
-            names = {(path.stem, 1), *_definitions(ast.parse(path.read_text("utf-8")))}
+            text = path.read_text("utf-8")
+            names = {(path.stem, 1)}
+            if any(_replacement(name, file) for name in {*_IDENTIFIER.findall(text)}):
+                names |= {*_definitions(ast.parse(text))}
             for name, line in sorted(names, key=lambda each: each[1]):
                 instead = _replacement(name, file)
                 if instead is not None:

@@ -33,6 +33,8 @@ from model.table.table import LocalizationTable
 from paper_table import smooth_rig
 from pressed_layout import Pressed
 
+pytestmark = pytest.mark.usefixtures("plain_pictures")
+
 EXAMPLE = Path(__file__).parents[3] / "examples" / "panel_layout.yaml"
 BUTTON = Rectangle(0.05, 0.04, 0.012, 0.012)
 SLIDER = Rectangle(0.02, 0.14, 0.26, 0.04)

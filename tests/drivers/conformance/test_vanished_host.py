@@ -46,6 +46,8 @@ async def result_at(url: str) -> CheckResult:
     return result
 
 
+@pytest.mark.long
+@pytest.mark.alone
 async def test_amplifier_with_a_watchdog_is_found_in_fault() -> None:
     """It has fallen silent although nothing was sent any more."""
     with far_end(SIMULATE) as url:

@@ -89,7 +89,7 @@ def simulated() -> LossyBackend:
     st.sampled_from([Fate.DELIVERED, Fate.REQUEST_LOST, Fate.CUT]),
     st.floats(0.0, 0.4),
 )
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @in_virtual_time
 async def test_confirmed_silence_is_never_wrong(
     fates: list[Fate], last: Fate, pause: float

@@ -153,6 +153,7 @@ def test_calibrate_keeps_what_is_not_identified(rig):
             assert abs(one.value - true) < 5 * one.standard_error
 
 
+@pytest.mark.long
 def test_calibrate_estimates_all_scales_when_requested(rig, truth):
     """Every sensor's scale relative to their median, also of one mounted upside down."""
     found = calibrate(rig, measured(truth, scales={"P2": -1.0, "P5": 1.01}), all_scales=True)

@@ -73,20 +73,21 @@ def test_stiffening_does_not_depend_on_rounding(rig: Rig) -> None:
         np.testing.assert_allclose(couplings(share), exact, atol=0.01)
 
 
-def test_intervals_hold_the_truth_on_plates_with_form_errors(rig: Rig) -> None:
+@pytest.mark.parametrize("plates", [1, pytest.param(2, marks=pytest.mark.long)])
+def test_intervals_hold_the_truth_on_plates_with_form_errors(rig: Rig, plates: int) -> None:
     """ERAs 1.5 mm off, a foreign mass, sides and Poisson's ratio off, by finite elements.
 
-    Of the 28 true values of two plates four in five or more lie within two standard errors and none
+    Of the 14 true values of a plate four in five or more lie within two standard errors and none
     beyond four; without form errors in the fit it is a third. The benchmark has more plates.
     """
     deviations = []
-    for seed in range(2):
+    for seed in range(plates):
         hidden = draw_plate(rig, FORMS["usual"], seed=seed, frequencies=FREQUENCIES)
         found = calibrate(rig, measure(hidden, rig, seed=seed, frequencies=FREQUENCIES))
         assert found.outlier_count == 0
         for one, true in zip(found.parameters, true_values(hidden), strict=True):
             if one.standard_error is not None:
                 deviations.append(abs(one.value - true) / one.standard_error)
-    assert len(deviations) > 24
+    assert len(deviations) > 12 * plates
     assert np.mean(np.array(deviations) < 2) > 0.8
     assert max(deviations) < 4

@@ -13,6 +13,8 @@ from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.rig.uncertainty import Uncertainty
 
+pytestmark = pytest.mark.usefixtures("plain_pictures")
+
 RIG = str(example_rig_path())
 
 
@@ -57,6 +59,7 @@ def test_design_writes_a_rig_that_loads_and_resumes(small, tmp_path: Path) -> No
     assert again["eras"] == found["eras"]
 
 
+@pytest.mark.long
 def test_the_best_of_several_stiffnesses_is_written(small, tmp_path: Path) -> None:
     """Two are designed; the rig has the one whose layout has more contrast, at new ERAs alone."""
     arguments = ("--eras", "4", "--keep", "NE", "--starts", "1", "-o", str(tmp_path), "--json")

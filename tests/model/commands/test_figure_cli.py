@@ -4,10 +4,13 @@ import csv
 import json
 from pathlib import Path
 
+import pytest
 from typer.testing import CliRunner
 
 from model.commands.figure_cli import figure_app
 from model.rig.file import example_rig_path
+
+pytestmark = pytest.mark.usefixtures("plain_pictures")
 
 RUNNER = CliRunner()
 RIG = str(example_rig_path())

@@ -18,6 +18,8 @@ from model.rig.file import example_rig_path, load_rig
 from model.studies import finalists, solve
 from model.table import table
 
+pytestmark = pytest.mark.usefixtures("plain_pictures")
+
 RUNNER = CliRunner()
 RIG = str(example_rig_path())
 QUICK = ["--mesh", "12x9", "--frequencies", "60,110,250", "--candidates", "7x5"]
@@ -118,6 +120,7 @@ def test_placement_study_keeps_what_it_does_not_vary(tmp_path: Path) -> None:
         assert (era.stiffness, era.damping) == (before.stiffness, before.damping)
 
 
+@pytest.mark.long
 def test_count_study_copies_a_driven_era_not_a_support(tmp_path: Path) -> None:
     """The rig's first ERA only supports: the recommended ones have the stroke of a driven one."""
     data = read_document(Path(RIG)).data
@@ -134,11 +137,13 @@ def test_count_study_copies_a_driven_era_not_a_support(tmp_path: Path) -> None:
     assert {era.stroke for era in rig.eras} == {80e-6}
 
 
+@pytest.mark.long
 def test_stiffness_study_recommends_a_rig_that_loads(tmp_path: Path) -> None:
     """All ERAs of the recommended rig have the stiffness of the best case."""
     check_recommendation(study("stiffness", tmp_path, "--layouts", "2"))
 
 
+@pytest.mark.long
 def test_count_study_gives_each_era_its_own_channel(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,6 +25,8 @@ from model.table import summary
 from model.table.file import load_table, save_table
 from model.table.pattern_choice import UnreachableLevel
 
+pytestmark = pytest.mark.usefixtures("plain_pictures")
+
 RIG = str(example_rig_path())
 ERA = str(Path(sys.executable).with_name("era"))
 QUICK = ["--mesh", "12x9", "--frequencies", "60,110,250", "--grid", "4x3"]

@@ -117,6 +117,7 @@ def test_kept_eras_stay_and_all_keep_their_distance() -> None:
     assert Edge(plate.length, plate.width).contains(found.positions).all()
 
 
+@pytest.mark.long
 def test_search_beats_the_rigs_corners_on_fresh_contact_sets(monkeypatch) -> None:
     """Answers of the table for contacts that the search has not seen confirm what it found."""
     monkeypatch.setitem(search_module.CANDIDATES, True, 24)

@@ -64,6 +64,7 @@ def error(table: LocalizationTable, plate: Mounted) -> float:
     return float(np.linalg.norm(found - true) / np.linalg.norm(true))
 
 
+@pytest.mark.long
 def test_answers_follow_a_loosened_mount(
     hidden: Hidden, rig: Rig, table: LocalizationTable
 ) -> None:

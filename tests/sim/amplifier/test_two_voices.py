@@ -207,7 +207,7 @@ SETS = st.tuples(
 
 
 @given(st.lists(SETS, min_size=3, max_size=14))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_output_is_that_of_two_oscillators(sets) -> None:
     """Whatever sets come how soon: the same are refused, and what is played has no jump."""
     small, now = Channel(), 0.0

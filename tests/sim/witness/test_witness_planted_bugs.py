@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import witness_scenarios
+from long_form import shortly
 from planted_bugs import BUGS, CONTROLLER, DRIVERS, FAR_ENDS
 from witnessed_chain import WITNESSED, Chain, play
 
@@ -62,7 +63,7 @@ def test_witness_finds_nothing_with_two_amplifiers(wire: str) -> None:
     assert outcome.errors == []
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", shortly(range(3), [0]))
 @pytest.mark.parametrize("wire", ["serial", "modbus-rtu", "slcan"])
 def test_witness_excuses_noise(wire: str, seed: int) -> None:
     """Lost and damaged frames on a line are borne by both sides as the pages say."""

@@ -116,7 +116,7 @@ class Rigs:
                         reply = bench.exchange(name, Apply(wanted), now=now)
                         assert isinstance(reply, Achieved)
                 bench.advance(now + case.step)
-            bench.fingers.felt(begin, bench.time)  # to the last sample
+            bench.fingers.felt(bench.time, bench.time)  # sampled to the last
 
         go_on(0.5)
         return go_on

@@ -54,8 +54,8 @@ def fade(
 class BaseMotions:
     """The motions of several ERAs' bases from a time [s] on: their terms, ascending in omega.
 
-    terms: of each ERA. keys: ERA and omega [rad/s] of each term; start, end [s], omega, c0, c1
-    (n,): those of the terms; moments: their starts and ends [s], ascending, each once.
+    terms: of each ERA. era (n,): whose base each term moves; start, end [s], omega, c0, c1 (n,):
+    those of the terms, c1 None for 0; moments: their starts and ends [s], ascending, each once.
     """
 
     def __init__(self, terms: Sequence[Sequence[Term]], *, since: float = -math.inf) -> None:
@@ -69,9 +69,8 @@ class BaseMotions:
         self.end: FloatArray = ends[order]
         self.omega: FloatArray = omegas[order]
         self.c0: ComplexArray = np.array(c0, dtype=complex)[order]
-        self.c1: ComplexArray = np.array(c1, dtype=complex)[order]
-        eras = np.repeat(np.arange(len(terms)), [len(each) for each in terms])[order]
-        self.keys = list(zip(eras.tolist(), self.omega.tolist(), strict=True))
+        self.c1: ComplexArray | None = np.array(c1, dtype=complex)[order] if any(c1) else None
+        self.era = np.repeat(np.arange(len(terms)), [len(each) for each in terms])[order]
         self.moments: list[float] = sorted({*start, *end})
 
     def active(self, time: float) -> NDArray[np.intp]:

@@ -30,31 +30,38 @@ from model.structure.fingertip import FingertipLoad
 from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import BaseMotions
 
-_MAX_CACHED_SOLUTIONS = 1024  # unit solutions that are kept, some kilobytes each
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForcedVibration:
-    """The particular solution q(t) = Im sum over n of (b0 + b1 tau) exp(i omega tau).
+    """The particular solution Im[vectors @ z(t)], z = sum over n of (a0 + a1 tau) exp(i omega tau).
 
-    tau = t - time [s]; omegas (n,) [rad/s], each once; b0, b1 (n, r), b1 None for 0.
+    tau = t - time [s]; omegas (n,) [rad/s], each once; a0, a1 (n, 2 r) in the eigenvectors of
+    `plate`, a1 None for 0.
     """
 
+    plate: "PlateInTime"
     time: float
     omegas: FloatArray
-    b0: ComplexArray
-    b1: ComplexArray | None
+    a0: ComplexArray
+    a1: ComplexArray | None
 
     def state(self, time: float) -> FloatArray:
         """Displacement and velocity (2 r,) at a time [s]."""
+        return np.asarray((self.plate.vectors @ self._modal(time)).imag)
+
+    def as_free(self, time: float) -> ComplexArray:
+        """z (m,) of the free vibration with the displacement and velocity at a time [s]."""
+        z = self._modal(time)
+        # The conjugate of an eigenvector is that of the conjugate eigenvalue.
+        return np.asarray((z[self.plate.half] - z[self.plate.partner].conj()) / 2j)
+
+    def _modal(self, time: float) -> ComplexArray:
         tau = time - self.time
         phase_factor = np.exp(1j * self.omegas * tau)
-        q = phase_factor @ self.b0
-        v = (1j * self.omegas * phase_factor) @ self.b0
-        if self.b1 is not None:
-            q += (tau * phase_factor) @ self.b1
-            v += ((1 + 1j * self.omegas * tau) * phase_factor) @ self.b1
-        return np.concatenate([q, v]).imag
+        z: ComplexArray = phase_factor @ self.a0
+        if self.a1 is not None:
+            z += (tau * phase_factor) @ self.a1
+        return z
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,32 +101,48 @@ class PlateInTime:
         Terms of one frequency are one there, so that its samples cost what its frequencies do.
         """
         active = motions.active(time)
-        omegas = motions.omega[active]
-        if not len(active):
-            return ForcedVibration(
-                time, omegas, np.zeros((0, len(self.displacement)), dtype=complex), None
-            )
-        solutions = self._unit_solutions
-        rows = solutions.rows(motions.keys)[active]
-        constant = solutions.constant[rows]
-        tau = time - motions.start[active]
-        phase_factor = np.exp(1j * omegas * tau)
-        c0, c1 = motions.c0[active], motions.c1[active]
-        starts = np.flatnonzero(np.concatenate([[True], omegas[1:] != omegas[:-1]]))
-        b1 = None
-        if c1.any():
-            rate = (phase_factor * c1)[:, None]
-            b0 = constant * (phase_factor * (c0 + c1 * tau))[:, None]
-            b0 += solutions.linear[rows] * rate
-            b1 = np.add.reduceat(constant * rate, starts)
-        else:
-            constant *= (phase_factor * c0)[:, None]
-            b0 = constant
-        return ForcedVibration(time, omegas[starts], np.add.reduceat(b0, starts), b1)
+        era, each = motions.era[active], motions.omega[active]
+        tau, s = time - motions.start[active], 1j * each
+        phase_factor = np.exp(s * tau)
+        c = self._dampers[era]
+        impedance = self._springs[era] + c * s  # force by displacement
+        is_first = np.ones(len(each), dtype=bool)
+        np.not_equal(each[1:], each[:-1], out=is_first[1:])
+        omegas = each[is_first]
+        # By frequency and ERA, of which it is the force on the base.
+        cell = (np.cumsum(is_first) - 1) * len(self.eras) + era
+        denominator = 1j * omegas[:, None] - self.eigenvalues
+        y = phase_factor * motions.c0[active]
+        if motions.c1 is None:
+            a0 = self._by_forces(cell, impedance * y, omegas) / denominator
+            return ForcedVibration(self, time, omegas, a0, None)
+        growth = phase_factor * motions.c1[active]
+        a1 = self._by_forces(cell, impedance * growth, omegas) / denominator
+        force = impedance * (y + growth * tau) + c * growth
+        a0 = (self._by_forces(cell, force, omegas) - a1) / denominator
+        return ForcedVibration(self, time, omegas, a0, a1)
+
+    def _by_forces(
+        self, cell: NDArray[np.intp], forces: ComplexArray, omegas: FloatArray
+    ) -> ComplexArray:
+        """z' (n, 2 r) at n omegas by forces [N] in cells of n times the number of ERAs."""
+        shape = len(omegas), len(self.eras)
+        size = shape[0] * shape[1]
+        summed = np.empty(shape, dtype=complex)
+        summed.real = np.bincount(cell, forces.real, size).reshape(shape)
+        summed.imag = np.bincount(cell, forces.imag, size).reshape(shape)
+        for number, era in enumerate(self.eras):
+            if era.gains:
+                summed[:, number] *= era.gain(omegas / (2 * np.pi))
+        return np.asarray(summed @ self.participation.T)
 
     @cached_property
-    def _unit_solutions(self) -> "_UnitSolutions":
-        return _UnitSolutions(self)
+    def _springs(self) -> FloatArray:
+        return np.array([era.stiffness for era in self.eras])
+
+    @cached_property
+    def _dampers(self) -> FloatArray:
+        return np.array([era.damping for era in self.eras])
 
     def particular(
         self,
@@ -153,23 +176,31 @@ class PlateInTime:
         return self.displacement * self.eigenvalues**2
 
     @cached_property
-    def _half(self) -> NDArray[np.bool_]:
-        # Eigenvalues come in conjugate pairs: one of a pair, twice, is both.
-        return self.eigenvalues.imag >= 0
+    def half(self) -> NDArray[np.intp]:
+        """Numbers (m,) of one eigenvalue of every conjugate pair, and of the real ones."""
+        return np.flatnonzero(self.eigenvalues.imag >= 0)
+
+    @cached_property
+    def partner(self) -> NDArray[np.intp]:
+        """Numbers (m,) of the eigenvalues that are conjugate to those, a real one its own."""
+        lower = np.flatnonzero(self.eigenvalues.imag < 0)
+        partner = self.half.copy()
+        partner[self.decay.imag > 0] = lower
+        return partner
 
     @cached_property
     def _upper(self) -> FloatArray:
-        return np.where(self.eigenvalues.imag > 0, 2.0, 1.0)[self._half]
+        return np.where(self.eigenvalues.imag > 0, 2.0, 1.0)[self.half]
 
     @cached_property
     def decay(self) -> ComplexArray:
         """One eigenvalue of every conjugate pair, and the real ones, (m,) [1/s]."""
-        return self.eigenvalues[self._half]
+        return self.eigenvalues[self.half]
 
     @cached_property
     def free_state(self) -> ComplexArray:
         """Displacement and velocity of a free vibration are Re[free_state @ z], (2 r, m)."""
-        return self.vectors[:, self._half] * self._upper
+        return self.vectors[:, self.half] * self._upper
 
     @cached_property
     def free_acceleration(self) -> ComplexArray:
@@ -179,51 +210,7 @@ class PlateInTime:
     @cached_property
     def to_free(self) -> ComplexArray:
         """z of a free vibration with a displacement and velocity is to_free @ those, (m, 2 r)."""
-        return self.inverse[self._half]
-
-
-class _UnitSolutions:
-    """Particular solutions for bases of one ERA at one frequency, kept since tables have few.
-
-    constant, linear (n, r): b0 for a base that moves with c0 = 1 m, and with c1 = 1 m/s.
-    """
-
-    def __init__(self, plate: PlateInTime) -> None:
-        self._plate = plate
-        self._rows: dict[tuple[int, float], int] = {}
-        # Those asked for last: a drive is solved again where one of its terms starts or ends.
-        self._keys: Sequence[tuple[int, float]] = ()
-        self._found = np.zeros(0, dtype=np.intp)
-        self._empty = np.zeros((0, len(plate.displacement)), dtype=complex)
-        self.constant = self.linear = self._empty
-
-    def rows(self, keys: Sequence[tuple[int, float]]) -> NDArray[np.intp]:
-        """Rows (k,) of solutions by ERA and omega [rad/s]."""
-        if keys is not self._keys:
-            try:
-                found = [self._rows[key] for key in keys]
-            except KeyError:
-                self._solve(keys)
-                found = [self._rows[key] for key in keys]
-            self._keys, self._found = keys, np.array(found)
-        return self._found
-
-    def _solve(self, keys: Sequence[tuple[int, float]]) -> None:
-        missing = list(dict.fromkeys(key for key in keys if key not in self._rows))
-        if len(self._rows) + len(missing) > _MAX_CACHED_SOLUTIONS:
-            self._rows, self.constant, self.linear = {}, self._empty, self._empty
-            missing = list(dict.fromkeys(keys))
-        count = len(missing)
-        a0, _ = self._plate.particular(
-            [era for era, _ in missing] * 2,
-            np.array([1j * omega for _, omega in missing] * 2),
-            np.repeat([1.0, 0.0], count),
-            np.repeat([0.0, 1.0], count),
-        )
-        solved = a0 @ self._plate.displacement.T
-        self._rows |= {key: len(self._rows) + number for number, key in enumerate(missing)}
-        self.constant = np.concatenate([self.constant, solved[:count]])
-        self.linear = np.concatenate([self.linear, solved[count:]])
+        return self.inverse[self.half]
 
 
 def plate_in_time(

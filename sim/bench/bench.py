@@ -255,7 +255,7 @@ class Bench:
         while True:
             events = [amplifier.next_event for amplifier in amplifiers]
             changes = [waiting[0][0] for waiting in self._delayed.values() if waiting]
-            moment = min([*events, *changes, to_time])
+            moment = min([to_time, *events, *changes])
             self._time = max(self._time, moment)
             for amplifier, event in zip(amplifiers, events, strict=True):
                 if event <= moment or amplifier.is_derated:

@@ -121,8 +121,9 @@ class Plant:
         shapes = self._current.plate.with_phalanges(shapes)
         # Few points are sampled directly, many by way of the coordinates.
         is_direct = len(shapes) < 2 * shapes.shape[1]
-        sampler = self._sampler_at(shapes if is_direct else np.eye(shapes.shape[1]))
-        samples = np.empty((len(times), len(sampler.points)))
+        points = shapes if is_direct else np.eye(shapes.shape[1])
+        sampler = self._sampler_at(points, sample_rate)
+        samples = np.empty((len(times), len(points)))
         done = 0
 
         def sample(upto: int) -> None:
@@ -133,7 +134,6 @@ class Plant:
                     samples[done:upto],
                     free=self._free * np.exp(self._current.plate.decay * (times[done] - self.time)),
                     forced=self._forced,
-                    sample_rate=sample_rate,
                 )
                 done = upto
 
@@ -157,10 +157,16 @@ class Plant:
             self._cross(change)
         self._propagate_free(to_time)
 
-    def _sampler_at(self, points: FloatArray) -> Sampler:
-        if self._sampler is None or not np.array_equal(self._sampler.points, points):
-            self._sampler = Sampler(self._current, points)
-        return self._sampler
+    def _sampler_at(self, points: FloatArray, sample_rate: float) -> Sampler:
+        """The sampler that is kept, or another for other points or another rate."""
+        kept = self._sampler
+        if (
+            kept is None
+            or kept.sample_rate != sample_rate
+            or not np.array_equal(kept.points, points)
+        ):
+            kept = self._sampler = Sampler(self._current, points, sample_rate=sample_rate)
+        return kept
 
     def _state(self) -> tuple[FloatArray, FloatArray]:
         """Displacement and velocity of all coordinates, the phalanges' last."""
@@ -204,10 +210,9 @@ class Plant:
 
     def _exchange(self) -> None:
         """Let the terms of the present time drive; displacement and velocity stay continuous."""
-        before = self._forced.state(self.time)
+        before = self._forced.as_free(self.time)
         self._forced = self._current.plate.driven(self._motions, self.time)
-        jump = before - self._forced.state(self.time)
-        self._free = self._free + self._current.plate.to_free @ jump
+        self._free = self._free + before - self._forced.as_free(self.time)
 
     def _propagate_free(self, to_time: float) -> None:
         self._free = self._free * np.exp(self._current.plate.decay * (to_time - self.time))

@@ -10,19 +10,25 @@ from model.arrays import ComplexArray, FloatArray
 from model.transients.time_response import ForcedVibration
 from sim.plant.loaded_plates import BLOCK, LoadedPlate
 
+_FINE = 16  # samples
+_FINE_NUMBERS = np.arange(_FINE)
 _SMALL_PRODUCT = 1_000_000  # multiplications; below, OpenBLAS is half as fast again
 
 
 class Sampler:
     """Samples a loaded plate at points of these shapes (q, r), phalanges included."""
 
-    def __init__(self, loaded: LoadedPlate, points: FloatArray) -> None:
+    def __init__(self, loaded: LoadedPlate, points: FloatArray, *, sample_rate: float) -> None:
         self.points = points
-        self._loaded = loaded
-        self._by_free = np.ascontiguousarray((points @ loaded.plate.free_acceleration).T)
-        self._by_coordinate = np.ascontiguousarray(points.T)
-        self._forced: ForcedVibration | None = None  # whose amplitudes these are, (2 n, q):
-        self._constant = self._growth = np.zeros((0, len(points)))
+        self.sample_rate = sample_rate
+        plate = loaded.plate
+        self._by_free = np.ascontiguousarray((points @ plate.free_acceleration).T)
+        self._by_forced = np.ascontiguousarray((points @ plate.displacement).T)
+        self._block = np.exp(plate.decay * (BLOCK / sample_rate))
+        self._free_columns = loaded.exponentials(sample_rate)
+        self._columns = self._free_columns  # and behind them, cosines and sines
+        self._forced: ForcedVibration | None = None  # whose amplitudes at the points these are,
+        self._amplitudes = np.zeros((0, len(points)))  # (2 n, q), or (4 n, q) where some grow
 
     def sample(
         self,
@@ -31,50 +37,63 @@ class Sampler:
         *,
         free: ComplexArray,
         forced: ForcedVibration,
-        sample_rate: float,
     ) -> None:
-        """Write accelerations at times (n,) [s] on the grid k / sample_rate [Hz] to out (n, q).
+        """Write accelerations at times (n,) [s], evenly spaced, to out (n, q).
 
         free (m,): amplitude of each free vibration at the first of them.
         """
-        self._use(forced)
-        table = self._loaded.exponentials(sample_rate)
-        step = np.exp(self._loaded.plate.decay * (BLOCK / sample_rate)) if len(out) > BLOCK else 1
-        rows = max(1, _SMALL_PRODUCT // (table.shape[1] * out.shape[1]))
+        if forced is not self._forced:
+            self._use(forced)
+        is_free = bool(free.any())
+        count = self._free_columns.shape[1]
+        columns = self._columns[:, 0 if is_free else count : count + len(self._amplitudes)]
+        rows = max(1, _SMALL_PRODUCT // max(1, columns.shape[1] * out.shape[1]))
         for start in range(0, len(times), BLOCK):
             into = out[start : start + BLOCK]
-            if start:
-                free = free * step
-            if free.any():
+            self._fill(float(times[start] - forced.time), len(into), forced)
+            amplitudes = self._amplitudes
+            if is_free:
                 modal = self._by_free * free[:, None]
-                amplitudes = np.concatenate([modal.real, modal.imag])
-                for first in range(0, len(into), rows):
-                    part = into[first : first + rows]
-                    np.matmul(table[first : first + len(part)], amplitudes, out=part)
-            else:
-                into[:] = 0
-            self._add_forced(times[start : start + BLOCK], into)
+                amplitudes = np.concatenate([modal.real, modal.imag, amplitudes])
+                free = free * self._block
+            for first in range(0, len(into), rows):
+                part = into[first : first + rows]
+                np.matmul(columns[first : first + len(part)], amplitudes, out=part)
 
     def _use(self, forced: ForcedVibration) -> None:
-        """Find the amplitudes at the points, of sines and cosines and of those that grow."""
-        if forced is self._forced:
-            return
+        """Find the amplitudes of cosines and sines at the points, and those of their growth."""
         self._forced = forced
         s = 1j * forced.omegas[:, None]
-        constant = s**2 * forced.b0
-        if forced.b1 is not None:
-            constant += 2 * s * forced.b1
-            growth = s**2 * forced.b1
-            self._growth = np.concatenate([growth.imag, growth.real]) @ self._by_coordinate
-        self._constant = np.concatenate([constant.imag, constant.real]) @ self._by_coordinate
+        constant = s**2 * forced.a0
+        if forced.a1 is not None:
+            constant = np.concatenate([constant + 2 * s * forced.a1, s**2 * forced.a1])
+        at_points = constant @ self._by_forced
+        count = len(forced.omegas)
+        self._amplitudes = np.concatenate(
+            [
+                part
+                for each in (at_points[:count], at_points[count:])
+                for part in (each.imag, each.real)
+            ]
+        )
+        free = self._free_columns.shape[1]
+        if self._columns.shape[1] < free + len(self._amplitudes):
+            self._columns = np.empty((BLOCK, free + len(self._amplitudes)))
+            self._columns[:, :free] = self._free_columns
 
-    def _add_forced(self, times: FloatArray, out: FloatArray) -> None:
-        forced = self._forced
-        if forced is None or not len(forced.omegas):
+    def _fill(self, tau: float, count: int, forced: ForcedVibration) -> None:
+        """Write cosines and sines for so many samples from a time tau [s] on, behind the others."""
+        omegas, free = forced.omegas, self._free_columns.shape[1]
+        if not len(omegas):
             return
-        tau = (times - forced.time)[:, None]
-        angle = tau * forced.omegas
-        phase_factor = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
-        out += phase_factor @ self._constant
-        if forced.b1 is not None:
-            out += (phase_factor * tau) @ self._growth
+        # Multiples of a few samples, times those few: products cost less than cosines.
+        coarse = tau + np.arange(-(-count // _FINE)) * (_FINE / self.sample_rate)
+        ahead = np.exp(1j * np.multiply.outer(coarse, omegas))
+        fine = np.exp(1j * np.multiply.outer(_FINE_NUMBERS / self.sample_rate, omegas))
+        phase_factor = (ahead[:, None] * fine).reshape(-1, len(omegas))[:count]
+        columns = self._columns[:count, free : free + len(self._amplitudes)]
+        both = columns[:, : 2 * len(omegas)]
+        both[:, : len(omegas)], both[:, len(omegas) :] = phase_factor.real, phase_factor.imag
+        if forced.a1 is not None:
+            tau_each = tau + np.arange(count) / self.sample_rate
+            np.multiply(both, tau_each[:, None], out=columns[:, 2 * len(omegas) :])

@@ -1,7 +1,8 @@
-"""Build hook: compiles the engine of `era soft-amp` into wheels of one platform.
+"""Build hook: compiles what is in C into wheels of one platform.
 
-Plain wheels hold its C sources, which are compiled at first use; with the environment variable
-ERA_HAPTICS_ENGINE=1 a wheel holds the engine, too, and is tagged with the platform.
+That is the engine of `era soft-amp` and the kernels of `model`. Plain wheels hold the C sources,
+which are compiled at first use; with the environment variable ERA_HAPTICS_ENGINE=1 a wheel holds
+the libraries, too, and is tagged with the platform.
 """
 
 import os
@@ -15,25 +16,30 @@ from packaging.tags import platform_tags
 
 
 class EngineHook(BuildHookInterface):  # type: ignore[type-arg]
-    """Adds the engine to a wheel; `make dist-platform` asks for it."""
+    """Adds the libraries to a wheel; `make dist-platform` asks for it."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Compile and include it."""
+        """Compile and include them."""
         if os.environ.get("ERA_HAPTICS_ENGINE") != "1" or version == "editable":
             return
         sys.path.insert(0, self.root)
         try:
+            from model.compiled.kernels import KERNELS, compile_kernels
             from sim.soft_amp.library import ENGINE, compile_engine
         finally:
             sys.path.pop(0)
         self._folder = tempfile.TemporaryDirectory(prefix="era-engine-")
-        made = Path(self._folder.name) / ENGINE
-        compile_engine(made)
-        build_data["force_include"][str(made)] = f"sim/soft_amp/{ENGINE}"
+        for where, name, compiled in (
+            ("sim/soft_amp", ENGINE, compile_engine),
+            ("model/compiled", KERNELS, compile_kernels),
+        ):
+            made = Path(self._folder.name) / name
+            compiled(made)
+            build_data["force_include"][str(made)] = f"{where}/{name}"
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-{next(platform_tags())}"
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
-        """Remove what was compiled."""
+        """Remove the folder in which they were compiled."""
         if hasattr(self, "_folder"):
             self._folder.cleanup()

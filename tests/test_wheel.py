@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("registry", "controller", "drivers", "era_haptics", "model", "sim")
 
 # Of the sources: what is neither a program nor made by one.
-DATA = re.compile(r"\.(py|typed|yaml|csv|json|js|css|html|svg|service|rules|conf)$")
+DATA = re.compile(r"\.(c|py|typed|yaml|csv|json|js|css|html|svg|service|rules|conf)$")
 
 
 def build(target: str, root: Path, folder: Path, **environment: str) -> Path:
@@ -117,7 +117,10 @@ def test_wheel_of_a_platform_brings_its_engine(wheel: Path, tmp_path: Path) -> N
     assert (python, abi) == ("py3", "none")
     assert platform in set(platform_tags())
     with zipfile.ZipFile(ours) as archive, zipfile.ZipFile(wheel) as plain:
-        assert set(archive.namelist()) - set(plain.namelist()) == {"sim/soft_amp/engine.so"}
+        assert set(archive.namelist()) - set(plain.namelist()) == {
+            "sim/soft_amp/engine.so",
+            "model/compiled/kernels.so",
+        }
         archive.extractall(tmp_path / "installed")
     done = subprocess.run(
         [

@@ -33,6 +33,7 @@ ALTERNATIVES = 4
 
 __all__ = [
     "DRIVE_MODES",
+    "UNRESTRICTED",
     "DriveMode",
     "find_drives",
     "max_sensation",
@@ -67,6 +68,9 @@ DRIVE_MODES: dict[str, DriveMode] = {
     "phased": DriveMode(PHASED, ("signed", "graded", "switched")),
 }
 """Drive modes by name, from the least freedom to the most."""
+
+UNRESTRICTED = "phased"
+"""The mode of any weights."""
 
 
 def find_drives(forms: Forms, drive_mode: str) -> list[tuple[float, Weights]]:

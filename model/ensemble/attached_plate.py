@@ -9,7 +9,7 @@ and frequencies higher by it (`model.vibration.parametric_plate`), so that
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -76,6 +76,12 @@ class AttachedPlate:
         """The receptance, and its changes by thickness and loss, (f, r, 3)."""
         return np.stack([self.receptance, self.by_thickness, self.by_loss], axis=2)
 
+    def at(self, frequencies: IntArray) -> "AttachedPlate":
+        """The plate at some of its frequencies, by index (n,)."""
+        return replace(
+            self, **{name: getattr(self, name).take(frequencies, axis=0) for name in _BY_FREQUENCY}
+        )
+
     def with_fingers(self, count: int, loads: Sequence[float] = ()) -> "Attachments":
         """What is attached to the plate with a number of fingers on it.
 
@@ -107,6 +113,20 @@ class AttachedPlate:
     @cached_property
     def _by_count(self) -> dict[int, "Attachments"]:
         return {}
+
+
+_BY_FREQUENCY = (
+    "minus_omega2",
+    "receptance",
+    "by_thickness",
+    "by_loss",
+    "stiffness",
+    "forces",
+    "strokes",
+    "by_stiffness",
+    "by_damping",
+    "omega",
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,8 +24,8 @@ import numpy as np
 from model.arrays import Complex64Array, Float32Array, IntArray
 from model.ensemble.attached_plate import AttachedPlate, Attachments
 
-# Share of a form's trace that is added to its diagonal: keeps it definite.
-_RIDGE = 1e-6
+RIDGE = 1e-6
+"""Share of a form's trace that is added to its diagonal: keeps it definite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class LoadedContacts:
         power = rows.conj().swapaxes(2, 3) @ rows
         power += (reach @ outer).view(np.complex64).reshape(f, p, n, n)
         error = self.error_power.take(frequencies, axis=0)[:, None]
-        _add_diagonal(power, self.gain_variance * _power_of(rows[:, :, 0]) + error)
+        _add_diagonal(power, self.gain_variance * power_of(rows[:, :, 0]) + error)
         return power
 
 
@@ -95,7 +95,7 @@ def load_contacts(
     A = between.take(attached, axis=1)
     attachments = plate.with_fingers(k, loads)
     stiffness = attachments.stiffness
-    inverse = _inverse(stiffness, A)
+    inverse = inverse_with(stiffness, A)
     forces = inverse[:, :, :n] * plate.forces[:, None]
     motion = A @ -forces
     motion.reshape(f, -1)[:, : n * n : n + 1] += plate.strokes
@@ -114,11 +114,11 @@ def load_contacts(
     power = scaled.conj().swapaxes(2, 3) @ scaled
     moved = motion.take(attachments.uncertain, axis=1) * attachments.changes[:, :, None]
     outer = _outer(moved).reshape(f, len(attachments.uncertain), -1)
-    reach = _power_of(to_points if b == n else to_points.take(attachments.uncertain, axis=2))
+    reach = power_of(to_points if b == n else to_points.take(attachments.uncertain, axis=2))
     mean = weights[:, None]
     shares = (mean @ reach.reshape(f, k, p, -1))[:, :, 0]
     power += (shares @ outer.view(np.float32)).view(np.complex64).reshape(f, k, n, n)
-    size = (mean @ _power_of(h).reshape(f, k, p, n))[:, :, 0]
+    size = (mean @ power_of(h).reshape(f, k, p, n))[:, :, 0]
     _add_diagonal(power, plate.gain_variance * size + error_power[:, None])
     return LoadedContacts(
         shapes,
@@ -146,13 +146,13 @@ def modal_fields(
     """
     shapes = np.concatenate([plate.shapes, fingers])
     A = (plate.receptance[:, None] * shapes) @ shapes.T
-    inverse = _inverse(plate.with_fingers(len(fingers), loads).stiffness, A)
+    inverse = inverse_with(plate.with_fingers(len(fingers), loads).stiffness, A)
     forces = inverse[:, :, : plate.era_count] * plate.forces[:, None]
     scale = plate.receptance * plate.minus_omega2[:, None]
     return np.asarray((shapes.T @ forces) * scale[:, :, None])
 
 
-def _inverse(stiffness: Complex64Array, receptance: Complex64Array) -> Complex64Array:
+def inverse_with(stiffness: Complex64Array, receptance: Complex64Array) -> Complex64Array:
     """K = (1 + Z A)^-1 of stiffness Z (f, a) and receptance A (f, a, a)."""
     system = stiffness[:, :, None] * receptance
     system.reshape(len(system), -1)[:, :: system.shape[1] + 1] += 1
@@ -185,7 +185,7 @@ def _outer(rows: Complex64Array) -> Complex64Array:
     return np.asarray(rows.conj()[..., :, None] * rows[..., None, :])
 
 
-def _power_of(values: Complex64Array) -> Float32Array:
+def power_of(values: Complex64Array) -> Float32Array:
     """Squared magnitude."""
     return np.asarray(values.real * values.real + values.imag * values.imag)
 
@@ -195,4 +195,4 @@ def _add_diagonal(forms: Complex64Array, values: Float32Array) -> None:
     n = values.shape[-1]
     diagonal = forms.reshape(*values.shape[:-1], -1)[..., :: n + 1]
     size = diagonal.real + values
-    diagonal[:] = size + size @ np.full((n, n), _RIDGE / n, dtype=np.float32)
+    diagonal[:] = size + size @ np.full((n, n), RIDGE / n, dtype=np.float32)

@@ -104,42 +104,61 @@ def choose_pattern(question: Question, drive_mode: str, candidates: Candidates) 
     At nine of ten plates where possible, else at the plate as modelled. Raises InputError where
     none does.
     """
-    playable = candidates.playable
-    forms = candidates.fingers.forms(candidates.background)
-    is_short = candidates.over_effect is not None and bool(question.quiet)
-    if is_short and candidates.ringing is not None:
-        forms = candidates.fingers.forms_over(candidates.ringing)
-    if len(playable) < forms.frequency_count:
-        forms = forms.at(playable)
+    forms = _forms(question, candidates)
     if drive_mode == "switched" and question.eras_at_most != 2:
         found, gap = _search_exactly(question, forms)
-    else:
-        forms, found = _search(question, drive_mode, forms)
-        if is_short:
-            found = found[:MAX_DURING_EFFECT]
-        further = _during_effect if is_short else _by_point
-        found, gap = found + further(question, drive_mode, candidates, forms, found), None
+        return _best(question, drive_mode, candidates, found, gap)
+    for some in (forms, replace(forms, level_margin=0.0)):
+        found = _search(question, drive_mode, candidates, some)
+        if found:
+            return _best(question, drive_mode, candidates, found)
+    raise _level_error(question, drive_mode, max_sensation(forms, drive_mode))
+
+
+def choose_reaching(question: Question, drive_mode: str, candidates: Candidates) -> Pattern | None:
+    """Choose the best pattern that reaches the level at nine of ten plates, None without one."""
+    found = _search(question, drive_mode, candidates, _forms(question, candidates))
+    return _best(question, drive_mode, candidates, found) if found else None
+
+
+def _forms(question: Question, candidates: Candidates) -> Forms:
+    """Forms to search, at the playable frequencies."""
+    playable = candidates.playable
+    forms = candidates.fingers.forms(candidates.background)
+    if candidates.ringing is not None and question.quiet:
+        forms = candidates.fingers.forms_over(candidates.ringing)
+    return forms.at(playable) if len(playable) < forms.frequency_count else forms
+
+
+def _search(
+    question: Question, drive_mode: str, candidates: Candidates, forms: Forms
+) -> list[tuple[float, Weights]]:
+    """The drives of the best scores, and further ones at their frequencies."""
+    found = find_drives(forms, drive_mode)
+    if not found:
+        return []
+    if candidates.over_effect is not None and question.quiet:
+        found = found[:MAX_DURING_EFFECT]
+        return found + _during_effect(question, drive_mode, candidates, forms, found)
+    return found + _by_point(question, drive_mode, candidates, forms, found)
+
+
+def _best(
+    question: Question,
+    drive_mode: str,
+    candidates: Candidates,
+    found: Sequence[tuple[float, Weights]],
+    gap_db: float | None = None,
+) -> Pattern:
+    """The pattern of the drive that drawn plates prefer."""
+    playable = candidates.playable
     scores = np.array([score for score, _ in found])
     drives = [each for _, each in found]
     if len(playable) < len(candidates.frequencies):
         drives = [replace(each, frequencies=_rows(each, playable)) for each in drives]
     responses = candidates.fingers.respond(drives)
     best = _judged(question, drives, scores, candidates, responses)
-    return _pattern(question, drive_mode, candidates, drives[best], responses.of(best), gap)
-
-
-def _search(
-    question: Question, drive_mode: str, forms: Forms
-) -> tuple[Forms, list[tuple[float, Weights]]]:
-    """The drives of the best scores, and the forms with the margin of the level that they meet.
-
-    Raises InputError where none reaches the level.
-    """
-    for some in (forms, replace(forms, level_margin=0.0)):
-        drives = find_drives(some, drive_mode)
-        if drives:
-            return some, drives
-    raise _level_error(question, drive_mode, max_sensation(forms, drive_mode))
+    return _pattern(question, drive_mode, candidates, drives[best], responses.of(best), gap_db)
 
 
 def _by_point(

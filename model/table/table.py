@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
+from model.drive_modes import UNRESTRICTED
 from model.drive_modes.exact_search import pattern_count
 from model.drive_modes.forms import Forms
 from model.drive_modes.sources import (
@@ -23,6 +24,7 @@ from model.drive_modes.sources import (
 )
 from model.ensemble.attached_plate import AttachedPlate, attach
 from model.ensemble.contact_forms import modal_fields
+from model.ensemble.preselection import Preselection
 from model.errors import InputError
 from model.fem.plate_mesh import PlateMesh
 from model.finger.contrast import is_background
@@ -38,7 +40,12 @@ from model.structure.point_load import PointLoad
 from model.table.fingers_on_plate import FingersOnPlate
 from model.table.fingertip_shapes import FingertipReader, FingertipShapes
 from model.table.pattern import ONSET_RAMP, Pattern
-from model.table.pattern_choice import Candidates, OnsetContrast, choose_pattern
+from model.table.pattern_choice import (
+    Candidates,
+    OnsetContrast,
+    choose_pattern,
+    choose_reaching,
+)
 from model.table.pulse_gains import OverEffect
 from model.table.question import MIN_LEVEL_DB_SL, Point, Question
 from model.table.raster import Raster, ReducedOnRaster
@@ -147,6 +154,10 @@ class LocalizationTable:
                 "Hz; build a table with others: era table build --frequencies"
             )
         tips = self.read_fingertips(question.contacts)
+        if drive_mode == UNRESTRICTED and over_effect is None:
+            found = self._pattern_of_part(question, drive_mode, tips, playable)
+            if found is not None:
+                return found
         candidates = Candidates(
             eras=self.eras,
             frequencies=self.frequencies,
@@ -380,12 +391,54 @@ class LocalizationTable:
             error_power=self.error_power,
         )
 
-    def _onset_contrast(self, question: Question, tips: FingertipShapes) -> OnsetContrast:
-        """Contrast of plain ramps at the fingertips, by row of the table's frequencies."""
+    def _pattern_of_part(
+        self, question: Question, drive_mode: str, tips: FingertipShapes, playable: IntArray
+    ) -> Pattern | None:
+        """The best pattern at the frequencies most worth a search, None where those do not do."""
+        if len(question.targets) > 1 or not question.quiet:
+            return None
+        wanted = np.float32(10 ** (question.level_db_sl / 20)) * self._threshold
+        rows = self._preselection.rows(tips.few, tips.few_weights, wanted, playable, question.loads)
+        if len(rows) in (0, len(playable)):
+            return None
+        threshold = self._threshold.take(rows)
+        part = Candidates(
+            eras=self.eras,
+            frequencies=self.frequencies.take(rows),
+            playable=np.arange(len(rows)),
+            fingers=FingersOnPlate(
+                self.attached.at(rows),
+                tips,
+                question,
+                threshold=threshold,
+                error_power=self.error_power.take(rows, axis=0),
+            ),
+            background=None,
+            threshold=threshold,
+            threshold_name=self.threshold,
+            onset_contrast=self._onset_contrast(question, tips, rows),
+            over_effect=None,
+            ringing=None,
+        )
+        return choose_reaching(question, drive_mode, part)
+
+    @cached_property
+    def _preselection(self) -> Preselection:
+        """Ranks the frequencies for a question."""
+        return Preselection(self.attached, self.error_power)
+
+    def _onset_contrast(
+        self, question: Question, tips: FingertipShapes, among: IntArray | None = None
+    ) -> OnsetContrast:
+        """Contrast of plain ramps at the fingertips, by row of the table's frequencies.
+
+        among (n,): rows of them that are counted, None for all.
+        """
 
         def contrast(rows: IntArray, weights: Complex64Array) -> FloatArray | None:
             if self.onsets is None:
                 return None
+            rows = rows if among is None else among.take(rows)
             discs, count = tips.fine, len(question.targets)
             # An onset's target counts by the plain mean over its points.
             scales = discs.shape[1] * tips.fine_weights[:count] * np.array(question.gains)[:, None]

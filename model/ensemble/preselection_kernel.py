@@ -1,0 +1,74 @@
+"""The scores of `model.ensemble.preselection` by its kernel in C."""
+
+import ctypes
+from ctypes import c_float, c_int, c_size_t, c_void_p
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import Complex64Array, Float32Array
+from model.compiled.kernels import kernels
+from model.compiled.lanes import LANES, aligned, in_lanes
+
+_MATRICES = ("modal", "receptance", "fields", "held", "by_damping", "by_stiffness", "error")
+
+
+class _Plate(ctypes.Structure):
+    _fields_ = (
+        *((name, c_int) for name in ("n", "b", "r")),
+        *((name, c_float) for name in ("gain_variance", "ridge")),
+        *((name, c_void_p) for name in _MATRICES),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PreselectionKernel:
+    """A plate of f frequencies as the kernel takes it, block by block of frequencies."""
+
+    library: ctypes.CDLL
+    count: int
+    plates: list[_Plate]
+    matrices: list[Float32Array]
+
+    @classmethod
+    def of(
+        cls, *, gain_variance: float, ridge: float, **matrices: Complex64Array | Float32Array
+    ) -> "PreselectionKernel | None":
+        """Of matrices (f, ...) by their names in `preselection.c`; None without a library."""
+        library = kernels()
+        if library is None:
+            return None
+        library.preselection_space.restype = c_size_t
+        lanes = [in_lanes(matrices[name]) for name in _MATRICES]
+        f, b, _ = matrices["held"].shape
+        size = (matrices["error"].shape[1], b, matrices["receptance"].shape[1])
+        plates = [
+            _Plate(*size, gain_variance, ridge, *(each.ctypes.data for each in block))
+            for block in zip(*lanes, strict=True)
+        ]
+        return cls(library, f, plates, lanes)
+
+    def score(
+        self, points: Float32Array, weights: Float32Array, fingers: Complex64Array
+    ) -> tuple[Float32Array, Float32Array]:
+        """Scores and amplitudes (f,), as of `Preselection`.
+
+        points (k, p, r), weights (k, p); fingers (f, k): their dynamic stiffness [N/m].
+        """
+        k, p, _ = points.shape
+        points, weights = np.ascontiguousarray(points), np.ascontiguousarray(weights)
+        stiffness = in_lanes(fingers)
+        space = self.library.preselection_space(ctypes.byref(self.plates[0]), k, p)
+        work, found = aligned(space, 2 * LANES), aligned(2, len(self.plates) * LANES)
+        for number, plate in enumerate(self.plates):
+            score, amplitude = found[:, number * LANES :]
+            self.library.preselection_scores(
+                *(ctypes.byref(plate), k, p),
+                *(_at(each) for each in (points, weights, stiffness[number], work)),
+                *(_at(score), _at(amplitude)),
+            )
+        return found[0, : self.count], found[1, : self.count]
+
+
+def _at(array: Float32Array) -> c_void_p:
+    return c_void_p(array.ctypes.data)

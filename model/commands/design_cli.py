@@ -17,6 +17,7 @@ from model.commands.options import (
     LowestOption,
     MeshOption,
     RigArgument,
+    cluster_at,
 )
 
 if TYPE_CHECKING:
@@ -84,7 +85,6 @@ def design(
 
     Resume an interrupted design.
     """
-    from model.cluster import Cluster
     from model.commands.progress import progress_bar
     from model.config.document import read_document
     from model.config.units import LENGTH
@@ -96,8 +96,7 @@ def design(
     from model.errors import InputError
     from model.rig.file import rig_of
 
-    if cluster is not None and workers is not None:
-        raise InputError("only one of --workers and --cluster can be given")
+    machines = cluster_at(cluster, workers=workers)
     document = read_document(rig_file)
     rig = rig_of(document, mesh=mesh)
     if uncertainty:
@@ -139,7 +138,7 @@ def design(
                 starts=starts,
                 folder=output,
                 workers=workers or 2,
-                cluster=None if cluster is None else Cluster(cluster),
+                cluster=machines,
                 progress=update,
             )
 

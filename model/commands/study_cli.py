@@ -16,6 +16,7 @@ from model.commands.options import (
     LowestOption,
     MeshOption,
     RigArgument,
+    cluster_at,
 )
 from model.counting import counted
 
@@ -68,7 +69,9 @@ def study(
         str, typer.Option(metavar="NXxNY", help="Candidate places, edges included.")
     ] = "13x13",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random layouts.")] = 0,
-    workers: Annotated[int, typer.Option(min=1, max=256, help="Local processes, at most.")] = 1,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=256, help="Local processes, at most; default: 1.")
+    ] = None,
     cluster: ClusterOption = None,
     mesh: MeshOption = None,
     as_json: JsonOption = False,
@@ -81,7 +84,6 @@ def study(
     from model.config.document import read_document
     from model.config.points import parse_frequencies, parse_pair
     from model.design.contacts import contact_rule
-    from model.errors import InputError
     from model.rig.file import rig_of
     from model.studies.finalists import judge_finalists
     from model.studies.finished import FinishedCases
@@ -93,10 +95,9 @@ def study(
     from model.studies.supported import check_supported_cases, support_of
     from model.studies.workers import on_cluster, on_processes, useful_processes
 
+    machines = cluster_at(cluster, workers=workers)
     document = read_document(rig_file)
     rig = rig_of(document, mesh=mesh)
-    if cluster is not None and workers != 1:
-        raise InputError("only one of --workers and --cluster can be given")
     started = time.perf_counter()
     cases = STUDIES[what](
         rig, layouts=layouts, seed=seed, raster=parse_pair(candidates, what="--candidates")
@@ -121,9 +122,9 @@ def study(
                 problem,
                 cases,
                 workers=(
-                    on_processes(useful_processes(problem, cases, workers))
-                    if cluster is None
-                    else on_cluster(cluster)
+                    on_processes(useful_processes(problem, cases, workers or 1))
+                    if machines is None
+                    else on_cluster(machines)
                 ),
                 finished=finished,
                 progress=advance,
@@ -138,7 +139,13 @@ def study(
     scored = score_order(rig, cases, run.results, drive=DRIVES.index(active), lowest=lowest)
     with progress_bar("finalists") as update:
         ranking = judge_finalists(
-            rig, scored, contacts=rule, finalists=finalists, workers=workers, progress=update
+            rig,
+            scored,
+            contacts=rule,
+            finalists=finalists,
+            workers=workers or 1,
+            cluster=machines,
+            progress=update,
         )
     files = [
         str(path) for path in write_outcome(output, what, rig, data=document.data, ranking=ranking)

@@ -153,6 +153,7 @@ class Coherent:
         R = _mean(some)
         shares = np.ones_like(some.quiet[:, :, 0, 0].real)
         multipliers = np.zeros((len(open_), 1), dtype=np.float32)
+        tried: list[_Tried] = []
         for step in range(LIMITED_STEPS):
             held = R.copy()
             held.reshape(len(R), -1)[:, :: some.era_count + 1] += multipliers
@@ -160,7 +161,7 @@ class Coherent:
             weights = weights * (LEVEL_RESERVE * some.gain_to_level(weights))[:, None]
             fitting = _saturated(weights, 1.0)
             expected = some.quiet_power(fitting)
-            found.add(open_, some, [(fitting, expected, None)])
+            tried.append((fitting, expected, None))
             power = np.abs(weights) ** 2
             if step == 0:
                 own = np.maximum.reduce(some.quiet_power(weights), axis=1)
@@ -170,6 +171,7 @@ class Coherent:
             if shares.shape[1] > 1:
                 shares = _moved(shares, expected)
                 R = _weighted(some, shares)
+        found.add(open_, some, tried)
 
     def _relax_level(self, forms: Forms, found: "_BestCandidates") -> None:
         """Raise the level where the best weights do not reach it, for less contrast."""

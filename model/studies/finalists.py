@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from model.arrays import FloatArray
+from model.cluster import Cluster
 from model.design.contacts import ContactRule
 from model.design.judge import JUDGED_SEED, JUDGED_SETS, Judged, judge
 from model.processes import on_processes
@@ -22,12 +23,14 @@ def judge_finalists(
     contacts: ContactRule,
     finalists: int = DEFAULT_FINALISTS,
     workers: int = 1,
+    cluster: Cluster | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Ranking:
     """Judge the finalists of a rig's study on fresh contact sets, and rank all cases.
 
-    The contact sets are those by which `era design` judges from its default seed. progress: called
-    with the number of finalists done and the total. Raises InputError.
+    The contact sets are those by which `era design` judges from its default seed. cluster: in place
+    of so many workers on this machine; progress: called with the number of finalists done and the
+    total. Raises InputError.
     """
     groups = (era_counts(scored.cases), scored.cases.stiffness_factors)
     chosen = scored.finalists(finalists, groups=groups)
@@ -40,7 +43,11 @@ def judge_finalists(
     }
     judged: dict[int, Judged] = {}
     progress(0, len(rigs))
-    for case, answers in on_processes(min(workers, len(rigs)), _judge, sets, rigs):
+    for case, answers in (
+        on_processes(min(workers, len(rigs)), _judge, sets, rigs)
+        if cluster is None
+        else cluster.solve(list, sets, _judge, rigs)
+    ):
         judged[case] = answers
         progress(len(judged), len(rigs))
     return rank(scored, {case: judged[case] for case in chosen}, finalists=finalists)

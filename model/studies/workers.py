@@ -38,12 +38,8 @@ def on_processes(count: int) -> Workers:
     return solve
 
 
-def on_cluster(address: str) -> Workers:
-    """The workers of a Dask scheduler, for example tcp://192.168.1.5:8786.
-
-    Raises InputError for what is not an address; further, when used: `model.cluster`.
-    """
-    cluster = Cluster(address)
+def on_cluster(cluster: Cluster) -> Workers:
+    """The workers of a Dask scheduler. Raises InputError when used: `model.cluster`."""
 
     def solve(problem: StudyProblem, chunks: Mapping[int, Cases]) -> Solved:
         yield from cluster.solve(_solve_plate, problem, solve_cases, chunks)

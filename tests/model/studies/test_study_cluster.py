@@ -11,7 +11,12 @@ from collections.abc import Iterator
 import pytest
 
 from model import cluster
+from model.cluster import Cluster
+from model.design.contacts import contact_rule
 from model.errors import InputError
+from model.studies import finalists
+from model.studies.ranking import score_order
+from model.studies.solve import solve_cases
 from model.studies.workers import on_cluster, on_processes
 from studies import chunks_of, same_to_the_bit, small_study
 
@@ -50,8 +55,24 @@ def test_cluster_equals_one_process_bit_for_bit(address):
     assert len(set(worker_pids(address)) - {os.getpid()}) == 2
     problem, cases = small_study(layouts=40)
     chunks = chunks_of(cases, 8)
-    there = dict(on_cluster(address)(problem, chunks))
+    there = dict(on_cluster(Cluster(address))(problem, chunks))
     assert same_to_the_bit(there, dict(on_processes(1)(problem, chunks)))
+
+
+def test_cluster_judges_finalists_as_one_process_does(address, monkeypatch):
+    """The answers of every finalist are the same."""
+    monkeypatch.setattr(finalists, "JUDGED_SETS", 6)
+    problem, cases = small_study(layouts=6)
+    results = solve_cases(problem.solve(), cases)
+    scored = score_order(problem.rig, cases, results, drive=0, lowest=1.0)
+    rule = contact_rule(None, problem.rig.plate)
+    here, there = (
+        finalists.judge_finalists(problem.rig, scored, contacts=rule, cluster=where)
+        for where in (None, Cluster(address))
+    )
+    assert {case: each.summary for case, each in here.judged.items()} == {
+        case: each.summary for case, each in there.judged.items()
+    }
 
 
 @pytest.mark.long
@@ -63,7 +84,7 @@ def test_cluster_replaces_killed_workers(address):
     problem, cases = small_study(layouts=60)
     chunks = chunks_of(cases, 2)
     before = worker_pids(address)
-    solving = on_cluster(address)(problem, chunks)
+    solving = on_cluster(Cluster(address))(problem, chunks)
     there = dict([next(solving)])
     for pid in before:
         os.kill(pid, signal.SIGKILL)
@@ -78,7 +99,7 @@ def test_cluster_refuses_workers_with_other_code(address, monkeypatch):
     problem, cases = small_study(layouts=4)
     monkeypatch.setattr(cluster, "code_version", lambda: OTHER)
     with pytest.raises(InputError, match="same era-haptics"):
-        dict(on_cluster(address)(problem, chunks_of(cases, 4)))
+        dict(on_cluster(Cluster(address))(problem, chunks_of(cases, 4)))
 
 
 def test_cluster_without_workers_is_refused():
@@ -90,7 +111,7 @@ def test_cluster_without_workers_is_refused():
         LocalCluster(n_workers=0, dashboard_address=":0") as empty,
         pytest.raises(InputError, match="has no workers"),
     ):
-        dict(on_cluster(empty.scheduler_address)(problem, chunks_of(cases, 4)))
+        dict(on_cluster(Cluster(empty.scheduler_address))(problem, chunks_of(cases, 4)))
 
 
 @pytest.mark.long
@@ -103,7 +124,7 @@ def test_cluster_gives_up_on_a_chunk_that_kills_its_workers(address, monkeypatch
     with Client(address, set_as_default=False) as client:
         client.run_on_scheduler(_allow_failures, 0)
     with pytest.raises(InputError, match="memory"):
-        dict(on_cluster(address)(problem, chunks_of(cases, 4)))
+        dict(on_cluster(Cluster(address))(problem, chunks_of(cases, 4)))
 
 
 def _allow_failures(count, dask_scheduler):
@@ -115,7 +136,7 @@ def test_cluster_without_dask_names_the_extra(monkeypatch):
     """The error names the extra to install."""
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"\[cluster\]"):
-        dict(on_cluster("tcp://127.0.0.1:1")(None, {}))
+        dict(on_cluster(Cluster("tcp://127.0.0.1:1"))(None, {}))
 
 
 def test_cluster_without_scheduler_is_refused(monkeypatch):
@@ -123,14 +144,14 @@ def test_cluster_without_scheduler_is_refused(monkeypatch):
     monkeypatch.setattr(cluster, "_CONNECT_TIMEOUT", 0.2)
     problem, cases = small_study(layouts=4)
     with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:1 "):
-        dict(on_cluster("tcp://127.0.0.1:1")(problem, chunks_of(cases, 4)))
+        dict(on_cluster(Cluster("tcp://127.0.0.1:1"))(problem, chunks_of(cases, 4)))
 
 
 @pytest.mark.parametrize("text", ["", "nonsense", "foo://x:1", "tcp://host", "tcp://host:port"])
 def test_on_cluster_refuses_an_invalid_address(text):
     """An address that Dask would hang over never reaches it."""
     with pytest.raises(InputError, match="dask scheduler"):
-        on_cluster(text)
+        on_cluster(Cluster(text))
 
 
 def test_every_worker_checks_its_code():

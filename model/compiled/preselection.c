@@ -23,14 +23,15 @@ typedef struct {
 } value;
 
 typedef struct {
-    int n, b, r;                 /* ERAs; these and masses; reduced coordinates */
+    int n, b, r; /* ERAs; these and masses; reduced coordinates */
     float gain_variance, ridge;
-    const value *modal;          /* (b + n, r): by a force at each attachment; change of each ERA's field by the thickness */
-    const value *receptance;     /* (r) */
-    const value *fields;         /* (b, 2 n): forces there by each ERA; by a force there */
-    const value *held;           /* (b, b) */
+    /* (b + n, r): by a force at each attachment; change of each ERA's field by the thickness */
+    const value *modal;
+    const value *receptance;                /* (r) */
+    const value *fields;                    /* (b, 2 n): forces there by each ERA; by a force there */
+    const value *held;                      /* (b, b) */
     const value *by_damping, *by_stiffness; /* (n, n) */
-    const lanes *error;          /* (n) */
+    const lanes *error;                     /* (n) */
 } plate;
 
 INLINE value plus(value c, value a, value b) { /* c + a b */
@@ -85,7 +86,7 @@ INLINE void multiply(value *restrict found, const float *restrict a, const value
 /* Values of work space for k fingers of p points. */
 size_t preselection_space(const plate *on, int k, int p) {
     size_t n = on->n, b = on->b, points = (size_t)k * p;
-    return points * (b + n + k + 4 * n) + b * k + n * (n + 2) + 3 * n +
+    return points * (b + n + k + 4 * n) + b * k + n * (n + 2) +
            (points * k * on->r * sizeof(float)) / sizeof(value) + 1;
 }
 
@@ -96,8 +97,8 @@ void preselection_scores(const plate *on, int fingers, int each, const float *po
     const size_t n = on->n, b = on->b, r = on->r, k = fingers, p = each, count = k * p;
     const size_t columns = b + n, wide = 3 * n;
     value *U = work, *G = U + count * columns, *WU = G + count * k, *H = WU + b * k;
-    value *D = H + count * wide, *R = D + count * n, *c = R + n * n, *w = c + n, *row = w + n;
-    float *products = (float *)(row + 3 * n);
+    value *D = H + count * wide, *R = D + count * n, *c = R + n * n, *w = c + n;
+    float *products = (float *)(w + n);
 
     multiply(U, points, on->modal, count, r, columns);
     for (size_t i = 0; i < count; i++)

@@ -2,9 +2,10 @@
 
 With the ERAs eliminated beforehand only the fingers are left to be attached: the plate on its ERAs
 has receptance G and fields h0, the fingers D a field h = h0 - G D (1 + G D)^-1 h0. The form of the
-mean over the quiet fingers follows as in `contact_forms`, but for two parts that hardly change the
-order of frequencies: what a deviating load or, through the load, a deviating thickness changes.
-|c^H w| / sqrt(w^H R w) of w = R^-1 c is then nearly the upper bound of a frequency's robust score.
+mean over the quiet fingers follows as in `contact_forms`, but for what hardly changes the order of
+frequencies: the deviation of a finger's load, what the thickness changes through a finger's load,
+and what the fingers change in the motion of the ERAs. |c^H w| / sqrt(w^H R w) of w = R^-1 c is then
+nearly the upper bound of a frequency's robust score.
 """
 
 from collections.abc import Sequence

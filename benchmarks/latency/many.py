@@ -25,8 +25,8 @@ _UNMEASURED = 2 * PLACES  # the flood's finger may come in between
 
 HEAD = (
     "| rig | ERAs on amplifiers | load | sets | unmatched | median | 99th | CPU | "
-    "answers remembered: median | 99th | CPU | other load |\n"
-    "|---|---|---|---|---|---|---|---|---|---|---|---|"
+    "answers remembered: median | 99th | CPU | of it at rest | other load |\n"
+    "|---|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
 
 
@@ -72,7 +72,7 @@ def _cells(found: list[Found | Failed]) -> Iterator[str]:
     for number, one in enumerate(found):
         if isinstance(one, Failed):
             print(f"{one.case.name}: {'; then: '.join(one.why)}", file=sys.stderr)
-            yield from [""] * (3 if number else 5)
+            yield from [""] * (4 if number else 5)
             continue
         newest = one.matched.newest
         if not number:
@@ -81,5 +81,7 @@ def _cells(found: list[Found | Failed]) -> Iterator[str]:
         quantiles = np.quantile(newest, [0.5, 0.99]) if len(newest) else [np.inf] * 2
         yield from (f"{1e3 * time:.2f}" for time in quantiles)
         yield f"{1e3 * one.computed / max(1, len(newest)):.2f}"
+        if number:
+            yield f"{1e3 * one.resting / RATE:.2f}"
     busy = [one.others for one in found if isinstance(one, Found)]
     yield f"{max(busy, default=0.0):.2f} of {os.cpu_count()}"

@@ -73,6 +73,7 @@ class Found:
     others: float
     is_urgent: bool
     stops: np.ndarray = field(default_factory=lambda: np.zeros(0))  # s; from call to result
+    resting: float = 0.0  # processors that the daemon keeps busy before the first touch
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,9 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
             flood.line()
             programs.append(flood)
             programs += [Program(all_, *module("clients"), "work") for _ in range(WORKERS)]
+        resting = -tested.computed()
         time.sleep(_SETTLE)
+        resting = (resting + tested.computed()) / _SETTLE
         others = Others(lambda: sum(program.computed() for program in programs))
         panel.tell("go")
         time.sleep(case.unmeasured / case.work.rate)
@@ -186,7 +189,7 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
         commands = list(read_commands(read, rig.amplifiers))
     matched = _matched(case, commands, sent, rig, table)
     is_urgent = all(program.is_urgent for program in programs)
-    return Found(case, matched, own, len(sent), computed, busy, is_urgent, stops)
+    return Found(case, matched, own, len(sent), computed, busy, is_urgent, stops, resting)
 
 
 def _matched(

@@ -68,20 +68,21 @@ class Voices:
         is_driven = command.level > 0 or command.onset > 0
         has_ending = self.ending > 0 and not (is_driven or command.skip_ending)
         faded = commit.latest + (max(ramp, self.ending) if has_ending else ramp)
-        voices = []
+        left: list[tuple[float, Voice]] = []
         for lasts_until, lasting, fading in self.voices:
             under_way = max(fading, lasting) if lasts_until <= commit.latest else fading
             # No ending cuts a fade short.
             end = under_way if has_ending else min(under_way, faded)
             if lasts_until > commit.earliest:
                 end = max(end, faded)
-            voices.append(Voice(fading=end))
+            if end > commit.latest:
+                left.append((end, Voice(fading=end)))
         if is_driven:
             lasts_until = commit.latest + (valid_for or math.inf)
             onset_end = commit.latest + onset if command.level == 0 else -math.inf
-            voices.append(Voice(lasts_until, lasts_until + max(ramp, ending), onset_end))
-        left = [(voice.end, voice) for voice in voices]
-        left = [each for each in left if each[0] > commit.latest]
+            voice = Voice(lasts_until, lasts_until + max(ramp, ending), onset_end)
+            if voice.end > commit.latest:
+                left.append((voice.end, voice))
         if len(left) > 1:
             left.sort(key=_END, reverse=True)
         return Voices(tuple([voice for _, voice in left]), ending)

@@ -27,8 +27,8 @@ firmware-test: .venv/installed-test
 	.ci/install gcc-arm-none-eabi:arm-none-eabi-gcc libnewlib-arm-none-eabi: qemu-system-arm:qemu-system-arm
 	$(BIN)/python firmware/test/run.py $(FIRMWARE)
 
-# What needs the processors, which a third of the time waits for processes: one worker more than
-# there are; what plays in real time; what loads the processors itself.
+# What needs the processors, and sometimes waits for processes: one worker more than there are; what
+# plays in real time; what loads the processors itself.
 WORKERS = $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
 test: .venv/installed-test
 	$(BIN)/pytest -m 'not real_time and not alone and not long' --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
@@ -36,7 +36,8 @@ test: .venv/installed-test
 	$(BIN)/pytest -m 'alone and not long'
 
 # Whole programmes of which `make test` has a short form: every command of the pages typed from an
-# empty folder, conformance of the examples, an identified plate, the firmware on the plate.
+# empty folder, conformance of the examples, an identified plate, the firmware on the plate; and those
+# cases of heavy tests that `make test` leaves out.
 test-long: .venv/installed-test
 	$(BIN)/pytest -m 'long and not alone' --numprocesses auto
 	$(BIN)/pytest -m 'long and alone'

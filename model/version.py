@@ -4,7 +4,7 @@ import hashlib
 from functools import cache
 from importlib import metadata, resources
 
-NUMERICS_VERSION = 8
+NUMERICS_VERSION = 9
 """Version of the numbers that the model computes: kept results of another one are not reused.
 
 Increase it with every change of figures beyond rounding, then record the new figures by
@@ -21,6 +21,6 @@ def code_version() -> str:
         for entry in sorted(pending.pop().iterdir(), key=lambda entry: entry.name):
             if entry.is_dir():
                 pending.append(entry)
-            elif entry.name.endswith(".py"):
+            elif entry.name.endswith((".py", ".c")):
                 digest.update(entry.read_bytes())
     return f"{metadata.version('era-haptics')}+{digest.hexdigest()[:12]}"

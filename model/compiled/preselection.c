@@ -25,7 +25,7 @@ typedef struct {
 typedef struct {
     int n, b, r; /* ERAs; these and masses; reduced coordinates */
     float gain_variance, ridge;
-    /* (b + n, r): by a force at each attachment; change of each ERA's field by the thickness */
+    /* (b + 2 n, r): by a force at each attachment; changes of each ERA's field by the thickness */
     const value *modal;
     const value *receptance;                /* (r) */
     const value *fields;                    /* (b, 2 n): forces there by each ERA; by a force there */
@@ -86,7 +86,7 @@ INLINE void multiply(value *restrict found, const float *restrict a, const value
 /* Values of work space for k fingers of p points. */
 size_t preselection_space(const plate *on, int k, int p) {
     size_t n = on->n, b = on->b, points = (size_t)k * p;
-    return points * (b + n + k + 4 * n) + b * k + n * (n + 2) +
+    return points * (b + k + 7 * n) + b * k + n * (n + 2) +
            (points * k * on->r * sizeof(float)) / sizeof(value) + 1;
 }
 
@@ -95,7 +95,7 @@ void preselection_scores(const plate *on, int fingers, int each, const float *po
                          const float *weights, const value *loads, value *work, lanes *score,
                          lanes *amplitude) {
     const size_t n = on->n, b = on->b, r = on->r, k = fingers, p = each, count = k * p;
-    const size_t columns = b + n, wide = 3 * n;
+    const size_t columns = b + 2 * n, wide = 4 * n;
     value *U = work, *G = U + count * columns, *WU = G + count * k, *H = WU + b * k;
     value *D = H + count * wide, *R = D + count * n, *c = R + n * n, *w = c + n;
     float *products = (float *)(w + n);
@@ -122,7 +122,7 @@ void preselection_scores(const plate *on, int fingers, int each, const float *po
             G[i * k + j] = plus(ZERO, sum, loads[j]);
         }
 
-    /* Fields of the ERAs, of a force at each, and the change of the fields by the thickness. */
+    /* Fields of the ERAs, of a force at each, and two changes of the fields by the thickness. */
     for (size_t i = 0; i < count; i++) {
         for (size_t j = 0; j < 2 * n; j++) {
             value sum = ZERO;
@@ -130,7 +130,7 @@ void preselection_scores(const plate *on, int fingers, int each, const float *po
                 sum = plus(sum, U[i * columns + s], on->fields[s * 2 * n + j]);
             H[i * wide + j] = sum;
         }
-        memcpy(H + i * wide + 2 * n, U + i * columns + b, n * sizeof(value));
+        memcpy(H + i * wide + 2 * n, U + i * columns + b, 2 * n * sizeof(value));
     }
 
     /* One finger after the other. Both it and the plate with those before are damped. */
@@ -181,6 +181,7 @@ void preselection_scores(const plate *on, int fingers, int each, const float *po
                 sum = plus_conjugate(sum, h[u], h[v]);
                 sum = plus_conjugate(sum, d[u], d[v]);
                 sum = plus_conjugate(sum, h[2 * n + u], h[2 * n + v]);
+                sum = plus_conjugate(sum, h[3 * n + u], h[3 * n + v]);
             }
             R[u * n + v] = sum;
         }

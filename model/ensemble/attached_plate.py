@@ -24,6 +24,9 @@ from model.structure.modal_elasticity import ModalElasticity
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 
+LEAST_THICKNESS = 0.1
+"""Of plates that deviate, relative to the modelled one."""
+
 
 @dataclass(frozen=True, eq=False)
 class AttachedPlate:
@@ -41,6 +44,7 @@ class AttachedPlate:
       load_std: standard deviation of the logarithm of its load
     - gain, phase: standard deviations of an ERA's amplitude and of its phase [rad]; gain_variance:
       mean square of both together
+    - thickness: its standard deviation, relative
     """
 
     minus_omega2: Float32Array
@@ -59,7 +63,7 @@ class AttachedPlate:
     gain: float
     phase: float
     gain_variance: float
-    has_thickness_error: bool
+    thickness: float
 
     @property
     def era_count(self) -> int:
@@ -81,6 +85,22 @@ class AttachedPlate:
         return replace(
             self, **{name: getattr(self, name).take(frequencies, axis=0) for name in _BY_FREQUENCY}
         )
+
+    def receptance_at(self, deviations: FloatArray, frequencies: IntArray) -> Complex64Array:
+        """Receptance of plates of deviating thickness at frequencies, by index: (f, d, r).
+
+        deviations (d,): in standard deviations.
+        """
+        w2 = -self.minus_omega2.take(frequencies).astype(float)[:, None]
+        stiffness = 1 / self.receptance.take(frequencies, axis=0).astype(complex) + w2
+        factor = np.maximum(1 + self.thickness * deviations, LEAST_THICKNESS)[:, None]
+        found = 1 / (factor * (factor**2 * stiffness[:, None] - w2[:, None]))
+        return np.asarray(found, dtype=np.complex64)
+
+    @cached_property
+    def deviating(self) -> Complex64Array:
+        """The receptance of plates thicker and thinner by one standard deviation, (f, 2, r)."""
+        return self.receptance_at(np.array([1.0, -1.0]), np.arange(len(self.omega)))
 
     def with_fingers(self, count: int, loads: Sequence[float] = ()) -> "Attachments":
         """What is attached to the plate with a number of fingers on it.
@@ -185,5 +205,5 @@ def attach(
         gain=uncertainty.gain,
         phase=math.radians(uncertainty.phase_deg),
         gain_variance=uncertainty.gain_variance,
-        has_thickness_error=uncertainty.thickness > 0,
+        thickness=uncertainty.thickness,
     )

@@ -8,6 +8,7 @@ and what the fingers change in the motion of the ERAs. |c^H w| / sqrt(w^H R w) o
 nearly the upper bound of a frequency's robust score.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -79,7 +80,9 @@ class Preselection:
         (f, b), n, k = plate.stiffness.shape, plate.era_count, len(points)
         p = points.shape[1]
         every = points.reshape(k * p, -1)
-        by_force = (every @ base.modal).view(np.complex64).reshape(k * p, f, b + n).swapaxes(0, 1)
+        by_force = (
+            (every @ base.modal).view(np.complex64).reshape(k * p, f, b + 2 * n).swapaxes(0, 1)
+        )
         from_attached = by_force[:, :, :b]
         products = (every[:, None] * points[:, 0]).reshape(k * p * k, -1)
         free = (products @ plate.modal_rows).view(np.complex64).reshape(k * p, k, f)
@@ -96,7 +99,8 @@ class Preselection:
         quiet = fields[:, p:] * np.sqrt(share)
         h, to_quiet = quiet[:, :, :n], quiet[:, :, n : 2 * n]
         reach = np.sqrt(np.add.reduce(power_of(to_quiet), axis=1))[:, :, None]
-        changes = [to_quiet @ base.by_damping, quiet[:, :, 2 * n :], reach * base.by_stiffness]
+        thicker = quiet[:, :, 2 * n :].reshape(f, -1, n)
+        changes = [to_quiet @ base.by_damping, thicker, reach * base.by_stiffness]
         rows = np.concatenate([h, *changes], axis=1)
         R = rows.conj().swapaxes(1, 2) @ rows
         diagonal = R.reshape(f, -1)[:, :: n + 1]
@@ -111,7 +115,7 @@ class Preselection:
         """The same in C, where it can be compiled."""
         plate, base = self.plate, self._base
         (f, b), n = plate.stiffness.shape, plate.era_count
-        modal = base.modal.view(np.complex64).reshape(-1, f, b + n)
+        modal = base.modal.view(np.complex64).reshape(-1, f, b + 2 * n)
         return PreselectionKernel.of(
             gain_variance=plate.gain_variance,
             ridge=RIDGE,
@@ -137,10 +141,14 @@ class Preselection:
         motion = A @ -forces
         motion.reshape(f, -1)[:, : n * n : n + 1] += plate.strokes
         by_force = plate.receptance[:, :, None] * shapes.T
-        thicker = plate.by_thickness[:, :, None] * (shapes.T @ forces)
         minus_omega2 = plate.minus_omega2[:, None, None]
-        by_thickness = minus_omega2 * (thicker - by_force @ (held @ (shapes @ thicker)))
-        modal = np.concatenate([by_force, by_thickness], axis=2).swapaxes(0, 1)
+        modal = plate.receptance[:, :, None] * (shapes.T @ forces)
+        columns = [by_force]
+        for receptance in plate.deviating.swapaxes(0, 1):
+            other = inverse_with(plate.stiffness, single((receptance[:, None] * shapes) @ shapes.T))
+            moved = receptance[:, :, None] * (shapes.T @ (other[:, :, :n] * plate.forces[:, None]))
+            columns.append(minus_omega2 * (moved - modal) * np.float32(math.sqrt(0.5)))
+        modal = np.concatenate(columns, axis=2).swapaxes(0, 1)
         return _PlateOnEras(
             single(modal, order="C").reshape(r, -1).view(np.float32),
             single(np.concatenate([forces, K[:, :, :n]], axis=2) * minus_omega2),
@@ -154,7 +162,7 @@ class Preselection:
 class _PlateOnEras:
     """A plate on its n ERAs and masses, b in all, without fingers.
 
-    - modal: (r, 2 f (b + n)) of each attachment's force, and of each ERA's change by the thickness
+    - modal: (r, 2 f (b + 2 n)) of each attachment's force, and of each ERA's changes by thickness
     - fields: (f, b, 2 n) forces at the attachments by each ERA at full stroke, and by a force there
     - held: (f, b, b) forces held by the attachments for a motion of each
     - by_damping, by_stiffness: (f, n, n) forces of a deviating damper or spring, by ERA driven

@@ -13,6 +13,7 @@ from model.ensemble.attached_plate import AttachedPlate
 from model.ensemble.contact_forms import LoadedContacts, load_contacts
 from model.ensemble.draws import draw
 from model.ensemble.measures import Felt, Fingertips, felt
+from model.ensemble.thickness import thickness_nodes, thickness_remainders
 from model.ensemble.tone_responses import Tones, tone_responses
 from model.table.fingertip_shapes import FingertipShapes
 from model.table.pulse_gains import PulseResponses
@@ -151,6 +152,9 @@ class FingersOnPlate:
             np.array(ends),
             Fingertips(tips.fine_weights, self._gains),
             plate,
+            self._contacts,
+            tones,
+            points,
         )
 
     def _expected(self, background: Complex64Array) -> Complex64Array:
@@ -172,7 +176,7 @@ class DriveResponses:
 
     values (m, k p, columns): of `tone_responses`; error (m,): root mean square of the
     discretisation error of each tone's field; threshold (m,) [m/s²]; starts, ends (c,): ranges of
-    the drives' tones.
+    the drives' tones; points (k p, r): shapes.
     """
 
     values: Complex64Array
@@ -182,6 +186,9 @@ class DriveResponses:
     ends: IntArray
     fingertips: Fingertips
     plate: AttachedPlate
+    contacts: LoadedContacts
+    tones: Tones
+    points: Float32Array
 
     def of(self, drive: int) -> "DriveResponses":
         """Responses to one of the drives, by index."""
@@ -194,11 +201,25 @@ class DriveResponses:
             np.array([end - start]),
             self.fingertips,
             self.plate,
+            self.contacts,
+            Tones(self.tones.frequencies[start:end], self.tones.weights[start:end]),
+            self.points,
         )
 
-    def drawn(self, *, count: int, seed: int) -> Felt:
-        """Measures on the plate as modelled, and on drawn ones, (c, 1 + count)."""
-        plate = self.plate
+    def drawn(self, *, count: int, seed: int, thicknesses: int) -> Felt:
+        """Measures on the plate as modelled, and on drawn ones, (c, 1 + count).
+
+        thicknesses: how many the drawn plates have.
+        """
+        plate, values = self.plate, self.values
+        if not plate.thickness:
+            thicknesses = 0
+        if thicknesses:
+            nodes = thickness_nodes(thicknesses)
+            further = thickness_remainders(
+                plate, self.contacts, self.tones, self.points, values, nodes
+            )
+            values = np.concatenate([values, further], axis=2)
         draws = draw(
             plate.era_count,
             len(self.fingertips.weights),
@@ -206,6 +227,7 @@ class DriveResponses:
             seed=seed,
             gain=plate.gain,
             phase=plate.phase,
+            thicknesses=thicknesses,
         )
-        power = draws.power(self.values, self.error)
+        power = draws.power(values, self.error)
         return felt(power, self.threshold, self.starts, self.fingertips)

@@ -29,11 +29,11 @@ from model.table.pulse_gains import OverEffect, contrast_over_effect
 from model.table.question import Question
 from model.transients.onset import RampedRinging
 
-JUDGING_DRAWS, JUDGING_SEED = 64, 1
+JUDGING_DRAWS, JUDGING_SEED, JUDGING_THICKNESSES = 64, 1, 5
 MAX_DURING_EFFECT = 3
 """Drives that are rated by what is felt over a short effect, and as many at their frequencies."""
 
-PROMISED_DRAWS, PROMISED_SEED = 200, 8
+PROMISED_DRAWS, PROMISED_SEED, PROMISED_THICKNESSES = 200, 8, 10
 
 PROMISED_PERCENTILE = 9
 """Percentile of the linear draws that is promised.
@@ -257,7 +257,9 @@ def _judged(
     """
     if len(drives) == 1:
         return 0
-    judged = responses.drawn(count=JUDGING_DRAWS, seed=JUDGING_SEED)
+    judged = responses.drawn(
+        count=JUDGING_DRAWS, seed=JUDGING_SEED, thicknesses=JUDGING_THICKNESSES
+    )
     if candidates.over_effect is not None:
         return _judged_over_effect(question, drives, scores, judged, candidates.over_effect)
     least = percentile(judged.level[:, 1:])
@@ -330,7 +332,9 @@ def _pattern(
     gap_db: float | None,
 ) -> Pattern:
     """The pattern of a drive, turned down to the wanted level at nine of ten plates."""
-    drawn = responses.drawn(count=PROMISED_DRAWS, seed=PROMISED_SEED)
+    drawn = responses.drawn(
+        count=PROMISED_DRAWS, seed=PROMISED_SEED, thicknesses=PROMISED_THICKNESSES
+    )
     measures = [drawn.level]
     if drawn.contrast is not None:
         measures += [drawn.contrast.loudest, drawn.contrast.acceleration, drawn.contrast.felt]

@@ -92,7 +92,7 @@ def test_felt_on_agrees_with_the_direct_solve(targets, mode):
     assert np.ptp(solved) > 0.3  # the plates do differ
 
 
-@pytest.mark.parametrize("loads", [(2.5, 0.4, 1.0), (0.2, 5.0, 5.0)])
+@pytest.mark.parametrize("loads", [(2.5, 0.4, 1.0), (5.0, 0.2, 0.2)])
 def test_answers_for_fingers_that_press_differently_agree_with_the_direct_solve(loads):
     """Contrasts of the answer, and on other plates with these fingers: within 0.15 dB.
 
@@ -260,3 +260,20 @@ def test_answers_reach_what_an_independent_optimum_does(known, percent, expected
             contrast = felt_on(table, question, pattern.excitation, plates).contrast.felt[0]
             found.append(20 * np.log10(np.percentile(contrast, percent)))
         assert np.median(found) == pytest.approx(optimum, abs=2.0)
+
+
+@pytest.mark.parametrize("places", range(4))
+def test_promise_holds_where_the_thickness_moves_resonances(places: int) -> None:
+    """Of plates that differ by 6 % in thickness nine of ten give what is promised, to a decibel."""
+    uncertainty = Uncertainty(0.01, 1.0, thickness=0.06, stiffness=0.02, damping=1.1)
+    table = replace(smooth_table(), uncertainty=uncertainty)
+    target, *quiet = contact_sets(places + 1, fingers=2 + places % 2, seed=11)[-1]
+    question = Question((target,), tuple(quiet))
+    pattern = table.query(question)
+    plates = draw_plates(
+        np.random.default_rng(3), uncertainty, count=600, era_count=4, contact_count=1 + len(quiet)
+    )
+    contrast = felt_on(table, question, pattern.excitation, plates).contrast
+    assert contrast is not None
+    found = 20 * np.log10(np.percentile(contrast.felt[0], 10))
+    assert pattern.robust_felt_contrast_db == pytest.approx(found, abs=1.0)

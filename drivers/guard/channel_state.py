@@ -96,7 +96,8 @@ class ChannelState:
             highest = (1 - fraction) * both + fraction * reached + kept
         if self.ending is not None and end > self.valid_for:
             interrupted = abs(self.path[0]) if last < settled_after else 0.0  # fades by itself
-            highest = max(highest, self._highest_knot + interrupted + self.fading_at(last))
+            fading = self.fading_at(min(last, max(start, self.valid_for)))
+            highest = max(highest, self._highest_knot + interrupted + fading)
         return highest
 
     @property

@@ -6,7 +6,7 @@ import random
 from dataclasses import replace
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from drivers import clock
@@ -221,6 +221,7 @@ async def test_unconfirmed_set_is_not_compared() -> None:
 
 
 @given(seed=st.integers(0, 2**32))
+@example(66104270)  # an ending after an envelope to silence, over a tone that fades
 @settings(max_examples=25, deadline=None)
 @in_virtual_time
 async def test_honest_amplifier_is_never_contradicted(seed: int) -> None:

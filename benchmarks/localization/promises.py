@@ -3,7 +3,8 @@
     python -m benchmarks.localization.promises [--only PLATE ...] [--plates N]
 
 Robust felt contrast of answers, mode phased, less the tenth percentile over plates drawn within
-each rig's uncertainty and solved exactly (`model.table.exact_plates`): above 0 is promised too much.
+each rig's uncertainty and solved exactly (`model.table.exact_plates`): more than 0 is promised too
+much.
 """
 
 import argparse

@@ -38,6 +38,10 @@ class Preselection:
     plate: AttachedPlate
     error_power: Float32Array
 
+    def __reduce__(self) -> tuple[type["Preselection"], tuple[AttachedPlate, Float32Array]]:
+        """Another process takes the kernel from its own library."""
+        return Preselection, (self.plate, self.error_power)
+
     def rows(
         self,
         points: Float32Array,

@@ -1,6 +1,7 @@
 """Ranking of frequencies, against the exact forms and against answers that search all of them."""
 
 import ctypes
+import pickle
 from dataclasses import replace
 from functools import cache
 
@@ -114,6 +115,14 @@ def test_level_that_no_kept_frequency_reaches_is_sought_at_all(
     frequency = next(iter(best.excitation.values())).frequency
     monkeypatch.setattr(Preselection, "rows", lambda *_: np.array([0]))  # 40 Hz
     assert next(iter(of.query(question).excitation.values())).frequency == frequency > 40
+
+
+def test_prepared_table_goes_to_another_process() -> None:
+    """With what it has computed ahead; its answers are the same there."""
+    of = table()
+    question = Question((PLACES[0],), (PLACES[1],))
+    pattern = of.query(question)
+    assert pickle.loads(pickle.dumps(of)).query(question).excitation == pattern.excitation  # noqa: S301
 
 
 def test_machine_without_a_compiler_answers(monkeypatch: pytest.MonkeyPatch) -> None:

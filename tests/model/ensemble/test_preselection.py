@@ -122,7 +122,7 @@ def test_prepared_table_goes_to_another_process() -> None:
     of = table()
     question = Question((PLACES[0],), (PLACES[1],))
     pattern = of.query(question)
-    assert pickle.loads(pickle.dumps(of)).query(question).excitation == pattern.excitation  # noqa: S301
+    assert pickle.loads(pickle.dumps(of)).query(question).excitation == pattern.excitation
 
 
 def test_machine_without_a_compiler_answers(monkeypatch: pytest.MonkeyPatch) -> None:

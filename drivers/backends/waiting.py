@@ -22,14 +22,18 @@ class ReplyTimer:
         self._due: dict[asyncio.Future[Any], float] = {}  # s; of the awaited replies
         self._delayed: set[asyncio.Future[Any]] = set()  # those that were granted _GRACE
         self._timer: asyncio.TimerHandle | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
 
     async def wait(self, reply: "asyncio.Future[_T]", timeout: float) -> _T:
         """Return the reply; TimeoutError if it does not arrive within the timeout [s].
 
         A reply that arrived in time counts even if this process was delayed and reads it late.
         """
-        due = self._due[reply] = asyncio.get_running_loop().time() + timeout
-        if self._timer is None or self._timer.when() > due:
+        loop = asyncio.get_running_loop()
+        due = self._due[reply] = loop.time() + timeout
+        # The timer of a loop that has ended never fires.
+        if self._timer is None or self._timer.when() > due or self._loop is not loop:
+            self._loop = loop
             self._set(due)
         try:
             return await reply

@@ -80,3 +80,20 @@ async def test_timer_of_an_earlier_reply_does_not_end_a_later_one() -> None:
     await asyncio.gather(wait(0.03), wait(0.01))
     assert list(ended) == [0.01, 0.03]
     assert all(after >= timeout for timeout, after in ended.items())
+
+
+def test_reply_in_another_loop_times_out() -> None:
+    """A line that is opened again waits no longer, though its first loop ended with a timer set."""
+    timer = ReplyTimer()
+
+    async def wait(*, is_there: bool) -> None:
+        reply: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        if is_there:
+            reply.set_result("here")
+        async with asyncio.timeout(10):
+            await timer.wait(reply, 0.02)
+
+    asyncio.run(wait(is_there=True))
+    with pytest.raises(TimeoutError) as caught:
+        asyncio.run(wait(is_there=False))
+    assert caught.value.__cause__ is None  # of the reply, not of these ten seconds

@@ -9,6 +9,7 @@ much.
 
 import argparse
 from collections import defaultdict
+from dataclasses import replace
 
 from benchmarks.setting import use_one_thread
 
@@ -26,10 +27,10 @@ def main() -> None:
     import numpy as np
 
     from model.table.build import build_table
-    from model.table.exact_plates import draw_plates, felt_on
     from sim.contrast_benchmark.data_set import data_set
+    from sim.contrast_benchmark.score import on_held_out
 
-    found = data_set()
+    found = replace(data_set(), draws=options.plates)
     print(
         f"{'plate':12} {'quiet':>5} {'given [dB]':>11} {'mean':>6} {'most':>6}  promised too much"
     )
@@ -39,18 +40,10 @@ def main() -> None:
         for contacts in found.plates[name].sets:
             question = contacts.question(level_db_sl=found.level_db_sl)
             pattern = table.query(question)
-            plates = draw_plates(
-                np.random.default_rng([found.seed, contacts.number]),
-                table.uncertainty,
-                count=options.plates,
-                era_count=len(table.eras),
-                contact_count=len(question.contacts),
-            )
-            contrast = felt_on(table, question, pattern.excitation, plates).contrast
             promised = pattern.robust_felt_contrast_db
-            if contrast is None or promised is None:
+            if promised is None:
                 raise ValueError(f"a set must have a quiet finger, got {contacts.name}")
-            given = 20 * float(np.log10(np.percentile(contrast.felt[0], 10)))
+            given, _ = on_held_out(found, table, contacts, pattern.excitation)
             rows[len(question.quiet)].append((given, promised - given))
         for quiet, row in sorted(rows.items()):
             given, excess = np.array(row).T

@@ -11,7 +11,8 @@ KERNELS = "kernels.so"
 """The file of the library in a wheel of one platform."""
 
 _HERE = Path(__file__).parent
-_SOURCES = (_HERE / "preselection.c",)
+_SOURCES = tuple(sorted(_HERE.glob("*.c")))
+_HEADERS = (_HERE / "lanes.h",)
 _FLAGS = ("-std=gnu99", "-O2", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
 _WHAT = "the library of kernels"
 
@@ -21,7 +22,11 @@ def kernels() -> ctypes.CDLL | None:
     """The library; None where there is no compiler, and numpy has to do."""
     try:
         own = _HERE / KERNELS
-        path = own if own.exists() else kept_library("kernels", _SOURCES, flags=_FLAGS, what=_WHAT)
+        path = (
+            own
+            if own.exists()
+            else kept_library("kernels", _SOURCES, _HEADERS, flags=_FLAGS, what=_WHAT)
+        )
         return ctypes.CDLL(str(path))
     except (InputError, OSError):
         return None

@@ -1,5 +1,7 @@
 """Arrays as kernels take them: for LANES frequencies at once."""
 
+import threading
+from ctypes import c_void_p
 from functools import cache
 
 import numpy as np
@@ -17,6 +19,23 @@ def aligned(*shape: int) -> Float32Array:
     room = np.empty(count + LANES, dtype=np.float32)
     start = -room.ctypes.data % size // 4
     return room[start : start + count].reshape(shape)
+
+
+def work_space(size: int) -> c_void_p:
+    """Where a kernel may work on a number of complex values of all lanes, until the next one does.
+
+    One for each thread, as large as the largest so far.
+    """
+    if len(_kept.work) < size:
+        _kept.work = aligned(size, 2 * LANES)
+    return c_void_p(_kept.work.ctypes.data)
+
+
+class _Kept(threading.local):
+    work = aligned(0, 2 * LANES)
+
+
+_kept = _Kept()
 
 
 def in_lanes(values: Complex64Array | Float32Array) -> Float32Array:

@@ -4,10 +4,34 @@ The weights are R^-1 conj(h_target), see `model.drive_modes.coherent`. A spring 
 adds a force where the drive acts anyway: without errors the best contrast does not depend on it.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from model.arrays import Complex64Array
-from model.drive_modes.coherent import Coherent
+from model.compiled.kernels import kernels
+from model.drive_modes import phased_kernel
+from model.drive_modes.coherent import Coherent, CoherentResult
+from model.drive_modes.forms import Forms
+
+
+@dataclass(frozen=True)
+class Phased(Coherent):
+    """The search for any weights, by a kernel in C for one target."""
+
+    def search(self, forms: Forms, min_score: float) -> CoherentResult:
+        """Find the best weights at each frequency that can have the best score of all."""
+        library = kernels()
+        if library is None or len(forms.targets) > 1:
+            return super().search(forms, min_score)
+        return phased_kernel.search(library, forms, min_score)
+
+    def search_all(self, forms: Forms) -> CoherentResult:
+        """Find the best weights at every frequency, none pruned and none raised to the level."""
+        library = kernels()
+        if library is None or len(forms.targets) > 1:
+            return super().search_all(forms)
+        return phased_kernel.search_all(library, forms)
 
 
 def solve_phased(
@@ -17,4 +41,4 @@ def solve_phased(
     return np.asarray(np.linalg.solve(R, c[..., None])[..., 0])
 
 
-PHASED = Coherent(solve_phased, phases=(1, 5), iterations=8)
+PHASED = Phased(solve_phased, phases=(1, 5), iterations=8)

@@ -35,13 +35,14 @@ class AttachedPlate:
     All in single precision: accelerations are within 1e-5 of their largest.
 
     - minus_omega2: (f,) [rad²/s²]
-    - receptance: (f, r) g; by_thickness, by_loss: (f, r) its change by one standard deviation
+    - receptance: (f, r) g; by_thickness, by_loss: (f, r) its change by one standard deviation;
+      deviating: (f, 2, r) that of plates thicker and thinner by it
     - shapes: (b, r) of the attachments; stiffness: (f, b) their dynamic stiffness [N/m]
     - forces: (f, n) of each ERA at full stroke [N]; strokes: (f, n) of its base [m]
     - by_stiffness: (f, n), by_damping: (f, n) change of the ERAs' dynamic stiffness by one standard
       deviation [N/m]
-    - fingertip: of the rig, None for weightless ones; omega: (f,) [rad/s] of its dynamic stiffness;
-      load_std: standard deviation of the logarithm of its load
+    - fingertip: of the rig, None for weightless ones; finger: (f,) its dynamic stiffness [N/m];
+      omega: (f,) [rad/s]; load_std: standard deviation of the logarithm of its load
     - gain, phase: standard deviations of an ERA's amplitude and of its phase [rad]; gain_variance:
       mean square of both together
     - thickness: its standard deviation, relative
@@ -51,6 +52,7 @@ class AttachedPlate:
     receptance: Complex64Array
     by_thickness: Complex64Array
     by_loss: Complex64Array
+    deviating: Complex64Array
     shapes: Float32Array
     stiffness: Complex64Array
     forces: Complex64Array
@@ -58,6 +60,7 @@ class AttachedPlate:
     by_stiffness: Complex64Array
     by_damping: Complex64Array
     omega: FloatArray
+    finger: ComplexArray
     fingertip: Fingertip | None
     load_std: float
     gain: float
@@ -91,16 +94,9 @@ class AttachedPlate:
 
         deviations (d,): in standard deviations.
         """
-        w2 = -self.minus_omega2.take(frequencies).astype(float)[:, None]
-        stiffness = 1 / self.receptance.take(frequencies, axis=0).astype(complex) + w2
-        factor = np.maximum(1 + self.thickness * deviations, LEAST_THICKNESS)[:, None]
-        found = 1 / (factor * (factor**2 * stiffness[:, None] - w2[:, None]))
-        return np.asarray(found, dtype=np.complex64)
-
-    @cached_property
-    def deviating(self) -> Complex64Array:
-        """The receptance of plates thicker and thinner by one standard deviation, (f, 2, r)."""
-        return self.receptance_at(np.array([1.0, -1.0]), np.arange(len(self.omega)))
+        w2 = -self.minus_omega2.take(frequencies).astype(float)
+        stiffness = 1 / self.receptance.take(frequencies, axis=0).astype(complex) + w2[:, None]
+        return _deviating(stiffness, w2, self.thickness * deviations)
 
     def with_fingers(self, count: int, loads: Sequence[float] = ()) -> "Attachments":
         """What is attached to the plate with a number of fingers on it.
@@ -110,7 +106,7 @@ class AttachedPlate:
         if loads:
             return self._attach_fingers(np.column_stack([*map(self._finger, loads)]))
         if count not in self._by_count:
-            finger = np.repeat(self._finger(1.0)[:, None], count, axis=1)
+            finger = np.repeat(self.finger[:, None], count, axis=1)
             self._by_count[count] = self._attach_fingers(finger)
         return self._by_count[count]
 
@@ -126,8 +122,8 @@ class AttachedPlate:
 
     def _finger(self, load: float) -> ComplexArray:
         """Dynamic stiffness of a finger of a load, (f,) [N/m]."""
-        if self.fingertip is None:
-            return np.zeros(len(self.omega), dtype=complex)
+        if self.fingertip is None or load == 1:
+            return self.finger
         return self.fingertip.scaled(load).dynamic_stiffness(self.omega)
 
     @cached_property
@@ -135,16 +131,28 @@ class AttachedPlate:
         return {}
 
 
+def _deviating(stiffness: ComplexArray, w2: FloatArray, deviations: FloatArray) -> Complex64Array:
+    """Receptance of plates thicker by deviations (d,), relative, (f, d, r).
+
+    stiffness (f, r) [rad²/s²] of the modelled plate; w2 (f,) squared frequencies.
+    """
+    factor = np.maximum(1 + deviations, LEAST_THICKNESS)[:, None]
+    found = 1 / (factor * (factor**2 * stiffness[:, None] - w2[:, None, None]))
+    return np.asarray(found, dtype=np.complex64)
+
+
 _BY_FREQUENCY = (
     "minus_omega2",
     "receptance",
     "by_thickness",
     "by_loss",
+    "deviating",
     "stiffness",
     "forces",
     "strokes",
     "by_stiffness",
     "by_damping",
+    "finger",
     "omega",
 )
 
@@ -183,27 +191,31 @@ def attach(
     w = 2 * np.pi * frequencies
     w2 = (w**2)[:, None]
     elasticity = ModalElasticity.of(plate, omega**2, losses, dispersion)
-    g = 1 / (elasticity.stiffness(w) - w2)
-    by_loss = -1j * elasticity.stiffness(w).imag * g**2
+    stiffness = elasticity.stiffness(w)
+    g = 1 / (stiffness - w2)
+    by_loss = -1j * stiffness.imag * g**2
+    thickness = uncertainty.thickness
     k, c = (np.array([getattr(era, key) for era in eras]) for key in ("stiffness", "damping"))
     log_damping = math.log(uncertainty.damping)
     single = np.complex64
     return AttachedPlate(
         minus_omega2=-w2[:, 0].astype(np.float32),
         receptance=g.astype(single),
-        by_thickness=(uncertainty.thickness * (-3 * g - 2 * w2 * g**2)).astype(single),
+        by_thickness=(thickness * (-3 * g - 2 * w2 * g**2)).astype(single),
         by_loss=(log_damping * by_loss).astype(single),
+        deviating=_deviating(stiffness, w2[:, 0], np.array([thickness, -thickness])),
         shapes=shapes.astype(np.float32),
         stiffness=attached_stiffness(eras, masses, w).astype(single),
         forces=drive_forces(eras, w).astype(single),
         strokes=full_strokes(eras, w).astype(single),
         by_stiffness=np.broadcast_to(uncertainty.stiffness * k, (len(w), len(k))).astype(single),
         by_damping=(log_damping * 1j * w[:, None] * c).astype(single),
+        finger=fingertip.dynamic_stiffness(w) if fingertip else np.zeros(len(w), dtype=complex),
         omega=w,
         fingertip=fingertip,
         load_std=uncertainty.fingertip,
         gain=uncertainty.gain,
         phase=math.radians(uncertainty.phase_deg),
         gain_variance=uncertainty.gain_variance,
-        thickness=uncertainty.thickness,
+        thickness=thickness,
     )

@@ -23,7 +23,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
+from model.compiled.kernels import kernels
 from model.ensemble.attached_plate import AttachedPlate, Attachments
+from model.ensemble.contact_forms_kernel import FoundForms, contact_forms
 
 RIDGE = 1e-6
 """Share of a form's trace that is added to its diagonal: keeps it definite."""
@@ -37,7 +39,7 @@ class LoadedContacts:
     - inverse: (f, a, a) K; forces: (f, a, n) F; motion: (f, a, n) r
     - fields: (f, k, p, n) h [m/s²] at each finger's points; power: (f, k, n, n) R
     - rows: (f, rows, k p, n) h and its changes dh; reach: (f, k p, j) |t|² of each uncertain
-      spring and load; outer: (f, j, n²) their s² r* r^T; error_power: (f, n) of discretisation
+      spring and load; moved: (f, j, n) their s r; error_power: (f, n) of discretisation
     """
 
     shapes: Float32Array
@@ -49,7 +51,7 @@ class LoadedContacts:
     power: Complex64Array
     rows: Complex64Array
     reach: Float32Array
-    outer: Complex64Array
+    moved: Complex64Array
     error_power: Float32Array
     gain_variance: float
 
@@ -62,7 +64,8 @@ class LoadedContacts:
         rows = self.rows.take(frequencies, axis=0)[:, :, start:].swapaxes(1, 2)
         f, p, _, n = rows.shape
         reach = self.reach.take(frequencies, axis=0)[:, start:]
-        outer = self.outer.take(frequencies, axis=0).view(np.float32)
+        moved = self.moved.take(frequencies, axis=0)
+        outer = _outer(moved).reshape(*moved.shape[:2], -1).view(np.float32)
         power = rows.conj().swapaxes(2, 3) @ rows
         power += (reach @ outer).view(np.complex64).reshape(f, p, n, n)
         error = self.error_power.take(frequencies, axis=0)[:, None]
@@ -84,17 +87,57 @@ def load_contacts(
     (k,): of each finger relative to the rig's fingertip, empty for 1.
     """
     k, p, r = points.shape
-    f, b = plate.stiffness.shape
-    n = plate.era_count
+    library, attachments = kernels(), plate.with_fingers(k, loads)
     shapes = np.concatenate([plate.shapes, points[:, 0]])
-    a = b + k
+    found = (
+        _forms_by_numpy(plate, attachments, shapes, points, weights, error_power)
+        if library is None
+        else contact_forms(
+            library,
+            gain_variance=plate.gain_variance,
+            ridge=RIDGE,
+            shapes=shapes,
+            points=points.reshape(-1, r),
+            weights=weights,
+            receptance=plate.receptance,
+            others=_others(plate),
+            minus_omega2=plate.minus_omega2,
+            error=error_power,
+            stiffness=attachments.stiffness,
+            drives=plate.forces,
+            strokes=plate.strokes,
+            by_damping=plate.by_damping,
+            changes=attachments.changes,
+        )
+    )
+    fields = found.rows[:, 0].reshape(-1, k, p, plate.era_count)
+    return LoadedContacts(
+        shapes=shapes,
+        attachments=attachments,
+        fields=fields,
+        error_power=error_power,
+        gain_variance=plate.gain_variance,
+        **vars(found),
+    )
+
+
+def _forms_by_numpy(
+    plate: AttachedPlate,
+    attachments: Attachments,
+    shapes: Float32Array,
+    points: Float32Array,
+    weights: Float32Array,
+    error_power: Float32Array,
+) -> FoundForms:
+    """As the kernel finds; shapes (a, r) of all attachments, the rest as of `load_contacts`."""
+    (k, p, r), a, n = points.shape, len(shapes), plate.era_count
+    f, b = plate.stiffness.shape
     every = np.concatenate([plate.shapes, points.reshape(-1, r)])
     products = (every[:, None] * shapes).reshape(-1, r)
     between = _between(products, plate.modal_rows, a)  # (f, b + k p, a)
     attached = np.concatenate([np.arange(b), b + p * np.arange(k)])
     A = between.take(attached, axis=1)
-    attachments = plate.with_fingers(k, loads)
-    stiffness = attachments.stiffness
+    stiffness, uncertain = attachments.stiffness, attachments.uncertain
     inverse = inverse_with(stiffness, A)
     forces = inverse[:, :, :n] * plate.forces[:, None]
     motion = A @ -forces
@@ -103,42 +146,35 @@ def load_contacts(
     to_points = between[:, b:] @ (inverse * minus_omega2)
 
     # One row for each point and part, then one for each uncertain spring and load.
-    deviating = plate.deviating.shape[1] if plate.thickness > 0 else 0
+    others = _others(plate)
+    deviating = others.shape[1]
     rows = np.empty((f, 2 + deviating, k * p, n), dtype=np.complex64)
     h = np.matmul(between[:, b:], forces * minus_omega2, out=rows[:, 0])
     damping = plate.by_damping[:, :, None] * motion[:, :n]
     np.matmul(to_points[:, :, :n], damping, out=rows[:, 1])
     for each in range(deviating):
-        modal_rows = np.ascontiguousarray(plate.deviating[:, each].T).view(np.float32)
+        modal_rows = np.ascontiguousarray(others[:, each].T).view(np.float32)
         other = _between(products, modal_rows, a)
         held = inverse_with(stiffness, other.take(attached, axis=1))
-        moved = other[:, b:] @ (held[:, :, :n] * plate.forces[:, None] * minus_omega2)
-        rows[:, 2 + each] = (moved - h) * np.float32(math.sqrt(1 / deviating))
+        thicker = other[:, b:] @ (held[:, :, :n] * plate.forces[:, None] * minus_omega2)
+        rows[:, 2 + each] = (thicker - h) * np.float32(math.sqrt(1 / deviating))
     by_finger = rows.reshape(f, -1, k, p, n).swapaxes(1, 2)
     scaled = (by_finger * np.sqrt(weights)[:, None, :, None]).reshape(f, k, -1, n)
     power = scaled.conj().swapaxes(2, 3) @ scaled
-    moved = motion.take(attachments.uncertain, axis=1) * attachments.changes[:, :, None]
-    outer = _outer(moved).reshape(f, len(attachments.uncertain), -1)
-    reach = power_of(to_points if b == n else to_points.take(attachments.uncertain, axis=2))
+    moved = motion.take(uncertain, axis=1) * attachments.changes[:, :, None]
+    reach = power_of(to_points.take(uncertain, axis=2))
     mean = weights[:, None]
     shares = (mean @ reach.reshape(f, k, p, -1))[:, :, 0]
-    power += (shares @ outer.view(np.float32)).view(np.complex64).reshape(f, k, n, n)
+    outer = _outer(moved).reshape(f, len(uncertain), -1).view(np.float32)
+    power += (shares @ outer).view(np.complex64).reshape(f, k, n, n)
     size = (mean @ power_of(h).reshape(f, k, p, n))[:, :, 0]
     _add_diagonal(power, plate.gain_variance * size + error_power[:, None])
-    return LoadedContacts(
-        shapes,
-        attachments,
-        inverse,
-        forces,
-        motion,
-        h.reshape(f, k, p, n),
-        power,
-        rows,
-        reach,
-        outer,
-        error_power,
-        plate.gain_variance,
-    )
+    return FoundForms(inverse, forces, motion, rows, reach, moved, power)
+
+
+def _others(plate: AttachedPlate) -> Complex64Array:
+    """Receptance of plates of other thickness, none where it is certain: (f, d, r)."""
+    return plate.deviating if plate.thickness > 0 else plate.deviating[:, :0]
 
 
 def modal_fields(

@@ -8,7 +8,7 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array
 from model.compiled.kernels import kernels
-from model.compiled.lanes import LANES, aligned, in_lanes
+from model.compiled.lanes import LANES, in_lanes, work_space
 
 _MATRICES = ("modal", "receptance", "fields", "held", "by_damping", "by_stiffness", "error")
 
@@ -56,19 +56,14 @@ class PreselectionKernel:
         points (k, p, r), weights (k, p); fingers (f, k): their dynamic stiffness [N/m].
         """
         k, p, _ = points.shape
-        points, weights = np.ascontiguousarray(points), np.ascontiguousarray(weights)
-        stiffness = in_lanes(fingers)
-        space = self.library.preselection_space(ctypes.byref(self.plates[0]), k, p)
-        work, found = aligned(space, 2 * LANES), aligned(2, len(self.plates) * LANES)
-        for number, plate in enumerate(self.plates):
-            score, amplitude = found[:, number * LANES :]
+        given = [np.ascontiguousarray(each) for each in (points, weights, fingers)]
+        found = np.empty((2, self.count), dtype=np.float32)
+        arrays = [c_void_p(each.ctypes.data) for each in (*given, *found)]
+        on = [ctypes.byref(plate) for plate in self.plates]
+        work = work_space(self.library.preselection_space(on[0], k, p))
+        for first, plate in zip(range(0, self.count, LANES), on, strict=True):
+            some = min(LANES, self.count - first)
             self.library.preselection_scores(
-                *(ctypes.byref(plate), k, p),
-                *(_at(each) for each in (points, weights, stiffness[number], work)),
-                *(_at(score), _at(amplitude)),
+                *(plate, first, some, k, p), *arrays[:3], work, *arrays[3:]
             )
-        return found[0, : self.count], found[1, : self.count]
-
-
-def _at(array: Float32Array) -> c_void_p:
-    return c_void_p(array.ctypes.data)
+        return found[0], found[1]

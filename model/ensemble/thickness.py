@@ -5,14 +5,16 @@ receptance is g = 1 / (h (h² s lambda - w²)) of s lambda and w as in `attached
 uncertainty the other parameters change the response nearly in proportion.
 """
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from statistics import NormalDist
 
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, FloatArray
+from model.compiled.kernels import kernels
 from model.ensemble.attached_plate import AttachedPlate
 from model.ensemble.contact_forms import LoadedContacts
+from model.ensemble.thickness_kernel import responses as by_kernel
 from model.ensemble.tone_responses import NOMINAL, THICKNESS, Tones
 
 
@@ -45,27 +47,51 @@ def thickness_remainders(
     points (p, r): shapes; responses (m, p, columns): of `tone_responses`; nodes: deviations in
     standard deviations.
     """
-    at, (m, r), count = tones.frequencies, (len(tones.frequencies), points.shape[1]), len(nodes)
-    receptance = plate.receptance_at(nodes, at).reshape(m * count, r)
-    shapes, a = contacts.shapes, len(contacts.shapes)
-    products = (shapes[:, None] * shapes).reshape(a * a, r).T
-    A = np.empty((m * count, a * a), dtype=np.complex64)
-    A.real, A.imag = receptance.real @ products, receptance.imag @ products
-    system = (
-        A.reshape(m, count, a, a)
-        * contacts.attachments.stiffness.take(at, axis=0)[:, None, :, None]
+    at, r, count = tones.frequencies, points.shape[1], len(nodes)
+    m, a = len(at), len(contacts.shapes)
+    applied = np.zeros((m, a), dtype=np.complex64)
+    applied[:, : plate.era_count] = plate.forces.take(at, axis=0) * tones.weights
+    library = kernels()
+    by = _by_numpy if library is None else partial(by_kernel, library)
+    found = by(
+        shapes=contacts.shapes,
+        at=points,
+        receptance=plate.receptance_at(nodes, at).reshape(m * count, r),
+        stiffness=contacts.attachments.stiffness.take(at, axis=0).repeat(count, axis=0),
+        applied=applied.repeat(count, axis=0),
+        minus_omega2=plate.minus_omega2.take(at).repeat(count),
     )
-    system.reshape(m, count, -1)[:, :, :: a + 1] += 1
-    applied = np.zeros((m, 1, a, 1), dtype=np.complex64)
-    applied[:, 0, : plate.era_count, 0] = plate.forces.take(at, axis=0) * tones.weights
-    forces = np.linalg.solve(system, applied)[..., 0].reshape(m * count, a)
-    modal = np.empty((m * count, r), dtype=np.complex64)
-    modal.real, modal.imag = forces.real @ shapes, forces.imag @ shapes
-    modal *= receptance
-    modal *= np.repeat(plate.minus_omega2.take(at), count)[:, None]
-    found = np.empty((m * count, len(points)), dtype=np.complex64)
-    found.real, found.imag = modal.real @ points.T, modal.imag @ points.T
     remainders = found.reshape(m, count, -1).swapaxes(1, 2)
     remainders -= responses[:, :, NOMINAL, None]
     remainders -= responses[:, :, THICKNESS, None] * nodes.astype(np.float32)
     return np.asarray(remainders)
+
+
+def _by_numpy(
+    *,
+    shapes: Float32Array,
+    at: Float32Array,
+    receptance: Complex64Array,
+    stiffness: Complex64Array,
+    applied: Complex64Array,
+    minus_omega2: Float32Array,
+) -> Complex64Array:
+    """Accelerations (c, p) at points of shapes at (p, r), as the kernel finds them.
+
+    shapes (a, r) of the attachments; in c cases receptance (c, r), dynamic stiffness and applied
+    forces of the attachments (c, a), and minus_omega2 (c,).
+    """
+    (a, r), c = shapes.shape, len(receptance)
+    products = (shapes[:, None] * shapes).reshape(a * a, r).T
+    A = np.empty((c, a * a), dtype=np.complex64)
+    A.real, A.imag = receptance.real @ products, receptance.imag @ products
+    system = A.reshape(c, a, a) * stiffness[:, :, None]
+    system.reshape(c, -1)[:, :: a + 1] += 1
+    forces = np.linalg.solve(system, applied[..., None])[..., 0]
+    modal = np.empty((c, r), dtype=np.complex64)
+    modal.real, modal.imag = forces.real @ shapes, forces.imag @ shapes
+    modal *= receptance
+    modal *= minus_omega2[:, None]
+    found = np.empty((c, len(at)), dtype=np.complex64)
+    found.real, found.imag = modal.real @ at.T, modal.imag @ at.T
+    return found

@@ -91,6 +91,7 @@ def test_find_switched_returns_only_better_patterns(targets):
         assert switched_mode.find_switched(given, 1.001 * score) == []
 
 
+@pytest.mark.usefixtures("kernels_or_numpy")
 @pytest.mark.parametrize(("mode", "quiet", "eras"), [("phased", 1, 3), ("signed", 1, 4)])
 def test_coherent_mode_equals_closed_form(mode, quiet, eras):
     """One target, one quiet fingertip: the largest Rayleigh quotient of h h^H by R.
@@ -135,6 +136,7 @@ def refined(given, frequency, start, free):
     return -minimize(loss, start, method="Nelder-Mead", options=options).fun
 
 
+@pytest.mark.usefixtures("kernels_or_numpy")
 @pytest.mark.parametrize(
     ("mode", "count", "free"),
     [

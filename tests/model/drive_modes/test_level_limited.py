@@ -58,6 +58,7 @@ def _optimum(forms: Forms) -> float:
     return float(abs(target @ weights(found.x)) / np.sqrt(power(found.x)))
 
 
+@pytest.mark.usefixtures("kernels_or_numpy")
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("short", [1.1, 1.4])
 def test_level_beyond_the_best_weights_costs_no_more_than_it_must(seed: int, short: float) -> None:

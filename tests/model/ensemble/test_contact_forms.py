@@ -84,6 +84,7 @@ def directly(
     )
 
 
+@pytest.mark.usefixtures("kernels_or_numpy")
 @pytest.mark.parametrize("loads", [(), (0.4, 1.0, 2.5)])
 def test_fields_are_those_of_the_direct_solve(loads):
     """At every finger's points, with an ERA's drive and a mass on the plate: to 1e-4.
@@ -138,6 +139,7 @@ def test_sensitivities_are_differences_of_the_direct_solve(column):
     assert error.max() < 0.01
 
 
+@pytest.mark.usefixtures("kernels_or_numpy")
 @pytest.mark.parametrize("deviation", [-2.0, -0.5, 1.5])
 def test_thickness_is_exact_at_its_nodes(deviation):
     """In proportion, and the remainder: together the direct solve of a plate so much thicker."""
@@ -171,6 +173,7 @@ def test_responses_add_up_from_the_parts_of_each_era():
     np.testing.assert_allclose(found[:, :, -4:].sum(axis=2), found[:, :, 0], rtol=1e-3, atol=1e-2)
 
 
+@pytest.mark.usefixtures("kernels_or_numpy")
 @pytest.mark.parametrize("is_by_point", [False, True])
 def test_expected_power_is_the_mean_square_of_the_draws(is_by_point):
     """w^H R w of random weights equals the mean over 4000 drawn plates but for the loss factor.

@@ -1,18 +1,15 @@
 """Ranking of frequencies, against the exact forms and against answers that search all of them."""
 
-import ctypes
 import pickle
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from model.compiled import kernels
-from model.ensemble import preselection
 from model.ensemble.contact_forms import load_contacts
 from model.ensemble.preselection import Preselection
-from model.errors import InputError
 from model.rig.uncertainty import Uncertainty
 from model.structure.point_load import PointLoad
 from model.table.build import build_table
@@ -32,16 +29,6 @@ def table(uncertainty: Uncertainty | None = None) -> LocalizationTable:
     return build_table(rig if uncertainty is None else replace(rig, uncertainty=uncertainty))
 
 
-@pytest.fixture(params=["C", "numpy"])
-def ranking(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> type[Preselection]:
-    """The class, computing in C or in numpy."""
-    if request.param == "numpy":
-        monkeypatch.setattr(preselection.PreselectionKernel, "of", lambda **_: None)
-    else:
-        assert kernels.kernels() is not None, "install a C compiler"
-    return Preselection
-
-
 @pytest.mark.parametrize("fingers", [2, 3, 5, 6, 8])
 @pytest.mark.parametrize("loads", [(), (0.3, 2.0, 1.0, 0.7, 1.5, 0.5, 1.0, 3.0)])
 @pytest.mark.parametrize(
@@ -49,8 +36,8 @@ def ranking(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     # Exact for the gains; for the rest, the ERAs move as without the fingers.
     [(GAINS, 2e-3), (replace(GAINS, stiffness=0.1), 0.1), (replace(GAINS, damping=1.5), 0.1)],
 )
+@pytest.mark.usefixtures("kernels_or_numpy")
 def test_bound_and_amplitude_are_those_of_the_exact_forms(
-    ranking: type[Preselection],
     fingers: int,
     loads: tuple[float, ...],
     uncertainty: Uncertainty,
@@ -60,7 +47,7 @@ def test_bound_and_amplitude_are_those_of_the_exact_forms(
     of = table(uncertainty)
     tips, loads = of.read_fingertips(PLACES[:fingers]), loads[:fingers]
     few, weights = tips.few, tips.few_weights
-    found = ranking(of.attached, of.error_power).scores(few, weights, loads)
+    found = Preselection(of.attached, of.error_power).scores(few, weights, loads)
     if fingers > 5:  # of the centres alone
         few, weights = few[:, :1], np.ones((fingers, 1), dtype=np.float32)
     contacts = load_contacts(of.attached, few, weights, of.error_power, loads)
@@ -72,12 +59,12 @@ def test_bound_and_amplitude_are_those_of_the_exact_forms(
     assert found[1] == pytest.approx(value / np.abs(w).max(axis=1), rel=3 * within)
 
 
-def test_both_ways_rank_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_ways_rank_alike(without_kernels: Callable[[], None]) -> None:
     """With all uncertainties, within rounding."""
     of = table()
     tips = of.read_fingertips(PLACES[:3])
     by_kernel = Preselection(of.attached, of.error_power).scores(tips.few, tips.few_weights)
-    monkeypatch.setattr(preselection.PreselectionKernel, "of", lambda **_: None)
+    without_kernels()
     by_numpy = Preselection(of.attached, of.error_power).scores(tips.few, tips.few_weights)
     assert np.array(by_kernel) == pytest.approx(np.array(by_numpy), rel=5e-4)
 
@@ -123,15 +110,3 @@ def test_prepared_table_goes_to_another_process() -> None:
     question = Question((PLACES[0],), (PLACES[1],))
     pattern = of.query(question)
     assert pickle.loads(pickle.dumps(of)).query(question).excitation == pattern.excitation
-
-
-def test_machine_without_a_compiler_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The library is none then, and no error."""
-
-    def fail(*_: object, **__: object) -> None:
-        raise InputError("no C compiler")
-
-    monkeypatch.setattr(kernels, "kept_library", fail)
-    assert kernels.kernels.__wrapped__() is None
-    monkeypatch.undo()
-    assert isinstance(kernels.kernels(), ctypes.CDLL)

@@ -1,0 +1,199 @@
+/* Arithmetic of LANES frequencies, or of other cases, at once.
+ *
+ * A complex value is the real parts at all lanes and then the imaginary parts, and a matrix is one of
+ * such values. Vector types are those of GCC and Clang, on any processor. Arrays of numpy hold one
+ * case after the other; they are loaded into lanes and stored from them.
+ */
+#ifndef LANES_H
+#define LANES_H
+
+#include <math.h>
+#include <stddef.h>
+#include <string.h>
+
+#define LANES 16
+#define INLINE static inline __attribute__((always_inline))
+
+#if defined(__x86_64__) && defined(__linux__) && !defined(__clang__)
+#define VERSIONS __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
+#else
+#define VERSIONS
+#endif
+
+/* Called, not inlined, in each version. */
+#define SHARED VERSIONS __attribute__((unused, noinline)) static
+
+typedef float lanes __attribute__((vector_size(LANES * sizeof(float))));
+
+typedef int mask __attribute__((vector_size(LANES * sizeof(int))));
+
+typedef struct {
+    lanes re, im;
+} value;
+
+INLINE value plus(value c, value a, value b) { /* c + a b */
+    return (value){c.re + a.re * b.re - a.im * b.im, c.im + a.re * b.im + a.im * b.re};
+}
+
+INLINE value minus(value c, value a, value b) { /* c - a b */
+    return (value){c.re - a.re * b.re + a.im * b.im, c.im - a.re * b.im - a.im * b.re};
+}
+
+INLINE value plus_conjugate(value c, value a, value b) { /* c + conj(a) b */
+    return (value){c.re + a.re * b.re + a.im * b.im, c.im + a.re * b.im - a.im * b.re};
+}
+
+INLINE value scaled(value a, lanes by) { return (value){a.re * by, a.im * by}; }
+
+INLINE lanes power(value a) { return a.re * a.re + a.im * a.im; }
+
+INLINE lanes inverse(lanes a) { return 1 / a; }
+
+INLINE value reciprocal(value a) {
+    lanes size = inverse(power(a));
+    return (value){a.re * size, -a.im * size};
+}
+
+INLINE lanes filled(float a) { return a - (lanes){0}; }
+
+INLINE lanes chosen(mask where, lanes a, lanes b) { /* a there, else b */
+    return (lanes)((where & (mask)a) | (~where & (mask)b));
+}
+
+INLINE lanes larger(lanes a, lanes b) { return chosen(a > b, a, b); }
+
+INLINE lanes smaller(lanes a, lanes b) { return chosen(a < b, a, b); }
+
+INLINE lanes root(lanes a) { /* 0 for what rounding made negative */
+    lanes found;
+    for (int l = 0; l < LANES; l++) found[l] = sqrtf(a[l] > 0 ? a[l] : 0);
+    return found;
+}
+
+static const value ZERO;
+
+/* Load rows of an array (f, width) of complex values. */
+SHARED void load(value *restrict to, const float *from, size_t width, const int *rows) {
+    for (size_t l = 0; l < LANES; l++) {
+        const float *at = from + 2 * width * rows[l];
+        float *re = (float *)to + l, *im = re + LANES;
+        for (size_t i = 0; i < width; i++) {
+            re[2 * LANES * i] = at[2 * i];
+            im[2 * LANES * i] = at[2 * i + 1];
+        }
+    }
+}
+
+/* Load rows of an array (f, width) of real values. */
+INLINE void load_real(lanes *restrict to, const float *from, size_t width, const int *rows) {
+    for (size_t l = 0; l < LANES; l++)
+        for (size_t i = 0; i < width; i++) ((float *)to)[LANES * i + l] = from[width * rows[l] + i];
+}
+
+/* Store the first count lanes as rows of an array (count, width) of complex values. */
+SHARED void store(float *to, const value *restrict from, size_t width, size_t count) {
+    for (size_t l = 0; l < count; l++) {
+        float *at = to + 2 * width * l;
+        const float *re = (const float *)from + l, *im = re + LANES;
+        for (size_t i = 0; i < width; i++) {
+            at[2 * i] = re[2 * LANES * i];
+            at[2 * i + 1] = im[2 * LANES * i];
+        }
+    }
+}
+
+/* Store the first count lanes as rows of an array (count, width) of real values. */
+INLINE void store_real(float *to, const lanes *restrict from, size_t width, size_t count) {
+    for (size_t l = 0; l < count; l++)
+        for (size_t i = 0; i < width; i++) to[width * l + i] = ((const float *)from)[LANES * i + l];
+}
+
+/* found (rows, columns) = a (rows, r), real, times b (columns, r) transposed. */
+SHARED void multiply(value *restrict found, const float *restrict a, const value *restrict b,
+                     size_t rows, size_t r, size_t columns) {
+    for (size_t column = 0; column < columns; column++, b += r) {
+        value *to = found + column;
+        size_t row = 0;
+        for (; row + 4 <= rows; row += 4) {
+            const float *a0 = a + row * r, *a1 = a0 + r, *a2 = a1 + r, *a3 = a2 + r;
+            value s0 = ZERO, s1 = ZERO, s2 = ZERO, s3 = ZERO; /* in registers, as no array is */
+            for (size_t j = 0; j < r; j++) {
+                value from = b[j];
+                s0.re += a0[j] * from.re, s0.im += a0[j] * from.im;
+                s1.re += a1[j] * from.re, s1.im += a1[j] * from.im;
+                s2.re += a2[j] * from.re, s2.im += a2[j] * from.im;
+                s3.re += a3[j] * from.re, s3.im += a3[j] * from.im;
+            }
+            to[row * columns] = s0, to[(row + 1) * columns] = s1;
+            to[(row + 2) * columns] = s2, to[(row + 3) * columns] = s3;
+        }
+        for (; row < rows; row++) {
+            value sum = ZERO;
+            for (size_t j = 0; j < r; j++) {
+                sum.re += a[row * r + j] * b[j].re;
+                sum.im += a[row * r + j] * b[j].im;
+            }
+            to[row * columns] = sum;
+        }
+    }
+}
+
+/* found (columns) from the first on = a (inner) b (inner, columns), each step apart in a; of a times
+ * a sign in the imaginary part. */
+SHARED void row_product(value *restrict found, const value *a, size_t step, const value *b, size_t inner,
+                        size_t columns, size_t first, float sign) {
+    size_t j = first;
+    for (; j + 4 <= columns; j += 4) {
+        value s0 = ZERO, s1 = ZERO, s2 = ZERO, s3 = ZERO;
+        for (size_t s = 0; s < inner; s++) {
+            const value *from = b + s * columns + j;
+            value by = a[s * step];
+            by.im *= sign;
+            s0 = plus(s0, by, from[0]), s1 = plus(s1, by, from[1]);
+            s2 = plus(s2, by, from[2]), s3 = plus(s3, by, from[3]);
+        }
+        found[j] = s0, found[j + 1] = s1, found[j + 2] = s2, found[j + 3] = s3;
+    }
+    for (; j < columns; j++) {
+        value sum = ZERO;
+        for (size_t s = 0; s < inner; s++) {
+            value by = a[s * step];
+            by.im *= sign;
+            sum = plus(sum, by, b[s * columns + j]);
+        }
+        found[j] = sum;
+    }
+}
+
+/* found (rows, columns) = a (rows, inner) b (inner, columns), the rows of a each width long. */
+SHARED void product(value *restrict found, const value *a, size_t width, const value *b, size_t rows,
+                    size_t inner, size_t columns) {
+    for (size_t i = 0; i < rows; i++)
+        row_product(found + i * columns, a + i * width, 1, b, inner, columns, 0, 1);
+}
+
+/* The upper triangle of R (n, n) = X^H X of X (rows, n). */
+SHARED void gram(value *restrict R, const value *X, size_t rows, size_t n) {
+    for (size_t i = 0; i < n; i++) row_product(R + i * n, X + i, n, X, rows, n, i, -1);
+}
+
+/* x = R^-1 c of a positive Hermitian R (n, n), of which the upper triangle is given and lost. */
+SHARED void solve_positive(value *restrict x, value *restrict R, const value *restrict c, size_t n) {
+    memcpy(x, c, n * sizeof(value));
+    for (size_t s = 0; s < n; s++) {
+        const value *from = R + s * n;
+        lanes pivot = inverse(from[s].re);
+        for (size_t u = s + 1; u < n; u++) {
+            value by = {from[u].re * pivot, -from[u].im * pivot};
+            for (size_t v = u; v < n; v++) R[u * n + v] = minus(R[u * n + v], by, from[v]);
+            x[u] = minus(x[u], by, x[s]);
+        }
+    }
+    for (size_t s = n; s-- > 0;) {
+        value own = x[s];
+        for (size_t u = s + 1; u < n; u++) own = minus(own, R[s * n + u], x[u]);
+        x[s] = scaled(own, inverse(R[s * n + s].re));
+    }
+}
+
+#endif

@@ -1,0 +1,33 @@
+"""Responses of `model.ensemble.thickness` by its kernel in C."""
+
+import ctypes
+from ctypes import c_int, c_size_t, c_void_p
+
+import numpy as np
+
+from model.arrays import Complex64Array, Float32Array
+from model.compiled.lanes import LANES, work_space
+
+_ARRAYS = ("shapes", "at", "receptance", "stiffness", "applied", "minus_omega2")
+
+
+class _Tones(ctypes.Structure):
+    _fields_ = (
+        *((name, c_int) for name in ("a", "r", "points")),
+        *((name, c_void_p) for name in _ARRAYS),
+    )
+
+
+def responses(library: ctypes.CDLL, **given: Complex64Array | Float32Array) -> Complex64Array:
+    """Accelerations (cases, points), of arrays by their names in `thickness.c`."""
+    arrays = {name: np.ascontiguousarray(given[name]) for name in _ARRAYS}
+    cases, r = arrays["receptance"].shape
+    points = len(arrays["at"])
+    pointers = [each.ctypes.data for each in arrays.values()]
+    on = ctypes.byref(_Tones(len(arrays["shapes"]), r, points, *pointers))
+    found = np.empty((cases, points), dtype=np.complex64)
+    library.thickness_space.restype = c_size_t
+    work, to = work_space(library.thickness_space(on)), c_void_p(found.ctypes.data)
+    for first in range(0, cases, LANES):
+        library.thickness_responses(on, first, min(LANES, cases - first), work, to)
+    return found

@@ -3,8 +3,7 @@
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import final
 
 from drivers import clock, trace
@@ -17,7 +16,7 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.guard import SafeCommandSet, SafeEnvelope, require_safe, require_safe_set
-from drivers.guard.recorder import PlayRecorder
+from drivers.guard.recorder import RECORDED, PlayRecorder
 from drivers.line.sender import SUPERSEDED
 from drivers.link.link import REPLY_TIMEOUT, Link, ReplyT
 from drivers.link.pacing import Pacing
@@ -72,10 +71,12 @@ WATCHDOG_REACTION = 0.005 + PROTOCOL.reaction
 _logger = logging.getLogger(__name__)
 
 # Requests that do not feed the watchdog, or silence the amplifier where they arrive.
-_NOT_FEEDING = (
-    *(Hello, GetCaps, GetStatus, GetFaults, GetMeasured, LoadEnvelope),
-    *(GetSensors, Measure, GetReading, GetBlock),
-    *(Clear, Stop, Disarm),
+_NOT_FEEDING = frozenset(
+    (
+        *(Hello, GetCaps, GetStatus, GetFaults, GetMeasured, LoadEnvelope),
+        *(GetSensors, Measure, GetReading, GetBlock),
+        *(Clear, Stop, Disarm),
+    )
 )
 
 
@@ -391,10 +392,11 @@ class Amplifier(SensorClient):
         """
         commit = Commit(token, self.session)
         self._recorder.sending(commit)
+        feeds = self._start_feeding(commit)
         try:
-            with self._feeding():
-                await self._link.broadcast(commit)
+            await self._link.broadcast(commit)
         finally:
+            self._end_feeding(feeds)
             self._recorder.left(commit)
 
     async def stop_on_bus(self, ramp: float = STOP_RAMP) -> None:
@@ -430,36 +432,39 @@ class Amplifier(SensorClient):
         timeout: float | None = None,
     ) -> ReplyT:
         require_safe(request)
-        _note(request, self._recorder.sending)
+        is_recorded = type(request) in RECORDED
+        if is_recorded:
+            _note(request, self._recorder.sending)
         started_at = clock.now()
         outcome: object = "cancelled"
+        feeds = self._start_feeding(request)
         try:
-            if isinstance(request, _NOT_FEEDING):
-                reply = await self._link.request(request, expect=expect, timeout=timeout)
-            else:
-                with self._feeding():
-                    reply = await self._link.request(request, expect=expect, timeout=timeout)
-            outcome = reply
+            outcome = reply = await self._link.request(request, expect=expect, timeout=timeout)
         except DriverError as error:
             outcome = error
             raise
         finally:
-            self._recorder.left(request)
+            self._end_feeding(feeds)
+            if is_recorded:
+                self._recorder.left(request)
             self._pacing.notice()
-            _note(request, trace.request, outcome, clock.now() - started_at)
+            if trace.has_requests():
+                _note(request, trace.request, outcome, clock.now() - started_at)
         _note(request, self._recorder.replied, reply)
         return reply
 
-    @contextmanager
-    def _feeding(self) -> Iterator[None]:
-        """Note that until the end of the context a request may feed the watchdog."""
-        if self.is_lost or self.is_degraded:  # nothing is sent that feeds it and may play
-            yield
-            return
-        self._feeding_count += 1
-        try:
-            yield
-        finally:
+    def _start_feeding(self, request: Request) -> bool:
+        """Note a request that may feed the watchdog until `_end_feeding`; returns whether it may.
+
+        Nothing that feeds it, and may play, is sent on a lost or degraded link.
+        """
+        feeds = type(request) not in _NOT_FEEDING and not (self.is_lost or self.is_degraded)
+        self._feeding_count += feeds
+        return feeds
+
+    def _end_feeding(self, feeds: bool) -> None:
+        """Note that a request, which feeds the watchdog or does not, is not pending any more."""
+        if feeds:
             self._feeding_count -= 1
             self._last_fed_at = clock.now()
 

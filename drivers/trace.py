@@ -45,6 +45,11 @@ def is_active() -> bool:
     return _wire.isEnabledFor(logging.DEBUG)
 
 
+def has_requests() -> bool:
+    """Whether requests are traced."""
+    return _request.isEnabledFor(logging.DEBUG)
+
+
 def frame(direction: Direction, data: bytes, where: str, decode: Callable[[], str]) -> None:
     """Trace one frame of a wire, named by its URL or port.
 
@@ -57,7 +62,7 @@ def frame(direction: Direction, data: bytes, where: str, decode: Callable[[], st
 
 def request(requested: object, outcome: object, duration: float) -> None:
     """Trace a request with its reply or error, and its duration [s]."""
-    if _request.isEnabledFor(logging.DEBUG):
+    if has_requests():
         _request.debug("%r -> %r in %.1f ms", requested, outcome, duration * 1e3)
 
 

@@ -14,7 +14,6 @@ import json
 import os
 import socket
 import sys
-from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -50,7 +49,7 @@ class Panel(asyncio.DatagramProtocol):
                     pass
                 case ["fseq", number]:
                     pass
-        chosen = replace(self._sets[int(x * SETS) % SETS], sequence=number & 0xFFFF)
+        chosen = self._sets[int(x * SETS) % SETS]._replace(sequence=number & 0xFFFF)
         with contextlib.suppress(BlockingIOError):  # no room: the touch is lost
             os.write(self._port, encode_frame(chosen))
 

@@ -54,12 +54,12 @@ class RecordedBackend(Backend):
         self.is_missing = False
         self._inner = inner
         self._name = name
-        self._recorder = recorder
+        self._add = recorder.add
 
     def _record(self, direction: str, message: object) -> None:
         """Record a message; a stop depends on no record."""
         try:
-            self._recorder.add(self._name, direction, message)
+            self._add(self._name, direction, message)
         except Exception:
             _logger.exception("recorder failed")
 

@@ -58,6 +58,9 @@ class TouchCalibration:
         )
 
 
+_ALIGNED = TouchCalibration()
+
+
 def turned(degrees: int = 0, *, mirror: str | None = None) -> TouchCalibration:
     """Return the calibration of a sensor mounted turned clockwise by 0, 90, 180 or 270 degrees.
 
@@ -121,14 +124,16 @@ class CalibratedSource(TouchSource):
 
         Its fingers are lifted as soon as it ends, fails or is cancelled.
         """
-        apply = self._calibration.apply
+        apply = None if self._calibration == _ALIGNED else self._calibration.apply
         touched: dict[str, TouchFrame] = {}
 
         def placed(frame: TouchFrame) -> None:
             touched.pop(frame.source, None)
             if frame.touches:
                 touched[frame.source] = frame
-            deliver(replace(frame, touches=tuple(map(apply, frame.touches))))
+            if apply is not None:
+                frame = replace(frame, touches=tuple(map(apply, frame.touches)))
+            deliver(frame)
 
         try:
             await self._source.run(placed)

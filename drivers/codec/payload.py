@@ -5,8 +5,9 @@ an amplifier's Nak.
 """
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from enum import IntEnum
+from functools import lru_cache
 from typing import Any, TypeVar, final
 
 from drivers.errors import CommandError, FrameError
@@ -34,12 +35,16 @@ class Row:
         self.quantities = quantities
         self._layout = struct.Struct("<" + "".join(each.struct_code for each in quantities))
         self.size = self._layout.size
+        self.pack_integers = self._layout.pack
         self.unpack_from = self._layout.unpack_from
 
     def pack(self, *values: float) -> bytes:
         """Pack values in their units; CommandError for one out of range."""
-        encoded = [each.to_wire(value) for each, value in zip(self.quantities, values, strict=True)]
-        return self._layout.pack(*encoded)
+        return self.pack_integers(*self.to_wire(values))
+
+    def to_wire(self, values: Iterable[float]) -> list[int]:
+        """Encode values in their units as integers; CommandError for one out of range."""
+        return [each.to_wire(value) for each, value in zip(self.quantities, values, strict=True)]
 
 
 class Malformed(FrameError):
@@ -100,18 +105,7 @@ class Cursor:
 
     def one_of(self, kind: type[EnumT]) -> EnumT:
         """Read a member of an enumeration, one byte."""
-        value = self._raw("B")
-        try:
-            return kind(value)
-        except ValueError:
-            raise Malformed(f"unknown {kind.__name__} {value}", code=NakCode.BAD_VALUE) from None
-
-    def flags(self, known: int) -> int:
-        """Read the flags of a request, in which only the known bits may be set."""
-        value = self._raw("B")
-        if value & ~known:
-            raise Malformed(f"reserved flags must be 0, got {value:#04x}", code=NakCode.BAD_VALUE)
-        return value
+        return member(kind, self._raw("B"))
 
     def optional_channel(self) -> int | None:
         """Read a channel, None for 255."""
@@ -171,6 +165,14 @@ class Cursor:
         return piece
 
 
+def member(kind: type[EnumT], value: int) -> EnumT:
+    """Return the member of an enumeration with a value; Malformed for an unknown one."""
+    try:
+        return kind(value)
+    except ValueError:
+        raise Malformed(f"unknown {kind.__name__} {value}", code=NakCode.BAD_VALUE) from None
+
+
 def _out_of_range(quantity: WireQuantity, value: int) -> Malformed:
     code = {"channel": NakCode.BAD_CHANNEL, "token": NakCode.BAD_TOKEN}.get(quantity.name)
     return Malformed(
@@ -228,7 +230,8 @@ def status_flags(status: Status) -> int:
     return status.other_flags | sum(known)
 
 
-def flags_of(flags: int) -> dict[str, Any]:
+@lru_cache(maxsize=256)
+def flags_of(flags: int) -> Mapping[str, Any]:
     """Return the fields of a status that its flags give."""
     known = {name: bool(flags >> bit & 1) for name, bit in _STATUS_FLAGS.items()}
     return {**known, "other_flags": flags & ~_KNOWN_FLAGS}

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 from drivers.command import DriveCommand, Envelope
 
@@ -17,12 +18,14 @@ _NOTHING: frozenset[float] = frozenset()
 _ROUNDING = 1e-9  # of full stroke; sums of floats
 
 
-@dataclass(frozen=True, slots=True)
-class Interval:
+class Interval(NamedTuple):
     """A time [s] between two bounds."""
 
     earliest: float
     latest: float
+
+
+_LONG_AGO = Interval(-_FAR, -_FAR)
 
 
 @dataclass(slots=True)  # frozen, each takes three times as long to make, and every set makes many
@@ -45,7 +48,7 @@ class ChannelState:
     step: float = 0.0
     is_shaped: bool = False
     first_low: float = 0.0
-    commit: Interval = Interval(-_FAR, -_FAR)
+    commit: Interval = _LONG_AGO
     fading: float = 0.0
     fade: float = 0.0
     frequencies: frozenset[float] = frozenset()
@@ -57,16 +60,34 @@ class ChannelState:
 
     def low(self, when: Interval) -> float:
         """Lower bound of the level within an interval."""
-        fading = 0.0
-        if self.frequency in self.frequencies:
-            fading = self.fading_at(self._elapsed(when)[0])
-        return max(0.0, self.lasting_low(when) - fading)
+        return self._low(*self._elapsed(when))
+
+    def high(self, when: Interval) -> float:
+        """Upper bound of the level within an interval."""
+        return self._high(*self._elapsed(when))
+
+    def levels(self, when: Interval) -> tuple[float, float]:
+        """Bounds of the level within an interval."""
+        start, end = self._elapsed(when)
+        return self._low(start, end), self._high(start, end)
 
     def lasting_low(self, when: Interval) -> float:
         """Lower bound of the lasting tone alone, which fading ones may cancel."""
-        start, end = self._elapsed(when)
+        return self._lasting_low(*self._elapsed(when))
+
+    def _low(self, start: float, end: float) -> float:
+        """Lower bound of the level between two times [s] since the commit."""
+        lasting = self._lasting_low(start, end)
+        if lasting > 0 and self.frequency in self.frequencies:
+            lasting -= self.fading_at(start)
+        return lasting if lasting > 0 else 0.0
+
+    def _lasting_low(self, start: float, end: float) -> float:
+        """See `lasting_low`, between two times [s] since the commit."""
         if end > self.valid_for or self.may_be_silent:
             return 0.0
+        if not (self.is_shaped or self.path[0]):  # it rises from silence
+            return abs(self.path[-1]) * self._progress(start)
         lowest = _least_modulus(self._amplitudes(start, end))
         if self.first_low < abs(self.path[0]):
             first, *others = self.path
@@ -76,16 +97,15 @@ class ChannelState:
             lowest = min(lowest, _least_modulus(weaker._amplitudes(start, end)))
         return lowest
 
-    def high(self, when: Interval) -> float:
-        """Upper bound of the level within an interval."""
-        start, end = self._elapsed(when)
+    def _high(self, start: float, end: float) -> float:
+        """Upper bound of the level between two times [s] since the commit."""
         # An envelope to silence ends by itself.
         length = math.inf if self.is_shaped and self.path[-1] == 0 else self.valid_for
         settled_after = self.settled_after
         if start >= settled_after and start >= self.valid_for + self.ending_time:
             return 0.0
-        last = min(end, length)
-        first = min(start, last)
+        last = end if end < length else length
+        first = start if start < last else last
         if self.is_shaped:
             highest = max(map(abs, self._amplitudes(first, last))) + self.fading_at(first)
         else:
@@ -121,19 +141,23 @@ class ChannelState:
     @property
     def settled_after(self) -> float:
         """Time [s] from the commit until only the lasting tone plays at its last amplitude."""
-        return max(self.step * (len(self.path) - 1), self.fade)
+        along = self.step * (len(self.path) - 1)
+        return along if along > self.fade else self.fade
 
     def fading_at(self, elapsed: float) -> float:
         """Upper bound of the fading tones a time [s] after the latest commit."""
+        if not self.fading:
+            return 0.0
         if self.fading_may_hold:
             return self.fading if elapsed < self.fade else 0.0
         return self.fading * (1 - _raised_cosine(elapsed, self.fade))
 
     def may_be_ending(self, when: Interval) -> bool:
         """Whether an envelope to silence may be running; longer ramps do not shorten it."""
-        start, end = self._elapsed(when)
-        if self.ending is not None and self.valid_for <= end:
-            return start < self.valid_for + self.ending_time
+        if self.ending is not None:
+            start, end = self._elapsed(when)
+            if self.valid_for <= end:
+                return start < self.valid_for + self.ending_time
         ends_silent = self.is_shaped and self.path[-1] == 0
         return (ends_silent or self.fading_may_hold) and not self.is_settled(when)
 
@@ -169,8 +193,8 @@ class ChannelState:
 
     def bounds(self, when: Interval) -> tuple[float, frozenset[float]]:
         """Upper bound of the level within an interval, and frequencies [Hz] of what may play."""
-        high = self.high(when)
-        start, _ = self._elapsed(when)
+        start, end = self._elapsed(when)
+        high = self._high(start, end)
         found = _NOTHING
         if self.frequencies and self.fading_at(start) > 0:
             found = self.frequencies
@@ -186,9 +210,12 @@ class ChannelState:
 
     def _elapsed(self, when: Interval) -> tuple[float, float]:
         """Shortest and longest time [s] since the commit."""
-        commit = self.commit
-        shortest = max(0.0, when.earliest - commit.latest)
-        return shortest, max(shortest, when.latest - commit.earliest)
+        earliest, latest = self.commit
+        shortest = when.earliest - latest
+        if shortest < 0:
+            shortest = 0.0
+        end = when.latest - earliest
+        return shortest, end if end > shortest else shortest
 
     def _progress(self, elapsed: float) -> float:
         return _raised_cosine(elapsed, self.step)
@@ -254,9 +281,8 @@ def state_after(
     if falls_silent and not command.skip_ending:
         shape = state.ending
     continues = None
-    if state.is_lasting(commit) and (
-        falls_silent or (command.keep_phase and state.frequency == command.frequency)
-    ):
+    may_continue = falls_silent or (command.keep_phase and state.frequency == command.frequency)
+    if may_continue and state.is_lasting(commit):
         continues = state.lasting_range(commit)
     low, high, phase_factor = continues or (0.0, 0.0, 1 + 0j)
     if continues is None:
@@ -277,7 +303,9 @@ def state_after(
         low, (high, others) = 0.0, state.bounds(commit)
         fading = high
         phase_factor = _phase_factor((*_phasors(shape), target)[0])  # the highest sum
-    fading_slope = 0.0 if state.is_settled(commit) else state.fading_slope
+    fading_slope = state.fading_slope
+    if fading_slope and state.is_settled(commit):
+        fading_slope = 0.0
     fading_may_hold = state.may_be_ending(commit)
     if fading_may_hold:
         fading = max(fading, state.max_level)

@@ -99,10 +99,12 @@ class PlayRecord:
         voices = self._voices
         if self._pending:
             voices = self._voices_after(self._pending, self._clock())
-        room_from = -math.inf
+        room_from, max_voices = -math.inf, self._max_voices
         for command in command_set.commands:
             if command.level > 0 or command.onset:
-                room_from = max(room_from, voices[command.channel].room_from(self._max_voices))
+                known = voices[command.channel]
+                if len(known.voices) >= max_voices:
+                    room_from = max(room_from, known.room_from(max_voices))
         return room_from
 
     def fade_left(self) -> float:
@@ -159,11 +161,10 @@ class PlayRecord:
 
     def confirm(self, token: int) -> None:
         """Record that the set of this token plays, and none that was sent before it."""
-        now = self._clock()
-        tokens = [sent.command_set.token for sent in self._pending]
-        if token not in tokens:
+        if not self._is_pending(token):
             return
-        number = tokens.index(token)
+        now = self._clock()
+        number = [sent.command_set.token for sent in self._pending].index(token)
         sent = self._pending[number]
         when = Interval(sent.sent_at, now)
         before = self._states(self._pending[:number], when)
@@ -221,7 +222,7 @@ class PlayRecord:
 
     def _is_pending(self, token: int) -> bool:
         """Whether the set of this token was sent and not confirmed."""
-        return any(sent.command_set.token == token for sent in self._pending)
+        return token in [sent.command_set.token for sent in self._pending]
 
     def _check_transition(self, command_set: CommandSet, now: float) -> None:
         if not self._needs_states(command_set):
@@ -330,16 +331,14 @@ class PlayRecord:
                     commit,
                     ramp=requested.ramp,
                     valid_for=requested.valid_for,
-                    onset=self._maximum(command.onset),
-                    ending=self._maximum(command.ending),
+                    onset=self._maximum(command.onset) if command.onset else 0.0,
+                    ending=self._maximum(command.ending) if command.ending else 0.0,
                 )
             )
         return tuple(following)
 
     def _maximum(self, slot: int) -> float:
-        """Return the longest duration [s] of an envelope that a slot may hold; 0 for no slot."""
-        if not slot:
-            return 0.0
+        """Return the longest duration [s] of an envelope that a slot may hold."""
         return max(map(duration, self.slots.get(slot, ())), default=0.0)
 
     def _fade(self, command_set: CommandSet, ramp: float) -> float:

@@ -19,6 +19,9 @@ from drivers.protocol.messages import (
     Stop,
 )
 
+RECORDED = frozenset((Apply, Stage, Commit, Stop, Disarm, Arm))
+"""Requests that change what plays, or may: those that are recorded when they are sent."""
+
 _ARMING_RAMP = 0.005  # s; within it an amplifier that is armed while it plays falls silent
 
 

@@ -75,6 +75,12 @@ def is_finite(value: object) -> bool:
     return (type(value) is float or isinstance(value, Real)) and math.isfinite(value)
 
 
+def _are_finite(first: float, second: float, third: float) -> bool:
+    """Whether three floats are finite, by their sum; false may mean that it is too large."""
+    are_floats = type(first) is type(second) is type(third) is float
+    return are_floats and math.isfinite(first + second + third)
+
+
 def is_token(value: object) -> bool:
     """Whether a value can identify a set."""
     token = PROTOCOL.quantities.token
@@ -116,6 +122,8 @@ def _check_channels(command_set: CommandSet, context: GuardContext) -> None:
 
 def _check_finite(command_set: CommandSet, context: GuardContext) -> None:
     for command in command_set.commands:
+        if _are_finite(command.frequency, command.level, command.phase):
+            continue
         for name, value in (
             ("frequency", command.frequency),
             ("level", command.level),
@@ -146,6 +154,10 @@ def _check_frequencies(command_set: CommandSet, context: GuardContext) -> None:
 def _check_slots(command_set: CommandSet, context: GuardContext) -> None:
     slots = context.capabilities.envelope_slots
     for command in command_set.commands:
+        if type(command.onset) is type(command.ending) is int and not (
+            command.onset or command.ending
+        ):
+            continue
         for name, slot in (("onset", command.onset), ("ending", command.ending)):
             if not _is_integer(slot, low=0, high=slots):
                 raise _refused(

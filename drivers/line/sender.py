@@ -70,7 +70,7 @@ class _Entry:
         self.queued_at = clock.now()
         self.result: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         self.is_withdrawn = False
-        self.started_at = 0.0
+        self.started_at = self.queued_at
 
     @property
     def is_unsent(self) -> bool:
@@ -188,6 +188,7 @@ class Sender:
                     continue
                 self._queue.remove(entry)
                 if not entry.result.done():
+                    entry.started_at = clock.now()
                     await self._carry_out(entry)
         except Exception as error:  # a bug: no caller may wait indefinitely
             for left in (entry, *self._queue):
@@ -237,7 +238,6 @@ class Sender:
 
     async def _carry_out(self, entry: _Entry) -> None:
         """Make one attempt."""
-        entry.started_at = clock.now()
         self._current, self._is_preempted = entry, False
         task = cast("asyncio.Task[Any]", self._task)
         cancellations = task.cancelling()

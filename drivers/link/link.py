@@ -276,8 +276,9 @@ class _Attempts:
             raise LinkError(link._lose(str(problem))) from problem
         link._unanswered = 0
         link._last_round_trip = clock.now() - begin
-        if is_busy(reply) and not link._is_persistently_busy and self._busy < RETRIES:
+        has_no_time = is_busy(reply)
+        if has_no_time and not link._is_persistently_busy and self._busy < RETRIES:
             self._busy += 1
             raise Retry(BUSY_PAUSE)
-        link._is_persistently_busy = is_busy(reply)
+        link._is_persistently_busy = has_no_time
         return reply

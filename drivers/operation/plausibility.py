@@ -54,6 +54,9 @@ class PlausibilityCheck:
         self._is_time_stepped = is_time_stepped
         self._capabilities = capabilities
         self._name = name
+        self._level_step = max(_Q.level.step, capabilities.level_step)
+        is_measured = Feature.LEVELS_MEASURED in capabilities.features
+        self._measuring_error = MEASURING_ERROR if is_measured else 0.0
         self._states: tuple[ChannelState, ...] = ()  # empty: unknown
         self._known: tuple[ChannelState, ...] = ()  # before the first unconfirmed set
         self._unconfirmed: set[int] = set()  # tokens
@@ -243,21 +246,21 @@ class PlausibilityCheck:
             yield f"playing set must be {possible}, got {status.token}"
 
     def _level_problems(self, status: Status, when: Interval) -> Iterator[str]:
-        step = max(_Q.level.step, self._capabilities.level_step)
+        step, measuring_error = self._level_step, self._measuring_error
         tolerance = 2 * step
-        is_measured = Feature.LEVELS_MEASURED in self._capabilities.features
-        measuring_error = MEASURING_ERROR if is_measured else 0.0
+        has_exact_fades = self._capabilities.has_exact_fades
         for channel, (state, level) in enumerate(zip(self._states, status.levels, strict=False)):
-            if not (self._capabilities.has_exact_fades or state.is_settled(when)):
+            if not (has_exact_fades or state.is_settled(when)):
                 continue
-            low, high = state.low(when), state.high(when)
+            low, high = state.levels(when)
             # Fading tones may cancel the lasting one, but not to zero twice in a row.
             if level == 0 and state.lasting_low(when) > 0.75 * step:
                 yield f"level of channel {channel} must be above 0, got 0"
-            low -= tolerance + min(measuring_error, _WEAK * low)
-            high += tolerance + min(measuring_error, _WEAK * high)
-            if not low <= level <= high:
-                expected = f"{max(0.0, low):.4g} to {high:.4g}"
+            if measuring_error:
+                low -= min(measuring_error, _WEAK * low)
+                high += min(measuring_error, _WEAK * high)
+            if not low - tolerance <= level <= high + tolerance:
+                expected = f"{max(0.0, low - tolerance):.4g} to {high + tolerance:.4g}"
                 yield f"level of channel {channel} must be {expected}, got {level:g}"
 
     def _shows_levels(self, when: Interval) -> bool:

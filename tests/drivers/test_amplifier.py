@@ -380,7 +380,7 @@ async def test_stop_and_disarm_depend_on_no_record(
     await amplifier.disarm()
     assert kinds(backend) == [Stop, Disarm]
     with pytest.raises(ZeroDivisionError):
-        await amplifier.heartbeat()
+        await amplifier.commit(1)
 
 
 async def test_stop_clips_its_ramp(amplifier: Amplifier, backend: ScriptedBackend) -> None:

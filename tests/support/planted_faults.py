@@ -10,13 +10,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from drivers.codec.payload import Cursor, Malformed
+from drivers.codec.payload import Cursor, Malformed, Row
 from drivers.codec.serial_line import exchanges as serial_exchanges
 from drivers.codec.serial_line import frame as serial_frame
 from drivers.codec.serial_line import sets as serial_sets
 from drivers.command import CommandSet, DriveCommand
 from drivers.conformance import LEVEL
-from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import (
     Achieved,
     AmplifierState,
@@ -67,6 +67,9 @@ SERIAL, MODBUS, CAN = ("serial",), ("modbus+tcp", "modbus+rtu"), ("can+slcan",)
 SESSIONS = ("serial", "modbus+tcp", "modbus+rtu")
 _Q = PROTOCOL.quantities
 _ENABLED = AmplifierState.OPERATION_ENABLED
+_WITH_ANY_FLAGS = Row(
+    *(_Q.channel, WireQuantity("flags", "u8", 1, "", 0, 255), _Q.frequency, _Q.level, _Q.phase)
+)
 
 
 @dataclass(frozen=True)
@@ -467,7 +470,7 @@ def _answers_any_address(init: Any, end: Any, *args: Any, **how: Any) -> None:
 def _broadcast_answered(broadcast: Any, end: Any, frame: Any) -> None:
     broadcast(end, frame)
     status = serial_exchanges.encode_reply(
-        end._first.status(), replace(frame, kind=PROTOCOL.types["get_status"])
+        end._first.status(), frame._replace(kind=PROTOCOL.types["get_status"])
     )
     end._line.outward.send(serial_frame.encode_frame(status))
 
@@ -493,7 +496,7 @@ def _strict_stop(decode: Any, frame: Any) -> Any:
 
 
 def _any_version(decode: Any, frame: Any) -> Any:
-    return decode(replace(frame, version=PROTOCOL.version))
+    return decode(frame._replace(version=PROTOCOL.version))
 
 
 def _without_serial_number(init: Any, amplifier: Any, *args: Any, **how: Any) -> None:
@@ -1138,7 +1141,7 @@ FAULTS: dict[str, PlantedFault] = {
     ),
     "flags that are not defined are ignored": PlantedFault(
         "invalid_frames",
-        wrapped(Cursor, "flags", lambda flags, self, known: self._raw("B") & known),
+        replaced(serial_sets, "_COMMAND", _WITH_ANY_FLAGS),
         wires=SERIAL,
     ),
     "a channel that occurs twice plays": PlantedFault(

@@ -145,7 +145,8 @@ class SerialBackend(WireBackend):
         line.send(data)
         self._last_sent_at = clock.now()
         self._counters.frames_out += 1
-        trace.frame(Direction.OUT, data, self._url.port, lambda: repr(request))
+        if trace.is_active():
+            trace.frame(Direction.OUT, data, self._url.port, lambda: repr(request))
 
     def _frame(self, request: Request, address: int) -> Frame:
         self._sequence = (self._sequence + 1) & 0xFFFF

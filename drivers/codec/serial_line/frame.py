@@ -11,6 +11,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from cobs import cobs
 
@@ -27,8 +28,7 @@ _OVERHEAD = _HEADER.size + _CRC.size
 _STUFFED_MAX = _OVERHEAD + PROTOCOL.serial.payload_max + 1
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+class Frame(NamedTuple):
     """A delimited and checked frame with its raw payload.
 
     kind: message type, with the bit REPLY in replies; address 0..255; sequence 0..65535, which a
@@ -96,11 +96,14 @@ class FrameReader:
         frames = []
         *ended, rest = bytes(data).split(b"\0")
         for piece in ended:
+            if not (piece or self._stuffed or self._skipping):
+                continue  # a leading zero
             self._append(piece)
             frame = self._finish()
             if frame is not None:
                 frames.append(frame)
-        self._append(rest)
+        if rest:
+            self._append(rest)
         return frames
 
     def _append(self, piece: bytes) -> None:

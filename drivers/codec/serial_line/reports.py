@@ -5,12 +5,14 @@ Unpacking yields values in range or raises Malformed.
 
 from collections.abc import Mapping
 from functools import lru_cache
+from operator import truediv
 from typing import Any
 
 from drivers.codec.payload import (
     Cursor,
     Row,
     flags_of,
+    member,
     pack,
     pack_optional_channel,
     pack_text,
@@ -34,8 +36,13 @@ from drivers.protocol.messages import (
 )
 
 _Q = PROTOCOL.quantities
-_MEASURED = Row(_Q.temperature, _Q.watchdog_left, _Q.voltage)
-_LATCH = Row(_Q.latch, _Q.channel_count)
+_MEASURED = (_Q.temperature, _Q.watchdog_left, _Q.voltage)
+_BYTE = WireQuantity("byte", "u8", 1, "", 0, 255)
+_STATUS = Row(  # up to its levels
+    *(_BYTE, _BYTE, _Q.active_token, _BYTE, *_MEASURED),
+    *(_Q.latch, _Q.channel_count),
+)
+_PER_UNIT = tuple(each.per_unit for each in _MEASURED)
 _CAPABILITIES: Mapping[str, WireQuantity] = {  # in the order of the payload; the limits follow
     "channels": _Q.channel_count,
     "frequency_min": _Q.frequency,
@@ -111,31 +118,28 @@ def _levels(channels: int) -> Row:
 
 def pack_status(status: Status) -> bytes:
     """Pack a status."""
-    head = bytes([status.state, status.fault]) + pack((_Q.active_token, status.token))
-    head += bytes([status_flags(status)])
-    head += _MEASURED.pack(status.temperature, status.watchdog_left, status.voltage)
-    head += _LATCH.pack(status.latch, len(status.levels))
+    head = _STATUS.pack(
+        *(status.state, status.fault, status.token, status_flags(status)),
+        *(status.temperature, status.watchdog_left, status.voltage),
+        *(status.latch, len(status.levels)),
+    )
     return head + _levels(len(status.levels)).pack(*status.levels)
 
 
 def unpack_status(cursor: Cursor) -> Status:
     """Unpack a status."""
-    state = cursor.one_of(AmplifierState)
-    fault = cursor.one_of(Fault)
-    token = cursor.integer(_Q.active_token)
-    flags = flags_of(cursor.byte())
-    temperature, watchdog_left, voltage = cursor.numbers(_MEASURED)
-    latch, channels = cursor.integers(_LATCH)
+    state, fault, token, flags, *measured, latch, channels = cursor.integers(_STATUS)
+    temperature, watchdog_left, voltage = map(truediv, measured, _PER_UNIT)
     return Status(
-        state=state,
-        fault=fault,
+        state=member(AmplifierState, state),
+        fault=member(Fault, fault),
         token=token,
         temperature=temperature,
         watchdog_left=watchdog_left,
         voltage=voltage,
         latch=latch,
         levels=tuple(cursor.numbers(_levels(channels))),
-        **flags,
+        **flags_of(flags),
     )
 
 

@@ -3,11 +3,12 @@
 Unpacking yields plain values in range or raises Malformed.
 """
 
-from functools import lru_cache
+from collections import OrderedDict
+from operator import truediv
 
 from drivers.codec.payload import Cursor, Malformed, Row, pack
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
-from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.definition import PROTOCOL, WireQuantity
 from drivers.protocol.messages import Achieved, NakCode
 
 _Q = PROTOCOL.quantities
@@ -15,32 +16,37 @@ _KEEP_PHASE = 0x01
 _SKIP_ENDING = 0x02
 _ENVELOPES = 0x04  # onset and ending follow the command
 _SET = Row(_Q.token, _Q.ramp, _Q.valid_for)
-_TONE = Row(_Q.frequency, _Q.level, _Q.phase)
+_FLAGS = WireQuantity("flags", "u8", 1, "", 0, _KEEP_PHASE | _SKIP_ENDING | _ENVELOPES)
+_COMMAND = Row(_Q.channel, _FLAGS, _Q.frequency, _Q.level, _Q.phase)
+_PER_UNIT = (_Q.frequency.per_unit, _Q.level.per_unit, _Q.phase.per_unit)
 _SLOTS = Row(_Q.envelope_slot, _Q.envelope_slot)
 _KNOT = Row(_Q.level, _Q.phase)
 
 
-def _pack_commands(commands: tuple[DriveCommand, ...]) -> bytes:
-    packed = [pack((_Q.channel_count, len(commands)))]
+def _pack_commands(commands: tuple[DriveCommand, ...]) -> tuple[bytes, bool]:
+    """Pack commands; returns the bytes, and whether these mean exactly the same."""
+    pieces = [pack((_Q.channel_count, len(commands)))]
+    are_exact = True
     for command in commands:
         is_shaped = command.onset or command.ending
         flags = _KEEP_PHASE if command.keep_phase else 0
         flags |= _SKIP_ENDING if command.skip_ending else 0
         flags |= _ENVELOPES if is_shaped else 0
-        packed += [pack((_Q.channel, command.channel)), bytes([flags])]
-        packed.append(_TONE.pack(command.frequency, command.level, command.phase))
+        tone = (command.frequency, command.level, command.phase)
+        encoded = _COMMAND.to_wire((command.channel, flags, *tone))
+        are_exact = are_exact and tone == tuple(map(truediv, encoded[2:], _PER_UNIT))
+        pieces.append(_COMMAND.pack_integers(*encoded))
         if is_shaped:
-            packed.append(_SLOTS.pack(command.onset, command.ending))
-    return b"".join(packed)
+            pieces.append(_SLOTS.pack(command.onset, command.ending))
+    return b"".join(pieces), are_exact
 
 
 def _unpack_commands(cursor: Cursor) -> tuple[DriveCommand, ...]:
     commands: list[DriveCommand] = []
     seen: set[int] = set()
+    per_hertz, per_stroke, per_degree = _PER_UNIT
     for _ in range(cursor.integer(_Q.channel_count)):
-        channel = cursor.integer(_Q.channel)
-        flags = cursor.flags(_KEEP_PHASE | _SKIP_ENDING | _ENVELOPES)
-        frequency, level, phase = cursor.numbers(_TONE)
+        channel, flags, frequency, level, phase = cursor.integers(_COMMAND)
         if channel in seen:
             raise Malformed(
                 f"channel {channel} occurs twice", code=NakCode.BAD_CHANNEL, channel=channel
@@ -50,9 +56,9 @@ def _unpack_commands(cursor: Cursor) -> tuple[DriveCommand, ...]:
         commands.append(
             DriveCommand(
                 channel=channel,
-                frequency=frequency,
-                level=level,
-                phase=phase,
+                frequency=frequency / per_hertz,
+                level=level / per_stroke,
+                phase=phase / per_degree,
                 keep_phase=bool(flags & _KEEP_PHASE),
                 onset=onset,
                 ending=ending,
@@ -65,7 +71,10 @@ def _unpack_commands(cursor: Cursor) -> tuple[DriveCommand, ...]:
 def pack_set(command_set: CommandSet) -> bytes:
     """Pack a set."""
     times = _SET.pack(command_set.token, command_set.ramp, command_set.valid_for)
-    return times + _pack_commands(command_set.commands)
+    packed, are_exact = _pack_commands(command_set.commands)
+    if are_exact:
+        _keep(packed, command_set.commands)
+    return times + packed
 
 
 def unpack_set(cursor: Cursor) -> CommandSet:
@@ -93,7 +102,8 @@ def unpack_envelope(cursor: Cursor) -> Envelope:
 
 def pack_achieved(achieved: Achieved) -> bytes:
     """Pack an achieved set."""
-    return pack((_Q.token, achieved.token)) + _pack_commands(achieved.commands)
+    packed, _ = _pack_commands(achieved.commands)
+    return pack((_Q.token, achieved.token)) + packed
 
 
 def unpack_achieved(cursor: Cursor) -> Achieved:
@@ -101,6 +111,21 @@ def unpack_achieved(cursor: Cursor) -> Achieved:
     return Achieved(token=cursor.integer(_Q.token), commands=_commands_in(cursor.rest()))
 
 
-@lru_cache(maxsize=64)  # replies to a stage, its commit and renewals repeat them
 def _commands_in(packed: bytes) -> tuple[DriveCommand, ...]:
-    return _unpack_commands(Cursor(packed))
+    commands = _known.get(packed)
+    if commands is None:
+        commands = _unpack_commands(Cursor(packed))
+        _keep(packed, commands)
+    return commands
+
+
+# By their bytes. Replies to a stage, its commit and renewals mostly repeat what was sent.
+_known: OrderedDict[bytes, tuple[DriveCommand, ...]] = OrderedDict()
+_MAX_KNOWN = 64
+
+
+def _keep(packed: bytes, commands: tuple[DriveCommand, ...]) -> None:
+    """Keep the commands that these bytes mean, in place of the oldest."""
+    _known[packed] = commands
+    if len(_known) > _MAX_KNOWN:
+        _known.popitem(last=False)

@@ -3,7 +3,6 @@
 import asyncio
 import struct
 from collections.abc import Sequence
-from dataclasses import replace
 
 from drivers.backends.serial_line.line import SerialLine, serial_line
 from drivers.backends.urls.serial_line import SerialUrl
@@ -79,31 +78,31 @@ class SerialRaw(RawLine):
             self._made("a Ping with a wrong CRC", _damaged(encode_frame(beat)), NO_REPLY),
             self._made("an Apply with a damaged bit", _damaged(encode_frame(played), 12), NO_REPLY),
             self._made(
-                "a Ping to another address", replace(beat, address=_OTHER_ADDRESS), NO_REPLY
+                "a Ping to another address", beat._replace(address=_OTHER_ADDRESS), NO_REPLY
             ),
             self._made(
-                "an Apply to another address", replace(played, address=_OTHER_ADDRESS), NO_REPLY
+                "an Apply to another address", played._replace(address=_OTHER_ADDRESS), NO_REPLY
             ),
             self._made(
-                "a Ping with the reply bit", replace(beat, kind=beat.kind | REPLY_BIT), NO_REPLY
+                "a Ping with the reply bit", beat._replace(kind=beat.kind | REPLY_BIT), NO_REPLY
             ),
             self._made("a frame of six bytes", b"\0\x07abcdef\0", NO_REPLY),
             self._made("data that cannot be unstuffed", b"\0\x20\x01\x01\x01\0", NO_REPLY),
             self._made(
-                "a message of an unknown type", replace(beat, kind=_UNKNOWN_TYPE), "UNKNOWN_TYPE"
+                "a message of an unknown type", beat._replace(kind=_UNKNOWN_TYPE), "UNKNOWN_TYPE"
             ),
         ]
         for version in (1, PROTOCOL.version + 1):
             found.append(
                 self._made(
                     f"a Ping of version {version}",
-                    replace(beat, version=version),
+                    beat._replace(version=version),
                     "UNSUPPORTED_VERSION",
                 )
             )
         for frame, what in ((beat, "a Ping"), (played, "an Apply")):
-            longer = replace(frame, payload=frame.payload + b"\0")
-            shorter = replace(frame, payload=frame.payload[:-1])
+            longer = frame._replace(payload=frame.payload + b"\0")
+            shorter = frame._replace(payload=frame.payload[:-1])
             found.append(self._made(f"{what} with a byte too many", longer, "BAD_LENGTH"))
             found.append(self._made(f"{what} with a byte too few", shorter, "BAD_LENGTH"))
         return [*found, *self._bad_sets(played)]
@@ -132,7 +131,7 @@ class SerialRaw(RawLine):
             ("session 0", _put(body, "<H", _SESSION, 0), "WRONG_SESSION"),
         ]
         return [
-            self._made(f"an Apply with {name}", replace(played, payload=payload), outcome)
+            self._made(f"an Apply with {name}", played._replace(payload=payload), outcome)
             for name, payload, outcome in changed
         ]
 
@@ -140,7 +139,7 @@ class SerialRaw(RawLine):
         """See `RawLine`."""
         whole = self._next(ping)
         half = len(whole) // 2
-        hello = replace(self._frame(Hello()), version=PROTOCOL.version + 7, payload=b"abc")
+        hello = self._frame(Hello())._replace(version=PROTOCOL.version + 7, payload=b"abc")
         return [
             self._made("half a frame, then a Ping", whole[:half] + self._next(ping), REPLY),
             self._made("noise, then a Ping", b"\xff\x55\xaa" * 9 + self._next(ping), REPLY),
@@ -173,7 +172,7 @@ class SerialRaw(RawLine):
 
     def stop_out_of_range(self) -> RawRequest:
         """See `RawLine`."""
-        stop = replace(self._frame(Stop(0.0)), payload=b"\xff\xff")
+        stop = self._frame(Stop(0.0))._replace(payload=b"\xff\xff")
         return self._made("a Stop with a ramp out of range", stop, REPLY)
 
     def carried_out(self, request: Broadcast) -> RawRequest:
@@ -210,7 +209,7 @@ class SerialRaw(RawLine):
         return encode_request(request, address=self._url.address, sequence=_SEQUENCE)
 
     def _to_all(self, request: Request) -> Frame:
-        return replace(self._frame(request), address=PROTOCOL.serial.broadcast)
+        return self._frame(request)._replace(address=PROTOCOL.serial.broadcast)
 
     def _next(self, request: Request) -> bytes:
         return encode_frame(self._frame(request))

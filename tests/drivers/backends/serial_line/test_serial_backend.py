@@ -63,7 +63,7 @@ async def test_timeout_names_the_sequence_number_that_no_reply_had(
 ) -> None:
     """As of an amplifier that repeats only one byte of it."""
     far_end.answer = lambda request, frame: encode_frame(
-        encode_reply(ARMED, replace(frame, sequence=frame.sequence ^ 0x0100))
+        encode_reply(ARMED, frame._replace(sequence=frame.sequence ^ 0x0100))
     )
     with pytest.raises(LinkTimeout, match="sequence number") as caught:
         await backend.exchange(Ping(), timeout=10 * SHORT)

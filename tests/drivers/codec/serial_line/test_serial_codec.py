@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.codec.payload import Malformed
+from drivers.codec.payload import Cursor, Malformed
 from drivers.codec.serial_line.exchanges import (
     decode_reply,
     decode_request,
@@ -16,6 +16,7 @@ from drivers.codec.serial_line.exchanges import (
     encode_request,
 )
 from drivers.codec.serial_line.frame import REPLY, Frame, encode_frame
+from drivers.codec.serial_line.sets import pack_set, unpack_achieved
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError
 from drivers.guard import Guard, GuardLimits
@@ -79,6 +80,16 @@ def test_set_is_these_bytes(wrap: Callable[[CommandSet, int], Request], code: in
     decoded = decode_request(frame)
     assert decoded == wrap(SET, 9)
     assert type(decoded.command_set) is CommandSet
+
+
+@pytest.mark.parametrize("level", [0.2, 0.123456789])
+def test_reply_that_repeats_a_set_says_what_arrived(level: float) -> None:
+    """Whatever was sent: levels of the wire are whole ten-thousandths."""
+    sent = CommandSet(7, (DriveCommand(2, 110.0, level),), ramp=0.02, valid_for=0.0)
+    packed = pack_set(sent)
+    head = len(packed) - 9  # a count and one command of eight bytes
+    achieved = unpack_achieved(Cursor(b"\x07\x00" + packed[head:]))
+    assert achieved == Achieved(7, (DriveCommand(2, 110.0, round(level, 4)),))
 
 
 def largest(pick: Callable[[WireQuantity], float]) -> tuple[list[Request], dict[int, Reply]]:
@@ -245,7 +256,7 @@ def test_unprintable_text_is_malformed(raw: bytes, problem: str) -> None:
     ("asked", "payload", "problem"),
     [
         (Hello(), "0400 21", "got 33"),
-        (GetStatus(), "08", "unknown AmplifierState 8"),
+        (GetStatus(), f"08{11 * '00'}010000", "unknown AmplifierState 8"),
         (GetFaults(), "01 04 10 00000000", "channel 16 does not exist"),
         (GetFaults(), "ff", "fault_count must be 0 to 32, got 255"),
     ],

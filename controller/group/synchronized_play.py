@@ -1,16 +1,17 @@
 """Playing one set on several amplifiers: load, stage, commit at one moment, read the tokens."""
 
 import math
-from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
+from controller.group.joint_start import JointStart
 from controller.group.tasks import gather_all
 from drivers import clock
 from drivers.guard import SafeCommandSet, SafeEnvelope
 from drivers.operation.checked_amplifier import CheckedAmplifier
-from drivers.operation.simultaneous import simultaneous_commits
+from drivers.operation.simultaneous import commit_at
 from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import Achieved, Feature
 
@@ -30,6 +31,10 @@ class Played:
     is_late: bool = False
 
 
+_Started: TypeAlias = tuple[dict[str, Achieved], float]
+"""What amplifiers achieve, by name, and when [s] their commit had left."""
+
+
 class SynchronizedPlay:
     """Plays sets on amplifiers, by name, so that all of them start at one moment.
 
@@ -39,6 +44,7 @@ class SynchronizedPlay:
     def __init__(self, amplifiers: Mapping[str, CheckedAmplifier]) -> None:
         self.is_set_incomplete = False
         self._amplifiers = amplifiers
+        self._started_at = 0.0  # s; when the last sets began to be committed
 
     def forget(self) -> None:
         """Forget what was played: the amplifiers are armed anew, and silent."""
@@ -75,27 +81,20 @@ class SynchronizedPlay:
         if len(sets) == 1 or is_silence or not self._can_stage:
             # A single amplifier needs no staging, and silence is not delayed by it.
             self.is_set_incomplete = self.is_set_incomplete or (len(sets) > 1 and not is_silence)
-            achieved = await gather_all(
+            replies = await gather_all(
                 self._amplifiers[name].apply(safe) for name, safe in sets.items()
             )
+            achieved = dict(zip(sets, replies, strict=True))
             sent_at = self._last_sent_at
         else:
-            achieved = await gather_all(
-                self._amplifiers[name].stage(safe) for name, safe in sets.items()
-            )
-            if not may_play():
+            starts = await gather_all(self._starts(sets, may_play))
+            started = [each for each in starts if each is not None]
+            if len(started) < len(starts):
                 return None  # as above
-            self.is_set_incomplete = True
-            committed_at = clock.now()
-            for name, safe in sets.items():
-                self._amplifiers[name].expect_commit(safe)
-            await gather_all(self._commits(sets, may_play))
-            sent_at = self._last_sent_at  # before the statuses are read
-            if not may_play():
-                return None
-            await self._confirm_commits(sets, committed_at)
+            achieved = {name: each for several, _ in started for name, each in several.items()}
+            sent_at = max(moment for _, moment in started)
         self.is_set_incomplete = False
-        return Played(dict(zip(sets, achieved, strict=True)), sent_at, loading_time)
+        return Played(achieved, sent_at, loading_time)
 
     @property
     def _can_stage(self) -> bool:
@@ -133,53 +132,84 @@ class SynchronizedPlay:
                 await checked.amplifier.load_envelope(envelope)
         return True
 
-    def _commits(
+    def _starts(
         self, sets: Mapping[str, SafeCommandSet], may_play: Callable[[], bool]
-    ) -> Iterable[Coroutine[Any, Any, object]]:
-        """Commit all staged sets so that they arrive at one moment; once for each shared bus."""
-        by_bus: dict[tuple[str, int], list[str]] = {}
+    ) -> list[Coroutine[Any, Any, _Started | None]]:
+        """Stage all sets and start them so that their commits arrive at one moment."""
+        by_bus: dict[tuple[str, int], dict[str, SafeCommandSet]] = {}
         for name, safe in sets.items():
             amplifier = self._amplifiers[name].amplifier
             takes_broadcasts = Feature.BROADCAST in amplifier.capabilities.features
             bus = (amplifier.bus if takes_broadcasts else None) or name
-            by_bus.setdefault((bus, safe.token), []).append(name)
-        return simultaneous_commits(
-            [
-                (
-                    self._amplifiers[first].amplifier.wire_times.commit(),
-                    partial(
-                        _commit,
-                        self._amplifiers[first],
-                        sets[first],
-                        on_bus=bool(others),
-                        may_play=may_play,
-                    ),
-                )
-                for first, *others in by_bus.values()
-            ]
-        )
+            by_bus.setdefault((bus, safe.token), {})[name] = safe
+        firsts = [self._amplifiers[next(iter(sharing))] for sharing in by_bus.values()]
+        takes = [first.amplifier.wire_times.commit() for first in firsts]
+        start = JointStart(len(takes), partial(self._start_commits, sets, may_play))
+        return [
+            self._start(sharing, start, may_play, delay=max(takes) - each)
+            for sharing, each in zip(by_bus.values(), takes, strict=True)
+        ]
 
-    async def _confirm_commits(
-        self, sets: Mapping[str, SafeCommandSet], committed_at: float
-    ) -> None:
-        """Raise CommandRefused unless every amplifier reports that it plays its set."""
+    def _start_commits(
+        self, sets: Mapping[str, SafeCommandSet], may_play: Callable[[], bool]
+    ) -> bool:
+        """Begin to commit staged sets, unless silence came first."""
+        if not may_play():
+            return False
+        self.is_set_incomplete = True
+        self._started_at = clock.now()
+        for name, safe in sets.items():
+            self._amplifiers[name].expect_commit(safe)
+        return True
+
+    async def _start(
+        self,
+        sets: Mapping[str, SafeCommandSet],
+        start: JointStart,
+        may_play: Callable[[], bool],
+        *,
+        delay: float,
+    ) -> _Started | None:
+        """Start the set of one amplifier, or those of a bus at once, when all are staged.
+
+        delay [s]: of the commit, so that it arrives together with that of the slowest wire. Returns
+        what is achieved and when [s] the commit had left; None if silence came before the end.
+        Raises CommandRefused unless every amplifier reports that it plays its set.
+        """
+        several = {name: self._amplifiers[name] for name in sets}
+        try:
+            achieved = await gather_all(
+                checked.stage(sets[name]) for name, checked in several.items()
+            )
+        except BaseException:
+            start.fail()
+            raise
+        if not await start.ready():
+            return None
+        started_at = self._started_at
+        commit = partial(_commit, [*several.values()], [*sets.values()], may_play)
+        if not await commit_at(started_at + delay, commit):
+            return None
+        sent_at = next(iter(several.values())).amplifier.last_sent_at
+        if not may_play():
+            return None
         await gather_all(
-            self._amplifiers[name].confirm_commit(safe, sent_at=committed_at)
-            for name, safe in sets.items()
+            checked.confirm_commit(sets[name], sent_at=started_at)
+            for name, checked in several.items()
         )
+        return dict(zip(sets, achieved, strict=True)), sent_at
 
 
 async def _commit(
-    checked: CheckedAmplifier,
-    safe: SafeCommandSet,
-    *,
-    on_bus: bool,
+    several: Sequence[CheckedAmplifier],
+    sets: Sequence[SafeCommandSet],
     may_play: Callable[[], bool],
-) -> None:
-    """Commit, unless silence came while this waited for an amplifier on a slower wire."""
+) -> bool:
+    """Commit; false if silence came while this waited for an amplifier on a slower wire."""
     if not may_play():
-        return
-    if on_bus:
-        await checked.amplifier.commit_on_bus(safe.token)
+        return False
+    if len(several) > 1:
+        await several[0].amplifier.commit_on_bus(sets[0].token)
     else:
-        await checked.commit(safe)
+        await several[0].commit(sets[0])
+    return True

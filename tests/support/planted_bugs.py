@@ -179,10 +179,6 @@ async def _sleeps_past_heartbeats(next_cause: Any, controller: Any) -> None:
             controller._heartbeat_due = due
 
 
-async def _checks_no_tokens(playback: Any, sets: Any, since: float) -> None:
-    pass
-
-
 async def _arms_again(clear: Any, controller: Any) -> None:
     await clear(controller)
     await controller._group.arm()
@@ -239,14 +235,11 @@ CONTROLLER: dict[str, Bug] = {
     ),
     "a set is committed by one amplifier only": Bug(
         "commit",
-        both(
-            replaced(SynchronizedPlay, "_confirm_commits", _checks_no_tokens),
-            wrapped(
-                SynchronizedPlay,
-                "_commits",
-                lambda commits, playback, sets, may_play: commits(
-                    playback, dict(list(sets.items())[:1]), may_play
-                ),
+        wrapped(
+            SynchronizedPlay,
+            "_starts",
+            lambda starts, playback, sets, *others: starts(
+                playback, dict(list(sets.items())[:1]), *others
             ),
         ),
         amplifiers=_TWO,
@@ -301,7 +294,7 @@ _unchecked = replaced(
 
 def _credited_to_first(received: Any, backend: Any, frame: Any) -> None:
     pending = backend._pending if frame.is_reply else None
-    received(backend, replace(frame, sequence=pending.request.sequence) if pending else frame)
+    received(backend, frame._replace(sequence=pending.request.sequence) if pending else frame)
 
 
 async def _sends_at_once(

@@ -20,9 +20,8 @@ from model.ensemble.attached_plate import AttachedPlate
 from model.ensemble.contact_forms import RIDGE, inverse_with, power_of
 from model.ensemble.preselection_kernel import PreselectionKernel
 
-REACHING, MISSING = 9, 3
-"""Frequencies kept of those that reach the level, and of better ones that miss it: what is lost are
-0.02 dB in the mean (docs/decisions, on the preselection)."""
+KEPT, MISSING = 16, 4
+"""Frequencies kept, as many as a kernel works on at once, and how many of them may miss the level."""
 
 MAX_FINGERS_BY_POINTS = 4
 """Quiet fingers up to which nulls are so deep that the points of each count, not its centre."""
@@ -60,10 +59,10 @@ class Preselection:
         score, amplitude = self.scores(points, weights, loads)
         order = among[np.argsort(-score[among])]
         reaches = amplitude[order] >= wanted[order]
-        reaching = order[reaches][:REACHING]
-        # All that would be better than the best, were it loud enough.
-        first = int(reaches.argmax()) if len(reaching) else len(order)
+        # Those that would be better than the best, were they loud enough.
+        first = int(reaches.argmax()) if reaches.any() else len(order)
         missing = order[:first][:MISSING]
+        reaching = order[reaches][: KEPT - len(missing)]
         return np.sort(np.concatenate([reaching, missing]))
 
     def scores(

@@ -435,7 +435,7 @@ class Amplifier(SensorClient):
         is_recorded = type(request) in RECORDED
         if is_recorded:
             _note(request, self._recorder.sending)
-        started_at = clock.now()
+        started_at = clock.now() if trace.has_requests() else None
         outcome: object = "cancelled"
         feeds = self._start_feeding(request)
         try:
@@ -448,7 +448,7 @@ class Amplifier(SensorClient):
             if is_recorded:
                 self._recorder.left(request)
             self._pacing.notice()
-            if trace.has_requests():
+            if started_at is not None:
                 _note(request, trace.request, outcome, clock.now() - started_at)
         _note(request, self._recorder.replied, reply)
         return reply

@@ -87,7 +87,7 @@ class ChannelState:
         if end > self.valid_for or self.may_be_silent:
             return 0.0
         if not (self.is_shaped or self.path[0]):  # it rises from silence
-            return abs(self.path[-1]) * self._progress(start)
+            return abs(self.path[-1]) * _raised_cosine(start, self.step)
         lowest = _least_modulus(self._amplitudes(start, end))
         if self.first_low < abs(self.path[0]):
             first, *others = self.path
@@ -112,7 +112,7 @@ class ChannelState:
             kept = self.fading_at(first) if self.fading_may_hold else 0.0
             both = abs(self.path[0]) + (0.0 if self.fading_may_hold else self.fading)
             reached = abs(self.path[-1])
-            fraction = self._progress(last if reached > both else first)
+            fraction = _raised_cosine(last if reached > both else first, self.step)
             highest = (1 - fraction) * both + fraction * reached + kept
         if self.ending is not None and end > self.valid_for:
             interrupted = abs(self.path[0]) if last < settled_after else 0.0  # fades by itself
@@ -184,7 +184,9 @@ class ChannelState:
             lowest = self.low(when)
         elif not self.is_shaped:
             # What played before may fade by itself, and sooner than the ramp.
-            lowest = min(lowest, self._progress(self._elapsed(when)[0]) * abs(self.path[-1]))
+            lowest = min(
+                lowest, _raised_cosine(self._elapsed(when)[0], self.step) * abs(self.path[-1])
+            )
         return max(0.0, lowest), max(one.real for one in along), phase_factor
 
     def frequencies_at(self, when: Interval) -> frozenset[float]:
@@ -217,9 +219,6 @@ class ChannelState:
         end = when.latest - earliest
         return shortest, end if end > shortest else shortest
 
-    def _progress(self, elapsed: float) -> float:
-        return _raised_cosine(elapsed, self.step)
-
     @property
     def _highest_knot(self) -> float:
         return max((knot.level for knot in self.ending.knots), default=0.0) if self.ending else 0.0
@@ -228,7 +227,9 @@ class ChannelState:
         """Amplitudes of the lasting tone at two times [s] since the commit, and knots between."""
         if not self.is_shaped:
             first, last = self.path[0], self.path[-1]
-            return tuple(first + (last - first) * self._progress(time) for time in (start, end))
+            return tuple(
+                first + (last - first) * _raised_cosine(time, self.step) for time in (start, end)
+            )
         inner = [
             value for number, value in enumerate(self.path) if start < number * self.step < end
         ]
@@ -367,7 +368,7 @@ def _raised_cosine(elapsed: float, ramp: float) -> float:
     """Progress 0..1 of a transition a time [s] after its start."""
     if elapsed >= ramp:
         return 1.0
-    return (1 - math.cos(math.pi * elapsed / ramp)) / 2 if math.isfinite(ramp) else 0.0
+    return (1 - math.cos(math.pi * elapsed / ramp)) / 2 if ramp < _FAR else 0.0
 
 
 def _phasors(envelope: Envelope | None) -> tuple[complex, ...]:

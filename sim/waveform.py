@@ -6,15 +6,13 @@ Every change is a cross-fade along a raised cosine, whose two gains add up to on
 import cmath
 import math
 from collections import defaultdict
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
-from model.transients.base_motion import Term, fade
+from model.transients.base_motion import Fade, Term
 
 
-@dataclass(frozen=True, slots=True)
-class FadingTone:
+class FadingTone(NamedTuple):
     """gain(t) Im[full exp(2 pi i frequency (t - origin))] from start.
 
     frequency [Hz]; full: complex amplitude at gain 1, in full strokes; origin [s]: of its phase.
@@ -71,21 +69,14 @@ class FadingTone:
         gain = self.gain(time)
         return FadingTone(self.frequency, self.full, self.origin, time, ramp, gain, 0.0)
 
-    def terms(self, *, stroke: float) -> tuple[Term, ...]:
+    def motion(self, *, stroke: float) -> tuple[Fade]:
         """Base motion of an ERA with this stroke [m] whose channel plays it."""
         omega = 2 * math.pi * self.frequency
-        phase_factor = cmath.exp(1j * omega * (self.start - self.origin))
-        return fade(
-            stroke * self.full * phase_factor,
-            omega=omega,
-            start=self.start,
-            ramp=self.ramp,
-            gains=(self.gain_from, self.gain_to),
-        )
+        amplitude = stroke * self.full * cmath.exp(1j * omega * (self.start - self.origin))
+        return (Fade(self.start, self.ramp, omega, amplitude, self.gain_from, self.gain_to),)
 
 
-@dataclass(frozen=True, slots=True)
-class ShapedTone:
+class ShapedTone(NamedTuple):
     """Im[a(t) exp(2 pi i frequency (t - origin))] from start, a in full strokes.
 
     frequency [Hz]; start, origin [s]; a interpolates `values` linearly, one per step [s] from
@@ -136,7 +127,7 @@ class ShapedTone:
         reached = self.amplitude(time)
         return FadingTone(self.frequency, reached, self.origin, time, ramp, 1.0, 0.0)
 
-    def terms(self, *, stroke: float) -> tuple[Term, ...]:
+    def motion(self, *, stroke: float) -> tuple[Term, ...]:
         """Base motion of an ERA with this stroke [m] whose channel plays it."""
         omega = 2 * math.pi * self.frequency
         terms = []

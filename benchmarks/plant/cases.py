@@ -18,7 +18,7 @@ from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
 from model.structure.fingertip import Fingertip, FingertipLoad
 from model.structure.point_load import footprints_of
-from model.transients.base_motion import fade
+from model.transients.base_motion import Fade
 from sim.bench.bench import Bench
 from sim.plant.plant import SAMPLE_RATE, Plant
 
@@ -129,9 +129,7 @@ def _resting(places: Sequence[tuple[float, float]]) -> dict[str, FingertipLoad]:
 def _new_tones(plant: Plant, eras: int) -> None:
     for number in range(eras):
         omega = 2 * np.pi * FREQUENCIES[number % 4]
-        plant.set_input(
-            number, fade(1e-4 + 0j, omega=omega, start=plant.time, ramp=0.02, gains=(0.0, 1.0))
-        )
+        plant.set_input(number, [Fade(plant.time, 0.02, omega, 1e-4, 0.0, 1.0)])
 
 
 def contact_times(rigs: Rigs) -> Iterator[tuple[str, float]]:

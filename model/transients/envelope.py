@@ -16,7 +16,7 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.structure.actuator import Era
-from model.transients.base_motion import Term, fade
+from model.transients.base_motion import Fade, Term
 from model.vibration.excitation import Excitation
 
 KNOT_STEP = 0.005
@@ -119,7 +119,7 @@ def ramped_pulse(
         # What rises from the end on is the tone itself, in opposite phase.
         omega = 2 * math.pi * tone.frequency
         opposite = -tone.phasor * cmath.exp(1j * omega * duration)
-        release.append(fade(opposite, omega=omega, start=duration, ramp=ramp, gains=(0.0, 1.0)))
+        release.append(Fade(duration, ramp, omega, opposite, 0.0, 1.0).terms())
     return tuple((*rise, *fall) for rise, fall in zip(onset, release, strict=True))
 
 
@@ -132,13 +132,7 @@ def _faded(
     excitation: Excitation, eras: Sequence[Era], *, ramp: float, gains: tuple[float, float]
 ) -> Bases:
     return tuple(
-        fade(
-            tone.phasor,
-            omega=2 * math.pi * tone.frequency,
-            start=0.0,
-            ramp=ramp,
-            gains=gains,
-        )
+        Fade(0.0, ramp, 2 * math.pi * tone.frequency, tone.phasor, *gains).terms()
         if (tone := excitation.get(era.name))
         else ()
         for era in eras

@@ -33,31 +33,38 @@ from model.transients.base_motion import BaseMotions
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForcedVibration:
-    """The particular solution Im[vectors @ z(t)], z = sum over n of (a0 + a1 tau) exp(i omega tau).
+    """Particular solutions Im[vectors @ z(t)], one after the other, from times (k,) [s] on.
 
-    tau = t - time [s]; omegas (n,) [rad/s], each once; a0, a1 (n, 2 r) in the eigenvectors of
-    `plate`, a1 None for 0.
+    z = sum over n of (a0 + a1 tau) exp(i omega tau), tau = t - time; number (n,): of the solution;
+    omegas (n,) [rad/s], each once in a solution; a0, a1 (n, 2 r) in the eigenvectors of `plate`, a1
+    None for 0.
     """
 
     plate: "PlateInTime"
-    time: float
+    times: FloatArray
+    number: NDArray[np.intp]
     omegas: FloatArray
     a0: ComplexArray
     a1: ComplexArray | None
 
-    def state(self, time: float) -> FloatArray:
-        """Displacement and velocity (2 r,) at a time [s]."""
-        return np.asarray((self.plate.vectors @ self._modal(time)).imag)
+    def rows(self, number: int) -> slice:
+        """Which of n belong to a solution."""
+        return slice(*self.number.searchsorted((number, number + 1)).tolist())
 
-    def as_free(self, time: float) -> ComplexArray:
-        """z (m,) of the free vibration with the displacement and velocity at a time [s]."""
-        z = self._modal(time)
+    def state(self, number: int, time: float) -> FloatArray:
+        """Displacement and velocity (2 r,) in a solution at a time [s]."""
+        return np.asarray((self.plate.vectors @ self._modal([number], [time])[0]).imag)
+
+    def as_free(self, numbers: Sequence[int], times: Sequence[float]) -> ComplexArray:
+        """z (j, m) of free vibrations with the state in solutions (j,) at times (j,) [s]."""
+        z = self._modal(numbers, times)
         # The conjugate of an eigenvector is that of the conjugate eigenvalue.
-        return np.asarray((z[self.plate.half] - z[self.plate.partner].conj()) / 2j)
+        return np.asarray(-0.5j * (z[:, self.plate.half] - z[:, self.plate.partner].conj()))
 
-    def _modal(self, time: float) -> ComplexArray:
-        tau = time - self.time
-        phase_factor = np.exp(1j * self.omegas * tau)
+    def _modal(self, numbers: Sequence[int], times: Sequence[float]) -> ComplexArray:
+        tau = np.array(times)[:, None] - self.times[self.number]
+        is_of_solution = self.number == np.array(numbers)[:, None]
+        phase_factor = is_of_solution * np.exp(1j * self.omegas * tau)
         z: ComplexArray = phase_factor @ self.a0
         if self.a1 is not None:
             z += (tau * phase_factor) @ self.a1
@@ -95,32 +102,36 @@ class PlateInTime:
         """Displacement of the reduced coordinates in each eigenvector, (r, 2 r)."""
         return self.vectors[: len(self.vectors) // 2]
 
-    def driven(self, motions: BaseMotions, time: float) -> ForcedVibration:
-        """Particular solution for the terms that move the ERAs' bases at a time [s], from then on.
+    def driven(
+        self, motions: BaseMotions, numbers: Sequence[int], times: Sequence[float]
+    ) -> ForcedVibration:
+        """Particular solutions for sets of motions (k,) that play from times (k,) [s] on.
 
-        Terms of one frequency are one there, so that its samples cost what its frequencies do.
+        Each for the terms that move the ERAs' bases at its time. Terms of one frequency are one
+        there, so that its samples cost what its frequencies do.
         """
-        active = motions.active(time)
+        moments = np.array(times, dtype=float)
+        number, active = np.nonzero(motions.active(numbers, moments))
         era, each = motions.era[active], motions.omega[active]
-        tau, s = time - motions.start[active], 1j * each
+        tau, s = moments[number] - motions.start[active], 1j * each
         phase_factor = np.exp(s * tau)
         c = self._dampers[era]
         impedance = self._springs[era] + c * s  # force by displacement
         is_first = np.ones(len(each), dtype=bool)
-        np.not_equal(each[1:], each[:-1], out=is_first[1:])
+        is_first[1:] = (each[1:] != each[:-1]) | (number[1:] != number[:-1])
         omegas = each[is_first]
         # By frequency and ERA, of which it is the force on the base.
         cell = (np.cumsum(is_first) - 1) * len(self.eras) + era
-        denominator = 1j * omegas[:, None] - self.eigenvalues
-        y = phase_factor * motions.c0[active]
+        receptance = 1 / (1j * omegas[:, None] - self.eigenvalues)
+        y, a1 = phase_factor * motions.c0[active], None
         if motions.c1 is None:
-            a0 = self._by_forces(cell, impedance * y, omegas) / denominator
-            return ForcedVibration(self, time, omegas, a0, None)
-        growth = phase_factor * motions.c1[active]
-        a1 = self._by_forces(cell, impedance * growth, omegas) / denominator
-        force = impedance * (y + growth * tau) + c * growth
-        a0 = (self._by_forces(cell, force, omegas) - a1) / denominator
-        return ForcedVibration(self, time, omegas, a0, a1)
+            a0 = self._by_forces(cell, impedance * y, omegas) * receptance
+        else:
+            growth = phase_factor * motions.c1[active]
+            a1 = self._by_forces(cell, impedance * growth, omegas) * receptance
+            force = impedance * (y + growth * tau) + c * growth
+            a0 = (self._by_forces(cell, force, omegas) - a1) * receptance
+        return ForcedVibration(self, moments, number[is_first], omegas, a0, a1)
 
     def _by_forces(
         self, cell: NDArray[np.intp], forces: ComplexArray, omegas: FloatArray
@@ -177,16 +188,19 @@ class PlateInTime:
 
     @cached_property
     def half(self) -> NDArray[np.intp]:
-        """Numbers (m,) of one eigenvalue of every conjugate pair, and of the real ones."""
-        return np.flatnonzero(self.eigenvalues.imag >= 0)
+        """Numbers (m,) of one eigenvalue of every conjugate pair, and of the real ones.
+
+        From the one that decays slowest to the one that decays fastest.
+        """
+        numbers = np.flatnonzero(self.eigenvalues.imag >= 0)
+        order = np.argsort(-self.eigenvalues.real[numbers], kind="stable")
+        return np.asarray(numbers[order])
 
     @cached_property
     def partner(self) -> NDArray[np.intp]:
         """Numbers (m,) of the eigenvalues that are conjugate to those, a real one its own."""
-        lower = np.flatnonzero(self.eigenvalues.imag < 0)
-        partner = self.half.copy()
-        partner[self.decay.imag > 0] = lower
-        return partner
+        # LAPACK has the conjugate behind each eigenvalue above the real axis.
+        return np.asarray(self.half + (self.decay.imag > 0))
 
     @cached_property
     def _upper(self) -> FloatArray:

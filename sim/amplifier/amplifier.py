@@ -8,7 +8,7 @@ Not modelled: the rise time of high voltage, and the voltage waveform of a tone.
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Protocol, TypeAlias
 
@@ -173,19 +173,19 @@ class SimulatedAmplifier:
         self._is_derated = False
 
     @property
-    def outputs(self) -> Sequence[Output]:
-        """The output of each channel from now on, without further events."""
+    def outputs(self) -> tuple[Output, ...]:
+        """The output of each channel from now on, without further events.
+
+        The same object until they change.
+        """
         return self._channels.outputs
 
     @property
     def next_event(self) -> float:
         """Time of the next event [s], up to which `outputs` holds."""
-        return min(
-            self._vibration_end,
-            self._watchdog_end,
-            self._silence_reached,
-            self._overtemperature_from,
-        )
+        if self.state in ENABLED:
+            return min(self._vibration_end, self._watchdog_end, self._overtemperature_from)
+        return min(self._vibration_end, self._silence_reached)
 
     @property
     def is_derated(self) -> bool:

@@ -1,6 +1,6 @@
 """Outputs of the channels of a simulated amplifier, and the transition between sets."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from drivers.command import CommandSet, DriveCommand, Envelope
@@ -54,14 +54,14 @@ class Channels:
 
     def __init__(self, count: int, voices: int) -> None:
         self._voices = voices
-        self._outputs: list[Output] = [()] * count
+        self._outputs: tuple[Output, ...] = ((),) * count
         self._endings: Mapping[int, Envelope] = {}
         self._ramp = 0.0  # of the active set
 
     @property
-    def outputs(self) -> Sequence[Output]:
-        """The output of each channel from now on."""
-        return tuple(self._outputs)
+    def outputs(self) -> tuple[Output, ...]:
+        """The output of each channel from now on; the same object until they change."""
+        return self._outputs
 
     @property
     def load(self) -> float:
@@ -87,7 +87,7 @@ class Channels:
 
     def play(self, playable: PlayableSet, time: float) -> None:
         """Play a set; channels that it does not name are silenced."""
-        self._outputs = [output for _, output in self._outputs_after(playable, time)]
+        self._outputs = tuple([output for _, output in self._outputs_after(playable, time)])
         self._endings = playable.endings
         self._ramp = playable.command_set.ramp
 
@@ -115,29 +115,33 @@ class Channels:
 
     def end(self, time: float) -> None:
         """End the vibration along its endings, or the ramp of its set."""
-        self._outputs = [
+        self._outputs = tuple(
             _ended(playing, time, self._endings[channel], self._ramp)
             if channel in self._endings
             else fade_to(playing, time, ramp=self._ramp)
             for channel, playing in enumerate(self._outputs)
-        ]
+        )
         self._endings = {}
 
     def silence(self, time: float, *, ramp: float) -> None:
         """Silence all channels within the ramp, without endings."""
-        self._outputs = [fade_to(output, time, ramp=ramp) for output in self._outputs]
+        self._outputs = tuple(fade_to(output, time, ramp=ramp) for output in self._outputs)
         self._endings = {}
 
     def derate(self, time: float, factor: float) -> None:
         """Scale the levels; phases continue."""
-        for channel, playing in enumerate(self._outputs):
-            tone = next((tone for tone in playing if tone.is_lasting), None)
-            if tone is not None:
-                levels = (tone.amplitude(time), factor * tone.settled_amplitude)
-                derated = ShapedTone(tone.frequency, tone.origin, time, _DERATING_RAMP, levels)
-                fading = (one for one in playing if one is not tone and one.silent_from > time)
-                self._outputs[channel] = (*fading, derated)
+        self._outputs = tuple(_derated_output(output, time, factor) for output in self._outputs)
         self._endings = _derated(self._endings, factor)
+
+
+def _derated_output(playing: Output, time: float, factor: float) -> Output:
+    tone = next((tone for tone in playing if tone.is_lasting), None)
+    if tone is None:
+        return playing
+    levels = (tone.amplitude(time), factor * tone.settled_amplitude)
+    derated = ShapedTone(tone.frequency, tone.origin, time, _DERATING_RAMP, levels)
+    fading = (one for one in playing if one is not tone and one.silent_from > time)
+    return (*fading, derated)
 
 
 def _derated(envelopes: Mapping[int, Envelope], factor: float) -> dict[int, Envelope]:

@@ -93,6 +93,8 @@ class SetStore:
         onsets: dict[int, Envelope] = {}
         endings: dict[int, Envelope] = {}
         for command in quantised.commands:
+            if not (command.onset or command.ending):
+                continue
             for slot, shapes in ((command.onset, onsets), (command.ending, endings)):
                 if slot and slot not in self.slots:
                     raise RefusedSet(NakCode.NO_ENVELOPE, command.channel)
@@ -153,9 +155,12 @@ def _quantised_envelope(wanted: Envelope, capabilities: Capabilities) -> Envelop
 
 def _quantised(command: DriveCommand, limits: ChannelLimits, *, has_phase: bool) -> DriveCommand:
     phase = command.phase if has_phase else _ANY_PHASE * command.channel
-    frequency = _in_steps(_Q.frequency, command.frequency, channel=command.channel)
-    level = _in_steps(_Q.level, command.level, channel=command.channel)
-    phase = _in_steps(_Q.phase, phase, channel=command.channel)
+    try:
+        frequency = _Q.frequency.quantise(command.frequency)
+        level = _Q.level.quantise(command.level)
+        phase = _Q.phase.quantise(phase)
+    except CommandError as error:
+        raise RefusedSet(NakCode.BAD_VALUE, command.channel) from error
     is_playable = limits.frequency_min <= frequency <= limits.frequency_max
     if level > limits.level_max or (level > 0 and not is_playable):
         raise RefusedSet(NakCode.BAD_VALUE, command.channel)
@@ -164,8 +169,8 @@ def _quantised(command: DriveCommand, limits: ChannelLimits, *, has_phase: bool)
     return replace(command, frequency=frequency, level=level, phase=phase)
 
 
-def _in_steps(quantity: WireQuantity, value: float, *, channel: int | None = None) -> float:
+def _in_steps(quantity: WireQuantity, value: float) -> float:
     try:
         return quantity.quantise(value)
     except CommandError as error:
-        raise RefusedSet(NakCode.BAD_VALUE, channel) from error
+        raise RefusedSet(NakCode.BAD_VALUE) from error

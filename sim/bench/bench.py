@@ -24,7 +24,7 @@ from model.structure.actuator import Era
 from model.structure.fingertip import FingertipLoad, check_loads
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, footprints_of
-from model.transients.base_motion import Term
+from model.transients.base_motion import Motion, terms_of
 from registry.voltage import Law
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.bench.reading import ToneReader
@@ -103,7 +103,7 @@ class Bench:
             channel = rig.wiring[era.name]
             self._wired[channel.amplifier].append((index, channel.number))
         self._commanded: dict[str, tuple[Output, ...]] = {
-            name: tuple(amplifier.outputs) for name, amplifier in self.amplifiers.items()
+            name: amplifier.outputs for name, amplifier in self.amplifiers.items()
         }
         self._delayed: dict[str, deque[tuple[float, int, Output]]] = {
             name: deque() for name in rig.amplifiers
@@ -285,9 +285,9 @@ class Bench:
     def _update_plant(self) -> None:
         """Pass changed outputs of the channels on to the plant, after their delay."""
         for name, amplifier in self.amplifiers.items():
-            outputs, commanded = tuple(amplifier.outputs), self._commanded[name]
+            outputs, commanded = amplifier.outputs, self._commanded[name]
             waiting = self._delayed[name]
-            if outputs != commanded:
+            if outputs is not commanded and outputs != commanded:
                 self._commanded[name] = outputs
                 delay = self.imperfections.delay(name)
                 for index, number in self._wired[name]:
@@ -306,21 +306,21 @@ class Bench:
         self._played.append((index, self._applied_outputs[index], self._time))
         self._applied_outputs[index] = playing
 
-    def _motion(self, index: int, playing: Output) -> list[Term]:
+    def _motion(self, index: int, playing: Output) -> Motion:
         """The base motion of an ERA by the output of its channel, imperfections included."""
         era = self.rig.eras[index]
         drive = self.rig.voltage.get(era.name)
         stroke = era.stroke if drive is None else 1.0
-        terms = [term for tone in playing for term in tone.terms(stroke=stroke)]
+        motion: Motion = [part for tone in playing for part in tone.motion(stroke=stroke)]
         if drive is not None:
-            terms = moved_by_voltage(terms, drive, stroke=era.stroke)
+            motion = moved_by_voltage(terms_of(motion), drive, stroke=era.stroke)
         errors = self._errors[index]
-        terms = realised(terms, errors)
+        motion = realised(motion, errors)
         if errors.noise and playing:
             end = max(tone.silent_from for tone in playing)
             rms = errors.noise * era.stroke
-            terms += self._noise[index].terms(rms, start=self._time, end=end)
-        return terms
+            motion += self._noise[index].terms(rms, start=self._time, end=end)
+        return motion
 
     def _frequencies(self, since: float, until: float) -> list[float]:
         """The frequencies [Hz] at which bases were moved by commands in a window."""

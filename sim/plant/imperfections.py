@@ -7,7 +7,7 @@ errors, ERAs in other places.
 
 import cmath
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from zlib import crc32
 
@@ -20,7 +20,7 @@ from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
 from model.structure.fingertip import Fingertip
 from model.structure.point_load import PointLoad
-from model.transients.base_motion import Term
+from model.transients.base_motion import Fade, Motion, Term
 from model.vibration.discretisation import finer_mesh
 from sim.waveform import Output
 
@@ -196,16 +196,21 @@ def delayed(output: Output, delay: float) -> Output:
     if delay == 0:
         return output
     return tuple(
-        replace(tone, start=tone.start + delay, origin=tone.origin + delay) for tone in output
+        tone._replace(start=tone.start + delay, origin=tone.origin + delay) for tone in output
     )
 
 
-def realised(terms: Sequence[Term], errors: ChannelErrors) -> list[Term]:
+def realised(motion: Motion, errors: ChannelErrors) -> list[Term | Fade]:
     """Base motion with the gain and phase errors of its channel."""
     if (errors.gain, errors.phase) == (1.0, 0.0):
-        return list(terms)
+        return list(motion)
     factor = errors.factor
-    return [term._replace(c0=factor * term.c0, c1=factor * term.c1) for term in terms]
+    return [
+        part._replace(amplitude=factor * part.amplitude)
+        if isinstance(part, Fade)
+        else part._replace(c0=factor * part.c0, c1=factor * part.c1)
+        for part in motion
+    ]
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.reduction.reduced_plate import ReducedPlate
 from model.structure.actuator import Era
 from model.structure.fingertip import FingertipLoad
@@ -38,20 +38,24 @@ class LoadedPlate:
     contacts: tuple[FingertipLoad, ...]
     reduced: ReducedPlate
     plate: PlateInTime
-    _tables: dict[float, FloatArray] = field(default_factory=dict)
+    _tables: dict[float, ComplexArray] = field(default_factory=dict)
 
-    def exponentials(self, sample_rate: float) -> FloatArray:
-        """Re and -Im of exp(eigenvalue k / sample_rate [Hz]), k up to a block, (BLOCK, 2 m)."""
+    def exponentials(self, sample_rate: float) -> ComplexArray:
+        """exp(eigenvalue k / sample_rate [Hz]), k up to a block, (BLOCK, m)."""
         if sample_rate not in self._tables:
-            grid = np.ones((BLOCK, len(self.plate.decay)), dtype=complex)
-            done = 1
-            while done < BLOCK:  # doubled, since an exponential costs ten products
-                ahead = np.exp(self.plate.decay * (done / sample_rate))
-                np.multiply(grid[:done], ahead, out=grid[done : 2 * done])
-                done *= 2
             self._tables.clear()
-            self._tables[sample_rate] = np.hstack([grid.real, -grid.imag])
+            self._tables[sample_rate] = exponentials(self.plate.decay, sample_rate)
         return self._tables[sample_rate]
+
+
+def exponentials(s: ComplexArray, sample_rate: float) -> ComplexArray:
+    """exp(s k / sample_rate) for s (n,) [1/s] and k up to a block, (BLOCK, n)."""
+    table = np.ones((BLOCK, len(s)), dtype=complex)
+    done = 1
+    while done < BLOCK:  # doubled, since an exponential costs ten products
+        np.multiply(table[:done], np.exp(s * (done / sample_rate)), out=table[done : 2 * done])
+        done *= 2
+    return table
 
 
 Under: TypeAlias = tuple[LoadedPlate, Mapping[str, FingertipLoad]]

@@ -5,26 +5,51 @@ present base motion, and the free vibration that remains after each change.
 """
 
 import math
-from bisect import bisect_right
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.reduction.reduced_plate import ReducedPlate
 from model.structure.actuator import Era
 from model.structure.fingertip import FingertipLoad
 from model.structure.point_load import PointLoad
-from model.transients.base_motion import BaseMotions, Term
+from model.transients.base_motion import BaseMotions, Motion
+from model.transients.time_response import ForcedVibration
 from sim.plant.loaded_plates import LoadedPlate, LoadedPlateCache, carried_state
 from sim.plant.sampler import Sampler
 
 SAMPLE_RATE = 10_000.0
 """Default sampling rate [Hz]: peaks at 500 Hz are sampled to within 1.3 %."""
 
-_NEGLIGIBLE = (
-    1e-60  # modal amplitude; smaller values are set to zero, since subnormal numbers are slow
-)
+_AT_ONCE = 8  # changes of the drive that are solved together
+
+
+class _Change(NamedTuple):
+    """A change of the drive at a time [s] to the terms of a set of motions that move then.
+
+    is_input: whether that set begins.
+    """
+
+    time: float
+    set_number: int
+    is_input: bool
+
+
+class _Stretch(NamedTuple):
+    """Vibration up to a time [s], between changes of the drive.
+
+    includes_end: whether a sample at its end belongs to it; free (m,): amplitude of each free
+    vibration at the time of the forced one, which is a solution by its number.
+    """
+
+    end: float
+    includes_end: bool
+    free: ComplexArray
+    forced: ForcedVibration
+    solution: int
 
 
 class Plant:
@@ -45,12 +70,16 @@ class Plant:
         self._plates = LoadedPlateCache(reduced, eras, loads)
         self._current: LoadedPlate = self._plates.under((), time=time)
         self._contacts: Mapping[str, FingertipLoad] = {}
+        # Amplitude of each free vibration at the time of the present solution.
         self._free = np.zeros(len(self._current.plate.decay), dtype=complex)
-        # Terms of each ERA's base; those that follow, by time [s] and ERA.
-        self._terms: list[list[Term]] = [[] for _ in eras]
-        self._motions = BaseMotions(())
-        self._scheduled: dict[float, dict[int, list[Term]]] = {}
-        self._forced = self._current.plate.driven(self._motions, time)
+        # The motion of each ERA's base; those that follow, by time [s] and ERA.
+        self._inputs: list[Motion] = [()] * len(eras)
+        self._scheduled: dict[float, dict[int, Motion]] = {}
+        # The sets of motions and the solutions that were found together, and the present ones.
+        self._motions = BaseMotions(self._inputs)
+        self._set = 0
+        self._forced = self._current.plate.driven(self._motions, [0], [time])
+        self._solution = 0
         self._sampler: Sampler | None = None  # until the contacts change
 
     @property
@@ -82,13 +111,13 @@ class Plant:
         r = len(self.reduced.omega)
         return q[r:], v[r:]
 
-    def set_input(self, era: int, terms: Sequence[Term], *, since: float | None = None) -> None:
+    def set_input(self, era: int, motion: Motion, *, since: float | None = None) -> None:
         """Set the base motion of an ERA after a time [s], by default the present one.
 
-        Terms may start later.
+        Its parts may start later.
         """
         moment = self.time if since is None else max(since, self.time)
-        self._scheduled.setdefault(moment, {})[era] = list(terms)
+        self._scheduled.setdefault(moment, {})[era] = tuple(motion)
 
     def set_contacts(self, contacts: Mapping[str, FingertipLoad]) -> None:
         """Replace the contacts, by id of the finger; a new finger's phalanx is at rest.
@@ -103,8 +132,9 @@ class Plant:
         self._current = self._plates.under(tuple(contacts.values()), time=self.time)
         self._contacts = dict(contacts)
         remainder = carried_state(state, before, (self._current, contacts))
-        self._forced = self._current.plate.driven(self._motions, self.time)
-        self._free = self._current.plate.to_free @ (remainder - self._forced.state(self.time))
+        self._forced = self._current.plate.driven(self._motions, [self._set], [self.time])
+        self._solution = 0
+        self._free = self._current.plate.to_free @ (remainder - self._forced.state(0, self.time))
         self._sampler = None
 
     def advance(
@@ -125,37 +155,28 @@ class Plant:
         sampler = self._sampler_at(points, sample_rate)
         samples = np.empty((len(times), len(points)))
         done = 0
-
-        def sample(upto: int) -> None:
-            nonlocal done
+        for each in self._advance(to_time):
+            # A term moves the base from its start on, an input after the moment it is set, which
+            # is rounded to the grid as to_time is.
+            if each.includes_end:
+                upto = math.floor(each.end * sample_rate) - int(first) + 1
+            else:
+                upto = int(np.searchsorted(times, each.end))
             if upto > done:
                 sampler.sample(
                     times[done:upto],
                     samples[done:upto],
-                    free=self._free * np.exp(self._current.plate.decay * (times[done] - self.time)),
-                    forced=self._forced,
+                    free=each.free,
+                    forced=each.forced,
+                    solution=each.solution,
                 )
                 done = upto
-
-        while (change := self._next_change) <= to_time:
-            # A term moves the base from its start on, an input after the moment it is set, which
-            # is rounded to the grid as to_time is.
-            if change == self._next_moment:
-                sample(int(np.searchsorted(times, change)))
-            else:
-                sample(int(np.floor(change * sample_rate) - first) + 1)
-            self._cross(change)
-        sample(len(times))
-        self._propagate_free(to_time)
         return times, samples if is_direct else samples @ shapes.T
 
     def skip(self, to_time: float) -> None:
         """Advance to a time [s] without sampling."""
-        if to_time <= self.time:
-            return
-        while (change := self._next_change) <= to_time:
-            self._cross(change)
-        self._propagate_free(to_time)
+        if to_time > self.time:
+            self._advance(to_time)
 
     def _sampler_at(self, points: FloatArray, sample_rate: float) -> Sampler:
         """The sampler that is kept, or another for other points or another rate."""
@@ -170,51 +191,61 @@ class Plant:
 
     def _state(self) -> tuple[FloatArray, FloatArray]:
         """Displacement and velocity of all coordinates, the phalanges' last."""
-        self._apply_inputs()
-        x = (self._current.plate.free_state @ self._free).real + self._forced.state(self.time)
+        self._advance(self.time)
+        plate, since = self._current.plate, self._forced.times[self._solution]
+        free = self._free * np.exp(plate.decay * (self.time - since))
+        x = (plate.free_state @ free).real + self._forced.state(self._solution, self.time)
         r = len(x) // 2
         return x[:r], x[r:]
 
-    @property
-    def _next_moment(self) -> float:
-        """Time of the next start or end of a term [s]."""
-        moments = self._motions.moments
-        number = bisect_right(moments, self.time)
-        return moments[number] if number < len(moments) else math.inf
+    def _advance(self, to_time: float) -> list[_Stretch]:
+        """Advance to a time [s]; return the stretches between changes of the drive."""
+        stretches: list[_Stretch] = []
+        moments = sorted([moment for moment in self._scheduled if moment <= to_time])
+        for until in (*moments[_AT_ONCE - 1 :: _AT_ONCE], to_time):
+            changes = self._next_changes(until)
+            for start in range(0, len(changes), _AT_ONCE):
+                self._cross(changes[start : start + _AT_ONCE], stretches)
+            stretches.append(self._end_stretch(until, includes_end=True))
+        return stretches
 
-    @property
-    def _next_change(self) -> float:
-        """Time of the next change of the drive [s]."""
-        return min(self._next_moment, min(self._scheduled, default=math.inf))
+    def _next_changes(self, until: float) -> list[_Change]:
+        """Changes of the drive up to a time [s], in order."""
+        sets, begins = [self._inputs], [self.time]
+        for moment in sorted([moment for moment in self._scheduled if moment <= until]):
+            changes = self._scheduled.pop(moment)
+            if any(self._inputs[era] != motion for era, motion in changes.items()):
+                self._inputs = self._inputs.copy()
+                for era, motion in changes.items():
+                    self._inputs[era] = motion
+                sets.append(self._inputs)
+                begins.append(moment)
+        if len(sets) > 1:
+            self._motions, self._set = BaseMotions(*sets, since=self.time), 0
+        found: list[_Change] = []
+        for begin, end in pairwise([*begins, until]):
+            for moment in self._motions.moments(self._set, begin, end):
+                found.append(_Change(moment, self._set, is_input=False))
+            if self._set + 1 < len(sets):
+                self._set += 1
+                found.append(_Change(end, self._set, is_input=True))
+        return found
 
-    def _cross(self, change: float) -> None:
-        """Advance to the next change of the drive, and let it happen."""
-        if change < self._next_moment:
-            self._propagate_free(change)
-            self._apply_inputs()
-            return
-        self._propagate_free(change)
-        self._exchange()
+    def _cross(self, changes: Sequence[_Change], stretches: list[_Stretch]) -> None:
+        """Advance to the last of a few changes; displacement and velocity stay continuous."""
+        numbers, times = range(len(changes)), [change.time for change in changes]
+        plate, before = self._current.plate, self._forced.times[self._solution]
+        forced = plate.driven(self._motions, [change.set_number for change in changes], times)
+        states = forced.as_free([*numbers, *numbers[:-1]], times + times[1:])
+        first = self._forced.as_free([self._solution], times[:1])
+        jumps = np.concatenate([first, states[len(changes) :]]) - states[: len(changes)]
+        decays = np.exp(np.diff(times, prepend=before)[:, None] * plate.decay)
+        for number, change in enumerate(changes):
+            stretches.append(self._end_stretch(change.time, includes_end=change.is_input))
+            self._free = self._free * decays[number] + jumps[number]
+            self._forced, self._solution = forced, number
 
-    def _apply_inputs(self) -> None:
-        """Exchange the terms that were set up to the present time, of all ERAs at once."""
-        changes: dict[int, list[Term]] = {}
-        for moment in sorted(self._scheduled):
-            if moment <= self.time:
-                changes |= self._scheduled.pop(moment)
-        if any(self._terms[era] != terms for era, terms in changes.items()):
-            for era, terms in changes.items():
-                self._terms[era] = terms
-            self._motions = BaseMotions(self._terms, since=self.time)
-            self._exchange()
-
-    def _exchange(self) -> None:
-        """Let the terms of the present time drive; displacement and velocity stay continuous."""
-        before = self._forced.as_free(self.time)
-        self._forced = self._current.plate.driven(self._motions, self.time)
-        self._free = self._free + before - self._forced.as_free(self.time)
-
-    def _propagate_free(self, to_time: float) -> None:
-        self._free = self._free * np.exp(self._current.plate.decay * (to_time - self.time))
-        self._free[np.abs(self._free) < _NEGLIGIBLE] = 0
-        self.time = to_time
+    def _end_stretch(self, end: float, *, includes_end: bool) -> _Stretch:
+        """Advance to the end of a stretch."""
+        self.time = end
+        return _Stretch(end, includes_end, self._free, self._forced, self._solution)

@@ -1,17 +1,20 @@
 """Accelerations of a vibrating plate on a grid of times, at points that stay for a while.
 
-A free vibration is a sum of exponentials, tabulated for a block of samples, so that a block is one
-product of matrices; a forced one is a sum of a few sinusoids.
+A free vibration is a sum of exponentials that decay, a forced one of a few that do not. All are
+tabulated for a block of samples, so that a block is one product of matrices.
 """
+
+from functools import lru_cache
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.transients.time_response import ForcedVibration
-from sim.plant.loaded_plates import BLOCK, LoadedPlate
+from sim.plant.loaded_plates import BLOCK, LoadedPlate, exponentials
 
-_FINE = 16  # samples
-_SMALL_PRODUCT = 1_000_000  # multiplications; below, OpenBLAS is half as fast again
+_NEGLIGIBLE = 1e-17  # of the strongest free vibration: a tenth of what rounding leaves of it
+_SMALLEST = 1e-60  # m/s²; what is subnormal is slow
+_TABLES_KEPT = 8  # sets of omegas
 
 
 class Sampler:
@@ -21,14 +24,20 @@ class Sampler:
         self.points = points
         self.sample_rate = sample_rate
         plate = loaded.plate
-        self._by_free = np.ascontiguousarray((points @ plate.free_acceleration).T)
+        at_points = points @ plate.free_acceleration
+        self._strengths = np.abs(at_points).max(axis=0, initial=0.0)
         self._by_forced = np.ascontiguousarray((points @ plate.displacement).T)
-        self._block = np.exp(plate.decay * (BLOCK / sample_rate))
-        self._free_columns = loaded.exponentials(sample_rate)
-        self._after = np.arange(BLOCK) / sample_rate  # the first sample [s]
-        self._columns = self._free_columns  # and behind them, cosines and sines
-        self._forced: ForcedVibration | None = None  # whose amplitudes at the points these are,
-        self._amplitudes = np.zeros((0, len(points)))  # (2 n, q), or (4 n, q) where some grow
+        # Of all exponentials, forced ones before the free ones, those that decay fastest last:
+        # conjugate exponents, conjugate amplitudes at the points, parts over time.
+        self._exponents = plate.decay.conj()
+        self._amplitudes = np.ascontiguousarray(at_points.conj().T)
+        self._columns = loaded.exponentials(sample_rate).view(float)
+        self._room = 0  # for forced ones
+        self._first = 0  # of those in use
+        self._forced: ForcedVibration | None = None
+        self._solution = -1  # which these are
+        self._constant = self._amplitudes[:0]  # conjugate amplitudes of all its solutions (n, q),
+        self._growth: ComplexArray | None = None  # and per second
 
     def sample(
         self,
@@ -37,63 +46,78 @@ class Sampler:
         *,
         free: ComplexArray,
         forced: ForcedVibration,
+        solution: int,
     ) -> None:
         """Write accelerations at times (n,) [s], evenly spaced, to out (n, q).
 
-        free (m,): amplitude of each free vibration at the first of them.
+        free (m,): amplitude of each free vibration at the time of the forced one, which is a
+        solution by its number.
         """
-        if forced is not self._forced:
-            self._use(forced)
-        is_free = bool(free.any())
-        count = self._free_columns.shape[1]
-        columns = self._columns[:, 0 if is_free else count : count + len(self._amplitudes)]
-        rows = max(1, _SMALL_PRODUCT // max(1, columns.shape[1] * out.shape[1]))
+        if forced is not self._forced or solution != self._solution:
+            self._use(forced, solution)
+        exponents, columns = self._exponents[self._first :], self._columns[:, 2 * self._first :]
+        count = self._room - self._first
         for start in range(0, len(times), BLOCK):
             into = out[start : start + BLOCK]
-            self._fill(float(times[start] - forced.time), len(into), forced)
-            amplitudes = self._amplitudes
-            if is_free:
-                modal = self._by_free * free[:, None]
-                amplitudes = np.concatenate([modal.real, modal.imag, amplitudes])
-                free = free * self._block
-            for first in range(0, len(into), rows):
-                part = into[first : first + rows]
-                np.matmul(columns[first : first + len(part)], amplitudes, out=part)
+            tau = float(times[start] - forced.times[solution])
+            now = np.exp(exponents * tau)
+            now[count:] *= free.conj()
+            kept = count + self._kept(now[count:])
+            amplitudes = self._amplitudes[self._first : self._first + kept] * now[:kept, None]
+            if self._growth is not None:
+                amplitudes[: count // 2] += tau * amplitudes[count // 2 : count]
+            parts = np.empty((kept, 2, len(self.points)))
+            parts[:, 0], parts[:, 1] = amplitudes.real, amplitudes.imag
+            rows = parts.reshape(2 * kept, len(self.points))
+            np.matmul(columns[: len(into), : 2 * kept], rows, out=into)
 
-    def _use(self, forced: ForcedVibration) -> None:
-        """Find the amplitudes of cosines and sines at the points, and those of their growth."""
+    def _kept(self, free: ComplexArray) -> int:
+        """How many free vibrations count."""
+        strengths = np.abs(free) * self._strengths
+        counts = strengths > max(_NEGLIGIBLE * strengths.max(), _SMALLEST)
+        last = counts.nonzero()[0][-1:]
+        return int(last[0]) + 1 if len(last) else 0
+
+    def _use(self, forced: ForcedVibration, solution: int) -> None:
+        """Put the exponentials of a solution before the free ones."""
+        if forced is not self._forced:
+            self._find_amplitudes(forced)
+        self._solution = solution
+        rows = forced.rows(solution)
+        table = _sinusoids(forced.omegas[rows].tobytes(), self.sample_rate)
+        exponents, amplitudes = -1j * forced.omegas[rows], self._constant[rows]
+        if self._growth is not None:
+            table = np.hstack([table, np.arange(BLOCK)[:, None] / self.sample_rate * table])
+            exponents = np.concatenate([exponents, exponents])
+            amplitudes = np.concatenate([amplitudes, self._growth[rows]])
+        if len(exponents) > self._room:
+            self._make_room(len(exponents))
+        self._first = self._room - len(exponents)
+        self._exponents[self._first : self._room] = exponents
+        self._amplitudes[self._first : self._room] = amplitudes
+        self._columns[:, 2 * self._first : 2 * self._room] = table.view(float)
+
+    def _find_amplitudes(self, forced: ForcedVibration) -> None:
+        """Find the amplitudes of all solutions at the points, all at once."""
         self._forced = forced
-        s = 1j * forced.omegas[:, None]
+        s, self._growth = 1j * forced.omegas[:, None], None
         constant = s**2 * forced.a0
         if forced.a1 is not None:
-            constant = np.concatenate([constant + 2 * s * forced.a1, s**2 * forced.a1])
-        at_points = constant @ self._by_forced
-        count = len(forced.omegas)
-        self._amplitudes = np.concatenate(
-            [
-                part
-                for each in (at_points[:count], at_points[count:])
-                for part in (each.imag, each.real)
-            ]
-        )
-        free = self._free_columns.shape[1]
-        if self._columns.shape[1] < free + len(self._amplitudes):
-            self._columns = np.empty((BLOCK, free + len(self._amplitudes)))
-            self._columns[:, :free] = self._free_columns
+            constant += 2 * s * forced.a1
+            # Im[a exp(s t)] is Re[-i a exp(s t)].
+            self._growth = np.asarray(1j * ((s**2 * forced.a1) @ self._by_forced).conj())
+        self._constant = np.asarray(1j * (constant @ self._by_forced).conj())
 
-    def _fill(self, tau: float, count: int, forced: ForcedVibration) -> None:
-        """Write cosines and sines for so many samples from a time tau [s] on, behind the others."""
-        omegas, free = forced.omegas, self._free_columns.shape[1]
-        if not len(omegas):
-            return
-        # Multiples of a few samples, times those few: products cost less than cosines.
-        s = 1j * omegas
-        coarse = np.exp((self._after[: count + _FINE - 1 : _FINE, None] + tau) * s)
-        fine = np.exp(self._after[:_FINE, None] * s)
-        phase_factor = (coarse[:, None] * fine).reshape(-1, len(omegas))[:count]
-        columns = self._columns[:count, free : free + len(self._amplitudes)]
-        both = columns[:, : 2 * len(omegas)]
-        both[:, : len(omegas)], both[:, len(omegas) :] = phase_factor.real, phase_factor.imag
-        if forced.a1 is not None:
-            each = tau + self._after[:count, None]
-            np.multiply(both, each, out=columns[:, 2 * len(omegas) :])
+    def _make_room(self, count: int) -> None:
+        """Make room for so many forced exponentials."""
+        more = count - self._room
+        self._exponents = np.pad(self._exponents, (more, 0))
+        self._amplitudes = np.pad(self._amplitudes, ((more, 0), (0, 0)))
+        self._columns = np.pad(self._columns, ((0, 0), (2 * more, 0)))
+        self._room = count
+
+
+@lru_cache(_TABLES_KEPT)
+def _sinusoids(omegas: bytes, sample_rate: float) -> ComplexArray:
+    """exp(i omega k / sample_rate) for k up to a block, (BLOCK, n)."""
+    return exponentials(np.asarray(1j * np.frombuffer(omegas), dtype=complex), sample_rate)

@@ -25,11 +25,11 @@ def test_fade_follows_a_raised_cosine() -> None:
 def test_base_motion_matches_the_faded_tone() -> None:
     """The exponentials add up to stroke x level x gain(t) x sin(2 pi f (t - origin) + phase)."""
     tone = FadingTone(110.0, cmath.rect(0.5, 0.7), 0.95, 1.0, 0.02, 0.3, 1.0)
-    terms = tone.terms(stroke=1e-4)
+    motion = tone.motion(stroke=1e-4)
     for t in [1.0, 1.003, 1.0125, 1.0199, 1.02, 1.5]:
         gain = 1.0 if t >= 1.02 else 0.3 + 0.7 * (1 - math.cos(math.pi * (t - 1.0) / 0.02)) / 2
         expected = 0.5e-4 * gain * math.sin(2 * math.pi * 110 * (t - 0.95) + 0.7)
-        assert motion_of(terms, np.array([t]))[0] == pytest.approx(expected, abs=1e-13)
+        assert motion_of(motion, np.array([t]))[0] == pytest.approx(expected, abs=1e-13)
 
 
 def test_fade_with_zero_ramp_is_a_step() -> None:
@@ -43,8 +43,8 @@ def test_fade_phase_with_and_without_keep_phase() -> None:
     """Only keep_phase at the same frequency leaves the phase running through a change of level."""
 
     def motion(playing: Output, t: float) -> float:
-        terms = [term for tone in playing for term in tone.terms(stroke=1.0)]
-        return float(motion_of(terms, np.array([t]))[0])
+        parts = [part for tone in playing for part in tone.motion(stroke=1.0)]
+        return float(motion_of(parts, np.array([t]))[0])
 
     first = fade_to((), 0.0, ramp=0.0, frequency=110.0, amplitude=1.0)
     kept = fade_to(first, 1.0023, ramp=0.01, frequency=110.0, amplitude=0.5, keep_phase=True)
@@ -102,6 +102,6 @@ def test_envelope_that_is_stopped_does_not_rise(ramp: float) -> None:
 def test_pieces_of_a_shaped_tone_join(start: float) -> None:
     """One piece plays at any moment: there is no gap by rounding that a sample could fall into."""
     tone = ShapedTone(80.0, start, start, 0.005, tuple(0.01j * n for n in range(20)))
-    terms = tone.terms(stroke=1e-4)
+    terms = tone.motion(stroke=1e-4)
     assert [one.end for one in terms[:-1]] == [one.start for one in terms[1:]]
     assert (terms[0].start, terms[-1].end) == (start, math.inf)

@@ -2,13 +2,13 @@
 
 import cmath
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from model.arrays import FloatArray
-from model.transients.base_motion import Term, fade
+from model.transients.base_motion import Fade, Motion, Term, terms_of
 from sim.waveform import ShapedTone
 
 
@@ -20,10 +20,10 @@ class Base:
     terms: tuple[Term, ...]
 
 
-def motion_of(terms: Iterable[Term], times: FloatArray) -> FloatArray:
+def motion_of(motion: Motion, times: FloatArray) -> FloatArray:
     """Displacement [m] at times (n,) [s] by the definition of a term."""
     y = np.zeros(len(times))
-    for term in terms:
+    for term in terms_of(motion):
         tau = times - term.start
         value = (term.c0 + term.c1 * tau) * np.exp(1j * term.omega * tau)
         y += np.where((times >= term.start) & (times < term.end), value.imag, 0.0)
@@ -70,9 +70,9 @@ def faded_base(
     def at(time: float) -> complex:
         return cmath.rect(amplitude, omega * time + phase)
 
-    up = fade(at(rise[0]), omega=omega, start=rise[0], ramp=rise[1] - rise[0], gains=(0, 1))
+    up = Fade(rise[0], rise[1] - rise[0], omega, at(rise[0]), 0, 1).terms()
     up = (*up[:-1], up[-1]._replace(end=fall[0]))
-    down = fade(at(fall[0]), omega=omega, start=fall[0], ramp=fall[1] - fall[0], gains=(1, 0))
+    down = Fade(fall[0], fall[1] - fall[0], omega, at(fall[0]), 1, 0).terms()
     return Base(motion, (*up, *down))
 
 
@@ -96,7 +96,7 @@ def shaped_base(
         return (value * turn).imag, ((slope + 1j * omega * value) * turn).imag
 
     tone = ShapedTone(frequency, 0.0, start, step, knots)
-    return Base(motion, tone.terms(stroke=amplitude))
+    return Base(motion, tone.motion(stroke=amplitude))
 
 
 STROKE = 1e-4  # m

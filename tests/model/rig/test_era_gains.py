@@ -73,7 +73,9 @@ def test_particular_solution_is_the_same_for_negative_frequency(
     reduced = reduce_plate(coarse_rig.plate, coarse_rig.mesh, footprints_of(coarse_rig.eras))
     plate, omega, c = plate_in_time(reduced, uneven.eras), 2 * math.pi * 150.0, 6e-5 + 3e-5j
     tones = Term(0.0, math.inf, omega, c), Term(0.0, math.inf, -omega, -c.conjugate())
-    expected, back = (plate.driven(BaseMotions([(), (tone,)]), 0.0).state(0.0123) for tone in tones)
+    expected, back = (
+        plate.driven(BaseMotions([(), (tone,)]), [0], [0.0]).state(0, 0.0123) for tone in tones
+    )
     np.testing.assert_allclose(back, expected, atol=1e-9 * np.abs(expected).max())
 
 

@@ -71,11 +71,11 @@ def test_envelope_moves_the_base_as_modelled() -> None:
     """The plant's terms are those of the model's own envelope with the destination as last knot."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 0.8, onset=1)), 0.25)  # 27.5 periods: a phase of its own
-    terms = [term for tone in amplifier.outputs[0] for term in tone.terms(stroke=STROKE)]
+    played = [part for tone in amplifier.outputs[0] for part in tone.motion(stroke=STROKE)]
     knots = tuple(STROKE * value for value in (0.2j, 0.4 + 0j, 0.8 + 0j))
     model = list(BaseEnvelope(110.0, 0j, knots, step=0.005).terms())
     times = np.linspace(0.0, 0.03, 500)
-    assert motion_of(terms, times + 0.25) == pytest.approx(motion_of(model, times), abs=1e-12)
+    assert motion_of(played, times + 0.25) == pytest.approx(motion_of(model, times), abs=1e-12)
 
 
 def test_ending_plays_before_a_silent_set() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
-from model.arrays import ComplexArray
+from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.reduction.modal_matrices import modal_matrices
@@ -146,6 +146,19 @@ def knotted(knots: list[tuple[float, float]]) -> list[Term]:
     ]
 
 
+def linear_acceleration(
+    small: ReducedPlate, bases: FloatArray, times: FloatArray, points: FloatArray
+) -> FloatArray:
+    """Accelerations (n, p) by lsim for bases (n, 2) of two ERAs on springs, on straight lines."""
+    M, C, K = modal_matrices(small, eras(damping=0.0))
+    inverse, r = np.linalg.inv(M), len(M)
+    by_base = inverse @ (small.at(np.array(CORNERS)) * 17000.0).T[:, [0, 2]]
+    A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
+    B = np.vstack([np.zeros((r, 2)), by_base])
+    _, expected, _ = lsim((A, B, points @ A[r:], points @ by_base), bases, times)
+    return np.asarray(expected)
+
+
 def test_plant_scheduled_inputs_agree_with_a_linear_system() -> None:
     """Set ahead and advanced at once, or set in time and advanced sample by sample: as lsim has it.
 
@@ -176,12 +189,6 @@ def test_plant_scheduled_inputs_agree_with_a_linear_system() -> None:
         if moment == turns:
             in_time.set_input(0, then)
 
-    M, C, K = modal_matrices(small, on_springs)
-    inverse, r = np.linalg.inv(M), len(M)
-    by_base = inverse @ (small.at(np.array(CORNERS)) * 17000.0).T[:, [0, 2]]
-    A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
-    B = np.vstack([np.zeros((r, 2)), by_base])
-    C_points, D_points = points @ A[r:], points @ by_base
     grid = np.concatenate([[0.0], times])
     bases = STROKE * np.column_stack(
         [
@@ -189,10 +196,41 @@ def test_plant_scheduled_inputs_agree_with_a_linear_system() -> None:
             np.interp(grid, [0.005, 0.0105, 0.03], [0.0, 1.0, 0.0]),
         ]
     )
-    _, expected, _ = lsim((A, B, C_points, D_points), bases, grid)
+    expected = linear_acceleration(small, bases, grid, points)
     peak = np.abs(expected).max()
     np.testing.assert_allclose(at_once, expected[1:], atol=1e-9 * peak)
     np.testing.assert_allclose(np.concatenate(pieces), expected[1:], atol=1e-9 * peak)
+
+
+def test_plant_with_many_changes_agrees_with_a_linear_system() -> None:
+    """Thirty knots, half of them set ahead one by one, then free vibration that dies away."""
+    small = reduce_plate(
+        PLATE, Mesh(8, 6, PLATE.length, PLATE.width), np.array(CORNERS), frequency_max=100.0
+    )
+    rate, end = 2000.0, 0.6
+    heights = np.random.default_rng(5).uniform(-STROKE, STROKE, (2, 14))
+    knots = [
+        [(0.0, 0.0), *zip(np.linspace(*span, 14).tolist(), row.tolist(), strict=True)]
+        for span, row in zip([(0.005, 0.07), (0.0025, 0.0675)], heights, strict=True)
+    ]
+    for era in (0, 1):
+        knots[era].append((0.08, 0.0))
+    points = small.at(MESH.nodes[::7])
+    plant = Plant(small, eras(damping=0.0))
+    for since, until in pairwise(knots[0]):
+        (line,) = knotted([since, until])  # goes on until the next one is set
+        lasting = line if until[0] == 0.08 else line._replace(end=1.0)
+        plant.set_input(0, [lasting], since=since[0])
+    plant.set_input(2, knotted(knots[1]))
+    times, felt = plant.advance(end, sample_rate=rate, shapes=points)
+    grid = np.concatenate([[0.0], times])
+    bases = np.column_stack([np.interp(grid, *np.transpose(each)) for each in knots])
+    expected = linear_acceleration(small, bases, grid, points)
+    np.testing.assert_allclose(felt, expected[1:], atol=1e-9 * np.abs(expected).max())
+    late = times > 0.4
+    np.testing.assert_allclose(
+        felt[late], expected[1:][late], atol=1e-6 * np.abs(expected[1:][late]).max()
+    )
 
 
 def test_plant_structural_damping_is_passive(reduced: ReducedPlate) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model.arrays import FloatArray
-from model.transients.base_motion import Term
+from model.transients.base_motion import Term, terms_of
 from registry.voltage import Law, VoltageDrive
 from sim.plant.voltage import moved_by_voltage
 from sim.waveform import FadingTone, ShapedTone
@@ -28,10 +28,9 @@ def sampled(terms: list[Term]) -> FloatArray:
 @pytest.mark.parametrize("bias", [0.0, 0.3])
 def test_square_of_a_cross_fade_is_that_of_its_samples(bias: float) -> None:
     """All sums and differences, while one tone fades out and another in; within 1e-12."""
-    voltage = [
-        *FadingTone(55.0, 0.5 + 0.1j, 0.01, 0.01, 0.03, 1.0, 0.0).terms(stroke=1.0),
-        *FadingTone(90.0, 0.4j, 0.01, 0.01, 0.03, 0.0, 1.0).terms(stroke=1.0),
-    ]
+    fading = FadingTone(55.0, 0.5 + 0.1j, 0.01, 0.01, 0.03, 1.0, 0.0)
+    rising = FadingTone(90.0, 0.4j, 0.01, 0.01, 0.03, 0.0, 1.0)
+    voltage = terms_of([*fading.motion(stroke=1.0), *rising.motion(stroke=1.0)])
     drive = VoltageDrive(FLAT, law=Law.QUADRATIC, bias=bias)
     expected = (bias + sampled(voltage)) ** 2 - bias**2
     found = sampled(moved_by_voltage(voltage, drive, stroke=1e-4))
@@ -40,7 +39,7 @@ def test_square_of_a_cross_fade_is_that_of_its_samples(bias: float) -> None:
 
 def test_square_of_a_linear_transition() -> None:
     """In parts that are linear each: within 1/256 of the square of its change."""
-    voltage = list(ShapedTone(55.0, 0.0, 0.0, 0.05, (0.5 + 0j, 0.1 + 0j)).terms(stroke=1.0))
+    voltage = list(ShapedTone(55.0, 0.0, 0.0, 0.05, (0.5 + 0j, 0.1 + 0j)).motion(stroke=1.0))
     drive = VoltageDrive(FLAT, law=Law.QUADRATIC)
     found = sampled(moved_by_voltage(voltage, drive, stroke=1.0))
     np.testing.assert_allclose(found, sampled(voltage) ** 2, atol=0.4**2 / 4 / 64 * 1.001)

@@ -1,0 +1,76 @@
+"""Motions of bases in terms, by hand calculation."""
+
+import cmath
+import math
+
+import numpy as np
+import pytest
+
+from model.transients.base_motion import BaseMotions, Fade, Motion, Term
+
+OMEGA = 2 * math.pi * 110.0
+FADES = [
+    Fade(1.0, 0.02, OMEGA, 1e-4 * cmath.exp(0.7j), 0.0, 1.0),
+    Fade(1.005, 0.01, 2 * OMEGA, 2e-4j, 0.8, 0.3),
+    Fade(1.01, 0.03, OMEGA, 5e-5 + 0j, 1.0, 0.0),
+    Fade(1.015, 0.0, OMEGA / 2, 1e-4 + 0j, 0.0, 0.6),
+]
+
+
+def moved(motions: BaseMotions, number: int, era: int, time: float) -> float:
+    """Displacement [m] of a base at a time [s] by the definition of a term."""
+    (of_set,) = motions.active([number], [time])
+    tau = time - motions.start
+    value = motions.c0 + (0j if motions.c1 is None else motions.c1) * tau
+    y = (value * np.exp(1j * motions.omega * tau)).imag
+    return float(y[of_set & (motions.era == era)].sum())
+
+
+def faded(fade: Fade, time: float) -> float:
+    """Displacement [m] along a raised cosine."""
+    tau = time - fade.start
+    if tau < 0:
+        return 0.0
+    share = 1.0 if tau >= fade.ramp else (1 - math.cos(math.pi * tau / fade.ramp)) / 2
+    gain = fade.gain_from + (fade.gain_to - fade.gain_from) * share
+    return gain * (fade.amplitude * cmath.exp(1j * fade.omega * tau)).imag
+
+
+@pytest.mark.parametrize("time", [0.99, 1.0, 1.0031, 1.0142, 1.015, 1.0199, 1.03, 1.2])
+def test_terms_of_fades_add_up_to_raised_cosines(time: float) -> None:
+    """Of two sets of motions each base has its own, at every moment of a fade and after it."""
+    rest: Motion = ()
+    motions = BaseMotions([FADES[:1], FADES[1:3]], [rest, FADES[3:]])
+    for number, era, fades in (
+        (0, 0, FADES[:1]),
+        (0, 1, FADES[1:3]),
+        (1, 0, []),
+        (1, 1, FADES[3:]),
+    ):
+        expected = sum(faded(fade, time) for fade in fades)
+        assert moved(motions, number, era, time) == pytest.approx(expected, abs=1e-17)
+
+
+def test_terms_stand_beside_fades() -> None:
+    """A base that moves by both moves as their sum, a linear term with its slope."""
+    term = Term(1.0, 1.1, OMEGA, 1e-4 + 0j, 3e-3j)
+    motions = BaseMotions([[FADES[0], term]])
+    for time in (1.004, 1.05, 1.2):
+        tau = time - 1.0
+        linear = ((1e-4 + 3e-3j * tau) * cmath.exp(1j * OMEGA * tau)).imag if tau < 0.1 else 0.0
+        expected = linear + faded(FADES[0], time)
+        assert moved(motions, 0, 0, time) == pytest.approx(expected, abs=1e-17)
+
+
+def test_moments_are_those_of_one_set() -> None:
+    """Starts and ends of its terms within a window, whose begin is left out."""
+    motions = BaseMotions([FADES[:1]], [FADES[1:2]])
+    assert motions.moments(0, 0.0, 2.0) == [1.0, 1.02]
+    assert motions.moments(1, 1.005, 2.0) == [pytest.approx(1.015)]
+
+
+def test_terms_that_have_ended_are_left_out() -> None:
+    """A fade to silence is forgotten once it is silent, a lasting tone is not."""
+    motions = BaseMotions([[FADES[0], FADES[2]]], since=1.05)
+    assert motions.omega.tolist() == [OMEGA]
+    assert motions.end.tolist() == [math.inf]

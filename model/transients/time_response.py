@@ -111,7 +111,7 @@ class PlateInTime:
         there, so that its samples cost what its frequencies do.
         """
         moments = np.array(times, dtype=float)
-        number, active = np.nonzero(motions.active(numbers, moments))
+        number, active = motions.active(numbers, moments).nonzero()
         era, each = motions.era[active], motions.omega[active]
         tau, s = moments[number] - motions.start[active], 1j * each
         phase_factor = np.exp(s * tau)
@@ -121,7 +121,7 @@ class PlateInTime:
         is_first[1:] = (each[1:] != each[:-1]) | (number[1:] != number[:-1])
         omegas = each[is_first]
         # By frequency and ERA, of which it is the force on the base.
-        cell = (np.cumsum(is_first) - 1) * len(self.eras) + era
+        cell = (is_first.cumsum() - 1) * len(self.eras) + era
         receptance = 1 / (1j * omegas[:, None] - self.eigenvalues)
         y, a1 = phase_factor * motions.c0[active], None
         if motions.c1 is None:
@@ -142,10 +142,13 @@ class PlateInTime:
         summed = np.empty(shape, dtype=complex)
         summed.real = np.bincount(cell, forces.real, size).reshape(shape)
         summed.imag = np.bincount(cell, forces.imag, size).reshape(shape)
-        for number, era in enumerate(self.eras):
-            if era.gains:
-                summed[:, number] *= era.gain(omegas / (2 * np.pi))
+        for number in self._gained:
+            summed[:, number] *= self.eras[number].gain(omegas / (2 * np.pi))
         return np.asarray(summed @ self.participation.T)
+
+    @cached_property
+    def _gained(self) -> list[int]:
+        return [number for number, era in enumerate(self.eras) if era.gains]
 
     @cached_property
     def _springs(self) -> FloatArray:

@@ -183,9 +183,9 @@ class SimulatedAmplifier:
     @property
     def next_event(self) -> float:
         """Time of the next event [s], up to which `outputs` holds."""
-        if self.state in ENABLED:
-            return min(self._vibration_end, self._watchdog_end, self._overtemperature_from)
-        return min(self._vibration_end, self._silence_reached)
+        if self.state not in ENABLED:
+            return min(self._vibration_end, self._silence_reached)
+        return min(self._vibration_end, self._watchdog_end, self._overtemperature_from)
 
     @property
     def is_derated(self) -> bool:

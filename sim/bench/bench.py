@@ -109,6 +109,7 @@ class Bench:
             name: deque() for name in rig.amplifiers
         }
         self._applied_outputs: list[Output] = [()] * len(rig.eras)  # by ERA
+        self._drives = [rig.voltage.get(era.name) for era in rig.eras]
         self._errors = [imperfections.errors_of(era.name, rig) for era in rig.eras]
         self._noise = [draw_noise(seed=imperfections.seed, number=n) for n in range(len(rig.eras))]
         self._shapes_at = lru_cache(_MAX_SHAPES)(
@@ -275,7 +276,10 @@ class Bench:
             return
         shapes = [layout.shapes, *(probe.shapes for probe in probes)]
         times, accelerations = self._plant.advance(
-            self._time, sample_rate=self.sample_rate, shapes=np.concatenate(shapes)
+            self._time,
+            sample_rate=self.sample_rate,
+            shapes=np.concatenate(shapes),
+            precision=np.float64 if probes else np.float32,  # of what is kept of fingers
         )
         parts = np.split(accelerations, np.cumsum([len(each) for each in shapes])[:-1], axis=1)
         self._fingers.record(times, parts[0])
@@ -308,8 +312,7 @@ class Bench:
 
     def _motion(self, index: int, playing: Output) -> Motion:
         """The base motion of an ERA by the output of its channel, imperfections included."""
-        era = self.rig.eras[index]
-        drive = self.rig.voltage.get(era.name)
+        era, drive = self.rig.eras[index], self._drives[index]
         stroke = era.stroke if drive is None else 1.0
         motion: Motion = [part for tone in playing for part in tone.motion(stroke=stroke)]
         if drive is not None:
@@ -345,7 +348,7 @@ class Bench:
 
     def _moved_at(self, index: int, frequency: float) -> tuple[float, ...]:
         """The frequencies [Hz] at which a tone of a channel moves its ERA."""
-        drive = self.rig.voltage.get(self.rig.eras[index].name)
+        drive = self._drives[index]
         if drive is None or drive.law is Law.LINEAR:
             return (frequency,)
         return (2 * frequency,) if drive.is_halved else (frequency, 2 * frequency)

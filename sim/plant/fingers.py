@@ -99,7 +99,7 @@ class Fingers:
         if not len(times):
             return
         if accelerations.shape[1]:
-            self._pieces.append((self.layout, times, accelerations.astype(np.float32)))
+            self._pieces.append((self.layout, times, accelerations.astype(np.float32, copy=False)))
         while self._pieces and self._pieces[0][1][-1] < times[-1] - KEPT:
             self._pieces.popleft()
 

@@ -18,11 +18,22 @@ _TABLES_KEPT = 8  # sets of omegas
 
 
 class Sampler:
-    """Samples a loaded plate at points of these shapes (q, r), phalanges included."""
+    """Samples a loaded plate at points of these shapes (q, r), phalanges included.
 
-    def __init__(self, loaded: LoadedPlate, points: FloatArray, *, sample_rate: float) -> None:
+    precision: of the sums, double or single; everything before them is double.
+    """
+
+    def __init__(
+        self,
+        loaded: LoadedPlate,
+        points: FloatArray,
+        *,
+        sample_rate: float,
+        precision: type[np.floating] = np.float64,
+    ) -> None:
         self.points = points
         self.sample_rate = sample_rate
+        self.precision = precision
         plate = loaded.plate
         at_points = points @ plate.free_acceleration
         self._strengths = np.abs(at_points).max(axis=0, initial=0.0)
@@ -31,7 +42,7 @@ class Sampler:
         # conjugate exponents, conjugate amplitudes at the points, parts over time.
         self._exponents = plate.decay.conj()
         self._amplitudes = np.ascontiguousarray(at_points.conj().T)
-        self._columns = loaded.exponentials(sample_rate).view(float)
+        self._columns = loaded.exponentials(sample_rate).view(float).astype(precision)
         self._room = 0  # for forced ones
         self._first = 0  # of those in use
         self._forced: ForcedVibration | None = None
@@ -66,7 +77,7 @@ class Sampler:
             amplitudes = self._amplitudes[self._first : self._first + kept] * now[:kept, None]
             if self._growth is not None:
                 amplitudes[: count // 2] += tau * amplitudes[count // 2 : count]
-            parts = np.empty((kept, 2, len(self.points)))
+            parts = np.empty((kept, 2, len(self.points)), dtype=self.precision)
             parts[:, 0], parts[:, 1] = amplitudes.real, amplitudes.imag
             rows = parts.reshape(2 * kept, len(self.points))
             np.matmul(columns[: len(into), : 2 * kept], rows, out=into)

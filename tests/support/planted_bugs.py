@@ -476,7 +476,7 @@ def _plays_each(change: Callable[[DriveCommand], DriveCommand]) -> Plant:
 def _on_first_channel(act: Any, channels: Channels, *args: Any, **kwargs: Any) -> None:
     others = channels.outputs[1:]
     act(channels, *args, **kwargs)
-    channels._outputs[1:] = others
+    channels._outputs = (*channels.outputs[:1], *others)
 
 
 def _plays_on(carry_out: Any, amplifier: Any, request: Any, *args: Any) -> Any:

@@ -69,7 +69,7 @@ def _unturned(one: DriveCommand) -> DriveCommand:
 
 def _keeps_any_frequency(shape_to: Any, playing: Any, time: float, **how: Any) -> Any:
     if how["keep_phase"] and playing:
-        playing = (*playing[:-1], replace(playing[-1], frequency=how["frequency"]))
+        playing = (*playing[:-1], playing[-1]._replace(frequency=how["frequency"]))
     return shape_to(playing, time, **how)
 
 

@@ -285,11 +285,11 @@ def _linear(tone: FadingTone, time: float) -> float:
 
 
 def _extends(fade_out: Any, tone: Any, time: float, *, ramp: float) -> Any:
-    return replace(tone, start=time, ramp=ramp, gain_from=tone.gain(time), gain_to=0.0)
+    return tone._replace(start=time, ramp=ramp, gain_from=tone.gain(time), gain_to=0.0)
 
 
 def _prolongs(fade_out: Any, tone: Any, time: float, *, ramp: float) -> Any:
-    return replace(fade_out(tone, time, ramp=ramp), ramp=ramp)
+    return fade_out(tone, time, ramp=ramp)._replace(ramp=ramp)
 
 
 def _never_shortens(fade_out: Any, tone: Any, time: float, *, ramp: float) -> Any:
@@ -297,7 +297,7 @@ def _never_shortens(fade_out: Any, tone: Any, time: float, *, ramp: float) -> An
 
 
 def _jumps(fade_out: Any, tone: Any, time: float, *, ramp: float) -> Any:
-    return replace(fade_out(tone, time, ramp=ramp), gain_from=1.0)
+    return fade_out(tone, time, ramp=ramp)._replace(gain_from=1.0)
 
 
 def _trips_when_polled(handle: Any, amplifier: Any, request: Any, now: float) -> Any:
@@ -307,20 +307,20 @@ def _trips_when_polled(handle: Any, amplifier: Any, request: Any, now: float) ->
 
 
 def _keeps_unnamed(play: Any, channels: Any, playable: Any, time: float) -> None:
-    kept = list(channels._outputs)
+    kept = channels._outputs
     play(channels, playable, time)
     named = {command.channel for command in playable.commands}
     if named:
-        channels._outputs = [
+        channels._outputs = tuple(
             output if number in named else kept[number]
             for number, output in enumerate(channels._outputs)
-        ]
+        )
 
 
 def _first_channel_only(silence: Any, channels: Any, time: float, *, ramp: float) -> None:
     kept = channels._outputs[1:]
     silence(channels, time, ramp=ramp)
-    channels._outputs[1:] = kept
+    channels._outputs = (*channels._outputs[:1], *kept)
 
 
 def _leaves_fades(silence: Any, channels: Any, time: float, *, ramp: float) -> None:

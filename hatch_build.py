@@ -24,18 +24,17 @@ class EngineHook(BuildHookInterface):  # type: ignore[type-arg]
             return
         sys.path.insert(0, self.root)
         try:
-            from model.compiled.kernels import KERNELS, compile_kernels
+            from model.compiled.kernels import compile_kernels
             from sim.soft_amp.library import ENGINE, compile_engine
         finally:
             sys.path.pop(0)
         self._folder = tempfile.TemporaryDirectory(prefix="era-engine-")
-        for where, name, compiled in (
-            ("sim/soft_amp", ENGINE, compile_engine),
-            ("model/compiled", KERNELS, compile_kernels),
-        ):
-            made = Path(self._folder.name) / name
-            compiled(made)
-            build_data["force_include"][str(made)] = f"{where}/{name}"
+        folder = Path(self._folder.name)
+        compile_engine(folder / ENGINE)
+        made = {"sim/soft_amp": [folder / ENGINE], "model/compiled": compile_kernels(folder)}
+        for where, paths in made.items():
+            for path in paths:
+                build_data["force_include"][str(path)] = f"{where}/{path.name}"
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-{next(platform_tags())}"
 

@@ -63,7 +63,6 @@ INLINE void invert(value *restrict K, const value *A, const value *Z, size_t a) 
     }
 }
 
-VERSIONS
 void contact_forms(const contacts *on, int first, int count, value *work) {
     const size_t n = on->n, b = on->b, k = on->k, p = on->p, r = on->r, a = b + k;
     const size_t every = a + k * p, at = k * p, others = on->deviating, j = n + k;

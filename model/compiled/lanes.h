@@ -1,4 +1,5 @@
-/* Arithmetic of LANES frequencies, or of other cases, at once.
+/* Arithmetic of LANES frequencies, or of other cases, at once: as many as fill a register, by the
+ * compiler's flags.
  *
  * A complex value is the real parts at all lanes and then the imaginary parts, and a matrix is one of
  * such values. Vector types are those of GCC and Clang, on any processor. Arrays of numpy hold one
@@ -11,17 +12,10 @@
 #include <stddef.h>
 #include <string.h>
 
-#define LANES 16
 #define INLINE static inline __attribute__((always_inline))
 
-#if defined(__x86_64__) && defined(__linux__) && !defined(__clang__)
-#define VERSIONS __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
-#else
-#define VERSIONS
-#endif
-
-/* Called, not inlined, in each version. */
-#define SHARED VERSIONS __attribute__((unused, noinline)) static
+/* Called, not inlined at every place. */
+#define SHARED static __attribute__((unused, noinline))
 
 typedef float lanes __attribute__((vector_size(LANES * sizeof(float))));
 

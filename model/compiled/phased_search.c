@@ -64,7 +64,7 @@ SHARED void quiet_power(lanes *restrict found, const block *on, const value *w) 
 }
 
 /* Amplitude at the target, and what is left of it less the margin. */
-INLINE lanes amplitude(lanes *least, const block *on, const value *w) {
+SHARED lanes amplitude(lanes *least, const block *on, const value *w) {
     lanes size = power(field(on->target, w, on->n)), found = root(size);
     *least = found;
     if (on->margin != 0)
@@ -80,7 +80,6 @@ INLINE lanes loudest_of(const lanes *power, size_t count) {
 
 /* At rows (count): the best weights (count, n) that reach the level and their score, the best score
  * of those that miss it, and the bound; of as many weights as steps. */
-VERSIONS
 void phased_search(const forms *from, const method *by, const int *at, int count, value *work,
                    float *weights, float *scores, float *missed, float *bounds) {
     const size_t n = from->n, q = from->q, few = from->few, fine = from->fine;

@@ -21,7 +21,6 @@ size_t preselection_space(const plate *on, int k, int p) {
 }
 
 /* points (k, p, r), weights (k, p), stiffness (f, k) of the fingers; score and amplitude (f). */
-VERSIONS
 void preselection_scores(const plate *on, int first, int some, int fingers, int each, const float *points,
                          const float *weights, const float *stiffness, value *work, float *score,
                          float *amplitude) {

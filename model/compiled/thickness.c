@@ -14,7 +14,6 @@ size_t thickness_space(const tones *on) {
 }
 
 /* found (c, points): accelerations at the points in cases from first on. */
-VERSIONS
 void thickness_responses(const tones *on, int first, int count, value *work, float *found) {
     const size_t a = on->a, r = on->r;
     int rows[LANES];

@@ -21,17 +21,17 @@ class Phased(Coherent):
 
     def search(self, forms: Forms, min_score: float) -> CoherentResult:
         """Find the best weights at each frequency that can have the best score of all."""
-        library = kernels()
-        if library is None or len(forms.targets) > 1:
+        by = kernels()
+        if by is None or len(forms.targets) > 1:
             return super().search(forms, min_score)
-        return phased_kernel.search(library, forms, min_score)
+        return phased_kernel.search(by, forms, min_score)
 
     def search_all(self, forms: Forms) -> CoherentResult:
         """Find the best weights at every frequency, none pruned and none raised to the level."""
-        library = kernels()
-        if library is None or len(forms.targets) > 1:
+        by = kernels()
+        if by is None or len(forms.targets) > 1:
             return super().search_all(forms)
-        return phased_kernel.search_all(library, forms)
+        return phased_kernel.search_all(by, forms)
 
 
 def solve_phased(

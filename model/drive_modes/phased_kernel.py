@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, Float32Array, IntArray
+from model.compiled.kernels import Kernels
 from model.compiled.lanes import work_space
 from model.drive_modes.coherent import (
     LAWSON_STEPS,
@@ -47,9 +48,9 @@ _WITHIN_STROKE = (
 )
 
 
-def search(library: ctypes.CDLL, forms: Forms, min_score: float) -> CoherentResult:
+def search(kernels: Kernels, forms: Forms, min_score: float) -> CoherentResult:
     """As `Coherent.search`, none pruned."""
-    kernel = _Kernel(library, forms)
+    kernel = _Kernel(kernels, forms)
     found = kernel.tried(np.arange(forms.frequency_count), _steps(forms))
     score, missed = found.score, found.missed
     best = max(min_score, float(score.max()))
@@ -65,9 +66,9 @@ def search(library: ctypes.CDLL, forms: Forms, min_score: float) -> CoherentResu
     return CoherentResult(score, found.weights, found.bound, len(open_) > 0)
 
 
-def search_all(library: ctypes.CDLL, forms: Forms) -> CoherentResult:
+def search_all(kernels: Kernels, forms: Forms) -> CoherentResult:
     """As `Coherent.search_all`."""
-    found = _Kernel(library, forms).tried(np.arange(forms.frequency_count), _steps(forms))
+    found = _Kernel(kernels, forms).tried(np.arange(forms.frequency_count), _steps(forms))
     open_ = _level_limited(found.score, found.missed, float(found.score.max()))
     return CoherentResult(found.score, found.weights, found.bound, len(open_) > 0)
 
@@ -97,7 +98,7 @@ class _Tried:
 class _Kernel:
     """The kernel for forms of one target."""
 
-    def __init__(self, library: ctypes.CDLL, forms: Forms) -> None:
+    def __init__(self, kernels: Kernels, forms: Forms) -> None:
         fields = () if forms.few is None or forms.fine is None else (forms.few, forms.fine)
         given = (forms.targets[0], forms.target_power[0], forms.quiet, forms.threshold, *fields)
         # Kept, since the kernel reads them.
@@ -108,9 +109,10 @@ class _Kernel:
         self._forms = ctypes.byref(
             _Forms(n, q, *points, forms.wanted, forms.level_margin, *pointers)
         )
+        library = kernels.library
         library.phased_search_space.restype = c_size_t
         self._space = library.phased_search_space(self._forms)
-        self._library, self._eras = library, n
+        self._kernels, self._eras = kernels, n
 
     def tried(self, rows: IntArray, method: _Method) -> _Tried:
         """What a method finds at frequencies, by index (n,)."""
@@ -118,9 +120,9 @@ class _Kernel:
         weights = np.empty((count, self._eras), dtype=np.complex64)
         measures = np.empty((3, count), dtype=np.float32)
         at = np.ascontiguousarray(rows, dtype=np.int32)
-        self._library.phased_search(
+        self._kernels.library.phased_search(
             *(self._forms, ctypes.byref(method)),
-            *(_at(at), count, work_space(self._space)),
+            *(_at(at), count, work_space(self._kernels, self._space)),
             *(_at(each) for each in (weights, *measures)),
         )
         return _Tried(weights, *measures)

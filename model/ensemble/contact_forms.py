@@ -87,13 +87,13 @@ def load_contacts(
     (k,): of each finger relative to the rig's fingertip, empty for 1.
     """
     k, p, r = points.shape
-    library, attachments = kernels(), plate.with_fingers(k, loads)
+    by, attachments = kernels(), plate.with_fingers(k, loads)
     shapes = np.concatenate([plate.shapes, points[:, 0]])
     found = (
         _forms_by_numpy(plate, attachments, shapes, points, weights, error_power)
-        if library is None
+        if by is None
         else contact_forms(
-            library,
+            by,
             gain_variance=plate.gain_variance,
             ridge=RIDGE,
             shapes=shapes,

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array
-from model.compiled.lanes import LANES, work_space
+from model.compiled.kernels import Kernels
+from model.compiled.lanes import work_space
 
 _SIZES = ("n", "b", "k", "p", "r", "deviating")
 _GIVEN = (
@@ -39,7 +40,7 @@ class FoundForms:
 
 
 def contact_forms(
-    library: ctypes.CDLL,
+    kernels: Kernels,
     *,
     gain_variance: float,
     ridge: float,
@@ -66,8 +67,9 @@ def contact_forms(
         *(each.ctypes.data for each in arrays.values()),
         *(getattr(found, name).ctypes.data for name in _FOUND),
     )
+    library, lanes = kernels.library, kernels.lanes
     library.contact_forms_space.restype = c_size_t
-    work = work_space(library.contact_forms_space(ctypes.byref(on)))
-    for first in range(0, f, LANES):
-        library.contact_forms(ctypes.byref(on), first, min(LANES, f - first), work)
+    work = work_space(kernels, library.contact_forms_space(ctypes.byref(on)))
+    for first in range(0, f, lanes):
+        library.contact_forms(ctypes.byref(on), first, min(lanes, f - first), work)
     return found

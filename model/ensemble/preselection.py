@@ -21,7 +21,7 @@ from model.ensemble.contact_forms import RIDGE, inverse_with, power_of
 from model.ensemble.preselection_kernel import PreselectionKernel
 
 KEPT, MISSING = 16, 4
-"""Frequencies kept, as many as a kernel takes at once, and how many of them may miss the level."""
+"""Frequencies kept, a multiple of what kernels take at once, and how many may miss the level."""
 
 MAX_FINGERS_BY_POINTS = 4
 """Quiet fingers up to which nulls are so deep that the points of each count, not its centre."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array
-from model.compiled.kernels import kernels
-from model.compiled.lanes import LANES, in_lanes, work_space
+from model.compiled.kernels import Kernels, kernels
+from model.compiled.lanes import in_lanes, work_space
 
 _MATRICES = ("modal", "receptance", "fields", "held", "by_damping", "by_stiffness", "error")
 
@@ -25,7 +25,7 @@ class _Plate(ctypes.Structure):
 class PreselectionKernel:
     """A plate of f frequencies as the kernel takes it, block by block of frequencies."""
 
-    library: ctypes.CDLL
+    kernels: Kernels
     count: int
     plates: list[_Plate]
     matrices: list[Float32Array]
@@ -35,18 +35,18 @@ class PreselectionKernel:
         cls, *, gain_variance: float, ridge: float, **matrices: Complex64Array | Float32Array
     ) -> "PreselectionKernel | None":
         """Of matrices (f, ...) by their names in `preselection.c`; None without a library."""
-        library = kernels()
-        if library is None:
+        by = kernels()
+        if by is None:
             return None
-        library.preselection_space.restype = c_size_t
-        lanes = [in_lanes(matrices[name]) for name in _MATRICES]
+        by.library.preselection_space.restype = c_size_t
+        lanes = [in_lanes(by, matrices[name]) for name in _MATRICES]
         f, b, _ = matrices["held"].shape
         size = (matrices["error"].shape[1], b, matrices["receptance"].shape[1])
         plates = [
             _Plate(*size, gain_variance, ridge, *(each.ctypes.data for each in block))
             for block in zip(*lanes, strict=True)
         ]
-        return cls(library, f, plates, lanes)
+        return cls(by, f, plates, lanes)
 
     def score(
         self, points: Float32Array, weights: Float32Array, fingers: Complex64Array
@@ -60,10 +60,9 @@ class PreselectionKernel:
         found = np.empty((2, self.count), dtype=np.float32)
         arrays = [c_void_p(each.ctypes.data) for each in (*given, *found)]
         on = [ctypes.byref(plate) for plate in self.plates]
-        work = work_space(self.library.preselection_space(on[0], k, p))
-        for first, plate in zip(range(0, self.count, LANES), on, strict=True):
-            some = min(LANES, self.count - first)
-            self.library.preselection_scores(
-                *(plate, first, some, k, p), *arrays[:3], work, *arrays[3:]
-            )
+        library, lanes = self.kernels.library, self.kernels.lanes
+        work = work_space(self.kernels, library.preselection_space(on[0], k, p))
+        for first, plate in zip(range(0, self.count, lanes), on, strict=True):
+            some = min(lanes, self.count - first)
+            library.preselection_scores(*(plate, first, some, k, p), *arrays[:3], work, *arrays[3:])
         return found[0], found[1]

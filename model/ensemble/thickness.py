@@ -51,8 +51,8 @@ def thickness_remainders(
     m, a = len(at), len(contacts.shapes)
     applied = np.zeros((m, a), dtype=np.complex64)
     applied[:, : plate.era_count] = plate.forces.take(at, axis=0) * tones.weights
-    library = kernels()
-    by = _by_numpy if library is None else partial(by_kernel, library)
+    found_by = kernels()
+    by = _by_numpy if found_by is None else partial(by_kernel, found_by)
     found = by(
         shapes=contacts.shapes,
         at=points,

@@ -6,7 +6,8 @@ from ctypes import c_int, c_size_t, c_void_p
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array
-from model.compiled.lanes import LANES, work_space
+from model.compiled.kernels import Kernels
+from model.compiled.lanes import work_space
 
 _ARRAYS = ("shapes", "at", "receptance", "stiffness", "applied", "minus_omega2")
 
@@ -18,7 +19,7 @@ class _Tones(ctypes.Structure):
     )
 
 
-def responses(library: ctypes.CDLL, **given: Complex64Array | Float32Array) -> Complex64Array:
+def responses(kernels: Kernels, **given: Complex64Array | Float32Array) -> Complex64Array:
     """Accelerations (cases, points), of arrays by their names in `thickness.c`."""
     arrays = {name: np.ascontiguousarray(given[name]) for name in _ARRAYS}
     cases, r = arrays["receptance"].shape
@@ -26,8 +27,9 @@ def responses(library: ctypes.CDLL, **given: Complex64Array | Float32Array) -> C
     pointers = [each.ctypes.data for each in arrays.values()]
     on = ctypes.byref(_Tones(len(arrays["shapes"]), r, points, *pointers))
     found = np.empty((cases, points), dtype=np.complex64)
+    library, lanes = kernels.library, kernels.lanes
     library.thickness_space.restype = c_size_t
-    work, to = work_space(library.thickness_space(on)), c_void_p(found.ctypes.data)
-    for first in range(0, cases, LANES):
-        library.thickness_responses(on, first, min(LANES, cases - first), work, to)
+    work, to = work_space(kernels, library.thickness_space(on)), c_void_p(found.ctypes.data)
+    for first in range(0, cases, lanes):
+        library.thickness_responses(on, first, min(lanes, cases - first), work, to)
     return found

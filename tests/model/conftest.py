@@ -1,4 +1,4 @@
-"""Kernels in C, and the same in numpy where there is no compiler."""
+"""Kernels in C for each kind of processor, and the same in numpy where there is no compiler."""
 
 from collections.abc import Callable, Iterator
 
@@ -6,6 +6,10 @@ import pytest
 
 from model.compiled import kernels
 from model.errors import InputError
+
+RUNNABLE = {
+    each.name: each for each in kernels.versions() if each.features <= kernels.processor_features()
+}
 
 
 @pytest.fixture
@@ -24,10 +28,19 @@ def without_kernels(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], No
     kernels.kernels.cache_clear()
 
 
-@pytest.fixture(params=["C", "numpy"])
-def kernels_or_numpy(request: pytest.FixtureRequest, without_kernels: Callable[[], None]) -> None:
-    """Computes with kernels, and without."""
+@pytest.fixture(params=[*RUNNABLE, "numpy"])
+def kernels_or_numpy(
+    request: pytest.FixtureRequest,
+    without_kernels: Callable[[], None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Computes with the kernels of each version that this processor can run, and without any."""
     if request.param == "numpy":
         without_kernels()
-    else:
-        assert kernels.kernels() is not None, "install a C compiler"
+        return
+    version = RUNNABLE[request.param]
+    monkeypatch.setattr(kernels, "processor_features", lambda: version.features)
+    kernels.kernels.cache_clear()
+    found = kernels.kernels()
+    assert found is not None, "install a C compiler"
+    assert found.lanes == version.lanes

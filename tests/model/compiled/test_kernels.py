@@ -1,6 +1,5 @@
 """Where the library of kernels comes from."""
 
-import ctypes
 from collections.abc import Callable
 
 from model.compiled.kernels import kernels
@@ -8,6 +7,6 @@ from model.compiled.kernels import kernels
 
 def test_machine_without_a_compiler_has_none(without_kernels: Callable[[], None]) -> None:
     """No library, and no error; with one there is a library."""
-    assert isinstance(kernels(), ctypes.CDLL)
+    assert kernels() is not None
     without_kernels()
     assert kernels() is None

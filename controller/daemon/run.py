@@ -16,6 +16,7 @@ from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
 from drivers.errors import DriverError
 from drivers.trace import tracing
+from model.compiled.kernels import kernels
 from model.config.document import ConfigError, read_document
 from model.counting import counted
 from model.errors import InputError
@@ -125,6 +126,7 @@ def _load_table(config: DaemonConfig, file: Path) -> LocalizationTable:
 
 
 def _table(config: DaemonConfig) -> LocalizationTable:
+    kernels()  # may be compiled, which must not be in the event loop
     if config.table is not None:
         return _load_table(config, config.table)
     table, file = cached_table(config.rig)

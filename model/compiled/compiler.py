@@ -6,6 +6,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -26,22 +27,39 @@ def compile_library(
             f"({compiler or ', '.join(_COMPILERS)}); install one (Debian: apt install gcc "
             "libc6-dev; macOS: xcode-select --install)"
         )
-    made = path.with_name(f".{path.name}.{os.getpid()}")
-    done = subprocess.run(  # noqa: S603  the user's compiler
-        [*compiler.split(), *flags, "-fPIC", "-shared", "-o", made, *sorted(sources), "-lm"],
-        capture_output=True,
-        text=True,
-        timeout=_TIMEOUT,
-        check=False,
-    )
+    # Of its own, since threads and processes may compile the same at once.
+    with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
+        made = Path(folder) / path.name
+        _compile(made, compiler.split(), sources, flags=flags, what=what)
+        made.replace(path)
+
+
+def _compile(
+    made: Path,
+    compiler: Sequence[str],
+    sources: Iterable[Path],
+    *,
+    flags: Sequence[str],
+    what: str,
+) -> None:
+    files = map(str, (made, *sorted(sources)))
+    command = [*compiler, *flags, "-fPIC", "-shared", "-o", *files, "-lm"]
+    try:
+        done = subprocess.run(  # noqa: S603  the user's compiler
+            command, capture_output=True, text=True, timeout=_TIMEOUT, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise InputError(
+            f"{what} must be compiled within {_TIMEOUT:g} s, got no end of {' '.join(compiler)}; "
+            "set CC to another compiler"
+        ) from None
     if done.returncode:
         lines = done.stderr.strip().splitlines() or ["no message"]
         first = next((line for line in lines if "error" in line), lines[0])
         raise InputError(
-            f"{what} could not be compiled by {compiler}: {first}; install the C headers "
+            f"{what} could not be compiled by {' '.join(compiler)}: {first}; install the C headers "
             "(Debian: apt install gcc libc6-dev)"
         )
-    made.replace(path)
 
 
 def kept_library(
@@ -68,7 +86,7 @@ def kept_library(
 
 
 def _digest(files: Iterable[Path], flags: Sequence[str]) -> str:
-    """Sixteen digits that change with the files, the flags, the compiler and the machine."""
+    """Sixteen digits that change with the files, the flags, CC and the architecture."""
     made_of = hashlib.sha256(repr((*flags, os.environ.get("CC"), sys.platform)).encode())
     made_of.update(platform.machine().encode())
     for path in sorted(files):

@@ -44,21 +44,21 @@ INLINE void between(value *restrict B, value *restrict modal, const value *g, co
     }
 }
 
-/* K = (1 + Z A)^-1, one attachment after the other, each of them damped: (a, a). */
+/* K = (1 + Z A)^-1 (a, a), one attachment after the other: none gives energy, the plate is damped. */
 INLINE void invert(value *restrict K, const value *A, const value *Z, size_t a) {
     for (size_t i = 0; i < a; i++)
-        for (size_t j = 0; j < a; j++) K[i * a + j] = plus(ZERO, Z[i], A[i * a + j]);
+        for (size_t j = 0; j < a; j++) K[i * a + j] = times(Z[i], A[i * a + j]);
     for (size_t i = 0; i < a; i++) K[i * a + i].re += 1;
     for (size_t s = 0; s < a; s++) {
         value *own = K + s * a, pivot = own[s];
         value factor = reciprocal(pivot);
         own[s] = (value){filled(1), ZERO.im};
-        for (size_t j = 0; j < a; j++) own[j] = plus(ZERO, own[j], factor);
+        for (size_t j = 0; j < a; j++) own[j] = times(own[j], factor);
         for (size_t i = 0; i < a; i++) {
             if (i == s) continue;
             value by = K[i * a + s];
             K[i * a + s] = ZERO;
-            for (size_t j = 0; j < a; j++) K[i * a + j] = minus(K[i * a + j], by, own[j]);
+            for (size_t j = 0; j < a; j++) K[i * a + j] = subtract_product(K[i * a + j], by, own[j]);
         }
     }
 }
@@ -91,7 +91,7 @@ void contact_forms(const contacts *on, int first, int count, value *work) {
         between(B, modal, g + plate * r, on);
         invert(K, B, Z, a);
         for (size_t i = 0; i < a; i++)
-            for (size_t e = 0; e < n; e++) F[i * n + e] = plus(ZERO, K[i * a + e], drives[e]);
+            for (size_t e = 0; e < n; e++) F[i * n + e] = times(K[i * a + e], drives[e]);
         value *fields = plate ? h + (1 + plate) * at * n : h;
         for (size_t i = 0; i < a * n; i++) wide[i] = scaled(F[i], minus_omega2);
         product(fields, B + a * a, a, wide, at, a, n);
@@ -113,13 +113,13 @@ void contact_forms(const contacts *on, int first, int count, value *work) {
         for (size_t i = 0; i < a * a; i++) K[i] = scaled(K[i], minus_omega2);
         product(T, B + a * a, a, K, at, a, a);
         for (size_t e = 0; e < n; e++)
-            for (size_t i = 0; i < n; i++) damped[e * n + i] = plus(ZERO, by_damping[e], u[e * n + i]);
+            for (size_t i = 0; i < n; i++) damped[e * n + i] = times(by_damping[e], u[e * n + i]);
         product(h + at * n, T, a, damped, at, n, n);
         for (size_t i = 0; i < at; i++)
             for (size_t s = 0; s < j; s++) reach[i * j + s] = power(T[i * a + (s < n ? s : b + s - n)]);
         for (size_t s = 0; s < j; s++)
             for (size_t e = 0; e < n; e++)
-                moved[s * n + e] = plus(ZERO, changes[s], u[(s < n ? s : b + s - n) * n + e]);
+                moved[s * n + e] = times(changes[s], u[(s < n ? s : b + s - n) * n + e]);
     }
     store(on->rows + 2 * first * (2 + others) * at * n, h, (2 + others) * at * n, count);
     store(on->moved + 2 * first * j * n, moved, j * n, count);

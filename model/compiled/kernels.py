@@ -1,10 +1,13 @@
 """The library of kernels for this processor: of a wheel, or compiled at first use."""
 
 import ctypes
+import logging
 import platform
+from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 
 from model.compiled.compiler import compile_library, kept_library
@@ -16,17 +19,19 @@ _HEADERS = (_HERE / "lanes.h",)
 _FLAGS = ("-std=gnu99", "-O2", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
 _WHAT = "the library of kernels"
 
+_logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class Version:
-    """Kernels for processors with some features.
+    """Kernels for processors with some features, by numpy's names, each with a compiler's flag.
 
     lanes: cases at once, as many as fill one register of the processor; more are many times slower.
     """
 
     name: str
     lanes: int
-    features: frozenset[str] = frozenset()
+    features: Mapping[str, str]
 
     @property
     def file(self) -> str:
@@ -36,13 +41,12 @@ class Version:
     @property
     def flags(self) -> tuple[str, ...]:
         """Flags of the compiler."""
-        needed = (f"-m{feature}" for feature in sorted(self.features))
-        return (*_FLAGS, f"-DLANES={self.lanes}", *needed)
+        return (*_FLAGS, f"-DLANES={self.lanes}", *self.features.values())
 
 
-_AVX2 = frozenset({"avx2", "fma"})
-_AVX512 = _AVX2 | {"avx512f", "avx512dq", "avx512vl"}
-_PLAIN = Version("plain", 4)
+_AVX2 = {"AVX2": "-mavx2", "FMA3": "-mfma"}
+_AVX512 = {"AVX512F": "-mavx512f", "AVX512DQ": "-mavx512dq", "AVX512VL": "-mavx512vl", **_AVX2}
+_PLAIN = Version("plain", 4, {})
 _OF_X86 = (Version("avx512", 16, _AVX512), Version("avx2", 8, _AVX2), _PLAIN)
 
 
@@ -52,12 +56,12 @@ def versions() -> tuple[Version, ...]:
 
 
 def processor_features() -> AbstractSet[str]:
-    """What this processor can do, where Linux names it."""
+    """What numpy knows of this processor; none where it does not say."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
+        known = import_module("numpy._core._multiarray_umath").__cpu_features__
+    except (ImportError, AttributeError):  # of no public interface
         return frozenset()
-    return next((set(line.split()) for line in lines if line.startswith("flags")), frozenset())
+    return {name for name, has in known.items() if has}
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +76,13 @@ class Kernels:
 def kernels() -> Kernels | None:
     """Those for this processor; None where there is no compiler, and numpy has to do."""
     has = processor_features()
-    version = next(each for each in versions() if each.features <= has)
+    version = next(each for each in versions() if each.features.keys() <= has)
     own = _HERE / version.file
     try:
         path = own if own.exists() else _compiled(version)
         return Kernels(ctypes.CDLL(str(path)), version.lanes)
-    except (InputError, OSError):
+    except (InputError, OSError) as error:
+        _logger.warning("answers take several times as long without kernels in C: %s", error)
         return None
 
 

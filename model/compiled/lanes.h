@@ -25,15 +25,19 @@ typedef struct {
     lanes re, im;
 } value;
 
-INLINE value plus(value c, value a, value b) { /* c + a b */
+INLINE value times(value a, value b) {
+    return (value){a.re * b.re - a.im * b.im, a.re * b.im + a.im * b.re};
+}
+
+INLINE value add_product(value c, value a, value b) { /* c + a b */
     return (value){c.re + a.re * b.re - a.im * b.im, c.im + a.re * b.im + a.im * b.re};
 }
 
-INLINE value minus(value c, value a, value b) { /* c - a b */
+INLINE value subtract_product(value c, value a, value b) { /* c - a b */
     return (value){c.re - a.re * b.re + a.im * b.im, c.im - a.re * b.im - a.im * b.re};
 }
 
-INLINE value plus_conjugate(value c, value a, value b) { /* c + conj(a) b */
+INLINE value add_conjugate_product(value c, value a, value b) { /* c + conj(a) b */
     return (value){c.re + a.re * b.re + a.im * b.im, c.im + a.re * b.im - a.im * b.re};
 }
 
@@ -132,10 +136,11 @@ SHARED void multiply(value *restrict found, const float *restrict a, const value
     }
 }
 
-/* found (columns) from the first on = a (inner) b (inner, columns), each step apart in a; of a times
- * a sign in the imaginary part. */
+/* found (columns) from the first on = a (inner) b (inner, columns), each step apart in a, or of a
+ * conjugated. */
 SHARED void row_product(value *restrict found, const value *a, size_t step, const value *b, size_t inner,
-                        size_t columns, size_t first, float sign) {
+                        size_t columns, size_t first, int conjugated) {
+    const float sign = conjugated ? -1 : 1;
     size_t j = first;
     for (; j + 4 <= columns; j += 4) {
         value s0 = ZERO, s1 = ZERO, s2 = ZERO, s3 = ZERO;
@@ -143,8 +148,8 @@ SHARED void row_product(value *restrict found, const value *a, size_t step, cons
             const value *from = b + s * columns + j;
             value by = a[s * step];
             by.im *= sign;
-            s0 = plus(s0, by, from[0]), s1 = plus(s1, by, from[1]);
-            s2 = plus(s2, by, from[2]), s3 = plus(s3, by, from[3]);
+            s0 = add_product(s0, by, from[0]), s1 = add_product(s1, by, from[1]);
+            s2 = add_product(s2, by, from[2]), s3 = add_product(s3, by, from[3]);
         }
         found[j] = s0, found[j + 1] = s1, found[j + 2] = s2, found[j + 3] = s3;
     }
@@ -153,7 +158,7 @@ SHARED void row_product(value *restrict found, const value *a, size_t step, cons
         for (size_t s = 0; s < inner; s++) {
             value by = a[s * step];
             by.im *= sign;
-            sum = plus(sum, by, b[s * columns + j]);
+            sum = add_product(sum, by, b[s * columns + j]);
         }
         found[j] = sum;
     }
@@ -163,12 +168,12 @@ SHARED void row_product(value *restrict found, const value *a, size_t step, cons
 SHARED void product(value *restrict found, const value *a, size_t width, const value *b, size_t rows,
                     size_t inner, size_t columns) {
     for (size_t i = 0; i < rows; i++)
-        row_product(found + i * columns, a + i * width, 1, b, inner, columns, 0, 1);
+        row_product(found + i * columns, a + i * width, 1, b, inner, columns, 0, 0);
 }
 
 /* The upper triangle of R (n, n) = X^H X of X (rows, n). */
 SHARED void gram(value *restrict R, const value *X, size_t rows, size_t n) {
-    for (size_t i = 0; i < n; i++) row_product(R + i * n, X + i, n, X, rows, n, i, -1);
+    for (size_t i = 0; i < n; i++) row_product(R + i * n, X + i, n, X, rows, n, i, 1);
 }
 
 /* x = R^-1 c of a positive Hermitian R (n, n), of which the upper triangle is given and lost. */
@@ -179,13 +184,13 @@ SHARED void solve_positive(value *restrict x, value *restrict R, const value *re
         lanes pivot = inverse(from[s].re);
         for (size_t u = s + 1; u < n; u++) {
             value by = {from[u].re * pivot, -from[u].im * pivot};
-            for (size_t v = u; v < n; v++) R[u * n + v] = minus(R[u * n + v], by, from[v]);
-            x[u] = minus(x[u], by, x[s]);
+            for (size_t v = u; v < n; v++) R[u * n + v] = subtract_product(R[u * n + v], by, from[v]);
+            x[u] = subtract_product(x[u], by, x[s]);
         }
     }
     for (size_t s = n; s-- > 0;) {
         value own = x[s];
-        for (size_t u = s + 1; u < n; u++) own = minus(own, R[s * n + u], x[u]);
+        for (size_t u = s + 1; u < n; u++) own = subtract_product(own, R[s * n + u], x[u]);
         x[s] = scaled(own, inverse(R[s * n + s].re));
     }
 }

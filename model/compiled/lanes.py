@@ -3,6 +3,7 @@
 import threading
 from ctypes import c_void_p
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,12 @@ from model.arrays import Complex64Array, Float32Array
 from model.compiled.kernels import Kernels
 
 _ALIGNMENT = 16  # floats: the widest vector
+
+
+def as_given(values: NDArray[Any]) -> NDArray[Any]:
+    """Values as a kernel reads them: single precision, one after the other."""
+    single = np.complex64 if np.iscomplexobj(values) else np.float32
+    return np.ascontiguousarray(values, dtype=single)
 
 
 def work_space(of: Kernels, size: int) -> c_void_p:

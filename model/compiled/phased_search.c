@@ -11,7 +11,7 @@ typedef struct {
 
 typedef struct {
     int steps, limited;   /* weights; whether each is brought to the level within full stroke */
-    float held, gain;     /* on the diagonal; on the weights up to full stroke, 0 for none */
+    float variance, gain; /* of each ERA beyond that of the form; up to full stroke, 0 for none */
     float reserve, growth;
 } method;
 
@@ -28,7 +28,7 @@ INLINE lanes expected(const value *R, const value *w, size_t n) {
     lanes sum = {0};
     for (size_t i = 0; i < n; i++) {
         value moved = scaled(w[i], R[i * n + i].re * 0.5f);
-        for (size_t j = i + 1; j < n; j++) moved = plus(moved, R[i * n + j], w[j]);
+        for (size_t j = i + 1; j < n; j++) moved = add_product(moved, R[i * n + j], w[j]);
         sum += w[i].re * moved.re + w[i].im * moved.im;
     }
     return 2 * sum;
@@ -37,7 +37,7 @@ INLINE lanes expected(const value *R, const value *w, size_t n) {
 /* sum of a w. */
 INLINE value field(const value *a, const value *w, size_t n) {
     value sum = ZERO;
-    for (size_t i = 0; i < n; i++) sum = plus(sum, a[i], w[i]);
+    for (size_t i = 0; i < n; i++) sum = add_product(sum, a[i], w[i]);
     return sum;
 }
 
@@ -80,7 +80,7 @@ INLINE lanes loudest_of(const lanes *power, size_t count) {
 
 /* At rows (count): the best weights (count, n) that reach the level and their score, the best score
  * of those that miss it, and the bound; of as many weights as steps. */
-void phased_search(const forms *from, const method *by, const int *at, int count, value *work,
+void phased_search(const forms *from, const method *by, const int *indices, int count, value *work,
                    float *weights, float *scores, float *missed, float *bounds) {
     const size_t n = from->n, q = from->q, few = from->few, fine = from->fine;
     value *c = work, *w = c + n, *fitting = w + n, *best = fitting + n, *target = best + n;
@@ -90,7 +90,7 @@ void phased_search(const forms *from, const method *by, const int *at, int count
     lanes *multiplier = own + q;
     for (int first = 0; first < count; first += LANES) {
         int rows[LANES], some = count - first < LANES ? count - first : LANES;
-        for (int l = 0; l < LANES; l++) rows[l] = at[first + (l < some ? l : some - 1)];
+        for (int l = 0; l < LANES; l++) rows[l] = indices[first + (l < some ? l : some - 1)];
         lanes wanted;
         load_real(&wanted, from->threshold, 1, rows);
         load(target, from->targets, n, rows);
@@ -115,12 +115,12 @@ void phased_search(const forms *from, const method *by, const int *at, int count
                         to->im += share[i] * own_form->im;
                     }
             for (size_t u = 0; u < n; u++)
-                R[u * n + u].re = R[u * n + u].re * (1 + by->held) + multiplier[u];
+                R[u * n + u].re = R[u * n + u].re * (1 + by->variance) + multiplier[u];
             solve_positive(w, R, c, n);
             value reached = ZERO;
             lanes most = {0};
             for (size_t u = 0; u < n; u++) {
-                reached = plus_conjugate(reached, c[u], w[u]);
+                reached = add_conjugate_product(reached, c[u], w[u]);
                 most = larger(most, power(w[u]));
             }
             bound = smaller(bound, root(root(power(reached))));
@@ -132,7 +132,7 @@ void phased_search(const forms *from, const method *by, const int *at, int count
                 lanes gain = by->reserve * on.wanted / larger(least, 0.1f * amp + LEAST_FIELD);
                 for (size_t u = 0; u < n; u++) w[u] = scaled(w[u], gain);
             }
-            float full = by->limited ? 1 : by->gain;
+            float full = by->gain;
             for (size_t u = 0; u < n; u++)
                 fitting[u] = full ? scaled(w[u], inverse(larger(root(power(w[u])), filled(1 / full)))) : w[u];
 

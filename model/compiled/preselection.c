@@ -46,36 +46,36 @@ void preselection_scores(const plate *on, int first, int some, int fingers, int 
         for (size_t j = 0; j < k; j++) {
             value sum = ZERO;
             for (size_t s = 0; s < b; s++)
-                sum = plus(sum, on->held[i * b + s], U[j * p * columns + s]);
+                sum = add_product(sum, on->held[i * b + s], U[j * p * columns + s]);
             WU[i * k + j] = sum;
         }
     for (size_t i = 0; i < count; i++) {
-        row_product(X, U + i * columns, 1, WU, b, k, 0, 1);
+        row_product(X, U + i * columns, 1, WU, b, k, 0, 0);
         for (size_t j = 0; j < k; j++) {
             value left = {G[i * k + j].re - X[j].re, G[i * k + j].im - X[j].im};
-            G[i * k + j] = plus(ZERO, left, loads[j]);
+            G[i * k + j] = times(left, loads[j]);
         }
     }
 
     /* Fields of the ERAs, of a force at each, and two changes of the fields by the thickness. */
     for (size_t i = 0; i < count; i++) {
-        row_product(H + i * wide, U + i * columns, 1, on->fields, b, 2 * n, 0, 1);
+        row_product(H + i * wide, U + i * columns, 1, on->fields, b, 2 * n, 0, 0);
         memcpy(H + i * wide + 2 * n, U + i * columns + b, 2 * n * sizeof(value));
     }
 
-    /* One finger after the other. Both it and the plate with those before are damped. */
+    /* One finger after the other: none gives energy, and the plate with those before is damped. */
     for (size_t f = 0; f < k; f++) {
         value *own = G + f * p * k, *field = H + f * p * wide;
         value pivot = own[f];
         pivot.re += 1;
         value factor = reciprocal(pivot);
-        for (size_t j = f + 1; j < k; j++) own[j] = plus(ZERO, own[j], factor);
-        for (size_t j = 0; j < wide; j++) field[j] = plus(ZERO, field[j], factor);
+        for (size_t j = f + 1; j < k; j++) own[j] = times(own[j], factor);
+        for (size_t j = 0; j < wide; j++) field[j] = times(field[j], factor);
         for (size_t i = 0; i < count; i++) {
             if (i == f * p) continue;
             value by = G[i * k + f];
-            for (size_t j = f + 1; j < k; j++) G[i * k + j] = minus(G[i * k + j], by, own[j]);
-            for (size_t j = 0; j < wide; j++) H[i * wide + j] = minus(H[i * wide + j], by, field[j]);
+            for (size_t j = f + 1; j < k; j++) G[i * k + j] = subtract_product(G[i * k + j], by, own[j]);
+            for (size_t j = 0; j < wide; j++) H[i * wide + j] = subtract_product(H[i * wide + j], by, field[j]);
         }
     }
 
@@ -95,7 +95,7 @@ void preselection_scores(const plate *on, int first, int some, int fingers, int 
         value *at = H + i * wide;
         for (size_t j = 0; j < wide; j++) at[j] = scaled(at[j], share);
         memcpy(to, at, n * sizeof(value));
-        row_product(to + n, at + n, 1, on->by_damping, n, n, 0, 1);
+        row_product(to + n, at + n, 1, on->by_damping, n, n, 0, 0);
         memcpy(to + 2 * n, at + 2 * n, 2 * n * sizeof(value));
         to += 4 * n;
     }

@@ -270,7 +270,7 @@ def _moved(shares: Float32Array, expected: Float32Array) -> Float32Array:
 
     As they were at frequencies where no ERA is driven, as those of `graded` that only push away.
     """
-    moved = shares * np.sqrt(expected)
+    moved = shares * np.sqrt(np.maximum(expected, 0))
     total = np.add.reduce(moved, axis=-1, keepdims=True)
     return np.where(total > _LEAST, moved / np.maximum(total, _LEAST), shares)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, Float32Array, IntArray
 from model.compiled.kernels import Kernels
-from model.compiled.lanes import work_space
+from model.compiled.lanes import as_given, work_space
 from model.drive_modes.coherent import (
     LAWSON_STEPS,
     LEVEL_RELAXATION,
@@ -37,14 +37,14 @@ class _Method(ctypes.Structure):
 
     _fields_ = (
         *((name, c_int) for name in ("steps", "limited")),
-        *((name, c_float) for name in ("held", "gain", "reserve", "growth")),
+        *((name, c_float) for name in ("variance", "gain", "reserve", "growth")),
     )
 
 
 _ONE_FINGER, _SEVERAL = _Method(steps=1), _Method(steps=1 + LAWSON_STEPS)
 _WITHIN_STROKE = (
-    _Method(steps=LIMITED_STEPS, limited=1, reserve=LEVEL_RESERVE, growth=MAX_GROWTH),
-    *(_Method(steps=1, held=sigma**2, gain=gain) for sigma, gain in LEVEL_RELAXATION),
+    _Method(steps=LIMITED_STEPS, limited=1, gain=1, reserve=LEVEL_RESERVE, growth=MAX_GROWTH),
+    *(_Method(steps=1, variance=sigma**2, gain=gain) for sigma, gain in LEVEL_RELAXATION),
 )
 
 
@@ -102,7 +102,7 @@ class _Kernel:
         fields = () if forms.few is None or forms.fine is None else (forms.few, forms.fine)
         given = (forms.targets[0], forms.target_power[0], forms.quiet, forms.threshold, *fields)
         # Kept, since the kernel reads them.
-        self._arrays = [np.ascontiguousarray(each) for each in given]
+        self._arrays = [as_given(each) for each in given]
         self._count, q, n, _ = forms.quiet.shape
         points = [each.shape[2] for each in fields] or [0, 0]
         pointers = [each.ctypes.data for each in self._arrays]

@@ -2,7 +2,8 @@
 
 Attachments a are the fixed ones and then the fingers, points p those under the fingertips:
 
-    Z = diag(k + i w c - w² m, D of the fingers),  K = (1 + Z A)^-1,  F = K z stroke,  u = A F
+    z = k + i w c,  Z = diag(z - w² m, D of the fingers),  K = (1 + Z A)^-1
+    F = K z stroke,   u = A F                                forces of each ERA, and what they move
     h_p = -w² A_pa F,   t_p = -w² A_pa K                     field, and force -> point
     dh_p / dZ_j = t_pj r_j^T,   r_j = stroke e_j - u_j of an ERA, -u_j of a finger
 
@@ -10,10 +11,11 @@ The expected power of weights w at a fingertip is w^H R w to first order,
 
     R = mean_p { h* h^T + dh* dh^T + dc* dc^T + sum_j |s_j t_pj|² r_j* r_j^T + sigma² diag |h|² },
 
-each change d by one standard deviation: the ERAs' damping c together, stiffness of each ERA and
-load of each finger j on their own, gains as sigma: exact derivatives of the loaded plate, but for
-what a finger deflects locally. For the thickness h half the sum of dh* dh^T of the plates thicker
-and thinner by it, exactly: it moves resonances. The loss factor changes next to nothing.
+each change d by one standard deviation, s_j that of Z_j: the ERAs' damping c together, stiffness of
+each ERA and load of each finger j on their own, gains as sigma: exact derivatives of the loaded
+plate, but for what a finger deflects locally. For the thickness, half the sum of dh* dh^T of the
+plates thicker and thinner by it, exactly: it moves resonances. The loss factor changes next to
+nothing.
 """
 
 import math

@@ -8,7 +8,7 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array
 from model.compiled.kernels import Kernels
-from model.compiled.lanes import work_space
+from model.compiled.lanes import as_given, work_space
 
 _SIZES = ("n", "b", "k", "p", "r", "deviating")
 _GIVEN = (
@@ -47,7 +47,7 @@ def contact_forms(
     **given: Complex64Array | Float32Array,
 ) -> FoundForms:
     """Find them of arrays by their names in `contact_forms.c`."""
-    arrays = {name: np.ascontiguousarray(given[name]) for name in _GIVEN}
+    arrays = {name: as_given(given[name]) for name in _GIVEN}
     f, n = arrays["drives"].shape
     a, r = arrays["shapes"].shape
     kp, _ = arrays["points"].shape

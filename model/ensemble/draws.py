@@ -66,7 +66,7 @@ def draw(
     factors = np.zeros((4 + n + k + n + thicknesses, 1 + count), dtype=np.complex64)
     factors[NOMINAL] = 1
     if thicknesses:
-        # By rank, so that each has as many plates.
+        # By rank, so that each has as many plates, or one less.
         node = parameters[0].argsort().argsort() * thicknesses // count
         parameters[0] = thickness_nodes(thicknesses)[node]
         factors[-thicknesses + node, 1 + np.arange(count)] = 1

@@ -23,7 +23,7 @@ from model.ensemble.preselection_kernel import PreselectionKernel
 KEPT, MISSING = 16, 4
 """Frequencies kept, a multiple of what kernels take at once, and how many may miss the level."""
 
-MAX_FINGERS_BY_POINTS = 4
+MAX_FINGERS_RANKED_BY_POINTS = 4
 """Quiet fingers up to which nulls are so deep that the points of each count, not its centre."""
 
 
@@ -70,7 +70,7 @@ class Preselection:
     ) -> tuple[Float32Array, Float32Array]:
         """Bounds of the score, and amplitudes of the target [m/s²] within full stroke, (f,)."""
         k, b = len(points), self.plate.stiffness.shape[1]
-        if k > 1 + MAX_FINGERS_BY_POINTS:
+        if k > 1 + MAX_FINGERS_RANKED_BY_POINTS:
             points, weights = points[:, :1], np.ones((k, 1), dtype=np.float32)
         fingers = self.plate.with_fingers(k, loads).stiffness[:, b:]
         by = self._by_numpy if self._kernel is None else self._kernel.score

@@ -8,7 +8,7 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array
 from model.compiled.kernels import Kernels, kernels
-from model.compiled.lanes import in_lanes, work_space
+from model.compiled.lanes import as_given, in_lanes, work_space
 
 _MATRICES = ("modal", "receptance", "fields", "held", "by_damping", "by_stiffness", "error")
 
@@ -56,7 +56,7 @@ class PreselectionKernel:
         points (k, p, r), weights (k, p); fingers (f, k): their dynamic stiffness [N/m].
         """
         k, p, _ = points.shape
-        given = [np.ascontiguousarray(each) for each in (points, weights, fingers)]
+        given = [as_given(each) for each in (points, weights, fingers)]
         found = np.empty((2, self.count), dtype=np.float32)
         arrays = [c_void_p(each.ctypes.data) for each in (*given, *found)]
         on = [ctypes.byref(plate) for plate in self.plates]

@@ -55,7 +55,7 @@ def thickness_remainders(
     by = _by_numpy if found_by is None else partial(by_kernel, found_by)
     found = by(
         shapes=contacts.shapes,
-        at=points,
+        at_points=points,
         receptance=plate.receptance_at(nodes, at).reshape(m * count, r),
         stiffness=contacts.attachments.stiffness.take(at, axis=0).repeat(count, axis=0),
         applied=applied.repeat(count, axis=0),
@@ -70,13 +70,13 @@ def thickness_remainders(
 def _by_numpy(
     *,
     shapes: Float32Array,
-    at: Float32Array,
+    at_points: Float32Array,
     receptance: Complex64Array,
     stiffness: Complex64Array,
     applied: Complex64Array,
     minus_omega2: Float32Array,
 ) -> Complex64Array:
-    """Accelerations (c, p) at points of shapes at (p, r), as the kernel finds them.
+    """Accelerations (c, p) at points of shapes at_points (p, r), as the kernel finds them.
 
     shapes (a, r) of the attachments; in c cases receptance (c, r), dynamic stiffness and applied
     forces of the attachments (c, a), and minus_omega2 (c,).
@@ -92,6 +92,6 @@ def _by_numpy(
     modal.real, modal.imag = forces.real @ shapes, forces.imag @ shapes
     modal *= receptance
     modal *= minus_omega2[:, None]
-    found = np.empty((c, len(at)), dtype=np.complex64)
-    found.real, found.imag = modal.real @ at.T, modal.imag @ at.T
+    found = np.empty((c, len(at_points)), dtype=np.complex64)
+    found.real, found.imag = modal.real @ at_points.T, modal.imag @ at_points.T
     return found

@@ -7,9 +7,9 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array
 from model.compiled.kernels import Kernels
-from model.compiled.lanes import work_space
+from model.compiled.lanes import as_given, work_space
 
-_ARRAYS = ("shapes", "at", "receptance", "stiffness", "applied", "minus_omega2")
+_ARRAYS = ("shapes", "at_points", "receptance", "stiffness", "applied", "minus_omega2")
 
 
 class _Tones(ctypes.Structure):
@@ -21,9 +21,9 @@ class _Tones(ctypes.Structure):
 
 def responses(kernels: Kernels, **given: Complex64Array | Float32Array) -> Complex64Array:
     """Accelerations (cases, points), of arrays by their names in `thickness.c`."""
-    arrays = {name: np.ascontiguousarray(given[name]) for name in _ARRAYS}
+    arrays = {name: as_given(given[name]) for name in _ARRAYS}
     cases, r = arrays["receptance"].shape
-    points = len(arrays["at"])
+    points = len(arrays["at_points"])
     pointers = [each.ctypes.data for each in arrays.values()]
     on = ctypes.byref(_Tones(len(arrays["shapes"]), r, points, *pointers))
     found = np.empty((cases, points), dtype=np.complex64)

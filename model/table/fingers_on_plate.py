@@ -193,17 +193,14 @@ class DriveResponses:
     def of(self, drive: int) -> "DriveResponses":
         """Responses to one of the drives, by index."""
         start, end = self.starts[drive], self.ends[drive]
-        return DriveResponses(
-            self.values[start:end],
-            self.error[start:end],
-            self.threshold[start:end],
-            np.zeros(1, dtype=int),
-            np.array([end - start]),
-            self.fingertips,
-            self.plate,
-            self.contacts,
-            Tones(self.tones.frequencies[start:end], self.tones.weights[start:end]),
-            self.points,
+        return replace(
+            self,
+            values=self.values[start:end],
+            error=self.error[start:end],
+            threshold=self.threshold[start:end],
+            starts=np.zeros(1, dtype=int),
+            ends=np.array([end - start]),
+            tones=Tones(self.tones.frequencies[start:end], self.tones.weights[start:end]),
         )
 
     def drawn(self, *, count: int, seed: int, thicknesses: int) -> Felt:

@@ -36,9 +36,10 @@ MAX_DURING_EFFECT = 3
 PROMISED_DRAWS, PROMISED_SEED, PROMISED_THICKNESSES = 200, 8, 10
 
 PROMISED_PERCENTILE = 9
-"""Percentile of the linear draws that is promised.
+"""Percentile of the draws that is promised.
 
-It is the tenth of plates solved exactly: the terms beyond the first order cost 0.1 to 0.3 dB.
+It is about the tenth of plates solved exactly: what is beyond the first order in other parameters
+than the thickness costs some tenths of a decibel.
 """
 
 _PERCENTS = (PROMISED_PERCENTILE, 50, 100 - PROMISED_PERCENTILE)

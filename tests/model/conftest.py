@@ -1,19 +1,21 @@
 """Kernels in C for each kind of processor, and the same in numpy where there is no compiler."""
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
 from model.compiled import kernels
 from model.errors import InputError
 
-RUNNABLE = {
-    each.name: each for each in kernels.versions() if each.features <= kernels.processor_features()
-}
+HAS = kernels.processor_features()
+RUNNABLE = {each.name: each for each in kernels.versions() if each.features.keys() <= HAS}
 
 
 @pytest.fixture
-def without_kernels(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+def without_kernels(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Iterator[Callable[[], None]]:
     """Takes the compiler away until the test is over."""
 
     def fail(*_: object, **__: object) -> None:
@@ -21,6 +23,7 @@ def without_kernels(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], No
 
     def take() -> None:
         monkeypatch.setattr(kernels, "kept_library", fail)
+        monkeypatch.setattr(kernels, "_HERE", tmp_path)  # nor one of a wheel
         kernels.kernels.cache_clear()
 
     yield take
@@ -39,7 +42,7 @@ def kernels_or_numpy(
         without_kernels()
         return
     version = RUNNABLE[request.param]
-    monkeypatch.setattr(kernels, "processor_features", lambda: version.features)
+    monkeypatch.setattr(kernels, "processor_features", version.features.keys)
     kernels.kernels.cache_clear()
     found = kernels.kernels()
     assert found is not None, "install a C compiler"

@@ -14,6 +14,7 @@ from sim.plant.loaded_plates import BLOCK, LoadedPlate, exponentials
 
 _NEGLIGIBLE = 1e-17  # of the strongest free vibration: a tenth of what rounding leaves of it
 _SMALLEST = 1e-60  # m/s²; what is subnormal is slow
+_ROOM = 16  # for forced exponentials, at first
 _TABLES_KEPT = 8  # sets of omegas
 
 
@@ -40,11 +41,12 @@ class Sampler:
         self._by_forced = np.ascontiguousarray((points @ plate.displacement).T)
         # Of all exponentials, forced ones before the free ones, those that decay fastest last:
         # conjugate exponents, conjugate amplitudes at the points, parts over time.
-        self._exponents = plate.decay.conj()
-        self._amplitudes = np.ascontiguousarray(at_points.conj().T)
-        self._columns = loaded.exponentials(sample_rate).view(float).astype(precision)
-        self._room = 0  # for forced ones
-        self._first = 0  # of those in use
+        self._room = self._first = _ROOM  # for forced ones, and the first of those in use
+        self._exponents = np.pad(plate.decay.conj(), (_ROOM, 0))
+        self._amplitudes = np.zeros((len(self._exponents), len(points)), dtype=complex)
+        self._amplitudes[_ROOM:] = at_points.conj().T
+        self._columns = np.empty((BLOCK, 2 * len(self._exponents)), dtype=precision)
+        self._columns[:, 2 * _ROOM :] = loaded.exponentials(sample_rate).view(float)
         self._forced: ForcedVibration | None = None
         self._solution = -1  # which these are
         self._constant = self._amplitudes[:0]  # conjugate amplitudes of all its solutions (n, q),

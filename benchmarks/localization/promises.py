@@ -32,7 +32,8 @@ def main() -> None:
 
     found = replace(data_set(), draws=options.plates)
     print(
-        f"{'plate':12} {'quiet':>5} {'given [dB]':>11} {'mean':>6} {'most':>6}  promised too much"
+        f"{'plate':12} {'quiet':>5} {'given [dB]':>11} {'least':>6} {'mean':>6} {'most':>6}  "
+        "promised too much"
     )
     for name in options.only or found.plates:
         table = build_table(found.plates[name].rig, drive_mode="phased")
@@ -48,8 +49,8 @@ def main() -> None:
         for quiet, row in sorted(rows.items()):
             given, excess = np.array(row).T
             print(
-                f"{name:12} {quiet:5d} {np.median(given):11.1f} {excess.mean():6.1f} "
-                f"{excess.max():6.1f}",
+                f"{name:12} {quiet:5d} {np.median(given):11.1f} {excess.min():6.1f} "
+                f"{excess.mean():6.1f} {excess.max():6.1f}",
                 flush=True,
             )
 

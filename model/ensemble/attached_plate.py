@@ -2,9 +2,9 @@
 
 Free plate in reduced coordinates: A(x, y) = phi_x diag(g) phi_y^T with g = 1 / (s lambda - w²),
 s lambda = (1 + i eta) lambda + i loss. A plate thicker by a factor has modal masses larger by it
-and frequencies higher by it (`model.vibration.parametric_plate`), so that
+and frequencies higher by it (`model.vibration.parametric_plate`), so that of one h times as thick
 
-    dg / d ln h = -3 g - 2 w² g²,    dg / d ln loss = -i Im(s lambda) g².
+    g = 1 / (h (h² s lambda - w²)),    dg / d ln loss = -i h³ Im(s lambda) g².
 """
 
 import math
@@ -35,8 +35,8 @@ class AttachedPlate:
     All in single precision: accelerations are within 1e-5 of their largest.
 
     - minus_omega2: (f,) [rad²/s²]
-    - receptance: (f, r) g; by_thickness, by_loss: (f, r) its change by one standard deviation;
-      deviating: (f, 2, r) that of plates thicker and thinner by it
+    - receptance: (f, r) g; by_loss: (f, r) its change by one standard deviation of the loss factor;
+      deviating: (f, 2, r) that of plates thicker and thinner by a standard deviation
     - shapes: (b, r) of the attachments; stiffness: (f, b) their dynamic stiffness [N/m]
     - forces: (f, n) of each ERA at full stroke [N]; strokes: (f, n) of its base [m]
     - by_stiffness: (f, n), by_damping: (f, n) change of the ERAs' dynamic stiffness by one standard
@@ -50,7 +50,6 @@ class AttachedPlate:
 
     minus_omega2: Float32Array
     receptance: Complex64Array
-    by_thickness: Complex64Array
     by_loss: Complex64Array
     deviating: Complex64Array
     shapes: Float32Array
@@ -78,11 +77,6 @@ class AttachedPlate:
         """Real and imaginary part of the receptance side by side, (r, 2 f)."""
         return np.ascontiguousarray(self.receptance.T).view(np.float32)
 
-    @cached_property
-    def modal_changes(self) -> Complex64Array:
-        """The receptance, and its changes by thickness and loss, (f, r, 3)."""
-        return np.stack([self.receptance, self.by_thickness, self.by_loss], axis=2)
-
     def at(self, frequencies: IntArray) -> "AttachedPlate":
         """The plate at some of its frequencies, by index (n,)."""
         return replace(
@@ -97,6 +91,19 @@ class AttachedPlate:
         w2 = -self.minus_omega2.take(frequencies).astype(float)
         stiffness = 1 / self.receptance.take(frequencies, axis=0).astype(complex) + w2[:, None]
         return _deviating(stiffness, w2, self.thickness * deviations)
+
+    def of_thicknesses(self, deviations: FloatArray, frequencies: IntArray) -> "AttachedPlate":
+        """Plates of known thicknesses, each deviation at each of the frequencies, by index.
+
+        deviations (d,): in standard deviations. The result has (f d,) frequencies.
+        """
+        count = len(deviations)
+        each = self.at(frequencies.repeat(count))
+        receptance = self.receptance_at(deviations, frequencies).reshape(each.receptance.shape)
+        factor = np.maximum(1 + self.thickness * deviations, LEAST_THICKNESS)
+        stiffer = np.tile(factor**3, len(frequencies))[:, None].astype(np.float32)
+        by_loss = each.by_loss * stiffer * (receptance / each.receptance) ** 2
+        return replace(each, receptance=receptance, by_loss=by_loss, thickness=0.0)
 
     def with_fingers(self, count: int, loads: Sequence[float] = ()) -> "Attachments":
         """What is attached to the plate with a number of fingers on it.
@@ -144,7 +151,6 @@ def _deviating(stiffness: ComplexArray, w2: FloatArray, deviations: FloatArray) 
 _BY_FREQUENCY = (
     "minus_omega2",
     "receptance",
-    "by_thickness",
     "by_loss",
     "deviating",
     "stiffness",
@@ -201,7 +207,6 @@ def attach(
     return AttachedPlate(
         minus_omega2=-w2[:, 0].astype(np.float32),
         receptance=g.astype(single),
-        by_thickness=(thickness * (-3 * g - 2 * w2 * g**2)).astype(single),
         by_loss=(log_damping * by_loss).astype(single),
         deviating=_deviating(stiffness, w2[:, 0], np.array([thickness, -thickness])),
         shapes=shapes.astype(np.float32),

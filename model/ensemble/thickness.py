@@ -1,8 +1,7 @@
 """Plates of other thickness, exactly: where modes are close it moves several past a tone.
 
-A plate thicker by a factor h has modal masses and frequencies that are larger by it, so that its
-receptance is g = 1 / (h (h² s lambda - w²)) of s lambda and w as in `attached_plate`. Within their
-uncertainty the other parameters change the response nearly in proportion.
+Their receptance is that of `attached_plate`. Within their uncertainty the other parameters change
+the response nearly in proportion.
 """
 
 from functools import lru_cache, partial
@@ -15,7 +14,7 @@ from model.compiled.kernels import kernels
 from model.ensemble.attached_plate import AttachedPlate
 from model.ensemble.contact_forms import LoadedContacts
 from model.ensemble.thickness_kernel import responses as by_kernel
-from model.ensemble.tone_responses import NOMINAL, THICKNESS, Tones
+from model.ensemble.tone_responses import Tones
 
 
 @lru_cache(maxsize=8)
@@ -34,18 +33,16 @@ def thickness_nodes(count: int) -> FloatArray:
     return found
 
 
-def thickness_remainders(
+def responses_of_thicknesses(
     plate: AttachedPlate,
     contacts: LoadedContacts,
     tones: Tones,
     points: Float32Array,
-    responses: Complex64Array,
     nodes: FloatArray,
 ) -> Complex64Array:
-    """What the responses at thicknesses differ by from those of `tone_responses`, (m, p, nodes).
+    """Accelerations [m/s²] at points of plates of other thickness, (m, p, nodes).
 
-    points (p, r): shapes; responses (m, p, columns): of `tone_responses`; nodes: deviations in
-    standard deviations.
+    points (p, r): shapes; nodes: deviations of the thickness in standard deviations.
     """
     at, r, count = tones.frequencies, points.shape[1], len(nodes)
     m, a = len(at), len(contacts.shapes)
@@ -61,10 +58,7 @@ def thickness_remainders(
         applied=applied.repeat(count, axis=0),
         minus_omega2=plate.minus_omega2.take(at).repeat(count),
     )
-    remainders = found.reshape(m, count, -1).swapaxes(1, 2)
-    remainders -= responses[:, :, NOMINAL, None]
-    remainders -= responses[:, :, THICKNESS, None] * nodes.astype(np.float32)
-    return np.asarray(remainders)
+    return found.reshape(m, count, len(points)).swapaxes(1, 2)
 
 
 def _by_numpy(

@@ -7,14 +7,14 @@ from itertools import accumulate
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array, IntArray
+from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.drive_modes.forms import Forms, Weights
 from model.ensemble.attached_plate import AttachedPlate
 from model.ensemble.contact_forms import LoadedContacts, load_contacts
-from model.ensemble.draws import draw
+from model.ensemble.draws import Draws, draw
 from model.ensemble.measures import Felt, Fingertips, felt
-from model.ensemble.thickness import thickness_nodes, thickness_remainders
-from model.ensemble.tone_responses import Tones, tone_responses
+from model.ensemble.thickness import responses_of_thicknesses, thickness_nodes
+from model.ensemble.tone_responses import NOMINAL, Tones, drawn_changes, tone_responses
 from model.table.fingertip_shapes import FingertipShapes
 from model.table.pulse_gains import PulseResponses
 from model.table.question import Question
@@ -155,6 +155,7 @@ class FingersOnPlate:
             self._contacts,
             tones,
             points,
+            self._question.loads,
         )
 
     def _expected(self, background: Complex64Array) -> Complex64Array:
@@ -176,7 +177,7 @@ class DriveResponses:
 
     values (m, k p, columns): of `tone_responses`; error (m,): root mean square of the
     discretisation error of each tone's field; threshold (m,) [m/s²]; starts, ends (c,): ranges of
-    the drives' tones; points (k p, r): shapes.
+    the drives' tones; points (k p, r): shapes; loads (k,): of the fingers, as of a question.
     """
 
     values: Complex64Array
@@ -189,6 +190,7 @@ class DriveResponses:
     contacts: LoadedContacts
     tones: Tones
     points: Float32Array
+    loads: tuple[float, ...]
 
     def of(self, drive: int) -> "DriveResponses":
         """Responses to one of the drives, by index."""
@@ -206,17 +208,47 @@ class DriveResponses:
     def drawn(self, *, count: int, seed: int, thicknesses: int) -> Felt:
         """Measures on the plate as modelled, and on drawn ones, (c, 1 + count).
 
-        thicknesses: how many the drawn plates have.
+        thicknesses: how many the drawn plates have. All else that is uncertain changes their
+        responses as on the plate as modelled, in proportion.
         """
-        plate, values = self.plate, self.values
-        if not plate.thickness:
-            thicknesses = 0
-        if thicknesses:
-            nodes = thickness_nodes(thicknesses)
-            further = thickness_remainders(
-                plate, self.contacts, self.tones, self.points, values, nodes
-            )
-            values = np.concatenate([values, further], axis=2)
+        draws, nodes = self._draws(count, seed, thicknesses)
+        return self._felt(draws, draws.accelerations(self.values, self._at_nodes(nodes)))
+
+    def promised(self, *, count: int, seed: int, thicknesses: int, bases: int) -> Felt:
+        """As `drawn`, but all else that is uncertain acts on a thickness as it does there.
+
+        bases: thicknesses at which its changes are computed, each for as many drawn plates.
+        """
+        draws, nodes = self._draws(count, seed, thicknesses)
+        if not len(nodes):
+            return self._felt(draws, draws.accelerations(self.values, self._at_nodes(nodes)))
+        tones, m, columns = self.tones, len(self.tones.frequencies), self.values.shape[2]
+        plates = self.plate.of_thicknesses(thickness_nodes(bases), tones.frequencies)
+        centres = self.contacts.shapes[self.plate.stiffness.shape[1] :, None]
+        contacts = load_contacts(
+            plates,
+            centres,
+            np.ones(centres.shape[:2], dtype=np.float32),
+            self.contacts.error_power.take(tones.frequencies.repeat(bases), axis=0),
+            self.loads,
+        )
+        factors = draws.factors[:columns, 1:].reshape(columns, bases, -1).swapaxes(0, 1)
+        changes = drawn_changes(
+            plates,
+            contacts,
+            Tones(np.arange(m * bases), tones.weights.repeat(bases, axis=0)),
+            self.points,
+            np.tile(factors, (m, 1, 1)),
+        ).reshape(len(self.points), m, count)
+        nominal = self._at_nodes(nodes).repeat(count // len(nodes), axis=2)
+        plates_drawn = nominal + changes.swapaxes(0, 1)
+        found = np.concatenate([self.values[:, :, NOMINAL, None], plates_drawn], axis=2)
+        return self._felt(draws, found)
+
+    def _draws(self, count: int, seed: int, thicknesses: int) -> tuple[Draws, FloatArray]:
+        """Drawn plates, and the deviations of their thickness, none where it is certain."""
+        plate = self.plate
+        thicknesses = thicknesses if plate.thickness > 0 else 0
         draws = draw(
             plate.era_count,
             len(self.fingertips.weights),
@@ -226,5 +258,12 @@ class DriveResponses:
             phase=plate.phase,
             thicknesses=thicknesses,
         )
-        power = draws.power(values, self.error)
+        return draws, thickness_nodes(thicknesses) if thicknesses else np.empty(0)
+
+    def _at_nodes(self, nodes: FloatArray) -> Complex64Array:
+        """Nominal responses at thicknesses, (m, k p, thicknesses)."""
+        return responses_of_thicknesses(self.plate, self.contacts, self.tones, self.points, nodes)
+
+    def _felt(self, draws: Draws, accelerations: Complex64Array) -> Felt:
+        power = draws.power(accelerations, self.error)
         return felt(power, self.threshold, self.starts, self.fingertips)

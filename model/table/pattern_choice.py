@@ -33,7 +33,7 @@ JUDGING_DRAWS, JUDGING_SEED, JUDGING_THICKNESSES = 64, 1, 5
 MAX_DURING_EFFECT = 3
 """Drives that are rated by what is felt over a short effect, and as many at their frequencies."""
 
-PROMISED_DRAWS, PROMISED_SEED, PROMISED_THICKNESSES = 200, 8, 10
+PROMISED_DRAWS, PROMISED_SEED, PROMISED_THICKNESSES, PROMISED_BASES = 200, 8, 40, 5
 
 PROMISED_PERCENTILE = 9
 """Percentile of the draws that is promised.
@@ -333,8 +333,11 @@ def _pattern(
     gap_db: float | None,
 ) -> Pattern:
     """The pattern of a drive, turned down to the wanted level at nine of ten plates."""
-    drawn = responses.drawn(
-        count=PROMISED_DRAWS, seed=PROMISED_SEED, thicknesses=PROMISED_THICKNESSES
+    drawn = responses.promised(
+        count=PROMISED_DRAWS,
+        seed=PROMISED_SEED,
+        thicknesses=PROMISED_THICKNESSES,
+        bases=PROMISED_BASES,
     )
     measures = [drawn.level]
     if drawn.contrast is not None:

@@ -26,16 +26,19 @@ EXIT_TIMEOUT = 3.0  # s
 _REMEDY = "see its output above and start the demonstration again"
 
 SIM_OPTIONS: Mapping[str, Sequence[str]] = {
-    "serial": ("--serial",),
+    "serial": ("--serial", "--shared"),
     "modbus": ("--modbus-tcp", "0"),
     "can": ("--socketcand", "0"),
     "firmware": ("--firmware",),
 }
-"""Options of `era sim` by wire."""
+"""Options of `era sim` by wire; amplifiers share a bus, so that they start together."""
 
 
 class SimulatedPlate:
-    """The plate behind the amplifiers, with their URLs by name; methods raise LinkError."""
+    """The plate behind the amplifiers, with their URLs by name; methods raise LinkError.
+
+    readings: a connection of their own for vibrations, so that no finger waits for one.
+    """
 
     def __init__(
         self,
@@ -43,10 +46,12 @@ class SimulatedPlate:
         urls: Mapping[str, str],
         *,
         threshold: str = DEFAULT_THRESHOLD,
+        readings: PlateControl | None = None,
     ) -> None:
         self.urls = urls
         self._threshold = threshold
         self._control = control
+        self._readings = readings or control
 
     async def place_fingers(
         self, positions: Mapping[str, Position], loads: Mapping[str, float] = MappingProxyType({})
@@ -62,7 +67,7 @@ class SimulatedPlate:
 
     async def vibration(self, since: float, until: float) -> dict[str, FingerVibration]:
         """Vibration of each finger by id between two times [s] of time.monotonic()."""
-        reply = await self._control.request({"op": "felt", "since_s": since, "until_s": until})
+        reply = await self._readings.request({"op": "felt", "since_s": since, "until_s": until})
         return {
             id: FingerVibration(
                 frequencies=np.array(felt["frequencies_hz"], dtype=float),
@@ -96,7 +101,9 @@ async def simulated_plate(
         path = Path(folder) / "control"
         async with contextlib.AsyncExitStack() as stack:
             control = PlateControl(path, remedy=_REMEDY)
+            readings = PlateControl(path, remedy=_REMEDY)
             stack.push_async_callback(control.close)
+            stack.push_async_callback(readings.close)
             if wire == "sim":
                 plate = "exact" if seed is None else f"seed={seed}"
                 base = f"sim://{quote(str(rig_file))}?control={quote(str(path))}&{plate}&amplifier="
@@ -105,7 +112,7 @@ async def simulated_plate(
                 process = await _start(rig_file, wire=wire, control=path, seed=seed)
                 stack.push_async_callback(_terminate, process)
                 urls = await _read_urls(process, count=len(amplifiers))
-            yield SimulatedPlate(control, urls, threshold=threshold)
+            yield SimulatedPlate(control, urls, threshold=threshold, readings=readings)
 
 
 async def _start(

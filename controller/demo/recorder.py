@@ -34,6 +34,8 @@ RESPONSE = 0.5
 STEADY_DURATION = 0.4
 """Shortest pattern [s] that counts as steady; the plate rings for 50 ms to 1 s."""
 
+_NOT_THE_TARGET = "another finger came down at the same moment and was the target"
+
 MIN_MOVEMENT = 0.001
 """Movement [m] below which a finger's sensor stays in place, so that its window is not broken."""
 
@@ -46,7 +48,7 @@ class _Touch:
     quiet: Mapping[str, Position]
     until: float = math.inf
     patterns: list["_Playing"] = field(default_factory=list)
-    reason: str = "another finger came down at the same moment and was the target"
+    reason: str | None = None
 
 
 @dataclass
@@ -117,7 +119,9 @@ class TouchRecorder:
             self._changed_at = clock.now()
         for contact in change.down:
             others = {_id(other): (other.x, other.y) for other in contacts if other != contact}
-            self._touches[contact.key] = _Touch(contact, others)
+            touch = self._touches[contact.key] = _Touch(contact, others)
+            if self._errors:
+                touch.reason = _cause(self._errors[0])
         for contact in change.up:
             touch = self._touches.pop(contact.key)
             touch.until = clock.now()
@@ -130,6 +134,8 @@ class TouchRecorder:
         self._playing = _Playing(applied, [touch for touch in found if touch is not None])
         for touch in self._playing.touches:
             touch.patterns.append(self._playing)
+        for touch in self._touches.values():
+            touch.reason = touch.reason or _NOT_THE_TARGET
         if applied.from_rest and applied.quiet:
             self._playing.onset = self._run(self._measure_onset(self._playing))
 
@@ -140,8 +146,12 @@ class TouchRecorder:
                 touch.reason = silenced.reason
 
     def _failed(self, error: str) -> None:
+        since = -math.inf if self._playing is None else self._playing.applied.time
         self._end_pattern(clock.now())
         self._errors.append(error)
+        for touch in self._touches.values():
+            if touch.contact.since > since:
+                touch.reason = _cause(self._errors[0])
 
     def _end_pattern(self, now: float) -> None:
         """Close the playing pattern and measure its end."""
@@ -189,7 +199,7 @@ class TouchRecorder:
             until_s=touch.until - self._start,
             targets_m=[(contact.x, contact.y)],
             quiet=touch.quiet,
-            reason=touch.reason,
+            reason=touch.reason or "no vibration was confirmed before it lifted",
         )
         if touch.patterns:
             row = await _played(touch, row)
@@ -265,6 +275,11 @@ def _fingers(
 def _prediction(touch: _Touch, playing: _Playing) -> Prediction:
     """Prediction for a touch under a pattern that played for it."""
     return next(felt for felt in playing.applied.targets if felt.contact.key == touch.contact.key)
+
+
+def _cause(error: str) -> str:
+    """What an error states, without its remedy."""
+    return error.partition("; ")[0]
 
 
 def _id(contact: Contact) -> str:

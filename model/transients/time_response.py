@@ -20,7 +20,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
@@ -250,9 +249,10 @@ def plate_in_time(
         reduced, eras, loads=loads, contacts=contacts, attachment_shapes=attachment_shapes
     )
     r = len(K)
-    inverse = linalg.inv(M)
+    # NumPy's, which let other threads run meanwhile, as SciPy's do not.
+    inverse = np.linalg.inv(M)
     A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
-    eigenvalues, vectors = linalg.eig(A)
+    eigenvalues, vectors = np.linalg.eig(A)
     inverse_vectors = _inverse(vectors)
     residual = np.abs((vectors * eigenvalues) @ inverse_vectors - A).max()
     if not residual < 1e-6 * np.abs(A).max():
@@ -262,14 +262,14 @@ def plate_in_time(
         )
     input_shapes = np.zeros((r, len(eras)))
     input_shapes[: attachment_shapes.shape[1]] = attachment_shapes[: len(eras)].T
-    forced = np.asarray(inverse_vectors[:, r:] @ inverse)
+    forced: ComplexArray = inverse_vectors[:, r:] @ inverse
     return PlateInTime(
         reduced,
         tuple(eras),
         eigenvalues,
         vectors,
         inverse_vectors,
-        forced @ input_shapes,
+        np.asarray(forced @ input_shapes, dtype=complex),
         forced,
     )
 

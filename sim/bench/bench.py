@@ -5,10 +5,11 @@ level 1 being the full stroke, with the imperfections given.
 """
 
 import asyncio
+import math
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from types import MappingProxyType
 from typing import Protocol
 
@@ -27,11 +28,13 @@ from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import Motion, terms_of
 from registry.voltage import Law
 from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.bench.placement import Placement
 from sim.bench.reading import ToneReader
 from sim.bench.sensing import PlateSensor, Sensing
 from sim.plant.felt import Felt, measure_vibration
 from sim.plant.fingers import KEPT, Fingers, Position, Record
 from sim.plant.imperfections import Imperfections, PlateErrors, delayed, draw_noise, realised
+from sim.plant.loaded_plates import LoadedPlate
 from sim.plant.plant import SAMPLE_RATE, Plant
 from sim.plant.voltage import moved_by_voltage
 from sim.waveform import Output
@@ -80,6 +83,11 @@ class Bench:
         self._plant = _plant_of(imperfections.plate.realised(rig), now)
         self._sampled_until = now  # up to when [s] fingers and probes have samples
         self._fingers = Fingers(self._plant.reduced)
+        self._is_sampling = False
+        # Fingers that are not on the plate in time yet; the newest, and those that load the plate.
+        self._placements: deque[Placement] = deque()
+        self.positions: Mapping[str, Position] = {}
+        self._contacts: Mapping[str, FingertipLoad] = {}
         self.observers: frozenset[str] = frozenset()  # fingers without weight
         self.loads: Mapping[str, float] = {}  # by finger, relative to the rig's fingertip
         self.amplifiers: Mapping[str, SimulatedAmplifier] = {
@@ -139,7 +147,7 @@ class Bench:
         """Advance to a time [s]; each event happens at its own time."""
         self._advance(now)
         if self._time - self._sampled_until >= _MAX_BEHIND:
-            self._sample_plate()
+            self._sample_what_is_solved()
 
     def _advance(self, now: float) -> None:
         """Advance the amplifiers to a time [s], and the plate with them if probes listen."""
@@ -152,8 +160,11 @@ class Bench:
             self._advance_amplifiers(self._time + _MAX_STEP)
             self._sample_plate()
         self._advance_amplifiers(now)
-        if self._probes or self._time - self._sampled_until > _MAX_STEP:
+        behind = self._time - self._sampled_until
+        if self._probes or behind > KEPT:
             self._sample_plate()
+        elif behind > _MAX_STEP:
+            self._sample_what_is_solved()
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Reduced shapes (p, r) at points (p, 2) [m].
@@ -183,30 +194,41 @@ class Bench:
         observers: fingers without weight; loads: of the others relative to the rig's fingertip, 1
         where left out.
         """
+        self.begin_placing(positions, now=now, observers=observers, loads=loads)
+        self._sample_plate()
+
+    def begin_placing(
+        self,
+        positions: Mapping[str, Position],
+        *,
+        now: float,
+        observers: Collection[str] = (),
+        loads: Mapping[str, float] = MappingProxyType({}),
+    ) -> None:
+        """Replace the fingers as `place_fingers`, with the plate under them still to be solved.
+
+        The amplifiers go on; the plate waits at this time until `unsolved` is solved or read.
+        """
         self._fingers.check(positions)
         check_loads(loads.values())
         self.advance(now)
-        self._sample_plate()
         self.observers = frozenset(observers) & positions.keys()
         self.loads = {name: load for name, load in loads.items() if name in positions}
-        fingertip = self.rig.fingertip
-        if fingertip is not None:
-            before = self._plant.reduced
-            self._plant.set_contacts(
-                {
-                    name: FingertipLoad(
-                        *at,
-                        self.imperfections.load_of(
-                            name, fingertip.scaled(self.loads.get(name, 1.0))
-                        ),
-                    )
-                    for name, at in positions.items()
-                    if name not in self.observers
-                }
-            )
-            if self._plant.reduced is not before:
-                self._shapes_at.cache_clear()
-        self._fingers.place(positions, reduced=self._plant.reduced)
+        self.positions = dict(positions)
+        before, self._contacts = self._contacts, self._contacts_at(positions)
+        solve = None
+        if self._contacts != before:
+            solution = self._plant.solution(self._contacts, time=self._time)
+            solve = partial(_tabulated, solution, self.sample_rate)
+        placement = Placement(self._time, positions, self._contacts, solve)
+        if len(self._placements) > 1 and placement.supersedes(*list(self._placements)[-2:]):
+            self._placements.pop()
+        self._placements.append(placement)
+
+    @property
+    def unsolved(self) -> Placement | None:
+        """The first of the fingers that are to be placed whose plate is not solved, if any."""
+        return next((one for one in self._placements if not one.is_solved), None)
 
     def change_plate(self, errors: PlateErrors, *, now: float) -> None:
         """Replace plate and ERAs by those of these errors, at rest; what plays drives them on.
@@ -244,7 +266,8 @@ class Bench:
 
         Also the frequencies [Hz] driven in it, ascending.
         """
-        return self.fingers.felt(since, until), self._frequencies(since, until)
+        self._sample_plate(until)
+        return self._fingers.felt(since, until), self._frequencies(since, until)
 
     def felt(self, since: float, until: float) -> dict[str, Felt]:
         """Vibration at each finger in such a window, by id."""
@@ -265,18 +288,65 @@ class Bench:
             if moment >= to_time:
                 return
 
-    def _sample_plate(self) -> None:
-        """Advance the plate to the present time, sampled if there are fingers or probes."""
-        if self._sampled_until >= self._time:
+    def _contacts_at(self, positions: Mapping[str, Position]) -> Mapping[str, FingertipLoad]:
+        """The fingers that load the plate."""
+        fingertip = self.rig.fingertip
+        if fingertip is None:
+            return {}
+        return {
+            name: FingertipLoad(
+                *at,
+                self.imperfections.load_of(name, fingertip.scaled(self.loads.get(name, 1.0))),
+            )
+            for name, at in positions.items()
+            if name not in self.observers
+        }
+
+    def _sample_plate(self, until: float = math.inf) -> None:
+        """Advance the plate to a time [s] or the present one; solves what is unsolved by then."""
+        end = min(until, self._time)
+        while self._placements and self._placements[0].time <= end and not self._is_sampling:
+            self._place(self._placements.popleft())
+        self._sample_until(end)
+
+    def _sample_what_is_solved(self) -> None:
+        """Advance the plate by a second at most, to a finger that is unsolved."""
+        end = min(self._time, self._sampled_until + _MAX_STEP)
+        while self._placements and self._placements[0].time <= end:
+            if not self._placements[0].is_solved:
+                end = self._placements[0].time
+                break
+            self._place(self._placements.popleft())
+        self._sample_until(end)
+
+    def _place(self, placement: Placement) -> None:
+        """Advance the plate to the time of a placement, and put its fingers on it."""
+        self._sample_until(placement.time)
+        before = self._plant.reduced
+        self._plant.set_contacts(placement.contacts, loaded=placement.solved())
+        if self._plant.reduced is not before:
+            self._shapes_at.cache_clear()
+        self._fingers.place(placement.positions, reduced=self._plant.reduced)
+
+    def _sample_until(self, end: float) -> None:
+        """Advance the plate to a time [s], sampled if there are fingers or probes."""
+        if self._sampled_until >= end or self._is_sampling:  # probes look at the fingers
             return
-        self._sampled_until = self._time  # first, since probes look at the fingers
+        self._is_sampling = True
+        try:
+            self._sampled_until = end
+            self._sample(end)
+        finally:
+            self._is_sampling = False
+
+    def _sample(self, end: float) -> None:
         layout, probes = self._fingers.layout, tuple(self._probes)
         if not (layout.positions or probes):
-            self._plant.skip(self._time)
+            self._plant.skip(end)
             return
         shapes = [layout.shapes, *(probe.shapes for probe in probes)]
         times, accelerations = self._plant.advance(
-            self._time,
+            end,
             sample_rate=self.sample_rate,
             shapes=np.concatenate(shapes),
             precision=np.float64 if probes else np.float32,  # of what is kept of fingers
@@ -352,6 +422,13 @@ class Bench:
         if drive is None or drive.law is Law.LINEAR:
             return (frequency,)
         return (2 * frequency,) if drive.is_halved else (frequency, 2 * frequency)
+
+
+def _tabulated(solve: Callable[[], LoadedPlate], sample_rate: float) -> LoadedPlate:
+    """A plate with the exponentials that are needed first."""
+    loaded = solve()
+    loaded.exponentials(sample_rate)
+    return loaded
 
 
 def _plant_of(real: Rig, time: float) -> Plant:

@@ -28,11 +28,38 @@ class SimulationContext:
     recorder: Recorder | None = None
     accelerometers: Accelerometers = field(init=False)
     first_plate: PlateErrors = field(init=False)
+    _solving: asyncio.Task[None] | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         """Start without sensors, from the plate as it is."""
         self.accelerometers = Accelerometers(self.bench)
         self.first_plate = self.bench.imperfections.plate
+
+    def start_solving(self) -> None:
+        """Solve the plate under the newest fingers in a thread, so that amplifiers go on replying.
+
+        At once in virtual time.
+        """
+        if self.step is not None:
+            return  # the first who reads the plate solves it
+        if self._solving is None or self._solving.done():
+            self._solving = asyncio.create_task(self._solve(), name="solve the plate")
+
+    async def solved(self, until: float) -> None:
+        """Wait until the plate under the fingers is solved up to a time [s]."""
+        while (placement := self.bench.unsolved) is not None and placement.time <= until:
+            await asyncio.gather(asyncio.to_thread(placement.solved), return_exceptions=True)
+
+    async def stop_solving(self) -> None:
+        """Leave what is unsolved."""
+        if self._solving is not None:
+            self._solving.cancel()
+            await asyncio.wait({self._solving})
+
+    async def _solve(self) -> None:
+        while (placement := self.bench.unsolved) is not None:
+            # An error is raised once more where the plate is read.
+            await asyncio.gather(asyncio.to_thread(placement.solved), return_exceptions=True)
 
     def record(self, path: Path) -> None:
         """Start recording the present sensors and fingers; InputError while another one runs."""

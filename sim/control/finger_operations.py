@@ -38,7 +38,7 @@ async def _fingers(context: SimulationContext, request: Request, now: float) -> 
 
 
 async def _touch_or_move(context: SimulationContext, request: Request, now: float) -> Response:
-    name, present = parse_finger(request), context.bench.fingers.layout.positions
+    name, present = parse_finger(request), context.bench.positions
     if (name in present) != (request["op"] == "move"):
         state = "already" if name in present else "not"
         raise InputError(f"finger {name!r} is {state} on the plate")
@@ -52,7 +52,7 @@ async def _touch_or_move(context: SimulationContext, request: Request, now: floa
 
 
 async def _lift(context: SimulationContext, request: Request, now: float) -> Response:
-    name, present = parse_finger(request), context.bench.fingers.layout.positions
+    name, present = parse_finger(request), context.bench.positions
     if name not in present:
         raise InputError(f"finger {name!r} is not on the plate")
     rest = {id: at for id, at in present.items() if id != name}
@@ -67,16 +67,17 @@ def _placed(
     observers: Collection[str],
     loads: Mapping[str, float],
 ) -> Response:
-    context.bench.place_fingers(positions, now=now, observers=observers, loads=loads)
+    context.bench.begin_placing(positions, now=now, observers=observers, loads=loads)
+    context.start_solving()
     return {"ok": True, "time_s": context.bench.time}
 
 
 async def _felt(context: SimulationContext, request: Request, now: float) -> Response:
     since, until = parse_window(request)
+    await context.solved(until)  # in a thread, as the fits below: amplifiers must go on replying
     context.bench.advance(now)
     records, frequencies = context.bench.records(since, until)
     felt = {
-        # In a thread: a long fit must not delay the amplifiers' replies.
         id: await asyncio.to_thread(measure_vibration, record, frequencies)
         for id, record in records.items()
     }

@@ -103,7 +103,7 @@ async def _state(context: SimulationContext, request: Request, now: float) -> Re
             "high_voltage": status.high_voltage,
             "levels": list(status.levels),
         }
-    resting = {name: list(position) for name, position in bench.fingers.layout.positions.items()}
+    resting = {name: list(position) for name, position in bench.positions.items()}
     return {"time_s": bench.time, "fingers": resting, "amplifiers": amplifiers}
 
 

@@ -51,6 +51,7 @@ async def control_socket(context: SimulationContext, path: Path) -> AsyncIterato
         for client in clients:
             client.cancel()
         await asyncio.gather(*clients, return_exceptions=True)
+        await context.stop_solving()
 
 
 async def _serve_client(context: SimulationContext, connection: socket.socket) -> None:

@@ -64,7 +64,7 @@ class FirmwareBench(Bench):
         ]
         self._play(np.column_stack(wired), now=now)
 
-    def place_fingers(
+    def begin_placing(
         self,
         positions: Mapping[str, Position],
         *,
@@ -72,8 +72,9 @@ class FirmwareBench(Bench):
         observers: Collection[str] = (),
         loads: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
-        """Replace the fingers, as `Bench.place_fingers`."""
-        super().place_fingers(positions, now=now, observers=observers, loads=loads)
+        """Replace the fingers at once, as `place_fingers`: the amplifiers are other processes."""
+        super().begin_placing(positions, now=now, observers=observers, loads=loads)
+        self._sample_plate()
         self._sampled.follow()
 
     def _play(self, levels: FloatArray, *, now: float) -> None:
@@ -94,9 +95,9 @@ class FirmwareBench(Bench):
         while self._recent[0][0] < self._time - KEPT:
             self._recent.popleft()
 
-    def _sample_plate(self) -> None:
+    def _sample(self, end: float) -> None:
         """Let the plate that lends its coordinates go on; the samples' is sampled as they come."""
-        self._plant.skip(self._time)
+        self._plant.skip(end)
 
     def _frequencies(self, since: float, until: float) -> list[float]:
         """The frequencies [Hz] that the samples of a window consist of."""

@@ -5,9 +5,9 @@ reduced basis is extended by the static vectors of the point, and the small syst
 again. Solutions are cached. Structural damping remains that of the plate on its ERAs.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TypeAlias
 
 import numpy as np
@@ -99,6 +99,12 @@ class LoadedPlateCache:
 
     def under(self, contacts: Sequence[FingertipLoad], *, time: float) -> LoadedPlate:
         """The plate under these contacts from a time [s]; calls must be in order of time."""
+        return self.solution(contacts, time=time)()
+
+    def solution(
+        self, contacts: Sequence[FingertipLoad], *, time: float
+    ) -> Callable[[], LoadedPlate]:
+        """What solves the plate under these contacts, in any thread; called as `under`."""
         resting = tuple(sorted({(each.x, each.y, each.foot) for each in contacts}))
         for point in self._resting:
             self._lifted.pop(point, None)
@@ -110,7 +116,7 @@ class LoadedPlateCache:
             if time - when < _KEEP_LIFTED and point not in resting
         ][-_MAX_LIFTED:]
         self._lifted = {point: self._lifted[point] for point in recent}
-        return self._solved((*resting, *sorted(recent)), tuple(contacts))
+        return partial(self._solved, (*resting, *sorted(recent)), tuple(contacts))
 
     def _solve(
         self, points: tuple[Footprint, ...], contacts: tuple[FingertipLoad, ...]

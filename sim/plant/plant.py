@@ -5,7 +5,7 @@ present base motion, and the free vibration that remains after each change.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -119,8 +119,21 @@ class Plant:
         moment = self.time if since is None else max(since, self.time)
         self._scheduled.setdefault(moment, {})[era] = tuple(motion)
 
-    def set_contacts(self, contacts: Mapping[str, FingertipLoad]) -> None:
+    def solution(
+        self, contacts: Mapping[str, FingertipLoad], *, time: float
+    ) -> Callable[[], LoadedPlate]:
+        """What solves the plate under the contacts from a time [s] on, in any thread.
+
+        Calls must be in order of time, also with those of `set_contacts`.
+        """
+        return self._plates.solution(tuple(contacts.values()), time=time)
+
+    def set_contacts(
+        self, contacts: Mapping[str, FingertipLoad], *, loaded: LoadedPlate | None = None
+    ) -> None:
         """Replace the contacts, by id of the finger; a new finger's phalanx is at rest.
+
+        loaded: the plate under them, where it is solved already.
 
         Displacement and velocity of the plate, and of the phalanges of fingers that stay, are
         continuous; energy in pulp, masses and joint of a finger comes and goes with it.
@@ -129,7 +142,7 @@ class Plant:
             return
         before = self._current, self._contacts
         state = np.concatenate(self._state())
-        self._current = self._plates.under(tuple(contacts.values()), time=self.time)
+        self._current = loaded or self.solution(contacts, time=self.time)()
         self._contacts = dict(contacts)
         remainder = carried_state(state, before, (self._current, contacts))
         self._forced = self._current.plate.driven(self._motions, [self._set], [self.time])

@@ -57,7 +57,7 @@ def draw(context: SimulationContext, plate: PlateView) -> RenderableType:
         amplifiers.add_row(name, status.state.name, status.fault.name, str(status.token), levels)
     fingers = Table("finger", "at", "peak acceleration")
     felt = bench.felt(bench.time - WINDOW, bench.time)
-    for name, (x, y) in bench.fingers.layout.positions.items():
+    for name, (x, y) in bench.positions.items():
         peak = f"{felt[name].peak.max() / G:.2f} g" if name in felt else ""
         fingers.add_row(name, f"{x * 1000:.0f}, {y * 1000:.0f} mm", peak)
     footer = [f"{bench.time - plate.begun:.1f} s"]
@@ -75,7 +75,7 @@ def _picture(bench: Bench, peaks: FloatArray) -> Text:
     rows = [[_SHADES[min(cell, len(_SHADES) - 1)] for cell in row] for row in shade]
     size = bench.rig.plate.length, bench.rig.plate.width
     places = [((era.x, era.y), "E") for era in bench.rig.eras]
-    places += [(at, "O") for at in bench.fingers.layout.positions.values()]
+    places += [(at, "O") for at in bench.positions.values()]
     for (x, y), mark in places:
         column = min(int(x / size[0] * _COLUMNS), _COLUMNS - 1)
         rows[min(int(y / size[1] * _ROWS), _ROWS - 1)][column] = mark

@@ -28,6 +28,9 @@ MAX_SIZE = 1 << 20  # bytes
 MAX_PROBLEMS = 50
 """Number of problems of one file that are reported; with more it is the wrong kind of file."""
 
+IF_EMPTY = "`era config init` writes one to begin with"
+"""Remedy for an empty configuration file."""
+
 _MAX_DEPTH = 20
 _MAX_VALUES = 50_000
 _ZIP = b"PK\x03\x04"
@@ -109,8 +112,11 @@ def key_name(path: KeyPath) -> str:
     return name
 
 
-def read_document(path: Path) -> Document:
-    """Read a YAML file; raises ConfigError if it cannot be read, or is more than plain data."""
+def read_document(path: Path, *, if_empty: str = IF_EMPTY) -> Document:
+    """Read a YAML file; if_empty: the remedy for a file without content.
+
+    Raises ConfigError if it cannot be read, or is more than plain data.
+    """
     source = str(path)
     try:
         with open(path, "rb", opener=regular_file) as stream:
@@ -137,10 +143,10 @@ def read_document(path: Path) -> Document:
         line = content.count(b"\n", 0, error.start) + 1
         message = f"byte 0x{content[error.start]:02x} is no UTF-8; save the file as UTF-8"
         raise ConfigError(source, [Problem(line, "", message)]) from error
-    return parse_document(source, text)
+    return parse_document(source, text, if_empty=if_empty)
 
 
-def parse_document(source: str, text: str) -> Document:
+def parse_document(source: str, text: str, *, if_empty: str = IF_EMPTY) -> Document:
     """Read the text of a YAML file that came from a source; raises ConfigError."""
     yaml = plain_yaml("safe")
     with _errors_at(source, text):
@@ -148,7 +154,7 @@ def parse_document(source: str, text: str) -> Document:
     if yaml.composer.repeated:
         raise ConfigError(source, yaml.composer.repeated)
     if data is None:
-        raise _whole(source, "is empty; `era config init` writes one to begin with")
+        raise _whole(source, f"is empty; {if_empty}")
     return Document(source, text, data, yaml.composer.lines)
 
 

@@ -23,6 +23,10 @@ EDGE, ANYWHERE = "edge", "anywhere"
 
 PICTURES = (".png", ".jpg", ".jpeg")
 
+PROPORTION_TOLERANCE = 0.02
+"""By how much the height of a picture may differ from the plate's proportions, relative."""
+
+_PICTURE_SIDE = 1000  # pixels of the longer side of the picture proposed
 _ON_EDGE = 1e-9  # m
 _MAX_CANDIDATES = 2000
 
@@ -117,7 +121,8 @@ class Within:
 def area_of(where: str, plate: Plate) -> Area:
     """The area of a name, a picture or a file of polygons.
 
-    Raises InputError for a picture that cannot be read and a file that is none.
+    Raises InputError for a picture that cannot be read or has other proportions than the plate, and
+    for a file that is none.
     """
     length, width = plate.length, plate.width
     if where == EDGE:
@@ -126,13 +131,16 @@ def area_of(where: str, plate: Plate) -> Area:
         return Within(length, width, everywhere)
     path = Path(where)
     if path.suffix.lower() in PICTURES:
-        return Within(length, width, _Picture(_white(path), length, width))
+        return Within(length, width, _picture(path, plate))
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise InputError(
             f"--where must be {EDGE}, {ANYWHERE}, a picture ({', '.join(PICTURES)}) or a .yaml "
             f"file of polygons, got {where!r}"
         )
-    validation = Validation(read_document(path), _PolygonsSection)
+    validation = Validation(
+        read_document(path, if_empty="it must have polygons, each a name with its corners"),
+        _PolygonsSection,
+    )
     return Within(
         length, width, _Polygons(tuple(map(_array, validation.finish().polygons.values())))
     )
@@ -214,6 +222,22 @@ class _PolygonsSection(Section):
 
 def _array(polygon: Sequence[tuple[float, float]]) -> FloatArray:
     return np.array(polygon, dtype=float)
+
+
+def _picture(path: Path, plate: Plate) -> _Picture:
+    """The white of a picture that has the proportions of the plate, to half a pixel at least."""
+    white = _white(path)
+    rows, columns = white.shape
+    expected = columns * plate.width / plate.length
+    if abs(rows - expected) > max(PROPORTION_TOLERANCE * expected, 0.5):
+        scale = _PICTURE_SIDE / max(plate.length, plate.width)
+        across, up = (max(1, round(side * scale)) for side in (plate.length, plate.width))
+        raise InputError(
+            f"{path}: must have the proportions of the plate of {plate.length:g} m by "
+            f"{plate.width:g} m, got {columns} by {rows} pixels; draw the whole plate, without a "
+            f"margin, for example on {across} by {up} pixels"
+        )
+    return _Picture(white, plate.length, plate.width)
 
 
 def _white(path: Path) -> NDArray[np.bool_]:

@@ -26,6 +26,7 @@ DEFAULT_APART = 0.05
 DEFAULT_QUIET = (1, 3)
 """Fewest and most quiet fingers."""
 
+_ROUNDING = 1e-9  # m
 _MAX_TRIES = 20_000
 _DRAWN_FOR_EACH = 8  # drawn for each place of a pool, of which the loneliest is taken
 
@@ -127,17 +128,24 @@ def load_contacts_file(path: Path, plate: Plate) -> ContactRule:
 
     Raises ConfigError for what is wrong in it.
     """
-    document = read_document(path)
+    document = read_document(path, if_empty="it must have regions or sets")
     validation = Validation(document, _ContactsSection)
     for name in validation.mapping(("regions",)):
         region = validation.part(("regions", name), _RegionSection)
         if region is not None and len(region.shapes) != 1:
             validation.add(("regions", name), "must have one of rectangle, circle and polygon")
+        elif region is not None and not (shape := _shape(region)).is_on(plate):
+            (x0, y0), (x1, y1) = shape.low.tolist(), shape.high.tolist()
+            validation.add(
+                ("regions", name),
+                f"must be on the plate, from (0, 0) to ({plate.length:g}, {plate.width:g}) m, got "
+                f"({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) m",
+            )
     section = validation.finish()
     given = tuple(np.array([each.target, *each.quiet]) for each in section.sets)
     problems = _off_plate(document, given, plate)
     if bool(section.sets) == bool(section.regions):
-        problems.append("must have regions or sets")
+        problems.append(f"must have regions or sets, got {'both' if section.sets else 'neither'}")
     low, high = section.quiet
     if not 1 <= low <= high < MAX_CONTACTS:
         problems.append(
@@ -167,13 +175,18 @@ class _Shape:
     high: FloatArray
     contains: Callable[[FloatArray], NDArray[np.bool_]]
 
+    def is_on(self, plate: Plate) -> bool:
+        """Whether all of it is on a plate."""
+        size = np.array([plate.length, plate.width])
+        return bool((self.low >= -_ROUNDING).all() and (self.high <= size + _ROUNDING).all())
+
     def draw(self, rng: np.random.Generator, plate: Plate) -> FloatArray:
         """A place [m] of the plate in it; raises InputError where there is none."""
         for _ in range(_MAX_TRIES):
             place = rng.uniform(self.low, self.high)
             if plate.contains(*place.tolist()) and self.contains(place[None])[0]:
                 return np.asarray(place)
-        raise InputError("regions of --contacts must be on the plate, got one that is not")
+        raise InputError("regions of --contacts must have an area, got one that has none")
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,9 +246,9 @@ class _ContactsSection(Section):
     quiet: Annotated[tuple[int, int], Strict(strict=False)] = DEFAULT_QUIET
     apart: Annotated[float, Quantity(LENGTH, at_least=0.026, at_most=10)] = DEFAULT_APART
     regions: Annotated[
-        dict[Identifier, _RegionSection], Field(max_length=256, default_factory=dict)
+        dict[Identifier, _RegionSection], Field(min_length=1, max_length=256, default_factory=dict)
     ]
-    sets: Annotated[list[_SetSection], Field(max_length=1000, default_factory=list)]
+    sets: Annotated[list[_SetSection], Field(min_length=1, max_length=1000, default_factory=list)]
     effects: Any = None
     elsewhere: Any = None
     most_at_once: Any = None

@@ -26,14 +26,80 @@ def test_polygons_hold_their_points(tmp_path) -> None:
 
 def test_white_of_a_picture_is_where_eras_may_stand(tmp_path) -> None:
     """The picture's top row is the plate's far side."""
-    pixels = np.zeros((20, 30))
-    pixels[:5, 15:] = 1.0
+    pixels = np.zeros((21, 28))
+    pixels[:5, 14:] = 1.0
     imsave(tmp_path / "mask.png", pixels, cmap="gray", vmin=0, vmax=1)
     area = area_of(str(tmp_path / "mask.png"), PLATE)
     x, y = area.candidates(0.01).T
     assert x.min() >= PLATE.length / 2
     assert y.min() >= 0.75 * PLATE.width
     assert y.max() == PLATE.width
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "is_refused"),
+    [
+        (300, 400, False),
+        (306, 400, False),
+        (294, 400, False),
+        (307, 400, True),
+        (293, 400, True),
+        (400, 300, True),
+        (100, 100, True),
+        (22, 30, False),
+    ],
+)
+def test_picture_has_the_proportions_of_the_plate(tmp_path, rows, columns, is_refused) -> None:
+    """12 by 9 inches is 400 by 300 pixels, to 2 % of the height or half a pixel."""
+    path = tmp_path / "mask.png"
+    imsave(path, np.ones((rows, columns)), cmap="gray", vmin=0, vmax=1)
+    if not is_refused:
+        assert area_of(str(path), PLATE).contains(np.array([[0.1, 0.1]])).all()
+        return
+    with pytest.raises(InputError, match=rf"mask\.png.*0\.3048 m.*{columns} by {rows} pixels"):
+        area_of(str(path), PLATE)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        "rectangle: {start: [25 cm, 5 cm], end: [31 cm, 10 cm]}",
+        "circle: {at: [2 cm, 10 cm], radius: 3 cm}",
+        "polygon: [[1 cm, 1 cm], [5 cm, 23 cm], [5 cm, 1 cm]]",
+        "circle: {at: [50 cm, 50 cm], radius: 2 cm}",
+    ],
+)
+def test_regions_off_the_plate_are_refused(tmp_path, shape) -> None:
+    """In part or wholly, of a plate of 12 by 9 inches, by file, line, name and size."""
+    path = tmp_path / "contacts.yaml"
+    path.write_text(
+        "regions:\n"
+        "  on: {rectangle: {start: [0, 0], end: [12 in, 9 in]}}\n"
+        f"  off: {{{shape}}}\n"
+    )
+    with pytest.raises(InputError, match=r"contacts\.yaml:3: regions\.off.*\(0\.3048, 0\.2286\) m"):
+        load_contacts_file(path, PLATE)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"), [("", "regions or sets"), ("sets: []", r"1: sets.*at least 1")]
+)
+def test_empty_contacts_name_what_is_expected(tmp_path, text, said) -> None:
+    """The keys of an empty file, the least number of an empty list."""
+    path = tmp_path / "contacts.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=said) as refused:
+        load_contacts_file(path, PLATE)
+    assert "config init" not in str(refused.value)
+
+
+def test_empty_area_names_what_is_expected(tmp_path) -> None:
+    """An empty file is told its key."""
+    path = tmp_path / "where.yaml"
+    path.write_text("")
+    with pytest.raises(InputError, match="polygons") as refused:
+        area_of(str(path), PLATE)
+    assert "config init" not in str(refused.value)
 
 
 def test_contacts_in_regions_of_a_layout(tmp_path) -> None:

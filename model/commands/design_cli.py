@@ -19,6 +19,7 @@ from model.commands.options import (
     RigArgument,
     cluster_at,
 )
+from model.counting import counted
 
 if TYPE_CHECKING:
     from model.config.document import Value
@@ -34,7 +35,13 @@ design_app = typer.Typer()
 def design(
     rig_file: RigArgument,
     eras: Annotated[
-        int, typer.Option("--eras", min=1, max=32, help="Number of ERAs, kept ones included.")
+        int,
+        typer.Option(
+            "--eras",
+            min=1,
+            max=32,
+            help="Number of ERAs, kept ones included; at least 3 with the rig's other mounts.",
+        ),
     ],
     output: FolderOption,
     keep: Annotated[
@@ -158,7 +165,7 @@ def design(
     if as_json:
         print(json.dumps(result))
         return
-    _show(result)
+    _show(result, own_count=len(own))
     print("wrote")
     for name in files:
         print(f"  {name}")
@@ -168,8 +175,11 @@ def design(
 
 
 def _changed(before: "Uncertainty", text: str) -> dict[str, "Value"]:
-    """The section of an uncertainty in which KEY=VALUE,... are replaced."""
-    from model.errors import InputError
+    """The section of an uncertainty in which KEY=VALUE,... are replaced; raises InputError."""
+    from pydantic import ValidationError
+
+    from model.errors import InputError, first_problem
+    from model.rig.sections import UncertaintySection
 
     section: dict[str, Value] = asdict(before)
     for each in text.split(","):
@@ -179,6 +189,10 @@ def _changed(before: "Uncertainty", text: str) -> dict[str, "Value"]:
                 f"--uncertainty must be KEY=VALUE,... of {', '.join(section)}, got {text[:80]!r}"
             )
         section[key.strip()] = value.strip()
+        try:
+            UncertaintySection.model_validate({key.strip(): value.strip()})
+        except ValidationError as error:
+            raise InputError(f"--uncertainty: {key.strip()} {first_problem(error)[1]}") from None
     return section
 
 
@@ -216,8 +230,9 @@ def _text_of(where: str) -> str:
     return path.read_bytes().hex() if path.is_file() else where
 
 
-def _show(result: dict[str, Any]) -> None:
-    """Print places, contrast, starts, and what each ERA buys."""
+def _show(result: dict[str, Any], *, own_count: int) -> None:
+    """Print places, contrast, starts, and what each ERA buys; own_count: ERAs of the rig."""
+    own = f"the rig's own {counted(own_count, 'ERA')}"
     print(
         f"{len(result['eras'])} ERAs in {result['time_s']:.1f} s, {result['resumed']} starts kept"
     )
@@ -228,7 +243,7 @@ def _show(result: dict[str, Any]) -> None:
             f"{name:8s} {x:7.1f}  {y:7.1f}   {era['sensitivity_db_per_mm']:9.3f}   "
             f"{era['static_load_n']:8.2f}"
         )
-    for title, key in (("this layout", "contrast_db"), ("the rig's own", "own_contrast_db")):
+    for title, key in (("this layout", "contrast_db"), (own, "own_contrast_db")):
         if result[key] is not None:
             medians = " / ".join(
                 f"{value:.1f}" for name, value in result[key].items() if name != "mean"

@@ -44,7 +44,10 @@ def study(
     what: Annotated[
         Study,
         typer.Argument(
-            help="Vary places of the rig's ERAs; their number, one to six; their stiffness.",
+            help=(
+                "Vary places of the rig's ERAs; their number, from one to six or the rig's own if "
+                "it has more; their stiffness."
+            ),
             metavar="WHAT",
         ),
     ],

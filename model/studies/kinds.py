@@ -13,7 +13,7 @@ STIFFNESS_FACTORS = 2.0 ** np.arange(-4, 5)
 """Factors of a stiffness study on the stiffness of the rig's ERAs."""
 
 MAX_ERAS = 6
-"""The largest number of ERAs of a count study."""
+"""The largest number of ERAs of a count study of a rig that has no more."""
 
 
 def placement_cases(rig: Rig, *, layouts: int, seed: int, raster: tuple[int, int]) -> Cases:
@@ -26,7 +26,10 @@ def placement_cases(rig: Rig, *, layouts: int, seed: int, raster: tuple[int, int
 
 
 def count_cases(rig: Rig, *, layouts: int, seed: int, raster: tuple[int, int]) -> Cases:
-    """One to MAX_ERAS ERAs like the rig's, with equal numbers of layouts for each count."""
+    """One to MAX_ERAS ERAs like the rig's, or as many as it has if those are more.
+
+    With equal numbers of layouts for each count.
+    """
     if not all_alike(rig.eras):
         raise InputError(
             "ERAs must be alike for a study of their count; give all of them the same stiffness, "

@@ -139,6 +139,8 @@ def demo(
         )
         return
     print(_summary(rows))
+    if wire == "sim" and len(rig.amplifiers) > 1:
+        print(_NO_BUS)
     for file in files:
         print(f"wrote {file}")
     if table_file is not None:
@@ -172,6 +174,11 @@ def _drift(rig_file: Path | None, out: Path, *, seed: int | None, as_json: bool)
         print(f"median contrast, {what}: {figures}")
     print(f"wrote {file}")
 
+
+_NO_BUS = (
+    "the amplifiers of wire sim have no bus and start one after the other, which costs contrast; "
+    "on --wire serial or can they start together"
+)
 
 _HEADING = (
     f"{'':51}{'felt contrast':^13}  {'contrast / dB':^13}  {'level':^13} {'latency':>7}\n"

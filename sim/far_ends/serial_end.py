@@ -22,6 +22,7 @@ from drivers.protocol.messages import (
     Stop,
 )
 from sim.bench.simulated_device import SimulatedDevice
+from sim.transport.frame_time import FrameTime
 from sim.transport.line import TwoWayLine
 from sim.transport.pseudo_terminal import make_terminal
 
@@ -44,6 +45,9 @@ class SerialEnd:
         self._addresses = {
             device.name: PROTOCOL.serial.address if alone else device.address for device in devices
         }
+        self._time = FrameTime()
+        for device in devices:
+            device.time = self._time.now
         self._first = devices[0]
         self._baud = baud or PROTOCOL.serial.baud
         self._line = TwoWayLine(
@@ -123,7 +127,7 @@ class SerialEnd:
         return device.exchange(request)
 
     def _broadcast(self, frame: Frame) -> None:
-        with contextlib.suppress(Malformed):
+        with contextlib.suppress(Malformed), self._time.in_one_frame():
             request = decode_request(frame)
             if isinstance(request, Commit | Stop | SetAddress):
                 for device in self._devices:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from drivers import clock
 from drivers.codec.can_bus.frame import CanFrame
 from sim.faults.fault_window import Faults
+from sim.transport.frame_time import FrameTime
 from sim.transport.line import TwoWayLine
 
 LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
@@ -35,7 +36,7 @@ class CanBus:
         self._bitrate = bitrate
         self._free_from = 0.0
         self._in_flight: set[asyncio.TimerHandle] = set()
-        self._end_of_frame: float | None = None
+        self.time = FrameTime()
 
     def join(self, listener: Listener) -> None:
         """Add a member."""
@@ -45,10 +46,6 @@ class CanBus:
         """Remove a member, if it is one."""
         if listener in self._members:
             self._members.remove(listener)
-
-    def time(self) -> float:
-        """The time [s]; the same for all members while they receive a frame."""
-        return clock.now() if self._end_of_frame is None else self._end_of_frame
 
     def send(self, frame: CanFrame, *, sender: Listener) -> None:
         """Deliver a frame to all but its sender, after the frames that were sent before."""
@@ -72,13 +69,10 @@ class CanBus:
         self._in_flight.clear()
 
     def _deliver(self, frame: CanFrame, sender: Listener) -> None:
-        before, self._end_of_frame = self._end_of_frame, self.time()
-        try:
+        with self.time.in_one_frame():
             for member in tuple(self._members):
                 if member is not sender:
                     member(frame)
-        finally:
-            self._end_of_frame = before
 
 
 class Stub:

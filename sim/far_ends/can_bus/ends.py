@@ -84,7 +84,7 @@ async def slcan(
 def _node_on(bus: CanBus, device: SimulatedDevice, number: int) -> Iterator[None]:
     stub = Stub(bus, lambda frame: node.receive(frame), faults=device.faults)
     node = CanNode(device, number, send=stub.send)
-    device.time = bus.time
+    device.time = bus.time.now
     node.start()
     try:
         yield

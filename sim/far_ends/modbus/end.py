@@ -25,6 +25,7 @@ from sim.far_ends.modbus.frames import (
     tcp_frame,
 )
 from sim.far_ends.modbus.unit import ModbusUnit
+from sim.transport.frame_time import FrameTime
 from sim.transport.line import TwoWayLine
 from sim.transport.loopback import HOST, listen, port_of
 from sim.transport.pseudo_terminal import make_terminal
@@ -41,22 +42,29 @@ class _Units:
 
     def __init__(self, devices: Sequence[SimulatedDevice]) -> None:
         self.devices = devices
+        self._time = FrameTime()
+        for device in devices:
+            device.time = self._time.now
         self.units = {device.address: ModbusUnit(device) for device in devices}
 
     def reply(self, request: RequestAdu, *, over_tcp: bool) -> bytes | None:
         """The reply PDU to a request, or None."""
         if request.unit == _MAP["broadcast"]:
-            for number, unit in list(self.units.items()):
-                taken = unit.handle_broadcast(request.pdu)
-                if taken is not None:
-                    del self.units[number]
-                    self.units[taken] = unit
+            with self._time.in_one_frame():
+                self._broadcast(request.pdu)
             return None
         number = request.unit
         if over_tcp and number == _ANY_UNIT and len(self.units) == 1:
             number = next(iter(self.units))
         addressed = self.units.get(number)
         return None if addressed is None else addressed.reply(request.pdu)
+
+    def _broadcast(self, pdu: bytes) -> None:
+        for number, unit in list(self.units.items()):
+            taken = unit.handle_broadcast(pdu)
+            if taken is not None:
+                del self.units[number]
+                self.units[taken] = unit
 
 
 class _Wire(ABC):

@@ -35,16 +35,25 @@ def draw_levels(axes: Axes, table: LocalizationTable, excitation: Excitation) ->
     axes.pcolormesh(100 * x, 100 * y, level, cmap=_COLORS, shading="gouraud", norm=_SCALE)
     axes.set_aspect("equal")
     draw_eras(axes, table.eras, active=excitation.keys())
+    frequencies = {tone.frequency for tone in excitation.values()}
     for era in table.eras:
         if tone := excitation.get(era.name):
             axes.annotate(
-                f"{era.name} {tone.frequency:g} Hz",
+                era.name if len(frequencies) == 1 else f"{era.name} {tone.frequency:g} Hz",
                 (100 * era.x, 100 * era.y),
                 xytext=(0, 9 if era.y > table.plate.width / 2 else -16),
                 textcoords="offset points",
                 ha="left" if era.x < table.plate.length / 2 else "right",
                 fontsize=9,
             )
+    if len(frequencies) == 1:
+        axes.text(
+            *(1, -0.02, f"{frequencies.pop():g} Hz"),
+            transform=axes.transAxes,
+            ha="right",
+            va="top",
+            fontsize=9,
+        )
 
 
 def draw_level_scale(figure: Figure, axes: Iterable[Axes], *, shrink: float) -> None:

@@ -103,7 +103,7 @@ class _Kernel:
         given = (forms.targets[0], forms.target_power[0], forms.quiet, forms.threshold, *fields)
         # Kept, since the kernel reads them.
         self._arrays = [as_given(each) for each in given]
-        self._count, q, n, _ = forms.quiet.shape
+        _, q, n, _ = forms.quiet.shape
         points = [each.shape[2] for each in fields] or [0, 0]
         pointers = [each.ctypes.data for each in self._arrays]
         self._forms = ctypes.byref(

@@ -68,7 +68,7 @@ class LoadedContacts:
         reach = self.reach.take(frequencies, axis=0)[:, start:]
         moved = self.moved.take(frequencies, axis=0)
         outer = _outer(moved).reshape(*moved.shape[:2], -1).view(np.float32)
-        power = rows.conj().swapaxes(2, 3) @ rows
+        power = gram(rows)
         power += (reach @ outer).view(np.complex64).reshape(f, p, n, n)
         error = self.error_power.take(frequencies, axis=0)[:, None]
         _add_diagonal(power, self.gain_variance * power_of(rows[:, :, 0]) + error)
@@ -162,7 +162,7 @@ def _forms_by_numpy(
         rows[:, 2 + each] = (thicker - h) * np.float32(math.sqrt(1 / deviating))
     by_finger = rows.reshape(f, -1, k, p, n).swapaxes(1, 2)
     scaled = (by_finger * np.sqrt(weights)[:, None, :, None]).reshape(f, k, -1, n)
-    power = scaled.conj().swapaxes(2, 3) @ scaled
+    power = gram(scaled)
     moved = motion.take(uncertain, axis=1) * attachments.changes[:, :, None]
     reach = power_of(to_points.take(uncertain, axis=2))
     mean = weights[:, None]
@@ -215,6 +215,11 @@ def inverse_with(stiffness: Complex64Array, receptance: Complex64Array) -> Compl
 def _outer(rows: Complex64Array) -> Complex64Array:
     """Forms conj(h) h^T of rows h (..., n): (..., n, n)."""
     return np.asarray(rows.conj()[..., :, None] * rows[..., None, :])
+
+
+def gram(rows: Complex64Array) -> Complex64Array:
+    """Forms of the sum over rows (..., rows, n): (..., n, n)."""
+    return np.asarray(rows.conj().swapaxes(-1, -2) @ rows)
 
 
 def power_of(values: Complex64Array) -> Float32Array:

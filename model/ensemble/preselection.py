@@ -17,7 +17,7 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
 from model.ensemble.attached_plate import AttachedPlate
-from model.ensemble.contact_forms import RIDGE, inverse_with, power_of
+from model.ensemble.contact_forms import RIDGE, gram, inverse_with, power_of
 from model.ensemble.preselection_kernel import PreselectionKernel
 
 KEPT, MISSING = 16, 4
@@ -105,7 +105,7 @@ class Preselection:
         thicker = quiet[:, :, 2 * n :].reshape(f, -1, n)
         changes = [to_quiet @ base.by_damping, thicker, reach * base.by_stiffness]
         rows = np.concatenate([h, *changes], axis=1)
-        R = rows.conj().swapaxes(1, 2) @ rows
+        R = gram(rows)
         diagonal = R.reshape(f, -1)[:, :: n + 1]
         diagonal += plate.gain_variance * np.add.reduce(power_of(h), axis=1) + self.error_power
         diagonal *= 1 + RIDGE

@@ -10,7 +10,7 @@ import numpy as np
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.drive_modes.forms import Forms, Weights
 from model.ensemble.attached_plate import AttachedPlate
-from model.ensemble.contact_forms import LoadedContacts, load_contacts
+from model.ensemble.contact_forms import LoadedContacts, gram, load_contacts
 from model.ensemble.draws import Draws, draw
 from model.ensemble.measures import Felt, Fingertips, felt
 from model.ensemble.thickness import responses_of_thicknesses, thickness_nodes
@@ -122,7 +122,7 @@ class FingersOnPlate:
         return replace(
             steady,
             targets=np.asarray(mean.swapaxes(0, 1) * self._gains[:, None, None]),
-            quiet=np.ascontiguousarray(steady.quiet + _gram(during) - _gram(lasting)),
+            quiet=np.ascontiguousarray(steady.quiet + gram(during) - gram(lasting)),
             level_margin=0.0,
             few=None,
             fine=None,
@@ -164,11 +164,6 @@ class FingersOnPlate:
         diagonal = expected.reshape(len(expected), -1)[:, :: expected.shape[1] + 1]
         diagonal *= 1 + np.float32(self._plate.gain_variance)
         return expected
-
-
-def _gram(rows: Complex64Array) -> Complex64Array:
-    """Forms of the sum over rows (..., rows, n): (..., n, n)."""
-    return np.asarray(rows.conj().swapaxes(-1, -2) @ rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,9 +214,9 @@ class DriveResponses:
 
         bases: thicknesses at which its changes are computed, each for as many drawn plates.
         """
+        if not self.plate.thickness:
+            return self.drawn(count=count, seed=seed, thicknesses=0)
         draws, nodes = self._draws(count, seed, thicknesses)
-        if not len(nodes):
-            return self._felt(draws, draws.accelerations(self.values, self._at_nodes(nodes)))
         tones, m, columns = self.tones, len(self.tones.frequencies), self.values.shape[2]
         plates = self.plate.of_thicknesses(thickness_nodes(bases), tones.frequencies)
         centres = self.contacts.shapes[self.plate.stiffness.shape[1] :, None]

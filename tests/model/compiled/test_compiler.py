@@ -32,7 +32,7 @@ def test_compiler_that_gives_no_library_is_bad_input(
 
 
 def test_threads_compile_the_same_at_once(source: Path, tmp_path: Path) -> None:
-    """Each in a folder of its own, so that whoever loads the library has a whole one."""
+    """Each in a folder of its own, so that no thread loads a part of the library."""
     path = tmp_path / "seven.so"
 
     def load(_: int) -> int:

@@ -94,7 +94,7 @@ def test_empty_contacts_name_what_is_expected(tmp_path, text, said) -> None:
 
 
 def test_empty_area_names_what_is_expected(tmp_path) -> None:
-    """An empty file is told its key."""
+    """An empty file is refused, with the keys that it must have."""
     path = tmp_path / "where.yaml"
     path.write_text("")
     with pytest.raises(InputError, match="polygons") as refused:

@@ -1,0 +1,303 @@
+"""What the channels of an amplifier play at a time: a pure function of sets and their commits.
+
+    Voice: Im[A(t) exp(2 pi i f (t - origin))], A(t) along its last transition, in full levels
+
+A channel plays the sum of its voices, in a few layers. A simulated amplifier asks this for samples,
+the ledger for the worst case, witness and conformance for what to expect. Times [s] are of any one
+clock and never go back; levels and frequencies are of protocol 3.
+"""
+
+import cmath
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from operator import attrgetter
+
+from drivers.protocol.sets import Command, Envelope, LayerSet
+from drivers.protocol.table import QUANTITIES, SHORTENED_FADE
+
+_LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
+_RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
+_STEP, _FREQUENCY = QUANTITIES["envelope_step"], QUANTITIES["frequency"]
+
+
+def amplitude_of(level: int, phase: int) -> complex:
+    """Return the complex amplitude in full levels of a level and phase of the wire."""
+    return cmath.rect(_LEVEL.from_wire(level), math.radians(_PHASE.from_wire(phase)))
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """From one complex amplitude to another, from start [s] on.
+
+    Along straight lines through knots a step [s] apart, or without knots along a raised cosine that
+    lasts one step; a step of 0 changes at once.
+    """
+
+    start: float
+    step: float
+    first: complex
+    last: complex
+    knots: tuple[complex, ...] = ()
+
+    @property
+    def end(self) -> float:
+        """Time from which the amplitude is the last [s]."""
+        return self.start + self.step * (len(self.knots) + 1)
+
+    def at(self, time: float) -> complex:
+        """Return the amplitude at a time not before start."""
+        if time >= self.end:
+            return self.last
+        steps = (time - self.start) / self.step
+        if not self.knots:
+            return self.first + (self.last - self.first) * (1 - math.cos(math.pi * steps)) / 2
+        points = (self.first, *self.knots, self.last)
+        index = int(steps)
+        return points[index] + (points[index + 1] - points[index]) * (steps - index)
+
+    def peak(self, time: float) -> float:
+        """Return the largest magnitude from a time on."""
+        passed = math.floor((time - self.start) / self.step) if self.step else len(self.knots)
+        points = (self.at(time), self.last, *self.knots[max(passed, 0) :])
+        return max(map(abs, points))
+
+    def slope(self, time: float) -> float:
+        """Return the steepest change [full levels/s] from a time on; infinite for a jump."""
+        if time >= self.end:
+            return 0.0 if time > self.end or self.step else _steepest(self.first, self.last, 0.0)
+        if not self.knots:
+            return math.pi / 2 * _steepest(self.first, self.last, self.step)
+        points = (self.first, *self.knots, self.last)
+        passed = int((time - self.start) / self.step)
+        pairs = zip(points[passed:], points[passed + 1 :], strict=False)
+        return max(_steepest(one, other, self.step) for one, other in pairs)
+
+
+def _steepest(first: complex, last: complex, time: float) -> float:
+    if first == last:
+        return 0.0
+    return abs(last - first) / time if time else math.inf
+
+
+@dataclass(frozen=True, slots=True)
+class Voice:
+    """A tone of a layer until it has faded: frequency [Hz], origin [s] of its phase.
+
+    has_ended: it falls silent and nothing continues it, unlike an onset that leads to level 0.
+    ending: how it falls silent, None for the ramp.
+    """
+
+    layer: int
+    frequency: float
+    origin: float
+    transition: Transition
+    has_ended: bool = False
+    ending: Envelope | None = None
+
+    @property
+    def silent_from(self) -> float:
+        """Time of silence [s]; infinite for a tone that lasts."""
+        return math.inf if self.transition.last else self.transition.end
+
+    def faded(self, time: float, ramp: float) -> "Voice":
+        """Return it falling silent along a ramp [s], or as it does if that is sooner."""
+        if self.silent_from <= time + ramp:
+            return replace(self, has_ended=True)
+        transition = Transition(time, ramp, self.transition.at(time), 0j)
+        return replace(self, transition=transition, has_ended=True)
+
+    def ended(self, time: float, ramp: float) -> "Voice":
+        """Return it falling silent along its ending, or along a ramp [s] without one."""
+        if self.ending is None or self.has_ended:
+            return self.faded(time, ramp)
+        transition = _along(self.ending, time, self.transition.at(time), 0j)
+        return replace(self, transition=transition, has_ended=True)
+
+
+def _along(envelope: Envelope, time: float, first: complex, last: complex) -> Transition:
+    knots = tuple(amplitude_of(*knot) for knot in envelope.knots)
+    return Transition(time, _STEP.from_wire(envelope.step), first, last, knots)
+
+
+@dataclass
+class _Layer:
+    """What a layer plays: ends [s] by valid_for; waiting: a set that starts at a time [s]."""
+
+    token: int = 0
+    ramp: float = 0.0
+    ends: float = math.inf
+    waiting: tuple[float, LayerSet, int] | None = None
+
+
+@dataclass
+class Playback:
+    """Voices of all channels, and the layers that they belong to; silent at first.
+
+    voices: how many a channel has for tones that are not cut short.
+    """
+
+    channels: int
+    voices: int
+    _playing: list[tuple[Voice, ...]] = field(init=False)
+    _layers: dict[int, _Layer] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Start silent."""
+        self._playing = [()] * self.channels
+
+    def commit(self, layers: Sequence[LayerSet], token: int, time: float) -> None:
+        """Play a set from a time on; what has a new tone counts its phase from there."""
+        self.advance(time)
+        for one in layers:
+            layer = self._layers.setdefault(one.layer, _Layer())
+            if one.renew:
+                layer.ends = _end_of(one, time)
+                continue
+            start = self._onsets_end(one.layer, time) if one.after else time
+            layer.waiting = (start, one, token) if start > time else None
+            if start <= time:
+                self._start(one, token, time)
+
+    def silence(self, time: float, ramp: float) -> None:
+        """Fade all layers along a ramp [s], without endings; nothing waits any longer."""
+        self.advance(time)
+        self._layers.clear()
+        self._playing = [
+            tuple(voice.faded(time, ramp) for voice in voices) for voices in self._playing
+        ]
+
+    def advance(self, time: float) -> None:
+        """Carry out what is due by a time: ends of `valid_for`, sets that wait, faded voices."""
+        while (due := self._next_due()) is not None and due[0] <= time:
+            at, number = due
+            layer = self._layers[number]
+            if layer.waiting is not None and layer.waiting[0] <= at:
+                _, one, token = layer.waiting
+                layer.waiting = None
+                self._start(one, token, at)
+            else:
+                self._end(number, at)
+        self._playing = [
+            tuple(voice for voice in voices if voice.silent_from > time) for voices in self._playing
+        ]
+
+    def voices_of(self, channel: int) -> tuple[Voice, ...]:
+        """Return the voices of a channel, the oldest first."""
+        return self._playing[channel]
+
+    def level(self, channel: int, time: float) -> float:
+        """Return the largest amplitude of a channel; voices of one frequency interfere."""
+        sums: dict[float, complex] = {}
+        for voice in self._playing[channel]:
+            turned = cmath.rect(1.0, -2 * math.pi * voice.frequency * voice.origin)
+            amplitude = voice.transition.at(time) * turned
+            sums[voice.frequency] = sums.get(voice.frequency, 0j) + amplitude
+        return sum(map(abs, sums.values()))
+
+    def peak(self, channel: int, time: float) -> float:
+        """Return a bound of the amplitude from a time on: all voices at their largest at once."""
+        return sum(voice.transition.peak(time) for voice in self._playing[channel])
+
+    def slope(self, channel: int, time: float) -> float:
+        """Return the steepest change of the sum [full levels/s] from a time on, at the most."""
+        return sum(voice.transition.slope(time) for voice in self._playing[channel])
+
+    @property
+    def tokens(self) -> Mapping[int, int]:
+        """Token of each layer that plays."""
+        lasting = {
+            voice.layer for voices in self._playing for voice in voices if not voice.has_ended
+        }
+        return {number: self._layers[number].token for number in sorted(lasting)}
+
+    @property
+    def silent_from(self) -> float:
+        """Time from which every channel is silent [s]; infinite while a tone lasts."""
+        ends = [voice.silent_from for voices in self._playing for voice in voices]
+        waits = any(layer.waiting is not None for layer in self._layers.values())
+        return math.inf if waits else max(ends, default=-math.inf)
+
+    def _next_due(self) -> tuple[float, int] | None:
+        dues = (
+            (min(layer.ends, layer.waiting[0] if layer.waiting else math.inf), number)
+            for number, layer in self._layers.items()
+        )
+        return min((due for due in dues if due[0] < math.inf), default=None)
+
+    def _onsets_end(self, layer: int, time: float) -> float:
+        ends = (
+            voice.transition.end
+            for voices in self._playing
+            for voice in voices
+            if voice.layer == layer and not voice.has_ended and voice.transition.knots
+        )
+        return max(ends, default=time)
+
+    def _end(self, layer: int, time: float) -> None:
+        """Let a layer fall silent by its endings."""
+        ramp = self._layers.pop(layer).ramp
+        self._playing = [
+            tuple(voice.ended(time, ramp) if voice.layer == layer else voice for voice in voices)
+            for voices in self._playing
+        ]
+
+    def _start(self, one: LayerSet, token: int, time: float) -> None:
+        commands = {command.channel: command for command in one.commands}
+        ramp = _RAMP.from_wire(one.ramp)
+        for channel, voices in enumerate(self._playing):
+            after = tuple(_after(voices, one.layer, commands.get(channel), time, ramp))
+            self._playing[channel] = _within(after, time, self.voices)
+        if not commands:
+            self._layers.pop(one.layer, None)
+            return
+        self._layers[one.layer] = _Layer(token, ramp, _end_of(one, time))
+
+
+def _end_of(one: LayerSet, time: float) -> float:
+    return time + _VALID_FOR.from_wire(one.valid_for) if one.valid_for else math.inf
+
+
+def _after(
+    voices: Sequence[Voice], layer: int, command: Command | None, time: float, ramp: float
+) -> Iterator[Voice]:
+    """Yield the voices of a channel once a command of a layer plays; None silences the layer."""
+    is_driven = command is not None and (command.level > 0 or command.onset is not None)
+    continued = False
+    for voice in voices:
+        if voice.layer != layer or voice.has_ended:
+            yield voice
+        elif is_driven and command is not None and _continues(voice, command):
+            continued = True
+            first = voice.transition.at(time)
+            transition = _towards(command, time, ramp, first)
+            yield replace(voice, transition=transition, ending=command.ending)
+        elif is_driven or (command is not None and command.skip_ending):
+            yield voice.faded(time, ramp)
+        else:
+            yield voice.ended(time, ramp)
+    if is_driven and command is not None and not continued:
+        transition = _towards(command, time, ramp, 0j)
+        frequency = _FREQUENCY.from_wire(command.frequency)
+        yield Voice(layer, frequency, time, transition, ending=command.ending)
+
+
+def _continues(voice: Voice, command: Command) -> bool:
+    return command.keep_phase and voice.frequency == _FREQUENCY.from_wire(command.frequency)
+
+
+def _towards(command: Command, time: float, ramp: float, first: complex) -> Transition:
+    last = amplitude_of(command.level, command.phase)
+    if command.onset is None:
+        return Transition(time, ramp, first, last)
+    return _along(command.onset, time, first, last)
+
+
+def _within(voices: Sequence[Voice], time: float, max_voices: int) -> tuple[Voice, ...]:
+    """Cut the oldest fades short where a channel has more voices than there are."""
+    uncut = [voice for voice in voices if voice.silent_from > time + SHORTENED_FADE]
+    fades = sorted(
+        (voice for voice in uncut if voice.has_ended), key=attrgetter("transition.start")
+    )
+    cut = fades[: max(len(uncut) - max_voices, 0)]
+    return tuple(voice.faded(time, SHORTENED_FADE) if voice in cut else voice for voice in voices)

@@ -1,0 +1,165 @@
+"""Sets: what layers are to play, as a stream of words that is cut into parts, and back.
+
+All numbers are integers of the wire. A stream has the layers that a set changes one after the
+other; a part is the values of one Set message. The far end collects parts in an `Assembly`.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.table import COMMAND, ENVELOPE, KNOT, LAYER, MAX_WORDS, MESSAGES, STAGED_LIFE
+
+_PART_WORDS = MAX_WORDS - len(MESSAGES["Set"].request.fields) + 1
+MAX_PARTS = 127
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """A transition: knots (level, phase), a step apart; the last step leads to the final level."""
+
+    step: int
+    knots: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """The tone of a channel in one layer; onset, ending: None for the ramp of the layer."""
+
+    channel: int
+    frequency: int
+    level: int
+    phase: int
+    keep_phase: bool = False
+    skip_ending: bool = False
+    onset: Envelope | None = None
+    ending: Envelope | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LayerSet:
+    """What one layer is to play: without commands it is silenced, or with renew prolonged.
+
+    after: the commands start when the onsets that the layer plays have ended.
+    """
+
+    layer: int
+    ramp: int
+    valid_for: int
+    commands: tuple[Command, ...] = ()
+    after: bool = False
+    renew: bool = False
+
+
+def pack_layers(layers: Iterable[LayerSet]) -> list[int]:
+    """Return the stream of a set; ValueError for a number out of range."""
+    words: list[int] = []
+    for layer in layers:
+        count = len(layer.commands)
+        LAYER.append({name: getattr(layer, name, count) for name in LAYER.names}, words)
+        for command in layer.commands:
+            shapes = (command.onset, command.ending)
+            values = {name: getattr(command, name) for name in COMMAND.names}
+            values["onset"], values["ending"] = (shape is not None for shape in shapes)
+            COMMAND.append(values, words)
+            for shape in filter(None, shapes):
+                ENVELOPE.append({"knots": len(shape.knots), "step": shape.step}, words)
+                for level, phase in shape.knots:
+                    KNOT.append({"level": level, "phase": phase}, words)
+    return words
+
+
+def unpack_layers(words: Sequence[int]) -> tuple[LayerSet, ...]:
+    """Return the layers of a stream; raises Refusal, also for a layer or channel that is twice."""
+    layers: list[LayerSet] = []
+    at = 0
+    while at < len(words):
+        head, at = LAYER.read(words, at)
+        commands: list[Command] = []
+        for _ in range(head.pop("count")):
+            command, at = _command(words, at)
+            if any(command.channel == other.channel for other in commands):
+                text = f"channel {command.channel} must occur once in a layer"
+                raise Refusal(text, "BAD_CHANNEL", command.channel)
+            commands.append(command)
+        head["after"], head["renew"] = bool(head["after"]), bool(head["renew"])
+        is_empty = not commands
+        if head["after"] if is_empty else head["renew"]:
+            raise Refusal("renew must be without commands, after with some")
+        if any(head["layer"] == other.layer for other in layers):
+            raise Refusal(f"layer {head['layer']} must occur once in a set")
+        layers.append(LayerSet(commands=tuple(commands), **head))
+    return tuple(layers)
+
+
+def _command(words: Sequence[int], at: int) -> tuple[Command, int]:
+    values, at = COMMAND.read(words, at)
+    for name in ("keep_phase", "skip_ending"):
+        values[name] = bool(values[name])
+    for name in ("onset", "ending"):
+        values[name], at = _envelope(words, at) if values[name] else (None, at)
+    return Command(**values), at
+
+
+def _envelope(words: Sequence[int], at: int) -> tuple[Envelope, int]:
+    head, at = ENVELOPE.read(words, at)
+    knots = []
+    for _ in range(head["knots"]):
+        knot, at = KNOT.read(words, at)
+        knots.append((knot["level"], knot["phase"]))
+    return Envelope(head["step"], tuple(knots)), at
+
+
+def parts(stream: Sequence[int], *, session: int, token: int, now: bool) -> Iterator[Values]:
+    """Yield the Set messages of a stream; now: it plays when it is complete."""
+    cuts = range(0, max(len(stream), 1), _PART_WORDS)
+    if len(cuts) > MAX_PARTS:
+        raise ValueError(f"a set must have at most {MAX_PARTS} parts, got {len(cuts)}")
+    for index, at in enumerate(cuts):
+        yield {
+            **{"session": session, "token": token, "index": index, "parts": len(cuts)},
+            **{"now": int(now), "stream": list(stream[at : at + _PART_WORDS])},
+        }
+
+
+@dataclass
+class Assembly:
+    """Parts of one set as they arrive, in any order and repeatedly.
+
+    is_newer: whether a token is newer than another. The parts of an older set are discarded, as
+    are all `STAGED_LIFE` after the first.
+    """
+
+    token: int = 0
+    count: int = 0
+    began: float = 0.0
+    collected: dict[int, list[int]] = field(default_factory=dict)
+
+    def add(self, part: Values, now: float, max_words: int) -> list[int] | None:
+        """Take a part at a time [s]; returns the stream once it is whole.
+
+        max_words: of a stream. Raises Refusal for a part that fits no set.
+        """
+        if not part["index"] < part["parts"]:
+            raise Refusal(f"index must be below {part['parts']}, got {part['index']}")
+        if part["token"] != self.token or now - self.began > STAGED_LIFE:
+            self.drop()
+            self.token, self.count, self.began = part["token"], part["parts"], now
+        if part["parts"] != self.count:
+            raise Refusal(f"parts must be {self.count} as before, got {part['parts']}")
+        self.collected[part["index"]] = part["stream"]
+        if sum(map(len, self.collected.values())) > max_words:
+            self.drop()
+            raise Refusal(f"a set must have at most {max_words} words", "BAD_LENGTH")
+        if self.missing is not None:
+            return None
+        return [word for index in range(self.count) for word in self.collected[index]]
+
+    @property
+    def missing(self) -> int | None:
+        """Number of the first part that has not come; None if all have."""
+        return next((index for index in range(self.count) if index not in self.collected), None)
+
+    def drop(self) -> None:
+        """Discard what was collected."""
+        self.token, self.count, self.collected = 0, 0, {}

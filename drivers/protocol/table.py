@@ -1,0 +1,249 @@
+"""Protocol 3 as data: quantities, messages and sets, each once, for every wire and both ends.
+
+`records` turns the messages into 16-bit words and back; a wire adds its frame. The numbers of
+states, faults and refusals, and the times of the contract, stand here too. What the messages mean
+is written in docs/decisions/0061-protocol-3.md.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from drivers.protocol.definition import WireQuantity
+from drivers.protocol.records import Bits, Number, Real, Record, Rest, Rows, Text
+
+VERSION: Final = 3
+MAX_WORDS: Final = 120
+"""Of a message: what one frame of the serial line and one write of Modbus carry."""
+STAGED_LIFE: Final = 1.0
+"""Seconds from the first part of a set after which it is discarded if it was not committed."""
+REACTION: Final = 0.01
+"""Longest time until a reply begins [s]."""
+SHORTENED_FADE: Final = 0.002
+"""Time in which the oldest fade ends where a set needs its voice [s]."""
+NO_CHANNEL: Final = 255
+
+STATES: Mapping[str, int] = {
+    name: number
+    for number, name in enumerate(
+        (
+            *("NOT_READY", "SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON", "SWITCHED_ON"),
+            *("OPERATION_ENABLED", "QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT"),
+        )
+    )
+}
+FAULTS: Mapping[str, int] = {
+    name: number
+    for number, name in enumerate(
+        (
+            *("NONE", "WATCHDOG", "OVER_TEMPERATURE", "OVER_VOLTAGE", "ARC", "CHANNEL"),
+            *("INTERNAL", "INTERLOCK", "OVER_CURRENT"),
+        )
+    )
+}
+REFUSALS: Mapping[str, int] = {
+    "UNKNOWN_TYPE": 1,
+    "BAD_LENGTH": 2,
+    "BAD_VALUE": 3,
+    "BAD_CHANNEL": 4,
+    "WRONG_STATE": 5,
+    "BAD_TOKEN": 6,
+    "BUSY": 7,
+    "UNSUPPORTED_VERSION": 8,
+    "WRONG_SESSION": 10,
+    "WRONG_LATCH": 11,
+    "INCOMPLETE": 12,
+}
+STATUS_FLAGS: Mapping[str, int] = {"high_voltage": 0, "interlock_open": 1, "limited": 2}
+FEATURES: Mapping[str, int] = {
+    **{"output": 0, "events": 1, "levels_measured": 2, "interlock": 3},
+    **{"electrical": 4, "sensors": 5, "address": 6},
+}
+"""Bits; output: full level is a linear amplifier's full output, else the stroke of a motion."""
+
+
+def _word(name: str, low: int, high: int, per_unit: int = 1, unit: str = "") -> WireQuantity:
+    wire = "i16" if low < 0 else "u16" if high < 1 << 16 else "u32"
+    return WireQuantity(name, wire, per_unit, unit, low, high, wraps=name == "phase")
+
+
+_QUANTITIES = (
+    _word("frequency", 0, 65535, 20, "Hz"),
+    _word("level", 0, 10000, 10000, "of full level"),
+    _word("phase", -18000, 17999, 100, "degrees"),
+    _word("phase_step", 0, 18000, 100, "degrees"),
+    _word("ramp", 0, 1000, 1000, "s"),
+    _word("valid_for", 0, 60000, 1000, "s"),
+    _word("watchdog", 100, 2000, 1000, "s"),
+    _word("watchdog_left", 0, 2000, 1000, "s"),
+    _word("session", 1, 65535),
+    _word("token", 1, 65535),
+    _word("played_token", 0, 65535),
+    _word("latch", 0, 65535),
+    _word("address", 1, 247),
+    _word("channel", 0, 15),
+    _word("channel_count", 1, 16),
+    _word("layer", 0, 15),
+    _word("layer_count", 1, 16),
+    _word("voices", 8, 255),
+    _word("set_words", 512, 65535),
+    _word("knots", 0, 32),
+    _word("envelope_step", 1, 1000, 10000, "s"),
+    _word("slew", 0, 65535, 10, "full levels/s"),
+    _word("temperature", -1000, 2000, 10, "°C"),
+    _word("voltage", 0, 65535, 1, "V"),
+    _word("channel_voltage", 0, 65535, 10, "V"),
+    _word("channel_current", 0, 65535, 1000000, "A"),
+    _word("age", 0, 0xFFFFFFFF, 1000, "s"),
+    _word("count", 0, 65535),
+    _word("flags", 0, 65535),
+    _word("code", 0, 65535),
+    _word("sensor", 0, 31),
+    _word("place", 0, 65535, 10000, "m"),
+    _word("reading", 1, 65535),
+    _word("held_reading", 0, 65535),
+    _word("window", 1, 10000, 1000, "s"),
+    _word("window_left", 0, 10000, 1000, "s"),
+    _word("window_start", 0, 0xFFFFFFFF, 1000000, "s"),
+    _word("tone_count", 1, 16),
+)
+QUANTITIES: Mapping[str, WireQuantity] = {each.name: each for each in _QUANTITIES}
+
+
+def _numbers(*names: str) -> tuple[Number, ...]:
+    """Fields by name; a name of another quantity is written name:quantity."""
+    split = (name.partition(":") for name in names)
+    return tuple(Number(name, QUANTITIES[quantity or name]) for name, _, quantity in split)
+
+
+_TONES = Record(*_numbers("frequency", "level", "phase"))
+KNOT = Record(*_numbers("level", "phase"))
+ENVELOPE = Record(*_numbers("knots", "step:envelope_step"))
+COMMAND = Record(
+    Bits((("channel", 4), ("keep_phase", 1), ("skip_ending", 1), ("onset", 1), ("ending", 1))),
+    *_TONES.fields,
+)
+LAYER = Record(
+    Bits((("layer", 4), ("after", 1), ("renew", 1), ("count", 5))),
+    *_numbers("ramp", "valid_for"),
+)
+
+_LIMITS = Record(*_numbers("frequency_min:frequency", "frequency_max:frequency", "level_max:level"))
+_STATUS = Record(
+    *_numbers("state:code", "fault:code", "flags", "latch", "watchdog_left"),
+    *_numbers("temperature", "voltage", "token:played_token"),
+    Bits((("channels", 8), ("layers", 8))),
+    Rows("levels", "channels", Record(*_numbers("level"))),
+    Rows("tokens", "layers", Record(*_numbers("token:played_token"))),
+)
+_CAPABILITIES = Record(
+    *_numbers("channels:channel_count", "layers:layer_count", "voices", "set_words", "knots"),
+    *_numbers("features:flags", "frequency_min:frequency", "frequency_max:frequency"),
+    *_numbers("frequency_step:frequency", "level_max:level", "level_step:level", "phase_step"),
+    *_numbers("ramp_max:ramp", "slew", "watchdog_min:watchdog", "watchdog_max:watchdog"),
+    *_numbers("envelope_step_min:envelope_step", "envelope_step_max:envelope_step"),
+    Rows("limits", "channels", _LIMITS),
+)
+_TAKEN = Record(
+    *_numbers("token"),
+    Bits((("exact", 1), ("staged", 1), ("played", 1))),
+    *_numbers("missing:count"),
+)
+_FAULT = Record(*_numbers("fault:code", "channel:code", "age"))
+_MEASURED = Record(*_numbers("channel_voltage", "channel_current"))
+_SENSOR = Record(
+    *_numbers("unit:code", "channel:code", "x:place", "y:place"),
+    Real("range"),
+    *_numbers("frequency_max:frequency"),
+)
+_TONE = Record(Real("amplitude"), *_numbers("phase"))
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A request with its number, and the record of its reply."""
+
+    name: str
+    number: int
+    request: Record
+    reply: Record
+    is_broadcast: bool = False
+    feeds: bool = False
+
+
+EVENT: Final = 30
+NAK: Final = 31
+EVENT_RECORD = Record(*_numbers("state:code", "fault:code", "channel:code", "latch"))
+NAK_RECORD = Record(*_numbers("request:code", "code", "channel:code"))
+IDENTITY = Record(
+    *_numbers("versions:flags"), *map(Text, ("vendor", "product", "serial_number", "firmware"))
+)
+"""Of CAN objects and Modbus registers; on a serial line Hello keeps the bytes of version 2."""
+
+
+def sensor_reading(tones: int) -> Record:
+    """Return the record of one sensor of a reading: its flags (bit 0 overload), then its tones."""
+    return Record(*_numbers("flags"), Rows("tones", tones, _TONE))
+
+
+_READING = Record(
+    *_numbers("reading:held_reading", "state:code", "window_left", "window_start"),
+    *_numbers("token:played_token", "tones:count", "count"),
+    Rest("sensors"),  # see `sensor_reading`
+)
+
+_MESSAGES = (
+    Message("GetCaps", 2, Record(), _CAPABILITIES),
+    Message("Arm", 3, Record(*_numbers("session", "watchdog")), _STATUS, feeds=True),
+    Message("Disarm", 4, Record(*_numbers("ramp")), _STATUS),
+    Message(
+        "Set",
+        5,
+        Record(
+            *_numbers("session", "token"),
+            Bits((("index", 8), ("parts", 7), ("now", 1))),
+            Rest("stream"),
+        ),
+        _TAKEN,
+        feeds=True,
+    ),
+    Message(
+        *("Commit", 6, Record(*_numbers("session", "token")), _STATUS),
+        is_broadcast=True,
+        feeds=True,
+    ),
+    Message("Silence", 7, Record(*_numbers("session", "ramp")), _STATUS, feeds=True),
+    Message("Stop", 8, Record(*_numbers("ramp")), _STATUS, is_broadcast=True),
+    Message("GetStatus", 9, Record(), _STATUS),
+    Message("GetFaults", 10, Record(), Record(*_numbers("count"), Rows("faults", "count", _FAULT))),
+    Message("Clear", 11, Record(*_numbers("latch")), _STATUS),
+    Message("Ping", 12, Record(*_numbers("session")), _STATUS, feeds=True),
+    Message(
+        *("GetAchieved", 13, Record(*_numbers("layer"))),
+        Record(*_numbers("token:played_token"), *LAYER.fields, Rows("commands", "count", COMMAND)),
+    ),
+    Message(
+        *("GetMeasured", 14, Record()),
+        Record(*_numbers("count"), Rows("channels", "count", _MEASURED)),
+    ),
+    Message(
+        *("SetAddress", 15, Record(*_numbers("address"), Text("serial_number")), _STATUS),
+        is_broadcast=True,
+    ),
+    Message(
+        *("GetSensors", 16, Record(*_numbers("first:sensor"))),
+        Record(*_numbers("all:count", "count"), Rows("sensors", "count", _SENSOR)),
+    ),
+    Message(
+        "Measure",
+        17,
+        Record(
+            *_numbers("reading", "window", "tones:tone_count"),
+            Rows("frequencies", "tones", Record(*_numbers("frequency"))),
+        ),
+        _READING,
+    ),
+    Message("GetReading", 18, Record(*_numbers("first:sensor")), _READING),
+)
+MESSAGES: Mapping[str, Message] = {message.name: message for message in _MESSAGES}
+BY_NUMBER: Mapping[int, Message] = {message.number: message for message in _MESSAGES}

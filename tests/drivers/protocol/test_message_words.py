@@ -1,0 +1,95 @@
+"""Messages of protocol 3 as words, against rows written by hand from their definition."""
+
+import random
+
+import pytest
+
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.table import BY_NUMBER, IDENTITY, MAX_WORDS, MESSAGES, sensor_reading
+
+STATUS: Values = {
+    **{"state": 4, "fault": 0, "flags": 1, "latch": 0, "watchdog_left": 250},
+    **{"temperature": -53, "voltage": 1800, "token": 513, "channels": 4, "layers": 2},
+    **{"levels": [2000, 0, 0, 10000], "tokens": [513, 0]},
+}
+STATUS_WORDS = [
+    *(4, 0, 1, 0, 250, 0xFFCB, 1800, 513, 0x0402),
+    *(2000, 0, 0, 10000, 513, 0),
+]
+
+
+def test_status_has_the_words_written_by_hand() -> None:
+    """State to token, both counts in one word, levels, tokens; -5.3 °C in two's complement."""
+    record = MESSAGES["GetStatus"].reply
+    assert record.pack(STATUS) == STATUS_WORDS
+    assert record.unpack(STATUS_WORDS, is_strict=True) == STATUS
+
+
+def test_long_numbers_and_texts_have_the_high_part_first() -> None:
+    """65.536 s is 0001 0000; 1.5 as binary32 is 3FC0 0000; "A-1" is 3, 412D, 3100."""
+    fault = {"count": 1, "faults": [{"fault": 4, "channel": 2, "age": 65536}]}
+    assert MESSAGES["GetFaults"].reply.pack(fault) == [1, 4, 2, 1, 0]
+    reading = {"flags": 1, "tones": [{"amplitude": 1.5, "phase": -1}]}
+    assert sensor_reading(1).pack(reading) == [1, 0x3FC0, 0, 0xFFFF]
+    texts = {"versions": 8, "vendor": "A-1", "product": "", "serial_number": "é", "firmware": ""}
+    words = [8, 3, 0x412D, 0x3100, 0, 2, 0xC3A9, 0]
+    assert IDENTITY.pack(texts) == words
+    assert IDENTITY.unpack(words, is_strict=True) == texts
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "code"),
+    [
+        ("Arm", [9], "BAD_LENGTH"),
+        ("Arm", [9, 250, 0], "BAD_LENGTH"),
+        ("Arm", [9, 99], "BAD_VALUE"),
+        ("Arm", [0, 250], "BAD_VALUE"),
+        ("Commit", [9, 0], "BAD_TOKEN"),
+        ("Set", [9, 1], "BAD_LENGTH"),
+        ("SetAddress", [5, 33, *[0x4141] * 17], "BAD_LENGTH"),
+        ("SetAddress", [5, 2, 0x0A41], "BAD_VALUE"),
+        ("SetAddress", [5, 1, 0xFF00], "BAD_VALUE"),
+        ("Measure", [1, 100, 2, 2200], "BAD_LENGTH"),
+        ("Measure", [1, 100, 0], "BAD_VALUE"),
+    ],
+)
+def test_request_that_no_host_may_send_is_refused(name: str, words: list[int], code: str) -> None:
+    """Too short, too long and out of range, each by its own code."""
+    with pytest.raises(Refusal) as caught:
+        MESSAGES[name].request.unpack(words, is_strict=True)
+    assert caught.value.code == code
+
+
+def test_reply_may_grow() -> None:
+    """A host ignores what a later amplifier adds."""
+    assert MESSAGES["GetStatus"].reply.unpack([*STATUS_WORDS, 7, 8], is_strict=False) == STATUS
+
+
+def test_longest_messages_fit_every_wire() -> None:
+    """Sixteen channels and sixteen layers, the widest that an amplifier can have."""
+    limits = {"frequency_min": 0, "frequency_max": 1, "level_max": 1}
+    zeros = dict.fromkeys(MESSAGES["GetCaps"].reply.names, 1)
+    widest = zeros | {"voices": 8, "set_words": 512, "watchdog_min": 100, "watchdog_max": 100}
+    caps = widest | {"channels": 16, "limits": [limits] * 16}
+    assert len(MESSAGES["GetCaps"].reply.pack(caps)) <= MAX_WORDS
+    status = STATUS | {"channels": 16, "layers": 16, "levels": [0] * 16, "tokens": [0] * 16}
+    assert len(MESSAGES["GetStatus"].reply.pack(status)) <= MAX_WORDS
+
+
+def test_random_words_are_read_or_refused() -> None:
+    """Whatever arrives, nothing else than a refusal is raised, and what is read packs to itself."""
+    random_words = random.Random(5)
+    read = 0
+    for _ in range(5_000):
+        message = BY_NUMBER[random_words.choice(list(BY_NUMBER))]
+        values = [
+            random_words.choice((0, 1, 2, 9, 300, 65535)) for _ in range(random_words.randrange(24))
+        ]
+        for record in (message.request, message.reply):
+            try:
+                found = record.unpack(values, is_strict=True)
+            except Refusal:
+                continue
+            read += 1
+            assert record.pack(found) == values
+    assert read > 300

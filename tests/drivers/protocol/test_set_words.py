@@ -1,0 +1,112 @@
+"""Sets of layers as streams of words, against a stream written by hand from the decision."""
+
+import random
+from itertools import permutations
+
+import pytest
+
+from drivers.protocol.records import Refusal
+from drivers.protocol.sets import (
+    Assembly,
+    Command,
+    Envelope,
+    LayerSet,
+    pack_layers,
+    parts,
+    unpack_layers,
+)
+from drivers.protocol.table import MESSAGES, STAGED_LIFE
+
+LAYERS = (
+    LayerSet(
+        *(0, 20, 500),
+        commands=(
+            Command(0, 2200, 2000, 0),
+            Command(
+                *(3, 5010, 10000, -9000, True),
+                onset=Envelope(50, ((1000, 9000), (10000, -1))),
+            ),
+        ),
+    ),
+    LayerSet(2, 10, 0),
+    LayerSet(3, 0, 800, renew=True),
+)
+STREAM = [
+    *(0x0002, 20, 500),  # layer 0, two commands
+    *(0x0000, 2200, 2000, 0),
+    *(0x003A, 5010, 10000, 0xDCD8),  # channel 3, keep phase, onset
+    *(2, 50, 1000, 9000, 10000, 0xFFFF),
+    *(0x0100, 10, 0),  # layer 2, silenced
+    *(0x01A0, 0, 800),  # layer 3, renewed
+]
+
+
+def test_layers_have_the_words_written_by_hand() -> None:
+    """Two tones, one with an onset, a layer that ends, one that is renewed."""
+    assert pack_layers(LAYERS) == STREAM
+    assert unpack_layers(STREAM) == LAYERS
+
+
+@pytest.mark.parametrize(
+    ("stream", "code", "channel"),
+    [
+        ([0x0002, 20, 500, 0x0000, 2200, 2000, 0], "BAD_LENGTH", None),
+        ([0x0002, 20, 500, *(0x0030, 2200, 0, 0) * 2], "BAD_CHANNEL", 3),
+        ([0x0000, 20, 500, 0x0000, 20, 500], "BAD_VALUE", None),
+        ([0x0021, 20, 500, 0x0000, 2200, 2000, 0], "BAD_VALUE", None),
+        ([0x0040, 20, 500], "BAD_VALUE", None),
+        ([0x0060, 20, 500], "BAD_VALUE", None),
+        ([0x1000, 20, 500], "BAD_VALUE", None),
+        ([0x0001, 20, 500, 0x0000, 2200, 10001, 0], "BAD_VALUE", None),
+        ([0x0001, 20, 500, 0x0002, 2200, 1, 0, 33, 50], "BAD_VALUE", None),
+    ],
+)
+def test_stream_that_no_host_may_send_is_refused(
+    stream: list[int], code: str, channel: int | None
+) -> None:
+    """Cut short, a channel or layer twice, renew or after in vain, a level or knots too many."""
+    with pytest.raises(Refusal) as caught:
+        unpack_layers(stream)
+    assert (caught.value.code, caught.value.channel) == (code, channel)
+
+
+def test_set_is_whole_whatever_the_order_of_its_parts() -> None:
+    """Three parts in all orders, each once more at the end, give the stream that was cut."""
+    stream = list(range(300))
+    cut = list(parts(stream, session=9, token=7, now=False))
+    assert [len(MESSAGES["Set"].request.pack(part)) for part in cut] == [120, 120, 69]
+    for order in permutations(cut):
+        assembly = Assembly()
+        results = [assembly.add(part, 0.1, 512) for part in (*order, order[0])]
+        assert results == [None, None, stream, stream]
+
+
+def test_parts_of_another_set_or_too_late_are_not_mixed() -> None:
+    """A newer token drops what was collected, and so does the time that a set may take."""
+    old, new = (list(parts([token] * 200, session=9, token=token, now=False)) for token in (1, 2))
+    assembly = Assembly()
+    assert assembly.add(old[0], 0.0, 512) is None
+    assert assembly.add(new[1], 0.1, 512) is None
+    assert assembly.missing == 0
+    assert assembly.add(new[0], 0.1 + STAGED_LIFE + 0.01, 512) is None
+    assert assembly.missing == 1
+    assert assembly.add(new[1], 0.2 + STAGED_LIFE, 512) == [2] * 200
+    with pytest.raises(Refusal):
+        Assembly().add(old[0], 0.0, 100)
+
+
+def test_damaged_streams_are_read_or_refused() -> None:
+    """Words exchanged at random raise a refusal at most, and what is read packs to itself."""
+    chance = random.Random(3)
+    read = 0
+    for _ in range(5_000):
+        stream = list(STREAM)
+        for _ in range(chance.randrange(1, 4)):
+            stream[chance.randrange(len(stream))] = chance.choice((0, 1, 2, 500, 0x3A, 65535))
+        try:
+            layers = unpack_layers(stream)
+        except Refusal:
+            continue
+        read += 1
+        assert pack_layers(layers) == stream
+    assert read > 300

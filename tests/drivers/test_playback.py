@@ -1,0 +1,158 @@
+"""Playback of layers against curves of the protocol computed by hand, and invariants."""
+
+import math
+import random
+
+import pytest
+
+from drivers.playback import Playback, Voice
+from drivers.protocol.sets import Command, Envelope, LayerSet
+
+RAMP = 20  # ms
+FULL = 10_000
+
+
+def layer(number: int, *commands: Command, **other: int | bool) -> LayerSet:
+    """A layer with a ramp of 20 ms that does not end."""
+    return LayerSet(number, RAMP, int(other.pop("valid_for", 0)), commands, **other)  # type: ignore[arg-type]
+
+
+def tone(channel: int = 0, frequency: int = 2000, level: int = 5000, **other: object) -> Command:
+    """A tone of 100 Hz at half level unless told otherwise."""
+    return Command(channel, frequency, level, 0, **other)  # type: ignore[arg-type]
+
+
+def amplitudes(playback: Playback, time: float) -> list[complex]:
+    """The amplitude of each voice of channel 0."""
+    return [voice.transition.at(time) for voice in playback.voices_of(0)]
+
+
+def test_tones_cross_fade_along_raised_cosines() -> None:
+    """A quarter into the ramp the gains are (1 ± cos 45°)/2; the old tone is gone at its end."""
+    playback = Playback(1, 8)
+    playback.commit([layer(0, tone())], 1, 0.0)
+    playback.commit([layer(0, tone(frequency=3000))], 2, 1.0)
+    old, new = (1 + math.cos(math.pi / 4)) / 2, (1 - math.cos(math.pi / 4)) / 2
+    assert amplitudes(playback, 1.005) == pytest.approx([0.5 * old, 0.5 * new])
+    playback.advance(1.02)
+    assert [voice.origin for voice in playback.voices_of(0)] == [1.0]
+    assert playback.tokens == {0: 2}
+
+
+def test_kept_phase_continues_the_voice() -> None:
+    """One voice from level 0.5 to 0.7: 0.6 amid the ramp, t still counted from the first commit."""
+    playback = Playback(1, 8)
+    playback.commit([layer(0, tone())], 1, 0.0)
+    playback.commit([layer(0, tone(level=7000, keep_phase=True))], 2, 1.0)
+    assert amplitudes(playback, 1.01) == pytest.approx([0.6])
+    assert [voice.origin for voice in playback.voices_of(0)] == [0.0]
+
+
+def test_onset_and_ending_follow_straight_lines_through_knots() -> None:
+    """From 0 through 0.2 at 90 degrees to 0.5; then from 0.5 through 0.1 to silence."""
+    onset, ending = Envelope(100, ((2000, 9000),)), Envelope(50, ((1000, 0),))
+    playback = Playback(1, 8)
+    playback.commit([layer(0, tone(onset=onset, ending=ending), valid_for=500)], 1, 0.0)
+    assert amplitudes(playback, 0.005) == pytest.approx([0.1j])
+    assert amplitudes(playback, 0.015) == pytest.approx([0.25 + 0.1j])
+    playback.advance(0.5025)
+    assert amplitudes(playback, 0.5025) == pytest.approx([0.3])
+    assert playback.silent_from == pytest.approx(0.51)
+    playback.silence(0.5025, 0.05)
+    assert playback.silent_from == pytest.approx(0.51)  # sooner, never later
+
+
+def test_set_silences_by_its_ending_unless_told_to_skip_it() -> None:
+    """Two steps of 30 ms along the ending, or the ramp of the later set."""
+    ending = Envelope(300, ((1000, 0),))
+    for skip, end in ((False, 1.06), (True, 1.02)):
+        playback = Playback(1, 8)
+        playback.commit([layer(0, tone(ending=ending))], 1, 0.0)
+        commands = (tone(level=0, skip_ending=True),) if skip else ()
+        playback.commit([layer(0, *commands)], 2, 1.0)
+        assert playback.silent_from == pytest.approx(end)
+
+
+def test_layers_do_not_touch_each_other() -> None:
+    """Sets, ends and renewals of layer 1 leave the voices of layer 0 the same objects."""
+    playback = Playback(2, 8)
+    playback.commit([layer(0, tone(), tone(1))], 1, 0.0)
+    kept = [playback.voices_of(channel)[0] for channel in (0, 1)]
+    playback.commit([layer(1, tone(frequency=4000), valid_for=100)], 2, 0.5)
+    playback.commit([layer(1, renew=True, valid_for=200)], 3, 0.55)
+    assert playback.silent_from == math.inf
+    playback.advance(0.74)
+    assert playback.tokens == {0: 1, 1: 2}
+    playback.advance(0.76)
+    assert playback.tokens == {0: 1}
+    assert [playback.voices_of(channel)[0] for channel in (0, 1)] == kept
+
+
+def test_waiting_set_starts_when_the_onset_ends() -> None:
+    """Envelopes of 40 ms follow each other without a gap, however late the time is asked for."""
+    playback = Playback(1, 8)
+    chunk = Envelope(200, ((3000, 0),))
+    playback.commit([layer(0, tone(onset=chunk))], 1, 0.0)
+    playback.commit([layer(0, tone(level=1000, keep_phase=True, onset=chunk), after=True)], 2, 0.01)
+    playback.advance(0.05)
+    (voice,) = playback.voices_of(0)
+    assert (voice.transition.start, voice.transition.first) == pytest.approx((0.04, 0.5))
+    assert playback.tokens == {0: 2}
+    playback.commit([layer(0, tone(onset=chunk), after=True), layer(1)], 3, 0.06)
+    playback.silence(0.065, 0.005)
+    playback.advance(1.0)
+    assert playback.voices_of(0) == ()
+
+
+def test_oldest_fade_makes_room_for_a_voice_too_many() -> None:
+    """Of nine voices the one that has faded longest is silent within 2 ms; no set is refused."""
+    playback = Playback(1, 8)
+    for number in range(9):
+        playback.commit([layer(0, tone(frequency=2000 + 40 * number))], number + 1, number / 1000)
+    voices = playback.voices_of(0)
+    assert len(voices) == 9
+    assert voices[0].silent_from == pytest.approx(0.008 + 0.002)
+    assert [voice.silent_from for voice in voices[1:8]] == pytest.approx(
+        [0.002 + number / 1000 + 0.02 for number in range(7)]
+    )
+
+
+def test_random_sets_never_jump_and_keep_their_bounds() -> None:
+    """Whatever is committed, amplitudes move no faster than `slope` and stay below `peak`."""
+    chance = random.Random(4)
+    for _ in range(60):
+        playback = Playback(1, 8)
+        time, token = 0.0, 0
+        for _ in range(12):
+            time += chance.choice((0.0007, 0.004, 0.013, 0.03))
+            if chance.random() < 0.1:
+                playback.silence(time, chance.choice((0.005, 0.05)))
+            else:
+                token += 1
+                playback.commit([_random_layer(chance)], token, time)
+            peak, slope = playback.peak(0, time), playback.slope(0, time)
+            before = _field(playback.voices_of(0), time)
+            for _ in range(12):
+                later = time + chance.random() * 5e-4
+                after = _field(playback.voices_of(0), later)
+                assert playback.level(0, later) <= peak + 1e-9
+                assert abs(after - before) <= slope * (later - time) + 1e-9
+
+
+def _random_layer(chance: random.Random) -> LayerSet:
+    knots = tuple((chance.randrange(FULL), chance.randrange(-9000, 9000)) for _ in range(3))
+    shape = chance.choice((None, Envelope(chance.choice((5, 40)), knots)))
+    command = tone(
+        frequency=chance.choice((2000, 3000)),
+        level=chance.randrange(FULL),
+        keep_phase=chance.random() < 0.5,
+        onset=shape,
+        ending=chance.choice((None, shape)),
+    )
+    commands = (command,) if chance.random() < 0.8 else ()
+    return layer(chance.randrange(3), *commands, valid_for=chance.choice((0, 9)))
+
+
+def _field(voices: tuple[Voice, ...], time: float) -> complex:
+    """The sum of all amplitudes, as if their tones stood still."""
+    return sum((voice.transition.at(time) for voice in voices), 0j)

@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware firmware-test test test-long lint format docs fuzz conformance-faults kill-test fault-test stop-test desk-test estimate-test soak bench bench-latency \
+.PHONY: demo firmware firmware-test test test-long test-busy test-kernels nightly lint format docs fuzz faults kill-test fault-test stop-test desk-test estimate-test soak bench bench-latency \
 	bench-localization bench-plant bench-promise bench-wires dist dist-platform smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -21,10 +21,10 @@ demo: .venv/installed
 firmware:
 	$(MAKE) -C firmware
 
-# Conformance of the firmware on this machine and on a Cortex-M3 in QEMU, its samples, mutated frames
+# The tests of the firmware, conformance on every wire among them, mutated frames
 # under sanitizers, and its sizes; a million frames: make firmware-test FIRMWARE=--long
 firmware-test: .venv/installed-test
-	.ci/install gcc-arm-none-eabi:arm-none-eabi-gcc libnewlib-arm-none-eabi: qemu-system-arm:qemu-system-arm
+	.ci/install gcc-arm-none-eabi:arm-none-eabi-gcc libnewlib-arm-none-eabi:
 	$(BIN)/python firmware/test/run.py $(FIRMWARE)
 
 # What needs the processors, and sometimes waits for processes: one worker more than there are; what
@@ -35,12 +35,34 @@ test: .venv/installed-test
 	$(BIN)/pytest -m 'real_time and not alone and not long' --numprocesses 2 --dist loadfile --no-loadscope-reorder
 	$(BIN)/pytest -m 'alone and not long'
 
+# All that is long, one target after another, each within an hour; the rest goes on after a failure.
+# Two hours on two cores. Others: make nightly NIGHTLY='soak kill-test'
+NIGHTLY := test-long test-kernels test-busy faults firmware-test fuzz stop-test kill-test soak desk-test estimate-test smoke-lowest
+nightly: .venv/installed-test
+	@failed=; for target in $(NIGHTLY); do start=$$(date +%s); echo "nightly: $$target"; \
+		$(MAKE) $$target || failed="$$failed $$target"; \
+		echo "nightly: $$target took $$(($$(date +%s) - start)) s"; done; \
+	echo "nightly: failed:$${failed:- none}"; test -z "$$failed"
+
 # Whole programmes of which `make test` has a short form: every command of the pages typed from an
 # empty folder, conformance of the examples, an identified plate, the firmware on the plate; and those
 # cases of heavy tests that `make test` leaves out.
 test-long: .venv/installed-test
 	$(BIN)/pytest -m 'long and not alone' --numprocesses auto
 	$(BIN)/pytest -m 'long and alone'
+
+# A short form of the whole suite on a machine that has no time: what talks to wires, processes and
+# clients, beside six processes that compute without pause.
+BUSY := tests/drivers/backends tests/drivers/conformance/test_vanished_host.py tests/firmware \
+	tests/controller/daemon tests/controller/gateway tests/controller/api tests/integration
+test-busy: .venv/installed-test
+	$(BIN)/python tests/support/busy_machine.py $(BIN)/pytest -m 'not long' --numprocesses 2 \
+		--dist loadfile --no-loadscope-reorder $(BUSY)
+
+# The model's tests, the typed pages and the demonstration with the arithmetic of four kinds of
+# processor, and what differs between their answers; an hour. Others: make test-kernels KERNELS=--answers
+test-kernels: .venv/installed-test
+	$(BIN)/python tests/support/kernels.py $(KERNELS)
 
 lint: .venv/installed-test
 	$(BIN)/ruff check .
@@ -52,10 +74,10 @@ lint: .venv/installed-test
 fuzz: .venv/installed-test
 	$(BIN)/python tests/support/mutation.py
 
-# Every fault planted into simulated amplifiers, on every wire, under the conformance check that must
-# find it; `make test` takes each on one wire.
-conformance-faults: .venv/installed-test
-	$(BIN)/python tests/support/conformance_faults.py
+# Every planted fault (tests/faults) in a copy of the tree, under the tests that must find it;
+# `make test` takes five. Others: make faults FAULTS='--only wire/ --json out/faults.json'
+faults: .venv/installed-test
+	$(BIN)/python tests/faults/run.py $(FAULTS)
 
 # Two hundred daemons killed at random moments, over every wire, and when all was silent;
 # `make test` takes eight. Others: make kill-test KILLS='--kills 20 --seed 7'

@@ -139,7 +139,7 @@ async def measure(url: str, frequencies: Sequence[float], window: float) -> dict
 
 
 async def stop(url: str) -> dict[str, Any]:
-    """Stop all channels, and identify the amplifier afterwards."""
+    """Stop all channels; the amplifier is identified after the first Stop."""
     amplifier = Amplifier(open_backend(url))
     rows: dict[str, Any] = {}
     try:
@@ -147,12 +147,16 @@ async def stop(url: str) -> dict[str, Any]:
             await amplifier.connect()
         except LinkError as error:
             outcome = stop_outcome(
-                None, last_fed_at=None, watchdog=None, now=clock.now(), cause=str(error)
+                None,
+                latch_before=None,
+                last_fed_at=None,
+                watchdog=None,
+                now=clock.now(),
+                cause=str(error),
             )
         else:
             outcome = await stop_and_confirm(amplifier, timeout=_STOP_TIMEOUT)
             with contextlib.suppress(DriverError):
-                await amplifier.identify()
                 rows = _status_rows(await amplifier.status())
     finally:
         await amplifier.close()
@@ -241,13 +245,12 @@ async def conform(
     checks: tuple[Check, ...],
     on_result: Callable[[CheckResult], None],
     *,
-    process: int | None = None,
     level: float = LEVEL,
     before: ConformanceReport | None = None,
 ) -> ConformanceReport:
     """Run checks in turn on one amplifier; on_result: called with each result.
 
-    process, level: see `run_check`; before: report of earlier checks, which this one continues:
+    level: see `run_check`; before: report of earlier checks, which this one continues:
     then a link that cannot be opened any more makes these checks inconclusive instead of a
     LinkError.
     """
@@ -259,7 +262,6 @@ async def conform(
                 amplifier,
                 raw,
                 url=url,
-                process=process,
                 level=level,
                 on_result=on_result,
             )

@@ -3,13 +3,14 @@
 import asyncio
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import final
 
 from drivers import clock, trace
 from drivers.backend import Backend
 from drivers.errors import (
     CommandError,
+    CommandRefused,
     DriverError,
     FrameError,
     LinkError,
@@ -21,7 +22,13 @@ from drivers.line.sender import SUPERSEDED
 from drivers.link.link import REPLY_TIMEOUT, Link, ReplyT
 from drivers.link.pacing import Pacing
 from drivers.link.refusals import PROTOCOL_VIOLATION
-from drivers.protocol.definition import PROTOCOL, random_session, random_token, token_after
+from drivers.protocol.definition import (
+    PROTOCOL,
+    is_newer_latch,
+    random_session,
+    random_token,
+    token_after,
+)
 from drivers.protocol.messages import (
     Achieved,
     AmplifierEvent,
@@ -68,6 +75,9 @@ STOP_RAMP = 0.005  # s; the shortest without a step
 # s; from the expiry of a watchdog until the outputs are silent, by the protocol
 WATCHDOG_REACTION = 0.005 + PROTOCOL.reaction
 
+_POSITIVE = ("channels", "voices", "frequency_step", "level_step", "phase_step")
+"""Capabilities that must be above 0."""
+
 _logger = logging.getLogger(__name__)
 
 # Requests that do not feed the watchdog, or silence the amplifier where they arrive.
@@ -111,6 +121,8 @@ class Amplifier(SensorClient):
         self._token = 0
         self.session = 0
         """Number of the last arming that was granted; requests carry it."""
+        self.latch: int | None = None
+        """Newest latch that a status has shown since it was connected."""
         self._stop_count = 0
         self._watchdog: float | None = None
         self._last_fed_at: float | None = None
@@ -131,6 +143,11 @@ class Amplifier(SensorClient):
         if self._capabilities is None:
             raise CommandError("capabilities are known only after opening; call open() first")
         return self._capabilities
+
+    @property
+    def is_identified(self) -> bool:
+        """Whether identity and capabilities are known."""
+        return self._capabilities is not None
 
     @property
     def last_sent_at(self) -> float:
@@ -218,6 +235,7 @@ class Amplifier(SensorClient):
     async def connect(self) -> None:
         """Open the wire and send nothing: enough for a stop."""
         self._token = random_token()  # a set of an earlier host must not be taken for a new one
+        self.latch = None  # it may have lost its supply
         await self._link.open()
 
     async def identify(self) -> None:
@@ -235,9 +253,9 @@ class Amplifier(SensorClient):
                 f"serial number must be {self._serial_number}, got {identity.serial_number}; "
                 "connect the expected amplifier, or restart with this one"
             )
-        self._capabilities = await self._request(
-            GetCaps(), expect=Capabilities, timeout=OPEN_TIMEOUT
-        )
+        capabilities = await self._request(GetCaps(), expect=Capabilities, timeout=OPEN_TIMEOUT)
+        _check_capabilities(capabilities)
+        self._capabilities = capabilities
         self._identity = identity
         self._serial_number = identity.serial_number
         self._link.allow_longest_exchange(self.round_trip())
@@ -384,20 +402,26 @@ class Amplifier(SensorClient):
         self._stop_count += 1
         self.abort_unsent()
 
-    async def commit_on_bus(self, token: int) -> None:
+    async def commit_on_bus(self, token: int, others: Sequence["Amplifier"] = ()) -> None:
         """Let every amplifier of the bus play its staged set of this token at the same time.
 
-        It must be armed by the same session. There are no replies: read the status of each. Raises
-        CommandError if the bus does not support broadcasts.
+        others: those on the bus beside this one that have staged it, whose watchdogs it feeds, too.
+        They must be armed by the same session. There are no replies: read the status of each.
+        Raises CommandError if the bus does not support broadcasts.
         """
         commit = Commit(token, self.session)
-        self._recorder.sending(commit)
+        receivers = (self, *others)
+        for each in receivers:
+            each._recorder.sending(commit)
         feeds = self._start_feeding(commit)
+        for each in others:
+            each._feeding_count += feeds
         try:
             await self._link.broadcast(commit)
         finally:
-            self._end_feeding(feeds)
-            self._recorder.left(commit)
+            for each in receivers:
+                each._end_feeding(feeds)
+                each._recorder.left(commit)
 
     async def stop_on_bus(self, ramp: float = STOP_RAMP) -> None:
         """Stop every amplifier of the bus, before all queued requests; there are no replies."""
@@ -440,8 +464,12 @@ class Amplifier(SensorClient):
         feeds = self._start_feeding(request)
         try:
             outcome = reply = await self._link.request(request, expect=expect, timeout=timeout)
+            if isinstance(reply, Status):
+                self._check_status(reply)
         except DriverError as error:
             outcome = error
+            if isinstance(error, CommandRefused) and not isinstance(error, Preempted):
+                self._recorder.refused(request, may_play=error.may_play)
             raise
         finally:
             self._end_feeding(feeds)
@@ -452,6 +480,17 @@ class Amplifier(SensorClient):
                 _note(request, trace.request, outcome, clock.now() - started_at)
         _note(request, self._recorder.replied, reply)
         return reply
+
+    def _check_status(self, status: Status) -> None:
+        """Note the latch of a status; FrameError unless it has the level of every channel."""
+        levels, channels = len(status.levels), self._capabilities and self._capabilities.channels
+        if channels not in (None, levels):
+            raise FrameError(
+                f"status must have the levels of all {channels} channels, got {levels}; "
+                f"{PROTOCOL_VIOLATION}"
+            )
+        if self.latch is None or is_newer_latch(status.latch, self.latch):
+            self.latch = status.latch
 
     def _start_feeding(self, request: Request) -> bool:
         """Note a request that may feed the watchdog until `_end_feeding`; returns whether it may.
@@ -497,6 +536,15 @@ def _note(request: Request, record: Callable[..., object], *details: object) -> 
         if not isinstance(request, Stop | Disarm):
             raise
         _logger.exception("amplifier: %s is not recorded", type(request).__name__)
+
+
+def _check_capabilities(reported: Capabilities) -> None:
+    """Raise FrameError for numbers of 0 with which nothing can be played."""
+    zero = [name for name in _POSITIVE if not getattr(reported, name) > 0]
+    if zero:
+        raise FrameError(
+            f"capabilities must be above 0, got 0 as {', '.join(zero)}; {PROTOCOL_VIOLATION}"
+        )
 
 
 def _of_token(achieved: Achieved, token: int) -> Achieved:

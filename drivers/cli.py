@@ -28,14 +28,13 @@ EXIT_STATUS: dict[type[BaseException], int] = {
 _URLS = """\b
 URLs:
   serial:///dev/ttyUSB0?baud=921600&address=1   a serial port, on Windows serial:///COM3
-  serial://HOST:PORT  rfc2217://HOST:PORT       a serial server
-  hwgrep://VENDOR:PRODUCT                       the serial port of a USB adapter
+  serial+tcp://HOST:PORT                        a serial server with raw TCP
   modbus+tcp://HOST:PORT/UNIT                   Modbus over TCP; ?baud=19200 for a gateway
   modbus+rtu:///dev/ttyS1?baud=115200#UNIT      Modbus on a serial port
   can+socketcan://can0#NODE                     CAN on a network interface
   can+slcan:///dev/ttyACM0?bitrate=500000#NODE  CAN on a serial adapter
   can+socketcand://HOST:PORT/can0#NODE          CAN through a socketcand server
-  can+pcan://PCAN_USBBUS1#NODE                  CAN on any interface of python-can, by its name
+  can+python-can://INTERFACE/CHANNEL#NODE       CAN on any other interface of python-can
   sim://RIG.yaml                                a simulated amplifier of a rig
 Quote URLs that contain ?, # or &.
 """
@@ -260,14 +259,6 @@ def conformance(
     write: Annotated[
         bool, typer.Option("--write", help="Drive the outputs too, without confirmation.")
     ] = False,
-    process: Annotated[
-        int | None,
-        typer.Option(
-            metavar="PID",
-            min=1,
-            help="Process of an emulated amplifier: its delays are not the amplifier's.",
-        ),
-    ] = None,
     level: Annotated[
         float | None,
         typer.Option(
@@ -289,16 +280,14 @@ def conformance(
     driving = tuple(check for check in CHECKS if check.drives)
     level = LEVEL if level is None else level
     show = _no_result if json_ else _show_result
-    report = _run(conform(url, reading, show, process=process), trace)
+    report = _run(conform(url, reading, show), trace)
     if not write and not json_ and sys.stdin.isatty():
         write = typer.confirm(
             f"{len(driving)} more checks arm the amplifier and drive its channels at {level:.0%} "
             "of full stroke. Continue?"
         )
     if write and report.overall != "failed":
-        report = _run(
-            conform(url, driving, show, process=process, level=level, before=report), trace
-        )
+        report = _run(conform(url, driving, show, level=level, before=report), trace)
     if json_:
         print(json.dumps(report.to_json()))
     else:

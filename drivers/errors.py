@@ -42,15 +42,22 @@ class CommandRefused(DriverError):
     """The guard or the amplifier refused a request; nothing of it was applied.
 
     channel: the one at fault, if any; until: time [s] from which the same request is allowed, if
-    only its time is wrong.
+    only its time is wrong. may_play: whether a set may have been played all the same, since an
+    earlier attempt had no reply.
     """
 
     def __init__(
-        self, reason: str, *, channel: int | None = None, until: float | None = None
+        self,
+        reason: str,
+        *,
+        channel: int | None = None,
+        until: float | None = None,
+        may_play: bool = False,
     ) -> None:
         super().__init__(reason)
         self.channel = channel
         self.until = until
+        self.may_play = may_play
 
 
 class Preempted(CommandRefused):

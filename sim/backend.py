@@ -1,8 +1,8 @@
 """The backend of `sim://`: a simulated amplifier in this process.
 
-The plate deviates from the rig's within its uncertainty, as that of `era sim`. Amplifiers of a rig
-that name one control socket are under one plate; otherwise each backend has a plate of its own. Not
-modelled: transmission time.
+The plate deviates from the rig's within its uncertainty, as that of `era sim`. The amplifiers of a
+rig that are named are under one plate, as are those of one control socket; the only amplifier of a
+rig that is not named has one of its own. Not modelled: transmission time.
 """
 
 import asyncio
@@ -111,10 +111,11 @@ class SimulatedBackend(Backend):
         return self._bench.exchange(self._name, request, now=self._last_sent_at)
 
     def _plate(self) -> "_Plate":
-        """The plate of this URL: that of open amplifiers of the same control, or a new one."""
-        if self._control is None:
+        """The plate of this URL: that of open amplifiers of the rig and control, or a new one."""
+        if self._control is None and self._amplifier is None:
             return _Plate(None)
-        key = (self._rig.resolve(), self._control.resolve(), self._is_exact, self._seed)
+        control = self._control and self._control.resolve()
+        key = (self._rig.resolve(), control, self._is_exact, self._seed)
         found = _plates.get(key)
         if found is None:
             found = _plates[key] = _Plate(self._control)
@@ -173,8 +174,8 @@ class _Plate:
                 await self._running.aclose()
 
 
-_plates: WeakValueDictionary[tuple[Path, Path, bool, int], _Plate] = WeakValueDictionary()
-"""Plates with a control socket that an amplifier of this process uses."""
+_plates: WeakValueDictionary[tuple[Path, Path | None, bool, int], _Plate] = WeakValueDictionary()
+"""Plates that amplifiers of this process share."""
 
 
 async def _cancel(task: "asyncio.Task[None]") -> None:

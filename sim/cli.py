@@ -10,8 +10,6 @@ import typer
 from drivers.errors import LinkError
 from model.commands.options import ExactOption, SeedOption, seed_of_plate
 from model.errors import InputError
-from sim.benchmark_cli import benchmark_app
-from sim.desk_plate_cli import desk_plate
 from sim.measure_cli import measure
 from sim.port_option import port_option
 from sim.soft_amp_cli import soft_amp
@@ -27,9 +25,7 @@ if TYPE_CHECKING:
 app = typer.Typer(pretty_exceptions_enable=False)
 app.command()(witness)
 app.command("soft-amp")(soft_amp)
-app.command("desk-plate")(desk_plate)
 app.command()(measure)
-app.add_typer(benchmark_app, name="benchmark")
 
 EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2, LinkError: 3}
 """Exit status by class of error."""
@@ -53,8 +49,8 @@ def sim(
         bool,
         typer.Option(
             "--firmware",
-            help="Run the firmware of `make firmware` for each amplifier, in QEMU where installed; "
-            "its samples move the plate.",
+            help="Run the firmware of `make firmware` for each amplifier; its samples move the "
+            "plate.",
         ),
     ] = False,
     wire: Annotated[
@@ -149,8 +145,6 @@ def sim(
         if firmware and (common is not None or wire or faults or virtual_time):
             raise InputError("--firmware has a serial line and real time; omit the other options")
         programs = find_firmware() if firmware else None
-        if programs is not None:
-            print(f"firmware: {programs.description}", file=sys.stderr)
         simulation = Simulation(
             loaded,
             {}

@@ -132,7 +132,7 @@ KINDS = [
         "    async def exchange(self, request, *, timeout): pass\n",
         "a class derived from Backend",
         open_backend,
-        ("rfc2217", SerialBackend),
+        ("serial+tcp", SerialBackend),
         known_schemes,
         fails="from era_haptics.plugins.backends import WireBackend\n"
         "class THING(WireBackend):\n"

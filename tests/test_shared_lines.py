@@ -7,9 +7,11 @@ from dataclasses import replace
 
 import pytest
 
+from controller.group.synchronized_play import SynchronizedPlay
 from drivers import clock
-from drivers.amplifier import Amplifier
+from drivers.amplifier import WATCHDOG_REACTION, Amplifier
 from drivers.errors import LinkError
+from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.protocol.messages import AmplifierState, Reply, Request, Status
 from drivers.registry import open_backend
 from memory_machine import live_in_memory
@@ -95,7 +97,7 @@ async def test_one_amplifier_reopens_while_the_other_stays_lost(
         for device in far.devices.values():
             device.inject_fault(FaultWindow("unplug"))
         for one in (east, west):
-            async with asyncio.timeout(10):
+            async with asyncio.timeout(60):
                 while not one.is_lost:
                     with contextlib.suppress(LinkError):
                         await one.status()
@@ -142,6 +144,20 @@ async def test_broadcast_commit_starts_all_together(
             assert (status.token, status.levels[0]) == (7, pytest.approx(level))
         origins = [one.outputs[0][0].origin for one in far.bench.amplifiers.values()]
         assert max(origins) == min(origins)
+
+
+@in_virtual_time
+async def test_broadcast_commit_feeds_every_watchdog(wire: Wire, two_amplifiers: Rig) -> None:
+    """The host knows of each when it was fed, within the time that an amplifier may take."""
+    async with armed(wire, two_amplifiers) as (far, amplifiers):
+        play = SynchronizedPlay({name: CheckedAmplifier(one) for name, one in amplifiers.items()})
+        for token, level in ((1, 0.2), (2, 0.4)):
+            sets = {name: tones(one, level, token=token) for name, one in amplifiers.items()}
+            assert await play.play(sets, {}, may_play=lambda: True) is not None
+            east, west = amplifiers["east"].last_fed_at, amplifiers["west"].last_fed_at
+            assert east == pytest.approx(west, abs=1e-4)
+            left = [device.status().watchdog_left for device in far.devices.values()]
+            assert max(left) <= east + 2.0 + WATCHDOG_REACTION - clock.now()
 
 
 @pytest.mark.parametrize("kind", ["can+socketcand", "can+slcan"])

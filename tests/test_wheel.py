@@ -126,8 +126,7 @@ def test_wheel_of_a_platform_brings_its_engine(wheel: Path, tmp_path: Path) -> N
     done = subprocess.run(
         [
             *(sys.executable, "-c"),
-            "import ctypes; from sim.soft_amp.library import library as found; "
-            "ctypes.CDLL(str(found())); print(found())",
+            "from sim.soft_amp.library import library as found; print(found()._name)",
         ],
         env={"PYTHONPATH": str(tmp_path / "installed"), "PATH": "", "CC": "no-such-compiler"},
         cwd=tmp_path,

@@ -41,6 +41,9 @@ SENSORS = np.array(
     ]
 )
 
+CHOSEN = {3: [0, 6, 9], 4: [0, 3, 5, 10], 6: [0, 2, 4, 7, 9, 10], 12: list(range(12))}
+"""Sensors of those above, by their number."""
+
 
 @dataclass(frozen=True)
 class FormErrors:
@@ -147,14 +150,19 @@ def measure(
     sensors: FloatArray = SENSORS,
     frequencies: FloatArray = FREQUENCIES,
     noise: float = 0.01,
+    count: int = 12,
 ) -> Responses:
-    """Measure with sensors where the rig's owner believes them; noise of each row's rms."""
+    """Measure with sensors where the rig's owner believes them; noise of each row's rms.
+
+    count: of the sensors that are used, far from each other.
+    """
     rng = np.random.default_rng([seed, 51])
-    values = hidden.scales * hidden.responses(frequencies, hidden.points)
+    some = CHOSEN[count]
+    values = (hidden.scales * hidden.responses(frequencies, hidden.points))[:, :, some]
     size = np.sqrt((np.abs(values) ** 2).mean(axis=2, keepdims=True))
     white = rng.standard_normal(values.shape) + 1j * rng.standard_normal(values.shape)
-    names = tuple(f"P{number}" for number in range(1, len(sensors) + 1))
-    points = sensors * [rig.plate.length, rig.plate.width]
+    names = tuple(f"P{number + 1}" for number in some)
+    points = sensors[some] * [rig.plate.length, rig.plate.width]
     return Responses(names, points, frequencies, values + noise * size * white / np.sqrt(2))
 
 
@@ -167,13 +175,38 @@ def true_values(hidden: HiddenPlate) -> list[float]:
     ]
 
 
+def true_gains(hidden: HiddenPlate) -> ComplexArray:
+    """Gains (f, e) of the drives."""
+    rows = np.array([era.gains for era in hidden.rig.eras])  # (e, f, 3)
+    return np.asarray((rows[..., 1] * np.exp(1j * rows[..., 2])).T)
+
+
+def gain_deviations(rig: Rig, true: ComplexArray) -> FloatArray:
+    """Errors of the gains of a rig against true ones (f, e), in its uncertainties.
+
+    Magnitudes, then phases, (2, f, e).
+    """
+    rows = np.array([era.gains for era in rig.eras])
+    found = (rows[..., 1] * np.exp(1j * rows[..., 2])).T
+    off = np.log(found / true)
+    known = rig.uncertainty
+    return np.abs([off.real / known.gain, off.imag / np.radians(known.phase_deg)])
+
+
 def main() -> None:
     folder, count, form = Path(sys.argv[1]), int(sys.argv[2]), FORMS[sys.argv[3]]
     rig = load_rig(RIG)
     for seed in range(count):
         hidden = draw_plate(rig, form, seed=seed)
-        write_responses_csv(folder / f"{seed}.csv", measure(hidden, rig, seed=seed), rig)
-        (folder / f"{seed}.json").write_text(json.dumps(true_values(hidden)))
+        for sensors in CHOSEN:
+            responses = measure(hidden, rig, seed=seed, count=sensors)
+            write_responses_csv(folder / f"{seed}-{sensors}.csv", responses, rig)
+        gains = true_gains(hidden)
+        truth = {
+            "values": true_values(hidden),
+            "gains": [gains.real.tolist(), gains.imag.tolist()],
+        }
+        (folder / f"{seed}.json").write_text(json.dumps(truth))
 
 
 if __name__ == "__main__":

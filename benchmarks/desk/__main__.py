@@ -3,8 +3,9 @@
     python -m benchmarks.desk [--plates 10] [--promises 20] [--touches 6] [--report]
     python -m benchmarks.desk --identify-only [--plates 10] [--report]
 
-Everything runs in processes of its own on a JACK server of the dummy driver: `era desk-plate`,
-`era measure`, `era calibrate`, `era table build`, `era table verify --device`, `era soft-amp`,
+Everything runs in processes of its own on a JACK server of the dummy driver:
+`python -m benchmarks.desk_plate`, `era measure`, `era calibrate`, `era table build`,
+`era table verify --device`, `era soft-amp`,
 `era daemon`, `era rig identify --device`. Three minutes a plate on an idle machine. Exits with
 status 1 unless 85 to 95 % of all promises are kept; of fewer than a hundred, unless four of five
 are.

@@ -20,6 +20,10 @@ from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
 from benchmarks.desk.session import desk
+from benchmarks.desk_plate.desk_plate import DeskPlate
+from benchmarks.desk_plate.model_in_time import DeskModel
+from benchmarks.desk_plate.sensing import Converters
+from benchmarks.desk_plate.truth import Truth, draw_truth
 from benchmarks.setting import use_one_thread
 from model.arrays import FloatArray, lattice
 from model.figures import draw_eras, save_figure
@@ -31,10 +35,6 @@ from model.structure.fingertip import fingertip_loads
 from model.table.file import load_table
 from model.table.question import Question
 from model.vibration.excitation import Excitation
-from sim.desk.desk_plate import DeskPlate
-from sim.desk.model_in_time import DeskModel
-from sim.desk.sensing import Converters
-from sim.desk.truth import Truth, draw_truth
 from sim.sensors.sensor_file import WiredSensor
 
 PICTURES = Path(__file__).parents[2] / "docs" / "pictures"

@@ -74,7 +74,16 @@ def desk(folder: Path, *, seed: int, mesh: str = "8x6 Q3") -> Iterator[Desk]:
     (folder / "rig.yaml").write_text(text.replace("/tmp/plate", str(link)), "utf-8")
     (folder / "sensors.csv").write_text((EXAMPLES / "sensors.csv").read_text("utf-8"), "utf-8")
     server = ["jackd", "-n", name, "-S", "-r", "-d", "dummy", "-p", str(BLOCK), "-r", str(RATE)]
-    plate = [ERA, "desk-plate", "rig.yaml", "--sensors", "sensors.csv", "--seed", seed]
+    plate = [
+        sys.executable,
+        "-m",
+        "benchmarks.desk_plate",
+        "rig.yaml",
+        "--sensors",
+        "sensors.csv",
+        "--seed",
+        seed,
+    ]
     plate += ["--mesh", mesh, "--truth", "truth.json", "--until-eof"]
     with contextlib.ExitStack() as stack:
         stack.enter_context(_own_server(name))

@@ -46,7 +46,7 @@ class Wire(asyncio.Protocol):
         """Open a TCP port on the loopback for one connection and return its URL."""
         loop = asyncio.get_running_loop()
         self._server = await loop.create_server(lambda: self, "127.0.0.1", 0)
-        return f"socket://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
+        return f"serial+tcp://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """The daemon has connected."""

@@ -1,7 +1,7 @@
 """Processes of the latency benchmark and their priorities.
 
 A real amplifier or panel does not use the daemon's processors; here it does, at the highest
-priority. The daemon has the priority of the unit that `era systemd install` prints, load programs
+priority. The daemon has the priority of `examples/systemd`, load programs
 the ordinary one.
 """
 
@@ -14,10 +14,9 @@ from collections.abc import Mapping
 from enum import Enum, auto
 from pathlib import Path
 
-from controller.deploy.files import NICE
-
 TIMEOUT = 60.0  # s
 DEVICE_NICE = -20
+DAEMON_NICE = -10  # as in the unit
 _DEVICE_PRIORITY = 1  # of SCHED_RR
 
 
@@ -116,7 +115,7 @@ ERA = Path(sys.executable).with_name("era")
 
 def _is_made_urgent(process: int, rank: Rank) -> bool:
     """Set the priority of a process; False if not permitted."""
-    nice = DEVICE_NICE if rank is Rank.DEVICE else NICE
+    nice = DEVICE_NICE if rank is Rank.DEVICE else DAEMON_NICE
     try:
         os.setpriority(os.PRIO_PROCESS, process, nice)
         # Where sessions share the cores among them, nice counts within a session only.

@@ -2,8 +2,9 @@
 
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.localization.entries -o DIR [--methods random,paper]
 
-Writes a file for each method, for `era benchmark score`. All but the paper's drive every ERA at one
-frequency of the table's 47, the one where the method itself does best on the plate as modelled:
+Writes a file for each method, for `python -m benchmarks.contrast score`. All but the paper's drive
+every ERA at one frequency of the table's 47, the one where the method itself does best on the plate
+as modelled:
 
 - random: any frequency, levels and phases
 - time-reversal: each ERA by the conjugate of its field at the target
@@ -24,6 +25,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.contrast.data_set import VERSION, ContactSet, DataSet, data_set
 from benchmarks.promise.optimum import optimum
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
@@ -33,7 +35,6 @@ from model.table.exact_plates import Plates, draw_plates, fields_on
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, Tone
-from sim.contrast_benchmark.data_set import VERSION, ContactSet, DataSet, data_set
 
 TIKHONOV = 1e-3
 """Share of the largest eigenvalue that is added to all."""

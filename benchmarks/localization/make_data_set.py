@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.contrast.data_set import FILE, checksum
 from benchmarks.setting import random_contacts
 from model.rig.file import load_rig
-from sim.contrast_benchmark.data_set import FILE, checksum
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PLATES = ("paper_plate", "eight_eras", "car_display", "table")

@@ -70,12 +70,13 @@ def main() -> None:
 def _show(table: "LocalizationTable") -> float:
     """Seconds of `era table show`."""
     from model.table.many_answers import ask_on_processes
+    from model.table.overview import find_overview
     from model.table.summary import summarize
-    from model.table.weak_cells import find_weak_cells
 
     started = time.perf_counter()
     with ask_on_processes(table) as ask:
-        summarize(table, find_weak_cells(table, ask=ask), ask=ask)
+        overview = find_overview(table, ask=ask)
+    summarize(table, overview)
     return time.perf_counter() - started
 
 

@@ -26,9 +26,9 @@ def main() -> None:
     use_one_thread()
     import numpy as np
 
+    from benchmarks.contrast.data_set import data_set
+    from benchmarks.contrast.score import on_held_out
     from model.table.build import build_table
-    from sim.contrast_benchmark.data_set import data_set
-    from sim.contrast_benchmark.score import on_held_out
 
     found = replace(data_set(), draws=options.plates)
     print(

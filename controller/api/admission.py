@@ -2,9 +2,11 @@
 
 However many clients there are, another one can connect and `stop`. A client that has sent nothing
 yet is evicted first, then an idle subscriber, then any idle client; never one that holds the arming
-lease or waits for a response. In reserve, a silent client is evicted first.
+lease or waits for a response. The reserve is shared among processes: a client of the one with the
+most there is evicted, silent ones first, but none whose first bytes have arrived unread.
 """
 
+from collections import Counter
 from collections.abc import Callable
 
 from controller.api.connection import Connection
@@ -36,12 +38,12 @@ class Admission:
         new.is_reserve = not self._has_room()
         if new.is_reserve:
             reserve = [each for each in self.admitted if each.is_reserve]
-            waiting = [each for each in reserve if not each.pending]
-            if len(reserve) >= RESERVE and not waiting:
-                new.abort()
-                return
             if len(reserve) >= RESERVE:
-                self._drop(min(waiting, key=lambda each: (each.has_spoken, each.received_at)))
+                evicted = _evictable(reserve, new)
+                if evicted is None:
+                    new.abort()
+                    return
+                self._drop(evicted)
         self.admitted.add(new)
 
     def promote(self, one: Connection) -> bool:
@@ -70,3 +72,23 @@ class Admission:
     def _drop(self, one: Connection) -> None:
         self.admitted.discard(one)
         one.abort()
+
+
+def _evictable(reserve: list[Connection], new: Connection) -> Connection | None:
+    """The client in reserve that a new one replaces, or None.
+
+    Of its own process, or of one with more clients there.
+    """
+    counts = Counter(each.process for each in reserve)
+    candidates = [
+        each
+        for each in reserve
+        if not each.pending
+        and (each.process == new.process or counts[each.process] > counts[new.process])
+        and not each.is_unread
+    ]
+    return min(
+        candidates,
+        key=lambda each: (-counts[each.process], each.has_spoken, each.received_at),
+        default=None,
+    )

@@ -8,7 +8,7 @@ async with await AsyncClient.connect() as era:
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -18,6 +18,7 @@ from controller.api.channel import Channel
 from controller.api.client_protocol import (
     DEFAULT_LEASE,
     RESPONSE_TIMEOUT,
+    ConnectionLost,
     LeaseLost,
     Notification,
     Unreachable,
@@ -35,6 +36,7 @@ from controller.api.methods import (
     HelloParams,
     HelloResult,
     PlayParams,
+    PlayResult,
     RenewParams,
     RenewResult,
     RequestedBy,
@@ -49,9 +51,12 @@ from drivers.operation.pauses import pauses
 
 MAX_QUEUED_EVENTS = 1000  # not yet taken; the oldest is dropped
 _MIN_RETRY_INTERVAL, _MAX_RETRY_INTERVAL = 0.05, 0.5  # s
+_REPEATED_FOR = 0.3  # s; requests whose connection is lost, as by a daemon with many clients
+_MIN_PAUSE, _MAX_PAUSE = 0.001, 0.02  # s
 _RENEWAL_INTERVAL = 0.25  # s; within it a lost lease is noticed, however long it was
-_NOT_REPEATED = ("arm", "play")  # a request that was lost may have been carried out
+_NOT_REPEATED = ("arm", "play", "clear")  # a request that was lost may have been carried out
 
+_T = TypeVar("_T")
 _ResultT = TypeVar("_ResultT", bound=Message)
 
 
@@ -71,8 +76,7 @@ class AsyncClient:
         self._channel: Channel | None = None
         self._connecting = asyncio.Lock()
         self._is_closed = False
-        self._topics: dict[Topic, None] = {}
-        self._rate: float | None = None
+        self._rates: dict[Topic, float | None] = {}  # of the subscriptions
         self._events: deque[Notification] = deque(maxlen=MAX_QUEUED_EVENTS)
         self._changed = asyncio.Event()  # an event arrived, or the connection was lost
         self._lease: ArmResult | None = None  # of `armed`
@@ -93,7 +97,7 @@ class AsyncClient:
         not to be believed.
         """
         client = cls(find_socket(path), name=name, timeout=timeout)
-        await client._within_timeout(client._connected())
+        await client._within_timeout(client._repeated(client._connected))
         return client
 
     async def __aenter__(self) -> Self:
@@ -169,24 +173,25 @@ class AsyncClient:
 
     async def play(
         self, effect: str, position: tuple[float, float], *, level_db_sl: float | None = None
-    ) -> None:
-        """Play an effect at the finger nearest to x, y [m]."""
+    ) -> PlayResult:
+        """Play an effect at the finger nearest to x, y [m]; say whether it is held back."""
         x, y = as_position(position)
         params = make_params(PlayParams, effect=effect, x_m=x, y_m=y, level_db_sl=level_db_sl)
-        await self.call("play", params, Empty)
+        return await self.call("play", params, PlayResult)
 
     async def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:
         """Receive notifications of topics; see `events`."""
         params = make_params(SubscribeParams, topics=list(topics), rate_hz=rate_hz)
         await self.call("subscribe", params, Empty)
-        self._topics |= dict.fromkeys(topics)
-        self._rate = rate_hz
+        for topic in topics:
+            self._rates.pop(topic, None)
+            self._rates[topic] = rate_hz
 
     async def unsubscribe(self, *topics: Topic) -> None:
         """Receive no more notifications of topics."""
         await self.call("unsubscribe", make_params(UnsubscribeParams, topics=list(topics)), Empty)
         for topic in topics:
-            self._topics.pop(topic, None)
+            self._rates.pop(topic, None)
 
     @asynccontextmanager
     async def armed(
@@ -265,15 +270,29 @@ class AsyncClient:
         return await self._within_timeout(self._send(method, params))
 
     async def _send(self, method: str, params: Message) -> Any:
-        """Send a request, once more over a new connection if that is harmless."""
-        channel = await self._connected()
-        try:
+        """Send a request, again over new connections if that is harmless."""
+        if method in _NOT_REPEATED:
+            channel = await self._repeated(self._connected)
             return await channel.request(method, params)
-        except Unreachable:
-            if method in _NOT_REPEATED or self._is_closed:
-                raise
-            channel = await self._connected()
-            return await channel.request(method, params)
+
+        async def attempt() -> Any:
+            return await (await self._connected()).request(method, params)
+
+        return await self._repeated(attempt)
+
+    async def _repeated(self, attempt: Callable[[], Awaitable[_T]]) -> _T:
+        """The result of an attempt, which is repeated for a while if the connection is lost."""
+        loop = asyncio.get_running_loop()
+        end = loop.time() + _REPEATED_FOR
+        following = pauses(first=_MIN_PAUSE, maximum=_MAX_PAUSE)
+        while True:
+            try:
+                return await attempt()
+            except ConnectionLost:
+                pause = next(following)
+                if self._is_closed or loop.time() + pause >= end:
+                    raise
+                await asyncio.sleep(pause)
 
     async def _within_timeout(self, work: Any) -> Any:
         try:
@@ -292,9 +311,10 @@ class AsyncClient:
                     self.path, name=self._name, on_event=self._received, on_lost=self._changed.set
                 )
                 try:
-                    if self._topics:
-                        topics = SubscribeParams(topics=list(self._topics), rate_hz=self._rate)
-                        await channel.request("subscribe", topics)
+                    for rate in dict.fromkeys(self._rates.values()):
+                        topics = [topic for topic, each in self._rates.items() if each == rate]
+                        params = SubscribeParams(topics=topics, rate_hz=rate)
+                        await channel.request("subscribe", params)
                 except BaseException:
                     channel.close()
                     raise

@@ -1,6 +1,7 @@
 """One connection of a client to the daemon: requests, their responses, and notifications."""
 
 import asyncio
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self, cast
@@ -17,6 +18,8 @@ from controller.api.jsonrpc import request_line
 from controller.api.methods import HelloParams
 from controller.api.peer import check_peer
 from controller.api.schema import Message
+
+_QUEUE_INTERVAL = 0.002  # s
 
 
 class Channel(asyncio.Protocol):
@@ -66,7 +69,8 @@ class Channel(asyncio.Protocol):
     async def _connect(self) -> None:
         loop = asyncio.get_running_loop()
         try:
-            transport, _ = await loop.create_unix_connection(lambda: self, str(self.path))
+            connected = await _connected_socket(self.path)
+            transport, _ = await loop.create_unix_connection(lambda: self, sock=connected)
             check_peer(self.path, transport.get_extra_info("socket"))
         except Unreachable:
             raise
@@ -130,3 +134,23 @@ class Channel(asyncio.Protocol):
             if not pending.done():
                 pending.set_exception(error)
         self._on_lost()
+
+
+async def _connected_socket(path: Path) -> socket.socket:
+    """Connect a socket, waiting while the daemon's queue is full; raises OSError.
+
+    asyncio would take a full queue for a connection in progress.
+    """
+    connecting = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    connecting.setblocking(False)
+    try:
+        while True:
+            try:
+                connecting.connect(str(path))
+            except BlockingIOError:
+                await asyncio.sleep(_QUEUE_INTERVAL)
+            else:
+                return connecting
+    except BaseException:
+        connecting.close()
+        raise

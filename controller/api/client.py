@@ -27,6 +27,7 @@ from controller.api.methods import (
     ArmResult,
     EffectsResult,
     HelloResult,
+    PlayResult,
     RenewResult,
     StatusResult,
     StopResult,
@@ -128,9 +129,9 @@ class Client:
 
     def play(
         self, effect: str, position: tuple[float, float], *, level_db_sl: float | None = None
-    ) -> None:
-        """Play an effect at the finger nearest to x, y [m]."""
-        self._run(self._client.play(effect, position, level_db_sl=level_db_sl))
+    ) -> PlayResult:
+        """Play an effect at the finger nearest to x, y [m]; say whether it is held back."""
+        return self._run(self._client.play(effect, position, level_db_sl=level_db_sl))
 
     def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:
         """Receive notifications of topics; see `events`."""

@@ -43,9 +43,13 @@ class Unreachable(LinkError):
         if isinstance(error, TimeoutError):
             return cls(f"the daemon at {path} does not respond; see its log, or restart it")
         reason = error.strerror or error
-        return cls(
+        return ConnectionLost(
             f"connection to the daemon at {path} lost ({reason}); see its log, or restart it"
         )
+
+
+class ConnectionLost(Unreachable):
+    """The daemon closed a connection, or has too many clients at once."""
 
 
 class LeaseLost(RpcError):

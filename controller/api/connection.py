@@ -6,6 +6,7 @@ flood on one costs the others nothing; output that a client does not read is bou
 
 import asyncio
 import math
+import select
 import time
 from collections.abc import Callable
 from typing import Any, cast
@@ -28,20 +29,24 @@ MAX_PENDING_STOPS = 64  # requests without responses, above which no further lin
 class Connection(asyncio.BufferedProtocol):
     """A client's connection.
 
-    on_connect: called at the beginning; on_lines: lines wait to be served; on_disconnect: called
-    once at the end. ahead: a request that was read from the next line, but not served.
+    process: its id, 0 if unknown; on_connect: called at the beginning; on_lines: lines wait to be
+    served; on_disconnect: called once at the end. ahead: a request that was read from the next
+    line, but not served.
     """
 
     def __init__(
         self,
+        process: int,
         *,
         on_connect: "Callable[[Connection], None]",
         on_lines: "Callable[[Connection], None]",
         on_disconnect: "Callable[[Connection], None]",
         clock: Callable[[], float],
     ) -> None:
+        self.process = process
         self.name = "unnamed client"
         self.received_at = clock()  # s; when the last bytes arrived
+        self.has_been_read = False  # whether any bytes were
         self.has_spoken = False  # whether it has sent a complete line
         self.is_reserve = False  # whether it is in reserve
         self.excess = 0  # requests beyond the rate since its last pause
@@ -75,6 +80,16 @@ class Connection(asyncio.BufferedProtocol):
     def has_left(self) -> bool:
         """Whether the client has closed its side, or the connection is lost."""
         return self.is_at_end or not self.is_open
+
+    @property
+    def is_unread(self) -> bool:
+        """Whether its first bytes have arrived and were not read."""
+        connected = self._transport.get_extra_info("socket") if self._transport else None
+        if self.has_been_read or connected is None:
+            return False
+        poll = select.poll()
+        poll.register(connected, select.POLLIN)
+        return bool(poll.poll(0))
 
     @property
     def has_lines(self) -> bool:
@@ -116,6 +131,7 @@ class Connection(asyncio.BufferedProtocol):
     def data_received(self, data: bytes | memoryview) -> None:
         """Keep it, undivided; pause reading while much waits to be served."""
         self.received_at = self._clock()
+        self.has_been_read = True
         before = len(self._input)
         self._input += data
         self._stop_at = max(self._stop_at, self._input.rfind(STOP, max(0, before - len(STOP) + 1)))

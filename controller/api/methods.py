@@ -163,6 +163,16 @@ class PlayParams(Message):
     level_db_sl: float | None = Field(None, description="at most, and by default, the effect's own")
 
 
+class PlayResult(Message):
+    """Whether the effect plays as requested."""
+
+    held_back: str | None = Field(
+        None,
+        description="why only the vibration of another finger's effect plays, as for a frequency "
+        "that differs; null if its own does. See `held_back` of the contact for what follows",
+    )
+
+
 class SubscribeParams(Message):
     """Topics to receive, and the rate of the periodic ones."""
 
@@ -210,7 +220,7 @@ METHODS: dict[str, Method] = {
     ),
     "touch": Method(TouchParams, Empty, "report all fingers of a touch source of this client"),
     "effects": Method(Empty, EffectsResult, "list the effects"),
-    "play": Method(PlayParams, Empty, "play an effect at a finger; only while armed"),
+    "play": Method(PlayParams, PlayResult, "play an effect at a finger; only while armed"),
     "subscribe": Method(SubscribeParams, Empty, "receive notifications of topics"),
     "unsubscribe": Method(UnsubscribeParams, Empty, "receive no more notifications of topics"),
 }

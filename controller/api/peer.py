@@ -25,10 +25,9 @@ def check_peer(
     """
     service = environment.get(SERVICE_USER_VARIABLE, _SERVICE_USER)
     owners = {"folder": path.parent.stat().st_uid, "socket": path.stat().st_uid}
-    option = getattr(socket, "SO_PEERCRED", None)  # of Linux
-    if option is not None:
-        raw = connected.getsockopt(socket.SOL_SOCKET, option, _CREDENTIALS.size)
-        owners["process"] = _CREDENTIALS.unpack(raw)[1]
+    credentials = credentials_of(connected)
+    if credentials is not None:
+        owners["process"] = credentials[1]
     trusted = {0, os.geteuid(), _uid(service)}
     if len(set(owners.values())) == 1 and set(owners.values()) <= trusted:
         return
@@ -38,6 +37,16 @@ def check_peer(
         f"user {service}, but {found}; give another socket, or name the service's user in "
         f"{SERVICE_USER_VARIABLE}"
     )
+
+
+def credentials_of(connected: socket.socket) -> tuple[int, int] | None:
+    """Process and user ids of the peer of a socket; None where the system does not give them."""
+    option = getattr(socket, "SO_PEERCRED", None)  # of Linux
+    if option is None:
+        return None
+    raw = connected.getsockopt(socket.SOL_SOCKET, option, _CREDENTIALS.size)
+    process, user, _ = _CREDENTIALS.unpack(raw)
+    return process, user
 
 
 def _uid(user: str) -> int | None:

@@ -4,23 +4,34 @@ from collections.abc import Callable
 
 
 class RateLimiter:
-    """Allows `per_second` actions per second, and as many in a burst; clock [s]."""
+    """Allows `per_second` actions per second, and a burst, as many unless given; clock [s]."""
 
-    def __init__(self, per_second: float, *, clock: Callable[[], float]) -> None:
+    def __init__(
+        self, per_second: float, *, burst: float | None = None, clock: Callable[[], float]
+    ) -> None:
         self._per_second = per_second
+        self._burst = per_second if burst is None else burst
         self._clock = clock
-        self._left = per_second
+        self._left = self._burst
         self._counted_at = clock()
 
     def take(self) -> bool:
         """Whether another action is allowed now; counts it."""
-        now = self._clock()
-        self._left = min(self._per_second, self._left + self._per_second * (now - self._counted_at))
-        self._counted_at = now
-        if self._left < 1:
+        if self._saved() < 1:
             return False
         self._left -= 1
         return True
+
+    @property
+    def is_unused(self) -> bool:
+        """Whether a whole burst is allowed now."""
+        return self._saved() >= self._burst
+
+    def _saved(self) -> float:
+        now = self._clock()
+        saved = self._left + self._per_second * (now - self._counted_at)
+        self._left, self._counted_at = min(self._burst, saved), now
+        return self._left
 
 
 class TimeBudget:

@@ -148,7 +148,10 @@ class ContactStatus(Message):
     contrast_db: float | None = Field(
         None, description="predicted, target over loudest quiet finger; null for a single finger"
     )
-    effect: str | None = Field(None, description="the effect that plays for it, if any")
+    effect: str | None = Field(None, description="the effect requested for it, if any")
+    held_back: str | None = Field(
+        None, description="why its effect does not play although it is a target; null if it does"
+    )
     load: float = Field(
         1.0,
         description="on the plate, relative to the rig's fingertip; 1 where none is reported",

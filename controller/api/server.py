@@ -12,6 +12,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from controller.api.acceptor import Acceptor
 from controller.api.admission import RESERVE_METHODS, Admission
 from controller.api.connection import STOP, Connection
 from controller.api.jsonrpc import (
@@ -34,8 +35,6 @@ from drivers.errors import CommandRefused, DriverError, LinkError
 from model.errors import InputError
 
 MAX_PENDING = 8  # requests of one client that take long; stop is not counted
-_ACCEPT_PER_TURN = 1  # connections
-_ACCEPT_QUEUE = 64  # connections
 
 Handler: TypeAlias = Callable[[Connection, Any], Message | Awaitable[Message]]
 
@@ -101,30 +100,26 @@ class ApiServer:
         self._turns = Turns(
             self._serve_line, is_busy=is_busy, clock=clock, processor_time=processor_time
         )
-        self._server: asyncio.Server | None = None
+        self._acceptor: Acceptor | None = None
 
     async def open(self, bound: socket.socket) -> None:
         """Listen on a bound Unix socket; its permissions decide who may connect."""
-        loop = asyncio.get_running_loop()
-        self._server = await loop.create_unix_server(
-            self._make_connection, sock=bound, backlog=_ACCEPT_PER_TURN
-        )
-        bound.listen(_ACCEPT_QUEUE)  # asyncio accepts up to its own backlog per turn
+        self._acceptor = Acceptor(bound, self._make_connection, clock=self._clock)
 
     async def close(self) -> None:
         """Stop listening and close all connections after their pending output."""
-        if self._server is None:
+        if self._acceptor is None:
             return
-        self._server.close()
+        self._acceptor.close()
         for connection in list(self._admission.admitted):
             connection.close()
         await asyncio.sleep(0)
         for connection in list(self._admission.admitted):
             connection.abort()
-        await self._server.wait_closed()
 
-    def _make_connection(self) -> Connection:
+    def _make_connection(self, process: int) -> Connection:
         return Connection(
+            process,
             on_connect=self._admission.admit,
             on_lines=self._turns.add,
             on_disconnect=self._disconnected,

@@ -165,17 +165,36 @@ def forget(socket: Socket = None, as_json: Json = False) -> None:
 
 @app.command()
 def touch(
-    at: Annotated[list[str], typer.Argument(metavar="X,Y ...", help="Fingers on the plate [m].")],
+    at: Annotated[
+        list[str] | None, typer.Argument(metavar="[X,Y ...]", help="Fingers on the plate [m].")
+    ] = None,
+    replay: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="TUIO capture to send instead of fingers.")
+    ] = None,
+    port: Annotated[
+        int, typer.Option(help="UDP port of the daemon's source tuio: on this machine.")
+    ] = 3333,
     duration: Annotated[
         float, typer.Option("--for", metavar="S", min=0, max=3600, help="Duration.")
     ] = 1.0,
     socket: Socket = None,
     as_json: Json = False,
 ) -> None:
-    """Put fingers on the plate for a while. The last one is the target, the others are quiet."""
+    """Put fingers on the plate for a while. The last one is the target, the others are quiet.
+
+    With --replay send a recorded TUIO stream to the daemon at its pace.
+    """
+    import asyncio
+
+    from controller.sources.capture import read_capture, replay_capture
     from model.config.points import parse_point
 
-    positions = [parse_point(text, what="era touch") for text in at]
+    if (at is None) == (replay is None):
+        raise InputError("era touch must have either fingers, such as 0.10,0.05, or --replay FILE")
+    if replay is not None:
+        asyncio.run(replay_capture(read_capture(replay), "127.0.0.1", port))
+        return
+    positions = [parse_point(text, what="era touch") for text in at or ()]
     with _client(socket) as era:
         _check_positions(positions, era.hello("era").rig)
         era.touch(positions, source="era touch")
@@ -332,10 +351,11 @@ def show_status(status: "StatusResult") -> str:
         promised = contact.robust_felt_contrast_db
         contrast = "" if promised is None else f", at least {promised:.1f} dB over the others"
         effect = "" if contact.effect is None else f", effect {contact.effect}"
+        held_back = "" if contact.held_back is None else f" (held back: {contact.held_back})"
         load = "" if contact.load == 1 else f", load {contact.load:.1f}"
         lines.append(
             f"  finger {contact.source} {contact.id} at {contact.x_m:.3f}, {contact.y_m:.3f} m: "
-            f"{contact.role or 'not driven'}{level}{contrast}{effect}{load}"
+            f"{contact.role or 'not driven'}{level}{contrast}{effect}{held_back}{load}"
         )
     if status.silence_reason is not None and status.contacts:
         lines.append(f"  silent: {status.silence_reason}")

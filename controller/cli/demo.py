@@ -48,7 +48,7 @@ def demo(
     ] = "serial",
     touches: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="TUIO capture, or evemu recording (.events)."),
+        typer.Option(metavar="FILE", help="TUIO capture."),
     ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the picture.")] = Path("out"),
     exact: ExactOption = False,
@@ -62,34 +62,17 @@ def demo(
             "--dashboard", help="Serve a page in the browser to touch the plate yourself."
         ),
     ] = False,
-    drift: Annotated[
-        bool,
-        typer.Option("--drift", help="Play an hour in which the plate changes, in virtual time."),
-    ] = False,
 ) -> None:
     """Play recorded touches on a simulated plate; measure contrast.
 
     The plate deviates from the table's within the rig's uncertainty, the same for the same --seed;
-    recorded places are shares of its size. With --drift it is played for an hour of virtual time
-    while it warms by 15 K, loosens a mount and gains a sticker, and is identified in service.
+    recorded places are shares of its size.
     """
-    if drift:
-        if wire not in ("serial", "sim") or touches is not None or exact or dashboard:
-            raise InputError(
-                "--drift plays on wire sim; omit --wire, --touches, --exact, and --dashboard"
-            )
-        _drift(rig_file, out, seed=seed, as_json=as_json)
-        return
     import asyncio
     import time
 
-    from controller.demo.run import (
-        WIRES,
-        example_touches_path,
-        read_touches,
-        run_demo,
-        write_picture,
-    )
+    from controller.demo.run import WIRES, example_touches_path, run_demo, write_picture
+    from controller.sources.capture import read_capture
     from model.rig.file import example_rig_path, load_rig
     from model.table.table_cache import cached_table
 
@@ -98,7 +81,7 @@ def demo(
     if dashboard and (touches is not None or as_json):
         raise InputError("--dashboard takes its touches from the page; omit --touches and --json")
     drawn = seed_of_plate(exact=exact, seed=seed)
-    recorded = read_touches(touches or example_touches_path())
+    recorded = read_capture(touches or example_touches_path())
     rig_file = rig_file or example_rig_path()
     rig = load_rig(rig_file)
     started = time.perf_counter()
@@ -147,34 +130,6 @@ def demo(
         print(next_line("era", "table", "show", table_file))
 
 
-def _drift(rig_file: Path | None, out: Path, *, seed: int | None, as_json: bool) -> None:
-    import asyncio
-
-    from controller.demo.drift import Event, run_drift
-    from controller.demo.drift_picture import write_drift_picture
-    from controller.demo.virtual_time import VirtualTimeLoop
-    from model.rig.file import example_rig_path
-
-    def show(event: Event) -> None:
-        if not as_json:
-            print(f"{event.time_s / 60:5.1f} min  {event.kind:11}  {event.text}", flush=True)
-
-    with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
-        hour = runner.run(run_drift(rig_file or example_rig_path(), seed=seed or 0, on_event=show))
-    file = write_drift_picture(hour, out)
-    if as_json:
-        print(json.dumps({**hour.as_json(), "files": [str(file)]}))
-        return
-    for change, after in hour.named.items():
-        print(f"{change}: " + ("not named" if after is None else f"named after {after:.0f} s"))
-    print(f"false alarms: {hour.false_alarms}")
-    found = hour.as_json()
-    for key, what in (("last_ten_minutes_db", "last ten minutes"), ("end_of_hour_db", "end")):
-        figures = ", ".join(f"{way} {value:.1f} dB" for way, value in found[key].items())
-        print(f"median contrast, {what}: {figures}")
-    print(f"wrote {file}")
-
-
 _NO_BUS = (
     "the amplifiers of wire sim have no bus and start one after the other, which costs contrast; "
     "on --wire serial or can they start together"
@@ -203,8 +158,10 @@ def _line(row: "TouchRow") -> str:
         (row.predicted_level_db_sl, row.measured_level_db_sl),
     )
     figures = "  ".join(f"{_number(one):>6s} {_number(other):>6s}" for one, other in pairs)
-    latency = f"{_number(row.latency_ms):>7s}"
-    return f"{start}{eras:22s} {figures} {latency}{'' if row.steady else '  still ringing'}"
+    note = "" if row.steady else "  still ringing"
+    if row.measured_level_db_sl is None:
+        note = f"  not measured: it played for {row.played_s:.2f} s"
+    return f"{start}{eras:22s} {figures} {_number(row.latency_ms):>7s}{note}"
 
 
 def _number(value: float | None) -> str:

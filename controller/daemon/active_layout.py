@@ -4,13 +4,14 @@ import math
 from collections.abc import Iterable, Sequence
 
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.methods import EffectsResult, PlayParams
+from controller.api.methods import EffectsResult, PlayParams, PlayResult
 from controller.api.schema import EffectDescription
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.loop.intent import HapticIntent
-from controller.loop.table_query import MAX_DB_SL
+from controller.loop.table_query import MAX_DB_SL, common_band, why_held_back
 from controller.sources.contacts import Contact, ContactKey
+from model.arrays import FloatArray
 
 PLAY_RADIUS = 0.020
 """Largest distance [m] from the position of a requested effect to the finger that feels it."""
@@ -48,11 +49,18 @@ class ActiveLayout:
             ]
         )
 
-    def play(self, params: PlayParams, contacts: Iterable[Contact], *, now: float) -> None:
+    def play(
+        self,
+        params: PlayParams,
+        contacts: Iterable[Contact],
+        *,
+        frequencies: FloatArray,
+        now: float,
+    ) -> PlayResult:
         """Start an effect at the contact nearest to a position, at its own level or below.
 
-        Raises RpcError for an unknown effect, a level above its own, and a position without a
-        contact within `PLAY_RADIUS`.
+        frequencies [Hz]: of the table. Raises RpcError for an unknown effect, a level above its
+        own, and a position without a contact within `PLAY_RADIUS`.
         """
         effect = self._player.layout.effects.get(params.effect)
         if effect is None:
@@ -85,3 +93,7 @@ class ActiveLayout:
                 remedy="touch the plate there, or send a touch over the API",
             )
         self._player.play(params.effect, nearest, now, level_db_sl=params.level_db_sl)
+        band = effect.tuned_band
+        before = self._player.bands_before(nearest.key)
+        played, is_shared = common_band([*before, band], frequencies)
+        return PlayResult(held_back=None if is_shared else why_held_back(band, played, frequencies))

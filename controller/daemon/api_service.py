@@ -15,6 +15,7 @@ from controller.api.methods import (
     HelloParams,
     HelloResult,
     PlayParams,
+    PlayResult,
     RenewParams,
     RenewResult,
     RequestedBy,
@@ -55,6 +56,7 @@ _LEASE_RECHECK = 0.25  # s
 _logger = logging.getLogger(__name__)
 
 _ENABLED = DaemonState.OPERATION_ENABLED
+_LEASE_OVER = DaemonEvent(Trigger.LEASE_LOST, "the arming lease was not renewed", "arm again")
 _REMEDIES = {
     DaemonState.SWITCH_ON_DISABLED: "wait a moment and try again",
     DaemonState.READY_TO_SWITCH_ON: "arm first (era arm)",
@@ -170,6 +172,9 @@ class ApiService:
         )
 
     async def _arm(self, client: Connection, params: ArmParams) -> ArmResult:
+        is_over = self._valid_lease.current(clock.now()) is None
+        if self._supervisor.machine.state is _ENABLED and is_over:
+            await self._handle(_LEASE_OVER)  # before its timer: what plays is not inherited
         machine, now = self._supervisor.machine, clock.now()
         if machine.state not in (DaemonState.READY_TO_SWITCH_ON, *ENERGISED):
             raise _wrong_state(machine)
@@ -272,13 +277,18 @@ class ApiService:
         )
         return Empty()
 
-    def _play(self, client: Connection, params: PlayParams) -> Empty:
+    def _play(self, client: Connection, params: PlayParams) -> PlayResult:
         machine = self._supervisor.machine
         if machine.state is not _ENABLED or machine.is_degraded:
             raise _wrong_state(machine)
-        self._layout.play(params, self._publisher.view.contacts, now=clock.now())
+        result = self._layout.play(
+            params,
+            self._publisher.view.contacts,
+            frequencies=self._table.frequencies,
+            now=clock.now(),
+        )
         self._controller.request_update()
-        return Empty()
+        return result
 
     def _subscribe(self, client: Connection, params: SubscribeParams) -> Empty:
         # After the reply, so that no event precedes it.
@@ -333,9 +343,7 @@ class ApiService:
         if self._lease.current(clock.now()) is not None:
             self._schedule_lease_check()
             return
-        self._supervisor.post(
-            DaemonEvent(Trigger.LEASE_LOST, "the arming lease was not renewed", "arm again")
-        )
+        self._supervisor.post(_LEASE_OVER)
 
 
 def _wrong_state(machine: StateMachine, code: ErrorCode = ErrorCode.WRONG_STATE) -> RpcError:

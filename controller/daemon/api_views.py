@@ -107,6 +107,7 @@ def contact_status(
                     "level_db_sl": _finite(felt.level_db_sl),
                     "robust_felt_contrast_db": _finite(applied.pattern.robust_felt_contrast_db),
                     "contrast_db": _finite(felt.contrast_db),
+                    "held_back": felt.held_back,
                 }
         if any(quiet.key == contact.key for quiet in applied.quiet):
             # With several quiet contacts only the level of the loudest is known.

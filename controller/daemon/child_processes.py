@@ -1,4 +1,4 @@
-"""Child processes of the daemon that must not disturb its loop: gateway and metrics.
+"""Child processes of the daemon that must not disturb its loop: the gateway.
 
 Each is an ordinary API client. A child that exits is restarted after a growing pause; all end with
 the daemon, even if that is killed.

@@ -184,7 +184,7 @@ def _layout(
 def _urls(
     validation: Validation[DaemonSection], rig: Rig | None, rig_file: Path | None
 ) -> dict[str, str]:
-    """The URL of each amplifier; `sim://` becomes a simulated one over this rig."""
+    """The URL of each amplifier; `sim://` becomes a simulated one under this rig's plate."""
     if rig is None or rig_file is None:
         return {}
     here = quote(str(rig_file.resolve()))
@@ -197,11 +197,11 @@ def _urls(
             open_backend(url)
         except CommandError as error:
             validation.add(("rig",), f"invalid amplifiers.{name}.url of the rig: {error}")
-    if len(urls) > 1 and any(url.startswith("sim://") for url in urls.values()):
+    if len({url.startswith("sim://") for url in urls.values()}) > 1:
         validation.add(
             ("rig",),
-            "sim:// supports one amplifier only; run era sim RIG --serial and put the URLs that it "
-            "prints into the rig",
+            "sim:// must be the URL of all amplifiers or of none; run era sim RIG --serial and put "
+            "the URLs that it prints into the rig",
         )
     return urls
 

@@ -25,6 +25,7 @@ class DaemonKind:
         rig = config.rig
         wired = Counter(channel.amplifier for channel in rig.wiring.values())
         _, warnings = check_links(config.urls, channels=wired, limits=rig.limits)
+        layout_warnings = config.layout.warnings() if config.layout else []
         daemon = f"era daemon {document.source}"
         hint = "" if config.table is None else f". {daemon} --check reads its table, too"
         line = (
@@ -34,7 +35,8 @@ class DaemonKind:
             f"socket {config.socket}{hint}"
         )
         note = rig.uncertainty.note
-        return CheckedFile(line, [*warnings, *voltage_costs(rig), *([note] if note else [])])
+        notes = [*layout_warnings, *voltage_costs(rig), *([note] if note else [])]
+        return CheckedFile(line, [*warnings, *notes])
 
     def example(self) -> str:
         """A commented example with every key."""

@@ -18,6 +18,7 @@ from pathlib import Path
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from model.errors import InputError
 
+_TIMEOUT = 60.0  # s; a plug-in or a file on a lost network folder may hang
 _NICE = 10  # above that of the daemon, whose loop comes first
 
 
@@ -26,17 +27,21 @@ def read_in_child(file: Path) -> DaemonConfig:
 
     Raises OSError if the process cannot be started or fails.
     """
-    done = subprocess.run(  # noqa: S603  our own module
-        # -P: do not import a folder named controller in the working directory
-        [
-            *(sys.executable, "-P", "-m", "controller.daemon.child_main", str(os.getpid())),
-            *("controller.daemon.config_reader", str(file)),
-        ],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        start_new_session=True,  # Ctrl-C is handled by the daemon
-        check=False,
-    )
+    try:
+        done = subprocess.run(  # noqa: S603  our own module
+            # -P: do not import a folder named controller in the working directory
+            [
+                *(sys.executable, "-P", "-m", "controller.daemon.child_main", str(os.getpid())),
+                *("controller.daemon.config_reader", str(file)),
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is handled by the daemon
+            timeout=_TIMEOUT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise TimeoutError(f"reading {file} took longer than {_TIMEOUT:g} s") from error
     if done.returncode != 0:
         raise OSError(f"reading {file} failed with status {done.returncode}")
     read = pickle.loads(done.stdout)  # noqa: S301  of our own process

@@ -46,7 +46,6 @@ def loopback_address(text: str) -> str:
 MAX_TOUCH_WAIT = 0.1
 """Upper bound of touch_wait [s]: a longer delay is felt as a separate event."""
 
-Port = Annotated[int, Field(ge=0, le=65535)]
 File = Annotated[str, Field(min_length=1, max_length=4096), AfterValidator(_file)]
 LevelDbSl = Annotated[float, Quantity(RATIO, at_least=-20, at_most=60)]
 
@@ -110,5 +109,4 @@ class DaemonSection(Section):
     socket: File | None = None
     log: LogSection = LogSection()
     dumps: DumpSection | None = None
-    metrics: Port | None = None
     dashboard: Annotated[str, AfterValidator(loopback_address)] | None = None

@@ -19,7 +19,7 @@ from controller.daemon.fault_dumps import FaultDumps
 from controller.daemon.log import LogThread
 from controller.daemon.message_recorder import MessageRecorder, RecordedBackend
 from controller.daemon.publisher import EventPublisher
-from controller.daemon.reload import DEFERRED, changed_keys, plan_reload
+from controller.daemon.reload import changed_keys, reload_problem
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
 from controller.daemon.states import ENERGISED, DaemonState, StateMachine
@@ -61,7 +61,6 @@ class Daemon:
         dashboard: str | None,
     ) -> None:
         self._config = config
-        self._initial_config = config
         self._log = log
         self._manager = manager
         self._dashboard = dashboard
@@ -162,7 +161,6 @@ class Daemon:
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.shut_down, f"{signal.strsignal(number)} received")
         loop.add_signal_handler(signal.SIGHUP, self._request_reload)
-        loop.add_signal_handler(signal.SIGUSR1, lambda: self._log.reopen())
         running: asyncio.Task[None] | None = None
         try:
             await self._server.open(lock.bind())
@@ -170,7 +168,7 @@ class Daemon:
             running = asyncio.create_task(
                 self._supervisor.run(self._controller), name="control loop"
             )
-            await self._inputs.replace(self._config.touch)
+            self._inputs.start(self._config.touch)
             self._start_children()
             shutdown = asyncio.create_task(self._shutdown.wait())
             started = asyncio.create_task(self._supervisor.started.wait())
@@ -198,48 +196,36 @@ class Daemon:
         self._shutdown.set()
 
     async def reload(self) -> None:
-        """Read the configuration again and apply what can change while running."""
+        """Read the configuration again and apply its layout, if nothing else has changed."""
         async with self._reload_lock:
             self._is_reload_pending = False  # a later request needs another read
             self._manager.reloading()
             try:
-                read = partial(_read, self._config, self._initial_config)
-                await self._apply(*await in_thread(read, name="reload"))
+                new, changed, differs = await in_thread(partial(_read, self._config), name="reload")
+                self._apply(new, changed, differs=differs)
             except InputError as error:
                 _logger.error("config: reload rejected, keeping previous: %s", error)
             except Exception:  # systemd waits for the end of the reload
                 _logger.exception("config: reload failed")
             self._manager.ready(self._status_line())
 
-    async def _apply(self, new: DaemonConfig, changed: list[str], restart: list[str]) -> None:
+    def _apply(self, new: DaemonConfig, changed: list[str], *, differs: bool) -> None:
         is_armed = self._supervisor.machine.state in ENERGISED
-        plan = plan_reload(self._config, new, changed, is_armed=is_armed)
-        if plan.refused is not None:
-            _logger.error("config: reload rejected, keeping previous: %s", plan.refused)
+        problem = reload_problem(self._config, new, changed, is_armed=is_armed)
+        if problem is not None:
+            _logger.error("config: reload rejected, keeping previous: %s", problem)
             return
-        for key in restart:
-            _logger.warning("config: %s changed, which needs a restart", key)
-        for key in plan.apply:
-            match key:
-                case "touch":
-                    await self._inputs.replace(new.touch)
-                case "layout":
-                    self._layout.replace(new.effective_layout)
-                    self._publisher.layout_changed(new.layout)
-                    self._controller.request_update()
-                case "longest_lease":
-                    self._api.longest_lease = new.section.longest_lease
-                case "log.level":
-                    logging.getLogger().setLevel(new.section.log.level.upper())
-                case _:
-                    pass  # read when needed
+        if differs:
+            self._layout.replace(new.effective_layout)
+            self._publisher.layout_changed(new.layout)
+            self._controller.request_update()
         self._config = new
-        _logger.info("config: reloaded, applied %s", ", ".join(plan.apply) or "no change")
+        _logger.info("config: reloaded, applied %s", "layout" if differs else "no change")
 
     async def _close(self, running: "asyncio.Task[None] | None") -> None:
         """Silence the amplifiers first, then close everything else."""
         self._manager.stopping()
-        for reload in self._reloads:  # it would start inputs again
+        for reload in self._reloads:
             reload.cancel()
         try:
             await self._supervisor.close(self._shutdown_cause)
@@ -274,9 +260,6 @@ class Daemon:
                 _logger.info("dashboard: token in %s", token_file)
                 options += ["--token-file", str(token_file)]
             self._children.start("controller.cli", "gateway", *options)
-        if self._config.section.metrics is not None:
-            port = str(self._config.section.metrics)
-            self._children.start("controller.metrics", "--socket", socket, "--port", port)
 
     def _deliver(self, frame: TouchFrame) -> None:
         """Pass touches to the control loop; ignore them while it is not running."""
@@ -308,8 +291,7 @@ class Daemon:
             self._learning.ended()
 
     def _request_reload(self) -> None:
-        """Reopen the log and start a reload; requests during one are combined into one after it."""
-        self._log.reopen()
+        """Start a reload; requests during one are combined into one after it."""
         if self._is_reload_pending:
             return
         self._is_reload_pending = True
@@ -322,9 +304,8 @@ class Daemon:
         return f"{machine.state.value}: {machine.cause}"
 
 
-def _read(old: DaemonConfig, initial: DaemonConfig) -> tuple[DaemonConfig, list[str], list[str]]:
-    """Read the configuration again; return it, its changed keys, and those that need a restart."""
+def _read(old: DaemonConfig) -> tuple[DaemonConfig, list[str], bool]:
+    """Read the configuration again; also its changed keys, and whether its layout differs."""
     with without_collections():  # of a large layout
         new = read_in_child(old.source)
-    restart = [key for key in changed_keys(initial, new) if key in DEFERRED]
-    return new, changed_keys(old, new), restart
+    return new, changed_keys(old, new), old.effective_layout != new.effective_layout

@@ -16,7 +16,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from enum import Enum, auto
 from pathlib import Path
 from typing import TextIO
 
@@ -51,13 +50,6 @@ class JsonFormatter(logging.Formatter):
         if record.exc_info:
             fields["traceback"] = self.formatException(record.exc_info)[-4 * _MAX_MESSAGE :]
         return json.dumps(fields)
-
-
-class _Command(Enum):
-    """Entries of the queue that are not lines."""
-
-    REOPEN = auto()
-    CLOSE = auto()
 
 
 def open_log_file(file: Path) -> TextIO:
@@ -102,15 +94,16 @@ class RateLimitFilter(logging.Filter):
 class LogThread:
     """Writes the log until it is closed; `lost` counts lines that could not be written.
 
-    file: appended to; None for standard error. A failing file is reopened for every line. listener:
-    called with every record in the thread that logs it.
+    file: appended to; None for standard error. A failing file is reopened for every line, one that
+    was renamed or removed before the next line. listener: called with every record in the thread
+    that logs it.
     """
 
     def __init__(self, file: Path | None) -> None:
         self.lost = 0
         self.listener: Callable[[logging.LogRecord], None] | None = None
         self._file = file
-        self._lines: queue.Queue[str | _Command] = queue.Queue(_MAX_QUEUED)
+        self._lines: queue.Queue[str | None] = queue.Queue(_MAX_QUEUED)
         self._thread = threading.Thread(target=self._write_all, name="log", daemon=True)
         self._thread.start()
 
@@ -121,27 +114,21 @@ class LogThread:
         except queue.Full:
             self.lost += 1
 
-    def reopen(self) -> None:
-        """Open the file again before the next line, since it may have been renamed."""
-        with contextlib.suppress(queue.Full):
-            self._lines.put_nowait(_Command.REOPEN)
-
     def close(self) -> None:
         """Write the queued lines, within a time limit."""
         try:
-            self._lines.put(_Command.CLOSE, timeout=_CLOSE_TIMEOUT)
+            self._lines.put(None, timeout=_CLOSE_TIMEOUT)
         except queue.Full:
             return
         self._thread.join(_CLOSE_TIMEOUT)
 
     def _write_all(self) -> None:
         stream: TextIO | None = None
-        while (line := self._lines.get()) is not _Command.CLOSE:
-            if line is _Command.REOPEN:
-                self._close_file(stream)
-                stream = None
-                continue
+        while (line := self._lines.get()) is not None:
             try:
+                if stream is not None and self._is_replaced(stream):
+                    self._close_file(stream)
+                    stream = None
                 if stream is None:
                     stream = self._open()
                 stream.write(f"{line}\n")
@@ -156,6 +143,15 @@ class LogThread:
         if self._file is None:
             return sys.stderr
         return open_log_file(self._file)
+
+    def _is_replaced(self, stream: TextIO) -> bool:
+        """Whether the file has another inode than the open one, as after its rotation."""
+        if self._file is None:
+            return False
+        try:
+            return os.fstat(stream.fileno()).st_ino != self._file.stat().st_ino
+        except FileNotFoundError:
+            return True
 
     def _close_file(self, stream: TextIO | None) -> None:
         if stream is not None and self._file is not None:

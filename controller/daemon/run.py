@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from controller.api.descriptors import MIN_DESCRIPTORS, allow_many_descriptors
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.config_sections import loopback_address
 from controller.daemon.daemon import Daemon
@@ -58,6 +59,12 @@ def run_daemon(path: Path, *, dashboard: str | None, trace: Path | None = None) 
         raise InputError(f"--dashboard: {error}") from error
     with ExitStack() as stack:
         stack.enter_context(_ignored_signals())
+        descriptors = allow_many_descriptors()
+        if descriptors < MIN_DESCRIPTORS:
+            raise InputError(
+                f"limit of open files must be at least {MIN_DESCRIPTORS}, got {descriptors}; raise "
+                "it (ulimit -n, LimitNOFILE=)"
+            )
         if trace is not None:
             stack.enter_context(tracing(trace))
         config = load_daemon_config(path)

@@ -39,7 +39,7 @@ class SocketLock:
             raise InputError(f"{error.filename}: {error.strerror}; {_REMEDY}") from error
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             self._lock.seek(0)
             owner = self._lock.read(20).strip()
             self._lock.close()
@@ -47,6 +47,11 @@ class SocketLock:
                 f"{path}: a daemon is running already (process {owner or 'unknown'}); stop it, or "
                 f"{_REMEDY}"
             ) from None
+        except OSError as error:
+            self._lock.close()
+            raise InputError(
+                f"{path}: its file system does not lock files ({error.strerror}); {_REMEDY}"
+            ) from error
         self._lock.truncate(0)
         self._lock.write(f"{os.getpid()}\n")
         self._lock.flush()

@@ -42,7 +42,14 @@ from controller.loop.loop import Controller
 from controller.loop.observer import Observer
 from drivers import clock
 from drivers.amplifier import Amplifier
-from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkError, Preempted
+from drivers.errors import (
+    CommandRefused,
+    DriverError,
+    FrameError,
+    LinkDegraded,
+    LinkError,
+    Preempted,
+)
 from drivers.operation.silence import StopOutcome
 from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault
 from registry.plugins import failure_text
@@ -115,8 +122,8 @@ class Supervisor:
     async def run(self, controller: Controller) -> None:
         """Open the amplifiers, run the control loop, and reconnect after every loss, until `close`.
 
-        Amplifiers that do not reply at the start are searched for as after a loss; one in a fault,
-        or one that refuses, leads to the state FAULT. Raises CommandError and InputError for
+        Amplifiers that do not reply at the start, or refuse, are searched for as after a loss; one
+        in a fault leads to the state FAULT. Raises CommandError and InputError for
         amplifiers that do not fit the configuration.
         """
         self._controller_if_running = controller
@@ -288,13 +295,13 @@ class Supervisor:
                     await self._handle_loss(error)
 
     async def _open(self) -> None:
-        """Open and verify the amplifiers; without a reply they are searched for."""
+        """Open and verify the amplifiers; without a good reply they are searched for."""
         try:
             await wait_alive(self._controller.open(), self._alive)
             if self._is_closing:
                 await self._controller.close()
                 return
-        except LinkError as error:
+        except (LinkError, CommandRefused, FrameError) as error:
             self._link_changed("retry", (), error_text(error))
             event = DaemonEvent(Trigger.NOT_FOUND, error_text(error), _SEARCHING)
             await self._in_background(self.handle(event))

@@ -22,11 +22,10 @@ _logger = logging.getLogger(__name__)
 
 
 class TouchInputs:
-    """Runs touch sources concurrently; sources can be replaced while others keep running.
+    """Runs touch sources concurrently.
 
     deliver receives their frames, each source name prefixed with the configured name; failed
-    receives the error of a source, which is then restarted after a growing pause. Contacts of a
-    removed source time out.
+    receives the error of a source, which is then restarted after a growing pause.
     """
 
     def __init__(
@@ -37,22 +36,19 @@ class TouchInputs:
     ) -> None:
         self._deliver = deliver
         self._failed = failed
-        self._running: dict[TouchInput, asyncio.Task[None]] = {}
+        self._running: list[asyncio.Task[None]] = []
 
-    async def replace(self, inputs: Iterable[TouchInput]) -> None:
-        """Run exactly these sources; those that are running already are not restarted."""
-        configured = list(inputs)
-        for old in [each for each in self._running if each not in configured]:
-            task = self._running.pop(old)
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
-        for new in configured:
-            if new not in self._running:
-                self._running[new] = asyncio.create_task(self._run(new), name=f"touch {new.name}")
+    def start(self, inputs: Iterable[TouchInput]) -> None:
+        """Run these sources until `close`."""
+        self._running += [
+            asyncio.create_task(self._run(each), name=f"touch {each.name}") for each in inputs
+        ]
 
     async def close(self) -> None:
         """Stop all sources."""
-        await self.replace(())
+        for task in self._running:
+            task.cancel()
+        await asyncio.gather(*self._running, return_exceptions=True)
 
     async def _run(self, touch_input: TouchInput) -> None:
         def deliver(frame: TouchFrame) -> None:

@@ -88,6 +88,8 @@ class TouchRecorder:
         self._sensors: dict[str, Position] = {}
         self._loads: dict[str, float] = {}
         self._tasks: set[asyncio.Task[Any]] = set()
+        self._lifted = asyncio.Event()
+        self._lifted.set()
 
     @property
     def observer(self) -> Observer:
@@ -100,6 +102,10 @@ class TouchRecorder:
             link_lost=self._failed,
             source_failed=self._failed,
         )
+
+    async def all_lifted(self) -> None:
+        """Wait until no finger is on the plate."""
+        await self._lifted.wait()
 
     def start(self) -> None:
         """Set the start of the recording to now."""
@@ -122,6 +128,10 @@ class TouchRecorder:
             touch = self._touches[contact.key] = _Touch(contact, others)
             if self._errors:
                 touch.reason = _cause(self._errors[0])
+        if contacts:
+            self._lifted.clear()
+        else:
+            self._lifted.set()
         for contact in change.up:
             touch = self._touches.pop(contact.key)
             touch.until = clock.now()

@@ -1,9 +1,9 @@
 """Runs the demonstration: far end, controller, recorded touches, rows, picture."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+import contextlib
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeAlias
 
 from controller.demo.far_end import SIM_OPTIONS, simulated_plate
 from controller.demo.picture import choose_rows, touches_figure
@@ -11,13 +11,9 @@ from controller.demo.recorder import TouchRecorder
 from controller.demo.touch_row import TouchRow
 from controller.loop.envelopes import MAX_LOADING_TIME
 from controller.loop.loop import Controller
-from controller.sources.capture import read_capture, replay_capture
-from controller.sources.contacts import CONTACT_TIMEOUT
-from controller.sources.evemu import EvemuSource
-from controller.sources.touch import TouchSource
+from controller.sources.capture import RecordedDatagram, replay_capture
 from controller.sources.tuio import TuioSource
 from drivers.amplifier import Amplifier
-from drivers.link.link import REPLY_TIMEOUT
 from drivers.operation.garbage_collection import no_long_collections
 from drivers.registry import open_backend
 from model.figures import save_figure
@@ -25,14 +21,16 @@ from model.rig.file import load_rig
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
 
-Play: TypeAlias = Callable[[], Awaitable[None]]
-RecordedTouches: TypeAlias = Callable[[], Awaitable[tuple[TouchSource, Play]]]
-
 WIRES = (*SIM_OPTIONS, "sim")
 
-EMULATOR_TIMEOUT = 0.15
-"""Time [s] to wait for a reply of emulated firmware, whose UART takes a byte each time the machine
-gets round to it; within the watchdog of 250 ms."""
+REPLY_TIMEOUT = 1.0
+"""Time [s] to wait for a reply: simulated amplifiers share a machine that may be busy."""
+
+WATCHDOG = 2.0
+"""Watchdog [s] of simulated amplifiers, the longest of the protocol, for the same reason."""
+
+CONTACT_TIMEOUT = 2.0
+"""Time [s] after which a recorded finger without news is lifted, also for that reason."""
 
 DECAY = 0.1
 """Time [s] for the plate to ring down after the last touch."""
@@ -45,41 +43,19 @@ def example_touches_path() -> Path:
     return installed if installed.exists() else package.parent / "examples" / "touches.tuio"
 
 
-def read_touches(path: Path) -> RecordedTouches:
-    """Read a TUIO capture or an evemu recording (.events); raises InputError.
-
-    Return a function that opens the touch source and returns it with a function that plays it.
-    """
-    if path.suffix == ".events":
-        recording = EvemuSource(f"evemu:{path}")
-
-        async def open_recording() -> tuple[TouchSource, Play]:
-            return recording, lambda: asyncio.sleep(recording.frames[-1].time)
-
-        return open_recording
-    datagrams = read_capture(path)
-
-    async def open_port() -> tuple[TouchSource, Play]:
-        tuio = TuioSource("tuio:127.0.0.1:0")
-        await tuio.open()
-        return tuio, lambda: replay_capture(datagrams, tuio.host, tuio.port)
-
-    return open_port
-
-
 async def run_demo(
     rig_file: Path,
     table: LocalizationTable,
     *,
     wire: str,
-    touches: RecordedTouches,
+    touches: Sequence[RecordedDatagram],
     on_row: Callable[[TouchRow], None],
     seed: int | None = 0,
     touch_wait: float = MAX_LOADING_TIME,
 ) -> list[TouchRow]:
     """Play recorded touches into a controller, over a wire, onto a simulated plate.
 
-    wire: one of WIRES; touches: from `read_touches`; on_row: called with each row when complete;
+    wire: one of WIRES; touches: of a TUIO capture; on_row: called with each row when complete;
     seed: of the plate within the rig's uncertainty, None for the rig's own; touch_wait [s]: for
     shaped onsets at most. Return all rows in order of time. Raises LinkError if the far end is
     lost.
@@ -88,29 +64,30 @@ async def run_demo(
     async with simulated_plate(
         rig_file, rig.amplifiers, wire=wire, seed=seed, threshold=rig.threshold
     ) as plate:
-        source, play = await touches()
+        tuio = TuioSource(f"tuio:127.0.0.1:0?timeout={CONTACT_TIMEOUT:g}")
+        await tuio.open()
         recorder = TouchRecorder(plate, on_row=on_row)
         controller = Controller(
             rig,
             table,
             amplifiers={
                 name: Amplifier(
-                    open_backend(url, rig.voltage_of(name)),
-                    reply_timeout=EMULATOR_TIMEOUT if wire == "firmware" else REPLY_TIMEOUT,
+                    open_backend(url, rig.voltage_of(name)), reply_timeout=REPLY_TIMEOUT
                 )
                 for name, url in plate.urls.items()
             },
-            sources=[source],
+            sources=[tuio],
             observer=recorder.observer,
             timing=Timing(table),
             max_loading_time=touch_wait,
+            watchdog=WATCHDOG,
         )
         await controller.open()
         try:
             with no_long_collections():
                 await controller.arm()
                 running = asyncio.create_task(controller.run())
-                playing = asyncio.create_task(_play(play, recorder))
+                playing = asyncio.create_task(_play(touches, tuio, recorder))
                 try:
                     await asyncio.wait({running, playing}, return_when=asyncio.FIRST_COMPLETED)
                     for task in (running, playing):
@@ -126,11 +103,17 @@ async def run_demo(
     return recorder.rows
 
 
-async def _play(play: Play, recorder: TouchRecorder) -> None:
+async def _play(
+    touches: Sequence[RecordedDatagram], tuio: TuioSource, recorder: TouchRecorder
+) -> None:
     """Play the touches and wait until the last one counts as lifted and the plate is at rest."""
     recorder.start()
-    await play()
-    await asyncio.sleep(CONTACT_TIMEOUT + DECAY)
+    await replay_capture(touches, tuio.host, tuio.port)
+    await asyncio.sleep(DECAY)  # the last datagrams arrive
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(CONTACT_TIMEOUT):
+            await recorder.all_lifted()
+    await asyncio.sleep(DECAY)
 
 
 def write_picture(table: LocalizationTable, rows: list[TouchRow], folder: Path) -> list[Path]:

@@ -28,14 +28,12 @@ class TonePlayer:
     ramp [s]: of what was played last.
     """
 
-    def __init__(
-        self, rig: Rig, amplifiers: Mapping[str, Amplifier], *, is_time_stepped: bool = False
-    ) -> None:
+    def __init__(self, rig: Rig, amplifiers: Mapping[str, Amplifier]) -> None:
         self.ramp = RAMP
         self.token = 0
         self._rig = rig
         self._amplifiers = amplifiers
-        self._group = AmplifierGroup(amplifiers, is_time_stepped=is_time_stepped)
+        self._group = AmplifierGroup(amplifiers)
         self._guards: dict[str, Guard] = {}
 
     @property

@@ -22,7 +22,8 @@ class LayoutKind:
         return CheckedFile(
             f"good: regions {', '.join(region.name for region in layout.regions) or 'none'}; "
             f"effects {', '.join(layout.effects)}; elsewhere {layout.elsewhere or 'nothing'}. "
-            "Check the daemon's file that names it to see whether it fits the plate"
+            "Check the daemon's file that names it to see whether it fits the plate",
+            layout.warnings(),
         )
 
     def example(self) -> str:

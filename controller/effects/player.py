@@ -99,6 +99,21 @@ class EffectPlayer:
         finger = self._fingers.get(key)
         return finger.plays[-1].name if finger and finger.plays else None
 
+    def bands_before(self, key: ContactKey) -> list[Band | None]:
+        """Bands of requested effects that have precedence over the one of a finger.
+
+        Those that are driven together with it, at fingers that came before it.
+        """
+        requested = {
+            each: finger.plays[-1]
+            for each, finger in self._fingers.items()
+            if finger.plays and finger.plays[-1].priority == REQUESTED_PRIORITY
+        }
+        newest = sorted(requested, key=lambda each: requested[each].number, reverse=True)
+        driven = newest[: self.layout.most_at_once]
+        before = list(requested)[: list(requested).index(key)]
+        return [requested[each].band for each in before if each in driven]
+
     def play(self, name: str, contact: Contact, now: float, *, level_db_sl: float | None) -> None:
         """Start a named effect at a finger, again if it was requested there before.
 

@@ -40,9 +40,9 @@ HEADERS = {
 class Access:
     """ASGI middleware that passes on allowed requests and refuses the others.
 
-    Everything under /api except the OpenAPI description needs the token: `Authorization: Bearer
-    TOKEN`, or for a WebSocket, where browsers cannot set headers, the subprotocol
-    `era-haptics.token.TOKEN` beside `era-haptics.v1`.
+    Everything under /api except the OpenAPI description needs the token, and so do the metrics
+    outside the loopback: `Authorization: Bearer TOKEN`, or for a WebSocket, where browsers cannot
+    set headers, the subprotocol `era-haptics.token.TOKEN` beside `era-haptics.v1`.
     """
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
@@ -74,7 +74,9 @@ class Access:
             origins or _is_navigation(headers)
         ):
             return 403, "cross-site requests are not allowed"
-        if not _needs_token(scope["path"]) or scope.get("method") == "OPTIONS":  # without effect
+        if scope.get("method") == "OPTIONS":  # without effect
+            return None
+        if not self._needs_token(scope["path"]):
             return None
         if not self._has_token(headers):
             return 401, "the token is missing or wrong; open the URL that the gateway printed"
@@ -94,6 +96,12 @@ class Access:
         own = f"{self._scheme}://{host}".lower()
         allowed = {own, *(origin.lower() for origin in self._settings.origins)}
         return len(origins) == 1 and origins[0].lower() in allowed
+
+    def _needs_token(self, path: str) -> bool:
+        """Whether a path needs the token, unlike the page and the OpenAPI description."""
+        if path == "/metrics":
+            return not self._settings.is_loopback
+        return path.startswith("/api/") and path != "/api/v1/openapi.json"
 
     def _has_token(self, headers: Headers) -> bool:
         tokens = [
@@ -115,11 +123,6 @@ class Access:
 def _is_navigation(headers: Headers) -> bool:
     """Whether the user followed a link to the page."""
     return headers.get("sec-fetch-mode") == "navigate"
-
-
-def _needs_token(path: str) -> bool:
-    """Whether a path needs the token, unlike the page and the OpenAPI description."""
-    return path.startswith("/api/") and path != "/api/v1/openapi.json"
 
 
 def _to_int(text: str) -> int:

@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
@@ -15,6 +16,7 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
+from controller.api.client_protocol import Unreachable, read_result
 from controller.api.jsonrpc import (
     ErrorCode,
     RpcError,
@@ -24,10 +26,11 @@ from controller.api.jsonrpc import (
     unknown_method,
 )
 from controller.api.jsonrpc import Request as RpcRequest
-from controller.api.methods import ArmParams
+from controller.api.methods import ArmParams, StatusResult
 from controller.api.rate_limit import RateLimiter
-from controller.api.schema import Message
+from controller.api.schema import Empty, Message
 from controller.gateway.access import MAX_BODY, SUBPROTOCOL, Access
+from controller.gateway.metrics import exposition
 from controller.gateway.mirror import DaemonMirror
 from controller.gateway.openapi import HTTP_METHODS, HTTP_STATUS, openapi
 from controller.gateway.session import (
@@ -65,6 +68,7 @@ class Gateway:
                         WebSocketRoute("/ws", self._serve),
                     ],
                 ),
+                Route("/metrics", self._metrics),
                 Mount("/", StaticFiles(directory=_PAGE, html=True)),
             ],
             middleware=[
@@ -89,6 +93,17 @@ class Gateway:
 
     async def _describe(self, _: Request) -> Response:
         return Response(self._openapi, media_type="application/json")
+
+    async def _metrics(self, _: Request) -> Response:
+        """Read the daemon's status for Prometheus."""
+        if not self._rate.take():
+            raise HTTPException(429, "too many requests; send fewer per second")
+        try:
+            found = await self._mirror.daemon.call("status", Empty())
+            status = read_result(found, StatusResult)
+        except (RpcError, Unreachable):
+            status = None
+        return Response(exposition(status), media_type=CONTENT_TYPE_LATEST)
 
     async def _call(self, request: Request) -> Response:
         """Call one method of the API; its parameters are the body."""

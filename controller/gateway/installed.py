@@ -4,7 +4,7 @@ from importlib.util import find_spec
 
 from model.errors import InputError
 
-_LIBRARIES = ("starlette", "uvicorn", "websockets")
+_LIBRARIES = ("prometheus_client", "starlette", "uvicorn", "websockets")
 
 
 def require_gateway() -> None:

@@ -101,6 +101,9 @@ class DaemonMirror:
             except InputError as error:
                 _logger.warning("field of the plate not computed: %s", error)
                 frame = _NO_FIELD
+            except Exception:  # without the picture, but with the stop button
+                _logger.exception("field of the plate not computed")
+                frame = _NO_FIELD
             if not self._field_due.is_set():
                 self._store_and_publish(FIELD, frame)
 

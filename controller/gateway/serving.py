@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import os
 import re
-import resource
 import signal
 import socket
 import ssl
@@ -13,6 +12,7 @@ from typing import Any
 
 import uvicorn
 
+from controller.api.descriptors import allow_many_descriptors
 from controller.gateway.app import Gateway
 from controller.gateway.connections import HttpConnection, WebSocketConnection
 from controller.gateway.settings import Settings
@@ -56,8 +56,9 @@ class _Server(uvicorn.Server):
 
 async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
     """Serve until SIGINT or SIGTERM; announce: called with the port. Raises InputError."""
-    os.nice(_NICENESS)
-    _allow_many_descriptors()
+    with contextlib.suppress(OSError):  # a service may be forbidden to
+        os.nice(_NICENESS)
+    allow_many_descriptors()
     check_certificate(settings)
     gateway = Gateway(settings)
     listening = listen(settings)
@@ -146,11 +147,3 @@ async def _signals(server: uvicorn.Server) -> AsyncIterator[None]:
     finally:
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.remove_signal_handler(number)
-
-
-def _allow_many_descriptors() -> None:
-    """Raise the limit of open files, so that idle connections do not use them up."""
-    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    limit = 65_536 if hard == resource.RLIM_INFINITY else hard
-    with contextlib.suppress(OSError, ValueError):
-        resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))

@@ -43,7 +43,7 @@ class Settings:
         if not 0 <= self.port < 65536:
             raise InputError(f"port must be 0 to 65535, got {self.port}")
         try:
-            address = ipaddress.ip_address(self.host)
+            is_loopback = self.is_loopback
         except ValueError as error:
             raise InputError(
                 f"the address to listen on must be an IP address, such as 127.0.0.1 or ::1, got "
@@ -59,12 +59,12 @@ class Settings:
         for path in (self.certificate, self.key):
             if path is not None and not path.is_file():
                 raise InputError(f"{path}: no such file; --certificate and --key must be PEM files")
-        if not address.is_loopback and not (self.certificate and self.is_token_user_supplied):
+        if not is_loopback and not (self.certificate and self.is_token_user_supplied):
             raise InputError(
                 f"listening on {self.host}, outside the loopback, needs TLS and your own token: "
                 "give --certificate, --key and --token-file, or listen on 127.0.0.1 behind a proxy"
             )
-        if not address.is_loopback and not self.extra_hosts:
+        if not is_loopback and not self.extra_hosts:
             raise InputError(
                 f"listening on {self.host}, outside the loopback, needs --allow-host with the name "
                 "or address that browsers use"
@@ -80,6 +80,11 @@ class Settings:
                 raise InputError(
                     f"--allow-origin must look like https://panel.example:8443, got {origin!r}"
                 )
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine can connect."""
+        return ipaddress.ip_address(self.host).is_loopback
 
     @property
     def is_encrypted(self) -> bool:

@@ -52,16 +52,15 @@ class AmplifierGroup:
 
     A pattern with one ERA missing is another pattern, so a failure of one amplifier stops all of
     them before the error is raised. Nothing arms again by itself. A stop runs to completion even if
-    its caller is cancelled.
+    its caller is cancelled. watchdog [s]: of armed amplifiers.
     """
 
-    def __init__(
-        self, amplifiers: Mapping[str, Amplifier], *, is_time_stepped: bool = False
-    ) -> None:
+    def __init__(self, amplifiers: Mapping[str, Amplifier], *, watchdog: float = WATCHDOG) -> None:
         self.state = GroupState.CLOSED
+        self._watchdog = watchdog
         self._amplifiers = dict(amplifiers)
         self._checked = {
-            name: CheckedAmplifier(amplifier, f"amplifier {name}", is_time_stepped=is_time_stepped)
+            name: CheckedAmplifier(amplifier, f"amplifier {name}")
             for name, amplifier in self._amplifiers.items()
         }
         self._playback = SynchronizedPlay(self._checked)
@@ -97,7 +96,7 @@ class AmplifierGroup:
         try:
             await gather_all(amplifier.open() for amplifier in self._all)
             for amplifier in self._all:
-                check_watchdog(WATCHDOG, amplifier.round_trip())
+                check_watchdog(self._watchdog, amplifier.round_trip())
         except BaseException:
             await self._close_wires()
             raise
@@ -142,7 +141,9 @@ class AmplifierGroup:
         self._may_be_armed = True
         session = random_session()  # one for all, so that a broadcast reaches them
         try:
-            await self._gather(each.arm(session=session) for each in self._checked.values())
+            await self._gather(
+                each.arm(self._watchdog, session=session) for each in self._checked.values()
+            )
             self._check_not_silenced(before)
         except BaseException:
             with self._silencing():

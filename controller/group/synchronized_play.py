@@ -209,7 +209,8 @@ async def _commit(
     if not may_play():
         return False
     if len(several) > 1:
-        await several[0].amplifier.commit_on_bus(sets[0].token)
+        first, *others = (checked.amplifier for checked in several)
+        await first.commit_on_bus(sets[0].token, others)
     else:
         await several[0].commit(sets[0])
     return True

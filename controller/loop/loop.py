@@ -20,7 +20,7 @@ from controller.sources.contacts import Change
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import TouchFrame, TouchSource
 from drivers import clock
-from drivers.amplifier import Amplifier
+from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.command import DriveCommand
 from drivers.errors import CommandError, DriverError, LinkError
 from drivers.guard import Guard
@@ -52,7 +52,7 @@ class Controller:
     intent_source: by default the newest contact buzzes where it is. timing: shapes the patterns of
     the table, ramps only without it. drive_mode: None for the best that the amplifiers can play.
     max_loading_time [s]: how long loading envelopes may delay a touch, 0 for ramps only.
-    is_supervised: whether amplifiers without a watchdog are driven.
+    is_supervised: whether amplifiers without a watchdog are driven. watchdog [s]: of armed ones.
     """
 
     def __init__(
@@ -68,6 +68,7 @@ class Controller:
         drive_mode: str | None = None,
         max_loading_time: float = MAX_LOADING_TIME,
         is_supervised: bool = False,
+        watchdog: float = WATCHDOG,
     ) -> None:
         if amplifiers.keys() != rig.amplifiers.keys():
             raise InputError(
@@ -78,7 +79,7 @@ class Controller:
         self._table = table
         self._is_supervised = is_supervised
         self._amplifiers = amplifiers
-        self._group = AmplifierGroup(amplifiers)
+        self._group = AmplifierGroup(amplifiers, watchdog=watchdog)
         self._sources = sources
         self._observer = observer or Observer()
         self._intent_source = intent_source or BuzzNewestContact()

@@ -11,7 +11,7 @@ import numpy as np
 
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.intent import HapticIntent, Target
-from controller.loop.table_query import TableAnswer, is_short, query_table
+from controller.loop.table_query import TableAnswer, is_short, query_table, why_held_back
 from controller.sources.contacts import Contact
 from model.errors import InputError
 from model.finger.contrast import contrast_db, mean_level_db_sl
@@ -41,12 +41,14 @@ class Prediction:
 
     contact: as it was when the pattern was chosen; level_db_sl: over the duration of the effect,
     onset included, or the steady one where it has none; contrast_db: of the steady vibration to the
-    loudest quiet point, None without quiet contacts.
+    loudest quiet point, None without quiet contacts. held_back: why another vibration than that of
+    its own effect plays; None if its own does.
     """
 
     contact: Contact
     level_db_sl: float
     contrast_db: float | None
+    held_back: str | None = None
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,7 @@ class Selector:
             return Selection((), quiet, None, intent.reason)
         try:
             answer = self._with_harmonic(self._query(targets, quiet, capabilities))
-            predictions = self._predict(targets, quiet, answer)
+            predictions = self._held_back(targets, self._predict(targets, quiet, answer), answer)
         except InputError as error:
             return Selection(targets, quiet, None, str(error))
         except Exception as error:
@@ -184,6 +186,20 @@ class Selector:
                 return None
         frequencies = {tone.frequency for tone in current.pattern.excitation.values()}
         return frequencies.pop() if len(frequencies) == 1 else None
+
+    def _held_back(
+        self,
+        targets: tuple[tuple[Contact, Target], ...],
+        predictions: tuple[Prediction, ...],
+        answer: TableAnswer,
+    ) -> tuple[Prediction, ...]:
+        """Say of each target whether the vibration of its own effect plays."""
+        played = [tone.frequency for tone in answer.pattern.excitation.values()]
+        band = min(played), max(played)
+        return tuple(
+            replace(each, held_back=why_held_back(target.band, band, self._table.frequencies))
+            for each, (_, target) in zip(predictions, targets, strict=True)
+        )
 
     def _predict(
         self,

@@ -11,6 +11,7 @@ from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.intent import Target
 from controller.sources.contacts import Contact
 from model.arrays import FloatArray
+from model.choice import best_of
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, decibels
 from model.table.effect_level import SHAPED_FROM, DriveLimits, EffectLevels
@@ -110,30 +111,53 @@ def _question(
         drive_mode=capabilities.drive_mode,
         playable=capabilities.playable,
         eras_at_most=capabilities.eras_at_most,
-        frequencies=_frequencies(targets, capabilities.frequencies, frequencies),
+        frequencies=common_band(
+            [target.band for _, target in targets], frequencies, playable=capabilities.frequencies
+        )[0],
         envelopes=capabilities.envelope_support.onsets and not is_short(targets),
         loads=() if all(load == 1 for load in loads) else loads,
     )
 
 
-def _frequencies(
-    targets: Sequence[tuple[Contact, Target]],
-    playable: tuple[float, float],
+def common_band(
+    bands: Sequence[tuple[float, float] | None],
     frequencies: FloatArray,
-) -> tuple[float, float]:
-    """Return the lowest and highest frequency [Hz] that all targets allow.
+    *,
+    playable: tuple[float, float] = (0.0, math.inf),
+) -> tuple[tuple[float, float], bool]:
+    """Return the lowest and highest frequency [Hz] that all bands allow, and if the last one does.
 
-    The band of a target that shares none with those before it is ignored.
+    A band that shares no frequency of a table with those before it is ignored.
     """
     low, high = playable
-    for _, target in targets:
-        if target.band is None:
+    is_shared = True
+    for each in bands:
+        if each is None:
+            is_shared = True
             continue
-        band = band_of_table(target.band, frequencies)
+        band = band_of_table(each, frequencies)
         together = max(low, band[0]), min(high, band[1])
-        if ((frequencies >= together[0]) & (frequencies <= together[1])).any():
+        is_shared = bool(((frequencies >= together[0]) & (frequencies <= together[1])).any())
+        if is_shared:
             low, high = together
-    return low, high
+    return (low, high), is_shared
+
+
+def why_held_back(
+    band: tuple[float, float] | None, played: tuple[float, float], frequencies: FloatArray
+) -> str | None:
+    """Return why an effect with a band does not play while others [Hz] do; None if it does."""
+    if band is None:
+        return None
+    low, high = band_of_table(band, frequencies)
+    if low <= played[1] and played[0] <= high:
+        return None
+    return f"its effect needs {_shown(band)}, and {_shown(played)} plays: one frequency at a time"
+
+
+def _shown(band: tuple[float, float]) -> str:
+    low, high = band
+    return f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
 
 
 def band_of_table(band: tuple[float, float], frequencies: FloatArray) -> tuple[float, float]:
@@ -188,7 +212,7 @@ def _over_duration(
         ),
         replace(limits, lowers=True),
     )
-    return max(first, second, key=lambda each: each.felt_db_sl)
+    return (first, second)[best_of([first.felt_db_sl, second.felt_db_sl])]
 
 
 def _over_effect(

@@ -32,7 +32,7 @@ def report(
 ) -> None:
     """Collect versions, files and daemon state for a bug report.
 
-    Shows known keys, numbers and words of this program alone; check the file before you send it.
+    Values of unknown keys, hosts, serial numbers and comments are hidden; look before you send it.
     """
     from controller.report.collect import collect
     from controller.report.zip_file import write_zip
@@ -43,4 +43,4 @@ def report(
         print(f"  {name}: {len(text)} characters")
     for what in collected.missing:
         print(f"  skipped: {what}")
-    print(f"Wrote {output}\nNext: check it, then attach it to your report")
+    print(f"Wrote {output}\nNext: look before you send: names and causes are not hidden")

@@ -15,7 +15,7 @@ from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.daemon.config import is_daemon_document
 from controller.daemon.fault_dumps import DUMP_PATTERN
-from controller.report.shown import Shown, installed_from
+from controller.report.shown import installed_from, shown
 from drivers.errors import LinkError
 from model.config.document import read_document
 from model.errors import InputError
@@ -51,9 +51,11 @@ def collect(configs: Iterable[Path], *, socket: Path | None, home: Path) -> Repo
             files["status.json"] = daemon.status().model_dump_json(indent=2)
     except (LinkError, RpcError) as error:
         missing.append(f"status of a daemon ({type(error).__name__})")
-    shown = Shown(home=home)
     return Report(
-        {name: shown.text(text, is_dump=name.endswith(".jsonl")) for name, text in files.items()}
+        {
+            name: shown(text, home=home, is_dump=name.endswith(".jsonl"))
+            for name, text in files.items()
+        }
         | {"versions.json": json.dumps(versions(), indent=2)},
         tuple(missing),
     )

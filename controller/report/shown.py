@@ -1,14 +1,12 @@
-"""Redaction of texts for a report: known keys with their values, numbers and own words remain.
+"""Redaction of texts for a report: of keys that this program does not know only the names remain.
 
-Anything else is hidden, since secrets cannot be recognised. A hidden word has the
-same number throughout a report, so that it can still be followed.
+Free text, as in causes and names, is not searched: whoever sends a report looks at it before.
 """
 
 import re
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, get_args
 
@@ -20,62 +18,37 @@ from controller.daemon.config_sections import DaemonSection
 from controller.effects.layout_file import LayoutSection
 from model.rig.sections import RigSection
 
-_PACKAGES = ("controller", "drivers", "model", "registry", "sim")
 _COMMENT = re.compile(r"(?m)(?:^|(?<=\s))#.*$")
 _HOST = re.compile(r"(?<=://)[^/?#\s\"']+")
 _PARAMETER = re.compile(r"""([\w-]+)(=)([^\s,&#}"']+)""")  # of a URL
 _ENTRY = re.compile(
     r"""([\w-]+)(["']?[ \t]*:[ \t]*)(?!//)("[^"\n]*"|'[^'\n]*'|[^\s,{}\[\]"'][^\n,{}\[\]"']*)"""
 )  # of YAML or JSON
-_WORD = re.compile(r"\w[\w-]*")
-_NUMBER = re.compile(r"[\d_]+(?:e[+-]?\d+)?|\d+[^\W\d_]{1,4}|0x[\da-f]+", re.IGNORECASE)
 
 
-class Shown:
-    """Shows texts of one report; home: the folder that is replaced by ~."""
-
-    def __init__(self, *, home: Path) -> None:
-        self._home = home
-        self._hidden: dict[str, str] = {}
-
-    def text(self, text: str, *, is_dump: bool = False) -> str:
-        """The text with everything hidden that is not known; is_dump: of messages on a link."""
-        keys = _keys(*(_OF_DUMPS if is_dump else _OF_FILES))
-        if self._home != self._home.parent:  # the home "/" of system users is part of every path
-            text = text.replace(str(self._home), "~")
-        text = _COMMENT.sub("", text)
-        text = _HOST.sub(lambda found: self._hide(found[0]), text)
-        for pattern in (_PARAMETER, _ENTRY):
-            text = pattern.sub(lambda found: self._value(keys, *found.groups()), text)
-        return _WORD.sub(lambda found: self._word(found[0]), text)
-
-    def _value(self, keys: frozenset[str], key: str, separator: str, value: str) -> str:
-        return f"{key}{separator}{value if key in keys else self._hide(value)}"
-
-    def _word(self, word: str) -> str:
-        if word in _words() or _NUMBER.fullmatch(word) or re.fullmatch(r"hidden-\d+", word):
-            return word
-        return self._hide(word)
-
-    def _hide(self, what: str) -> str:
-        return self._hidden.setdefault(what, f"hidden-{len(self._hidden) + 1}")
+_HIDDEN = "hidden"
 
 
-@cache
-def _words() -> frozenset[str]:
-    """Every word of this program's own files: none of them is the user's."""
-    found: set[str] = set()
-    for package in _PACKAGES:
-        spec = find_spec(package)
-        for folder in (spec and spec.submodule_search_locations) or ():
-            for file in Path(folder).rglob("*"):
-                if file.suffix in (".py", ".yaml"):
-                    found.update(_WORD.findall(file.read_text("utf-8")))
-    return frozenset(found)
+def shown(text: str, *, home: Path, is_dump: bool = False) -> str:
+    """Hide in a text the values of unknown keys, hosts and comments.
+
+    home: the folder that is replaced by ~; is_dump: of messages on a link.
+    """
+    keys = _keys(*(_OF_DUMPS if is_dump else _OF_FILES)) - _PRIVATE
+
+    def entry(found: re.Match[str]) -> str:
+        key, separator, value = found.groups()
+        return f"{key}{separator}{value if key in keys else _HIDDEN}"
+
+    if home != home.parent:  # the home "/" of system users is part of every path
+        text = text.replace(str(home), "~")
+    text = _HOST.sub(_HIDDEN, _COMMENT.sub("", text))
+    return _ENTRY.sub(entry, _PARAMETER.sub(entry, text))
 
 
 _OF_FILES = (RigSection, DaemonSection, LayoutSection, StatusResult)
 _OF_DUMPS = tuple(each for each in vars(drivers.protocol.messages).values() if is_dataclass(each))
+_PRIVATE = frozenset({"serial_number"})
 _OTHERS = ("baud", "bitrate", "timeout", "cause", "unix_time_s", "link", "way", "message")
 
 

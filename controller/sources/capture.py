@@ -15,12 +15,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller.sources.recording import recorded_lines
 from drivers.errors import LinkError, system_message
 from model.errors import InputError
+from model.files.regular_file import regular_file
 
 HEADER = "# era-haptics TUIO capture 1"
 _LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)", re.ASCII)
+MAX_BYTES = 16 << 20  # 100 s of ten fingers at 100 Hz; of one finger a quarter of an hour
+_MAX_LINE = 1 << 18  # bytes; a datagram of the largest size takes half of it
 _MAX_DATAGRAM = 65_507  # bytes; UDP over IPv4
 
 
@@ -35,7 +37,7 @@ class RecordedDatagram:
 def read_capture(path: Path | str) -> list[RecordedDatagram]:
     """Read a capture; raises InputError with file and line."""
     path = Path(path)
-    lines = recorded_lines(path, what="a TUIO capture")
+    lines = _lines(path)
     if not lines or lines[0] != HEADER:
         raise InputError(f"{path}, line 1: must be {HEADER!r} for a TUIO capture")
     datagrams: list[RecordedDatagram] = []
@@ -60,6 +62,29 @@ def read_capture(path: Path | str) -> list[RecordedDatagram]:
     if not datagrams:
         raise InputError(f"{path}: capture must contain datagrams")
     return datagrams
+
+
+def _lines(path: Path) -> list[str]:
+    """Read the lines of a capture; raises InputError."""
+    lines: list[str] = []
+    left = MAX_BYTES
+    try:
+        with open(path, "rb", opener=regular_file) as stream:
+            while line := stream.readline(_MAX_LINE):
+                left -= len(line)
+                if left < 0:
+                    raise InputError(
+                        f"{path}: must have at most {MAX_BYTES >> 20} MiB; record a shorter time"
+                    )
+                lines.append(line.decode("utf-8").removesuffix("\n").removesuffix("\r"))
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); check the path, which is relative to the "
+            "working directory, and its permissions"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: must be a TUIO capture, got a binary file") from error
+    return lines
 
 
 def write_capture(path: Path | str, datagrams: Iterable[RecordedDatagram]) -> None:

@@ -6,12 +6,12 @@ import logging
 from collections.abc import Callable
 
 from controller.sources.input_device import InputDevice
-from controller.sources.playing import REPEAT_INTERVAL
 from controller.sources.slots import SlotReader, light_press
 from controller.sources.touch import Touch, TouchFrame, TouchSource
 from controller.sources.url_options import panel_options
 from model.errors import InputError
 
+REPEAT_INTERVAL = 0.05  # s; a panel at rest is silent, but contacts time out without frames
 # Between attempts to reopen an unplugged panel [s], doubled each time.
 _FIRST_PAUSE, _MAX_PAUSE = 0.5, 5.0
 

@@ -17,7 +17,7 @@ _SOURCES: PluginRegistry[Callable[[str], TouchSource]] = PluginRegistry(
 
 
 def open_source(url: str) -> TouchSource:
-    """Create the touch source of a URL such as `tuio:127.0.0.1:3333` or `evemu:taps.events`.
+    """Create the touch source of a URL such as `tuio:127.0.0.1:3333` or `evdev:/dev/input/event5`.
 
     Raises InputError for an unknown scheme, a failing plug-in or a URL that it refuses.
     """

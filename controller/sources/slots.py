@@ -60,14 +60,12 @@ class SlotState:
 class _Slot:
     """The state of one slot; x and y are None until reported.
 
-    contact: id of the touch, None without a contact. has_reported_id: whether a
-    tracking id was reported; one that moves without it was touched before the first event.
+    contact: id of the touch, None without a contact.
     tool: MT_TOOL_FINGER for a finger; palms and pens are ignored. distance: above 0 while hovering,
     ignored. pressure, touch_major: 0..1 of their ranges; values: of these axes as reported.
     """
 
     contact: int | None = None
-    has_reported_id: bool = False
     x: float | None = None
     y: float | None = None
     tool: int = MT_TOOL_FINGER
@@ -93,25 +91,22 @@ class SlotReader:
     """Decoder of events into reports, without I/O.
 
     A contact appears once both its coordinates are known. A slot keeps the coordinates of its last
-    contact, since the kernel omits values that did not change. Contacts that were down before the
-    first event have negative ids. Palms, pens and what hovers are no touches: a finger that becomes
-    a palm is lifted. ranges: of the axes ABS_MT_POSITION_X and _Y, and of ABS_MT_PRESSURE and
-    ABS_MT_TOUCH_MAJOR where there are any. light_press: values of these two under a finger that
-    presses lightly.
+    contact, since the kernel omits values that did not change. Palms, pens and what hovers are no
+    touches: a finger that becomes a palm is lifted. ranges: of the axes ABS_MT_POSITION_X and _Y,
+    and of ABS_MT_PRESSURE and ABS_MT_TOUCH_MAJOR where there are any. light_press: values of these
+    two under a finger that presses lightly.
     """
 
     def __init__(
         self,
         ranges: Mapping[int, Range],
         *,
-        first_slot: int = 0,
         light_press: LightPress = LightPress(),  # noqa: B008  frozen
     ) -> None:
         self._ranges = ranges
         self._light_press = light_press
         self._slots: dict[int, _Slot] = {}
-        self._current = first_slot
-        self._anonymous = 0
+        self._current = 0
         self._pending: list[tuple[Touch, ...]] = []  # intermediate states of this report
         self._changed: set[int] = set()  # slots whose contact has changed within this report
         self._dropped = False
@@ -146,7 +141,6 @@ class SlotReader:
         self._slots = {
             number: _Slot(
                 contact=state.tracking_id if state.tracking_id >= 0 else None,
-                has_reported_id=True,
                 x=self._normalised(ABS_MT_POSITION_X, state.x),
                 y=self._normalised(ABS_MT_POSITION_Y, state.y),
                 tool=state.tool,
@@ -181,15 +175,10 @@ class SlotReader:
                 self._pending.append(self.touches)
             self._changed.add(self._current)
             slot.contact = value if value >= 0 else None
-            slot.has_reported_id = True
-        elif code in (ABS_MT_POSITION_X, ABS_MT_POSITION_Y):
-            if slot.contact is None and not slot.has_reported_id:
-                self._anonymous += 1
-                slot.contact = -self._anonymous  # tracking ids are never negative
-            if code == ABS_MT_POSITION_X:
-                slot.x = self._normalised(code, value)
-            else:
-                slot.y = self._normalised(code, value)
+        elif code == ABS_MT_POSITION_X:
+            slot.x = self._normalised(code, value)
+        elif code == ABS_MT_POSITION_Y:
+            slot.y = self._normalised(code, value)
         elif code == ABS_MT_TOOL_TYPE:
             slot.tool = value
         elif code == ABS_MT_DISTANCE:

@@ -1,7 +1,7 @@
 """Lock with which one program on this machine arms an amplifier that cannot tell hosts apart.
 
-Serial ports are exclusive, and CAN nodes reveal another host. Reading the status and stopping need
-no lock.
+Laboratory instruments need it; others tell hosts apart by their session. Reading the status and
+stopping need no lock.
 """
 
 import contextlib

@@ -5,7 +5,8 @@ from typing import Any, TypeVar, final
 
 DUPLICATE_WAIT = 0.02  # s; for a second amplifier of the same address to reply
 _LATE = 0.005  # s; a timer later than this means that this process was delayed
-_GRACE = 0.010  # s; for data received but not read yet, here or in a reader thread
+_GRACE = 0.010  # s; for data received but not read yet in a reader thread, which was delayed, too
+_MAX_LOOKS = 4  # for a reply at or after its timeout
 
 _T = TypeVar("_T")
 
@@ -15,12 +16,14 @@ class ReplyTimer:
     """The timeouts of the replies on one line, under one timer.
 
     Nearly every reply comes long before its timeout. So the timer is left as it is until then, and
-    only set again if a reply is still awaited.
+    only set again if a reply is still awaited. A timeout is declared only after the line was read
+    once more; if this process was delayed, after a pause in which it was not, or after the last of
+    several looks.
     """
 
     def __init__(self) -> None:
         self._due: dict[asyncio.Future[Any], float] = {}  # s; of the awaited replies
-        self._delayed: set[asyncio.Future[Any]] = set()  # those that were granted _GRACE
+        self._looks: dict[asyncio.Future[Any], int] = {}  # at those that are due
         self._timer: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
 
@@ -39,7 +42,7 @@ class ReplyTimer:
             return await reply
         finally:
             del self._due[reply]
-            self._delayed.discard(reply)
+            self._looks.pop(reply, None)
             if reply.done() and not reply.cancelled():
                 reply.exception()  # it counts as retrieved where this wait was cancelled
 
@@ -55,9 +58,10 @@ class ReplyTimer:
         for reply, due in [*self._due.items()]:
             if due > max(now, scheduled) or reply.done():
                 continue
-            if now - due > _LATE and reply not in self._delayed:
-                self._delayed.add(reply)
-                self._due[reply] = now + _GRACE
+            was_delayed, looks = now - due > _LATE, self._looks.get(reply, 0)
+            if looks == 0 or (was_delayed and looks < _MAX_LOOKS):
+                self._looks[reply] = looks + 1
+                self._due[reply] = now + (_GRACE if was_delayed else 0.0)
             else:
                 reply.set_exception(TimeoutError())
         left = [due for reply, due in self._due.items() if not reply.done()]

@@ -74,12 +74,11 @@ class Bench:
         self.level = min(level, limits.level)
         self.exchange_time = 0.0  # s; the typical one of a status
         self.max_delay = 0.0  # s; of a reply, beyond the typical
-        self._late_replies: list[tuple[float, float]] = []
         self.fed = Interval(-math.inf, math.inf)  # when the watchdog was fed last
         self.watchdog = 0.0
         self._timeouts = amplifier.statistics.timeouts
         self._since = -math.inf  # from when delays count for the event that was timed last
-        # How long [s] the amplifier may not have run since a time, as an emulated one.
+        # How long [s] this program did not run since a time.
         self.delayed_since: Callable[[float], float] = lambda time: 0.0
 
     def has(self, feature: Feature) -> bool:
@@ -188,13 +187,7 @@ class Bench:
             typical = 3 * self.exchange_time
             delay = when.latest - when.earliest - typical
             self.max_delay = max(self.max_delay, delay)
-            if delay > 0:
-                self._late_replies.append((when.latest, delay))
         return result, when
-
-    def replies_late_since(self, time: float) -> float:
-        """How late [s] replies were since a time, together, beyond the typical."""
-        return math.fsum(delay for at, delay in self._late_replies if at >= time)
 
     async def arm(self, watchdog: float = LONG_WATCHDOG) -> Status:
         """Arm with a watchdog [s], or the nearest that is possible."""
@@ -348,7 +341,6 @@ class Bench:
                 expected=bounds,
                 seen=found,
                 is_certain=seen.latest < early - delayed or seen.earliest > late + delayed,
-                is_explicable=delayed > 0,
             )
         uncertain = max(coarse, 2 * self.exchange_time)
         if seen.earliest < early - uncertain or seen.latest > late + uncertain:

@@ -115,8 +115,7 @@ class _Attempt:
         if isinstance(self.finding, NotApplicable):
             return False
         if isinstance(self.finding, ContractViolation):
-            is_explicable = self._is_disturbed or self.finding.is_explicable
-            return is_explicable and not self.finding.is_certain
+            return self._is_disturbed and not self.finding.is_certain
         return isinstance(self.finding, Inconclusive) or self._is_disturbed
 
     @property
@@ -157,7 +156,6 @@ async def run_check(
     raw: RawLine | None = None,
     *,
     url: str = "",
-    process: int | None = None,
     level: float = LEVEL,
 ) -> CheckResult:
     """Run a check on an open, disarmed amplifier, and leave it disarmed.
@@ -166,13 +164,12 @@ async def run_check(
     evidence: the check is repeated, and inconclusive if that does not end. It has failed if every
     attempt failed and this program was not late in one, or at once if no delay can explain it. It
     is skipped only if no attempt failed. raw: access to the line, url: of the amplifier; checks
-    that need them are skipped without. process: number of the process that is the amplifier,
-    whose delays count as this program's. level: of driven channels, at most.
+    that need them are skipped without. level: of driven channels, at most.
     """
     start, place = clock.now(), check.place(raw)
     attempts: list[_Attempt] = []
     while len(attempts) < MAX_ATTEMPTS:
-        attempt = await _attempt(check, Bench(amplifier, raw, url=url, level=level), process)
+        attempt = await _attempt(check, Bench(amplifier, raw, url=url, level=level))
         attempts.append(attempt)
         if not attempt.is_doubtful or isinstance(attempt.finding, LinkGone):
             break
@@ -214,18 +211,12 @@ def _is_mute(attempt: _Attempt) -> bool:
     return isinstance(attempt.finding, LinkError)
 
 
-async def _attempt(check: Check, bench: Bench, process: int | None) -> _Attempt:
+async def _attempt(check: Check, bench: Bench) -> _Attempt:
     """Run the steps once."""
-    with Lateness(process) as lateness:
-        bench.delayed_since = (
-            lateness.since
-            if process is None
-            # It may be blocked without waiting for a processor, as by a pseudo-terminal's worker.
-            else lambda time: lateness.since(time) + bench.replies_late_since(time)
-        )
+    with Lateness() as lateness:
+        bench.delayed_since = lateness.since
         finding = await _finding(check, bench)
-    late = lateness.worst if process is None else max(lateness.worst, bench.max_delay)
-    return _Attempt(finding, late, bench.max_delay, bench.missed_replies)
+    return _Attempt(finding, lateness.worst, bench.max_delay, bench.missed_replies)
 
 
 async def _finding(check: Check, bench: Bench) -> Exception | None:

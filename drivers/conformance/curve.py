@@ -126,7 +126,6 @@ def expect_curve(
                 expected=f"{max(low, 0):.4f} to {high:.4f}",
                 seen=f"{level:.4f}",
                 is_certain=not lowest - bench.tolerance <= level <= highest + bench.tolerance,
-                is_explicable=apart > 0,
             )
         if 0 <= middle < lasts and high - low <= _SHARP * peak:
             sharp[int(middle / lasts * _PARTS)] += 1

@@ -4,8 +4,7 @@
 class ContractViolation(Exception):
     """The amplifier does not behave as its page says.
 
-    is_certain: whether no delay of this program or the wire can have made it appear so;
-    is_explicable: whether one that was measured can, however short it was.
+    is_certain: whether no delay of this program or the wire can have made it appear so.
     """
 
     def __init__(
@@ -15,10 +14,8 @@ class ContractViolation(Exception):
         expected: object,
         seen: object,
         is_certain: bool = False,
-        is_explicable: bool = False,
     ) -> None:
         self.is_certain = is_certain
-        self.is_explicable = is_explicable
         super().__init__(f"{what} must be {expected}, got {seen}")
         self.expected = str(expected)
         self.seen = f"{what}: {seen}"

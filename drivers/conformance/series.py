@@ -8,7 +8,7 @@ from drivers.conformance.check import Check, CheckResult, Result, run_check
 from drivers.conformance.raw.line import RawLine
 from drivers.conformance.reopening import reopened
 
-_MAX_LOSSES = 3  # an amplifier that a busy machine emulates may stand still for seconds
+_MAX_LOSSES = 3
 
 
 async def run_checks(
@@ -17,14 +17,13 @@ async def run_checks(
     raw: RawLine | None = None,
     *,
     url: str = "",
-    process: int | None = None,
     level: float = LEVEL,
     on_result: Callable[[CheckResult], None] = lambda result: None,
 ) -> tuple[CheckResult, ...]:
     """Run checks on an open, disarmed amplifier; on_result is called with each result.
 
     A link that was lost is opened again before the next check. Once it could not be before several
-    in turn, all that are left are inconclusive. raw, url, process, level: see `run_check`.
+    in turn, all that are left are inconclusive. raw, url, level: see `run_check`.
     """
     results: list[CheckResult] = []
     loss, losses = "", 0  # why it could not be opened; before how many checks in turn
@@ -35,9 +34,7 @@ async def run_checks(
         if loss:
             results.append(not_started(check, raw, loss))
         else:
-            results.append(
-                await run_check(check, amplifier, raw, url=url, process=process, level=level)
-            )
+            results.append(await run_check(check, amplifier, raw, url=url, level=level))
         on_result(results[-1])
     return tuple(results)
 

@@ -1,6 +1,7 @@
 """Limits over time: command sets per second, on-time and duty."""
 
 from collections import deque
+from typing import TypeAlias
 
 from drivers.errors import CommandRefused
 from registry.limits import GuardLimits
@@ -15,6 +16,9 @@ CHECK_DELAY = 0.25
 """Longest time [s] from a check until the set is played, envelopes loaded in between."""
 
 _RATE_WINDOW = 1.0  # s
+
+Vibration: TypeAlias = tuple[float | None, float]
+"""Earliest start [s] of a vibration, None without one, and its latest end [s]."""
 
 
 class Budget:
@@ -62,13 +66,20 @@ class Budget:
         used = max(self._used(now) - self._duty_time, now - self._start - self._limits.on_time)
         return max(0.0, -used - COMMIT_DELAY)
 
-    def sent(self, now: float, *, lasts: float) -> None:
-        """Note a set that vibrates for at most a time [s], its fade included."""
+    def sent(self, now: float, *, lasts: float) -> Vibration:
+        """Note a set that vibrates for at most a time [s], fade included; what vibrated before."""
         self._sent.append(now)
         self._close(now)
+        before = self._start, self._end
         if self._start is None:
             self._start, self._end = now, now
         self._end = max(self._end, now + COMMIT_DELAY + lasts)
+        return before
+
+    def restore(self, before: Vibration | None) -> None:
+        """Note that the set sent last was refused; before: as `sent` returned."""
+        if before is not None:
+            self._start, self._end = before
 
     def confirm(self, sent_at: float, now: float, *, end: float) -> None:
         """Note that the set sent at a time [s] plays, and ends at another at the latest."""

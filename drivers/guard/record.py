@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.errors import CommandRefused
-from drivers.guard.budget import COMMIT_DELAY, Budget
+from drivers.guard.budget import COMMIT_DELAY, Budget, Vibration
 from drivers.guard.channel_state import (
     ChannelState,
     Interval,
@@ -37,11 +37,12 @@ class _Sent:
     """A set that may play; sent_at [s]: when it was sent.
 
     latest [s]: when it has been carried out if it ever is; infinite while a request for it is
-    pending, None while it is only staged.
+    pending, None while it is only staged. before: the vibration as it was, of a set that vibrates.
     """
 
     command_set: CommandSet
     sent_at: float
+    before: Vibration | None = None
     latest: float | None = math.inf
     achieved: tuple[DriveCommand, ...] = field(default=())
 
@@ -119,17 +120,17 @@ class PlayRecord:
         self.last_token = token = command_set.token
         if token == self._confirmed_token or self._is_pending(token):
             return
-        now = self._clock()
+        now, before = self._clock(), None
         if vibrates(command_set):
             fade = self._fade(command_set, command_set.ramp)
             left = self._budget.remaining(now, fade=fade, delay=COMMIT_DELAY)
             if left < (command_set.valid_for or math.inf) and left != math.inf:
                 raise CommandRefused("set was checked too long ago; check it again")
             self._check_transition(command_set, now)
-            self._budget.sent(now, lasts=(command_set.valid_for or math.inf) + fade)
+            before = self._budget.sent(now, lasts=(command_set.valid_for or math.inf) + fade)
         elif not skips_endings(command_set):
             self._check_transition(command_set, now)
-        self._pending.append(_Sent(command_set, now))
+        self._pending.append(_Sent(command_set, now, before))
 
     def stage(self, command_set: CommandSet) -> None:
         """Record a set that is about to be staged: from then on it may be committed."""
@@ -146,6 +147,28 @@ class PlayRecord:
         if self._staged is not None and self._staged.command_set.token == token:
             self.send(self._staged.command_set)
             self._staged.latest = math.inf
+
+    def refuse(self, token: int) -> None:
+        """Record that the amplifier has refused the set of this token, which never plays."""
+        if self._staged is not None and self._staged.command_set.token == token:
+            self._staged = None
+        if self._pending and self._pending[-1].command_set.token == token:
+            self._budget.restore(self._pending[-1].before)
+        self._pending = [sent for sent in self._pending if sent.command_set.token != token]
+
+    def refuse_commit(self, token: int) -> None:
+        """Record that the amplifier has not committed the set of this token, which stays staged."""
+        for sent in self._pending:
+            if sent.command_set.token == token:
+                sent.latest = None
+
+    def confirm_staged(self, token: int) -> None:
+        """Record that the set of this token is staged, in the place of any other."""
+        self._pending = [
+            sent
+            for sent in self._pending
+            if sent.latest is not None or sent.command_set.token == token
+        ]
 
     def left(self, token: int) -> None:
         """Record that no request to play the set of this token is pending any more."""

@@ -71,6 +71,20 @@ class PlayRecorder:
             case _:
                 pass
 
+    def refused(self, request: Request, *, may_play: bool) -> None:
+        """Record that the amplifier refused a set; may_play: see `CommandRefused`."""
+        match request:
+            case (
+                Apply(command_set=SafeCommandSet() as safe)
+                | Stage(command_set=SafeCommandSet() as safe)
+            ) if not may_play:
+                safe.record.refuse(safe.token)
+            case Commit(token=token) if not may_play:
+                for record in self._records:
+                    record.refuse_commit(token)
+            case _:
+                pass
+
     def replied(self, request: Request, reply: Reply) -> None:
         """Record what a reply confirms."""
         if isinstance(request, LoadEnvelope) and isinstance(reply, Loaded):
@@ -81,7 +95,9 @@ class PlayRecorder:
             match reply:
                 case Achieved(token=token):
                     record.achieve(reply)
-                    if not isinstance(request, Stage):
+                    if isinstance(request, Stage):
+                        record.confirm_staged(token)
+                    else:
                         record.confirm(token)
                 case Status():
                     if isinstance(request, Stop | Disarm):

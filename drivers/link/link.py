@@ -184,7 +184,7 @@ class Link:
             ) from problem
         if isinstance(reply, Nak):
             self._refusals += 1
-            raise refusal(name, reply)
+            raise refusal(request, reply, may_play=attempts.unanswered_count > 0)
         if not isinstance(reply, expect):
             raise FrameError(
                 f"reply to {name} must be {expect.__name__}, got {type(reply).__name__}; "
@@ -245,13 +245,13 @@ class Link:
 class _Attempts:
     """The attempts of one request."""
 
-    __slots__ = ("_busy", "_link", "_made", "_request", "_timeout")
+    __slots__ = ("_busy", "_link", "_made", "_request", "_timeout", "unanswered_count")
 
     def __init__(self, link: Link, request: Request, timeout: float) -> None:
         self._link = link
         self._request = request
         self._timeout = timeout
-        self._made = self._busy = 0
+        self._made = self._busy = self.unanswered_count = 0
 
     async def make_one(self) -> Reply:
         """Send the request and return its reply; raises `Retry` to repeat it."""
@@ -263,6 +263,7 @@ class _Attempts:
         try:
             reply = await link.backend.exchange(self._request, timeout=self._timeout)
         except LinkTimeout as problem:
+            self.unanswered_count += 1
             if priority_of(self._request) is Priority.READING:  # its absence says nothing of others
                 if self._made > link._retries_allowed:
                     raise

@@ -1,7 +1,7 @@
 """Reasons of refusals, in words."""
 
 from drivers.errors import CommandRefused
-from drivers.protocol.messages import Nak, NakCode, Reply
+from drivers.protocol.messages import Disarm, Nak, NakCode, Reply, Request, Stop
 
 _REASONS = {
     NakCode.UNKNOWN_TYPE: "it does not support this request",
@@ -26,11 +26,18 @@ PROTOCOL_VIOLATION = (
 """Remedy for an invalid reply."""
 
 
-def refusal(request: str, nak: Nak) -> CommandRefused:
-    """Make the error of a refused request."""
+_STOP_REFUSED = "outputs must fall silent in every state; switch it off, and update its firmware"
+
+
+def refusal(request: Request, nak: Nak, *, may_play: bool) -> CommandRefused:
+    """Make the error of a refused request; may_play: see `CommandRefused`."""
     where = "" if nak.channel is None else f" (channel {nak.channel})"
+    is_stop = isinstance(request, Stop | Disarm) and nak.code is not NakCode.BUSY
     return CommandRefused(
-        f"the amplifier refused {request}{where}: {_REASONS[nak.code]}", channel=nak.channel
+        f"the amplifier refused {type(request).__name__}{where}: "
+        f"{_STOP_REFUSED if is_stop else _REASONS[nak.code]}",
+        channel=nak.channel,
+        may_play=may_play,
     )
 
 

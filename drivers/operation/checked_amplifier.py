@@ -21,12 +21,9 @@ class CheckedAmplifier:
     (`PlausibilityCheck`) or it is no longer enabled, and the errors of `Amplifier`.
     """
 
-    def __init__(
-        self, amplifier: Amplifier, name: str = "the amplifier", *, is_time_stepped: bool = False
-    ) -> None:
+    def __init__(self, amplifier: Amplifier, name: str = "the amplifier") -> None:
         self.amplifier = amplifier
         self._name = name
-        self._is_time_stepped = is_time_stepped
         self._check_if_used: PlausibilityCheck | None = None
         self._running_checked_at = -math.inf
 
@@ -117,6 +114,4 @@ class CheckedAmplifier:
         return self._check_if_used
 
     def _new_check(self) -> PlausibilityCheck:
-        return PlausibilityCheck(
-            self.amplifier.capabilities, self._name, is_time_stepped=self._is_time_stepped
-        )
+        return PlausibilityCheck(self.amplifier.capabilities, self._name)

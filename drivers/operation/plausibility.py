@@ -40,18 +40,10 @@ class PlausibilityCheck:
 
     name: of the amplifier, in messages. Times [s] are of the host's clock: sent_at of the request,
     now of its reply. Two contradictions in a row raise CommandRefused with the reason; an Achieved
-    that contradicts its set counts again with each Status until the next set. is_time_stepped: for
-    simulated amplifiers whose time is stepped, so that levels and watchdog cannot be compared.
+    that contradicts its set counts again with each Status until the next set.
     """
 
-    def __init__(
-        self,
-        capabilities: Capabilities,
-        name: str = "the amplifier",
-        *,
-        is_time_stepped: bool = False,
-    ) -> None:
-        self._is_time_stepped = is_time_stepped
+    def __init__(self, capabilities: Capabilities, name: str = "the amplifier") -> None:
         self._capabilities = capabilities
         self._name = name
         self._level_step = max(_Q.level.step, capabilities.level_step)
@@ -143,9 +135,7 @@ class PlausibilityCheck:
             or next(self._other_problems(status), None)
             or self._achieved_problem
         )
-        level_problem = (
-            None if self._is_time_stepped else next(self._level_problems(status, when), None)
-        )
+        level_problem = next(self._level_problems(status, when), None)
         if problem or level_problem:
             self._contradictions += 1
             self._was_about_level = problem is None
@@ -159,7 +149,7 @@ class PlausibilityCheck:
 
         status: of a request that does not feed it.
         """
-        if self._watchdog is None or self._fed is None or self._is_time_stepped:
+        if self._watchdog is None or self._fed is None:
             return
         elapsed = sent_at - max(last_fed_at, self._fed.latest)
         if elapsed <= 2 * _WATCHDOG_ERROR:
@@ -175,7 +165,7 @@ class PlausibilityCheck:
 
     def _watchdog_problem(self, status: Status, when: Interval, *, feeds: bool) -> str | None:
         """Describe an impossible time that is left; notes that the watchdog was fed."""
-        if self._watchdog is None or self._fed is None or self._is_time_stepped:
+        if self._watchdog is None or self._fed is None:
             return None
         full = self._watchdog + _WATCHDOG_ERROR
         lowest = self._watchdog - (when.latest - self._fed.earliest) - _WATCHDOG_ERROR

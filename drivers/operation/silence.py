@@ -1,9 +1,12 @@
 """Silence of an amplifier after a stop: confirmed, or how long it may still play.
 
-Confirmed silent means that a Status read after the Stop was sent reports all levels zero in a state
-in which Arm is refused until Clear. In another state a late Clear has come after the Stop, and a
-late Arm might follow: the Stop is repeated. Everything else is unconfirmed: the amplifier may play
-until its watchdog expires, which only bounds the time while nothing feeds it.
+Confirmed silent means that a Status read after the Stop was sent reports the levels of all channels
+as zero, in a state in which Arm is refused until Clear, under a latch newer than every one seen
+before the Stop was sent: one that is not may be an old Status, kept by a converter on the way. In
+another state a late Clear has come after the Stop, and a late Arm might follow: the Stop is
+repeated, also after the first Status of an amplifier of which nothing was read before. Everything
+else is unconfirmed: the amplifier may play until its watchdog expires, which only bounds the time
+while nothing feeds it.
 """
 
 import asyncio
@@ -14,6 +17,7 @@ from enum import StrEnum
 
 from drivers import clock
 from drivers.amplifier import STOP_RAMP, WATCHDOG_REACTION, Amplifier
+from drivers.protocol.definition import is_newer_latch
 from drivers.protocol.messages import AmplifierState, Status
 
 CONFIRM_TIMEOUT = 0.3  # s; three replies of the slowest wire
@@ -69,14 +73,24 @@ def is_silent(status: Status) -> bool:
     return status.state is not AmplifierState.OPERATION_ENABLED and not any(status.levels)
 
 
-def is_stopped(status: Status) -> bool:
+def is_latched(status: Status, latch_before: int | None) -> bool:
+    """Whether a status shows that a Stop has been carried out, and not been cleared since.
+
+    latch_before: the newest latch seen before the Stop was sent; without one no status shows it.
+    """
+    is_new = latch_before is not None and is_newer_latch(status.latch, latch_before)
+    return is_new and status.state in _LATCHED
+
+
+def is_stopped(status: Status, latch_before: int | None) -> bool:
     """Whether an amplifier is silent and stays so until it is cleared, whatever else reaches it."""
-    return status.state in _LATCHED and not any(status.levels)
+    return is_latched(status, latch_before) and not any(status.levels)
 
 
 def stop_outcome(
     status: Status | None,
     *,
+    latch_before: int | None,
     last_fed_at: float | None,
     watchdog: float | None,
     now: float,
@@ -84,16 +98,17 @@ def stop_outcome(
 ) -> StopOutcome:
     """Derive the outcome of a stop at a time [s].
 
-    status: read after the Stop was sent, or None; last_fed_at [s]: when a request
-    that feeds the watchdog may have reached the amplifier for the last time, None if unknown;
-    watchdog [s]: None without one; cause: why there is no status.
+    status: read after the Stop was sent, or None; latch_before: see `is_latched`; last_fed_at [s]:
+    when a request that feeds the watchdog may have reached the amplifier for the last time, None if
+    unknown; watchdog [s]: None without one; cause: why there is no status.
     """
     if status is not None:
-        if is_stopped(status):
+        if is_stopped(status, latch_before):
             return StopOutcome(SilenceStatus.CONFIRMED)
-        cause = f"status after the stop: state {status.state.name}, highest level " + (
-            f"{max(status.levels, default=0.0):g}"
-        )
+        cause = (
+            f"status after the stop: state {status.state.name}, highest level "
+            f"{max(status.levels, default=0.0):g}, latch {status.latch}"
+        ) + ("" if latch_before is None else f" (must be newer than {latch_before})")
     cause = cause or "no status was read after the stop"
     if watchdog is None:
         return StopOutcome(
@@ -127,29 +142,39 @@ async def stop_and_confirm(
     stop, which is sent at once; cleared here.
     """
     requested = requested or asyncio.Event()
-    status, cause = None, ""
+    status, latch_before, cause = None, None, ""
     try:
         async with asyncio.timeout(timeout):
-            while status is None or not is_stopped(status):
+            while True:
                 may_read = (
                     status is not None
-                    and status.state in _LATCHED
+                    and is_latched(status, latch_before)
                     and not (amplifier.is_lost or requested.is_set())
                 )
                 status = None
                 requested.clear()
                 try:
-                    status = await (amplifier.status() if may_read else amplifier.stop(ramp))
+                    if may_read:
+                        status = await amplifier.status()
+                    else:
+                        latch_before = amplifier.latch
+                        status = await amplifier.stop(ramp)
+                    if not amplifier.is_identified:  # its channels are unknown
+                        status = None
+                        await amplifier.identify()
+                        continue
                 except Exception as error:
                     _logger.debug("stop: not confirmed: %s", error)
                     cause = str(error) or type(error).__name__
-                if status is None or not is_stopped(status):
-                    with suppress(TimeoutError):
-                        await asyncio.wait_for(requested.wait(), ramp + _INTERVAL)
+                if status is not None and is_stopped(status, latch_before):
+                    break
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(requested.wait(), ramp + _INTERVAL)
     except TimeoutError:
         cause = cause or f"silence was not reported within {timeout:g} s"
     return stop_outcome(
         status,
+        latch_before=latch_before,
         last_fed_at=amplifier.last_fed_at,
         watchdog=amplifier.watchdog,
         now=clock.now(),

@@ -216,6 +216,11 @@ def is_newer_token(token: int, than: int) -> bool:
     return than == 0 or 0 < (token - than) % (1 << 16) < 1 << 15
 
 
+def is_newer_latch(latch: int, than: int) -> bool:
+    """Whether a latch follows another by at most 127, of 1 to 255 in turn; any follows 0, none."""
+    return latch > 0 and (than == 0 or 0 < (latch - than) % PROTOCOL.quantities.latch.maximum < 128)
+
+
 def random_token() -> int:
     """Return a random initial token, so that tokens of an earlier host are not repeated."""
     return _random(PROTOCOL.quantities.token)

@@ -9,8 +9,7 @@ enum function {
     READ_HOLDING = 3,
     READ_INPUT = 4,
     WRITE = 16,
-    WRITE_AND_READ = 23,
-    IDENTIFY = 43
+    WRITE_AND_READ = 23
 };
 
 #define EXCEPTION 0x80 // bit of the function
@@ -18,9 +17,6 @@ enum exception { ILLEGAL_FUNCTION = 1, ILLEGAL_ADDRESS = 2, ILLEGAL_VALUE = 3, F
 
 #define READ_MAX 125
 #define WRITE_MAX 123
-
-#define IDENTIFICATION 14 // of function 43
-#define SERIAL_NUMBER_OBJECT 128
 
 void modbus_init(struct modbus *modbus, struct amplifier *amplifier, uint8_t unit)
 {
@@ -152,45 +148,6 @@ static uint16_t read_request(struct modbus *modbus, const uint8_t *pdu, uint16_t
     return read_registers(modbus, pdu[0], address, count, reply);
 }
 
-static uint16_t put_object(uint8_t *reply, uint16_t at, uint8_t number, const char *text)
-{
-    uint8_t size = (uint8_t)strlen(text);
-    reply[at] = number;
-    reply[at + 1] = size;
-    memcpy(reply + at + 2, text, size);
-    reply[6]++; // number of objects
-    return (uint16_t)(at + 2 + size);
-}
-
-// Access 1 and 2: the basic objects in a stream; 3: all; 4: one.
-static uint16_t identify_request(struct modbus *modbus, const uint8_t *pdu, uint16_t length,
-                                 uint8_t *reply)
-{
-    const struct {
-        uint8_t number;
-        const char *text;
-    } objects[] = {{0, VENDOR},
-                   {1, PRODUCT},
-                   {2, FIRMWARE_VERSION},
-                   {SERIAL_NUMBER_OBJECT, modbus->amplifier->serial_number}};
-    if (length != 4 || pdu[1] != IDENTIFICATION)
-        return exception(reply, IDENTIFY, ILLEGAL_FUNCTION);
-    uint8_t access = pdu[2], object = pdu[3];
-    if (access < 1 || access > 4)
-        return exception(reply, IDENTIFY, ILLEGAL_VALUE);
-    const uint8_t head[] = {IDENTIFY, IDENTIFICATION, access, 0x83, 0, 0, 0};
-    uint16_t at = sizeof head;
-    memcpy(reply, head, sizeof head);
-    for (unsigned i = 0; i < sizeof objects / sizeof objects[0]; i++) {
-        bool is_wanted = access == 4   ? objects[i].number == object
-                         : access == 3 ? true
-                                       : objects[i].number < SERIAL_NUMBER_OBJECT;
-        if (is_wanted)
-            at = put_object(reply, at, objects[i].number, objects[i].text);
-    }
-    return reply[6] > 0 ? at : exception(reply, IDENTIFY, ILLEGAL_ADDRESS);
-}
-
 // Take a unit number, from a write of the whole address block that names this amplifier.
 static void take_unit(struct modbus *modbus, const uint8_t *registers)
 {
@@ -236,8 +193,6 @@ static uint16_t shortest(uint8_t function)
         return 6;
     case WRITE_AND_READ:
         return 10;
-    case IDENTIFY:
-        return 4;
     default:
         return 1;
     }
@@ -260,8 +215,6 @@ uint16_t modbus_request(struct modbus *modbus, uint8_t unit, const uint8_t *pdu,
         return write_request(modbus, pdu, length, reply);
     case WRITE_AND_READ:
         return write_and_read_request(modbus, pdu, length, reply);
-    case IDENTIFY:
-        return identify_request(modbus, pdu, length, reply);
     default:
         return exception(reply, pdu[0], ILLEGAL_FUNCTION);
     }

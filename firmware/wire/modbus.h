@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
 //
-// Modbus: functions 3, 4, 16, 23 and 43/14 on the registers of the amplifier (docs/reference/
+// Modbus: functions 3, 4, 16 and 23 on the registers of the amplifier (docs/reference/
 // wire-modbus.md). The same for RTU and TCP: what is between unit and checksum, the PDU.
 
 #ifndef MODBUS_H

@@ -32,8 +32,6 @@ static uint16_t expected_length(const uint8_t *frame, uint16_t length)
     case 23:
         count_at = 10;
         break;
-    case 43:
-        return 5 + CRC_SIZE;
     default:
         return 6 + CRC_SIZE;
     }

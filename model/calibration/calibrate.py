@@ -1,5 +1,6 @@
 """Calibration of a rig by measured responses, without dead channels and outliers."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -28,12 +29,13 @@ from model.calibration.fitted_rig import (
     standard_error,
     uncertainty_of,
 )
-from model.calibration.form_errors import SIDE, FormModel, form_model
+from model.calibration.form_errors import SENSOR_SCALE, SIDE, FormModel, form_model
 from model.calibration.form_fit import FormFit, solve_with_form
 from model.calibration.held_out import hold_out, initial_responses, relative_error
 from model.calibration.parameters import Parameter, parameters_of, starts
 from model.calibration.responses import Responses
 from model.calibration.variable_projection import row_rms
+from model.choice import best_first, best_of
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.vibration.parametric_plate import ParametricPlate, parametric_plate
@@ -81,8 +83,8 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
     problem, found = _identified(problem, model, solve(problem, fit.x, relative))
     if all_scales:
         found = _with_median_scale_one(found)
-    _check_outliers(problem, found)
     _check_sides(problem, model, found)
+    _check_outliers(problem, found)
     names = tuple(name for name, live in zip(responses.sensors, alive, strict=True) if live)
     return _report(
         problem,
@@ -119,10 +121,11 @@ def _problem(
 
 def _best_fit(problem: Problem) -> Fit:
     """Fit from several starts, since a fit finds only the nearest minimum; return the best."""
-    best_starts = sorted(starts(problem.parameters), key=lambda x: misfit(problem, x))[:_STARTS]
+    possible = starts(problem.parameters)
+    order = best_first([-misfit(problem, x) for x in possible])[:_STARTS]
     ones = np.ones(problem.values.shape[2])
-    fits = [solve(problem, start, ones) for start in best_starts]
-    return min(fits, key=lambda fit: misfit(problem, fit.x))
+    fits = [solve(problem, possible[each], ones) for each in order]
+    return fits[best_of([-misfit(problem, fit.x) for fit in fits])]
 
 
 def _identified(problem: Problem, model: FormModel, start: Fit) -> tuple[Problem, FormFit]:
@@ -136,7 +139,7 @@ def _identified(problem: Problem, model: FormModel, start: Fit) -> tuple[Problem
         if not excess.max() > 1 or _fit_error(problem, model, fit) > MAX_FIT_ERROR:
             return problem, fit
         free = problem.free.copy()
-        free[int(excess.argmax())] = False
+        free[best_of(excess)] = False
         problem = replace(problem, free=free)
         fit = solve_with_form(problem, model, replace(fit, x=np.where(free, fit.x, own)))
 
@@ -176,13 +179,15 @@ def _check_sides(problem: Problem, model: FormModel, fit: FormFit) -> None:
 
 
 def _with_median_scale_one(fit: FormFit) -> FormFit:
+    """Attribute the common scale of sensors to the gains, which do not tell them apart."""
     middle = float(np.median(fit.scales))
+    common = SENSOR_SCALE * math.sqrt(math.pi / (2 * len(fit.scales)))  # of a median
     return replace(
         fit,
         scales=fit.scales / middle,
         scales_error=fit.scales_error / abs(middle),
         gains=fit.gains * middle,
-        gains_error=fit.gains_error * abs(middle),
+        gains_error=np.hypot(fit.gains_error, common * np.abs(fit.gains)) * abs(middle),
     )
 
 
@@ -216,13 +221,13 @@ def _report(
         )
     )
     held_out = hold_out(problem, model, fit, points, names)
-    uncertainty = uncertainty_of(before.uncertainty, problem, fit, parameters, held_out)
+    uncertainty = uncertainty_of(before.uncertainty, problem, fit, parameters, held_out, gains)
     measured_count = int(np.isfinite(problem.values).sum())
     return Calibration(
         rig=replace(rig, eras=eras, uncertainty=uncertainty),
         parameters=parameters,
         moved=moved_eras(before, model, fit),
-        gains_error=fit.gains_error,
+        gains_error=np.hypot(fit.gains_error, np.abs(gains) - np.abs(fit.gains)),
         dead_sensors=dead_sensors,
         dead_eras=dead_eras,
         scales=tuple(

@@ -68,7 +68,8 @@ class HeldOut:
 class Calibration:
     """Calibrated rig with everything found about the measurement.
 
-    moved: ERAs at other places than in the rig before; dead_sensors, dead_eras: left out of the
+    moved: ERAs at other places than in the rig before; gains_error (f, eras): standard errors of
+    the rig's gains, NaN where unmeasured; dead_sensors, dead_eras: left out of the
     fit; scales: of sensors with a wrong scale, or of all if requested; held_out: None with too few
     sensors; error: as in HeldOut, of the fit with its form errors; chi2: of that fit, about 1;
     measured, before, after: responses (f, eras, s) [1/s²] of the live sensors, divided by their

@@ -34,6 +34,7 @@ _Loss: TypeAlias = Literal["linear", "soft_l1"]
 MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
 _PEAK = 3.0  # times the median of a row; twice that is rare on a plate
 _ROUNDS = 8
+_LEAST_LEFT = 0.1  # of a value's noise: residuals with less tell nothing of it
 _STEPS = 60  # of one search; a plate that fits takes ten
 _SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
 
@@ -210,10 +211,16 @@ def _without_peaks(values: ComplexArray, used: NDArray[np.bool_]) -> ComplexArra
     return np.asarray(values * np.minimum(1, limit[:, :, None] / np.maximum(size, 1e-300)))
 
 
-def noise_of(values: ComplexArray, raw: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
+def noise_of(
+    values: ComplexArray,
+    raw: FloatArray,
+    used: NDArray[np.bool_],
+    left: FloatArray | None = None,
+) -> FloatArray:
     """Standard deviation (f, e) of a value's real or imaginary part: sqrt(a² + b² size²).
 
-    From the medians of residuals raw (f, e, s), over rows from weak to strong.
+    From the medians of residuals raw (f, e, s), over rows from weak to strong. left (f, e, s):
+    share of noise power that a fit leaves in them; by default all but what a gain takes of its row.
     """
     size = row_rms(values, used)
     sensors = used.sum(axis=2)
@@ -221,10 +228,14 @@ def noise_of(values: ComplexArray, raw: FloatArray, used: NDArray[np.bool_]) -> 
     floor = _SMALLEST_NOISE * size
     if len(rows) < 4:
         return floor
-    # A gain takes one of the row's values with it.
-    share = (sensors / np.maximum(sensors - 1, 1))[:, :, None]
-    power = np.where(used, raw**2 * share / 2, np.nan).reshape(-1, used.shape[2])[rows]
-    order = np.argsort(size.ravel()[rows])
+    if left is None:
+        # A gain takes one of the row's values with it.
+        left = np.broadcast_to((1 - 1 / np.maximum(sensors, 2))[:, :, None], raw.shape)
+    telling = used & (left > _LEAST_LEFT)
+    power = np.full(raw.shape, np.nan)
+    power[telling] = raw[telling] ** 2 / left[telling] / 2
+    power = power.reshape(-1, used.shape[2])[rows]
+    order = np.argsort(size.ravel()[rows], kind="stable")
     found, at = [], []
     for group in np.array_split(order, min(12, len(rows) // 2)):
         # The median of |z|² of complex noise with variance 2 is 2 log 2.

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import brentq
+from scipy.special import ndtr
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_result import FittedParameter, HeldOut, MovedEra
@@ -20,6 +22,7 @@ from model.vibration.parametric_plate import parametric_plate
 
 _CLEAR = 3.0  # standard errors of a place
 _LEAST = 1e-4  # of an uncertainty; no fit is exact
+_HELD, _HALF_WIDTH = 0.9, 1.645  # share that an interval holds, in standard errors either side
 
 # Relative error of values by idealisations of the model: viscous instead of hysteretic damping
 # changes the loss factor by 0.15 %, other values by less.
@@ -91,12 +94,14 @@ def uncertainty_of(
     fit: FormFit,
     parameters: Sequence[FittedParameter],
     held_out: HeldOut | None,
+    gains: ComplexArray,
 ) -> Uncertainty:
     """How well a calibrated rig is known, for its file.
 
     Without the error of the whole mass, by which all scales and which no pattern feels. Thickness
     stands for the plate's rigidity: 1 % of modulus shifts modes as 0.5 % of thickness does. Gain
-    and phase have the median error at held-out sensors, too, which is that of the field. What is
+    and phase are those of the rig's gains (f, e) against the fit's, whose form errors a rig cannot
+    express, and at least the median error at held-out sensors, which is that of the field. What is
     not identified keeps the value of the rig before.
     """
     relative = {
@@ -121,11 +126,16 @@ def uncertainty_of(
         return float(np.sqrt(np.mean(np.square(relative[kind]))))
 
     gain, phase_deg = before.gain, before.phase_deg
-    share = fit.gains_error / np.abs(fit.gains)
-    if np.isfinite(share).any(axis=0).all():
-        field = 0.0 if held_out is None else held_out.median / math.sqrt(2)
-        error = max(math.hypot(float(np.nanmedian(share)), field), _LEAST)
-        gain, phase_deg = min(error, before.gain), min(math.degrees(error), before.phase_deg)
+    known_gains = np.isfinite(fit.phases_error) & np.isfinite(gains)
+    if known_gains.any(axis=0).all():
+        # The median of |z| of complex errors with standard deviation 1 of each part is 1.18.
+        field = 0.0 if held_out is None else held_out.median / math.sqrt(2 * math.log(2))
+        off = np.log(gains[known_gains] / fit.gains[known_gains])
+        share = (fit.gains_error / np.abs(fit.gains))[known_gains]
+        gain = max(pooled_error(off.real, share), field, _LEAST)
+        phase_deg = math.degrees(
+            max(pooled_error(off.imag, fit.phases_error[known_gains]), field, _LEAST)
+        )
     losses = (
         max(rms("loss_factor"), rms("damping"))
         if known["loss_factor"] and known["damping"]
@@ -137,9 +147,24 @@ def uncertainty_of(
         phase_deg=_rounded(phase_deg),
         thickness=_rounded(min(rms("modulus") / 2, 0.03)) if known["modulus"] else before.thickness,
         stiffness=_rounded(min(rms("stiffness"), 0.5)) if known["stiffness"] else before.stiffness,
-        damping=_rounded(min(math.exp(losses), 4.0)),
+        damping=1 + _rounded(min(math.exp(losses), 4.0) - 1),
     )
 
 
+def pooled_error(bias: FloatArray, error: FloatArray) -> float:
+    """Standard error (one for all) whose interval of 90 % holds nine in ten of some values.
+
+    bias, error (n,): of the normal distributions of what they are off by.
+    """
+
+    def missing(half_width: float) -> float:
+        inside = ndtr((half_width - bias) / error) - ndtr((-half_width - bias) / error)
+        return float(inside.mean()) - _HELD
+
+    widest = float((np.abs(bias) + 2 * _HALF_WIDTH * error).max())
+    return float(brentq(missing, 0, widest)) / _HALF_WIDTH
+
+
 def _rounded(value: float) -> float:
-    return float(f"{value:.4g}")
+    """To two digits: an error is hardly known better."""
+    return float(f"{value:.2g}")

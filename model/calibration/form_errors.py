@@ -14,20 +14,21 @@ derivative by any parameter is P (db - dS q): no further solve.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray, lattice
 from model.calibration.parameters import Parameter
-from model.reduction.reduced_plate import ReducedPlate, reduce_plate
+from model.fem.element_slopes import element_slopes
+from model.fem.mesh import Mesh
+from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
+from model.spectral.shape_stiffness import stiffness_slopes
 from model.structure.dynamic_stiffness import attached_stiffness
 from model.structure.modal_elasticity import ModalElasticity
-from model.structure.plate import Plate
 from model.structure.point_load import footprints_of
 
 # Tolerances: standard deviations.
@@ -39,9 +40,7 @@ POISSON = 0.015  # of Poisson's ratio
 FOREIGN_MASS = 0.01  # of the plate's, spread over the cells below
 _MASS_CELLS = (8, 6)
 _MODE_SHIFT = 0.003  # of an eigenvalue: theory and mesh
-_LATTICE = (31, 23)  # points that tell all modes apart
 _STEP = 1e-4  # m, of differences
-_RELATIVE_STEP = 5e-4  # of central differences: modes of two plates agree to 1e-7 only
 
 
 def mass_scale_error(rig: Rig) -> float:
@@ -236,21 +235,6 @@ def form_model(rig: Rig, points: FloatArray, frequencies: FloatArray) -> FormMod
             found.append((moved - reduced.at(places)) / (sign * _STEP))
         return np.array(found)
 
-    def stiffening(changed: Callable[[float], Plate]) -> FloatArray:
-        more, less = (
-            _stiffness_of(rig, changed(change), attached, reduced, high)
-            for change in (_RELATIVE_STEP, -_RELATIVE_STEP)
-        )
-        return (more - less) / (2 * _RELATIVE_STEP)
-
-    material = plate.material
-    stiffenings = [
-        stiffening(lambda change: replace(plate, length=plate.length * (1 + change))),
-        stiffening(lambda change: replace(plate, width=plate.width * (1 + change))),
-        stiffening(
-            lambda change: replace(plate, material=replace(material, nu=material.nu + change))
-        ),
-    ]
     natural = np.sqrt(np.maximum(eigenvalues, 0))
     low = np.flatnonzero(
         (natural > 0.1 * plate.lowest_bending_frequency * 2 * math.pi)
@@ -283,32 +267,18 @@ def form_model(rig: Rig, points: FloatArray, frequencies: FloatArray) -> FormMod
         reduced.at(points),
         slopes(points),
         reduced.at(cells),
-        np.array(stiffenings),
+        _stiffening(rig, reduced.unknowns(), math.sqrt(plate.lowest_bending_frequency * high)),
         ratios[:, :, None] * ratios[:, None, :],
         low,
         std,
     )
 
 
-def _stiffness_of(
-    rig: Rig, other: Plate, attached: FloatArray, reduced: ReducedPlate, frequency_max: float
-) -> FloatArray:
-    """Modal stiffness (r, r) of another plate in the coordinates of a reduced one.
-
-    At the old mass: a larger plate of the same mass. The other plate's modes are expressed by the
-    plate's own, so that modes of one frequency may mix.
-    """
-    plate = rig.plate
-    ratio = np.array([other.length / plate.length, other.width / plate.width])
-    same: Any = rig.mesh
-    mesh = replace(same, length=other.length, width=other.width)
-    changed = reduce_plate(other, mesh, attached * [*ratio, 1.0], frequency_max=frequency_max)
-    points = lattice(
-        *(
-            np.linspace(0, side, n)
-            for side, n in zip((plate.length, plate.width), _LATTICE, strict=True)
-        )
-    )
-    mixing = np.linalg.lstsq(reduced.at(points), changed.at(points * ratio), rcond=None)[0]
-    mixing *= math.sqrt(other.mass / plate.mass)
-    return np.asarray((mixing * changed.omega**2) @ mixing.T)
+def _stiffening(rig: Rig, unknowns: Sequence[FloatArray], frequency: float) -> FloatArray:
+    """Derivatives of the stiffness between shapes, with the moduli at a frequency [Hz]."""
+    match rig.mesh:
+        case Mesh():
+            return element_slopes(rig.plate, rig.mesh, unknowns)
+        case _:
+            degrees = rig.mesh.nx, rig.mesh.ny
+            return stiffness_slopes(rig.plate, degrees, unknowns, frequency=frequency)

@@ -5,9 +5,15 @@
 as `model.calibration.fit`, from which it starts, with form errors t and the scales of good sensors
 held by their tolerances (`model.calibration.form_errors`). What they leave undetermined is then
 part of the standard errors: C = (J^T J)^-1 with the tolerances as rows of J, times chi² per degree
-of freedom.
+of freedom where that is above 1. With gains projected out of J this is the Schur complement, so
+that of a gain
+
+    var g_fe = sigma_fe² + (dg_fe/dz) C (dg_fe/dz)^T
+
+sigma of the noise, z all that is searched: scales that sensors have in common are part of it.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,10 +34,11 @@ _SETTLED = 0.1  # of the noise between two rounds
 class FormFit(Fit):
     """Result of the fit: as `Fit`, with form errors (t,) in their tolerances and chi².
 
-    covariance (n, n): of all x, zero for those held; chi2: sum of squares per degree of freedom,
-    before scaling.
+    phases_error (f, e) [rad]: as gains_error, which is of magnitudes; covariance (n, n): of all x,
+    zero for those held; chi2: sum of squares per degree of freedom, before scaling.
     """
 
+    phases_error: FloatArray
     form: FloatArray
     form_error: FloatArray
     covariance: FloatArray
@@ -61,9 +68,12 @@ def solve_with_form(problem: Problem, model: FormModel, start: Fit) -> FormFit:
     noise, used = start.noise, start.used
     finite = np.isfinite(problem.values)
     for _ in range(_ROUNDS):
-        z, _, _ = _search(problem, model, z, used / noise[:, :, None])
-        raw = _deviation(problem, model, z, used / noise[:, :, None])
-        before, noise = noise, noise_of(problem.values, raw, used)
+        weight = used / noise[:, :, None]
+        z, jacobian, _ = _search(problem, model, z, weight)
+        raw = _deviation(problem, model, z, weight)
+        before = noise
+        left = _noise_left(problem, model, z, weight, jacobian)
+        noise = noise_of(problem.values, raw, used, left)
         # What form errors explain comes back.
         kept = finite & ~(raw > MAX_DEVIATION * np.sqrt(2) * noise[:, :, None])
         is_settled = bool((kept == used).all() and (np.abs(noise / before - 1) < _SETTLED).all())
@@ -82,6 +92,26 @@ def _deviation(problem: Problem, model: FormModel, z: FloatArray, weight: FloatA
     whole = plain * z[n : n + s]
     gains, _ = project_gains(whole, problem.values, weight)
     return np.abs(problem.values - np.nan_to_num(gains)[:, :, None] * whole)
+
+
+def _noise_left(
+    problem: Problem, model: FormModel, z: FloatArray, weight: FloatArray, jacobian: FloatArray
+) -> FloatArray:
+    """Share (f, e, s) of each value's noise that is left in its residual: 1 - its leverage.
+
+    That is of its row's gain, and of all that is searched, for which tolerances leave less.
+    """
+    n, s = len(problem.parameters), len(problem.free_scales)
+    inside = weight > 0
+    plain, _ = model.responses(problem.parameters, z[:n], z[n + s :])
+    by_gain = np.abs(weight * plain * z[n : n + s]) ** 2
+    total = by_gain.sum(axis=2, keepdims=True)
+    left = 1 - by_gain / np.where(total > 0, total, 1)
+    size = np.linalg.norm(jacobian, axis=0)
+    rows, strength, _ = np.linalg.svd(jacobian / np.where(size > 0, size, 1), full_matrices=False)
+    leverage = (rows[:, strength > 1e-9 * strength[0]] ** 2).sum(axis=1)
+    left[inside] -= leverage[: 2 * inside.sum()].reshape(2, -1).mean(axis=0)
+    return np.asarray(left)
 
 
 def _free(problem: Problem, model: FormModel) -> NDArray[np.bool_]:
@@ -198,27 +228,39 @@ def _result(
     _, strength, directions = np.linalg.svd(jacobian / size, full_matrices=False)
     seen = strength > 1e-9 * strength[0]
     blind = (np.abs(directions[~seen]) > 1e-6).any(axis=0)
-    root = directions[seen].T / strength[seen] / size[:, None]
-    inner = root @ root.T * chi2
+    root = directions[seen].T / strength[seen] / size[:, None] * math.sqrt(max(chi2, 1.0))
+    inner = root @ root.T
     covariance = np.zeros((len(z), len(z)))
     covariance[np.ix_(free, free)] = inner
     errors = np.zeros(len(z))
     errors[free] = np.where(blind, np.inf, np.sqrt(np.diagonal(inner)))
-    plain, _ = model.responses(problem.parameters, x, form)
-    gains, left = project_gains(plain * scales, problem.values, weight)
-    power = (np.abs(weight * plain * scales) ** 2).sum(axis=2)
-    with np.errstate(divide="ignore"):
-        gains_error = np.where(power > 0, np.sqrt(chi2 / power), np.nan)
+    plain, by = model.responses(problem.parameters, x, form)
+    whole = plain * scales
+    gains, left = project_gains(whole, problem.values, weight)
+    by_scale = plain[None] * np.eye(s)[:, None, None, :]
+    by_all = np.concatenate([by[:n] * scales, by_scale, by[n:] * scales])[free]
+    power = (np.abs(weight * whole) ** 2).sum(axis=2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_all = -(weight**2 * whole.conj() * by_all).sum(axis=3) / power  # relative, (z, f, e)
+        of_noise = np.where(power > 0, max(chi2, 1.0) / (power * np.abs(gains) ** 2), np.nan)
+    magnitude, phase = (
+        np.sqrt(
+            of_noise
+            + ((root.T @ part.reshape(len(root), -1)) ** 2).sum(axis=0).reshape(power.shape)
+        )
+        for part in (by_all.real, by_all.imag)
+    )
     return FormFit(
         x,
         errors[:n],
         scales,
         np.where(problem.free_scales, errors[n : n + s], 0.0),
         gains,
-        gains_error,
+        np.abs(gains) * magnitude,
         noise,
         used,
         np.abs(left),
+        phase,
         form,
         errors[n + s :],
         covariance[:n, :n],

@@ -115,7 +115,9 @@ def plate_map(
         title = ", ".join([*drive, *(["not supported"] if unsupported else [])])
         figure = map_figure(rig, solved, active=excitation.keys(), title=title)
         save_figure(figure, output)
-    row, column = divmod(int(solved.peak.argmax()), len(solved.x))
+    from model.choice import best_of
+
+    row, column = divmod(best_of(solved.peak.ravel()), len(solved.x))
     if as_json:
         print(
             json.dumps(

@@ -36,16 +36,18 @@ def plot(
     from model.figures import save_figure
     from model.figures.table_pictures import table_figures
     from model.table.file import load_table
+    from model.table.overview import kept_overview
 
     table = load_table(table_file)
     output.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
     files = []
     with progress_bar("cells and contact sets") as progress:
-        for name, figure in table_figures(table, progress=progress):
-            path = output / f"{name}.png"
-            save_figure(figure, path)
-            files.append(str(path))
+        overview = kept_overview(table_file, table, progress=progress)
+    for name, figure in table_figures(table, overview):
+        path = output / f"{name}.png"
+        save_figure(figure, path)
+        files.append(str(path))
     if as_json:
         print(json.dumps({"files": files}))
         return
@@ -61,7 +63,7 @@ def export(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")],
     content: Annotated[
         Content | None,
-        typer.Option(help="Rows of a CSV file: patterns at the cells, or fields on the raster."),
+        typer.Option(help="Rows of a CSV file: patterns of the map, or fields on the raster."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

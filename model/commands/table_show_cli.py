@@ -23,17 +23,14 @@ def show(
     """Show levels, weak cells, contrast and origin of a table."""
     from model.commands.progress import progress_bar
     from model.table.file import load_table
-    from model.table.many_answers import ask_on_processes
+    from model.table.overview import kept_overview
     from model.table.summary import summarize
-    from model.table.weak_cells import find_weak_cells
 
     table = load_table(table_file)
     started = time.perf_counter()
-    with ask_on_processes(table) as ask:
-        with progress_bar("cells") as progress:
-            cells = find_weak_cells(table, ask=ask, progress=progress)
-        with progress_bar("contact sets") as progress:
-            summary = summarize(table, cells, ask=ask, progress=progress)
+    with progress_bar("cells and contact sets") as progress:
+        overview = kept_overview(table_file, table, progress=progress)
+    summary, cells = summarize(table, overview), overview.cells
     elapsed = time.perf_counter() - started
     if as_json:
         print(json.dumps(summary | {"map": cells.as_json()}))

@@ -1,11 +1,8 @@
 """Compilation of C sources to a library, by the compiler of the machine."""
 
-import hashlib
 import os
-import platform
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -31,6 +28,8 @@ def compile_library(
     with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
         made = Path(folder) / path.name
         _compile(made, compiler.split(), sources, flags=flags, what=what)
+        with made.open("rb") as file:
+            os.fsync(file.fileno())  # a name must not outlive a power failure without its content
         made.replace(path)
 
 
@@ -60,35 +59,3 @@ def _compile(
             f"{what} could not be compiled by {' '.join(compiler)}: {first}; install the C headers "
             "(Debian: apt install gcc libc6-dev)"
         )
-
-
-def kept_library(
-    name: str,
-    sources: Iterable[Path],
-    headers: Iterable[Path] = (),
-    *,
-    flags: Sequence[str],
-    what: str,
-) -> Path:
-    """The library of C sources in the user's cache, compiled if there is none.
-
-    Raises InputError, and OSError where no cache can be written.
-    """
-    import platformdirs
-
-    sources = list(sources)
-    kept = platformdirs.user_cache_path("era-haptics", appauthor=False)
-    path = kept / f"{name}-{_digest([*sources, *headers], flags)}.so"
-    if not path.exists():
-        kept.mkdir(parents=True, exist_ok=True)
-        compile_library(path, sources, flags=flags, what=what)
-    return path
-
-
-def _digest(files: Iterable[Path], flags: Sequence[str]) -> str:
-    """Sixteen digits that change with the files, the flags, CC and the architecture."""
-    made_of = hashlib.sha256(repr((*flags, os.environ.get("CC"), sys.platform)).encode())
-    made_of.update(platform.machine().encode())
-    for path in sorted(files):
-        made_of.update(path.name.encode() + path.read_bytes())
-    return made_of.hexdigest()[:16]

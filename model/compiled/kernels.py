@@ -10,7 +10,8 @@ from functools import cache
 from importlib import import_module
 from pathlib import Path
 
-from model.compiled.compiler import compile_library, kept_library
+from model.compiled.compiler import compile_library
+from model.compiled.library_cache import kept_library
 from model.errors import InputError
 
 _HERE = Path(__file__).parent
@@ -79,8 +80,8 @@ def kernels() -> Kernels | None:
     version = next(each for each in versions() if each.features.keys() <= has)
     own = _HERE / version.file
     try:
-        path = own if own.exists() else _compiled(version)
-        return Kernels(ctypes.CDLL(str(path)), version.lanes)
+        library = ctypes.CDLL(str(own)) if own.exists() else _compiled(version)
+        return Kernels(library, version.lanes)
     except (InputError, OSError) as error:
         _logger.warning("answers take several times as long without kernels in C: %s", error)
         return None
@@ -94,6 +95,6 @@ def compile_kernels(folder: Path) -> list[Path]:
     return paths
 
 
-def _compiled(version: Version) -> Path:
+def _compiled(version: Version) -> ctypes.CDLL:
     name = f"kernels-{version.name}"
     return kept_library(name, _SOURCES, _HEADERS, flags=version.flags, what=_WHAT)

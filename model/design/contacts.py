@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, Strict
 
 from model.arrays import FloatArray, IntArray
+from model.choice import best_of
 from model.config.document import Document, read_document
 from model.config.sections import Quantity, Section, Validation
 from model.config.units import LENGTH
@@ -75,7 +76,7 @@ class ContactRule:
         while len(pool) < fingers:
             drawn = self.draw(rng, _DRAWN_FOR_EACH)
             gaps = np.linalg.norm(drawn[:, None] - pool, axis=-1).min(axis=1)
-            pool = np.vstack([pool, drawn[gaps.argmax()]])
+            pool = np.vstack([pool, drawn[best_of(gaps)]])
         return [
             pool[self._others(rng, pool, target, quiet)]
             for quiet in range(low, high + 1)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from model.arrays import FloatArray
+from model.choice import best_of
 from model.cluster import Cluster
 from model.design.judge import JUDGED_SEED, JUDGED_SETS, Judged, judge
 from model.design.search import CANDIDATES, DesignProblem, Found, LayoutSearch
@@ -130,8 +131,9 @@ def run_design(
         [list(_layouts(done[number])) for number in tasks if tasks[number][0] == one]
         for one in range(len(problems))
     ]
-    bests = [max((path[-1] for path in each), key=_mean) for each in found]
-    chosen = max(range(len(problems)), key=lambda one: _mean(bests[one]))
+    ends = [[path[-1] for path in each] for each in found]
+    bests = [each[best_of([_mean(end) for end in each])] for each in ends]
+    chosen = best_of([_mean(best) for best in bests])
     problem, best = problems[chosen], bests[chosen]
     search = LayoutSearch(problem)
     sets = judged_sets(problem)

@@ -11,6 +11,7 @@ from scipy.special import stdtr
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.parameters import parameters_of, responses_at, starts
 from model.calibration.variable_projection import modal_assurance
+from model.choice import best_of
 from model.rig.rig import Rig
 from model.vibration.parametric_plate import ParametricPlate
 
@@ -38,7 +39,8 @@ class ShapeMatch:
             ]
         )
         return tuple(
-            int(np.nanargmax(row)) if np.isfinite(row).any() else i for i, row in enumerate(typical)
+            best_of(np.nan_to_num(row, nan=-1.0)) if np.isfinite(row).any() else i
+            for i, row in enumerate(typical)
         )
 
     def confidence(self, channel: int, era: int, other: int) -> float:

@@ -17,6 +17,7 @@ from scipy.optimize import minimize_scalar
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.variable_projection import modal_assurance
+from model.choice import best_first
 from model.diagnosis.plate_match import Match, match_plate
 from model.errors import InputError
 from model.fem.plate_mesh import stretched
@@ -152,7 +153,7 @@ def explain(
         )
         for (cause, factor, match), weight in zip(fits, weights / weights.sum(), strict=True)
     ]
-    return sorted(explained, key=lambda each: -each.share)
+    return [explained[each] for each in best_first([each.share for each in explained])]
 
 
 def _refined(

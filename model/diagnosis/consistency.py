@@ -22,6 +22,7 @@ from model.calibration.calibration_screening import (
 from model.calibration.parameters import parameters_of, responses_at
 from model.calibration.responses import Responses
 from model.calibration.variable_projection import project_gains, row_rms
+from model.choice import best_of
 from model.diagnosis.assignment import ShapeMatch, match_shapes
 from model.diagnosis.observation import Observation
 from model.diagnosis.plate_match import MAX_FIT_ERROR, Match, match_plate
@@ -122,7 +123,7 @@ def _check_quantity(
 
     level = float(np.median(size[known]))
     own = distance(1.0, 0)
-    nearest = min(_QUANTITIES, key=lambda each: distance(each.factor, each.power))
+    nearest = _QUANTITIES[best_of([-distance(each.factor, each.power) for each in _QUANTITIES])]
     gap = distance(nearest.factor, nearest.power)
     if abs(level) < np.log(_MAX_GAIN) or own < gap:
         return
@@ -145,11 +146,11 @@ def _check_phases_and_places(
     own = tuple(range(len(rig.eras)))
 
     def best(values: ComplexArray) -> tuple[Match, tuple[int, ...]]:
-        found = [
+        found: list[tuple[Match, tuple[int, ...]]] = [
             (match_plate(rig, plate, values, drives=drives, starts=starts), drives)
             for drives in dict.fromkeys([own, shapes.nearest])
         ]
-        return min(found, key=lambda each: each[0].cost)
+        return found[best_of([-each.cost for each, _ in found])]
 
     match, drives = best(observation.values)
     other, _ = best(observation.values.conj())

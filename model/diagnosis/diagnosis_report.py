@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from model.choice import best_of
 from model.diagnosis.causes import Explanation
 from model.diagnosis.plate_difference import NOTICEABLE_DB
 from model.diagnosis.plate_match import MAX_FIT_ERROR
@@ -84,7 +85,7 @@ def _plate_rows(verdict: Verdict) -> list[str]:
     if match.error > MAX_FIT_ERROR:
         why = f"{percent(match.error)} unexplained at best"
     else:
-        at = int(abs(match.z).argmax())
+        at = best_of(abs(match.z))
         parameter = match.parameters[at].name
         why = f"{parameter} would be off by {abs(match.z[at]):.1f} standard deviations"
     rows = [f"PLATE: the rig does not match the plate: {why}"]

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
+from model.choice import best_along
 from model.diagnosis.plate_match import Match
 from model.rig.rig import Rig
 
@@ -68,6 +69,6 @@ def _contrasts(model: ComplexArray, true: ComplexArray, variance: float) -> Floa
         leakage = variance * np.einsum("fqe,fqet->fqt", np.abs(at) ** 2, np.abs(weights) ** 2)
         return np.asarray(10 * np.log10(target / (rest + leakage)))
 
-    best = ratio(model).argmax(axis=0)
+    best = best_along(ratio(model), axis=0)
     found = np.take_along_axis(ratio(true), best[None], axis=0)[0]
     return np.asarray(found[~np.eye(s, dtype=bool)])

@@ -20,6 +20,7 @@ from scipy.optimize import least_squares
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.parameters import Parameter, parameters_of, responses_at, rig_with
 from model.calibration.variable_projection import jacobian_of, project_gains, row_rms
+from model.choice import best_of
 from model.rig.rig import Rig
 from model.vibration.parametric_plate import ParametricPlate
 
@@ -128,7 +129,7 @@ def match_plate(
         )
         for guess in initial
     ]
-    best = min(found, key=lambda each: float(each.cost))
+    best = found[best_of([-float(each.cost) for each in found])]
     x = center + std * best.x[:count]
     gains = np.full(values.shape[1], np.nan)
     gains[used] = np.exp(_GAIN_STD * best.x[count:])

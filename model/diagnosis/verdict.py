@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
+from model.choice import best_of
 from model.diagnosis.assignment import ShapeMatch, match_responses, match_shapes
 from model.diagnosis.causes import Explanation, explain
 from model.diagnosis.diagnosis_screening import (
@@ -145,7 +146,8 @@ def diagnose(
             floor=observation.floor,
             model_error=error,
         )
-        fitted = min([match, *(each.match for each in explanations)], key=lambda each: each.cost)
+        tried = [match, *(each.match for each in explanations)]
+        fitted = tried[best_of([-each.cost for each in tried])]
     shapes = match_responses(fitted.responses, values)
     phases = _phases(rig, observation, fitted, dead)
     channels = tuple(

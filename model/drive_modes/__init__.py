@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from model.choice import best_first
 from model.drive_modes.coherent import PRUNE_MARGIN, Coherent
 from model.drive_modes.forms import Forms, Weights
 from model.drive_modes.graded import GRADED
@@ -102,9 +103,10 @@ def find_drives(forms: Forms, drive_mode: str) -> list[tuple[float, Weights]]:
         if best > 0 and is_done and len(forms.targets) == 1:
             break
         open_ = open_[found.bound > best]
-    top = np.argsort(-score)[:ALTERNATIVES].tolist()
+    top = best_first(score)[:ALTERNATIVES].tolist()
     drives = [(float(score[f]), Weights.at(f, weights[f])) for f in top if score[f] > 0]
-    return sorted(drives + mixed[:ALTERNATIVES], key=lambda each: -each[0])
+    drives += mixed[:ALTERNATIVES]
+    return [drives[each] for each in best_first([score for score, _ in drives])]
 
 
 def max_sensation(forms: Forms, drive_mode: str) -> float:

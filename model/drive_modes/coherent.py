@@ -19,6 +19,7 @@ from typing import TypeAlias
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
+from model.choice import best_along, best_first
 from model.drive_modes.forms import Forms
 
 Solve = Callable[[Complex64Array, Complex64Array, Complex64Array | None], Complex64Array]
@@ -84,7 +85,7 @@ class Coherent:
                 _mean(forms), forms.targets, self.bound, starts=_starts(1, (1, 1)), iterations=1
             )
             found.bound[:] = bound
-            order = np.argsort(-bound)
+            order = best_first(bound)
             self._search_at(forms, found, np.sort(order[:FIRST_BOUNDED]))
             rest = np.sort(order[FIRST_BOUNDED:])
             rest = rest[bound[rest] > PRUNE_MARGIN * found.score]
@@ -108,7 +109,7 @@ class Coherent:
         if len(kept) == 0:
             return
         if len(kept) > MAX_CANDIDATES:
-            kept = kept[np.argsort(-bound[kept])[:MAX_CANDIDATES]]
+            kept = kept[best_first(bound[kept])[:MAX_CANDIDATES]]
         if len(kept) < len(chosen):
             chosen, forms, expected = chosen[kept], forms.at(kept), expected[kept]
         found.add(chosen, forms, self._iterate(forms, expected))
@@ -235,7 +236,7 @@ class _BestCandidates:
                 self._infeasible_scores[frequencies], missed
             )
             score = np.where(reaches, score, 0)
-        at = (score.argmax(axis=0), np.arange(len(frequencies)))
+        at = (best_along(score, axis=0), np.arange(len(frequencies)))
         highest = score[at]
         better = highest > self._scores[frequencies]
         self._scores[frequencies[better]] = highest[better]
@@ -344,7 +345,7 @@ def _optimise_target_phases(
         every = np.concatenate(tried)
         cost = np.vecdot(every, np.matvec(R, every)).real
         values = np.concatenate(magnitudes) / np.sqrt(np.maximum(cost, 1e-30))
-        best = (values.argmax(axis=0), np.arange(n))
+        best = (best_along(values, axis=0), np.arange(n))
         w, value = every[best], values[best]
     size = np.maximum.reduce(np.abs(w), axis=-1, keepdims=True)
     return np.asarray(w / np.maximum(size, 1e-30), dtype=np.complex64), value

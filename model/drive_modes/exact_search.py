@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import FloatArray, IntArray
+from model.choice import NEARLY, best_first, best_of
 from model.drive_modes.dual_weights import dual_weights
 from model.drive_modes.forms import SILENT, Forms, Weights
 from model.drive_modes.switched import find_switched, source_powers
@@ -84,7 +85,7 @@ def sensation_found(forms: Forms, *, eras_at_most: int) -> float:
         left = np.ones(forms.frequency_count, dtype=bool)
         for place in (places[mask] for mask in groups):
             reached = (power_sums[:, None] + powers[:, place]).min(axis=0)
-            frequency = int(np.where(left, reached, -1.0).argmax())
+            frequency = best_of(np.where(left, reached, -1.0))
             left[frequency] = False
             power_sums = power_sums + powers[:, place, frequency]
         highest = max(highest, math.sqrt(float(power_sums.min())))
@@ -163,7 +164,7 @@ class _Search:
         for row, groups in enumerate(left):
             padded[row, : len(groups)] = groups
         bound = self.ratio
-        order = np.argsort(-self._gain_bound(padded))
+        order = best_first(self._gain_bound(padded))
         for done, row in enumerate(order):
             if self._gain_bound(padded[row : row + 1])[0] > 0:
                 self._enumerate(left[row])
@@ -246,8 +247,8 @@ class _Search:
         reached = np.sqrt(powers) - self._forms.level_margin * np.sqrt(variance)
         reaches = (reached >= self._forms.wanted).all(axis=0)
         ratio = np.where(reaches, powers.min(axis=0) / loud, 0.0)
-        best = int(ratio.argmax())
-        if ratio[best] > self.ratio:
+        best = best_of(ratio)
+        if ratio[best] > (1 + NEARLY) * self.ratio:
             self.ratio = float(ratio[best])
             self.drive = self._drive(groups, chosen[best])
 

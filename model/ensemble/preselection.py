@@ -16,6 +16,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
+from model.choice import best_first
 from model.ensemble.attached_plate import AttachedPlate
 from model.ensemble.contact_forms import RIDGE, gram, inverse_with, power_of
 from model.ensemble.preselection_kernel import PreselectionKernel
@@ -57,7 +58,7 @@ class Preselection:
         fingertip, empty for 1.
         """
         score, amplitude = self.scores(points, weights, loads)
-        order = among[np.argsort(-score[among])]
+        order = among[best_first(score[among])]
         reaches = amplitude[order] >= wanted[order]
         # Those that would be better than the best, were they loud enough.
         first = int(reaches.argmax()) if reaches.any() else len(order)

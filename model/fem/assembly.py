@@ -65,14 +65,19 @@ def element_matrices(plate: Plate, mesh: Mesh) -> ElementMatrices:
             f"mesh: must cover the plate of {plate.length:g} x {plate.width:g} m, got "
             f"{mesh.length:g} x {mesh.width:g} m; make the mesh for this plate"
         )
-    widths = [(size, mesh.strip) if mesh.strip else (size,) for size in mesh.element_size]
-    sizes = [(dx, dy) for dy in widths[1] for dx in widths[0]]
+    sizes = element_sizes(mesh)
     side_x, side_y = mesh.element_sides
     return ElementMatrices(
         stiffness=np.array([mesh.element.stiffness(plate, dx, dy) for dx, dy in sizes]),
         mass=np.array([mesh.element.mass(plate, dx, dy) for dx, dy in sizes]),
-        size=(len(widths[0]) * side_y[:, None] + side_x).ravel(),
+        size=((2 if mesh.strip else 1) * side_y[:, None] + side_x).ravel(),
     )
+
+
+def element_sizes(mesh: Mesh) -> list[tuple[float, float]]:
+    """Length and width [m] of each size of element."""
+    widths = [(size, mesh.strip) if mesh.strip else (size,) for size in mesh.element_size]
+    return [(dx, dy) for dy in widths[1] for dx in widths[0]]
 
 
 def element_dofs(mesh: Mesh) -> IntArray:

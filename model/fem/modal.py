@@ -53,7 +53,7 @@ def shift_invert_modes(
         OPinv=LinearOperator(stiffness.shape, matvec=factor.solve, dtype=float),
         v0=np.random.default_rng(0).standard_normal(size),  # ARPACK's own start is random
     )
-    order = np.argsort(eigenvalues)
+    order = np.argsort(eigenvalues, kind="stable")
     return eigenvalues[order], vectors[:, order]
 
 

@@ -1,6 +1,6 @@
 """Pictures of a table: weak cells, levels, contrast and a pattern."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,32 +15,21 @@ from model.figures.drawing import COLORS, draw_eras, label_plate
 from model.figures.fingertips import draw_fingertip, draw_level_scale, draw_levels
 from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL
+from model.table.overview import Overview
 from model.table.pattern import Pattern
 from model.table.question import Question
-from model.table.summary import CONTACT_SETS, contrast_distribution
 from model.table.table import LocalizationTable
-from model.table.weak_cells import WANTED_CONTRAST_DB, WeakCells, find_weak_cells, map_grid
+from model.table.weak_cells import WANTED_CONTRAST_DB, WeakCells
 
 # Fingers of the example, in shares of the plate.
 _EXAMPLE = ((0.3, 0.35), (0.8, 0.6), (0.45, 0.85))
 
 
-def table_figures(
-    table: LocalizationTable, *, progress: Callable[[int, int], None] = lambda done, of: None
-) -> Iterator[tuple[str, Figure]]:
-    """Draw all pictures, with names.
-
-    progress: called with the number of finished cells and contact sets, and the total.
-    """
-    cells = map_grid(table).cell_count
-    total = cells + 3 * CONTACT_SETS
-    weak = find_weak_cells(table, progress=lambda done, _: progress(done, total))
-    yield "weak_cells", weak_cells_figure(table, weak)
+def table_figures(table: LocalizationTable, overview: Overview) -> Iterator[tuple[str, Figure]]:
+    """Draw all pictures, with names."""
+    yield "weak_cells", weak_cells_figure(table, overview.cells)
     yield "levels", levels_figure(table)
-    yield (
-        "contrast",
-        contrast_figure(table, progress=lambda done, _: progress(cells + done, total)),
-    )
+    yield "contrast", contrast_figure(table, overview)
     yield "answer", answer_figure(table)
 
 
@@ -83,16 +72,12 @@ def levels_figure(table: LocalizationTable) -> Figure:
     return figure
 
 
-def contrast_figure(
-    table: LocalizationTable, *, progress: Callable[[int, int], None] = lambda done, of: None
-) -> Figure:
-    """Draw the distribution of contrast over random contact sets of 1, 2 and 3 other fingers."""
+def contrast_figure(table: LocalizationTable, overview: Overview) -> Figure:
+    """Draw the distribution of contrast over contact sets of 1, 2 and 3 other fingers."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
-    rng = np.random.default_rng(0)
-    for others in (1, 2, 3):
-        found, _ = contrast_distribution(table, others=others, rng=rng, progress=progress)
-        contrasts = np.sort(found)
+    for others, (robust, _) in enumerate(overview.contrasts, start=1):
+        contrasts = np.sort(robust)
         share = 1 - np.arange(len(contrasts)) / max(1, len(contrasts))
         label = f"{others} other{'s' if others > 1 else ''}"
         if len(contrasts):
@@ -105,7 +90,7 @@ def contrast_figure(
     axes.set_ylabel("contact sets with at least this contrast / %")
     axes.grid(color="0.9")
     figure.legend(loc="outside lower center", ncols=3, fontsize=9, frameon=False)
-    axes.set_title(f"Mode {table.drive_mode}: random contact sets at least 5 cm apart")
+    axes.set_title(f"Mode {table.drive_mode}: contact sets at least 5 cm apart")
     return figure
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
+from model.choice import best_of
 from model.identification.derivatives import jacobian
 from model.identification.forward import Sensor
 from model.identification.parameters import space_of
@@ -52,7 +53,7 @@ def unknowns(setting: Setting, fitted: Fitted, posterior: Posterior) -> list[Unk
         # Of losses and frequencies of single modes only those count that no tone has shown.
         if not len(unknown) or (kind in ("frequency", "loss") and len(unknown) < len(rows)):
             continue
-        worst = unknown[int(after[unknown].argmax())]
+        worst = unknown[best_of(after[unknown])]
         name = kind if kind in ("frequency", "loss") else _name(rows[worst], space.names)
         best = _best(setting, fitted, posterior, rows[worst])
         found.append(Unknown(name, float(before[worst]), float(after[worst]), *best))
@@ -60,7 +61,7 @@ def unknowns(setting: Setting, fitted: Fitted, posterior: Posterior) -> list[Unk
 
 
 def _name(row: FloatArray, names: tuple[str, ...]) -> str:
-    return names[int(np.abs(row).argmax())]
+    return names[best_of(np.abs(row))]
 
 
 def _best(
@@ -90,7 +91,7 @@ def _best(
     scale = _NOISE * np.sqrt((np.abs(at.responses) ** 2).mean(axis=(0, 2), keepdims=True))
     direction = covariance @ (wanted * space.std)
     gains = _gains(jacobian(at) / scale[..., None], covariance, direction)
-    f, s, e = np.unravel_index(int(gains.argmax()), gains.shape)
+    f, s, e = np.unravel_index(best_of(gains.ravel()), gains.shape)
     return rig.eras[e].name, float(tones[f]), sensors[s]
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import linalg, stats
 
 from model.arrays import FloatArray
+from model.choice import best_first
 from model.identification.alarm import places_on
 from model.identification.alterations import Alteration, Altered, Crack, Hand, scores
 from model.identification.derivatives import by_mass_at
@@ -214,7 +215,7 @@ def _scan(
     curvature += 1 / std**2
     sizes = slope / curvature
     gains = np.where(sizes > 0, sizes * slope, 0.0)
-    best = np.argsort(-gains, kind="stable")
+    best = best_first(gains)
     return [(float(sizes[n]), points[n]) for n in best if gains[n] > 0]
 
 

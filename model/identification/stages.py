@@ -11,6 +11,7 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import FloatArray
+from model.choice import best_first, best_of
 from model.identification.derivatives import by_mass_at
 from model.identification.fit import Linearised, Problem, solve
 from model.identification.forward import ForwardModel
@@ -143,7 +144,7 @@ def _with_mass(problem: Problem, x: FloatArray, *, number: int) -> list[Linearis
         starts.append(moved)
     free = space.of(*LOCATED)
     found = [solve(problem, each, free) for each in starts]
-    return sorted(found, key=lambda each: each.cost)
+    return [found[each] for each in best_first([-each.cost for each in found])]
 
 
 def _scan(problem: Problem, x: FloatArray, own: int) -> list[tuple[FloatArray, float]]:
@@ -170,7 +171,7 @@ def _scan(problem: Problem, x: FloatArray, own: int) -> list[tuple[FloatArray, f
     curvature = (columns * beside).sum(axis=0) + 1
     sizes = -(left @ columns) / curvature
     gains = np.where(sizes > 0, sizes**2 * curvature, 0.0)
-    best = np.argsort(-gains, kind="stable")[:_KEPT]
+    best = best_first(gains)[:_KEPT]
     reach = space.std[own + 1 : own + 3]
     return [((points[n] - sides / 2) / reach, float(sizes[n])) for n in best if gains[n] > 0]
 
@@ -179,7 +180,7 @@ def _in_full(problem: Problem, starts: list[Linearised]) -> Fitted:
     """Fit everything to the noise as it is, from the two best starts."""
     free = problem.model.space.uncertain
     found = [solve(problem, each.x, free) for each in starts[:2]]
-    return Fitted(problem, min(found, key=lambda each: each.cost))
+    return Fitted(problem, found[best_of([-each.cost for each in found])])
 
 
 def _another_mass(setting: Setting, found: Fitted) -> Fitted:

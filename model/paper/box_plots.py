@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from model.arrays import FloatArray
+from model.choice import best_of
 from model.figures.layout_boxes import LayoutBox, layout_boxes_figure
 from model.files.csv_file import Columns
 from model.paper.figure import PaperFigure
@@ -99,7 +100,7 @@ def _findings(best: list[_Drive]) -> dict[str, str | float | dict[str, float]]:
     medians = {drive.layout.name: float(drive.statistics[MEDIAN] / G) for drive in best}
     return {
         "median_g": medians,
-        "highest_median_layout": max(medians, key=lambda name: medians[name]),
+        "highest_median_layout": list(medians)[best_of(list(medians.values()))],
         "unfelt_share": {drive.layout.name: float(drive.statistics[-1]) for drive in best},
     }
 

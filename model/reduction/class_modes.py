@@ -139,5 +139,5 @@ def _lowest(
             v0=np.random.default_rng(0).standard_normal(size),  # ARPACK's own start is random
         )
         u = 1 / (eigenvalues + shift)
-    order = np.argsort(-u)
+    order = np.argsort(-u, kind="stable")
     return 1 / u[order] - shift, vectors[:, order]

@@ -9,7 +9,7 @@ from scipy import sparse
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.reduction.class_modes import ClassModes, finite_element_classes
-from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
+from model.reduction.free_modes import RESIDUAL_ORDER, CacheKey, PointSolutions, unknowns_of
 from model.structure.dispersion import Dispersion
 from model.structure.footprint import as_footprints
 from model.structure.plate import Plate
@@ -44,7 +44,7 @@ class FiniteElementModes:
         self.dispersion: Dispersion | None = None
         self.largest_truncated = max(part.largest_truncated for part in classes)
         self._solved: dict[tuple[float, ...], tuple[_Solved, ...]] = {}
-        self._observed: dict[bytes, tuple[FloatArray, tuple[sparse.csr_array, ...]]] = {}
+        self._observed: dict[CacheKey, tuple[FloatArray, tuple[sparse.csr_array, ...]]] = {}
 
     def solve_at(self, points: FloatArray) -> PointSolutions:
         """Solve for forces at points [m] (n, 2), from the cache where possible."""
@@ -112,9 +112,13 @@ class FiniteElementModes:
             extra += each @ residual.transpose(2, 1, 0).reshape(residual.shape[2], -1)
         return np.hstack([shapes, extra])
 
+    def unknowns(self, attached: PointSolutions) -> tuple[FloatArray, ...]:
+        """The columns of `basis` by symmetry class."""
+        return unknowns_of([part.vectors for part in self._classes], attached.residuals)
+
     def _observe(self, points: FloatArray) -> tuple[FloatArray, tuple[sparse.csr_array, ...]]:
         """Mode shapes at points (p, r), and by class the map to deflections there; cached."""
-        key = points.tobytes()
+        key = points.shape, points.tobytes()
         if key not in self._observed:
             maps = tuple(part.deflection_at(points) for part in self._classes)
             pairs = zip(maps, self._classes, strict=True)

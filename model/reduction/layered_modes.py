@@ -11,7 +11,7 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.fem.symmetry import CLASSES
-from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
+from model.reduction.free_modes import RESIDUAL_ORDER, CacheKey, PointSolutions, unknowns_of
 from model.spectral.layered_class import Band, LayeredClass, LayeredPlate
 from model.spectral.local_compliance import (
     Unresolved,
@@ -63,7 +63,7 @@ class LayeredModes:
         self.largest_truncated = float(u.max())
         # u / u_c of each truncated mode to the powers 1, 2, ...
         self._powers = (u / u.max()) ** np.arange(1, 2 * RESIDUAL_ORDER + 1)[:, None]
-        self._known: dict[bytes, _Observed] = {}
+        self._known: dict[CacheKey, _Observed] = {}
 
     def solve_at(self, points: FloatArray) -> PointSolutions:
         """Solve for forces at points [m] (n, 2)."""
@@ -91,6 +91,20 @@ class LayeredModes:
         extra[:count] += self._local(self._observe(attached.points), at)
         return np.hstack([at.shapes, extra.T])
 
+    def unknowns(self, attached: PointSolutions) -> tuple[FloatArray, ...]:
+        """The columns of `basis` by symmetry class, without the local compliance."""
+        (together,) = attached.residuals
+        ends = np.cumsum([len(part.truncated) for part in self._classes])[:-1]
+        truncated = np.split(together, ends, axis=2)
+        counts = [len(part.eigenvalues) for part in self._classes]
+        pairs = list(zip(self._classes, counts, strict=True))
+        modes = [part.shapes[:, :count] for part, count in pairs]
+        residuals = [
+            own @ part.shapes[:, count:].T
+            for own, (part, count) in zip(truncated, pairs, strict=True)
+        ]
+        return unknowns_of(modes, residuals)
+
     def uncertain(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """By how much `truncated_terms` of the first power may be too low, (n, m)."""
         own, other = self._observe(points), self._observe(others)
@@ -107,7 +121,7 @@ class LayeredModes:
     def _observe(self, points: FloatArray) -> _Observed:
         """What is known of points or footprints on the plate, cached."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
-        key = points.tobytes()
+        key = points.shape, points.tobytes()
         if key not in self._known:
             check_on_plate(points, length=self._mesh.length, width=self._mesh.width)
             if len(self._known) >= _MAX_CACHED:

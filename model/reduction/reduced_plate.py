@@ -79,6 +79,18 @@ class ReducedPlate:
         together = np.vstack([self.origin.points, as_footprints(points)])
         return reduce_free_plate(self.origin.free, together)
 
+    def unknowns(self) -> tuple[FloatArray, ...]:
+        """Its coordinates (r,) in the unknowns of the free plate, by symmetry class, (n, r)."""
+        if self.origin is None:
+            raise ValueError("only the coordinates of the plate are known")
+        modes, transform = self.origin.free.modes, self.origin.residual_transform
+        own = slice(len(modes.eigenvalues))
+        residual = slice(own.stop, own.stop + len(transform))
+        return tuple(
+            np.hstack([each[:, own], each[:, residual] @ transform])
+            for each in modes.unknowns(modes.solve_at(self.origin.points))
+        )
+
     def projection_from(self, other: "ReducedPlate") -> FloatArray:
         """M-orthogonal projection of another reduction's coordinates onto its own, (r, other's r).
 

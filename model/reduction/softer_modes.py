@@ -60,3 +60,7 @@ class SofterModes:
             points, attached.points
         )
         return basis
+
+    def unknowns(self, attached: PointSolutions) -> tuple[FloatArray, ...]:
+        """Those of the modes."""
+        return self.modes.unknowns(attached)

@@ -13,7 +13,7 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.fem.symmetry import CLASSES
-from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
+from model.reduction.free_modes import RESIDUAL_ORDER, CacheKey, PointSolutions, unknowns_of
 from model.spectral.local_compliance import (
     Unresolved,
     compliance_between,
@@ -56,7 +56,7 @@ class SpectralModes:
         self._first: PointSolutions | None = None
         self._alone_count = 0
         self._operators: tuple[FloatArray, ...] | None = None
-        self._known: dict[bytes, _Observed] = {}
+        self._known: dict[CacheKey, _Observed] = {}
 
     def solve_at(self, points: FloatArray) -> PointSolutions:
         """Solve for forces at points [m] (n, 2)."""
@@ -103,6 +103,12 @@ class SpectralModes:
         extra[:, :count] += self._local(at, self._observe(attached.points))
         return basis
 
+    def unknowns(self, attached: PointSolutions) -> tuple[FloatArray, ...]:
+        """The columns of `basis` by symmetry class, without the local compliance."""
+        modes = [part.vectors[: part.deflections] for part in self._classes]
+        density = self._plate.material.rho * self._plate.thickness
+        return tuple(each / math.sqrt(density) for each in unknowns_of(modes, attached.residuals))
+
     def uncertain(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """By how much `truncated_terms` of the first power may be too low, (n, m)."""
         own, other = self._observe(points), self._observe(others)
@@ -147,7 +153,7 @@ class SpectralModes:
     def _observe(self, points: FloatArray) -> _Observed:
         """What is known of points or footprints on the plate, cached."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
-        key = points.tobytes()
+        key = points.shape, points.tobytes()
         if key not in self._known:
             check_on_plate(points, length=self._mesh.length, width=self._mesh.width)
             if len(self._known) >= _MAX_CACHED:

@@ -11,6 +11,7 @@ from itertools import combinations
 import numpy as np
 
 from model.arrays import FloatArray
+from model.choice import best_of
 from model.errors import InputError
 from model.structure.actuator import Era
 from model.structure.plate import Plate
@@ -98,7 +99,8 @@ def edge_pair(eras: Sequence[Era]) -> tuple[int, int]:
 
 def diagonal_pair(eras: Sequence[Era]) -> tuple[int, int]:
     """The two ERAs that are furthest apart; the first of several such pairs."""
-    return max(_pairs(eras), key=lambda pair: _rounded(np.hypot(*_apart(eras, pair))))
+    pairs = _pairs(eras)
+    return pairs[best_of([np.hypot(*_apart(eras, pair)) for pair in pairs])]
 
 
 def _pairs(eras: Sequence[Era]) -> list[tuple[int, int]]:

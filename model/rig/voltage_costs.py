@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from model.choice import best_of
 from model.finger.perception import decibels, detection_threshold
 from model.rig.rig import Rig
 from registry.voltage import HIGHEST_FELT, Law, VoltageDrive
@@ -71,7 +72,7 @@ def second_harmonic(drive: VoltageDrive, *, level: float, threshold: str) -> Har
         2 * frequencies, threshold
     )
     relative = decibels(4 * share * felt)
-    worst = int(np.argmax(relative))
+    worst = best_of(relative)
     return Harmonic(float(np.median(relative)), float(relative[worst]), float(frequencies[worst]))
 
 
@@ -143,7 +144,7 @@ def _harmonic_text(drives: dict[str, VoltageDrive], rig: Rig) -> list[str]:
     }
     if not found:
         return []
-    name, worst = max(found.items(), key=lambda each: each[1].worst_db)
+    name, worst = list(found.items())[best_of([each.worst_db for each in found.values()])]
     median = max(one.median_db for one in found.values())
     return [
         f"a second harmonic of {median:+.0f} dB (median) to {worst.worst_db:+.0f} dB ({name} at "

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import FloatArray, IntArray
+from model.choice import best_first
 from model.design.judge import Judged
 from model.rig.rig import Rig
 from model.studies.cases import OWN, VACANT, Cases
@@ -78,7 +79,8 @@ def score_order(
     support = support_of(rig, cases, lowest=lowest)
     medians = np.nan_to_num(results.statistics[:, drive, MEDIAN])
     values = np.where(support.is_supported, results.expected_db, medians)
-    order = np.lexsort((-values, ~support.is_supported))
+    order = best_first(values)
+    order = order[np.argsort(~support.is_supported[order], kind="stable")]
     return Scored(cases, results, drive, support, order)
 
 

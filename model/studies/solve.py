@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, FloatArray, IntArray
+from model.choice import best_along
 from model.design.contacts import ContactRule
 from model.design.places import DesignPlate, Places
 from model.design.score import Mounts, Scorer
@@ -33,9 +34,6 @@ from model.vibration.activation import (
 
 DRIVES = ("1", "2", "all")
 """Numbers of active ERAs: the best single one, the best pair, and all of a case."""
-
-EQUAL = 1e-5
-"""Statistics that differ by less than this share are equal but for rounding."""
 
 SETS_SEED = 0
 """Seed of the contact sets of every study, so that studies compare."""
@@ -194,8 +192,6 @@ def _solve_layouts(
         if not len(numbers):
             continue
         medians = every[:, numbers, MEDIAN]
-        # Of sets that are equal by symmetry the first, not the one that rounding favours.
-        equal = medians >= (1 - EQUAL) * medians.max(axis=1, keepdims=True)
-        best = numbers[equal.argmax(axis=1)]
+        best = numbers[best_along(medians, axis=1)]
         results.statistics[rows, drive] = every[np.arange(len(rows)), best]
         results.active[rows, drive] = bits[best]

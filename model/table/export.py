@@ -5,6 +5,7 @@
 
 from collections.abc import Iterator
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_rows
 from model.table.file import FORMAT_VERSION
 from model.table.table import LocalizationTable
+from model.table.weak_cells import pair_questions
 
 MAX_MAT_BYTES = (1 << 31) - 1
 """Size of one variable in a .mat file of version 5, its header included."""
@@ -78,9 +80,10 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
 def export_csv(table: LocalizationTable, path: Path, *, content: str) -> None:
     """Write a .csv file whose columns have their units in their names.
 
-    content: "patterns": a row for each `switched` pattern, with the frequency of each ERA, empty
-    where it is silent, and the response of every cell; "fields": a row for each raster point and
-    frequency, with real and imaginary acceleration by each ERA alone at full stroke.
+    content: "patterns": a row for each target and quiet finger of the table's map, with what each
+    ERA plays in the table's drive mode, empty where it is silent, and what is promised, all empty
+    where the level is not reached; "fields": a row for each raster point and frequency, with real
+    and imaginary acceleration by each ERA alone at full stroke.
     """
     write_rows(path, {"patterns": _pattern_rows, "fields": _field_rows}[content](table))
 
@@ -92,10 +95,20 @@ def _pattern_frequencies(table: LocalizationTable) -> np.ndarray[Any, np.dtype[n
 
 
 def _pattern_rows(table: LocalizationTable) -> Iterator[list[object]]:
-    cells = [f"x{x:.4f}_y{y:.4f}_m_s2" for x, y in table.cell_centres]
-    yield [*(f"{era.name}_hz" for era in table.eras), *cells]
-    for frequencies, response in zip(_pattern_frequencies(table), table.cell_response, strict=True):
-        yield [*(f or "" for f in frequencies.tolist()), *_short(response)]
+    parts = [f"{era.name}_{part}" for era in table.eras for part in ("hz", "level", "phase_deg")]
+    contacts = [f"{finger}_{axis}_m" for finger in ("target", "quiet") for axis in "xy"]
+    yield [*contacts, *parts, "robust_level_db_sl", "robust_felt_contrast_db"]
+    for question in chain.from_iterable(pair_questions(table)):
+        at = chain.from_iterable(question.contacts)
+        try:
+            pattern = table.query(question)
+        except InputError:
+            yield [*at, *[""] * (len(parts) + 2)]
+            continue
+        drive = table.drive_of(pattern.excitation)
+        tones = (drive[era.name].values() if era.name in drive else [""] * 3 for era in table.eras)
+        promised = (pattern.robust_level_db_sl, pattern.robust_felt_contrast_db)
+        yield [*at, *chain.from_iterable(tones), *promised]
 
 
 def _field_rows(table: LocalizationTable) -> Iterator[list[object]]:

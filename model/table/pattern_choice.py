@@ -13,6 +13,7 @@ from typing import TypeAlias
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from model.choice import best_of
 from model.counting import counted
 from model.drive_modes import DRIVE_MODES, find_drives, max_sensation
 from model.drive_modes.coherent import CoherentResult
@@ -269,9 +270,9 @@ def _judged(
         reaches[:] = True
     if judged.contrast is None:
         steadiness = least / percentile(judged.level[:, 1:], 50)
-        return int((reaches * scores * steadiness).argmax())
+        return best_of(reaches * scores * steadiness)
     robust = np.where(reaches, percentile(judged.contrast.felt[:, 1:]), 0.0)
-    best = int(robust.argmax())
+    best = best_of(robust)
     if question.envelopes:
         return best
     near = np.flatnonzero(robust >= 10 ** (-ONSET_MARGIN_DB / 20) * robust[best]).tolist()
@@ -282,7 +283,7 @@ def _judged(
             np.array([index for index, _ in tones]), np.array([weights for _, weights in tones])
         )
         if contrast is not None:
-            best = near[int((robust[near] * contrast**ONSET_WEIGHT).argmax())]
+            best = near[best_of(robust[near] * contrast**ONSET_WEIGHT)]
     return best
 
 
@@ -303,11 +304,11 @@ def _judged_over_effect(
     level = judged.level[:, 0] * lag
     near = min(10 ** (question.level_db_sl / 20) * _ROUNDING, level.max() * _NEARLY)
     if judged.contrast is None:
-        return int(((level >= near) * scores * lag).argmax())
+        return best_of((level >= near) * scores * lag)
     quiet = 10 ** (np.array([each.quiet_db_sl for each in gains]) / 20)
     felt = judged.contrast.felt
     contrast = contrast_over_effect(level / quiet, felt[:, 0], percentile(felt[:, 1:]))
-    return int(((level >= near) * contrast).argmax())
+    return best_of((level >= near) * contrast)
 
 
 def _level_error(question: Question, drive_mode: str, reachable: float) -> UnreachableLevel:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from model.arrays import FloatArray
 from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL
-from model.table.many_answers import Ask, ask_here
+from model.table.many_answers import Ask, Contrasts, ask_here
 from model.table.question import Question
 from model.table.table import LocalizationTable
 
@@ -35,20 +35,22 @@ less variance than from places drawn freely.
 """
 
 # Weak places are as large as a quarter of a wavelength.
-_MAX_GRID = Grid(16, 12)
+_MAX_GRID = Grid(8, 6)
 
 
 @dataclass(frozen=True, eq=False)
 class WeakCells:
     """Median and tenth percentile of felt contrast [dB] from each cell to other fingers, (cells,).
 
-    -inf where the level is not reached, NaN on a plate too small for two fingers.
+    -inf where the level is not reached, NaN on a plate too small for two fingers. pairs_db: robust
+    and nominal felt contrast [dB] of all pairs that reach it, (2, pairs).
     """
 
     grid: Grid
     centres: FloatArray
     median_db: FloatArray
     tenth_db: FloatArray
+    pairs_db: FloatArray
 
     @property
     def feasible(self) -> NDArray[np.bool_]:
@@ -96,25 +98,32 @@ def find_weak_cells(
     """
     grid = map_grid(table)
     centres = grid.centres(table.plate)
+    found = np.full((2, len(centres)), np.nan)
+    asked = pair_questions(table)
+    answers = (ask or ask_here(table))([question for some in asked for question in some])
+    pairs: list[Contrasts] = []
+    for cell, questions in enumerate(asked):
+        answered = list(islice(answers, len(questions)))
+        pairs += filter(None, answered)
+        # -inf where the level is not reached.
+        contrasts = [-np.inf if each is None else each[0] for each in answered]
+        if contrasts:
+            # A sample with -inf cannot be interpolated.
+            found[:, cell] = np.percentile(contrasts, [50, 10], method="inverted_cdf")
+        progress(cell + 1, len(centres))
+    median, tenth = found
+    return WeakCells(grid, centres, median, tenth, np.array(pairs, dtype=float).reshape(-1, 2).T)
+
+
+def pair_questions(table: LocalizationTable) -> list[list[Question]]:
+    """For each cell of `map_grid` as the target, those with each other finger at a distance."""
     size = np.array([table.plate.length, table.plate.width])
     corner = np.stack(np.meshgrid(*(np.arange(n) for n in STRATA)), axis=-1).reshape(-1, 1, 2)
     drawn = np.random.default_rng(0).uniform(0, 1, corner.shape)
     drawn = (corner + drawn) / (2 * np.array(STRATA))
     mirrored = np.abs(drawn - [[0, 0], [1, 0], [0, 1], [1, 1]])
     places = size * mirrored.reshape(-1, 2)
-    found = np.full((2, len(centres)), np.nan)
-    asked = [_questions(centre, places) for centre in centres]
-    answers = (ask or ask_here(table))([question for some in asked for question in some])
-    for cell, questions in enumerate(asked):
-        # -inf where the level is not reached.
-        contrasts = [
-            -np.inf if each is None else each[0] for each in islice(answers, len(questions))
-        ]
-        if contrasts:
-            # A sample with -inf cannot be interpolated.
-            found[:, cell] = np.percentile(contrasts, [50, 10], method="inverted_cdf")
-        progress(cell + 1, len(centres))
-    return WeakCells(grid, centres, *found)
+    return [_questions(centre, places) for centre in map_grid(table).centres(table.plate)]
 
 
 def text_map(weak: WeakCells) -> Iterator[str]:

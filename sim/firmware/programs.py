@@ -1,6 +1,6 @@
-"""Start the firmware as a process for each amplifier: in QEMU where installed, else as a program.
+"""Start the firmware as a process for each amplifier.
 
-`make firmware` builds both from the sources of a checkout; they are not part of the wheel.
+`make firmware` builds it from the sources of a checkout; it is not part of the wheel.
 """
 
 import asyncio
@@ -8,11 +8,8 @@ import contextlib
 import fcntl
 import os
 import re
-import shutil
-import socket
 import sys
 from collections.abc import AsyncIterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +30,6 @@ FOLDER = Path(__file__).parents[2] / "out" / "firmware"
 _FULL_STROKE = 32767.0  # as a sample
 _PIPE_SIZE = 1 << 20  # bytes; eight seconds
 _STARTUP_TIMEOUT = 10.0  # s
-_QEMU = "qemu-system-arm"
 _WITH_PARENT = (
     "import ctypes, os, signal, sys; "
     "ctypes.CDLL(None).prctl(1, signal.SIGTERM); "  # PR_SET_PDEATHSIG
@@ -41,35 +37,11 @@ _WITH_PARENT = (
 )
 
 
-@dataclass(frozen=True)
-class Firmware:
-    """A program that is an amplifier; description: where it runs."""
-
-    command: Sequence[str | Path]
-    description: str
-    is_emulated: bool
-
-    def arguments(self, samples: Path, *, listening: int | None) -> list[str | Path]:
-        """The command; samples: a file for them; listening: descriptor of a socket for its line.
-
-        Without one the line is a pseudo-terminal.
-        """
-        if listening is None:
-            return [*self.command, "--serial", "--samples", samples]
-        line = f"socket,id=line,fd={listening},server=on,wait=off,nodelay=on"
-        uarts = ("-serial", "chardev:line", "-serial", "null", "-serial", f"file:{samples}")
-        return [*self.command, "-chardev", line, *uarts]
-
-
-def find_firmware() -> Firmware:
-    """The built firmware, in QEMU where that is installed; InputError where there is none."""
-    emulated, program = FOLDER / "mps2-amplifier.elf", FOLDER / "era-firmware"
-    if shutil.which(_QEMU) and emulated.exists():
-        machine = (_QEMU, "-M", "mps2-an385", "-display", "none", "-monitor", "none", "-kernel")
-        return Firmware((*machine, emulated), "on a Cortex-M3 in QEMU (mps2-an385)", True)
+def find_firmware() -> Path:
+    """The built firmware, a program; InputError where there is none."""
+    program = FOLDER / "era-firmware"
     if program.exists():
-        missing = "is not installed" if not shutil.which(_QEMU) else "has no program to run"
-        return Firmware((program,), f"as a program of this machine ({_QEMU} {missing})", False)
+        return program
     if (FOLDER.parents[1] / "firmware").is_dir():
         raise InputError(f"firmware: {program} does not exist; run `make firmware` first")
     raise InputError(
@@ -81,7 +53,7 @@ def find_firmware() -> Firmware:
 def ending_with_parent(command: Sequence[str | Path]) -> list[str | Path]:
     """A command whose process ends with the thread that starts it, also if that is killed.
 
-    An emulator does not notice by itself that nobody reads it, and computes on. On Linux only.
+    On Linux only.
     """
     if sys.platform != "linux":
         return [*command]
@@ -107,33 +79,21 @@ class RunningFirmware:
 
 
 @contextlib.asynccontextmanager
-async def running(firmware: Firmware, folder: Path, name: str) -> AsyncIterator[RunningFirmware]:
-    """Run the firmware for an amplifier; folder: for its pipe. Raises LinkError.
-
-    The emulator has its line on TCP: beside other load, the kernel would keep bytes of a
-    pseudo-terminal for longer than a host waits.
-    """
+async def running(program: Path, folder: Path, name: str) -> AsyncIterator[RunningFirmware]:
+    """Run the firmware for an amplifier; folder: for its pipe. Raises LinkError."""
     path = folder / f"{name}.samples"
     os.mkfifo(path)
     async with contextlib.AsyncExitStack() as stack:
         pipe = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         stack.callback(os.close, pipe)
         fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
-        listening = socket.create_server(("127.0.0.1", 0)) if firmware.is_emulated else None
-        line = listening.fileno() if listening is not None else None
         process = await asyncio.create_subprocess_exec(
-            *ending_with_parent(firmware.arguments(path, listening=line)),
+            *ending_with_parent([program, "--serial", "--samples", path]),
             stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.DEVNULL,  # the emulator tells how it was ended
-            pass_fds=() if line is None else (line,),
+            stderr=asyncio.subprocess.DEVNULL,
         )
         stack.push_async_callback(_terminate, process)
-        if listening is not None:
-            port = listening.getsockname()[1]
-            listening.close()
-            yield RunningFirmware(f"serial://127.0.0.1:{port}", pipe)
-        else:
-            yield RunningFirmware(f"serial://{await _terminal_of(process, name)}", pipe)
+        yield RunningFirmware(f"serial://{await _terminal_of(process, name)}", pipe)
 
 
 async def _terminal_of(process: asyncio.subprocess.Process, name: str) -> str:

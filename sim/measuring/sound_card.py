@@ -8,7 +8,6 @@ import ctypes
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from functools import cache
 
 import numpy as np
 
@@ -60,11 +59,6 @@ class Ports(ctypes.Structure):
     )
 
 
-@cache
-def _callbacks() -> ctypes.CDLL:
-    return ctypes.CDLL(str(library()))
-
-
 class SoundCard(ABC):
     """An open device with some outputs and inputs, the first ones that it has.
 
@@ -92,7 +86,7 @@ class SoundCard(ABC):
     @staticmethod
     def address(name: str) -> int:
         """The address of a callback."""
-        found = ctypes.cast(getattr(_callbacks(), name), ctypes.c_void_p).value
+        found = ctypes.cast(getattr(library(), name), ctypes.c_void_p).value
         assert found is not None  # noqa: S101  of a function
         return found
 

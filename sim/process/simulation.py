@@ -22,7 +22,7 @@ from sim.far_ends.wire_assignment import WireAssignment
 from sim.far_ends.wires import open_wires
 from sim.faults.fault_file import FaultFile
 from sim.firmware.bench import FirmwareBench
-from sim.firmware.programs import Firmware, running
+from sim.firmware.programs import running
 from sim.plant.fingers import Position
 from sim.plant.imperfections import Imperfections
 from sim.plant.plant import SAMPLE_RATE
@@ -55,7 +55,7 @@ class Simulation:
     control: Path | None = None
     record: Path | None = None
     until_eof: bool = False
-    firmware: Firmware | None = None
+    firmware: Path | None = None
     links: Mapping[str, Path] = field(default_factory=dict)
 
 
@@ -148,7 +148,7 @@ async def _open_devices(
 
 
 async def _start_firmware(
-    stack: contextlib.AsyncExitStack, bench: FirmwareBench, firmware: Firmware
+    stack: contextlib.AsyncExitStack, bench: FirmwareBench, firmware: Path
 ) -> dict[str, str]:
     """Run the firmware for each amplifier; returns the URLs by name."""
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="era-")))

@@ -5,7 +5,6 @@ import os
 import time
 
 from drivers.errors import LinkError
-from model.errors import InputError
 from sim.soft_amp.counters import Counters
 from sim.soft_amp.library import library
 from sim.soft_amp.settings import MAX_CHANNELS, Settings
@@ -53,11 +52,7 @@ class Engine:
     """The library, loaded; raises InputError."""
 
     def __init__(self) -> None:
-        path = library()
-        try:
-            self._library = ctypes.CDLL(str(path))
-        except OSError as problem:
-            raise InputError(f"soft-amp: {path} cannot be loaded: {problem}; delete it") from None
+        self._library = library()
 
     def start(
         self,

@@ -1,10 +1,12 @@
 """The engine as a library: of a wheel of this platform, or compiled at first use."""
 
-import tempfile
+import ctypes
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 
-from model.compiled.compiler import compile_library, kept_library
+from model.compiled.compiler import compile_library
+from model.compiled.library_cache import kept_library
 from model.errors import InputError
 
 ENGINE = "engine.so"
@@ -25,20 +27,22 @@ _FLAGS = (
 _WHAT = "soft-amp: its engine"
 
 
-def library() -> Path:
-    """The file of the library, compiled if there is none; raises InputError."""
-    if (_HERE / ENGINE).exists():
-        return _HERE / ENGINE
+@cache
+def library() -> ctypes.CDLL:
+    """Load the library, compiled if there is none; raises InputError."""
+    own = _HERE / ENGINE
+    if own.exists():
+        try:
+            return ctypes.CDLL(str(own))
+        except OSError as problem:
+            raise InputError(
+                f"soft-amp: {own} cannot be loaded: {problem}; reinstall era-haptics"
+            ) from None
     folder = _sources()
     headers = [path for part in _PARTS for path in (folder / part).glob("*.h")]
-    try:
-        return kept_library(
-            "soft-amp", _files(folder, suffix=".c"), headers, flags=_flags(folder), what=_WHAT
-        )
-    except OSError:  # no cache can be written
-        path = Path(tempfile.mkdtemp(prefix="era-soft-amp-")) / ENGINE
-        compile_engine(path)
-        return path
+    return kept_library(
+        "soft-amp", _files(folder, suffix=".c"), headers, flags=_flags(folder), what=_WHAT
+    )
 
 
 def compile_engine(path: Path) -> None:

@@ -58,6 +58,6 @@ def tcp_place(port: int, *, protocol: Protocol) -> Iterator[Place]:
         ) from None
     with listening:
         listening.setblocking(False)
-        scheme = "serial" if protocol is Protocol.SERIAL else "modbus+tcp"
+        scheme = "serial+tcp" if protocol is Protocol.SERIAL else "modbus+tcp"
         url = f"{scheme}://{_LOOPBACK}:{listening.getsockname()[1]}"
         yield Place(url, listening=listening.fileno())

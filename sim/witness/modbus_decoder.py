@@ -110,8 +110,6 @@ class ModbusDecoder:
             case 23:
                 read = struct.unpack_from(">HH", body)
                 written = _written(body[4:])
-            case 43:
-                pass
             case _:
                 raise OutOfRange(f"function {function}")
         tag = None if written is None else self._tag(adu.unit, *written)

@@ -9,7 +9,7 @@ from sim.witness.decoded import Direction
 _MIN_LENGTH, _MAX_LENGTH = 4, 256
 _PAUSE = 0.04  # s; a longer pause ends a partial frame
 _SIZES: dict[Direction, dict[int, int]] = {
-    "amplifier": {3: 8, 4: 8, 6: 8, 43: 7},
+    "amplifier": {3: 8, 4: 8, 6: 8},
     "host": {6: 8, 16: 8},
 }
 # Of the others: offset of the byte count, and bytes around the data, CRC included.
@@ -118,21 +118,11 @@ class RtuSplitter(Splitter):
             return 5
         if function in _SIZES[self._direction]:
             return _SIZES[self._direction][function]
-        if self._direction == "host" and function == 43:
-            return _identification_size(data)
         if function not in _COUNTS[self._direction]:
             return 0
         at, around = _COUNTS[self._direction][function]
         size = around + data[at] if len(data) > at else around
         return size if size <= _MAX_LENGTH else 0
-
-
-def _identification_size(data: bytes) -> int:
-    """Size of a reply to function 43: eight bytes, then each object with its length."""
-    at = 8
-    for _ in range(data[7] if len(data) > 7 else 0):
-        at += 2 + (data[at + 1] if len(data) > at + 1 else 0)
-    return at + 2
 
 
 def crc16(data: bytes) -> bytes:

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from controller import plate_control
-from controller.diagnosis.sensors import simulated_sensors
 from controller.plate_control import PlateControl
 from drivers.errors import LinkError
 
@@ -107,12 +106,3 @@ async def test_invalid_plate_reply_is_quoted_in_the_error(tmp_path: Path, said: 
         with pytest.raises(LinkError, match=r"/sock: .*--control") as caught:
             await control.request(HELLO)
     assert len(str(caught.value)) < 300
-
-
-async def test_older_plate_has_no_sensors(tmp_path: Path) -> None:
-    """Version 1 of the control protocol has no sensors; none is requested."""
-    old = saying(b'{"protocol": "era-sim-control", "version": 1, "clock": "wall"}\n')
-    async with listening(tmp_path / "sock", old):
-        with pytest.raises(LinkError, match="restart"):
-            async with simulated_sensors(tmp_path / "sock", [(0.1, 0.1)], noise=0.0):
-                pass

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from command_page import own_commands
 from model.cli import app
-from model.table import summary
+from model.table import contact_sets
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "reference" / "commands.md").read_text("utf-8")
@@ -96,7 +96,7 @@ def test_the_keys_are_those_that_are_printed(
 ) -> None:
     """The table names the keys at the top of what `--json` prints, and no others."""
     monkeypatch.chdir(built)
-    monkeypatch.setattr(summary, "CONTACT_SETS", 12)
+    monkeypatch.setattr(contact_sets, "CONTACT_SETS", 12)
     result = CliRunner().invoke(app, [*arguments, "--json"])
     assert result.exit_code == 0, result.output
     name = " ".join(["era", *arguments[:2]])

@@ -14,8 +14,8 @@ from controller.daemon.config_sections import (
     LogSection,
     TouchSection,
 )
+from controller.gateway.metrics import exposition
 from controller.learning.learning_status import LearningStatus
-from controller.metrics.collector import exposition
 from daemon_bench import running_daemon, until_state
 from model.config.sections import Section
 

@@ -150,6 +150,17 @@ async def test_open_refuses_another_protocol_version(backend: ScriptedBackend) -
     assert backend.closed == 1
 
 
+@pytest.mark.parametrize(
+    "name", ["channels", "voices", "frequency_step", "level_step", "phase_step"]
+)
+async def test_open_refuses_capabilities_of_zero(backend: ScriptedBackend, name: str) -> None:
+    """The wire is closed again; the error names the capability."""
+    backend.script += [IDENTITY, replace(CAPABILITIES, **{name: 0})]
+    with pytest.raises(FrameError, match=f"above 0, got 0 as {name};"):
+        await Amplifier(backend).open()
+    assert backend.closed == 1
+
+
 async def test_request_is_repeated_twice_when_replies_are_lost(
     amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
 ) -> None:
@@ -194,12 +205,15 @@ async def test_link_error_is_not_retried(amplifier: Amplifier, backend: Scripted
 async def test_refusal_names_request_and_channel(
     amplifier: Amplifier, backend: ScriptedBackend, code: NakCode
 ) -> None:
-    """Every code has a reason in words."""
+    """Every code has a reason in words; none tells of arming after a Stop."""
     backend.script += [Nak(code, 2)] * 3  # busy is retried
     with pytest.raises(CommandRefused, match=r"refused Arm \(channel 2\): \w+ \w+") as caught:
         await amplifier.arm()
     assert caught.value.channel == 2
     assert not amplifier.is_lost
+    backend.script += [Nak(code, 2)] * 3
+    with pytest.raises(CommandRefused, match=r"refused Stop \(channel 2\): (?!.*\barm)"):
+        await amplifier.stop()
 
 
 async def test_busy_amplifier_is_retried_twice(

@@ -45,7 +45,7 @@ def test_limits_of_a_rig_file_are_those_of_the_guard() -> None:
             "serail:///dev/ttyUSB0",
             r"unknown backend 'serail://'; did you mean serial://\? known are can",
         ),
-        ("carrier+pigeon://coop", "known are .*modbus.tcp://, .*serial://, sim://"),
+        ("carrier+pigeon://coop", "known are .*modbus.tcp://, serial://, .*sim://"),
         ("serial:///dev/ttyUSB0?baud=fast", "baud must be.*'fast'"),
         ("modbus+tcp://host/999", "unit must be.*'999'"),
         (f"{BUS}#300", "node after # must be.*'300'"),

@@ -47,7 +47,7 @@ QUICK = [
 
 LONG = {
     "table plot table.npz -o plots": "model.figures.table_pictures.table_figures",
-    "table show table.npz": "model.table.weak_cells.find_weak_cells",
+    "table show table.npz": "model.table.overview.kept_overview",
     "table verify table.npz rig.yaml": "model.table.verify.verify_table",
     "plate convergence rig.yaml": "model.vibration.convergence.study_convergence",
     "rig check rig.yaml --measured measured.csv": "model.diagnosis.verdict.diagnose",
@@ -197,7 +197,7 @@ def test_recording_fails_without_a_file_when_the_disk_is_full(home: Path) -> Non
         try:
             fill_disk(process.pid)
             process.send_signal(signal.SIGINT)
-            _, said = process.communicate(timeout=20)
+            _, said = process.communicate(timeout=60)
         finally:
             process.kill()
     assert process.returncode == 2

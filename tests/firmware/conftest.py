@@ -26,11 +26,3 @@ def firmware(compiled: Path) -> Path:
 def replaying(compiled: Path) -> Path:
     """That folder, with the program that plays scripts."""
     return build_firmware(compiled, "era-replay")
-
-
-@pytest.fixture(scope="session")
-def bare_metal(replaying: Path) -> Path:
-    """That folder, with the same program for a Cortex-M3, too, to be run in QEMU."""
-    if not (shutil.which("arm-none-eabi-gcc") and shutil.which("qemu-system-arm")):
-        pytest.skip("needs gcc-arm-none-eabi and qemu-system-arm")
-    return build_firmware(replaying, "mps2-replay.elf")

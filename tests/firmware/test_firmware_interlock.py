@@ -41,7 +41,7 @@ async def test_open_interlock_is_a_fault_until_it_is_closed(firmware: Path) -> N
 
 async def until(amplifier: Amplifier, reached: Callable[[Status], bool]) -> Status:
     """Poll until a status is reached."""
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         status = await amplifier.status()
         while not reached(status):
             status = await amplifier.status()

@@ -18,8 +18,9 @@ from firmware_script import (
     command,
     load,
     replay,
-    replay_on_the_machine,
     request,
+    stuffed,
+    unstuffed,
 )
 from model.arrays import FloatArray
 
@@ -55,6 +56,18 @@ def test_channels_start_together_with_their_phases(replaying: Path) -> None:
     for channel, each in enumerate(tones):
         expected = tone(seconds(len(playing)), *each)
         assert np.abs(playing[:, channel] - expected).max() < TOLERANCE
+
+
+def test_frame_with_any_wrong_bit_is_not_answered(replaying: Path) -> None:
+    """A CRC-32 finds every single one, be it in the frame or in the checksum."""
+    frame = unstuffed(arm()[1:-1])
+    damaged = [
+        stuffed(frame[:at] + bytes([frame[at] ^ 1 << bit]) + frame[at + 1 :])
+        for at in range(len(frame))
+        for bit in range(8)
+    ]
+    _, replies = replay(replaying, [(10, each) for each in damaged], 20)
+    assert replies == []
 
 
 def test_sets_cross_fade_along_raised_cosines(replaying: Path) -> None:
@@ -196,13 +209,16 @@ def test_ending_plays_amid_an_onset_to_level_zero(replaying: Path) -> None:
     assert np.abs(samples[:, 0] - tone(t, 90, 1) * level).max() < TOLERANCE
 
 
-def test_same_commands_in_another_order_are_another_set(replaying: Path) -> None:
+def test_same_token_with_another_order_or_ending_is_another_set(replaying: Path) -> None:
     """An Apply with active_token is refused with BAD_TOKEN then, and confirmed otherwise."""
-    commands = command(0, 100, 0.5), command(1, 130, 0.4)
-    again = [(10, apply(1, *commands)), (20, apply(1, *commands[::-1]))]
-    _, replies = replay(replaying, [(0, arm()), (0, apply(1, *commands)), *again], 30)
-    assert replies[-2][0] == 0x87
-    assert replies[-1] == (NAK, bytes([7, BAD_TOKEN, 255]))
+    first, second = command(0, 100, 0.5, ending=1), command(1, 130, 0.4)
+    other_ending = command(0, 100, 0.5, ending=2)
+    script = [(0, arm()), (0, load(1, 1, (0.4, 0))), (0, load(2, 1, (0.3, 0)))]
+    sets = ((first, second), (first, second), (second, first), (other_ending, second))
+    _, replies = replay(replaying, [*script, *((10, apply(1, *each)) for each in sets)], 30)
+    refused = (NAK, bytes([7, BAD_TOKEN, 255]))
+    assert [kind for kind, _ in replies[-4:-2]] == [0x87, 0x87]
+    assert replies[-2:] == [refused, refused]
 
 
 def test_envelopes_move_along_straight_lines(replaying: Path) -> None:
@@ -225,18 +241,24 @@ def test_envelopes_move_along_straight_lines(replaying: Path) -> None:
     assert not samples[:, [0, 1, 3]].any()
 
 
-def test_brake_goes_on_from_the_present_amplitude(replaying: Path) -> None:
-    """With keep phase, an onset to level 0 begins where the vibration is, on its own t."""
+@pytest.mark.parametrize("ramp_ms", [0, 100])
+def test_brake_goes_on_from_the_present_amplitude(replaying: Path, ramp_ms: int) -> None:
+    """With keep phase, an onset to level 0 begins where the vibration is, on its own t.
+
+    Amid a ramp of 100 ms that is half of its level.
+    """
     script: Script = [
         (0, load(1, 10, (0.5, -180.0))),
         (0, arm()),
-        (0, apply(1, command(0, 90, 0.4, 20))),
+        (0, apply(1, command(0, 90, 0.4, 20), ramp_ms=ramp_ms)),
         (50, apply(2, command(0, 90, 0, flags=KEEP_PHASE, onset=1), ramp_ms=500)),
     ]
     samples, _ = replay(replaying, script, 100)
     t = seconds(len(samples))
-    values = [0.4 * np.exp(1j * np.radians(20))] * 2 + [-0.5, 0]
-    amplitude = np.interp(t, [0, 0.05, 0.06, 0.07], values)
+    full = 0.4 * np.exp(1j * np.radians(20))
+    rising = 1 - falling(t, ramp_ms / 1000) if ramp_ms else np.ones(len(t))
+    braking = np.interp(t, [0.05, 0.06, 0.07], [full / 2 if ramp_ms else full, -0.5, 0])
+    amplitude = np.where(t < 0.05, full * rising, braking)
     expected = (amplitude * np.exp(2j * np.pi * 90 * t)).imag
     assert np.abs(samples[:, 0] - expected).max() < TOLERANCE
 
@@ -272,21 +294,3 @@ def test_shorter_stop_ends_sooner_and_a_longer_one_changes_nothing(replaying: Pa
     at_140 = falling(np.array([0.04]), 0.1)[0]
     gain = np.where(t < 0.14, falling(t - 0.1, 0.1), at_140 * falling(t - 0.14, 0.02))
     assert np.abs(samples[:, 0] - gain * tone(t, 150, 0.8)).max() < TOLERANCE
-
-
-@pytest.mark.long
-def test_cortex_m3_makes_the_same_samples_bit_for_bit(bare_metal: Path) -> None:
-    """Of a script with fades, envelopes, a brake, valid_for and a stop."""
-    script: Script = [
-        (0, load(1, 10, (0.5, -180.0))),
-        (0, load(2, 7.3, (0.1, 45.0), (0.9, -60.0))),
-        (1, arm()),
-        (5, apply(1, command(0, 90, 0.4, 20), command(1, 333.35, 0.9, onset=2), ramp_ms=13)),
-        (60, apply(2, command(0, 90, 0, flags=KEEP_PHASE, onset=1), command(3, 700, 1), ramp_ms=9)),
-        (120, apply(3, command(3, 701, 0.5, ending=2), ramp_ms=30, valid_for_ms=50)),
-        (180, apply(4, command(2, 50, 0.25, -90), ramp_ms=5)),
-        (200, request(STOP, bytes([50, 0]))),
-    ]
-    samples, _ = replay(bare_metal, script, 300)
-    assert np.array_equal(replay_on_the_machine(bare_metal, script, 300), samples)
-    assert np.abs(samples).max(axis=0).min() > 0.2

@@ -50,7 +50,7 @@ async def panel(folder: Path, far_end: FarEndProcess) -> AsyncIterator[tuple[Asy
     (folder / "daemon.yaml").write_text(
         "rig: rig.yaml\ntable: table.npz\nsocket: era.sock\nlayout: layout.yaml\n"
         "touch_wait: 100 ms\n"  # or a busy machine gets a plain ramp, and is told so
-        f'touch:\n  - {{name: panel, url: "tuio:127.0.0.1:{port}?timeout={PATIENCE:g}"}}\n',
+        f'touch:\n  - {{name: panel, url: "tuio:127.0.0.1:{port}?timeout=60"}}\n',
         encoding="utf-8",
     )
     process = await asyncio.create_subprocess_exec(*PROGRAM, "daemon", folder / "daemon.yaml")

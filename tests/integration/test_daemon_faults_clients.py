@@ -4,6 +4,7 @@ The control loop of the whole daemon must not be affected.
 """
 
 import asyncio
+import contextlib
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ import patient_daemon
 from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import RpcError
 from daemon_bench import PATIENCE, far_end, holding, until
-from daemon_process import DaemonProcess, daemon_process, play, plays_on
+from daemon_process import DaemonProcess, daemon_process, play, plays_on, run_era
 from floods import flood
 from journal import Journal, loudness
 
@@ -83,3 +84,17 @@ async def test_daemon_plays_on_when_clients_flood(tmp_path: Path, kind: str) -> 
         assert not daemon.has_logged("Traceback")
         assert not daemon.has_logged("no json")
         assert len(daemon.log) < 200  # invalid requests do not fill the disk
+
+
+async def test_stops_are_served_while_clients_connect_again_and_again(tmp_path: Path) -> None:
+    """Of 25 new clients each, beside 2000 connections in a second, and of the command."""
+    async with far_end(tmp_path) as far, daemon_process(tmp_path, far) as daemon:
+        async with flood("again", daemon.socket, 200):
+            served = 0
+            for _ in range(25):
+                with contextlib.suppress(RpcError, Unreachable):
+                    async with await daemon.client() as era:
+                        await era.stop()
+                        served += 1
+            status, _, problem = await run_era("stop", "--socket", daemon.socket)
+        assert (served, status, problem) == (25, 0, "")

@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 
 import numpy as np
@@ -9,12 +10,12 @@ import pytest
 
 from benchmarks.desk.chain import chain
 from benchmarks.desk.identified import identified_errors
-from benchmarks.desk.session import ERA, Desk, desk
+from benchmarks.desk.session import Desk, desk
+from benchmarks.desk_plate.model_in_time import DeskModel
+from benchmarks.desk_plate.truth import draw_truth
 from model.calibration.responses import responses_of
 from model.calibration.responses_file import read_functions
 from model.rig.file import load_rig
-from sim.desk.model_in_time import DeskModel
-from sim.desk.truth import draw_truth
 
 pytestmark = [
     pytest.mark.real_time,
@@ -75,7 +76,16 @@ def test_identified_plate_is_the_one_on_the_desk(plate: Desk) -> None:
 def test_second_plate_of_a_name_is_refused(plate: Desk) -> None:
     """It could not be told from the first, which would be measured in its place."""
     done = subprocess.run(
-        [ERA, "desk-plate", "rig.yaml", "--sensors", "sensors.csv", "--mesh", MESH],
+        [
+            sys.executable,
+            "-m",
+            "benchmarks.desk_plate",
+            "rig.yaml",
+            "--sensors",
+            "sensors.csv",
+            "--mesh",
+            MESH,
+        ],
         cwd=plate.folder,
         env=plate.environment,
         capture_output=True,

@@ -1,15 +1,12 @@
 """The gateway flooded, starved and killed, without effect on the daemon's control loop.
 
 The daemon is a process over a simulated amplifier, armed, with a finger down. Its amplifier faults
-without a heartbeat within 250 ms, so a late control loop shows as another state than
-OPERATION_ENABLED, or by the age of the last reply. Pauses of the whole machine are detected by a
-metronome and excused.
+without a heartbeat within its watchdog, the longest of the protocol here, so a control loop that
+stands still shows as another state than OPERATION_ENABLED.
 """
 
 import contextlib
-import logging
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -20,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from controller.api.client import Client
-from daemon_bench import PLACE
+from daemon_bench import PATIENCE, PLACE
 from gateway_bench import (
     ARM,
     ERA,
@@ -30,19 +27,17 @@ from gateway_bench import (
     frame,
     gateway_process,
     http,
-    raise_priority,
     real_daemon,
     upgrade,
     wait_for,
     wait_for_daemon,
     wait_for_state,
 )
+from patient_daemon import PROGRAM
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.real_time
 
 ENABLED = "OPERATION_ENABLED"
-WATCHDOG = 0.25  # s; of the amplifiers, by default
-LATE = 0.06  # s; of a process that does nothing, on a machine that is busy with something else
 
 IMPATIENT = """
 import sys
@@ -53,76 +48,11 @@ sys.exit(main())
 """
 """`era` with shorter timeouts of the gateway."""
 
-_logger = logging.getLogger(__name__)  # what was measured; shown by pytest --log-cli-level=info
-
-
-class Metronome:
-    """A process with the daemon's priority that wakes every 10 ms, to detect a paused machine."""
-
-    _CODE = (
-        "import time\n"
-        "while True:\n"
-        "    due = time.monotonic() + 0.01\n"
-        "    time.sleep(0.01)\n"
-        "    late = time.monotonic() - due\n"
-        "    if late > 0.02: print(due, late, flush=True)\n"
-    )
-
-    def __init__(self) -> None:
-        self.late: list[tuple[float, float]] = []  # when it was due, and how late it was [s]
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", self._CODE], stdout=subprocess.PIPE, text=True
-        )
-        raise_priority(self._process.pid)
-        self._reading = threading.Thread(target=self._read)
-        self._reading.start()
-
-    def stood_still(self) -> bool:
-        """Whether it was late within the last 5 s."""
-        since = time.monotonic() - 5
-        return sum(late for due, late in self.late if due > since) > LATE
-
-    @property
-    def latest(self) -> float:
-        """Its largest delay [s]."""
-        return max((late for _, late in self.late), default=0.0)
-
-    def close(self) -> None:
-        """End it."""
-        self._process.kill()
-        self._process.wait()
-        self._reading.join()
-
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        with self._process.stdout as lines:
-            for line in lines:
-                due, late = map(float, line.split())
-                self.late.append((due, late))
-
-
-@pytest.fixture(scope="module")
-def metronome() -> Iterator[Metronome]:
-    """One metronome for all tests."""
-    made = Metronome()
-    yield made
-    made.close()
-
-
-def _arm_again(era: Client) -> str:
-    """Arm after the amplifier's watchdog tripped; return the lease."""
-    wait_for_state(era, "FAULT")
-    era.clear()
-    wait_for_state(era, "READY_TO_SWITCH_ON")
-    return era.arm("watch", lease_s=30).lease
-
 
 @dataclass
 class Watch:
     """A client of the daemon that holds a finger down."""
 
-    metronome: "Metronome"
-    oldest: float = 0.0  # s; age of the amplifier's replies
     looks: int = 0
     has_failed: bool = False
     over: threading.Event = field(default_factory=threading.Event)
@@ -137,17 +67,13 @@ class Watch:
 
     def _run(self, path: Path) -> None:
         """Renew the lease, repeat the touch and read the status fifty times a second."""
-        with Client.connect(path, name="watch") as era:
-            lease = era.arm("watch", lease_s=30).lease
+        with Client.connect(path, name="watch", timeout=PATIENCE) as era:
+            lease = era.arm("watch", lease_s=60).lease
             while not self.over.wait(0.02):
                 era.touch([PLACE])
                 status = era.status()
-                if status.state != ENABLED:
-                    assert self.metronome.stood_still(), f"{status.state}: {status.cause}"
-                    lease = _arm_again(era)
-                    continue
+                assert status.state == ENABLED, status.cause
                 era.renew(lease)
-                self.oldest = max(self.oldest, *(a.reply_age_s or 0.0 for a in status.amplifiers))
                 self.looks += 1
             era.disarm()
 
@@ -155,14 +81,14 @@ class Watch:
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The socket of one daemon for all tests."""
-    with real_daemon(tmp_path_factory.mktemp("daemon")) as path:
+    with real_daemon(tmp_path_factory.mktemp("daemon"), program=PROGRAM) as path:
         yield path
 
 
 @pytest.fixture
-def watched(daemon: Path, metronome: "Metronome") -> Iterator[Watch]:
-    """The daemon armed and watched; it must stay armed while the machine runs."""
-    watch = Watch(metronome)
+def watched(daemon: Path) -> Iterator[Watch]:
+    """The daemon armed and watched; it must stay armed."""
+    watch = Watch()
     thread = threading.Thread(target=watch.run, args=(daemon,))
     with Client.connect(daemon, name="test") as era:
         wait_for_state(era, "READY_TO_SWITCH_ON")
@@ -174,8 +100,6 @@ def watched(daemon: Path, metronome: "Metronome") -> Iterator[Watch]:
             watch.over.set()
             thread.join()
         assert not watch.has_failed
-        assert watch.oldest < WATCHDOG or watch.metronome.latest > LATE
-        _logger.info("%d looks, oldest answer %.0f ms", watch.looks, 1000 * watch.oldest)
 
 
 @pytest.fixture
@@ -203,7 +127,7 @@ def deaf_connection(gateway: GatewayProcess) -> socket.socket:
     """A connection with a small receive buffer."""
     made = socket.socket()
     made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
-    made.settimeout(20)
+    made.settimeout(60)
     made.connect(("127.0.0.1", gateway.port))
     return made
 
@@ -264,7 +188,7 @@ def test_gateway_closes_connections_that_trickle_or_do_not_read(gateway: Gateway
                 deaf.sendall(upgrade(gateway))
             left.append((deaf, 20 * (hello if number % 2 else page)))
         assert_served(gateway)
-        end = time.monotonic() + 40
+        end = time.monotonic() + PATIENCE
         while left:
             assert time.monotonic() < end, f"{len(left)} are still there"
             for each in list(left):
@@ -305,19 +229,15 @@ def test_gateway_serves_during_a_flood_of_requests(gateway: GatewayProcess, watc
     threads = [threading.Thread(target=flood, args=(number,)) for number in range(4)]
     for thread in threads:
         thread.start()
-    answered = []
-    end = time.monotonic() + 2
     try:
-        while time.monotonic() < end:
-            asked = time.monotonic()
+        for _ in range(20):
             assert http(gateway, "/api/v1/effects", body=b"{}").status in (200, 429)
-            answered.append(time.monotonic() - asked)
+        wait_for(lambda: watched.looks > before)
     finally:
         over.set()
         for thread in threads:
             thread.join()
-    _logger.info("%d requests, others' answers in %.0f ms", sum(sent), 1000 * max(answered))
-    assert watched.looks > before
+    assert min(sent) > 0
 
 
 def test_daemon_continues_when_gateways_are_killed_under_load(

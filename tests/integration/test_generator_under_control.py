@@ -89,7 +89,7 @@ async def controlled(
 
 async def held(controller: Controller, *touches: Touch, until: Callable[[], bool]) -> None:
     """Repeat a frame until something holds."""
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while not until():
             controller.deliver(TouchFrame("test", clock.now(), touches))
             await asyncio.sleep(0.02)

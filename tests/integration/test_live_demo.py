@@ -27,14 +27,14 @@ def test_page_and_daemon(tmp_path: Path) -> None:
         try:
             assert process.stdout is not None
             assert process.stdout.readline().startswith("dashboard: http://127.0.0.1:")
-            with Client.connect(socket, timeout=20) as daemon:
+            with Client.connect(socket, timeout=60) as daemon:
                 daemon.subscribe("state")
                 while (state := daemon.status().state) != "READY_TO_SWITCH_ON":
                     assert state != "OPERATION_ENABLED"
-                    next(daemon.events(timeout=20))
+                    next(daemon.events(timeout=60))
                 assert daemon.hello("test").rig.simulated
             process.send_signal(signal.SIGINT)
-            assert process.wait(20) == 0
+            assert process.wait(60) == 0
         finally:
             process.kill()
     assert not socket.exists()

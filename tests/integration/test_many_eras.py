@@ -1,6 +1,5 @@
 """Examples of eight, twelve and sixteen ERAs, from their files to fingertips in virtual time."""
 
-import asyncio
 import math
 from collections import Counter
 from pathlib import Path
@@ -9,16 +8,16 @@ import numpy as np
 import pytest
 
 import model
-from controller.demo.run import read_touches, run_demo
-from controller.demo.virtual_time import VirtualTimeLoop
+from controller.demo.run import run_demo
 from controller.effects.layout_file import load_layout
-from controller.sources.capture import RecordedDatagram, write_capture
+from controller.sources.capture import RecordedDatagram, read_capture, write_capture
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
 from long_form import shortly
 from model.rig.file import load_rig
 from model.table.build import build_table
 from model.table.question import Question
+from virtual_sockets import run_virtual_on_sockets
 
 EXAMPLES = Path(model.__file__).parents[1] / "examples"
 CHANNELS = {"eight_eras": [4, 4], "car_display": [4, 4, 4], "table": [4, 4, 4, 4]}
@@ -51,12 +50,9 @@ def test_finger_feels_what_many_eras_promise(name: str, capture: Path) -> None:
     counts = Counter(wire.amplifier for wire in rig.wiring.values())
     assert [counts[amplifier] for amplifier in rig.amplifiers] == CHANNELS[name]
     table = build_table(rig, frequencies=np.array([120.0, 160.0, 200.0]), drive_mode="phased")
-    with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
-        rows = runner.run(
-            run_demo(
-                file, table, wire="sim", touches=read_touches(capture), on_row=lambda row: None
-            )
-        )
+    rows = run_virtual_on_sockets(
+        run_demo(file, table, wire="sim", touches=read_capture(capture), on_row=lambda row: None)
+    )
     row = rows[-1]
     assert row.drive.keys() == {era.name for era in rig.eras}
     x, y = SCHEDULE[1][3:]

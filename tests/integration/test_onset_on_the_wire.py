@@ -5,9 +5,9 @@ import asyncio
 import numpy as np
 import pytest
 
-from controller.demo.run import read_touches, run_demo
+from controller.demo.run import run_demo
 from controller.sources import contacts
-from controller.sources.capture import RecordedDatagram, write_capture
+from controller.sources.capture import RecordedDatagram
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
 from model.rig.file import example_rig_path, load_rig
@@ -22,7 +22,7 @@ DOWN, UP, END = 0.1, 1.2, 1.3  # s; a tenth of a second of it is measured
 
 
 @pytest.fixture
-def touches(tmp_path):
+def touches():
     """Two fingers that come down at one moment on a plate at rest."""
     datagrams = []
     for number in range(int(END / FRAME)):
@@ -31,9 +31,7 @@ def touches(tmp_path):
         datagrams.append(
             RecordedDatagram(now, tuio_datagram(TouchFrame("test", now, down), number + 1))
         )
-    path = tmp_path / "touches.tuio"
-    write_capture(path, datagrams)
-    return read_touches(path)
+    return datagrams
 
 
 @pytest.mark.real_time

@@ -72,6 +72,17 @@ async def test_sim_backends_of_one_control_are_under_one_plate(tmp_path: Path) -
     assert not [task for task in asyncio.all_tasks() if "simulated plate" in task.get_name()]
 
 
+async def test_sim_backends_of_named_amplifiers_are_under_one_plate(tmp_path: Path) -> None:
+    """Without a control socket, too; closed, all can be opened again."""
+    rig = write_rig(tmp_path / "rig.yaml", *TWO_AMPLIFIERS)
+    backends = [SimulatedBackend(f"sim://{rig}?amplifier={name}") for name in ("main", "side")]
+    for _ in range(2):
+        await asyncio.gather(*(backend.open() for backend in backends))
+        assert backends[0]._bench is backends[1]._bench is not None
+        await asyncio.gather(*(backend.close() for backend in backends))
+    assert not [task for task in asyncio.all_tasks() if "simulated plate" in task.get_name()]
+
+
 async def test_sim_backend_advances_the_plate_while_open() -> None:
     """Simulated time follows the clock without being asked, and the backend closes twice."""
     backend = SimulatedBackend(URL)

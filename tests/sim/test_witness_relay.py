@@ -35,7 +35,7 @@ async def _drive(url: str) -> None:
         assert (await amplifier.apply(guard.check(wanted))).commands[0].level == 0.4
         await amplifier.heartbeat()
         assert (await amplifier.stop()).state is AmplifierState.QUICK_STOP_ACTIVE
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(60):
             while True:  # it can be cleared once its ramp is over
                 if (await amplifier.clear()).state is AmplifierState.SWITCH_ON_DISABLED:
                     break

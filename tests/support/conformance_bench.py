@@ -2,17 +2,17 @@
 
 from collections.abc import Sequence
 
-import pytest
-
 from drivers.amplifier import Amplifier
 from drivers.conformance import CHECKS, LEVEL, Check, CheckResult, raw_line
 from drivers.conformance.series import run_checks
 from drivers.registry import open_backend
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
-from planted_faults import PlantedFault
 from virtual_loop import Seen, run_virtual
 from wires import WIRES, far_side, patient
+
+ALL = ("serial", "modbus+tcp", "modbus+rtu", "can+slcan")
+"""Wires on which conformance of the simulated amplifier is tried."""
 
 
 async def results_at(
@@ -20,13 +20,12 @@ async def results_at(
     checks: Sequence[Check] = CHECKS,
     *,
     level: float = LEVEL,
-    process: int | None = None,
 ) -> list[CheckResult]:
-    """Results of checks on the amplifier at a URL, a process perhaps, driven at a level."""
+    """Results of checks on the amplifier at a URL, driven at a level."""
     amplifier, raw = Amplifier(open_backend(url)), raw_line(url)
     await amplifier.open()
     try:
-        return list(await run_checks(checks, amplifier, raw, level=level, process=process))
+        return list(await run_checks(checks, amplifier, raw, level=level))
     finally:
         await amplifier.close()
 
@@ -38,22 +37,12 @@ def results_on(
     *,
     seen: Seen | None = None,
     level: float = LEVEL,
-    process: int | None = None,
 ) -> list[CheckResult]:
     """Results of checks on the simulated amplifier of a rig; seen: observer of the bytes."""
 
     async def run() -> list[CheckResult]:
         live_in_memory()
         async with far_side(WIRES[wire], rig) as far:
-            return await results_at(patient(far.url), checks, level=level, process=process)
+            return await results_at(patient(far.url), checks, level=level)
 
     return run_virtual(run(), seen=seen)
-
-
-def result_of(fault: PlantedFault, wire: str, rig: Rig) -> CheckResult:
-    """The result of the check that must find a fault, on an amplifier that has it."""
-    (check,) = [check for check in CHECKS if check.name == fault.check]
-    with pytest.MonkeyPatch.context() as patch:
-        fault.plant(patch)
-        (result,) = results_on(wire, rig, [check], level=fault.level)
-    return result

@@ -32,7 +32,7 @@ from model.table.file import save_table
 from wires import FarSide
 
 ERA = Path(sys.executable).with_name("era")
-STARTING = 60.0  # s; for a loaded machine
+STARTING = 180.0  # s; for a loaded machine
 WATCHDOG, REACTION = 0.25, 0.005  # s; the longest time of an amplifier to be silent
 
 

@@ -5,8 +5,8 @@ from types import MappingProxyType
 
 import numpy as np
 
+from benchmarks.desk_plate.desk_plate import DeskPlate
 from model.arrays import Float32Array, FloatArray
-from sim.desk.desk_plate import DeskPlate
 from sim.measuring.sound_card import SoundCard
 
 BLOCK = 480

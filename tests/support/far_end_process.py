@@ -14,7 +14,7 @@ from typing import Any
 
 from model.rig.file import example_rig_path
 
-PATIENCE = 60  # s; for a loaded machine, not an expectation
+PATIENCE = 180  # s; for a loaded machine, not an expectation
 
 
 @dataclass

@@ -31,7 +31,6 @@ from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
-from planted_bugs import Plant
 from sim.bench.bench import Bench
 from sim.bench.simulated_device import SimulatedDevice
 from sim.control.context import SimulationContext
@@ -73,7 +72,7 @@ class Chain:
     """A chain to play one stream.
 
     rig, table: of the controller; truth: the rig of the plate; wires: kinds by amplifier, None for
-    sim:// of the rig's file; bug: planted in the controller.
+    sim:// of the rig's file.
     """
 
     rig: Rig
@@ -82,15 +81,12 @@ class Chain:
     wires: Mapping[str, str] | None
     rig_file: Path
     drive_mode: str | None = None
-    bug: Plant | None = None
     witness: Witness | None = field(default=None, init=False)
     _early: list[tuple[str, str, bytes]] = field(default_factory=list, init=False)
 
     def play(self, stream: Stream) -> Played:
         """Play a stream from arming to closing."""
         with pytest.MonkeyPatch.context() as patch:
-            if self.bug is not None:
-                self.bug(patch)
             patch.setattr(sim.backend, "control_socket", self._keep_context)
             return run_virtual(self._play(stream), rng=random.Random(1), seen=self._seen)
 

@@ -31,7 +31,3 @@ def running_firmware(folder: Path, *options: str) -> Iterator[tuple[str, int]]:
         assert process.stdout is not None
         yield process.stdout.readline().strip(), process.pid
         process.stdin.close()
-
-
-MACHINE = ("qemu-system-arm", "-M", "mps2-an385", "-display", "none", "-monitor", "none")
-"""QEMU's board with a Cortex-M3."""

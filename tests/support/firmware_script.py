@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_programs import MACHINE
 from model.arrays import FloatArray
 
 RATE = 16000  # samples per second
@@ -110,23 +109,3 @@ def replay(
     )
     frames = [unstuffed(part) for part in done.stdout.split(b"\0") if part]
     return _samples(path), [(frame[0], frame[5:-4]) for frame in frames[:-1]]
-
-
-def replay_on_the_machine(folder: Path, script: Script, until_ms: float) -> FloatArray:
-    """The samples of a script on the Cortex-M3 in QEMU, by its UART2."""
-    path = folder / "samples-of-uart2"
-    uarts = ["-serial", "stdio", "-serial", "null", "-serial", f"file:{path}"]
-    with subprocess.Popen(
-        [*MACHINE, "-kernel", folder / "mps2-replay.elf", *uarts],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        process.stdin.write(_text(script, until_ms))
-        process.stdin.flush()
-        replies = b""
-        while replies.count(b"\0") < 2 * (len(script) + 1):  # the last comes after the last sample
-            replies += process.stdout.read1()
-        process.terminate()
-    return _samples(path)

@@ -5,6 +5,7 @@
     unreading SOCKET COUNT    connections that subscribe to everything and read nothing
     garbage SOCKET SEED       invalid requests as fast as possible
     asking SOCKET COUNT       requests as fast as they are served, on several connections
+    again SOCKET COUNT        subscribers that connect again when they are closed, 2000 in a second
 
 All but the first run until their standard input ends; each prints `ready` once it runs.
 """
@@ -162,12 +163,40 @@ def _asking(path: str, count: str) -> None:
                 connection.send(many)
 
 
+def _again(path: str, count: str) -> None:
+    line = {"jsonrpc": "2.0", "id": 1, "method": "subscribe", "params": _SUBSCRIBE}
+    subscribe = json.dumps(line).encode() + b"\n"
+    poll = select.poll()
+    connections: dict[int, socket.socket] = {}
+    begin, made = time.monotonic(), 0
+    _print("ready")
+    while not _is_over():
+        while len(connections) < int(count) and made < 2000 * (time.monotonic() - begin):
+            connection = _connect(path)
+            with contextlib.suppress(OSError):
+                connection.sendall(subscribe)
+            connection.setblocking(False)
+            connections[connection.fileno()] = connection
+            poll.register(connection, select.POLLIN)
+            made += 1
+        for number, _ in poll.poll(1):
+            try:
+                is_open = bool(connections[number].recv(1 << 16))
+            except OSError:
+                is_open = False
+            if not is_open:
+                poll.unregister(number)
+                connections.pop(number).close()
+    _print(f"{made / (time.monotonic() - begin):.0f}")
+
+
 _KINDS = {
     "tuio": _tuio,
     "idle": _idle,
     "unreading": _unreading,
     "garbage": _garbage,
     "asking": _asking,
+    "again": _again,
 }
 
 

@@ -202,7 +202,7 @@ def _status() -> StatusResult:
         predicted_contrast_db=None,
         predicted_level_db_sl=None,
         amplifiers=[],
-        latency_ms=LatencySummary(count=0, median=None, p99=None, p999=None, histogram=[]),
+        latency_ms=LatencySummary(count=0, median=None, p99=None, p999=None, histogram=[(1.0, 0)]),
         rejected_touches={},
         uptime_s=1.0,
     )

@@ -20,7 +20,7 @@ from controller.api.client_protocol import Notification
 from model.arrays import ComplexArray, FloatArray
 from touch_stream import Place, Situation
 
-PATIENCE = 60.0  # s; for a loaded machine, not an expectation
+PATIENCE = 180.0  # s; for a loaded machine, not an expectation
 SENSORS: Mapping[str, Place] = {
     "P1": (0.03, 0.05),
     "P2": (0.20, 0.11),

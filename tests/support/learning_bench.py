@@ -24,7 +24,6 @@ from controller.daemon.log import LogThread
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
 from controller.demo.touch_row import FingerVibration, steady_contrast_db
-from controller.demo.virtual_time import VirtualTimeLoop
 from controller.learning.estimator_process import EstimatorTimeouts
 from controller.learning.learning import Learning
 from controller.learning.learning_status import LearningState
@@ -35,6 +34,7 @@ from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from rig_files import write_rig
+from virtual_sockets import VirtualSocketsLoop
 from wires import WIRES, FarSide, far_side
 
 P = ParamSpec("P")
@@ -191,7 +191,7 @@ def _never() -> bool:
     return False
 
 
-class _StandingLoop(VirtualTimeLoop):
+class _StandingLoop(VirtualSocketsLoop):
     """Virtual time that stands still while `stands` says so; sockets and pipes are served."""
 
     def __init__(self) -> None:

@@ -67,7 +67,7 @@ class Peer(asyncio.Protocol):
         self._transport.abort()
 
     async def count(self, number: int) -> None:
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(60):
             while len(self.requests) < number:
                 self._arrived.clear()
                 await self._arrived.wait()

@@ -17,6 +17,9 @@ from preloaded import ERA
 from printed import difference
 from typed_page import Edited, Interrupted, PageError, Seen, Step, Typed, Written
 
+_PROGRESS = re.compile(r"^\d+ of \d+ [a-z ]+\n", re.MULTILINE)
+"""Lines that appear where a command takes long; how many depends on the machine."""
+
 PATIENCE = 60.0  # s; for one command, on a machine that is busy with other things
 LOOK_AGAIN = 0.05  # s
 PORTS = {
@@ -64,8 +67,12 @@ class Reader:
             "COLUMNS": "100",
             "PATH": ":".join([*first, str(Path(sys.executable).parent), os.environ["PATH"]]),
             "PYTHONUNBUFFERED": "1",
-            # Figures depend by 1e-10 on the processor for which OpenBLAS is set.
-            **{name: value for name, value in os.environ.items() if name.startswith("OPENBLAS_")},
+            # Of `make test-kernels`: what processor to compute as.
+            **{
+                name: value
+                for name, value in os.environ.items()
+                if name.startswith(("OPENBLAS_", "PYTHONPATH"))
+            },
             "OPENBLAS_NUM_THREADS": "1",
             "TMPDIR": str(home),
             "XDG_CACHE_HOME": str(home / "cache"),
@@ -133,7 +140,7 @@ class Reader:
                 timeout=PATIENCE,
                 check=False,
             )
-            printed, status = printed + done.stdout, done.returncode
+            printed, status = printed + _PROGRESS.sub("", done.stdout), done.returncode
             if status:
                 break
         if status != step.status:

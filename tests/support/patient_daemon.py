@@ -1,7 +1,8 @@
 """`era` that waits for its amplifiers as long as a busy machine may take: `patient_daemon.py ...`.
 
-Its amplifiers wait as long for it. What it does is the same; what it does about silence is not,
-which other tests have as their subject.
+With `--resting` first it waits as long for news of fingers. Its amplifiers wait as long for it.
+What it does is the same; what it does about silence is not, which other tests have as their
+subject.
 """
 
 import sys
@@ -9,20 +10,31 @@ import sys
 import pytest
 
 from controller.cli.main import main
+from controller.loop.loop import Controller
+from controller.sources import contacts
+from drivers.amp_actions import _opened
 from drivers.amplifier import Amplifier
 from drivers.operation.checked_amplifier import CheckedAmplifier
 
 PROGRAM = (sys.executable, __file__)
+RESTING = (*PROGRAM, "--resting")
 REPLY_TIMEOUT = 5.0  # s; in place of 30 ms
 WATCHDOG = 2.0  # s; in place of 0.25 s, the longest of the protocol
+CONTACT_TIMEOUT = 5.0  # s; in place of 0.15 s
 
 
 def wait_long(patch: pytest.MonkeyPatch) -> None:
     """Let amplifiers be waited for, and wait, that long in this process."""
     patch.setitem(Amplifier.__init__.__kwdefaults__, "reply_timeout", REPLY_TIMEOUT)  # type: ignore[arg-type]
+    patch.setitem(_opened.__wrapped__.__kwdefaults__, "reply_timeout", REPLY_TIMEOUT)  # type: ignore[attr-defined]
     patch.setattr(CheckedAmplifier.arm, "__defaults__", (WATCHDOG,))
+    patch.setitem(Controller.__init__.__kwdefaults__, "watchdog", WATCHDOG)  # type: ignore[arg-type]
 
 
 if __name__ == "__main__":
-    wait_long(pytest.MonkeyPatch())
+    patch = pytest.MonkeyPatch()
+    wait_long(patch)
+    if sys.argv[1:2] == ["--resting"]:
+        patch.setattr(contacts, "CONTACT_TIMEOUT", CONTACT_TIMEOUT)
+        del sys.argv[1]
     sys.exit(main())

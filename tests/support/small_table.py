@@ -1,5 +1,6 @@
 """A table of the paper's plate that is built in a moment."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -22,3 +23,9 @@ def small_problem(*, nx: int = 12, ny: int = 9) -> TableProblem:
 def small_table(*, drive_mode: str = "switched") -> LocalizationTable:
     """On the paper's own mesh."""
     return build_in_parts(small_problem(), drive_mode=drive_mode).table
+
+
+def with_strokes(table: LocalizationTable, factor: float) -> LocalizationTable:
+    """The table of ERAs with other strokes, in which accelerations are in proportion."""
+    eras = tuple(replace(era, stroke=factor * era.stroke) for era in table.eras)
+    return replace(table, eras=eras)

@@ -40,7 +40,7 @@ async def running_daemon(folder: Path, url: str, *, table: Path) -> AsyncIterato
     config = folder / "daemon.yaml"
     config.write_text(
         f"rig: rig.yaml\ntable: {table}\nsocket: era.sock\nlevel_db_sl: {LEVEL_DB_SL}\n"
-        f'touch:\n  - {{name: panel, url: "tuio:127.0.0.1:{port}?timeout={PATIENCE:g}"}}\n',
+        f'touch:\n  - {{name: panel, url: "tuio:127.0.0.1:{port}?timeout=60"}}\n',
         encoding="utf-8",
     )
     process = await asyncio.create_subprocess_exec(

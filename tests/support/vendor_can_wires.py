@@ -36,7 +36,7 @@ def on_a_bus(channel: str) -> Iterator[str]:
     thread = threading.Thread(target=run, name="an amplifier from elsewhere")
     thread.start()
     try:
-        yield f"can+virtual://{channel}?heartbeat=1000#{NODE}"
+        yield f"can+python-can://virtual/{channel}?heartbeat=10000#{NODE}"
     finally:
         ending.set()
         thread.join()
@@ -68,5 +68,5 @@ async def in_virtual_time() -> AsyncIterator[str]:
     terminal = live_in_memory().make_terminal(heard, unpluggable=False)
     amplifier = VendorAmplifier(send, asyncio.get_running_loop().time)
     running = asyncio.create_task(run())
-    yield f"can+slcan://{terminal.port}?heartbeat=1000#{NODE}"
+    yield f"can+slcan://{terminal.port}?heartbeat=10000#{NODE}"
     running.cancel()

@@ -25,8 +25,8 @@ class _Selector(selectors.DefaultSelector):
         return ready
 
 
-class _Loop(asyncio.SelectorEventLoop):
-    """asyncio's own loop on a virtual clock."""
+class VirtualSocketsLoop(asyncio.SelectorEventLoop):
+    """asyncio's own loop on a virtual clock, which stands still while threads would work."""
 
     def __init__(self) -> None:
         self._virtual = _Selector()
@@ -36,10 +36,21 @@ class _Loop(asyncio.SelectorEventLoop):
         """Virtual seconds."""
         return self._virtual.now
 
+    def run_in_executor(  # type: ignore[override]
+        self, executor: Any, func: Callable[..., T], *args: Any
+    ) -> "asyncio.Future[T]":
+        """Call a function at once."""
+        future: asyncio.Future[T] = self.create_future()
+        try:
+            future.set_result(func(*args))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
 
 def run_virtual_on_sockets(main: Coroutine[Any, Any, T]) -> T:
     """As `run_virtual`, for what must have real sockets and pipes."""
-    with asyncio.Runner(loop_factory=_Loop) as runner:
+    with asyncio.Runner(loop_factory=VirtualSocketsLoop) as runner:
         return runner.run(main)
 
 

@@ -64,7 +64,6 @@ RETIRED_WORDS = {
     "patience": "_TIMEOUT",
     "(?<!at_)most|longest|usual": "MAX_, DEFAULT_",
     "persistently": "retry_while_degraded",
-    "own_time": "is_time_stepped",
     "or_less": "allow_weaker",
     "sole": "HostLock",
     "sounding": "frequencies_at",

@@ -248,10 +248,11 @@ const HANDLERS = {
 };
 
 // Play an effect at the keyboard's finger, or at the newest one.
-function play(effect) {
+async function play(effect) {
   const { rig, cursor, contacts } = overlay;
   const { x_m, y_m } = cursor ?? contacts.at(-1) ?? { x_m: rig.length_m / 2, y_m: rig.width_m / 2 };
-  call("play", { effect, x_m, y_m });
+  const result = await call("play", { effect, x_m, y_m });
+  if (result?.held_back) at("problem").textContent = `${effect}: ${result.held_back}`;
 }
 
 function opened() {

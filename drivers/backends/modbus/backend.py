@@ -12,7 +12,6 @@ import asyncio
 from collections.abc import Awaitable, Callable
 
 from drivers.backends.hardware import number_below
-from drivers.backends.host_lock import HostLock
 from drivers.backends.modbus.line import ModbusLine, modbus_line
 from drivers.backends.urls.modbus import ModbusUrl
 from drivers.backends.waiting import DUPLICATE_WAIT
@@ -26,7 +25,6 @@ from drivers.errors import LinkError, LinkTimeout
 from drivers.protocol.messages import (
     AmplifierEvent,
     AmplifierState,
-    Arm,
     Broadcast,
     Capabilities,
     Fault,
@@ -56,7 +54,6 @@ class ModbusBackend(WireBackend):
         super().__init__()
         self._url = ModbusUrl.parse(url)
         self._line: ModbusLine | None = None
-        self._host_lock = HostLock(f"{self._url.endpoint}/{self._url.unit}")
         # A random start, so that a response to an earlier run does not match.
         self._tag = number_below(_TAGS)
         self._can_read_back = True
@@ -90,19 +87,14 @@ class ModbusBackend(WireBackend):
     async def close(self) -> None:
         """Leave the line, which the last one closes."""
         line, self._line = self._line, None
-        try:
-            if line is not None:
-                await line.leave(self._url.unit)
-        finally:  # also if cancelled
-            self._host_lock.release()
+        if line is not None:
+            await line.leave(self._url.unit)
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send a request and wait for its reply; LinkTimeout, LinkError or FrameError.
 
         timeout [s]: of each transaction, extended on slow lines (see `ModbusLine`).
         """
-        if isinstance(request, Arm) and not self._url.device:
-            self._host_lock.acquire()
         self._is_exchanging = True
         try:
             reply, registers = await self._request(request, timeout)

@@ -78,10 +78,8 @@ def _open_port(name: str, baud: int, parity: str, stop: int) -> serial.Serial:
 
 def _why_not_open(port: str, error: Exception) -> str:
     remedy = remedy_of(error)
-    if remedy is None and port.startswith(("socket://", "rfc2217://")):
+    if remedy is None and port.startswith("socket://"):
         remedy = "no server there; check the address, and that the serial server runs"
-    elif remedy is None and port.startswith("hwgrep://"):
-        remedy = "no port matches; list them: python -m serial.tools.list_ports -v"
     elif remedy is None:
         remedy = "check its name, the plug, its speed and its parity"
     said = system_message(error)

@@ -1,6 +1,6 @@
 """An open serial port, read by the event loop or by a thread.
 
-The event loop watches the port's file descriptor; if there is none (RFC 2217, Windows), a thread
+The event loop watches the port's file descriptor; if there is none (as on Windows), a thread
 reads the port.
 """
 

@@ -1,6 +1,7 @@
 """CAN amplifier URLs, such as can+socketcan://can0#NODE, with the node after the hash sign.
 
-Every interface of python-can has one by its name; see also `drivers.backends.can_bus.interfaces`.
+Interfaces of python-can other than these three are can+python-can://INTERFACE/CHANNEL#NODE; see
+also `drivers.backends.can_bus.interfaces`.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from drivers.errors import CommandError
 _FORMS = (
     "can+socketcan://can0#1, can+slcan:///dev/ttyACM0?bitrate=500000#1, "
     "can+slcan://HOST:PORT#1, can+socketcand://HOST:PORT/can0#1 or "
-    "can+INTERFACE://CHANNEL#1 with an interface of python-can"
+    "can+python-can://INTERFACE/CHANNEL#1"
 )
 _OPTIONS = {  # lowest and highest
     "bitrate": (10_000, 1_000_000),
@@ -31,6 +32,10 @@ _ADAPTER_OPTIONS = {  # of python-can, passed on as they are: which of several a
     "udp_multicast": ("port",),
     "vector": ("app_name", "serial"),
 }
+
+
+_OWN_SCHEMES = ("slcan", "socketcan", "socketcand")
+"""Interfaces with a URL scheme of their own."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,10 @@ class CanBusUrl:
 
     def __str__(self) -> str:
         where = f"{self.host}:{self.port}" if self.host else ""
-        return f"can+{self.interface}://{'/'.join(part for part in (where, self.channel) if part)}"
+        scheme = self.interface
+        if scheme not in _OWN_SCHEMES:
+            scheme, where = "python-can", self.interface
+        return f"can+{scheme}://{'/'.join(part for part in (where, self.channel) if part)}"
 
 
 @dataclass(frozen=True)
@@ -72,6 +80,10 @@ class CanUrl:
         is_server = interface == "socketcand" or (interface == "slcan" and rest[:1] not in "/")
         # The names of some interfaces are no schemes for urlsplit.
         parts = split_url(f"can://{rest}", kind="a CAN", forms=_FORMS, has_port=is_server)
+        if interface == "python-can":
+            interface = parts.netloc
+            if not interface or interface in _OWN_SCHEMES:
+                raise CommandError(f"{url!r} must name an interface; use {_FORMS}")
         adapter_options = _ADAPTER_OPTIONS.get(interface, ())
         known = (*_OPTIONS, *adapter_options)
         options = options_of(parts.query, known=known, url=url, kind="a CAN")
@@ -86,7 +98,7 @@ class CanUrl:
                 channel, rest = parts.path.strip("/"), "" if port else "no port"
                 host = parts.hostname or ""
             case _:
-                channel, rest = device_of(unquote(parts.netloc + parts.path)), ""
+                channel, rest = unquote(parts.path[1:]), ""
         is_named = not channel if is_server and interface == "slcan" else channel.strip("/")
         if not is_named or rest or (is_server and not host):
             raise CommandError(f"{url!r} must name the bus; use {_FORMS}")

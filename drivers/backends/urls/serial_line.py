@@ -1,9 +1,7 @@
 """Serial amplifier URLs.
 
 serial:///dev/ttyUSB0?baud=921600&address=1     a port of this machine
-socket://HOST:PORT (or serial://HOST:PORT)      a serial server with raw TCP
-rfc2217://HOST:PORT?baud=115200                 a serial server with RFC 2217
-hwgrep://0403:6001                              the port whose description matches
+serial+tcp://HOST:PORT                          a serial server with raw TCP
 """
 
 from dataclasses import dataclass
@@ -13,7 +11,7 @@ from drivers.backends.urls.options import device_of, options_of, split_url, whol
 from drivers.errors import CommandError
 from drivers.protocol.definition import PROTOCOL
 
-_FORM = "serial:///dev/ttyUSB0?baud=921600 (or serial://HOST:PORT for a serial server)"
+_FORM = "serial:///dev/ttyUSB0?baud=921600 (or serial+tcp://HOST:PORT for a serial server)"
 _BAUD_MAX = 12_000_000  # the fastest USB adapters
 
 
@@ -28,13 +26,12 @@ class SerialUrl:
     @property
     def is_local(self) -> bool:
         """Whether the port is a line to the amplifier without a server in between."""
-        return not self.port.startswith(("socket://", "rfc2217://"))
+        return not self.port.startswith("socket://")
 
     @classmethod
     def parse(cls, url: str) -> "SerialUrl":
         """Parse a URL; CommandError names the invalid part."""
-        is_pattern = url.startswith("hwgrep:")
-        parts = split_url(url, kind="a serial", forms=_FORM, has_port=not is_pattern)
+        parts = split_url(url, kind="a serial", forms=_FORM)
         if parts.fragment:
             raise CommandError(
                 f"{url!r}: a serial URL must not contain #; write ?address={parts.fragment} for "
@@ -42,17 +39,11 @@ class SerialUrl:
             )
         options = options_of(parts.query, known=("baud", "address"), url=url, kind="a serial")
         path = unquote(parts.path)
-        if is_pattern:
-            pattern = unquote(parts.netloc) + path
-            if not pattern:
-                raise CommandError(f"{url!r} must name a pattern; use hwgrep://VENDOR:PRODUCT")
-            port = f"hwgrep://{pattern}"
-        elif parts.netloc:
+        if parts.scheme == "serial+tcp":
             if parts.hostname is None or parts.port is None or path.strip("/"):
                 raise CommandError(f"{url!r} must name a host and port; use {_FORM}")
-            kind = "rfc2217" if parts.scheme == "rfc2217" else "socket"
-            port = f"{kind}://{parts.netloc}"
-        elif path.strip("/"):
+            port = f"socket://{parts.netloc}"
+        elif path.strip("/") and not parts.netloc:
             port = device_of(path)
         else:
             raise CommandError(f"{url!r} must name a port; use {_FORM}")

@@ -5,26 +5,20 @@
 #include "modbus_tcp.h"
 #include "line.h"
 #include "loop.h"
+#include "mbap.h"
 
 #include <errno.h>
 #include <fcntl.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
-#include <string.h>
 #include <sys/socket.h>
 #include <unistd.h>
-
-// A frame: transaction u16, protocol u16 (0), length u16 of what follows, unit u8, PDU.
-#define HEADER 7
-#define FRAME_MAX (HEADER + MODBUS_PDU_MAX)
-#define ANY_UNIT 255
 
 static int listening = -1;
 
 static struct host {
     int connection; // 0: none
-    uint8_t received[FRAME_MAX];
-    uint16_t length;
+    struct mbap mbap;
 } hosts[TCP_HOSTS];
 
 uint16_t tcp_open(uint16_t port)
@@ -43,46 +37,18 @@ void tcp_watch(struct pollfd watched[TCP_WATCHED])
     watched[TCP_HOSTS].events = POLLIN;
 }
 
-static void answer(struct modbus *modbus, struct host *host, uint16_t size)
+static void send_frame(int connection, const uint8_t *frame, uint16_t length)
 {
-    uint8_t reply[FRAME_MAX];
-    uint8_t unit = host->received[6] == ANY_UNIT ? modbus->unit : host->received[6];
-    uint16_t length = modbus_request(modbus, unit, host->received + HEADER,
-                                     (uint16_t)(size - HEADER), reply + HEADER);
-    if (length == 0)
-        return;
-    memcpy(reply, host->received, HEADER); // transaction, protocol and unit are the request's
-    reply[4] = (uint8_t)((length + 1) >> 8);
-    reply[5] = (uint8_t)(length + 1);
-    if (send(host->connection, reply, (size_t)(HEADER + length), MSG_NOSIGNAL) < 0)
+    if (send(connection, frame, length, MSG_NOSIGNAL) < 0)
         return; // a host that does not read loses replies; one that is gone is noticed below
-}
-
-// Answer the whole frames that have arrived. What is no frame is discarded with all that came with it.
-static void take_frames(struct modbus *modbus, struct host *host)
-{
-    while (host->length >= HEADER) {
-        uint16_t following = (uint16_t)(host->received[4] << 8 | host->received[5]);
-        bool is_frame = host->received[2] == 0 && host->received[3] == 0 && following >= 2 &&
-                        following <= MODBUS_PDU_MAX + 1;
-        uint16_t size = (uint16_t)(6 + following);
-        if (!is_frame) {
-            host->length = 0;
-            return;
-        }
-        if (host->length < size)
-            return;
-        answer(modbus, host, size);
-        host->length = (uint16_t)(host->length - size);
-        memmove(host->received, host->received + size, host->length);
-    }
 }
 
 static void take(struct modbus *modbus, struct host *host)
 {
     for (;;) {
-        ssize_t size = recv(host->connection, host->received + host->length,
-                            sizeof host->received - host->length, 0);
+        struct mbap *mbap = &host->mbap;
+        ssize_t size = recv(host->connection, mbap->received + mbap->length,
+                            sizeof mbap->received - mbap->length, 0);
         if (size < 0 && (errno == EAGAIN || errno == EINTR))
             return;
         if (size <= 0) {
@@ -90,9 +56,9 @@ static void take(struct modbus *modbus, struct host *host)
             host->connection = 0;
             return;
         }
-        host->length = (uint16_t)(host->length + size);
+        mbap->length = (uint16_t)(mbap->length + size);
         loop_samples();
-        take_frames(modbus, host);
+        mbap_take(mbap, modbus, send_frame, host->connection);
     }
 }
 
@@ -106,7 +72,7 @@ static void accept_host(void)
         // A reply must not wait for the acknowledgement of the one before.
         setsockopt(connection, IPPROTO_TCP, TCP_NODELAY, &yes, sizeof yes);
         hosts[i].connection = connection;
-        hosts[i].length = 0;
+        hosts[i].mbap.length = 0;
         return;
     }
     if (connection > 0)

@@ -17,7 +17,7 @@ _MBAP = struct.Struct(">HHHB")  # transaction, protocol, length, unit
 _LENGTH_MAX = 254
 _MIN_LENGTH = 4  # unit, function, CRC
 _MAX_LENGTH = 256
-_SIZES = {3: 8, 4: 8, 6: 8, 43: 7}  # of RTU requests, by function
+_SIZES = {3: 8, 4: 8, 6: 8}  # of RTU requests, by function
 _COUNTS = {16: 6, 23: 10}  # where the others say how many bytes of registers follow
 
 

@@ -38,7 +38,6 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
-from sim.far_ends.modbus.identification import IDENTIFY, identification
 from sim.far_ends.modbus.pdu import (
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
@@ -195,8 +194,6 @@ class ModbusUnit:
             check_range(*wanted, end=_END)
             self._write(*to_write(READ_WRITE, body[4:]))
             return registers_read(function, self._read(*wanted))
-        if function == IDENTIFY and body[:1] == b"\x0e":
-            return identification(body, self._query(Hello(), Identity))
         raise ModbusException(ILLEGAL_FUNCTION)
 
     def _exchange(self, request: Request) -> Reply:

@@ -1,13 +1,19 @@
 """Bounds of one connection, to the byte and the request, in virtual time."""
 
 import asyncio
+import contextlib
 import json
+import os
+import resource
+import socket
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import cast
 
 import pytest
 
+from controller.api.acceptor import Acceptor
 from controller.api.admission import MAX_CONNECTIONS, Admission
 from controller.api.connection import MAX_REQUEST_RATE, MAX_UNREAD_BYTES, Connection
 from controller.api.hub import Hub
@@ -25,9 +31,10 @@ async def iterate() -> None:
         await asyncio.sleep(0)
 
 
-def connect(now: Callable[[], float]) -> tuple[Connection, Wire]:
-    """A connection and its transport."""
+def connect(now: Callable[[], float], *, process: int = 1) -> tuple[Connection, Wire]:
+    """A connection of a process and its transport."""
     connection = Connection(
+        process,
         on_connect=lambda one: None,
         on_lines=lambda one: None,
         on_disconnect=lambda one: None,
@@ -69,7 +76,7 @@ def serve(served: list[str]) -> tuple[ApiServer, Connection, Wire]:
         clock=lambda: 0.0,
         processor_time=lambda: 0.0,
     )
-    connection, wire = server._make_connection(), Wire()
+    connection, wire = server._make_connection(1), Wire()
     connection.connection_made(wire)
     return server, connection, wire
 
@@ -196,6 +203,99 @@ def test_place_is_taken_from_the_silent_then_idle_subscribers_then_the_idle(
     assert new.is_reserve is (dropped is None)
     gone = [number for number, (one, _) in enumerate(made) if one not in admission.admitted]
     assert gone == ([] if dropped is None else [dropped])
+
+
+@pytest.mark.parametrize("processes", [1, 20])
+def test_client_in_reserve_survives_processes_that_connect_again_and_again(
+    processes: int,
+) -> None:
+    """Neither before its first bytes were read nor after, if they hold more of the reserve.
+
+    However many processes there are, none evicts a client whose first bytes wait to be read.
+    """
+    now = 0.0
+    admission = Admission(
+        holds_lease=lambda one: not one.is_reserve,
+        is_subscribed=lambda one: True,
+        clock=lambda: now,
+    )
+
+    def newcomers(count: int) -> None:
+        nonlocal now
+        for number in range(count):
+            now += 0.0005
+            one, _ = connect(lambda now=now: now, process=number % processes)
+            one.has_been_read = one.has_spoken = True
+            admission.admit(one)
+
+    newcomers(2000)
+    near, far = socket.socketpair()
+    with near, far:
+        own, wire = connect(lambda: now, process=4711)
+        wire._extra = {"socket": near}
+        admission.admit(own)
+        assert own in admission.admitted
+        far.send(b"{")
+        newcomers(2000)
+        assert own in admission.admitted
+        own.data_received(near.recv(10))
+        newcomers(2000 if processes == 1 else 0)
+        assert own in admission.admitted
+
+
+async def test_server_refuses_connections_of_a_process_above_a_rate(tmp_path: Path) -> None:
+    """After 64 at once the next is closed; a twentieth of a second later one is accepted."""
+    now = 0.0
+    bound = socket.socket(socket.AF_UNIX)
+    bound.bind(str(tmp_path / "s"))
+    made: list[Connection] = []
+
+    def make(process: int) -> Connection:
+        assert process == os.getpid()
+        made.append(connect(lambda: now)[0])
+        return made[-1]
+
+    acceptor = Acceptor(bound, make, clock=lambda: now)
+    with contextlib.ExitStack() as stack:
+        stack.callback(acceptor.close)
+
+        async def is_accepted() -> bool:
+            client = stack.enter_context(socket.socket(socket.AF_UNIX))
+            client.setblocking(False)
+            before = len(made)
+            client.connect(str(tmp_path / "s"))
+            while len(made) == before:
+                with contextlib.suppress(BlockingIOError):
+                    return bool(client.recv(1))
+                await asyncio.sleep(0)
+            return True
+
+        assert [await is_accepted() for _ in range(65)] == [True] * 64 + [False]
+        now = 0.05
+        assert [await is_accepted() for _ in range(2)] == [True, False]
+        for each in made:
+            each.abort()
+        await iterate()
+
+
+async def test_server_without_descriptors_closes_new_connections(tmp_path: Path) -> None:
+    """The client reads the end in place of waiting."""
+    bound = socket.socket(socket.AF_UNIX)
+    bound.bind(str(tmp_path / "s"))
+    acceptor = Acceptor(bound, lambda process: connect(lambda: 0.0)[0], clock=lambda: 0.0)
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with socket.socket(socket.AF_UNIX) as client:
+        client.setblocking(False)
+        client.connect(str(tmp_path / "s"))
+        free = os.open(os.devnull, os.O_RDONLY)
+        os.close(free)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (free, before[1]))
+        try:
+            received = await asyncio.get_running_loop().sock_recv(client, 1)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, before)
+        assert received == b""
+    acceptor.close()
 
 
 async def test_hub_survives_an_exception_of_a_producer(caplog: pytest.LogCaptureFixture) -> None:

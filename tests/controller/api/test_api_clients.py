@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import inspect
 import json
 import os
@@ -20,7 +21,7 @@ import pytest
 import controller
 from controller.api.async_client import AsyncClient
 from controller.api.client import Client
-from controller.api.client_protocol import LeaseLost, Unreachable
+from controller.api.client_protocol import ConnectionLost, LeaseLost, Unreachable
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError, event_line
 from controller.api.methods import METHODS
 from controller.api.peer import check_peer
@@ -162,27 +163,34 @@ HELLO = b'{"jsonrpc":"2.0","id":1,"result":{"api_version":"1.0"}}\n'
 
 
 @contextlib.contextmanager
-def responding(path: Path, *answers: bytes, rest: bytes = b"") -> Iterator[None]:
-    """A server that answers its client's requests in turn, then closes, or repeats the rest."""
+def responding(path: Path, *answers: bytes, rest: bytes = b"") -> Iterator[list[bytes]]:
+    """A server that answers each client's requests in turn, then closes, or repeats the rest.
+
+    Yields the requests.
+    """
+    received: list[bytes] = []
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(path))
         server.listen()
 
+        def serve(client: socket.socket) -> None:
+            with client, contextlib.suppress(OSError):
+                for answer in answers or [b""]:
+                    received.append(client.recv(1000))
+                    client.sendall(answer)
+                while rest:
+                    client.sendall(rest)
+                    time.sleep(0.01)
+
         def respond() -> None:
             with contextlib.suppress(OSError):
-                client, _ = server.accept()
-                with client:
-                    for answer in answers or [b""]:
-                        client.recv(1000)
-                        client.sendall(answer)
-                    while rest:
-                        client.sendall(rest)
-                        time.sleep(0.01)
+                while True:
+                    serve(server.accept()[0])
 
         thread = threading.Thread(target=respond)
         thread.start()
-        yield
-        server.close()
+        yield received
+        server.shutdown(socket.SHUT_RDWR)
         thread.join()
 
 
@@ -221,6 +229,70 @@ async def test_connect_raises_an_error_without_id(tmp_path: Path) -> None:
     for error in await connect_error(tmp_path, busy):
         assert isinstance(error, RpcError)
         assert error.code is ErrorCode.BUSY
+
+
+def test_client_subscribes_again_with_the_rate_of_each_topic(tmp_path: Path) -> None:
+    """A later subscription to another topic does not change it."""
+    done = b'{"jsonrpc":"2.0","id":%d,"result":{}}\n'
+    with (
+        responding(tmp_path / "s", HELLO, done % 2, done % 3) as received,
+        Client.connect(tmp_path / "s") as era,
+    ):
+        era.subscribe("amplifiers", rate_hz=2.0)
+        era.subscribe("state")
+        with pytest.raises(ConnectionLost):
+            era.status()
+    subscriptions = [
+        (params["topics"], params.get("rate_hz"))
+        for line in received
+        if (params := json.loads(line)["params"]).get("topics")
+    ]
+    assert subscriptions[:4] == 2 * [(["amplifiers"], 2.0), (["state"], None)]
+
+
+@pytest.mark.parametrize(
+    ("method", "is_repeated"),
+    [("stop", True), ("status", True), ("clear", False), ("play", False), ("arm", False)],
+)
+def test_request_is_repeated_when_the_connection_is_lost_if_that_is_harmless(
+    tmp_path: Path, method: str, is_repeated: bool
+) -> None:
+    """A stop is; what could undo a stop of another client, or be felt twice, is sent once."""
+    arguments = {"play": ("tap", PLACE), "arm": ("me",)}.get(method, ())
+    with (
+        responding(tmp_path / "s", HELLO, b"") as received,
+        Client.connect(tmp_path / "s") as era,
+        pytest.raises(ConnectionLost),
+    ):
+        getattr(era, method)(*arguments)
+    sent = [json.loads(line)["method"] for line in received]
+    assert (sent.count(method) > 1) is is_repeated
+
+
+async def test_client_waits_while_the_queue_of_the_daemon_is_full(tmp_path: Path) -> None:
+    """A full queue is neither a connection nor a process of a wrong owner."""
+    with socket.socket(socket.AF_UNIX) as server, contextlib.ExitStack() as stack:
+        server.bind(str(tmp_path / "s"))
+        server.listen(0)
+        server.setblocking(False)
+        problem = 0
+        while problem != errno.EAGAIN:
+            client = stack.enter_context(socket.socket(socket.AF_UNIX))
+            client.setblocking(False)
+            problem = client.connect_ex(str(tmp_path / "s"))
+        connecting = asyncio.create_task(AsyncClient.connect(tmp_path / "s"))
+        for _ in range(3):
+            await asyncio.sleep(0)
+        assert not connecting.done()
+        server.accept()[0].close()
+        loop = asyncio.get_running_loop()
+        accepting = asyncio.create_task(loop.sock_accept(server))
+        await asyncio.wait({accepting, connecting}, return_when=asyncio.FIRST_COMPLETED)
+        assert not connecting.done()
+        accepted, _ = await accepting
+        with accepted:
+            await loop.sock_sendall(accepted, HELLO)
+            await (await connecting).close()
 
 
 def test_calls_end_within_the_timeout(tmp_path: Path) -> None:
@@ -285,20 +357,18 @@ def test_client_refuses_invalid_arguments(tmp_path: Path) -> None:
     ],
 )
 def test_peer_is_believed_only_as_root_caller_or_service(
-    monkeypatch: pytest.MonkeyPatch, folder: int, file: int, process: int, is_trusted: bool
+    folder: int, file: int, process: int, is_trusted: bool
 ) -> None:
     """Folder, socket and process have one owner, who is one of the three."""
     users = {"/run/x": folder, "/run/x/era.sock": file}
     found = dict.fromkeys(("st_mode", "st_ino"), 0)
-    monkeypatch.setattr(
-        Path, "stat", lambda path: SimpleNamespace(st_uid=users[str(path)], **found)
-    )
-    monkeypatch.setattr("os.geteuid", lambda: 1000)
-    monkeypatch.setattr("pwd.getpwnam", lambda name: SimpleNamespace(pw_uid={"plate": 990}[name]))
     credentials = struct.pack("3i", 4711, process, process)
     connected = cast(socket.socket, SimpleNamespace(getsockopt=lambda *_: credentials))
     expected = contextlib.nullcontext() if is_trusted else pytest.raises(Unreachable, match="ERA_")
-    with expected:
+    with pytest.MonkeyPatch.context() as patch, expected:  # pytest itself reports by Path.stat
+        patch.setattr(Path, "stat", lambda path: SimpleNamespace(st_uid=users[str(path)], **found))
+        patch.setattr("os.geteuid", lambda: 1000)
+        patch.setattr("pwd.getpwnam", lambda name: SimpleNamespace(pw_uid={"plate": 990}[name]))
         check_peer(Path("/run/x/era.sock"), connected, environment={"ERA_HAPTICS_USER": "plate"})
 
 

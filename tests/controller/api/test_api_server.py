@@ -280,14 +280,23 @@ async def test_control_loop_runs_between_iterations(
     assert order[:4] == ["status", "touch", "command", "status"]
 
 
-async def test_stop_is_served_among_silent_and_asking_clients(served: Served) -> None:
-    """With 160 silent connections after 32 that ask: a place in reserve stops, but does not arm."""
+async def test_stop_is_served_among_silent_and_asking_clients(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With 160 silent connections after 32 that ask: a place in reserve stops, but does not arm.
+
+    They are those of another process.
+    """
+    process = 1
+    monkeypatch.setattr("controller.api.acceptor.credentials_of", lambda _: (process, 0))
     asking = [await served.connect() for _ in range(32)]
     for wire in asking:
         wire.call("effects")
         assert "result" in await wire.line()
     for _ in range(160):
         await served.connect()
+    await iterate(200)
+    process = 2
     wire = await served.connect()
     for method in ("effects", "hello", "status", "stop", "disarm"):
         wire.call(method, '{"client":"me"}' if method == "hello" else "{}")
@@ -298,6 +307,12 @@ async def test_stop_is_served_among_silent_and_asking_clients(served: Served) ->
     await until(lambda: served.disconnected)
     wire.call("effects")
     assert "result" in await wire.line()  # there is a place for all methods now
+
+
+async def iterate(count: int) -> None:
+    """Run the event loop for some iterations."""
+    for _ in range(count):
+        await asyncio.sleep(0)
 
 
 async def test_client_that_does_not_read_loses_notifications_then_the_connection(

@@ -46,7 +46,7 @@ class Served:
             processor_time=lambda: self._processor_time,
         )
         self.began_at = self._loop.time()
-        self._client = server._make_connection()
+        self._client = server._make_connection(1)
         self._client.connection_made(Wire())
 
     def receive(self, data: bytes) -> None:

@@ -18,7 +18,7 @@ from controller.api.schema import Empty
 from controller.api.topics import TOPICS, EventParams
 from controller.gateway.daemon_link import DaemonLink
 from controller.gateway.mirror import FIELD, DaemonMirror
-from daemon_bench import PLACE, running_daemon, until, until_state
+from daemon_bench import PLACE, holding, running_daemon, until, until_state
 
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 MAPPINGS = ("drive", "rejected_touches", "parameters", "layout")  # keyed by name, not messages
@@ -88,8 +88,7 @@ async def test_extra_keys_of_a_later_minor_version_are_ignored(tmp_path: Path) -
             await until(lambda: FIELD in frames)
             empty = frames[FIELD]
             await era.subscribe("pattern")
-            async with era.armed("me"), asyncio.timeout(20):
-                await era.touch([PLACE])
+            async with era.armed("me"), holding(era, PLACE), asyncio.timeout(60):
                 async for event in era.events():
                     assert "extra" in event.data["contacts"][0]
                     assert "extra" in next(iter(event.data["drive"].values()))
@@ -129,7 +128,7 @@ async def test_daemon_sends_exactly_the_documented_keys(tmp_path: Path) -> None:
             assert response.keys() == {"jsonrpc", "id", "result"}, response
             METHODS[method].result.model_validate_json(json.dumps(response["result"]))
 
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             await call("hello", client="me")
             await call("subscribe", topics=topics, rate_hz=60.0)
             await call("effects")

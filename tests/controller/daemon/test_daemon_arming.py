@@ -97,7 +97,8 @@ async def test_daemon_disarms_when_arming_client_left(
         released.set()
         with pytest.raises((asyncio.CancelledError, LinkError)):
             await using
-        await until_state(era, READY)
+        async with asyncio.timeout(20):  # before the lease would end by itself
+            await until_state(era, READY)
         assert (await era.status()).armed_by is None
         assert bench.far.device.status().state is AmplifierState.SWITCH_ON_DISABLED
 
@@ -123,7 +124,7 @@ async def test_reload_ends_after_unexpected_error(
 
 
 async def test_shutdown_cancels_reload(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Touch sources of a configuration that is still being read are not opened."""
+    """One whose configuration is still being read applies nothing."""
     async with running_daemon(tmp_path) as bench:
         daemon, is_reading = bench.daemon, asyncio.Event()
 

@@ -10,14 +10,12 @@ from datetime import datetime
 from pathlib import Path
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from controller.api.client_protocol import Notification
 from controller.api.jsonrpc import RpcError
 from controller.cli.daemon import app, show_event, show_status, status, touch
 from controller.daemon.run import run_daemon
-from controller.metrics.__main__ import serve
 from daemon_bench import holding, ready_daemon, until, until_state, write_daemon
 from drivers.errors import CommandError
 from model.errors import InputError
@@ -125,6 +123,15 @@ def test_daemon_does_not_start_when_log_not_writable(tmp_path: Path) -> None:
     assert not (tmp_path / "era.sock").exists()
 
 
+def test_daemon_refuses_to_start_with_few_descriptors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Below 64 its own files and 40 clients would use them up."""
+    monkeypatch.setattr("controller.daemon.run.allow_many_descriptors", lambda: 63)
+    with pytest.raises(InputError, match="64, got 63"):
+        run_daemon(write_daemon(tmp_path, {"main": "sim://"}), dashboard=None)
+
+
 def test_daemon_refuses_pipe_as_log_or_trace(tmp_path: Path) -> None:
     """A named pipe is not waited for, whether it is read or not."""
     pipe = tmp_path / "pipe"
@@ -139,20 +146,6 @@ def test_daemon_refuses_pipe_as_log_or_trace(tmp_path: Path) -> None:
             run_daemon(write_daemon(tmp_path, {"main": "sim://"}), dashboard=None, trace=pipe)
         if is_read:
             os.close(reader)
-
-
-def test_metrics_exit_when_port_taken(capsys: pytest.CaptureFixture[str]) -> None:
-    """Exit status 2 with the port and the key to change."""
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        with pytest.raises(typer.Exit) as caught:
-            serve(port)
-    assert caught.value.exit_code == 2
-    message = capsys.readouterr().err
-    assert str(port) in message
-    assert "`metrics`" in message
 
 
 def test_daemon_imports_no_package_of_other_commands() -> None:

@@ -15,8 +15,11 @@ from model.commands.config_cli import config_app
 from model.config.document import ConfigError
 from model.errors import InputError
 from model.rig.file import example_rig_path
+from rig_files import TWO_AMPLIFIERS, write_rig
 
 RUNNER = CliRunner()
+EXAMPLES = Path(__file__).parents[3] / "examples"
+SERIAL = 'side: {url: "serial:///dev/ttyUSB0"}'
 
 
 @pytest.fixture
@@ -83,7 +86,6 @@ def test_config_reports_all_problems_at_once(folder: Path) -> None:
         '  - {name: d, url: "tuio:3333", calibration: {matrix: [[1,0,0],[1,0,0]]}}\n'
         "log: {level: loud}\n"
         "dashboard: 0.0.0.0:80\n"
-        "metrics: 65536\n"
         "longest_lease: 61 s\n"
         "touch_wait: 101 ms\n",
         rig="rigg.yaml",
@@ -100,9 +102,8 @@ def test_config_reports_all_problems_at_once(folder: Path) -> None:
         (10, "touch[4].calibration"),
         (11, "log.level"),
         (12, "dashboard"),
-        (13, "metrics"),
-        (14, "longest_lease"),
-        (15, "touch_wait"),
+        (13, "longest_lease"),
+        (14, "touch_wait"),
     ]
 
 
@@ -164,6 +165,22 @@ def test_config_refuses_rig_that_does_not_support_its_plate(folder: Path) -> Non
     lines = rig.read_text("utf-8").splitlines(keepends=True)
     rig.write_text("".join(line for line in lines if line[:5] not in ("  NE:", "  NW:")), "utf-8")
     assert problems(written(folder)) == [(1, "rig")]
+
+
+@pytest.mark.parametrize("name", ["car_display", "table"])
+def test_example_with_several_simulated_amplifiers_is_accepted(name: str) -> None:
+    """With its layout; all amplifiers are of one rig."""
+    config = load_daemon_config(EXAMPLES / f"{name}_daemon.yaml")
+    rig = EXAMPLES.resolve() / f"{name}.yaml"
+    assert len(config.urls) > 2
+    assert config.urls == {each: f"sim://{rig}?amplifier={each}" for each in config.urls}
+    assert config.layout is not None
+
+
+def test_config_refuses_simulated_amplifiers_beside_others(tmp_path: Path) -> None:
+    """A plate is simulated as a whole or not at all."""
+    write_rig(tmp_path / "rig.yaml", *TWO_AMPLIFIERS, ('side: {url: "sim://"}', SERIAL))
+    assert problems(written(tmp_path)) == [(1, "rig")]
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,32 @@
 """The arming lease: duration, owner, token."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.daemon.lease import LeaseHolder
+from daemon_bench import ready_daemon
+
+
+async def test_client_that_arms_after_the_end_of_a_lease_inherits_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the end of a lease and its event: disarmed first, then armed anew."""
+    async with ready_daemon(tmp_path) as (bench, era):
+        api = bench.daemon._api
+        monkeypatch.setattr(api, "_check_lease", lambda: None)  # its event comes later
+        states: list[str] = []
+        await era.arm("me", lease_s=60)
+        monkeypatch.setattr(api._lease, "_lease", replace(api._lease._lease, expires_at=0.0))
+        monkeypatch.setattr(
+            bench.daemon._publisher, "state_changed", lambda old, new: states.append(new.state.name)
+        )
+        async with await bench.client() as other:
+            await other.arm("you", lease_s=60)
+            assert (await other.status()).state == "OPERATION_ENABLED"
+        assert "READY_TO_SWITCH_ON" in states
 
 
 def test_lease_lasts_its_duration_from_each_renewal() -> None:

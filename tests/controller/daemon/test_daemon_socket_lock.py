@@ -1,5 +1,6 @@
 """The daemon's socket: reserved for one daemon, with permissions, in a safe place."""
 
+import errno
 import os
 import socket
 import subprocess
@@ -87,6 +88,19 @@ def test_socket_lock_refuses_second_daemon(tmp_path: Path) -> None:
         other.release()
         assert first.path.is_socket()
     first.release()
+
+
+def test_socket_lock_says_that_a_file_system_has_no_locks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As over a network; it is no second daemon."""
+
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr("fcntl.flock", no_locks)
+    with pytest.raises(InputError, match=os.strerror(errno.ENOLCK)):
+        SocketLock(tmp_path / "era.sock")
 
 
 @pytest.mark.parametrize("kind", ["link", "pipe", "foreign"])

@@ -187,19 +187,19 @@ def test_unexpected_exception_is_latched(state: DaemonState) -> None:
         assert (after.state, after.cause) == (DaemonState.FAULT, "a bug")
 
 
-def test_step_requires_new_acknowledgement_after_fault() -> None:
-    """A failed read-back revokes the acknowledgement."""
+@pytest.mark.parametrize("trigger", [Trigger.FAULT, Trigger.STOP])
+def test_step_requires_new_acknowledgement_after_fault_and_stop(trigger: Trigger) -> None:
+    """Either revokes the acknowledgement, while the amplifiers are being read back for it."""
     fault = StateMachine(DaemonState.FAULT, "arc", is_latched=True)
     seen, actions = step(fault, DaemonEvent(Trigger.CLEAR), 0)
     assert actions == (Action.CLEAR,)
-    still, _ = step(seen, DaemonEvent(Trigger.FAULT, "arc again"), 0)
-    assert actions == (Action.CLEAR,)
-    assert (still.state, still.cause) == (DaemonState.FAULT, "arc again")
+    still, _ = step(seen, DaemonEvent(trigger, "again"), 0)
     assert step(still, DaemonEvent(Trigger.VERIFIED), 0)[0].state is DaemonState.FAULT
     assert (
         step(seen, DaemonEvent(Trigger.VERIFIED, "cleared"), 0)[0].state
         is DaemonState.SWITCH_ON_DISABLED
     )
+    assert still.cause == ("again" if trigger is Trigger.FAULT else "arc")
 
 
 events = st.lists(st.tuples(st.sampled_from(Trigger), st.floats(0, 0.5)), min_size=1, max_size=40)

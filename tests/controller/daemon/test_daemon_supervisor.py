@@ -101,9 +101,14 @@ def status(state: AmplifierState, fault: Fault = Fault.NONE, level: float = 0.0)
 
 
 @asynccontextmanager
-async def watched() -> AsyncIterator[Watched]:
-    """A supervisor with a running control loop, which must end when it is closed."""
+async def watched(*, refuses: bool = False) -> AsyncIterator[Watched]:
+    """A supervisor with a running control loop, which must end when it is closed.
+
+    refuses: whether the amplifier refuses all requests at first.
+    """
     bench = make_bench()
+    if refuses:
+        bench.far_end.answer = lambda request: Nak(NakCode.BUSY)
     amplifiers = {"main": Amplifier(bench.far_end)}
     loop = asyncio.get_running_loop()
 
@@ -142,6 +147,17 @@ def slow_down(controller: Controller, *, stop: float) -> None:
         await asyncio.sleep(stop)
 
     controller.stop = slow_stop
+
+
+@in_virtual_time
+async def test_amplifier_that_refuses_at_the_start_is_opened_again_later() -> None:
+    """The daemon serves meanwhile, as while none replies."""
+    async with watched(refuses=True) as daemon:
+        assert daemon.state is DaemonState.COMM_LOST
+        daemon.obey()
+        await asyncio.sleep(1)
+        assert {*daemon.links} == {"retry", "reopened"}
+        assert daemon.state is DaemonState.READY_TO_SWITCH_ON
 
 
 @in_virtual_time

@@ -81,3 +81,25 @@ async def test_mirror_reconnects_after_an_event_it_does_not_understand(
     following.cancel()
     await asyncio.gather(following, return_exceptions=True)
     assert "update the older of daemon and gateway" in caplog.text
+
+
+async def test_mirror_goes_on_without_the_field_when_drawing_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bug in the picture must not end the gateway with its stop button."""
+    frames: asyncio.Queue[str] = asyncio.Queue()
+    mirror = DaemonMirror(tmp_path / "nowhere", publish=lambda topic, _: frames.put_nowait(topic))
+
+    def fail(*_: object) -> bytes:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(mirror, "_field", fail)
+    following = asyncio.create_task(mirror.run())
+    for _ in range(2):
+        mirror._field_due.set()
+        getting = asyncio.create_task(frames.get())
+        await asyncio.wait({getting, following}, return_when=asyncio.FIRST_COMPLETED)
+        assert not following.done()
+        assert getting.result() == "field"
+    following.cancel()
+    await asyncio.wait({following})

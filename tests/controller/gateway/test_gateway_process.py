@@ -1,6 +1,7 @@
 """`era gateway` as a process: how it begins, what it refuses, TLS, and its end within a second."""
 
 import asyncio
+import errno
 import os
 import signal
 import socket
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from controller.gateway.cli import gateway as gateway_command
-from controller.gateway.serving import check_certificate, listen
+from controller.gateway.serving import check_certificate, listen, serve
 from controller.gateway.settings import Settings, read_token
 from gateway_bench import (
     TOKEN,
@@ -276,3 +277,20 @@ def test_settings_show_and_allow_the_address_listened_on() -> None:
     )  # type: ignore[arg-type]
     assert panel.shown_host == "panel.local"
     assert settings.allowed_names == {"localhost", "127.0.0.1", "[::1]", "127.0.0.2"}
+
+
+async def test_gateway_starts_where_its_priority_cannot_be_lowered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As within the system service, whose filter of system calls forbids it."""
+
+    def forbidden(_: int) -> int:
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+    def reached(_: object) -> None:
+        raise InputError("reached")
+
+    monkeypatch.setattr("os.nice", forbidden)
+    monkeypatch.setattr("controller.gateway.serving.check_certificate", reached)
+    with pytest.raises(InputError, match="reached"):
+        await serve(Settings(socket=Path("era.sock")), announce=lambda port: None)

@@ -274,6 +274,57 @@ async def test_controller_silences_before_a_due_heartbeat() -> None:
             assert lifted < far_end.times(Apply)[-1] < far_end.times(Ping)[-1]
 
 
+@pytest.mark.parametrize("later", range(3))
+@in_virtual_time
+async def test_lift_as_a_set_is_confirmed_precedes_a_due_heartbeat(later: int) -> None:
+    """In whichever of the last iterations of the event loop before the exchange ends it comes."""
+    async with running("a", "b") as bench:
+        before: list[int] = []  # requests to each amplifier before the lift
+
+        def lift(after: int) -> None:
+            if after:
+                asyncio.get_running_loop().call_soon(lift, after - 1)
+            else:
+                before.extend(len(far_end.asked) for far_end in bench.far_ends)
+                bench.touch()
+
+        def answer(request: Request) -> Reply | None:
+            if isinstance(request, GetStatus) and not before:
+                lift(later)
+            return None
+
+        await asyncio.sleep(0.046)
+        for far_end in bench.far_ends:
+            far_end.delay = 0.002
+        bench.far_ends[-1].answer = answer
+        bench.touch(FINGER)
+        await asyncio.sleep(0.05)
+        for far_end, count in zip(bench.far_ends, before, strict=True):
+            sent = [type(request) for _, request in far_end.asked[count:]]
+            assert sent.index(Apply) < sent.index(Ping)
+
+
+@in_virtual_time
+async def test_new_pattern_waits_until_all_amplifiers_reply() -> None:
+    """The other amplifier, too, is sent nothing but heartbeats; then it is played at once."""
+    async with running("a", "b") as bench:
+        await bench.hold(FINGER, seconds=0.1)
+        silent, other = bench.far_ends
+
+        def mute(request: Request) -> Reply | None:
+            raise LinkTimeout("no reply")
+
+        silent.answer = mute
+        await bench.hold(FINGER, seconds=0.1)
+        assert bench.controller.degraded == ("a",)
+        begin, applied = now(), len(bench.reports.applied)
+        await bench.hold(OTHER, seconds=0.05)
+        assert {type(one) for time, one in other.asked if time > begin} <= {Ping, GetStatus}
+        silent.answer = lambda request: None
+        await bench.hold(OTHER, seconds=0.1)
+        assert len(bench.reports.applied) == applied + 1
+
+
 @in_virtual_time
 async def test_controller_resends_cancelled_silence() -> None:
     """A loop that replaces a cancelled one does not rely on its last command."""
@@ -480,6 +531,21 @@ async def test_controller_retries_a_pattern_when_the_rate_limit_permits(
         await asyncio.sleep(2)
         assert not any(bench.far_end.levels)
         assert len(bench.reports.applied) == 4
+
+
+@in_virtual_time
+async def test_opening_again_gives_no_limit_anew() -> None:
+    """Of two sets a second the third is refused though all was closed and opened before it."""
+    async with armed(rate=2.0) as bench:
+        for _ in range(3):
+            await bench.controller.close()
+            await bench.controller.open()
+            await bench.controller.arm()
+            for touches in ((FINGER,), ()):
+                bench.touch(*touches)
+                await bench.controller.step()
+        assert len(bench.reports.applied) == 2
+        assert len(bench.reports.refused) == 1
 
 
 @in_virtual_time

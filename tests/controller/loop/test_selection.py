@@ -103,6 +103,17 @@ def test_selector_keeps_other_contacts_quiet(table: Table) -> None:
     assert (predicted.contact.key.id, predicted.level_db_sl) == (3, 17.0)
 
 
+def test_selector_asks_within_the_bands_of_its_targets(table: Table) -> None:
+    """What both bands share; a target whose band shares no frequency of the table is held back."""
+    table.frequencies = np.array([80.0, 100.0, 120.0, 250.0])
+    bands = ((90.0, 260.0), (60.0, 130.0), (240.0, 300.0))
+    targets = (Target(ContactKey("a", n), 12.0, band=band) for n, band in enumerate(bands, 1))
+    contacts = (at(1, 0.1), at(2, 0.2), at(3, 0.25))
+    selection = Selector(table).select(contacts, HapticIntent(tuple(targets)), CAPABILITIES)
+    assert table.asked[0].frequencies == (90.0, 130.0)
+    assert [bool(each.held_back) for each in selection.predictions] == [False, False, True]
+
+
 def test_selector_predicts_each_of_several_targets(table: Table) -> None:
     """The strongest gives the level, the others are softer.
 

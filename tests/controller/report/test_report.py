@@ -11,7 +11,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from controller.report.collect import MAX_DUMPS, collect, versions
-from controller.report.shown import Shown
+from controller.report.shown import shown
 from model.rig.file import example_rig_path
 
 HOME = Path("/home/user")
@@ -21,34 +21,27 @@ yaml = YAML(typ="safe")
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("stroke: 100 um", "stroke: 100 um"),
         ("thickness: 1.5mm, mesh: auto 1 %", "thickness: 1.5mm, mesh: auto 1 %"),
-        ("frequency: [40, 5e2]", "frequency: [40, 5e2]"),
         ("url: serial:///dev/ttyUSB0?baud=921600", "url: serial:///dev/ttyUSB0?baud=921600"),
-        ("url: 'socket://me:1234@amp:4000'", "url: 'socket://hidden-1'"),
-        ("url: modbus+tcp://plc.example/7", "url: modbus+tcp://hidden-1/7"),
-        ("url: socket:///x?pin=1234&baud=9600", "url: socket:///x?hidden-2=hidden-1&baud=9600"),
-        ("token: 123456  # my bank's", "token: hidden-1"),
-        ('{"access_key": 1234, "stroke": 1}', '{"hidden-2": hidden-1, "stroke": 1}'),
-        ("cause: no reply from hunter2", "cause: no reply from hidden-1"),
-        ("file: /home/user/zugang.yaml", "file: ~/hidden-1.yaml"),
-        (
-            "{Otto: 1, stroke: 2}, {Otto: 3}",
-            "{hidden-3: hidden-1, stroke: 2}, {hidden-3: hidden-2}",
-        ),
+        ("url: 'socket://me:1234@amp:4000'", "url: 'socket://hidden'"),
+        ("url: modbus+tcp://plc.example/7", "url: modbus+tcp://hidden/7"),
+        ("url: socket:///x?pin=1234&baud=9600", "url: socket:///x?pin=hidden&baud=9600"),
+        ("token: 123456  # my bank's", "token: hidden"),
+        ('{"access_key": 1234, "stroke": 1}', '{"access_key": hidden, "stroke": 1}'),
+        ('serial_numbers: {main: "A1234"}', "serial_numbers: {main: hidden}"),
+        ('{"serial_number": "A1234"}', '{"serial_number": hidden}'),
+        ("rig: /home/user/rig.yaml", "rig: ~/rig.yaml"),
     ],
 )
-def test_report_shows_only_what_is_known(text: str, expected: str) -> None:
-    """Keys, numbers and words of the program; a hidden word can be followed by its number."""
-    assert Shown(home=HOME).text(text) == expected
+def test_report_hides_values_of_unknown_keys(text: str, expected: str) -> None:
+    """And hosts, serial numbers, comments and the home folder."""
+    assert shown(text, home=HOME).rstrip() == expected
 
 
 def test_example_rig_is_shown_without_its_comments() -> None:
-    """All values of plate, ERAs, amplifier and limits; an ERA's name may be a person's."""
+    """All values of plate, ERAs, amplifier and limits."""
     text = example_rig_path().read_text("utf-8")
-    shown, given = yaml.load(Shown(home=HOME).text(text)), yaml.load(text)
-    assert list(shown.pop("eras").values()) == list(given.pop("eras").values())
-    assert shown == given
+    assert yaml.load(shown(text, home=HOME)) == yaml.load(text)
 
 
 def test_report_includes_files_of_daemon(tmp_path: Path) -> None:
@@ -99,7 +92,7 @@ def test_report_includes_invalid_files(tmp_path: Path) -> None:
     files = [tmp_path / name for name in ("broken.yaml", "bytes.yaml", "none.yaml")]
     report = collect(files, socket=tmp_path / "no.sock", home=HOME)
     assert set(report.files) == {"broken.yaml", "bytes.yaml", "versions.json"}
-    assert report.files["broken.yaml"] == "rig: [\nhidden-2: hidden-1\n\tx"
+    assert report.files["broken.yaml"] == "rig: [\napi_token: hidden\n\tx"
     assert [sum(path.name in each for each in report.missing) for path in files] == [1, 1, 1]
 
 

@@ -2,12 +2,14 @@
 
 import asyncio
 import socket
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from controller.cli.main import run
 from controller.sources.capture import (
     HEADER,
     RecordedDatagram,
@@ -129,3 +131,18 @@ async def test_replay_capture_raises_when_the_system_refuses() -> None:
     """An address to which the system may not send is reported at once."""
     with pytest.raises(LinkError, match=r"255\.255\.255\.255:3333 \(Perm"):
         await replay_capture([RecordedDatagram(0.0, b"x")], "255.255.255.255", 3333)
+
+
+def test_era_touch_sends_a_capture(tmp_path: Path) -> None:
+    """To the UDP port of the daemon's source; fingers and a capture exclude each other."""
+    commands = entry_points(group="era_haptics.commands", name="daemon")
+    path = tmp_path / "taps.tuio"
+    write_capture(path, [RecordedDatagram(0.0, b"one"), RecordedDatagram(0.0, b"two")])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(10)
+        options = ["--replay", str(path), "--port", str(receiver.getsockname()[1])]
+        assert run(["touch", *options], commands) == 0
+        assert [receiver.recv(100) for _ in range(2)] == [b"one", b"two"]
+        assert run(["touch", "0.1,0.1", *options], commands) == 2
+    assert run(["touch"], commands) == 2

@@ -34,7 +34,7 @@ async def receiving() -> AsyncIterator[Send]:
         for datagram in datagrams:
             sender.sendto(datagram, ("127.0.0.1", line.port))
             time.sleep(pause)  # noqa: ASYNC251  the loop is to be busy
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             return [await received.get() for _ in datagrams]
 
     line = await listen("127.0.0.1", 0, feed, max_size=100)
@@ -53,7 +53,7 @@ async def until_stamped(send: Send) -> None:
     which they are read.
     """
     loop = asyncio.get_running_loop()
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(60):
         while True:
             begin = loop.time()
             ((_, arrived),) = await send(b"0", pause=PAUSE)
@@ -99,7 +99,7 @@ async def test_receiver_may_close_within_its_callback() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for datagram in (b"1", b"2"):
             sender.sendto(datagram, ("127.0.0.1", lines[0].port))
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(60):
         await done.wait()
     await asyncio.sleep(0)
     assert received == [b"1"]

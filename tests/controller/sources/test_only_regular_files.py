@@ -7,9 +7,7 @@ from pathlib import Path
 import pytest
 
 from controller.effects.layout_file import load_layout
-from controller.sources.capture import read_capture
-from controller.sources.evemu import read_evemu
-from controller.sources.recording import MAX_BYTES
+from controller.sources.capture import MAX_BYTES, read_capture
 from model.calibration.responses_file import read_functions
 from model.errors import InputError
 from model.rig.file import load_rig
@@ -19,7 +17,6 @@ READERS: dict[str, Callable[[Path], object]] = {
     "rig.yaml": load_rig,
     "layout.yaml": lambda path: load_layout(path, None),
     "taps.tuio": read_capture,
-    "taps.events": read_evemu,
     "measured.csv": read_functions,
     "measured.uff": read_functions,
     "table.npz": load_table,
@@ -40,11 +37,10 @@ def test_reader_refuses_what_is_no_regular_file(tmp_path: Path, name: str, kind:
     assert "Errno" not in str(caught.value)
 
 
-@pytest.mark.parametrize("read", [read_capture, read_evemu])
-def test_recording_has_a_maximum_size(tmp_path: Path, read: Callable[[Path], object]) -> None:
+def test_capture_has_a_maximum_size(tmp_path: Path) -> None:
     """A sparse file one byte above it is refused before it is read as text."""
     path = tmp_path / "long"
     with path.open("wb") as stream:
         stream.truncate(MAX_BYTES + 1)
     with pytest.raises(InputError, match="16 MiB"):
-        read(path)
+        read_capture(path)

@@ -1,54 +1,79 @@
-"""Waiting for a reply: in time, too late, and in a delayed process."""
+"""Waiting for a reply: in time, too late, and in a delayed process, in virtual time."""
 
 import asyncio
-import os
-import time
+from collections.abc import Sequence
 
 import pytest
 
+from drivers import clock
 from drivers.backends.waiting import ReplyTimer
+from virtual_loop import VirtualLoop, in_virtual_time, run_virtual
 
 
+def stall(duration: float) -> None:
+    """Let this process not run for a time [s]."""
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualLoop)
+    loop.now += duration
+
+
+@in_virtual_time
 async def test_wait_returns_a_reply_or_times_out() -> None:
-    """A missing reply is a TimeoutError and ends the future."""
+    """A missing reply is a TimeoutError when it is due, and ends the future."""
     loop = asyncio.get_running_loop()
     there: asyncio.Future[str] = loop.create_future()
     there.set_result("here")
     assert await ReplyTimer().wait(there, 60.0) == "here"
     missing: asyncio.Future[str] = loop.create_future()
+    began = clock.now()
     with pytest.raises(TimeoutError):
-        await ReplyTimer().wait(missing, 0.001)
+        await ReplyTimer().wait(missing, 0.03)
+    assert clock.now() == began + 0.03
     assert missing.done()
 
 
-async def test_reply_counts_when_the_process_was_delayed() -> None:
-    """A reply in the pipe at the timeout is in time."""
-    loop = asyncio.get_running_loop()
-    reply: asyncio.Future[bytes] = loop.create_future()
-    reading, writing = os.pipe()
-    loop.add_reader(reading, lambda: reply.set_result(os.read(reading, 16)))
-    try:
-        waiting = asyncio.create_task(ReplyTimer().wait(reply, 0.002))
+@pytest.mark.parametrize(
+    ("stalls", "read_at"),
+    [
+        ([], 0.03),  # in the turn of the loop in which it is due
+        ([0.05], 0.035),  # by a thread, after a stall beyond its timeout
+        ([0.05, 0.05, 0.05], 0.14),  # after several in turn
+    ],
+)
+def test_reply_that_came_in_time_counts_however_late_it_is_read(
+    stalls: Sequence[float], read_at: float
+) -> None:
+    """Of 30 ms, in a process that does not run for 50 ms once or several times."""
+
+    async def run() -> str:
+        loop = asyncio.get_running_loop()
+        reply: asyncio.Future[str] = loop.create_future()
+        waiting = loop.create_task(ReplyTimer().wait(reply, 0.03))
         await asyncio.sleep(0)
-        os.write(writing, b"here")
-        time.sleep(0.004)  # noqa: ASYNC251  the process is held up, past the time
-        assert await waiting == b"here"
-    finally:
-        loop.remove_reader(reading)
-        os.close(reading)
-        os.close(writing)
+        loop.call_later(read_at, reply.set_result, "here")
+        for duration in stalls:
+            stall(duration)
+            await asyncio.sleep(0.001)
+        return await waiting
+
+    assert run_virtual(run()) == "here"
 
 
-async def test_reply_counts_when_the_reader_thread_was_delayed() -> None:
-    """A reply posted a little later is in time."""
-    loop = asyncio.get_running_loop()
-    reply: asyncio.Future[str] = loop.create_future()
-    waiting = asyncio.create_task(ReplyTimer().wait(reply, 0.002))
-    await asyncio.sleep(0)
-    time.sleep(0.02)  # noqa: ASYNC251  held up
-    # As a thread posts that runs once the process runs again: after the timer has been seen.
-    loop.call_soon(lambda: loop.call_soon(lambda: reply.done() or reply.set_result("late")))
-    assert await waiting == "late"
+def test_reply_that_never_comes_is_given_up_however_late_this_process_is() -> None:
+    """After a bounded number of looks, in a process that is delayed at each of them."""
+
+    async def run() -> float:
+        loop = asyncio.get_running_loop()
+        waiting = loop.create_task(ReplyTimer().wait(loop.create_future(), 0.03))
+        began = clock.now()
+        while not waiting.done():
+            await asyncio.sleep(0.001)
+            stall(0.05)
+        with pytest.raises(TimeoutError):
+            await waiting
+        return clock.now() - began
+
+    assert 0.03 < run_virtual(run()) < 0.6
 
 
 async def test_cancelled_wait_ends_at_once() -> None:
@@ -62,10 +87,11 @@ async def test_cancelled_wait_ends_at_once() -> None:
     assert reply.cancelled()
 
 
+@in_virtual_time
 async def test_timer_of_an_earlier_reply_does_not_end_a_later_one() -> None:
     """Every reply has its own time, whichever was awaited first: each ends when it is due."""
     loop = asyncio.get_running_loop()
-    timer, begin = ReplyTimer(), loop.time()
+    timer, begin = ReplyTimer(), clock.now()
     there: asyncio.Future[str] = loop.create_future()
     there.set_result("here")
     await timer.wait(there, 0.005)
@@ -75,11 +101,10 @@ async def test_timer_of_an_earlier_reply_does_not_end_a_later_one() -> None:
         reply: asyncio.Future[str] = loop.create_future()
         with pytest.raises(TimeoutError):
             await timer.wait(reply, timeout)
-        ended[timeout] = loop.time() - begin
+        ended[timeout] = clock.now() - begin
 
     await asyncio.gather(wait(0.03), wait(0.01))
-    assert list(ended) == [0.01, 0.03]
-    assert all(after >= timeout for timeout, after in ended.items())
+    assert ended == {0.01: pytest.approx(0.01), 0.03: pytest.approx(0.03)}
 
 
 def test_reply_in_another_loop_times_out() -> None:
@@ -90,10 +115,8 @@ def test_reply_in_another_loop_times_out() -> None:
         reply: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         if is_there:
             reply.set_result("here")
-        async with asyncio.timeout(10):
-            await timer.wait(reply, 0.02)
+        await timer.wait(reply, 0.02)
 
-    asyncio.run(wait(is_there=True))
-    with pytest.raises(TimeoutError) as caught:
-        asyncio.run(wait(is_there=False))
-    assert caught.value.__cause__ is None  # of the reply, not of these ten seconds
+    run_virtual(wait(is_there=True))
+    with pytest.raises(TimeoutError):
+        run_virtual(wait(is_there=False))

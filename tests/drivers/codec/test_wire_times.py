@@ -29,7 +29,7 @@ GAP = 0.00175  # s of silence between RTU frames above 19 200 baud, by the stand
         # unknown speed
         *(
             (url, 0.0, 0.0, 0.0)
-            for url in ("serial://box:4001", "modbus+tcp://h/1", "sim://r.yaml")
+            for url in ("serial+tcp://box:4001", "modbus+tcp://h/1", "sim://r.yaml")
         ),
     ],
 )

@@ -1,7 +1,6 @@
 """Attempts and results of conformance checks: delays of this program do not count."""
 
 import asyncio
-import os
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from functools import partial
@@ -70,28 +69,6 @@ def test_violation_amid_a_stall_is_looked_at_again(coarse_rig: Rig) -> None:
     found = result_of(partial(disturbed_at_first, tries), coarse_rig)
     assert found.result is Result.PASSED
     assert found.attempts == 2
-
-
-@pytest.mark.parametrize(
-    ("is_process", "result"), [(False, Result.FAILED), (True, Result.INCONCLUSIVE)]
-)
-def test_late_replies_of_a_process_are_its_own_delays(
-    is_process: bool, result: Result, coarse_rig: Rig
-) -> None:
-    """It may have stood still, which an amplifier elsewhere must not."""
-    delays = []
-
-    async def steps(bench: Bench) -> None:
-        began = clock.now()
-        await bench.timed(asyncio.sleep(0.3))
-        delays.append(bench.delayed_since(began))
-        expect(False, "level", expected="0.2", seen="0.1", is_certain=not delays[-1])
-
-    check = Check("named", "does as told", ("wire-protocol.md#watchdog",), drives=True, run=steps)
-    process = os.getpid() if is_process else None
-    (found,) = results_on("serial", coarse_rig, [check], process=process)
-    assert found.result is result
-    assert (max(delays) > 0.25) is is_process
 
 
 @pytest.mark.parametrize("is_violation", [True, False])

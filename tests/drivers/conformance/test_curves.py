@@ -3,7 +3,6 @@
 import asyncio
 import cmath
 import math
-from dataclasses import replace
 
 import pytest
 
@@ -11,7 +10,7 @@ from conformance_bench import results_on
 from drivers import clock
 from drivers.conformance import Result
 from drivers.conformance.bench import Bench, Sample
-from drivers.conformance.check import MAX_ATTEMPTS, Check
+from drivers.conformance.check import Check
 from drivers.conformance.curve import along, expect_curve, raised_cosine
 from drivers.conformance.envelopes import load, step_of
 from drivers.guard.channel_state import Interval
@@ -44,27 +43,6 @@ def test_span_of_a_cross_fade_has_the_moment_of_least_level() -> None:
 def test_later_curve_turns_later() -> None:
     """By its delay, so that its span has the knot."""
     assert along(STEP, 0.2, 0.1, 0.2).after(0.5).span(0.55, 0.65) == pytest.approx((0.1, 0.15))
-
-
-@pytest.mark.parametrize(("waited", "attempts"), [(0.0, 1), (0.002, MAX_ATTEMPTS)])
-def test_level_that_a_short_wait_explains_is_looked_at_again(
-    waited: float, attempts: int, coarse_rig: Rig
-) -> None:
-    """An amplifier on this machine that waited 2 ms for a processor may be as much ahead."""
-
-    async def steps(bench: Bench) -> None:
-        bench.delayed_since = lambda time: waited
-        sample = await bench.sample()
-        # At its commit it has a level that the curve has 1.5 ms later.
-        ahead = replace(sample.status, levels=(0.006, *sample.status.levels[1:]))
-        commit = Interval(sample.when.latest, sample.when.latest)
-        curve = along(STEP, 0.0, 2 * bench.level)
-        samples = [Sample(sample.when, ahead)]
-        expect_curve(bench, samples, curve, commit=commit, lasts=STEP, what="")
-
-    check = Check("named", "does as told", ("wire-protocol.md#envelopes",), drives=True, run=steps)
-    (found,) = results_on("serial", coarse_rig, [check])
-    assert (found.result, found.attempts) == (Result.FAILED, attempts)
 
 
 def test_level_of_a_status_that_took_long_is_right(coarse_rig: Rig) -> None:

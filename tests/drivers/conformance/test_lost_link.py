@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
+from conformance_bench import ALL
 from drivers import clock
 from drivers.amp_actions import conform
 from drivers.conformance import CHECKS, CheckResult, Result
@@ -16,7 +17,6 @@ from drivers.conformance.report import ConformanceReport
 from drivers.errors import LinkError
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
-from planted_faults import ALL
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import run_virtual
 from wires import WIRES, FarSide, far_side, patient

@@ -4,11 +4,10 @@ import asyncio
 
 import pytest
 
-from conformance_bench import results_on
+from conformance_bench import ALL, results_on
 from drivers.conformance import CHECKS, Result
 from long_form import shortly
 from model.rig.rig import Rig
-from planted_faults import ALL
 from witness_config import witness_of_one
 
 INVALID = (

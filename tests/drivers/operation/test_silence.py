@@ -48,7 +48,9 @@ def test_stop_outcome_by_status_and_watchdog(
     until: float | None,
 ) -> None:
     """Only a status in a state that plays nothing confirms; only a known watchdog ends it."""
-    outcome = stop_outcome(status, last_fed_at=last_fed_at, watchdog=watchdog, now=NOW)
+    outcome = stop_outcome(
+        status, latch_before=0, last_fed_at=last_fed_at, watchdog=watchdog, now=NOW
+    )
     assert outcome.silence is silence
     assert outcome.is_confirmed is (silence is SilenceStatus.CONFIRMED)
     assert (outcome.cause == "") is outcome.is_confirmed
@@ -57,6 +59,24 @@ def test_stop_outcome_by_status_and_watchdog(
     else:
         assert outcome.may_play_until is not None
         assert until <= outcome.may_play_until <= until + SLACK
+
+
+@pytest.mark.parametrize(
+    ("latch", "before", "is_confirmed"),
+    [
+        (1, 0, True),
+        (1, 255, True),
+        (127, 255, True),
+        (9, 9, False),
+        (8, 9, False),
+        (9, None, False),
+    ],
+)
+def test_only_a_newer_latch_confirms(latch: int, before: int | None, is_confirmed: bool) -> None:
+    """They count from 1 to 255, then from 1 again; what was read before no Stop proves nothing."""
+    status = replace(STOPPED, levels=(0.0,) * 4, latch=latch)
+    outcome = stop_outcome(status, latch_before=before, last_fed_at=NOW, watchdog=WATCHDOG, now=NOW)
+    assert outcome.is_confirmed is is_confirmed
 
 
 def test_outcome_as_json() -> None:

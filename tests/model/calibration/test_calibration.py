@@ -77,15 +77,15 @@ def test_calibrate_finds_every_parameter(truth, fitted):
 def test_calibrate_finds_gains(truth, fitted):
     """Gains 8 % and 6 degrees off are known to 1 % in the median, 4 % at worst.
 
-    Their standard error follows from noise of 1 %, half of its power in each part, over the eleven
-    live sensors: 0.21 %.
+    Their standard error is at least that of noise of 1 %, half of its power in each part, over the
+    eleven live sensors, and of what their scales have in common, of which each is known to 1 %.
     """
     true = gains_of(truth)
     wrong = np.abs(gains_of(fitted.rig) / true - 1)
     assert np.median(wrong) < 0.01
     assert wrong.max() < 0.04
     errors = fitted.gains_error / np.abs(true)
-    assert np.median(errors) == pytest.approx(0.01 / np.sqrt(2 * 11), rel=0.1)
+    assert 0.01 * np.sqrt(1 / 22 + 1 / 11) < np.median(errors) < 0.01
 
 
 def test_calibrate_finds_dead_and_wrongly_scaled_sensors(fitted):

@@ -5,7 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.calibration.hidden_plates import FORMS, SENSORS, draw_plate, measure, true_values
+from benchmarks.calibration.hidden_plates import (
+    FORMS,
+    SENSORS,
+    draw_plate,
+    gain_deviations,
+    measure,
+    true_gains,
+    true_values,
+)
 from model.arrays import FloatArray
 from model.calibration.calibrate import calibrate
 from model.calibration.form_errors import form_model
@@ -55,7 +63,7 @@ def test_derivatives_of_form_model_agree_with_differences(rig: Rig) -> None:
 
 
 def test_stiffening_does_not_depend_on_rounding(rig: Rig) -> None:
-    """Moduli that differ in the eleventh digit give derivatives by the sides that agree to 1 %.
+    """Moduli that differ in the eleventh digit give derivatives by the sides that agree to 1e-4.
 
     Relative to the modes' own stiffness, as couplings are that move a mode's frequency.
     """
@@ -70,29 +78,38 @@ def test_stiffening_does_not_depend_on_rounding(rig: Rig) -> None:
 
     exact = couplings(0.0)
     for share in (1e-11, 2e-11, 3e-11):
-        np.testing.assert_allclose(couplings(share), exact, atol=0.01)
+        np.testing.assert_allclose(couplings(share), exact, atol=1e-4)
 
 
 @pytest.mark.parametrize(
-    ("plates", "share"), [(1, 0.7), pytest.param(2, 0.8, marks=pytest.mark.long)]
+    ("sensors", "plates", "share"),
+    [
+        pytest.param(4, 1, 0.7, id="4-sensors"),
+        pytest.param(12, 1, 0.7, id="12-sensors"),
+        pytest.param(12, 2, 0.8, id="two-plates", marks=pytest.mark.long),
+    ],
 )
 def test_intervals_hold_the_truth_on_plates_with_form_errors(
-    rig: Rig, plates: int, share: float
+    rig: Rig, sensors: int, plates: int, share: float
 ) -> None:
     """ERAs 1.5 mm off, a foreign mass, sides and Poisson's ratio off, by finite elements.
 
     Of the 28 true values of two plates four in five or more lie within two standard errors and none
     beyond four, of the 14 of one plate seven in ten; without form errors in the fit it is a third.
-    The benchmark has more plates.
+    So do three in four of the gains and phases within the interval of 90 % by the uncertainty of
+    the new rig. The benchmark has more plates.
     """
-    deviations = []
+    deviations, gains = [], []
     for seed in range(plates):
         hidden = draw_plate(rig, FORMS["usual"], seed=seed, frequencies=FREQUENCIES)
-        found = calibrate(rig, measure(hidden, rig, seed=seed, frequencies=FREQUENCIES))
+        responses = measure(hidden, rig, seed=seed, frequencies=FREQUENCIES, count=sensors)
+        found = calibrate(rig, responses)
         assert found.outlier_count == 0
+        gains.append(gain_deviations(found.rig, true_gains(hidden)))
         for one, true in zip(found.parameters, true_values(hidden), strict=True):
             if one.standard_error is not None:
                 deviations.append(abs(one.value - true) / one.standard_error)
     assert len(deviations) > 12 * plates
     assert np.mean(np.array(deviations) < 2) > share
     assert max(deviations) < 4
+    assert np.mean(np.array(gains) < 1.645) > 0.75

@@ -57,7 +57,7 @@ def test_check_passes_a_good_rig_with_warnings(tmp_path: Path) -> None:
     assert check(example_rig_path()) == (0, [], [])
     links = EXAMPLE.replace(
         'main: {url: "sim://"}',
-        "main: {url: 'serial:///dev/ttyS0'}\n  two: {url: 'can+virtual://v#1'}",
+        "main: {url: 'serial:///dev/ttyS0'}\n  two: {url: 'can+python-can://virtual/v#1'}",
     ).replace("amplifier: main, channel: 3", "amplifier: two, channel: 0")
     status, errors, warnings = check(tmp_path / "rig.yaml", links)
     assert (status, errors, len(warnings)) == (0, [], 1)

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,9 +20,8 @@ from typer.testing import CliRunner
 
 from model.cli import app
 from model.errors import InputError
-from model.figures import table_pictures
 from model.rig.file import example_rig_path
-from model.table import summary
+from model.table import contact_sets, overview
 from model.table.file import load_table, save_table
 from model.table.pattern_choice import UnreachableLevel
 
@@ -48,11 +48,13 @@ def as_json(*arguments: str | Path) -> dict[str, Any]:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def few_sets() -> Iterator[None]:
-    """Distributions of few contact sets."""
+def few_sets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Distributions of few contact sets, kept in a folder of these tests."""
+    folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(summary, "CONTACT_SETS", 12)
-        patch.setattr(table_pictures, "CONTACT_SETS", 12)
+        cache = SimpleNamespace(user_cache_path=lambda *_, **__: folder)
+        patch.setattr(overview, "platformdirs", cache)
+        patch.setattr(contact_sets, "CONTACT_SETS", 12)
         yield
 
 
@@ -229,7 +231,7 @@ def test_export_writes_both_formats(built: Path, tmp_path: Path) -> None:
     table("export", built, "--format", "csv", "-o", tmp_path / "t.csv")
     table("export", built, "--format", "csv", "--content", "fields", "-o", tmp_path / "f.csv")
     heads = [(tmp_path / name).read_text().split(",")[0] for name in ("t.csv", "f.csv")]
-    assert heads == ["SW_hz", "x_m"]
+    assert heads == ["target_x_m", "x_m"]
     assert (tmp_path / "t.mat").read_bytes().startswith(b"MATLAB 5.0")
     with pytest.raises(InputError, match="--content"):
         table("export", built, "--format", "mat", "--content", "fields", "-o", tmp_path / "t.mat")

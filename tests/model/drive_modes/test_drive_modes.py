@@ -9,6 +9,7 @@ from scipy.linalg import eigh
 from scipy.optimize import minimize
 
 from drives import by_hand
+from model.choice import NEARLY
 from model.drive_modes import DRIVE_MODES, find_drives, max_sensation, playable_drive_modes
 from model.drive_modes import switched as switched_mode
 from model.drive_modes.forms import SILENT, Forms, Weights
@@ -189,13 +190,13 @@ def test_find_drives_is_hardly_worse_in_a_less_restricted_mode(level, sets):
 
 @pytest.mark.parametrize("mode", DRIVE_MODES)
 def test_find_drives_returns_the_best_first(mode):
-    """Scores are those of the drives by hand, in descending order, all reaching the level."""
+    """Scores are those of the drives by hand, none above the one before, all reaching the level."""
     for places in contact_sets(4, fingers=3, seed=11):
         given = forms_on_plate(places)
         found = find_drives(given, mode)
         assert len(found) >= 4
         scores = [score for score, _ in found]
-        assert scores == sorted(scores, reverse=True)
+        assert (np.diff(scores) <= NEARLY * np.array(scores[:-1])).all()
         for score, drive in found:
             by, level = by_hand(given, drive)
             assert score == pytest.approx(by, rel=1e-3)

@@ -105,5 +105,6 @@ def test_elements_converge_with_theoretical_rates(name: str, expected: float) ->
     By h² where rotations are linear; by h^2(p - 1) where slopes and rotations of order p are made
     equal by being thin alone.
     """
-    errors = [frequency_error(ELEMENTS[name], count) for count in (4, 8)]
-    assert rate(*errors) == pytest.approx(expected, abs=0.2)
+    # With 8 elements a side Q4 errs by 7e-9 of a thin plate's frequency, no more than by rounding.
+    errors = [frequency_error(ELEMENTS[name], count) for count in (3, 6)]
+    assert rate(*errors) == pytest.approx(expected, abs=0.15)

@@ -14,7 +14,9 @@ from model.fem.harmonic import direct_acceleration
 from model.fem.mesh import Mesh
 from model.fem.modal import modes
 from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.spectral.mesh import SpectralMesh
 from model.structure.actuator import Era
+from model.structure.laminate import Laminate, Layer
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 from paper_plate import ALUMINIUM, LENGTH, WIDTH
@@ -182,3 +184,17 @@ def test_acceleration_is_independent_of_the_cache_size(monkeypatch):
     for eras, kept in zip(layouts, keeping, strict=True):
         again = plates[1].acceleration(eras, frequencies, plates[1].mesh.nodes)
         np.testing.assert_allclose(again, kept, rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["elements", "polynomials", "layers"])
+def test_shapes_at_footprints_are_not_those_of_points_of_the_same_bytes(kind):
+    """Three points and two footprints of six numbers each, one after the other."""
+    plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
+    if kind == "layers":
+        halves = Layer(ALUMINIUM, 0.0007), Layer(ALUMINIUM, 0.0008)
+        plate = replace(plate, laminate=Laminate(halves))
+    mesh = MESHES["5x4 Q4"] if kind == "elements" else SpectralMesh(8, 8, LENGTH, WIDTH)
+    modes = solve_free_plate(plate, mesh, frequency_max=200.0).modes
+    numbers = np.array([0.1, 0.05, 0.01, 0.12, 0.06, 0.012])
+    for shape in ((3, 2), (2, 3)):
+        assert len(modes.shapes_at(numbers.reshape(shape))) == shape[0]

@@ -14,7 +14,8 @@ from model.structure.point_load import PointLoad
 from model.table import export
 from model.table.export import export_csv, export_mat
 from model.table.file import save_table
-from small_table import FREQUENCIES, small_table
+from model.table.question import Question
+from small_table import FREQUENCIES, small_table, with_strokes
 
 
 @pytest.fixture(scope="module")
@@ -93,21 +94,37 @@ def test_export_mat_refuses_a_table_too_large(table, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_export_csv_of_patterns(table, tmp_path):
-    """A row a pattern, frequencies in Hz and empty where silent, a column a cell, to the bit."""
+@pytest.mark.parametrize("drive_mode", ["switched", "phased"])
+def test_export_csv_of_patterns_holds_answers_in_the_drive_mode_of_the_table(drive_mode, tmp_path):
+    """In each row the levels of the ERAs, asked anew, give the promised level and contrast.
+
+    In mode `switched` ERAs play at one level, and at one frequency or two; in `phased` at one
+    frequency with levels and phases of their own.
+    """
+    table = small_table(drive_mode=drive_mode)
     export_csv(table, tmp_path / "t.csv", content="patterns")
     rows = read_csv(tmp_path / "t.csv")
-    assert len(rows) == 66
-    assert list(rows[0])[:5] == ["SW_hz", "SE_hz", "NE_hz", "NW_hz", "x0.0381_y0.0381_m_s2"]
-    (row,) = (
-        number
-        for number, row in enumerate(rows)
-        if [row[f"{era}_hz"] for era in ("SW", "SE", "NE", "NW")] == ["", "60.0", "", "110.0"]
-    )
-    found = np.array([rows[row][name] for name in list(rows[0])[4:]], dtype=np.float32)
-    np.testing.assert_array_equal(found, table.cell_response[row])
-    # SE at 60 Hz and NW at 110 Hz: sources 1 * 3 + 0 and 3 * 3 + 1, ERA after ERA.
-    np.testing.assert_array_equal(found, table.cell_sources[3] + table.cell_sources[10])
+    assert len({(row["target_x_m"], row["target_y_m"]) for row in rows}) == 12
+    assert len(rows) > 12 * 4
+    names = [era.name for era in table.eras]
+    for row in rows[::16]:
+        levels = {float(row[f"{name}_level"]) for name in names if row[f"{name}_level"]}
+        driven = [name for name in names if row[f"{name}_hz"]]
+        frequencies = {row[f"{name}_hz"] for name in driven}
+        if drive_mode == "switched":
+            assert max(levels) == pytest.approx(min(levels))
+            assert len(frequencies) <= 2
+        else:
+            assert (len(driven), len(frequencies)) == (4, 1)
+        target, quiet = (
+            (float(row[f"{finger}_x_m"]), float(row[f"{finger}_y_m"]))
+            for finger in ("target", "quiet")
+        )
+        answer = table.query(Question((target,), (quiet,)))
+        assert float(row["robust_felt_contrast_db"]) == answer.robust_felt_contrast_db
+        assert float(row["robust_level_db_sl"]) >= 20 - 1e-3
+    export_csv(with_strokes(table, 1e-6), tmp_path / "weak.csv", content="patterns")
+    assert all(not row["SW_level"] for row in read_csv(tmp_path / "weak.csv"))
 
 
 def test_export_csv_of_fields(table, tmp_path):

@@ -10,25 +10,20 @@ import pytest
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.table.build import build_table
+from model.table.contact_sets import CONTACT_SETS, contrast_distribution
+from model.table.file import save_table
 from model.table.many_answers import ask_on_processes
-from model.table.summary import contrast_distribution, similar_share, summarize
+from model.table.overview import Overview, find_overview, kept_overview
+from model.table.summary import similar_share, summarize
 from model.table.weak_cells import WeakCells, find_weak_cells, map_grid, text_map
 from paper_plate import make_paper_rig
-from small_table import small_table
+from small_table import small_table, with_strokes
 
 
 @pytest.fixture(scope="module")
 def table():
     """A small one."""
     return small_table()
-
-
-def with_strokes(table, factor):
-    """The table of ERAs with other strokes, in which accelerations are in proportion."""
-    return replace(
-        table,
-        eras=tuple(replace(era, stroke=factor * era.stroke) for era in table.eras),
-    )
 
 
 def test_weak_cells_of_a_symmetric_plate_are_symmetric(table):
@@ -73,21 +68,58 @@ def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
 
 
 @pytest.mark.long
-def test_summary_is_the_same_on_processes(table, monkeypatch):
+def test_overview_is_the_same_on_processes(table, monkeypatch):
     """Questions are drawn and counted in the same order, whoever answers them."""
-    monkeypatch.setattr("model.table.summary.CONTACT_SETS", 20)
+    monkeypatch.setattr("model.table.contact_sets.CONTACT_SETS", 20)
     with ask_on_processes(table, 2) as ask:
-        weak = find_weak_cells(table, ask=ask)
-        summary = summarize(table, weak, ask=ask)
-    here = find_weak_cells(table)
-    np.testing.assert_array_equal(weak.median_db, here.median_db)
-    assert summary == summarize(table, here)
+        found = find_overview(table, ask=ask)
+    here = find_overview(table)
+    np.testing.assert_array_equal(found.cells.median_db, here.cells.median_db)
+    assert summarize(table, found) == summarize(table, here)
+
+
+def test_overview_is_computed_once_for_a_table_file(table, tmp_path, monkeypatch):
+    """Kept until the file or the code is another, and where what is kept is damaged."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    computed = []
+
+    def find(table, *, ask, progress):
+        computed.append(table)
+        cells = WeakCells(
+            map_grid(table),
+            map_grid(table).centres(table.plate),
+            np.array([-np.inf, np.nan, *range(10)]),
+            np.zeros(12),
+            np.array([[12.0, 13.0], [15.0, 16.0]]),
+        )
+        return Overview(cells, [cells.pairs_db, np.zeros((2, 3)), np.empty((2, 0))])
+
+    monkeypatch.setattr("model.table.overview.find_overview", find)
+    path = tmp_path / "table.npz"
+    save_table(table, path)
+    first, again = (kept_overview(path, table) for _ in range(2))
+    assert len(computed) == 1
+    for one, other in zip(
+        (*vars(first.cells).values(), *first.contrasts),
+        (*vars(again.cells).values(), *again.contrasts),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one, other)
+    (kept,) = (tmp_path / "cache" / "era-haptics").glob("overview-*")
+    kept.write_bytes(kept.read_bytes()[:-20])
+    kept_overview(path, table)
+    save_table(replace(table, drive_mode="phased"), path)
+    kept_overview(path, table)
+    monkeypatch.setattr("model.table.overview.code_version", lambda: "another")
+    kept_overview(path, table)
+    kept_overview(path, table)
+    assert len(computed) == 4
 
 
 def test_map_grid_is_coarser_than_a_fine_grid(table):
-    """A cell of the map is no smaller than a sixteenth by a twelfth of the plate."""
-    assert map_grid(replace(table, grid=Grid(24, 5))) == Grid(16, 5)
-    assert map_grid(replace(table, grid=Grid(4, 20))) == Grid(4, 12)
+    """A cell of the map is no smaller than an eighth by a sixth of the plate."""
+    assert map_grid(replace(table, grid=Grid(24, 5))) == Grid(8, 5)
+    assert map_grid(replace(table, grid=Grid(4, 20))) == Grid(4, 6)
 
 
 def test_weak_and_feasible_follow_from_twelve_decibels():
@@ -97,6 +129,7 @@ def test_weak_and_feasible_follow_from_twelve_decibels():
         np.zeros((4, 2)),
         median_db=np.array([20.4, 12.0, -np.inf, 9.0]),
         tenth_db=np.array([12.0, 11.9, -np.inf, 5.0]),
+        pairs_db=np.empty((2, 0)),
     )
     assert weak.feasible.tolist() == [True, True, False, False]
     assert weak.weak.tolist() == [False, True, True, True]
@@ -113,7 +146,7 @@ def test_summary_of_a_plate_too_small_for_two_fingers():
         eras=tuple(replace(era, x=0.03 * (era.x > 0), y=0.03 * (era.y > 0)) for era in rig.eras),
     )
     built = build_table(small, frequencies=np.array([110.0]), grid=Grid(2, 2))
-    summary = summarize(built, find_weak_cells(built))
+    summary = summarize(built, find_overview(built))
     assert summary["robust_felt_contrast_1_quiet_median_db"] is None
     assert summary["feasible_share"] is None
 
@@ -127,22 +160,15 @@ def test_weak_cells_are_not_feasible_when_only_19_db_sl_are_reached(table):
     assert not weak.feasible.any()
 
 
-def test_summary_counts_levels_and_shares(table, monkeypatch):
+def test_summary_counts_levels_and_shares(table):
     """Levels from 12 dB SL count as felt; shares are of the cells for which there is a value."""
-    asked = []
-
-    def one_to_hundred(table, *, others, rng, ask, progress):
-        asked.append(others)
-        return np.array([np.arange(101.0), np.arange(101.0) + 5])
-
-    monkeypatch.setattr("model.table.summary.contrast_distribution", one_to_hundred)
+    one_to_hundred = np.array([np.arange(101.0), np.arange(101.0) + 5])
     levels = np.sort(table.available_level_db_sl)
     lower = 10 ** ((12.0 - levels[5:7].mean()) / 20)  # six of twelve cells are below 12 dB SL then
     quieter = with_strokes(table, lower)
     values = np.array([20.0, 12.0, 9.0, -np.inf, *[np.nan] * 8])
-    weak = WeakCells(table.grid, np.zeros((12, 2)), median_db=values, tenth_db=values - 0.1)
-    summary = summarize(quieter, weak)
-    assert asked == [1, 2, 3]
+    weak = WeakCells(table.grid, np.zeros((12, 2)), values, values - 0.1, one_to_hundred)
+    summary = summarize(quieter, Overview(weak, [one_to_hundred] * 3))
     assert summary["frequency_range_hz"] == [60.0, 250.0]
     expected = {
         "dead_zone_share": 0.5,
@@ -161,7 +187,7 @@ def test_summary_counts_levels_and_shares(table, monkeypatch):
 
 @pytest.mark.parametrize("others", [1, 3])
 def test_contrast_distribution_uses_fingers_apart(table, others):
-    """Two hundred sets at least 5 cm apart; where no target is reached it ends at four hundred."""
+    """A number of sets at least 5 cm apart; where no target is reached it ends at twice that."""
     asked = []
 
     def answer(question):
@@ -182,8 +208,8 @@ def test_contrast_distribution_uses_fingers_apart(table, others):
         )
         for each in (answer, refuse)
     )
-    assert found.tolist() == [list(range(1, 201)), list(range(4, 204))]
-    assert (none.shape, len(asked)) == ((2, 0), 200 + 400)
+    assert found.tolist() == [list(range(1, CONTACT_SETS + 1)), list(range(4, CONTACT_SETS + 4))]
+    assert (none.shape, len(asked)) == ((2, 0), 3 * CONTACT_SETS)
     for contacts in asked:
         assert contacts.shape == (others + 1, 2)
         gaps = np.linalg.norm(contacts[:, None] - contacts, axis=-1)

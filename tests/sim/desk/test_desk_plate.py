@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from benchmarks.desk_plate.desk_plate import DeskPlate
+from benchmarks.desk_plate.lifted_blocks import LiftedBlocks, sampled
+from benchmarks.desk_plate.model_in_time import DeskModel
+from benchmarks.desk_plate.sensing import Converters
+from benchmarks.desk_plate.truth import Truth, draw_truth
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.structure.fingertip import fingertip_loads
 from model.vibration.direct import direct_responder
-from sim.desk.desk_plate import DeskPlate
-from sim.desk.lifted_blocks import LiftedBlocks, sampled
-from sim.desk.model_in_time import DeskModel
-from sim.desk.sensing import Converters
-from sim.desk.truth import Truth, draw_truth
 from sim.sensors.sensor_file import WiredSensor, read_sensors
 
 RATE = 48_000.0

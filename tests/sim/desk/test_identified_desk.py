@@ -3,6 +3,9 @@
 import numpy as np
 import pytest
 
+from benchmarks.desk_plate.desk_plate import DeskPlate
+from benchmarks.desk_plate.sensing import Converters
+from benchmarks.desk_plate.truth import Truth, draw_truth
 from desk_card import DeskCard
 from drivers.errors import LinkError
 from model.arrays import FloatArray
@@ -11,9 +14,6 @@ from model.identification.identify import identify
 from model.identification.measured_plate import MeasuredPlate
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
-from sim.desk.desk_plate import DeskPlate
-from sim.desk.sensing import Converters
-from sim.desk.truth import Truth, draw_truth
 from sim.measuring.desk import Desk
 from sim.measuring.multisine import Multisine
 from sim.measuring.plate_measurement import measure_through

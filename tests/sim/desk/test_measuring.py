@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.desk_plate.desk_plate import DeskPlate
+from benchmarks.desk_plate.model_in_time import DeskModel
+from benchmarks.desk_plate.sensing import Converters
+from benchmarks.desk_plate.truth import Truth, draw_truth
 from desk_card import DeskCard
 from drivers.errors import LinkError
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
-from sim.desk.desk_plate import DeskPlate
-from sim.desk.model_in_time import DeskModel
-from sim.desk.sensing import Converters
-from sim.desk.truth import Truth, draw_truth
 from sim.measuring.desk import Desk
 from sim.measuring.loopback import latency
 from sim.measuring.measure import measure

@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.desk_plate.desk_plate import DeskPlate
+from benchmarks.desk_plate.sensing import Converters
+from benchmarks.desk_plate.truth import Actuator, Truth, draw_truth
 from desk_card import DeskCard
 from drivers.blocking import BlockingAmplifier
 from drivers.command import DriveCommand
@@ -29,9 +32,6 @@ from model.table.table import LocalizationTable
 from model.table.table_check import CheckSettings
 from model.vibration.direct import direct_responder
 from model.vibration.peak import tone_amplitudes
-from sim.desk.desk_plate import DeskPlate
-from sim.desk.sensing import Converters
-from sim.desk.truth import Actuator, Truth, draw_truth
 from sim.measuring import table_check
 from sim.measuring.sound_card import SoundCard
 from sim.sensors.sensor_file import read_sensors

@@ -189,7 +189,7 @@ async def test_serial_end_survives_a_host_that_does_not_read(end: SerialEnd) -> 
     )
     os.set_blocking(fd, False)  # or a full buffer would wait for a reader in this very thread
     hello = encode_frame(encode_request(Hello(), address=ADDRESS, sequence=1))
-    async with asyncio.timeout(10):  # as long as the system takes to hand the bytes over
+    async with asyncio.timeout(60):  # as long as the system takes to hand the bytes over
         while not end.dropped_replies:
             with contextlib.suppress(BlockingIOError):
                 os.write(fd, hello)

@@ -1,4 +1,4 @@
-"""Processes of emulated firmware."""
+"""Processes of firmware, which end with the one that started them."""
 
 import os
 import signal

@@ -38,7 +38,7 @@ from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultWindow
 from wires import FarSide, far_side, patient, tones
 
-PATIENCE = 5.0  # s; for a busy machine
+PATIENCE = 60.0  # s; for a busy machine
 _NUMBERS = itertools.count()
 LIMITS = GuardLimits(20.0, 600.0, 1.0)
 
@@ -97,7 +97,7 @@ class Virtual:
     far: FarSide
 
     def url(self, node: int = 1, options: str = "") -> str:
-        return f"can+virtual://{self.gateway.channel}{options}#{node}"
+        return f"can+python-can://virtual/{self.gateway.channel}{options}#{node}"
 
 
 @asynccontextmanager
@@ -531,12 +531,14 @@ async def test_exception_of_a_frame_callback_is_logged(
     def fail(*frame: object) -> None:
         raise RuntimeError("a bug")
 
-    bus = can_bus(CanUrl.parse("can+virtual://any#1").bus)
+    bus = can_bus(CanUrl.parse("can+python-can://virtual/any#1").bus)
     bus.network.subscribe(0x123, fail)
     with caplog.at_level(logging.DEBUG, "drivers"):
         bus._received(CanFrame(0x123, b""))
     (record,) = [
-        record for record in caplog.records if "can+virtual://any: frame 123" in record.getMessage()
+        record
+        for record in caplog.records
+        if "can+python-can://virtual/any: frame 123" in record.getMessage()
     ]
     assert record.exc_info is not None
     assert str(record.exc_info[1]) == "a bug"
@@ -545,13 +547,11 @@ async def test_exception_of_a_frame_callback_is_logged(
 async def test_exchange_works_on_a_flooded_bus(virtual: Virtual) -> None:
     """Thousands of foreign frames and invalid replies between request and reply."""
     async with opened(patient(virtual.url()), reply_timeout=PATIENCE) as amplifier:
-        await amplifier.arm(2.0)
         for number in range(3000):
             virtual.gateway.say(CanFrame(number % 0x700, bytes(number % 9)))
             virtual.gateway.say(CanFrame(0x181, bytes(number % 8)))
             virtual.gateway.say(CanFrame(0x581, bytes(8)))
-        safe = tones(amplifier, 0.3)
-        assert (await amplifier.apply(safe)).token == safe.token
+        assert (await amplifier.status()).state is AmplifierState.SWITCH_ON_DISABLED
         assert amplifier.statistics.invalid_frames >= 3000
         assert await amplifier.faults() == ()
 

@@ -55,7 +55,7 @@ async def test_amplifier_plays_behind_a_tcp_port_until_it_is_closed(coarse_rig: 
     async with far_side(WIRES["can+slcan"], coarse_rig) as far:
         path = far.url.partition("://")[2].partition("?")[0].partition("#")[0]
         async with served(path) as port:
-            url = f"can+slcan://127.0.0.1:{port}?heartbeat=1000#1"
+            url = f"can+slcan://127.0.0.1:{port}?heartbeat=10000#1"
             amplifier = Amplifier(open_backend(url), reply_timeout=REPLY_TIMEOUT)
             await amplifier.open()
             await amplifier.arm(2.0)

@@ -55,7 +55,7 @@ from vendor_pages import (
     usual_reply,
 )
 
-PATIENCE = 5.0  # s; for an expected reply
+PATIENCE = 60.0  # s; for a busy machine
 SHORT = 0.02  # s; without a reply
 MAP = PROTOCOL.modbus
 
@@ -265,11 +265,11 @@ async def test_damaged_response_is_discarded(far: Peer, backend: ModbusBackend, 
         return None
 
     far.answer = answer
-    try:
-        assert await backend.exchange(Ping(), timeout=PATIENCE / 10) == ARMED
-    except LinkTimeout:
-        assert not far.is_rtu
-        assert place == 5  # a greater length includes the start of the next frame
+    if place == 5 and not far.is_rtu:  # a greater length includes the start of the next frame
+        with pytest.raises(LinkTimeout):
+            await backend.exchange(Ping(), timeout=0.5)
+    else:
+        assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
     counters = backend.counters
     assert counters.invalid_frames + counters.unexpected_frames >= 1
     far.answer = far.usual

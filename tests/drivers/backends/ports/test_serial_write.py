@@ -74,13 +74,13 @@ async def test_closed_port_is_a_link_error(ends: tuple[serial.Serial, int]) -> N
 
 
 async def test_port_without_a_descriptor_is_written_by_a_thread() -> None:
-    """A server of RFC 2217 that takes nothing for seconds does not block the caller."""
+    """A port that takes nothing for seconds does not block the caller."""
     entered, taken = threading.Semaphore(0), threading.Semaphore(0)
     written: list[bytes] = []
     errors: asyncio.Queue[OSError] = asyncio.Queue()
 
     class Server:
-        name = "rfc2217://server"
+        name = "server"
 
         def fileno(self) -> int:
             raise OSError("no descriptor")

@@ -22,7 +22,7 @@ from drivers.protocol.messages import GetStatus, Hello, Nak, NakCode, Ping, Requ
 from scripted_amplifier import FarEnd
 from vendor_pages import ARMED, IDENTITY, usual_reply
 
-PATIENCE = 5.0  # s; for what is expected to come
+PATIENCE = 60.0  # s; for a busy machine
 SHORT = 0.02  # s; for what is expected not to come
 
 
@@ -186,8 +186,7 @@ async def test_port_refuses_a_second_speed(far_end: FarEnd, backend: SerialBacke
     [
         ("serial:///dev/no-such-port", "plug in"),
         ("serial:///dev/null", "check its name"),
-        ("serial://127.0.0.1:1", "check the address"),
-        ("hwgrep://no-such-adapter", "list them"),
+        ("serial+tcp://127.0.0.1:1", "check the address"),
     ],
 )
 async def test_unusable_port_has_a_remedy(url: str, remedy: str) -> None:
@@ -214,7 +213,7 @@ async def test_serial_server_replies_and_its_end_is_a_loss() -> None:
     loop = asyncio.get_running_loop()
     listener = socket.create_server(("127.0.0.1", 0))
     listener.setblocking(False)
-    backend = SerialBackend(f"serial://127.0.0.1:{listener.getsockname()[1]}")
+    backend = SerialBackend(f"serial+tcp://127.0.0.1:{listener.getsockname()[1]}")
     opening = asyncio.create_task(backend.open())
     connection, _ = await loop.sock_accept(listener)
     await opening

@@ -34,7 +34,7 @@ NUMBERED = [
     (name, number)
     for number, name in (*enumerate(_BEFORE, start=1), *enumerate(OF_SENSORS, start=27))
 ]
-BESIDE = ("Refusal", "FC16 Apply", "FC4 Apply", "FC43 Identification", "FC16 Disarm")
+BESIDE = ("Refusal", "FC16 Apply", "FC4 Apply", "FC16 Disarm")
 BROADCASTS = {
     "Broadcast Commit": (22, Commit(513, 9)),
     "Broadcast Stop": (23, Stop(0.005)),
@@ -175,17 +175,7 @@ def test_broadcast_is_carried_out(name: str, wire: str) -> None:
 
 @every_wire
 def test_other_masters_are_served(wire: str) -> None:
-    """The device identification names vendor, product, firmware and serial number.
-
-    One register disarms, along the ramp that the block has at first. The objects are those of the
-    standard: 0, 1 and 2, and 128 as the first of the vendor's own.
-    """
-    device = ScriptedDevice()
-    device.follow(EXAMPLES["Hello"])
-    reply = FRAMES[f"FC43 Identification reply, {wire}"]
-    assert answered(device, "FC43 Identification", wire) == reply
-    for number, text in ((0, b"Acme"), (1, b"Quad"), (2, b"1.2"), (0x80, b"A-17")):
-        assert bytes([number, len(text)]) + text in reply
+    """One register disarms, along the ramp that the block has at first."""
     device = ScriptedDevice()
     assert answered(device, "FC16 Disarm", wire) == FRAMES[f"FC16 Disarm reply, {wire}"]
     assert device.asked == [Disarm(0.005)]

@@ -1,0 +1,127 @@
+"""A plate without hardware, as a client of a JACK server.
+
+python -m benchmarks.desk_plate RIG --sensors SENSORS.csv
+"""
+
+import json
+import select
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from drivers.errors import LinkError
+from model.commands.options import RigArgument
+from model.errors import InputError
+
+if TYPE_CHECKING:
+    from benchmarks.desk_plate.desk_plate import DeskPlate
+    from benchmarks.desk_plate.jack_plate import JackPlate
+
+_POLL = 0.05  # s
+
+
+def desk_plate(
+    rig_file: RigArgument,
+    sensors_file: Annotated[
+        Path,
+        typer.Option(
+            "--sensors", metavar="SENSORS.csv", help="Accelerometers, as for era measure."
+        ),
+    ],
+    name: Annotated[str, typer.Option(metavar="NAME", help="Name of the client.")] = "desk",
+    seed: Annotated[
+        int, typer.Option(metavar="N", help="Draw another plate, and other noise.", min=0)
+    ] = 1,
+    noise: Annotated[
+        float,
+        typer.Option(metavar="DENSITY", help="Noise of an accelerometer, m/s²/sqrt(Hz).", min=0),
+    ] = 5e-3,
+    delay: Annotated[
+        int, typer.Option(metavar="SAMPLES", help="Delay of the converters.", min=0, max=48_000)
+    ] = 73,
+    mesh: Annotated[
+        str | None, typer.Option(metavar="NXxNY", help="Mesh that the plate is solved on.")
+    ] = None,
+    truth: Annotated[
+        Path | None, typer.Option(metavar="FILE.json", help="Write what the plate really is.")
+    ] = None,
+    until_eof: Annotated[
+        bool,
+        typer.Option(
+            "--until-eof",
+            help='Exit at the end of standard input; lines {"fingers": [[X, Y], ...]} touch it.',
+        ),
+    ] = False,
+) -> None:
+    """Be a plate that deviates from its rig. Print the device to play to; Ctrl-C ends.
+
+    Its inputs take what a sound card would play to the ERAs, by their channels, and the loop-back
+    last; its outputs give what accelerometers would record. Everything is simulated.
+    """
+    import gc
+
+    from benchmarks.desk_plate.desk_plate import DeskPlate
+    from benchmarks.desk_plate.jack_plate import JackPlate
+    from benchmarks.desk_plate.sensing import Converters
+    from benchmarks.desk_plate.truth import MESH, draw_truth
+    from model.rig.file import load_rig
+    from sim.libjack import JackClient
+    from sim.sensors.sensor_file import read_sensors
+
+    rig = load_rig(rig_file)
+    sensors = read_sensors(sensors_file, rig.plate)
+    drawn = draw_truth(rig, seed=seed, mesh=mesh or MESH)
+    client = JackClient(name, is_only=True)
+    try:
+        converters = Converters(delay=delay, noise=noise)
+        plate = DeskPlate(drawn, sensors, rate=client.rate, converters=converters, seed=seed)
+        if truth is not None:
+            truth.write_text(json.dumps(drawn.as_json(), indent=1) + "\n", encoding="utf-8")
+        running = JackPlate(client, plate)
+        gc.collect()
+        gc.freeze()  # what is loaded is never looked through again, in the middle of a block
+        running.start()
+        print(f"jack:{name}", flush=True)
+        print(
+            f"desk-plate: simulated; {plate.outputs} inputs for ERAs and loop-back, "
+            f"{plate.inputs} outputs, {client.rate} Hz, blocks of {client.block} frames",
+            file=sys.stderr,
+            flush=True,
+        )
+        with suppress(KeyboardInterrupt):
+            _run(running, plate, until_eof=until_eof)
+    finally:
+        client.close()
+
+
+def _run(running: "JackPlate", plate: "DeskPlate", *, until_eof: bool) -> None:
+    """Take lines from standard input until it ends, or for ever."""
+    while True:
+        running.wait(0 if until_eof else _POLL)
+        if until_eof and select.select([sys.stdin], [], [], _POLL)[0]:
+            line = sys.stdin.readline()
+            if not line:
+                return
+            places = _places(line)
+            plate.set_fingers(places)
+            print(json.dumps({"fingers": len(places)}), flush=True)
+
+
+def _places(line: str) -> list[tuple[float, float]]:
+    try:
+        return [(float(x), float(y)) for x, y in json.loads(line)["fingers"]]
+    except (ValueError, TypeError, KeyError) as problem:
+        raise InputError(
+            f'a line must be {{"fingers": [[X, Y], ...]}}, got {line[:60]!r}'
+        ) from problem
+
+
+if __name__ == "__main__":
+    try:
+        typer.run(desk_plate)
+    except (InputError, LinkError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(3) from None

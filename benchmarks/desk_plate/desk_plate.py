@@ -1,0 +1,73 @@
+"""The plate behind a sound card: samples of all outputs in, samples of all inputs out."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from benchmarks.desk_plate.lifted_blocks import SAMPLES, LiftedBlocks, sampled
+from benchmarks.desk_plate.model_in_time import DeskModel
+from benchmarks.desk_plate.sensing import Converters, SensorChannels
+from benchmarks.desk_plate.truth import Truth
+from model.arrays import FloatArray
+from model.structure.fingertip import FingertipLoad, fingertip_loads
+from sim.sensors.sensor_file import WiredSensor
+
+_LOOPED = 0.9  # of what a cable from an output to an input brings back
+
+
+class DeskPlate:
+    """A plate with accelerometers, a loop-back cable, and fingers on request.
+
+    Outputs of the card: as many as the highest channel of an ERA, and one more for the loop-back.
+    Inputs: those of the sensors, and the next for the loop-back. rate [Hz]. `advance` and
+    `set_fingers` may be called by different threads.
+    """
+
+    def __init__(
+        self,
+        truth: Truth,
+        sensors: Sequence[WiredSensor],
+        *,
+        rate: float,
+        converters: Converters,
+        seed: int,
+    ) -> None:
+        rig = truth.rig
+        self._truth, self._rate = truth, rate
+        self._columns = [rig.wiring[era.name].number for era in rig.eras]
+        self.outputs = max(self._columns) + 2
+        self._model = DeskModel(truth, np.array([[sensor.x, sensor.y] for sensor in sensors]))
+        self._channels = SensorChannels(
+            sensors,
+            loopback=max(sensor.input for sensor in sensors) + 1,
+            converters=converters,
+            rate=rate,
+            seed=seed,
+        )
+        self.inputs = self._channels.count
+        self._next: LiftedBlocks | None = None
+        self._plate = self._under(())
+        self._kept = self._model.shared
+
+    def set_fingers(self, places: Sequence[tuple[float, float]]) -> None:
+        """Replace the fingers on the plate, at places [m]; computed here, swapped between blocks.
+
+        The plate's motion is continuous; phalanges begin at rest.
+        """
+        self._next = self._under(fingertip_loads(self._truth.rig.fingertip, places))
+
+    def _under(self, fingers: Sequence[FingertipLoad]) -> LiftedBlocks:
+        return LiftedBlocks(sampled(self._model.under(fingers), rate=self._rate))
+
+    def advance(self, played: FloatArray) -> FloatArray:
+        """Samples (n, inputs) for samples (n, outputs); n a multiple of 16."""
+        following, self._next = self._next, None
+        if following is not None:
+            following.carry_on(self._plate, self._kept)
+            self._plate = following
+        accelerations = self._plate.advance(played[:, self._columns])
+        return self._channels.samples(accelerations, _LOOPED * played[:, self.outputs - 1])
+
+
+BLOCK_MULTIPLE = SAMPLES
+"""Frames of a block must be a multiple of this."""

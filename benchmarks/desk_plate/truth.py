@@ -1,0 +1,110 @@
+"""What a plate on the desk really is, drawn within what a rig's drawing leaves open."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.rig.meshes import parse_mesh
+from model.rig.rig import Rig
+from model.structure.plate import Plate
+
+MESH = "16x12 Q3"
+"""Elements of high order: another solver than the polynomials of a table."""
+
+_RESONANCES = 550.0, 800.0  # Hz, of actuators; above the played range, but felt in its phases
+_RATIOS = 0.2, 0.4  # of their damping
+_PLACE = 1e-3  # m
+_BOLT = 0.008  # kg
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """The motion of an ERA's base by a sample: g w² / (s² + 2 zeta w s + w²) full strokes.
+
+    resonance w / 2 pi [Hz], damping ratio zeta, gain g.
+    """
+
+    resonance: float
+    ratio: float
+    gain: float
+
+    def response(self, frequencies: FloatArray) -> ComplexArray:
+        """Full strokes by full scale at frequencies [Hz]."""
+        x = np.asarray(frequencies) / self.resonance
+        return np.asarray(self.gain / (1 - x**2 + 2j * self.ratio * x))
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A plate on its ERAs as it is: a rig without measured gains, and an actuator of each ERA."""
+
+    rig: Rig
+    actuators: tuple[Actuator, ...]
+
+    def as_json(self) -> Mapping[str, object]:
+        """Its parameters, as those that `era calibrate` finds, for programs."""
+        plate = self.rig.plate
+        return {
+            "thickness_m": plate.thickness,
+            "flexural_rigidity_n_m": plate.flexural_rigidity,
+            "loss_factor": plate.loss_factor,
+            "eras": {
+                era.name: {
+                    "at_m": [era.x, era.y],
+                    "stiffness": era.stiffness,
+                    "damping": era.damping,
+                    "bolt_mass": era.bolt_mass,
+                    "resonance_hz": actuator.resonance,
+                    "damping_ratio": actuator.ratio,
+                    "gain": actuator.gain,
+                }
+                for era, actuator in zip(self.rig.eras, self.actuators, strict=True)
+            },
+        }
+
+
+def draw_truth(rig: Rig, *, seed: int, mesh: str = MESH) -> Truth:
+    """Draw a plate of a rig: by the rig's uncertainty, with places, bolts and actuators of its own.
+
+    Places are off by 1 mm (standard deviation), bolts weigh up to 8 g more.
+    """
+    rng = np.random.default_rng(seed)
+    std = rig.uncertainty
+
+    def relative(deviation: float) -> float:
+        return float(max(0.05, 1 + deviation * rng.standard_normal()))
+
+    plate = rig.plate.scaled(thickness=relative(std.thickness))
+    loss = min(plate.loss_factor * std.damping ** rng.standard_normal(), 0.5)
+    plate = replace(plate, loss_factor=float(loss))
+    damping = std.damping ** rng.standard_normal()
+    eras = tuple(
+        replace(
+            era,
+            x=float(x),
+            y=float(y),
+            stiffness=era.stiffness * relative(std.stiffness),
+            damping=float(era.damping * damping * relative(std.stiffness)),
+            bolt_mass=era.bolt_mass + float(rng.uniform(0, _BOLT)),
+            gains=(),
+        )
+        for era in rig.eras
+        for x, y in (_near((era.x, era.y), plate, rng),)
+    )
+    actuators = tuple(
+        Actuator(float(rng.uniform(*_RESONANCES)), float(rng.uniform(*_RATIOS)), relative(std.gain))
+        for _ in eras
+    )
+    return Truth(replace(rig, plate=plate, eras=eras, mesh=parse_mesh(mesh, plate)), actuators)
+
+
+def _near(place: Sequence[float], plate: Plate, rng: np.random.Generator) -> tuple[float, float]:
+    """A place beside another, on the plate."""
+    found = np.abs(np.asarray(place) + _PLACE * rng.standard_normal(2))
+    sides = np.array([plate.length, plate.width])
+    x, y = np.where(found > sides, 2 * sides - found, found).tolist()
+    assert math.isfinite(x + y)
+    return x, y

@@ -1,1 +1,0 @@
-"""Install the daemon as a system service."""

@@ -1,0 +1,164 @@
+// SPDX-License-Identifier: MIT
+//
+// A board in memory, whose clock stands still until its caller moves it: the amplifier as a shared
+// library. One amplifier at a time; the caller brings what arrives and fetches what is sent.
+
+#include "board.h"
+#include "loop.h"
+#include "mbap.h"
+
+#include <string.h>
+
+#define LINES 3
+#define RING 8192 // bytes
+#define STEP 1000 // us; between two turns of the loop
+
+static struct {
+    uint8_t arrived[RING], sent[RING];
+    uint32_t arrived_length, arrived_at, sent_length;
+    uint64_t heard_at;
+} lines[LINES];
+static struct mbap connection;
+static uint64_t now, samples_counted; // us, and those made of them
+static bool is_high_voltage, is_interlock_open;
+static uint8_t addresses[LINES];
+
+void moved_begin(void)
+{
+    memset(lines, 0, sizeof lines);
+    memset(addresses, 1, sizeof addresses);
+    connection.length = 0;
+    now = samples_counted = 0;
+    is_interlock_open = false;
+    loop_init();
+}
+
+void moved_to(uint64_t time)
+{
+    while (now < time) {
+        now = time - now > STEP ? now + STEP : time;
+        loop_once();
+    }
+}
+
+void moved_interlock(bool is_open)
+{
+    is_interlock_open = is_open;
+}
+
+void moved_receive(enum line line, const uint8_t *bytes, uint32_t length)
+{
+    uint32_t room = RING - lines[line].arrived_length;
+    length = length < room ? length : room;
+    memcpy(lines[line].arrived + lines[line].arrived_length, bytes, length);
+    lines[line].arrived_length += length;
+    lines[line].heard_at = now;
+    loop_once();
+}
+
+uint32_t moved_sent(enum line line, uint8_t bytes[RING])
+{
+    uint32_t length = lines[line].sent_length;
+    memcpy(bytes, lines[line].sent, length);
+    lines[line].sent_length = 0;
+    return length;
+}
+
+static void send_frame(int line, const uint8_t *frame, uint16_t length)
+{
+    board_write((enum line)line, frame, length);
+}
+
+// Bytes of a connection of Modbus TCP, the only one; replies are sent on LINE_MODBUS.
+void moved_receive_tcp(const uint8_t *bytes, uint32_t length)
+{
+    loop_samples();
+    for (uint32_t at = 0; at < length;) {
+        uint32_t room = MBAP_FRAME_MAX - connection.length, left = length - at;
+        uint32_t part = left < room ? left : room;
+        memcpy(connection.received + connection.length, bytes + at, part);
+        connection.length = (uint16_t)(connection.length + part);
+        at += part;
+        mbap_take(&connection, loop_modbus(), send_frame, LINE_MODBUS);
+    }
+    loop_once();
+}
+
+uint32_t board_samples_due(void)
+{
+    uint64_t due = now * SAMPLE_RATE / 1000000 - samples_counted;
+    samples_counted += due;
+    return (uint32_t)due;
+}
+
+void board_output(const int16_t samples[CHANNELS])
+{
+    (void)samples;
+}
+
+void board_wait(void)
+{
+}
+
+int board_read(enum line line)
+{
+    if (lines[line].arrived_at == lines[line].arrived_length) {
+        lines[line].arrived_at = lines[line].arrived_length = 0;
+        return -1;
+    }
+    return lines[line].arrived[lines[line].arrived_at++];
+}
+
+void board_write(enum line line, const uint8_t *bytes, uint16_t length)
+{
+    if (length > RING - lines[line].sent_length)
+        return; // lost, as on a wire that nobody reads
+    memcpy(lines[line].sent + lines[line].sent_length, bytes, length);
+    lines[line].sent_length += length;
+}
+
+uint32_t board_silence(enum line line)
+{
+    return (uint32_t)(now - lines[line].heard_at);
+}
+
+void board_high_voltage(bool on)
+{
+    is_high_voltage = on;
+}
+
+int16_t board_temperature(void)
+{
+    return 250;
+}
+
+uint16_t board_voltage(void)
+{
+    return is_high_voltage ? 1800 : 0;
+}
+
+bool board_interlock_open(void)
+{
+    return is_interlock_open;
+}
+
+enum fault board_fault(uint8_t *channel)
+{
+    *channel = NO_CHANNEL;
+    return FAULT_NONE;
+}
+
+const char *board_serial_number(void)
+{
+    return "FW-1";
+}
+
+uint8_t board_address(enum line line)
+{
+    return addresses[line];
+}
+
+void board_store_address(enum line line, uint8_t address)
+{
+    addresses[line] = address;
+}

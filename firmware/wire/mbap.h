@@ -1,0 +1,25 @@
+// SPDX-License-Identifier: MIT
+//
+// Frames of Modbus TCP: transaction u16, protocol u16 (0), length u16 of what follows, unit u8, PDU.
+
+#ifndef MBAP_H
+#define MBAP_H
+
+#include "modbus.h"
+
+#define MBAP_HEADER 7
+#define MBAP_FRAME_MAX (MBAP_HEADER + MODBUS_PDU_MAX)
+
+// A connection: what has arrived, and was not carried out.
+struct mbap {
+    uint8_t received[MBAP_FRAME_MAX];
+    uint16_t length;
+};
+
+typedef void mbap_send(int to, const uint8_t *frame, uint16_t length);
+
+// Carry out the whole frames that have arrived; send the replies `to` the connection. What is no
+// frame is discarded with all that came with it.
+void mbap_take(struct mbap *mbap, struct modbus *modbus, mbap_send *send, int to);
+
+#endif

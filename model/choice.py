@@ -1,0 +1,43 @@
+"""Choices among scores that rounding cannot turn.
+
+Scores that are equal in theory, as of two places that mirror each other, differ by rounding, which
+is another one on another processor. So scores within a small distance of the best count as equal to
+it, and the first of them is chosen.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from model.arrays import IntArray
+
+NEARLY = 1e-5
+"""Distance from the best, relative to it, within which scores count as equal."""
+
+
+def best_of(scores: ArrayLike) -> int:
+    """Index of the first of the highest scores (n,)."""
+    return int(best_along(scores, axis=0))
+
+
+def best_along(scores: ArrayLike, axis: int) -> IntArray:
+    """Index of the first of the highest scores along an axis."""
+    values = np.asarray(scores)
+    best = values.max(axis=axis, keepdims=True)
+    with np.errstate(invalid="ignore"):  # infinite: equal only to itself
+        is_best = (values == best) | (values >= best - NEARLY * np.abs(best))
+    return np.asarray(is_best.argmax(axis=axis))
+
+
+def best_first(scores: ArrayLike) -> IntArray:
+    """Order of scores (n,), the highest first; of those nearly equal the first one first.
+
+    Each of a run of nearly equal scores is near its neighbours, not always near all others.
+    """
+    values = np.asarray(scores)
+    order = np.argsort(-values, kind="stable")
+    ordered = values[order]
+    above, below = ordered[:-1], ordered[1:]
+    with np.errstate(invalid="ignore"):  # infinite: equal only to itself
+        is_near = (below == above) | (below >= above - NEARLY * np.abs(above))
+    run = np.concatenate([[0], np.cumsum(~is_near)])[: len(order)]
+    return np.asarray(order[np.lexsort((order, run))])

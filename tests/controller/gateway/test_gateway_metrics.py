@@ -1,0 +1,95 @@
+"""Metrics as read by a Prometheus parser."""
+
+from collections.abc import MutableMapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from starlette.responses import PlainTextResponse
+
+from controller.api.methods import StatusResult
+from controller.gateway.access import Access
+from controller.gateway.metrics import exposition
+from controller.gateway.settings import Settings
+from daemon_bench import ready_daemon
+from gateway_bench import ScriptedDaemon, gateway_process, http, wait_for_daemon
+
+
+def scraped(status: StatusResult | None) -> dict[tuple[str, str], float]:
+    """Samples by name and first label."""
+    return {
+        (sample.name, next(iter(sample.labels.values()), "")): sample.value
+        for family in text_string_to_metric_families(exposition(status).decode())
+        for sample in family.samples
+    }
+
+
+async def test_metrics_follow_status(tmp_path: Path) -> None:
+    """State, link counters and latency of a daemon, in base units."""
+    async with ready_daemon(tmp_path) as (_, era):
+        status = await era.status()
+        read = scraped(status)
+    assert read["era_up", ""] == 1
+    assert read["era_state", "READY_TO_SWITCH_ON"] == 1
+    assert read["era_state", "FAULT"] == 0
+    assert read["era_link_frames_out_total", "main"] == status.amplifiers[0].statistics.frames_out
+    assert read["era_amplifier_temperature_celsius", "main"] == pytest.approx(25)
+    assert read["era_amplifier_high_voltage", "main"] == 0
+    round_trip = status.amplifiers[0].statistics.round_trip_ms
+    assert round_trip is not None
+    assert read["era_amplifier_round_trip_seconds", "main"] == pytest.approx(round_trip / 1000)
+    assert read["era_touch_to_wire_seconds_bucket", "+Inf"] == 0
+    histogram = [(1.0, 2), (5.0, 3), (100.0, 4)]
+    latency = status.latency_ms.model_copy(update={"count": 9, "histogram": histogram})
+    later = status.model_copy(update={"latency_ms": latency, "rejected_touches": {"off_plate": 3}})
+    read = scraped(later)
+    assert read["era_touch_to_wire_seconds_bucket", "0.001"] == 2
+    assert read["era_touch_to_wire_seconds_bucket", "0.005"] == 5
+    assert read["era_touch_to_wire_seconds_bucket", "+Inf"] == 9
+    assert read["era_rejected_touches_total", "off_plate"] == 3
+
+
+def test_metrics_are_era_up_0_without_daemon() -> None:
+    """No other sample is given."""
+    assert scraped(None) == {("era_up", ""): 0}
+
+
+def test_metrics_need_no_token_on_the_loopback(daemon: ScriptedDaemon, tmp_path: Path) -> None:
+    """Prometheus reads them of an allowed Host; they say that the daemon responds."""
+    with gateway_process(tmp_path, daemon.socket) as gateway:
+        wait_for_daemon(gateway)
+        served = http(gateway, "/metrics", method="GET", body=b"", token=())
+        assert served.status == 200
+        assert b"\nera_up 1.0\n" in served.body
+        foreign = http(gateway, "/metrics", method="GET", body=b"", host=["evil.example"])
+        assert foreign.status == 421
+
+
+async def test_metrics_need_the_token_elsewhere(tmp_path: Path) -> None:
+    """Nothing of the machine is told to a network without it."""
+    certificate = tmp_path / "panel.pem"
+    certificate.touch()
+    settings = Settings(
+        socket=tmp_path / "era.sock",
+        host="192.0.2.7",
+        certificate=certificate,
+        key=certificate,
+        is_token_user_supplied=True,
+        extra_hosts=("panel.local",),
+    )
+    statuses: list[int] = []
+
+    async def send(message: MutableMapping[str, Any]) -> None:
+        if message["type"] == "http.response.start":
+            statuses.append(message["status"])
+
+    async def receive() -> MutableMapping[str, Any]:
+        return {"type": "http.request", "body": b""}
+
+    access = Access(PlainTextResponse("era_up 1"), settings)
+    for token in (b"wrong", settings.token.encode()):
+        headers = [(b"host", b"panel.local"), (b"authorization", b"Bearer " + token)]
+        scope = {"type": "http", "path": "/metrics", "method": "GET", "headers": headers}
+        await access(scope, receive, send)
+    assert statuses == [401, 200]

@@ -1,0 +1,264 @@
+"""Judge the tests by planted faults: plant each in a copy of the tree, run the tests that find it.
+
+    python tests/faults/run.py [--only PATTERN] [--quick] [--workers N] [--json FILE]
+
+Faults are data, in the files `AREA.yaml` beside this one; CONTRIBUTING.md has their format. A fault
+is found if every test named by it fails and shows what it must, missed if one of them does not or
+takes too long, stale if a text to change does not occur exactly once in its file, or no test can be
+run with it. Those of `missed.yaml` are not found by any test of today, with the reason: a line to
+fall behind never.
+Exit status 1 for anything missed or stale that is not among them, or found though it is.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import shutil
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import cache, partial
+from importlib import import_module
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import pytest
+from ruamel.yaml import YAML
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+TIME_LIMIT = 120.0  # s; for the tests of one fault
+SOUND_TIME_LIMIT = 1800.0  # s; for all tests in the tree as it is
+_FORK = get_context("fork")
+_NOT_COPIED = shutil.ignore_patterns(
+    ".git", ".venv", ".*_cache", ".hypothesis", "__pycache__", "out", "dist", "_build"
+)
+_PRELOADED = (
+    *("numpy", "scipy.linalg", "scipy.optimize", "scipy.sparse.linalg", "scipy.special"),
+    *("scipy.interpolate", "scipy.signal", "scipy.ndimage", "hypothesis", "pydantic", "can"),
+    *("canopen", "pymodbus.client", "pint", "ruamel.yaml", "rich.console", "matplotlib.figure"),
+)
+"""Modules of others that most tests load: processes are forked once they are loaded."""
+
+
+@dataclass(frozen=True)
+class PlantedFault:
+    """A fault in words of behaviour, the edits (file, find, replace) that plant it, and its tests.
+
+    name: AREA/NAME; shows: what the first line of each failure must contain; missed: why no test of
+    today finds it, empty for all others.
+    """
+
+    name: str
+    behaviour: str
+    edits: tuple[tuple[str, str, str], ...]
+    tests: tuple[str, ...]
+    shows: str
+    is_quick: bool
+    missed: str
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What became of a fault: found, missed or stale; how its tests ended, or what is stale."""
+
+    fault: str
+    result: str
+    seconds: float
+    tests: Mapping[str, str]
+
+    def __str__(self) -> str:
+        passed = (
+            [] if self.result == "found" else [f"\n    {t}: {w}" for t, w in self.tests.items()]
+        )
+        return f"{self.result:6} {self.seconds:5.1f} s  {self.fault}{''.join(passed)}"
+
+
+class _Outcomes:
+    """How each test ended: passed, or the first line of why it failed."""
+
+    def __init__(self) -> None:
+        self.by_test: dict[str, str] = {}
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Note a failure in any phase; pytest calls it for each."""
+        crash = getattr(report.longrepr, "reprcrash", None)
+        if report.failed:
+            self.by_test[report.nodeid] = crash.message.split("\n")[0] if crash else "failed"
+        elif report.when == "call":
+            self.by_test[report.nodeid] = report.outcome
+
+
+def load_faults() -> list[PlantedFault]:
+    """Return the faults of all areas; ValueError for a name that occurs twice."""
+    yaml = YAML(typ="safe")
+    faults = [
+        _fault_of(path.stem, row)
+        for path in sorted(HERE.glob("*.yaml"))
+        for row in yaml.load(path) or ()
+    ]
+    twice = [name for name, count in Counter(one.name for one in faults).items() if count > 1]
+    if twice:
+        raise ValueError(f"names of faults must be unique, got {', '.join(twice)} twice")
+    return faults
+
+
+def _fault_of(area: str, row: dict[str, Any]) -> PlantedFault:
+    wires = row.get("where", [""])
+    tests = [each.replace("{where}", wire) for each in row["found_by"] for wire in wires]
+    return PlantedFault(
+        f"{area}/{row['fault']}",
+        row["behaviour"],
+        tuple((edit["file"], edit["find"], edit["replace"]) for edit in row["change"]),
+        tuple(dict.fromkeys(tests)),
+        row.get("shows", ""),
+        row.get("quick", False),
+        row.get("missed", ""),
+    )
+
+
+def run_tests(folder: Path, tests: Sequence[str], *, limit: float) -> dict[str, str]:
+    """Run tests in a tree, in a process of their own; return how those ended that came to an end.
+
+    limit: time [s] after which the process is killed, with those that it has started.
+    """
+    receiving, sending = _FORK.Pipe(duplex=False)
+    process = _FORK.Process(target=_run_pytest, args=(folder, tests, sending))
+    process.start()
+    sending.close()
+    try:
+        outcomes = receiving.recv() if receiving.poll(limit) else dict.fromkeys(tests, "timed out")
+    except EOFError:
+        outcomes = {}
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid or 0, signal.SIGKILL)
+    process.join()
+    return outcomes
+
+
+def _run_pytest(folder: Path, tests: Sequence[str], sending: Connection) -> None:
+    os.setsid()
+    os.chdir(folder)
+    os.environ["PYTHONPATH"] = str(folder)
+    sys.path[0] = str(folder)
+    null = os.open(os.devnull, os.O_RDWR)
+    for number in (0, 1, 2):
+        os.dup2(null, number)
+    outcomes = _Outcomes()
+    pytest.main(["-q", "-p", "no:cacheprovider", "--assert=plain", *tests], plugins=[outcomes])
+    sending.send(outcomes.by_test)
+
+
+def stale_edits(fault: PlantedFault, tree: Path) -> dict[str, str]:
+    """Return what is wrong with the files of a tree that do not have a text to change once."""
+    return {
+        file: "must contain the text to change once"
+        for file, find, _ in fault.edits
+        if not (tree / file).is_file() or _text(tree / file).count(find) != 1
+    }
+
+
+def judge(fault: PlantedFault, sound: Path) -> Judgement:
+    """Plant a fault into this worker's copy of a sound tree, run its tests, and repair the copy."""
+    folder, began = _own_copy(sound), time.monotonic()
+    try:
+        if stale := stale_edits(fault, folder):
+            return Judgement(fault.name, "stale", 0.0, stale)
+        for file, find, replacement in fault.edits:
+            (folder / file).write_text(_text(folder / file).replace(find, replacement), "utf-8")
+        ended = run_tests(folder, fault.tests, limit=TIME_LIMIT) if fault.tests else {}
+    finally:
+        for file, *_ in fault.edits:
+            shutil.copy2(sound / file, folder / file)
+    ended = {test: ended.get(test, "cannot be run") for test in fault.tests}
+    result = "found"
+    if "cannot be run" in ended.values():
+        result = "stale"
+    elif not ended or not all(_is_finding(how, fault.shows) for how in ended.values()):
+        result = "missed"
+    return Judgement(fault.name, result, time.monotonic() - began, ended)
+
+
+def _is_finding(how: str, shows: str) -> bool:
+    return how not in ("passed", "skipped", "timed out") and shows in how
+
+
+def _text(path: Path) -> str:
+    return path.read_text("utf-8")
+
+
+@cache
+def _own_copy(sound: Path) -> Path:
+    """This process's copy of a tree, which has compiled what it will not compile again."""
+    sys.dont_write_bytecode = True
+    os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
+    return Path(shutil.copytree(sound, sound.with_name(str(os.getpid())), symlinks=True))
+
+
+def _unsound(
+    pool: ProcessPoolExecutor, sound: Path, tests: Sequence[str], shares: int
+) -> list[str]:
+    """Tests that do not pass in a sound tree, with how they ended."""
+    run = partial(run_tests, sound, limit=SOUND_TIME_LIMIT)
+    ended: dict[str, str] = {}
+    for outcomes in pool.map(run, [tests[at::shares] for at in range(shares) if tests[at:]]):
+        ended |= outcomes
+    how = {test: ended.get(test, "cannot be run") for test in tests}
+    return [f"{test}: {ended}" for test, ended in how.items() if ended != "passed"]
+
+
+def judge_all(faults: Sequence[PlantedFault], *, workers: int) -> Iterable[Judgement]:
+    """Judge faults by turns; RuntimeError if a test of theirs does not pass without them."""
+    with TemporaryDirectory() as folder, ProcessPoolExecutor(workers, _FORK) as pool:
+        sound = Path(shutil.copytree(ROOT, Path(folder) / "sound", ignore=_NOT_COPIED))
+        tests = sorted({test for fault in faults for test in fault.tests})
+        if unsound := _unsound(pool, sound, tests, workers):
+            raise RuntimeError("\n    ".join(["these must pass without faults:", *unsound]))
+        yield from pool.map(partial(judge, sound=sound), faults)
+
+
+def main() -> int:
+    """Judge the faults asked for; print each, then the totals."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--only", default="", help="part of AREA/NAME of faults")
+    parser.add_argument("--quick", action="store_true", help="those that `make test` takes")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--json", type=Path, help="file for the judgements")
+    asked = parser.parse_args()
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[variable] = "1"  # before numpy loads
+    for module in _PRELOADED:
+        import_module(module)
+    faults = [
+        one for one in load_faults() if asked.only in one.name and one.is_quick >= asked.quick
+    ]
+    known = {one.name for one in faults if one.missed}
+    began, judgements = time.monotonic(), []
+    for judgement in judge_all(faults, workers=asked.workers):
+        sys.stdout.write(f"{judgement}\n")
+        sys.stdout.flush()
+        judgements.append(judgement)
+    results = Counter(one.result for one in judgements)
+    now_found = [one for one in judgements if one.fault in known and one.result != "missed"]
+    newly_missed = [one for one in judgements if one.fault not in known and one.result != "found"]
+    sys.stdout.write(
+        f"{len(faults)} faults: {results['found']} found, {results['missed']} missed "
+        f"({len(known)} known), {results['stale']} stale; {time.monotonic() - began:.0f} s\n"
+    )
+    for text, wrong in (("not found", newly_missed), ("not missed as known", now_found)):
+        sys.stdout.writelines(f"{text}: {one.fault}\n" for one in wrong)
+    if asked.json:
+        asked.json.write_text(json.dumps([asdict(one) for one in judgements], indent=1), "utf-8")
+    return 1 if newly_missed or now_found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,69 @@
+"""The judge of planted faults: it judges rightly, and the quick ones of today are found."""
+
+import json
+import runpy
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+RUN = Path(__file__).with_name("run.py")
+FAULT = """
+- fault: {name}
+  behaviour: Two and two are {result}.
+  where: [two, three]
+  change: [{{file: sums.py, find: "{find}", replace: "{result}"}}]
+  found_by: ["tests/test_sums.py::test_sum[{{where}}]"]
+"""
+TESTS = """
+import pytest
+from sums import SUM
+@pytest.mark.parametrize("below", [pytest.param(2, id="two"), pytest.param(3, id="three")])
+def test_sum(below):
+    assert below < SUM < 5
+"""
+
+
+def judged(run: Path, *options: str) -> tuple[int, dict[str, str]]:
+    """Exit status of the judge, and what became of each fault."""
+    report = run.with_name("judged.json")
+    command = [sys.executable, run, "--workers", "1", "--json", report, *options]
+    status = subprocess.run(command, stdout=subprocess.PIPE).returncode
+    rows = json.loads(report.read_text("utf-8"))
+    report.unlink()
+    return status, {row["fault"]: row["result"] for row in rows}
+
+
+def test_no_fault_is_stale() -> None:
+    """Every text that a fault changes occurs once in its file; who rewrites it, the fault too."""
+    judge = runpy.run_path(str(RUN))
+    stale = {one.name: judge["stale_edits"](one, judge["ROOT"]) for one in judge["load_faults"]()}
+    assert {name: files for name, files in stale.items() if files} == {}
+
+
+def test_quick_faults_are_found() -> None:
+    """Five faults of safety, in amplifiers and in the chain, are planted and found."""
+    status, results = judged(RUN, "--quick")
+    assert (status, set(results.values())) == (0, {"found"})
+
+
+def test_fault_is_found_only_if_every_test_of_it_fails(tmp_path: Path) -> None:
+    """It is missed where one passes, stale where it cannot be planted or tested."""
+    folder = tmp_path / "tests" / "faults"
+    folder.mkdir(parents=True)
+    shutil.copy(RUN, folder)
+    (tmp_path / "sums.py").write_text("SUM = 2 + 2\n")
+    (tmp_path / "tests" / "test_sums.py").write_text(TESTS)
+    rows = [
+        ("found", "2 + 2", "5"),
+        ("missed-by-one", "2 + 2", "3"),
+        ("missed", "2 + 2", "1 + 3"),
+        ("moved", "2 + 1", "5"),
+        ("twice", "2", "5"),
+        ("no-code", "2 + 2", "5 +"),
+    ]
+    texts = [FAULT.format(name=name, find=find, result=result) for name, find, result in rows]
+    (folder / "sums.yaml").write_text("".join(texts))
+    status, results = judged(folder / "run.py")
+    assert status == 1
+    assert list(results.values()) == ["found", "missed", "missed", "stale", "stale", "stale"]

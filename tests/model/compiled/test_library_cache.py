@@ -1,0 +1,135 @@
+"""Compiled libraries in the cache folder: safe, whole, and not piled up."""
+
+import hashlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from model.compiled import library_cache
+from model.compiled.compiler import compile_library
+
+_PROGRAM = """
+import sys
+from pathlib import Path
+from model.compiled.library_cache import kept_library
+found = kept_library("seven", [Path(sys.argv[1])], flags=(), what="seven")
+print(found.seven())
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The cache folder of these tests."""
+    return tmp_path / "cache" / "era-haptics"
+
+
+def seven(folder: Path) -> int:
+    """What a function that returns seven gives, compiled or kept, in a process of its own."""
+    source = folder.parents[1] / "seven.c"
+    source.write_text("int seven(void) { return 7; }")
+    done = subprocess.run(
+        [sys.executable, "-c", _PROGRAM, str(source)],
+        env=os.environ | {"XDG_CACHE_HOME": str(folder.parent)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return int(done.stdout)
+
+
+def forge(path: Path) -> None:
+    """Put a library there that returns eight, with its checksum."""
+    source = path.with_suffix(".c")
+    source.write_text("int seven(void) { return 8; }")
+    compile_library(path, [source], flags=(), what="eight")
+    source.unlink()
+    checksum = hashlib.sha256(path.read_bytes()).hexdigest()
+    path.with_name(f"{path.name}.sha256").write_text(checksum)
+
+
+def truncate(path: Path) -> None:
+    """Leave the first page, as after a power failure: what is mapped beyond it is SIGBUS."""
+    os.truncate(path, 4096)
+
+
+def let_others_write(path: Path) -> None:
+    """Put a library there that every user may have written."""
+    forge(path)
+    path.chmod(0o777)
+
+
+def let_others_write_checksum(path: Path) -> None:
+    """The same of its checksum."""
+    forge(path)
+    path.with_name(f"{path.name}.sha256").chmod(0o666)
+
+
+def exchange(path: Path) -> None:
+    """Put another library there, without its checksum."""
+    forge(path)
+    path.with_name(f"{path.name}.sha256").unlink()
+
+
+@pytest.mark.parametrize(
+    "damage", [truncate, let_others_write, let_others_write_checksum, exchange]
+)
+def test_library_unsafe_or_not_whole_is_compiled_again(
+    damage: Callable[[Path], None], folder: Path
+) -> None:
+    """It is not loaded, and the next process finds a good one."""
+    assert seven(folder) == 7
+    (path,) = folder.glob("*.so")
+    good = path.read_bytes()
+    damage(path)
+    assert seven(folder) == 7
+    assert path.read_bytes() == good
+    forge(path)  # safe and whole: what is kept is loaded
+    assert seven(folder) == 8
+
+
+def test_folder_in_which_others_write_is_not_used(folder: Path) -> None:
+    """Neither the folder nor one above it, unless it is sticky as /tmp; no library is left."""
+    assert seven(folder) == 7
+    (path,) = folder.glob("*.so")
+    forge(path)
+    for each in (folder, folder.parent):
+        each.chmod(0o777)
+        assert seven(folder) == 7
+        each.chmod(0o700)
+    assert seven(folder) == 8
+    folder.parent.chmod(0o1777)
+    assert seven(folder) == 8
+
+
+def test_files_of_another_user_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Root's are not: who could write them need not."""
+    path = tmp_path / "library.so"
+    path.touch(0o755)
+    library_cache.check_own(path)
+    owner = os.geteuid()
+    if owner:
+        monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
+    else:
+        os.chown(path, 1, -1)
+    with pytest.raises(PermissionError):
+        library_cache.check_own(path)
+    library_cache.check_own(Path("/"))
+
+
+def test_least_recently_used_libraries_are_removed(folder: Path) -> None:
+    """With their checksums; names hold the C library, so that another one compiles its own."""
+    folder.mkdir(parents=True, mode=0o700)
+    for number in range(library_cache.MAX_KEPT_LIBRARIES + 1):
+        for name in (f"old{number}.so", f"old{number}.so.sha256"):
+            (folder / name).touch()
+            os.utime(folder / name, (number, number))
+    assert seven(folder) == 7
+    (path,) = folder.glob("seven-*.so")
+    kept = {f"old{number}.so" for number in range(2, library_cache.MAX_KEPT_LIBRARIES + 1)}
+    kept |= {path.name}
+    assert {each.name for each in folder.iterdir()} == kept | {f"{name}.sha256" for name in kept}
+    assert os.confstr("CS_GNU_LIBC_VERSION").replace(" ", "") in path.name

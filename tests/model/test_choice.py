@@ -1,0 +1,31 @@
+"""Choices among scores that rounding cannot turn."""
+
+import numpy as np
+
+from model.choice import NEARLY, best_along, best_first, best_of
+
+
+def test_the_first_of_the_nearly_equal_best_is_chosen():
+    """Whatever rounding adds to scores that are equal, of any sign, along any axis."""
+    for scores in ([1.0, 3.0, 2.0, 3.0], [-5.0, -1.0, -2.0, -1.0], [0.0, np.inf, 1.0, np.inf]):
+        for seed in range(20):
+            rounding = 1 + NEARLY / 4 * np.random.default_rng(seed).uniform(-1, 1, 4)
+            rounded = np.array(scores) * rounding
+            assert best_of(rounded) == 1
+            assert best_along(np.column_stack([rounded, rounded[::-1]]), axis=0).tolist() == [1, 0]
+            assert best_along(rounded[None], axis=1).tolist() == [1]
+
+
+def test_what_is_better_by_more_than_rounding_is_chosen():
+    """However little more."""
+    assert best_of([1.0, 1 + 3 * NEARLY]) == 1
+    assert best_first([1.0, 1 + 3 * NEARLY]).tolist() == [1, 0]
+
+
+def test_an_order_keeps_nearly_equal_scores_as_they_came():
+    """Best first, and of none there is an empty one."""
+    for seed in range(20):
+        rounding = 1 + NEARLY / 4 * np.random.default_rng(seed).uniform(-1, 1, 5)
+        assert best_first([2.0, 7.0, 2.0, 0.0, 7.0] * rounding).tolist() == [1, 4, 0, 2, 3]
+    assert best_first([1.0, np.inf, -np.inf, np.inf]).tolist() == [1, 3, 0, 2]
+    assert best_first([]).tolist() == []

@@ -1,0 +1,95 @@
+"""The witness finds nothing in the chain as it is; planted faults make it find their rule broken.
+
+The chain is the real one, from a touch to the amplifiers' channels, over wires in memory and in
+virtual time. The faults, each with the rule that must be reported: tests/faults.
+"""
+
+import inspect
+import re
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+import witness_scenarios
+from long_form import shortly
+from witnessed_chain import WITNESSED, Chain, play
+
+SCENARIOS: dict[str, Callable[[Chain], Awaitable[None]]] = {
+    name: scenario
+    for name, scenario in inspect.getmembers(witness_scenarios, inspect.iscoroutinefunction)
+    if not name.startswith("_") and name not in ("rough", "lossy")
+}
+RULES = {
+    *("limits", "garbage", "enabled", "justified", "pattern", "lift", "touch", "commit", "token"),
+    *("session", "voices"),
+    *("stop", "heartbeat", "armed", "identified", "credit", "answer", "damage", "watchdog"),
+    *("latched", "state", "ramp", "plays", "silent", "high_voltage", "constant", "faults"),
+}
+"""As docs/reference/witness.md lists them."""
+
+SERIAL_ONLY = {"noise", "late_copy", "damaged_answer", "foreign_answer"}
+# Over RTU an answer begins within 10 ms, and nothing may be sent before it: 25 ms are a fault, and
+# the stop that follows a fault is still under way when the operator clears.
+NOT_OVER_RTU = {"slow_stop", "slow_lift", "slow_touch", "asked"}
+
+
+def _played() -> list[tuple[str, str, int]]:
+    """Each scenario, a wire and the amplifiers: on two wires each, the day on every wire."""
+    wires: dict[str, tuple[str, ...]] = {"incomplete_set": ("slcan",)}
+    wires |= dict.fromkeys(SERIAL_ONLY, ("serial",))
+    wires |= dict.fromkeys(NOT_OVER_RTU, ("serial", "modbus-tcp", "socketcand", "slcan"))
+    played = [("day", wire, amplifiers) for wire in WITNESSED for amplifiers in (1, 2)]
+    played += [("asked", wire, 1) for wire in wires["asked"]]
+    for number, name in enumerate(SCENARIOS):
+        possible = wires.get(name, WITNESSED)
+        played += [(name, wire, 1) for wire in (possible[0], possible[number % len(possible)])]
+    return [*dict.fromkeys(played)]
+
+
+@pytest.mark.parametrize(("scenario", "wire", "amplifiers"), _played())
+def test_witness_finds_nothing_in_the_chain(scenario: str, wire: str, amplifiers: int) -> None:
+    """Every scenario passes clean; amplifiers share a wire of a kind that can be shared."""
+    outcome = play(wire, SCENARIOS[scenario], amplifiers=("a", "b")[:amplifiers])
+    broken = sorted({one.invariant for one in outcome.found})
+    assert not broken, f"broken {', '.join(broken)}: {outcome.found[0]}"
+    assert outcome.errors == []
+    assert outcome.frames > 5
+
+
+@pytest.mark.parametrize("seed", shortly(range(3), [0]))
+@pytest.mark.parametrize("wire", ["serial", "modbus-rtu", "slcan"])
+def test_witness_excuses_noise(wire: str, seed: int) -> None:
+    """Lost and damaged frames on a line are borne by both sides as the pages say."""
+    scenario = witness_scenarios.lossy if wire == "slcan" else witness_scenarios.rough
+    outcome = play(wire, scenario, seed=seed)
+    assert not outcome.found, str(outcome.found[0])
+
+
+@pytest.mark.parametrize("seed", [3, 8])
+def test_chain_ends_with_a_hardly_reachable_node(seed: int) -> None:
+    """Nothing asks itself again and again in one moment, which the loop here calls stuck."""
+    outcome = play("slcan", witness_scenarios.rough, seed=seed)
+    assert outcome.frames > 5
+
+
+def test_witness_page_lists_every_rule() -> None:
+    """docs/reference/witness.md has a row for each rule, and no other."""
+    page = (Path(__file__).parents[3] / "docs" / "reference" / "witness.md").read_text(
+        encoding="utf-8"
+    )
+    rules = page.partition("## The rules")[2].partition("## In tests")[0]
+    assert set(re.findall(r"^\| (\w+) \|", rules, flags=re.M)) - {"name"} == RULES
+
+
+def test_a_fault_is_planted_for_every_rule() -> None:
+    """Each rule has a fault that the chain's own test must report as broken."""
+    faults = Path(__file__).parents[2] / "faults"
+    planted = [
+        fault
+        for area in sorted(faults.glob("*.yaml"))
+        for fault in YAML(typ="safe").load(area)
+        if any(Path(__file__).name in test for test in fault["found_by"])
+    ]
+    assert {fault["shows"] for fault in planted if "shows" in fault} == RULES

@@ -1,0 +1,221 @@
+"""The same on every processor? Tests and answers with the arithmetic of several of them.
+
+    python tests/support/kernels.py [--answers] [--workers N]
+
+OpenBLAS has kernels of its own for each kind of processor, which round in different ways, and so do
+our compiled ones of 4, 8 and 16 lanes. First a fixed set of questions is answered with all of them,
+each in a process of its own: frequencies must be the same, contrasts within 1e-3 dB. Then the tests
+of the model, the typed pages and the demonstration run as on each kind of processor (--answers:
+not). What this processor lacks is printed as not run. Status 1 if anything differs or fails.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from ctypes import CDLL, c_char_p
+from dataclasses import dataclass
+from pathlib import Path
+
+from model.compiled.kernels import processor_features, versions
+from model.table.question import Question
+
+ROOT = Path(__file__).parents[2]
+TESTS = (
+    "tests/model",
+    "tests/docs/test_tutorials.py",
+    "tests/docs/test_printed.py",
+    "tests/examples/test_how_to_pages.py",
+    "tests/integration/test_demo.py",
+)
+MAX_CONTRAST = 1e-3
+"""Difference of contrast [dB] that rounding may make."""
+
+_SYMBOLS = ("scipy_openblas_get_corename", "scipy_openblas_get_corename64_")
+
+# Run by every Python process at its start: numpy says what the processor has.
+_WITHOUT = """
+from numpy._core._multiarray_umath import __cpu_features__
+__cpu_features__.update(dict.fromkeys({features!r}, False))
+"""
+
+
+@dataclass(frozen=True)
+class Processor:
+    """A kind of processor: name of its kernels of OpenBLAS, what it needs, lanes of ours."""
+
+    blas: str
+    features: frozenset[str]
+    lanes: int
+
+    def __str__(self) -> str:
+        return f"{self.blas} with {self.lanes} lanes"
+
+
+BLAS = {
+    "Nehalem": frozenset[str](),
+    "Sandybridge": frozenset({"AVX"}),
+    "Haswell": frozenset({"AVX2", "FMA3"}),
+    "SkylakeX": frozenset({"AVX512F", "AVX512DQ", "AVX512VL", "AVX2", "FMA3"}),
+}
+LANES = {version.lanes: frozenset(version.features) for version in versions()}
+EVERY = [
+    Processor(blas, needs | LANES[lanes], lanes)
+    for blas, needs in BLAS.items()
+    for lanes in sorted(LANES)
+]
+KINDS = [
+    Processor(blas, needs, max(lanes for lanes, features in LANES.items() if features <= needs))
+    for blas, needs in BLAS.items()
+]
+"""As they are built: kernels of OpenBLAS, and the most lanes that go with them."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Frequencies [Hz] that play, and contrast [dB], None without a quiet finger."""
+
+    frequencies: tuple[float, ...]
+    contrast: float | None
+
+
+def differences(one: Sequence[Answer], other: Sequence[Answer]) -> tuple[list[int], float]:
+    """Numbers of answers with other frequencies, and the largest difference of contrast [dB]."""
+    pairs = list(zip(one, other, strict=True))
+    turned = [number for number, (a, b) in enumerate(pairs) if a.frequencies != b.frequencies]
+    contrasts = [
+        abs(a.contrast - b.contrast)
+        for a, b in pairs
+        if a.contrast is not None and b.contrast is not None
+    ]
+    return turned, max(contrasts, default=0.0)
+
+
+def answers() -> list[Answer]:
+    """Answers to the fixed questions: one target, none to five quiet fingers, both drive modes."""
+    from paper_table import contact_sets, smooth_table
+
+    found = []
+    for quiet in (0, 1, 2, 3, 5):
+        for target, *others in contact_sets(12, fingers=max(2, 1 + quiet), seed=quiet):
+            for drive_mode in ("phased", "switched"):
+                question = Question(
+                    (target,), tuple(others[:quiet]), level_db_sl=10.0, drive_mode=drive_mode
+                )
+                pattern = smooth_table().query(question)
+                tones = sorted({tone.frequency for tone in pattern.excitation.values()})
+                found.append(Answer(tuple(tones), pattern.robust_contrast_db))
+    return found
+
+
+def blas_in_use() -> set[str]:
+    """Names of the kernels that the loaded libraries of OpenBLAS say they use."""
+    import scipy.linalg  # noqa: F401 - which loads its own beside numpy's
+
+    mapped = Path("/proc/self/maps").read_text("utf-8").splitlines()
+    found = set()
+    for path in {line.split()[-1] for line in mapped if "openblas" in line}:
+        library = CDLL(path)
+        (symbol,) = (name for name in _SYMBOLS if hasattr(library, name))
+        asked = library[symbol]
+        asked.restype = c_char_p
+        found.add(asked().decode().lower())
+    return found
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+@contextmanager
+def environment_of(processor: Processor) -> Iterator[dict[str, str]]:
+    """Environment in which Python computes as on a processor."""
+    faster = {name for features in LANES.values() for name in features} - LANES[processor.lanes]
+    with tempfile.TemporaryDirectory() as folder:
+        text = _WITHOUT.format(features=sorted(faster))
+        (Path(folder) / "sitecustomize.py").write_text(text, "utf-8")
+        yield {
+            **os.environ,
+            "OPENBLAS_CORETYPE": processor.blas,
+            "OPENBLAS_NUM_THREADS": "1",
+            "PYTHONPATH": os.pathsep.join([folder, str(ROOT / "tests" / "support")]),
+        }
+
+
+def answers_as_on(processor: Processor) -> list[Answer]:
+    """Answers of a process that computes as on a processor."""
+    with environment_of(processor) as environment:
+        command = [sys.executable, __file__, "--here", f"{processor.blas}:{processor.lanes}"]
+        done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE)
+    return [Answer(tuple(each[0]), each[1]) for each in json.loads(done.stdout)]
+
+
+def answer_here(expected: str) -> None:
+    """Print the answers of this process, if it computes as it should."""
+    from model.compiled.kernels import kernels
+
+    own = kernels()
+    blas, lanes = expected.split(":")
+    if blas_in_use() != {blas.lower()} or own is None or own.lanes != int(lanes):
+        raise SystemExit(f"expected {expected}, got {blas_in_use()} and {own}")
+    json.dump([(each.frequencies, each.contrast) for each in answers()], sys.stdout)
+
+
+def compare(processors: Sequence[Processor]) -> bool:
+    """Print how answers differ from those of the first processor; whether they may."""
+    first = answers_as_on(processors[0])
+    _say(f"{len(first)} answers, beside {processors[0]}:")
+    is_same = True
+    for processor in processors[1:]:
+        turned, contrast = differences(first, answers_as_on(processor))
+        is_same &= not turned and contrast < MAX_CONTRAST
+        _say(
+            f"  {processor}: {len(turned)} other frequencies {turned or ''}, "
+            f"contrast differs by {contrast:.1e} dB at most"
+        )
+    return is_same
+
+
+def passes(processor: Processor, workers: int) -> bool:
+    """Run the tests as on a processor; print how long that took; whether they pass."""
+    start = time.monotonic()
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "not long"]
+    command += ["--numprocesses", str(workers), "--dist", "loadfile", *TESTS]
+    with environment_of(processor) as environment:
+        done = subprocess.run(command, env=environment, cwd=ROOT, check=False)
+    verdict = "failed" if done.returncode else "passed"
+    _say(f"{processor}: {verdict} in {(time.monotonic() - start) / 60:.1f} min")
+    return done.returncode == 0
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--answers", action="store_true", help="compare answers only")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--here", metavar="BLAS:LANES", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.here:
+        answer_here(options.here)
+        return 0
+    has = processor_features()
+    for processor in EVERY:
+        if not processor.features <= has:
+            _say(
+                f"{processor}: not run, this processor lacks "
+                f"{', '.join(sorted(processor.features - has))}"
+            )
+    results = [compare([each for each in EVERY if each.features <= has])]
+    if not options.answers:
+        results += [passes(each, options.workers) for each in KINDS if each.features <= has]
+    return 0 if all(results) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

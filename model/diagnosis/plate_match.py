@@ -67,15 +67,14 @@ def match_plate(
     values: ComplexArray,
     *,
     drives: Sequence[int],
-    floor: FloatArray | None = None,
     model_error: float = MODEL_ERROR,
     starts: tuple[tuple[float, float], ...] = ((0.0, 0.0),),
 ) -> Match:
     """Fit the rig's plate to values (f, e, s) of channels.
 
     plate: of the rig at those points and frequencies; drives (e,): index of the ERA that each
-    channel drives; model_error: relative to a row's rms; floor (s,): noise in the unit of values;
-    starts: logarithms of factors on the modulus and on all stiffnesses from which to search.
+    channel drives; model_error: relative to a row's rms; starts: logarithms of factors on the
+    modulus and on all stiffnesses from which to search.
     """
     parameters = parameters_of(rig)
     center = np.array([parameter.start for parameter in parameters])
@@ -83,10 +82,7 @@ def match_plate(
     rows: NDArray[np.bool_] = np.asarray(np.isfinite(values).any(axis=2))
     used = np.flatnonzero(rows.any(axis=0))
     size = row_rms(values)
-    noise = model_error * size[:, :, None] * np.ones(values.shape[2])
-    if floor is not None:
-        noise = np.hypot(noise, floor)
-    weight = np.where(np.isfinite(values), 1 / noise, 0)
+    weight = np.isfinite(values) / (model_error * size[:, :, None])
     count = len(parameters)
     driven = list(drives)
 
@@ -138,7 +134,7 @@ def match_plate(
     _, residual = project_gains(
         model, values, weight, expected=np.nan_to_num(gains, nan=1.0), tolerance=_GAIN_TOLERANCE
     )
-    share = (np.abs(residual) * noise / size[:, :, None])[weight > 0]
+    share = (model_error * np.abs(residual))[weight > 0]
     return Match(
         fitted,
         parameters,

@@ -18,8 +18,14 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.parameters import Parameter, parameters_of, responses_at, rig_with
-from model.calibration.variable_projection import jacobian_of, project_gains, row_rms
+from model.calibration.parameters import (
+    Parameter,
+    parameters_of,
+    response_slopes,
+    responses_at,
+    rig_with,
+)
+from model.calibration.variable_projection import project_gains, projection_slopes, row_rms
 from model.choice import best_of
 from model.rig.rig import Rig
 from model.vibration.parametric_plate import ParametricPlate
@@ -87,19 +93,53 @@ def match_plate(
     driven = list(drives)
 
     def responses(x: FloatArray) -> ComplexArray:
-        return np.asarray(responses_at(plate, rig, parameters, x)[..., driven, :])
+        return np.asarray(responses_at(plate, rig, parameters, x)[:, driven])
+
+    def expected(z: FloatArray) -> FloatArray:
+        gains = np.ones(values.shape[1])
+        gains[used] = np.exp(_GAIN_STD * z[count:])
+        return gains
 
     def residuals(z: FloatArray) -> FloatArray:
-        model = responses(center + std * z[..., :count])
-        gains = np.ones((*z.shape[:-1], values.shape[1]))
-        gains[..., used] = np.exp(_GAIN_STD * z[..., count:])
+        gains = expected(z)
+        projected, left = project_gains(
+            responses(center + std * z[:count]),
+            values,
+            weight,
+            expected=gains,
+            tolerance=_GAIN_TOLERANCE,
+        )
+        left = _robust(left[weight > 0])
+        wander = _robust(((np.abs(projected) / gains - 1) / _GAIN_TOLERANCE)[rows])
+        return np.concatenate([left.real, left.imag, wander, z])
+
+    def jacobian(z: FloatArray) -> FloatArray:
+        gains = expected(z)
+        model, by_x = response_slopes(plate, rig, parameters, center + std * z[:count])
+        model = model[:, driven]
+        slopes = np.zeros((len(z), *model.shape), dtype=complex)
+        slopes[:count] = by_x[:, :, driven] * std[:, None, None, None]
+        gain_slopes = np.zeros((len(z), len(gains)))
+        gain_slopes[count + np.arange(len(used)), used] = _GAIN_STD * gains[used]
         projected, left = project_gains(
             model, values, weight, expected=gains, tolerance=_GAIN_TOLERANCE
         )
-        expected = gains[..., None, :]
-        wander = ((np.abs(projected) - expected) / (_GAIN_TOLERANCE * expected))[..., rows]
-        left = _robust(left[..., weight > 0])
-        return np.concatenate([left.real, left.imag, _robust(wander), z], axis=-1)
+        by_gain, by_left = projection_slopes(
+            model,
+            slopes,
+            values,
+            weight,
+            expected=gains,
+            expected_slopes=gain_slopes,
+            tolerance=_GAIN_TOLERANCE,
+        )
+        size = np.abs(projected)
+        by_size = (projected.conj() * by_gain).real / size
+        by_wander = (by_size - size * gain_slopes[:, None] / gains) / gains / _GAIN_TOLERANCE
+        wander = (size / gains - 1) / _GAIN_TOLERANCE
+        of_left = _robust_slopes(left[weight > 0], by_left[:, weight > 0])
+        of_wander = _robust_slopes(wander[rows], by_wander[:, rows])
+        return np.hstack([of_left.real, of_left.imag, of_wander, np.eye(len(z))]).T
 
     bounds = np.array([[p.lower, p.upper] for p in parameters])
     bounds = (bounds - center[:, None]) / std[:, None]
@@ -116,7 +156,7 @@ def match_plate(
         least_squares(
             residuals,
             guess,
-            jacobian_of(residuals, lower, upper),
+            jacobian,
             bounds=(lower, upper),
             x_scale="jac",
             max_nfev=_STEPS,
@@ -149,7 +189,16 @@ def match_plate(
 
 
 def _robust(left: NDArray[_Number]) -> NDArray[_Number]:
-    """Residuals [standard deviations] whose squares are a soft L1 loss."""
-    share = np.abs(left) / _ROBUST
-    half = 2 * (np.sqrt(1 + share**2) - 1)
-    return np.asarray(left * np.sqrt(half) / np.maximum(share, 1e-12))
+    """Residuals [standard deviations] (m,) whose squares are a soft L1 loss."""
+    return np.asarray(left * np.sqrt(2 / (1 + _hypotenuse(left))))
+
+
+def _robust_slopes(left: NDArray[_Number], slopes: NDArray[_Number]) -> NDArray[_Number]:
+    """Derivatives of `_robust` for those of its argument, (n, m)."""
+    root = _hypotenuse(left)
+    grown = (left.conj() * slopes).real / (2 * _ROBUST**2 * root * (1 + root))
+    return np.asarray(np.sqrt(2 / (1 + root)) * (slopes - left * grown))
+
+
+def _hypotenuse(left: NDArray[_Number]) -> FloatArray:
+    return np.asarray(np.sqrt(1 + (np.abs(left) / _ROBUST) ** 2))

@@ -37,7 +37,7 @@ _DOUBLINGS = 3
 
 # Relative to the plate's lowest bending frequency, below which a natural frequency is rounding of
 # free tilting on one or two ERAs.
-_MIN_FREQUENCY_RATIO = 1e-4
+_MIN_FREQUENCY_RATIO = 1e-3
 
 # Raster for comparing responses, finer than half a wavelength.
 _RASTER = (49, 37)

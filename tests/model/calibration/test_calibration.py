@@ -9,16 +9,9 @@ from model.calibration.calibrate import calibrate
 from model.calibration.calibration_result import Calibration
 from model.calibration.responses import Responses
 from model.errors import InputError
-from model.fem.assembly import assemble
-from model.fem.harmonic import direct_acceleration
-from model.fem.mesh import Mesh
 from model.rig.rig import Rig
-from model.structure.point_load import PointLoad
-from model.vibration.parametric_plate import parametric_plate
 from paper_plate import make_paper_rig
 from perturbed_plate import FREQUENCIES, NAMES, POINTS, measured, perturbed
-
-FEW = FREQUENCIES[::3]
 
 
 @pytest.fixture(scope="module")
@@ -48,20 +41,6 @@ def true_values(rig: Rig) -> list[float]:
 def gains_of(rig: Rig) -> np.ndarray:
     """Complex gains, (f, eras)."""
     return np.column_stack([era.gain(FREQUENCIES) for era in rig.eras])
-
-
-def test_parametric_plate_agrees_with_the_direct_solve(rig, truth):
-    """Another modulus, damping and mass without a new solve: as the sparse solve to 0.1 %."""
-    loaded = replace(rig, masses=(PointLoad(0.2, 0.1, mass=0.02),))
-    plain = replace(truth, eras=tuple(replace(era, gains=()) for era in truth.eras))
-    loaded_truth = replace(plain, masses=loaded.masses)
-    fast = parametric_plate(loaded, POINTS, FREQUENCIES).responses(loaded_truth)
-    matrices = assemble(plain.plate, plain.mesh)
-    exact = direct_acceleration(
-        matrices, plain.eras, FREQUENCIES, POINTS, loads=loaded_truth.masses
-    ) / np.array([era.stroke for era in plain.eras]).reshape(-1, 1)
-    wrong = np.linalg.norm(fast - exact, axis=2) / np.linalg.norm(exact, axis=2)
-    assert wrong.max() < 1e-3
 
 
 def test_calibrate_finds_every_parameter(truth, fitted):
@@ -105,33 +84,24 @@ def test_calibrate_predicts_held_out_sensors_to_the_noise(fitted):
     assert fitted.is_good
 
 
-def test_calibrate_leaves_outliers_out(rig, truth):
-    """Five in a hundred values wrong by factors of 2 to 20 with any phase move nothing."""
-    clean = measured(truth)
-    rng = np.random.default_rng(6)
-    wild = rng.random(clean.values.shape) < 0.05
-    values = clean.values.copy()
-    values[wild] *= rng.uniform(2, 20, wild.sum()) * np.exp(2j * np.pi * rng.random(wild.sum()))
-    found = calibrate(rig, replace(clean, values=values))
-    assert found.outlier_count >= 0.9 * wild.sum()
-    assert found.outlier_count <= 1.1 * wild.sum()
-    np.testing.assert_allclose(
-        [one.value for one in found.parameters], true_values(truth), rtol=0.02
-    )
-    assert found.dead_sensors == ()
-    assert found.scales == ()
-
-
-def test_calibrate_finds_a_dead_era_despite_gaps(rig, truth):
+def test_calibrate_finds_a_dead_era_despite_gaps_and_outliers(rig, truth):
     """An ERA that moves nothing is named; its spring is still found by the others' responses.
 
-    So is a sensor that has come off and hears next to nothing.
+    So is a sensor that has come off and hears next to nothing. One in twenty of the other values is
+    wrong by factors of 2 to 20 with any phase, and left out.
     """
     clean = measured(truth, scales={"P4": 0.05})
     values = clean.values.copy()
+    rng = np.random.default_rng(7)
+    values[rng.random(values.shape) < 0.3] = np.nan
+    wild = rng.random(values.shape) < 0.05
+    wild &= np.isfinite(values)
+    wild[:, 2] = wild[:, :, NAMES.index("P4")] = False
+    values[wild] *= rng.uniform(2, 20, wild.sum()) * np.exp(2j * np.pi * rng.random(wild.sum()))
     values[:, 2] *= 1e-4
-    values[np.random.default_rng(7).random(values.shape) < 0.3] = np.nan
     found = calibrate(rig, replace(clean, values=values))
+    assert 0.9 * wild.sum() <= found.outlier_count <= 1.1 * wild.sum()
+    assert found.scales == ()
     assert found.dead_eras == ("NE",)
     assert found.dead_sensors == ("P4",)
     assert found.rig.era("NE").gains == ()
@@ -162,17 +132,6 @@ def test_calibrate_estimates_all_scales_when_requested(rig, truth):
     assert scales["P2"] == pytest.approx(-1.0, abs=0.005)
     assert scales["P5"] == pytest.approx(1.01, abs=0.005)
     assert scales["P12"] == pytest.approx(1.0, abs=0.005)
-
-
-@pytest.mark.long
-def test_calibrate_refuses_a_plate_of_another_size(rig):
-    """A plate twice as thick and 9 mm shorter: its length is refused, whatever the values."""
-    plate = replace(rig.plate, thickness=0.003, length=0.296)
-    eras = tuple(replace(era, x=min(era.x, 0.296)) for era in rig.eras)
-    other = replace(rig, plate=plate, eras=eras, mesh=Mesh(16, 12, 0.296, rig.plate.width))
-    found = measured(perturbed(other, frequencies=FEW), frequencies=FEW)
-    with pytest.raises(InputError, match=r"plate\.length"):
-        calibrate(rig, found)
 
 
 def test_calibrate_refuses_too_few_sensors_and_silence(rig, truth):

@@ -85,7 +85,7 @@ def test_stiffening_does_not_depend_on_rounding(rig: Rig) -> None:
     ("sensors", "plates", "share"),
     [
         pytest.param(4, 1, 0.7, id="4-sensors"),
-        pytest.param(12, 1, 0.7, id="12-sensors"),
+        pytest.param(12, 1, 0.7, id="12-sensors", marks=pytest.mark.long),
         pytest.param(12, 2, 0.8, id="two-plates", marks=pytest.mark.long),
     ],
 )

@@ -37,12 +37,8 @@ def test_figure_writes_a_picture_and_its_numbers(tmp_path: Path) -> None:
     ]  # fmt: skip
     assert str(folder / "figure_7.png") in result.stdout
     assert result.stdout.splitlines()[-1].startswith("Next: ")
-
-
-def test_figure_prints_findings_as_json(tmp_path: Path) -> None:
-    """Figure 13: ratio and correlation by name, and the files."""
-    arguments = ["13", RIG, "-o", str(tmp_path), "--mesh", "12x9", "--json"]
-    answer = json.loads(RUNNER.invoke(figure_app, arguments).stdout)
-    assert 1.5 < answer["figures"]["figure_13_maps"]["maximum_stiff_to_soft_ratio"] < 1.8
+    result = RUNNER.invoke(figure_app, ["7", RIG, "-o", str(folder), "--mesh", "12x9", "--json"])
+    answer = json.loads(result.stdout)
+    assert "figure_7" in answer["figures"]
     assert all(Path(name).is_file() for name in answer["files"])
-    assert len(answer["files"]) == 4
+    assert len(answer["files"]) == 3

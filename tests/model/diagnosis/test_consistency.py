@@ -8,6 +8,7 @@ import pytest
 from distorted_responses import DISTORTIONS
 from long_form import shortly
 from model.calibration.responses import Responses
+from model.diagnosis import causes
 from model.diagnosis.consistency import check_consistency
 from model.errors import InputError
 from model.fem.mesh import Mesh
@@ -58,8 +59,15 @@ def test_distorted_responses_are_refused_by_their_cause(
         check_consistency(rig, DISTORTIONS[name](responses))
 
 
-def test_plate_of_another_length_is_refused_by_its_length(rig: Rig) -> None:
-    """A plate that is a fifth longer than the rig's, sensors where they are said to be."""
+def test_plate_of_another_length_is_refused_by_its_length(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A plate that is a fifth longer than the rig's, sensors where they are said to be.
+
+    Of few sizes and causes; whole searches are tested with diagnoses.
+    """
+    monkeypatch.setattr(causes, "_SIZES", (0.82, 1.21))
+    monkeypatch.setattr(causes, "_REFINEMENTS", 4)
     plate = replace(rig.plate, length=1.2 * rig.plate.length)
     eras = tuple(replace(era, x=1.2 * era.x) for era in rig.eras)
     longer = replace(rig, plate=plate, eras=eras, mesh=Mesh(16, 12, plate.length, plate.width))

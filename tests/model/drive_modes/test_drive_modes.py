@@ -148,7 +148,7 @@ def refined(given, frequency, start, free):
 )
 def test_weights_are_not_improved_by_nelder_mead(mode, count, free):
     """On the plate with two quiet fingers the three iterations are within 4 % (0.34 dB)."""
-    for number, places in enumerate(contact_sets(2, fingers=3, seed=4)):
+    for number, places in enumerate(contact_sets(1, fingers=3, seed=4)):
         given = forms_on_plate(places, level=-60.0).at(np.array([2, 9, 16]))
         score = by_hand(given, found_alone(mode, given))[0]
         rng = np.random.default_rng(number)
@@ -257,10 +257,11 @@ def test_find_drives_reaches_two_targets():
         for f in range(F):
             h, R = given.targets[:, f].astype(complex), given.quiet[f, 0].astype(complex)
             single = np.linalg.solve(R, h.conj().T)
-            for phase, ratio in product(np.linspace(0, 2 * np.pi, 73), np.geomspace(0.1, 10, 41)):
-                w = single[:, 0] + ratio * np.exp(1j * phase) * single[:, 1]
-                cost = np.sqrt((w.conj() @ R @ w).real)
-                best = max(best, np.abs(h @ w).min() / cost)
+            turns = np.exp(1j * np.linspace(0, 2 * np.pi, 73))
+            mixed = np.outer(np.geomspace(0.1, 10, 41), turns).ravel()
+            w = single[:, :1] + mixed * single[:, 1:]
+            cost = np.sqrt((w.conj() * (R @ w)).sum(axis=0).real)
+            best = max(best, (np.abs(h @ w).min(axis=0) / cost).max())
         assert score == pytest.approx(by_hand(given, drive)[0], rel=1e-3)
         assert score >= 0.97 * best
 

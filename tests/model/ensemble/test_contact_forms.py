@@ -50,6 +50,7 @@ def solved(uncertainty, loads=()):
     return plate, contacts, shapes
 
 
+@cache
 def directly(
     *,
     thickness=1.0,
@@ -122,24 +123,6 @@ def test_sensitivity_to_the_load_of_a_finger_that_presses_harder():
     assert error.max() < 0.01
 
 
-@pytest.mark.parametrize("column", CHANGES)
-def test_sensitivities_are_differences_of_the_direct_solve(column):
-    """Columns of the tone responses: loss, damping, an ERA's stiffness, a load.
-
-    Central differences of the whole loaded plate, relative to the largest change: within 1 %.
-    """
-    uncertainty = Uncertainty(0, 0, 1.0, 1.0, math.e, 1.0)
-    plate, contacts, shapes = solved(uncertainty)
-    weights = np.array([0.6, -0.3 + 0.5j, 1.0, 0.2j], dtype=np.complex64)
-    tones = Tones(np.arange(4), np.tile(weights, (4, 1)))
-    found = tone_responses(plate, contacts, tones, shapes.reshape(15, -1))
-    step = 1e-3
-    more, less = (directly(**CHANGES[column](d)) for d in (step, -step))
-    exact = np.einsum("e,fep->fp", weights, (more - less) / (2 * step))
-    error = np.abs(found[:, :, column] - exact).max(axis=1) / np.abs(exact).max(axis=1)
-    assert error.max() < 0.01
-
-
 @pytest.mark.usefixtures("kernels_or_numpy")
 def test_thickness_is_exact_at_its_nodes():
     """The direct solve of plates so much thicker, far from what is in proportion."""
@@ -148,7 +131,7 @@ def test_thickness_is_exact_at_its_nodes():
     points, nodes = shapes.reshape(15, -1), np.array([-2.0, -0.5, 0.0, 0.7, 1.5])
     found = responses_of_thicknesses(plate, contacts, tones, points, nodes)
     for at in (0, 1, 4):
-        exact = np.einsum("e,fep->fp", WEIGHTS, thicker(float(nodes[at])))
+        exact = np.einsum("e,fep->fp", WEIGHTS, directly(thickness=1 + 0.02 * float(nodes[at])))
         error = np.abs(found[:, :, at] - exact).max(axis=1) / np.abs(exact).max(axis=1)
         assert error.max() < 5e-3
     nominal = tone_responses(plate, contacts, tones, points)[:, :, NOMINAL]
@@ -171,12 +154,6 @@ def test_sensitivities_of_a_thicker_plate_are_differences_of_the_direct_solve(co
     exact = np.einsum("e,fep->fp", WEIGHTS, (more - less) / 2e-3)
     error = np.abs(found[:, :, column] - exact).max(axis=1) / np.abs(exact).max(axis=1)
     assert error.max() < 0.01
-
-
-@cache
-def thicker(deviation):
-    """Fields of a plate so much thicker, by the direct solve."""
-    return directly(thickness=1 + 0.02 * deviation)
 
 
 @pytest.mark.parametrize("count", [2, 5, 10])
@@ -224,33 +201,3 @@ def test_expected_power_is_the_mean_square_of_the_draws(is_by_point):
         forms, drawn = contacts.power, powers @ FIVE_POINTS.weights
     found = np.einsum("fi,fqij,fj->fq", weights.conj(), forms, weights).real
     np.testing.assert_allclose(found, drawn, rtol=0.05)
-
-
-def test_without_errors_the_best_contrast_does_not_depend_on_the_mounts():
-    """Springs and dampers act where drives act anyway: R^-1 bounds the same ratio for any of them.
-
-    Quiet at one finger's centre only, no uncertainty, weightless fingers.
-    """
-    ratios = []
-    for factor in (1.0, 3.0):
-        eras = tuple(replace(era, stiffness=factor * era.stiffness) for era in RIG.eras)
-        reduced = reduce_plate(RIG.plate, RIG.mesh, footprints_of(eras), frequency_max=500.0)
-        plate = attach(
-            RIG.plate,
-            reduced.omega,
-            reduced.losses,
-            reduced.at(footprints_of(eras)),
-            eras=eras,
-            masses=(),
-            fingertip=None,
-            uncertainty=Uncertainty.none(),
-            frequencies=FREQUENCIES,
-        )
-        shapes = reduced.at(POINTS.reshape(-1, 2)).astype(np.float32).reshape(3, 5, -1)
-        weights = np.tile(FIVE_POINTS.weights, (3, 1)).astype(np.float32)
-        found = load_contacts(plate, shapes, weights, np.zeros((4, 4), np.float32))
-        h = found.fields[:, 0, 0].astype(complex)
-        q = found.fields[:, 1].astype(complex)
-        R = np.einsum("fpi,fpj->fij", q.conj(), q)
-        ratios.append(np.einsum("fi,fij,fj->f", h, np.linalg.inv(R), h.conj()).real)
-    np.testing.assert_allclose(ratios[0], ratios[1], rtol=0.02)

@@ -73,7 +73,7 @@ def test_identified_rig_states_less_uncertainty_but_for_fingers(found: Identific
     "factors",
     [
         pytest.param(np.full(4, 1 / 9.80665), marks=pytest.mark.long),
-        np.full(4, -1.0),
+        pytest.param(np.full(4, -1.0), marks=pytest.mark.long),
         np.array([1.0, 1.0, -1.0, 1.0]),
     ],
 )

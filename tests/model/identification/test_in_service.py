@@ -43,12 +43,12 @@ def play(
 def test_loosened_mount_is_named_and_followed(hidden: Hidden, found: Identification) -> None:
     """Quiet patterns raise no alarm; a mount 20 % softer does within 8, and is named NE."""
     live = LivePlate(found)
-    quiet = play(live, hidden, hidden.mounted, count=20, start=0)
+    quiet = play(live, hidden, hidden.mounted, count=10, start=0)
     assert not any(report.alarm for report in quiet)
     assert np.mean([report.nis / report.count for report in quiet]) < 1.5
     factors = np.where(np.arange(4) == NE, 0.8, 1.0)
     loose = replace(hidden.mounted, stiffness=factors * hidden.mounted.stiffness)
-    after = play(live, hidden, loose, count=16, start=20)
+    after = play(live, hidden, loose, count=10, start=10)
     assert any(report.alarm for report in after[:8])
     (explanation,) = (each.explanation for each in after if each.explanation)
     assert explanation.name == "stiffness NE"

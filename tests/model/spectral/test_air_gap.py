@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.layers.gap import air_pressure, cell_middles
+from long_form import in_turn
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
@@ -44,8 +45,7 @@ def polynomial(degree, x, side):
     return np.polynomial.legendre.legval(2 * x / side - 1, coefficients)
 
 
-@pytest.mark.parametrize("closed", [False, True])
-@pytest.mark.parametrize("parity", CLASSES)
+@pytest.mark.parametrize(("parity", "closed"), in_turn(CLASSES, [False, True]))
 @pytest.mark.parametrize(("depth", "frequency"), [(0.5e-3, 60.0), (5e-3, 300.0)])
 def test_air_equals_finite_differences(closed, parity, depth, frequency):
     """Its force on the first two deflections of each symmetry, to 1.5 %, far from any resonance."""

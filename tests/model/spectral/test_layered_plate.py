@@ -148,8 +148,8 @@ def test_complex_modes_equal_a_complex_eigenproblem():
 @pytest.mark.parametrize(
     ("core", "error"),
     [
-        ({}, 1e-3),
-        ({"loss_factor": 0.3}, 0.01),
+        pytest.param({}, 1e-3, marks=pytest.mark.long),
+        pytest.param({"loss_factor": 0.3}, 0.01, marks=pytest.mark.long),
         ({"by_frequency": ((10.0, 0.5, 0.3), (100.0, 1.0, 0.4), (1000.0, 2.0, 0.5))}, 0.02),
     ],
 )

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
+from long_form import in_turn
 from model.errors import InputError
 from model.fem.elements import Q5
 from model.fem.mesh import Mesh
@@ -68,8 +69,9 @@ LAYOUTS = {
 }
 
 
-@pytest.mark.parametrize("layout", ["corners", "edges", "inside"])
-@pytest.mark.parametrize("foot", [0.002, 0.005, 0.01])
+@pytest.mark.parametrize(
+    ("layout", "foot"), in_turn(["corners", "edges", "inside"], [0.002, 0.005, 0.01])
+)
 def test_response_on_feet_is_that_of_fine_elements(layout, foot):
     """At degrees 12x9 within 0.5 %, at 24x18 within 0.1 %, also of feet that an edge cuts."""
     eras = [replace(era, foot=foot) for era in _on_plate(PAPER, LAYOUTS[layout])]
@@ -172,15 +174,15 @@ def test_static_vectors_carry_the_local_compliance():
 
 
 @pytest.mark.parametrize(
-    ("thickness", "foot", "inside", "at_edges"),
-    [(1.5e-3, 0.0, 0.05, 0.12), (1e-2, 5e-3, 0.25, 0.35)],
+    ("low", "tolerances"),
+    in_turn([(12, 9), (13, 10)], [(1.5e-3, 0.0, 0.05, 0.12), (1e-2, 5e-3, 0.25, 0.35)]),
 )
-@pytest.mark.parametrize("low", [(12, 9), (13, 10)])
-def test_local_compliance_is_what_higher_degrees_add(thickness, foot, inside, at_edges, low):
+def test_local_compliance_is_what_higher_degrees_add(low, tolerances):
     """Within 5 % of the receptance that degrees 48x36 add under points inside, odd or even.
 
     Within 12 % near edges, and 25 % and 35 % on feet on a plate so thick that shear matters most.
     """
+    thickness, foot, inside, at_edges = tolerances
     plate = Plate(PAPER.length, PAPER.width, thickness, PAPER.material)
     rng = np.random.default_rng(7)
     sides = np.array([plate.length, plate.width])

@@ -55,6 +55,7 @@ def file_of(build, folder):
     return (folder / "again.npz").read_bytes()
 
 
+@pytest.mark.long
 def test_build_is_the_same_to_the_bit_by_two_processes(problem, whole, tmp_path):
     """Whichever process solves a part."""
     build = build_in_parts(problem, drive_mode="switched", workers=2)

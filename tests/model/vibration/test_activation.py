@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from long_form import shortly
 from model.fem.mesh import Mesh
 from model.finger.grid import Grid
 from model.paper.box_plots import PAPER_FREQUENCIES
@@ -68,7 +69,9 @@ def test_equal_area_points_are_cell_centres():
     assert plate.bending_wavelength(2000.0) / spacing >= 11.5
 
 
-@pytest.mark.parametrize("layout", FOUR_ERA_LAYOUTS, ids=lambda layout: layout.name)
+@pytest.mark.parametrize(
+    "layout", shortly(FOUR_ERA_LAYOUTS, FOUR_ERA_LAYOUTS[:2]), ids=lambda layout: layout.name
+)
 def test_equal_area_points_have_the_stated_accuracy(free_plate, layout):
     """Against 96 x 72 cells: medians within 3 %, quartiles 8 %, maxima at most 12 % low."""
     plate = free_plate.plate

@@ -27,9 +27,10 @@ def automatic():
 
 @pytest.fixture(scope="module")
 def study(automatic):
-    """Of two meshes of MITC4 and of the automatic one."""
-    meshes = [Mesh(12, 9, LENGTH, WIDTH), Mesh(24, 18, LENGTH, WIDTH), automatic.mesh]
-    return study_convergence(automatic, meshes, frequencies=default_frequencies(automatic))
+    """Of the paper's mesh of MITC4 and of the automatic one."""
+    meshes = [Mesh(12, 9, LENGTH, WIDTH), automatic.mesh]
+    limited = replace(automatic, limits=replace(automatic.limits, frequency_max=350.0))
+    return study_convergence(limited, meshes, frequencies=default_frequencies(automatic))
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def test_auto_mesh_has_the_stated_accuracy(study):
     automatic = study.errors[-1]
     assert np.abs(automatic.frequency).max() < 1e-3
     assert automatic.response.max() < 1e-2
-    assert automatic.dof < study.errors[1].dof
+    assert automatic.dof < Mesh(24, 18, LENGTH, WIDTH).dof
 
 
 @pytest.mark.long
@@ -81,6 +82,7 @@ def test_mitc4_converges_to_the_same_field(whole):
     assert errors[-1].max() < 0.04
 
 
+@pytest.mark.long
 def test_response_converges_for_eras_within_the_plate():
     """A force within an element bends it sharply; the automatic mesh is still within 1 %."""
     rig = make_paper_rig(12, 9)
@@ -106,7 +108,7 @@ def test_places_and_feet_count_more_than_the_mesh(study):
 def test_unsupported_motion_is_not_compared(count, free):
     """On one ERA the plate can tilt both ways, on two about their line: 0 Hz has no error."""
     rig = make_paper_rig(12, 9)
-    few = replace(rig, eras=rig.eras[:count], limits=replace(rig.limits, frequency_max=250.0))
+    few = replace(rig, eras=rig.eras[:count], limits=replace(rig.limits, frequency_max=120.0))
     study = study_convergence(few, [Mesh(24, 18, LENGTH, WIDTH)], frequencies=[110.0])
     assert len(study.natural_frequencies) == len(study.errors[0].frequency) == 12 - free
     assert study.natural_frequencies[0] > 1

@@ -14,7 +14,7 @@ from paper_plate import LENGTH, WIDTH, make_paper_rig
 
 @pytest.mark.parametrize(
     "name",
-    shortly(["the paper's", "thick, 10 mm", "5:1", "telephone"], ["the paper's", "thick, 10 mm"]),
+    shortly(["the paper's", "thick, 10 mm", "5:1", "telephone"], ["telephone", "thick, 10 mm"]),
 )
 def test_error_is_within_the_estimate_and_the_accuracy(name):
     """Wherever it is above 0.25 %: at most 1.4 times the estimate, and 1 % on mesh auto.
@@ -22,7 +22,7 @@ def test_error_is_within_the_estimate_and_the_accuracy(name):
     A part of the programme that prints docs/measured/accuracy.md.
     """
     case = next(case for case in CASES if case.name == name)
-    judged = judge(case, degrees=(-2, 0), every=4)
+    judged = judge(case, degrees=(-2, 0), every=6)
     assert {each.kind for each in judged} >= {"corners", "edges", "inside"}
     assert max(each.ratio for each in judged) < MAX_RATIO
     assert max(each.error for each in judged if each.added == 0) < 0.01

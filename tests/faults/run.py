@@ -39,14 +39,19 @@ TIME_LIMIT = 120.0  # s; for the tests of one fault
 SOUND_TIME_LIMIT = 1800.0  # s; for all tests in the tree as it is
 _FORK = get_context("fork")
 _NOT_COPIED = shutil.ignore_patterns(
-    ".git", ".venv", ".*_cache", ".hypothesis", "__pycache__", "out", "dist", "_build"
+    ".git", ".venv", ".*_cache", ".hypothesis", "out", "dist", "_build"
 )
 _PRELOADED = (
-    *("numpy", "scipy.linalg", "scipy.optimize", "scipy.sparse.linalg", "scipy.special"),
-    *("scipy.interpolate", "scipy.signal", "scipy.ndimage", "hypothesis", "pydantic", "can"),
-    *("canopen", "pymodbus.client", "pint", "ruamel.yaml", "rich.console", "matplotlib.figure"),
+    *("numpy", "scipy.linalg", "scipy.sparse.linalg", "scipy.special"),
+    *("hypothesis", "pydantic", "can", "canopen", "ruamel.yaml"),
 )
 """Modules of others that most tests load: processes are forked once they are loaded."""
+_PRELOADED_FOR_MANY = (
+    *("scipy.optimize", "scipy.interpolate", "scipy.signal", "scipy.ndimage"),
+    *("pymodbus.client", "pint", "rich.console", "matplotlib.figure"),
+)
+"""Modules that some tests load, preloaded for more than so many faults."""
+_MANY = 20
 
 
 @dataclass(frozen=True)
@@ -173,11 +178,14 @@ def judge(fault: PlantedFault, sound: Path) -> Judgement:
         if stale := stale_edits(fault, folder):
             return Judgement(fault.name, "stale", 0.0, stale)
         for file, find, replacement in fault.edits:
-            (folder / file).write_text(_text(folder / file).replace(find, replacement), "utf-8")
+            text = _text(folder / file).replace(find, replacement)
+            (folder / file).unlink()  # or the sound tree would have the fault
+            (folder / file).write_text(text, "utf-8")
         ended = run_tests(folder, fault.tests, limit=TIME_LIMIT) if fault.tests else {}
     finally:
         for file, *_ in fault.edits:
-            shutil.copy2(sound / file, folder / file)
+            (folder / file).unlink(missing_ok=True)
+            (folder / file).hardlink_to(sound / file)
     ended = {test: ended.get(test, "cannot be run") for test in fault.tests}
     result = "found"
     if "cannot be run" in ended.values():
@@ -197,10 +205,11 @@ def _text(path: Path) -> str:
 
 @cache
 def _own_copy(sound: Path) -> Path:
-    """This process's copy of a tree, which has compiled what it will not compile again."""
+    """This process's copy of a tree, by hard links; all is compiled, and nothing is again."""
     sys.dont_write_bytecode = True
     os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
-    return Path(shutil.copytree(sound, sound.with_name(str(os.getpid())), symlinks=True))
+    own = sound.with_name(str(os.getpid()))
+    return Path(shutil.copytree(sound, own, symlinks=True, copy_function=os.link))
 
 
 def _unsound(
@@ -235,11 +244,11 @@ def main() -> int:
     asked = parser.parse_args()
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"  # before numpy loads
-    for module in _PRELOADED:
-        import_module(module)
     faults = [
         one for one in load_faults() if asked.only in one.name and one.is_quick >= asked.quick
     ]
+    for module in (*_PRELOADED, *(_PRELOADED_FOR_MANY if len(faults) > _MANY else ())):
+        import_module(module)
     known = {one.name for one in faults if one.missed}
     began, judgements = time.monotonic(), []
     for judgement in judge_all(faults, workers=asked.workers):

@@ -1,4 +1,7 @@
-"""The desk without hardware, its short form: real JACK server, plate and commands."""
+"""The desk without hardware: real JACK server, plate and commands.
+
+Its short forms have no server, or no plate: tests/sim/desk/test_measuring.py, test_jack_card.py.
+"""
 
 import shutil
 import subprocess
@@ -18,7 +21,8 @@ from model.calibration.responses_file import read_functions
 from model.rig.file import load_rig
 
 pytestmark = [
-    pytest.mark.real_time,
+    pytest.mark.long,
+    pytest.mark.alone,
     pytest.mark.skipif(
         not (shutil.which("jackd") and shutil.which("cc")), reason="needs jackd2 and a C compiler"
     ),
@@ -34,10 +38,7 @@ def plate(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
         yield running
 
 
-@pytest.mark.parametrize(
-    ("device", "late"),
-    [("jack:desk", 0), pytest.param("desk", 512, marks=[pytest.mark.long, pytest.mark.alone])],
-)
+@pytest.mark.parametrize(("device", "late"), [("jack:desk", 0), ("desk", 512)])
 def test_measured_plate_is_the_one_on_the_desk(plate: Desk, device: str, late: int) -> None:
     """Through JACK or PortAudio and files, against the plate's closed form, and its hidden delay.
 
@@ -57,8 +58,6 @@ def test_measured_plate_is_the_one_on_the_desk(plate: Desk, device: str, late: i
     np.testing.assert_allclose(found.values[loud], exact[loud], rtol=0.03)
 
 
-@pytest.mark.long
-@pytest.mark.alone
 def test_identified_plate_is_the_one_on_the_desk(plate: Desk) -> None:
     """Few tones, through JACK and the command: what drives the plate, its springs, its places."""
     plate.run(
@@ -96,8 +95,6 @@ def test_second_plate_of_a_name_is_refused(plate: Desk) -> None:
     assert not done.stdout
 
 
-@pytest.mark.long
-@pytest.mark.alone
 def test_chain_from_measurement_to_touches_keeps_its_promises() -> None:
     """Values found are the plate's, promises are kept, and touches are felt where they are.
 

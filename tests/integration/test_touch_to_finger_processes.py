@@ -3,15 +3,13 @@
 Of all checks those that do not depend on how fast the machine is; in virtual time all hold.
 """
 
-import asyncio
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from felt_assertions import CHECKS, Truth
-from felt_chain import Played
+from long_form import shortly
 from model.finger.grid import Grid
 from model.rig.file import load_rig
 from model.table.build import build_table
@@ -49,35 +47,14 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
     return Truth(rig, table, STREAM)
 
 
-@pytest.fixture(scope="module")
-def played(
-    truth: Truth, tmp_path_factory: pytest.TempPathFactory
-) -> Mapping[str, tuple[Played, int]]:
-    """Results and the daemon's exit status by wire, two of them at a time."""
-    return asyncio.run(play_all(tmp_path_factory.mktemp("wires"), truth))
-
-
-async def play_all(folder: Path, truth: Truth) -> Mapping[str, tuple[Played, int]]:
-    """Play the stream over each wire."""
-    table = folder / "table.npz"
-    save_table(truth.table, table)
-
-    two_at_once = asyncio.Semaphore(2)  # beside six plates that are solved a watchdog elapses
-
-    async def play(wire: str) -> tuple[Played, int]:
-        (folder / wire).mkdir()
-        async with two_at_once, running_chain(folder / wire, wire, table=table) as chain:
-            return await chain.play(STREAM)
-
-    return dict(zip(WIRES, await asyncio.gather(*map(play, WIRES)), strict=True))
-
-
-@pytest.mark.parametrize("check", TIMELESS)
-@pytest.mark.parametrize("wire", WIRES)
-def test_processes_make_fingers_feel_the_commanded_pattern(
-    played: Mapping[str, tuple[Played, int]], truth: Truth, wire: str, check: str
+@pytest.mark.parametrize("wire", shortly(WIRES, ["serial", "socketcand"]))
+async def test_processes_make_fingers_feel_the_commanded_pattern(
+    wire: str, truth: Truth, tmp_path: Path
 ) -> None:
     """Over every wire; the daemon ends without an error."""
-    result, status = played[wire]
+    save_table(truth.table, tmp_path / "table.npz")
+    async with running_chain(tmp_path, wire, table=tmp_path / "table.npz") as chain:
+        played, status = await chain.play(STREAM)
     assert status == 0
-    CHECKS[check](result, truth)
+    for check in TIMELESS:
+        CHECKS[check](played, truth)

@@ -1,6 +1,6 @@
 """Clicks of a layout over a serial line in real time, daemon and far end in their own processes.
 
-Four equal presses of a finger that loads the plate; what it feels is read from the plate. Each press
+Four equal presses of a finger that loads the plate; what it feels is read from the plate. Each
 waits for its pattern, however slow the machine is.
 """
 

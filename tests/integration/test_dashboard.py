@@ -1,6 +1,6 @@
 """The dashboard in a real browser, with a real daemon over a simulated amplifier.
 
-One browser and one daemon for all tests; each opens a tab of its own.
+One browser and one daemon for all tests, and one tab for those that load nothing anew.
 """
 
 import asyncio
@@ -91,11 +91,29 @@ def era(daemon: Path) -> Iterator[Client]:
 
 
 @pytest_asyncio.fixture(loop_scope="module")
-async def page(tab: Page, gateway: GatewayProcess, era: Client) -> Page:
-    """The dashboard on a desktop, connected."""
+async def fresh(tab: Page, gateway: GatewayProcess, era: Client) -> Page:
+    """The dashboard on a desktop, connected, in a tab of its own."""
     await open_dashboard(tab, gateway, DESKTOP)
     await settled(tab, era)
     return tab
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def shared(browser: Browser, gateway: GatewayProcess) -> AsyncIterator[Page]:
+    """The dashboard in a tab that no test leaves or loads anew."""
+    async with browser.open_page() as page:
+        await open_dashboard(page, gateway, DESKTOP)
+        yield page
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def page(shared: Page, era: Client) -> Page:
+    """That dashboard on a desktop, connected, in light colours, nothing focused."""
+    await shared.fit(DESKTOP.width, DESKTOP.height)
+    await shared.dark(False)
+    await shared.evaluate("document.activeElement.blur(); window.scrollTo(0, 0)")
+    await settled(shared, era)
+    return shared
 
 
 async def settled(page: Page, era: Client) -> None:
@@ -246,15 +264,15 @@ async def test_cancelled_touches_are_lifted(page: Page, era: Client) -> None:
             await contacts(era, 0)
 
 
-async def test_reload_lifts_resting_fingers(page: Page, era: Client) -> None:
+async def test_reload_lifts_resting_fingers(fresh: Page, era: Client) -> None:
     """The next touch is felt."""
-    await page.touch("touchStart", await on_plate(page, *PLACES))
+    await fresh.touch("touchStart", await on_plate(fresh, *PLACES))
     await contacts(era, 2)
-    await page.call("Page.reload")
+    await fresh.call("Page.reload")
     assert await contacts(era, 0) == []
-    await page.until(f"{STATE} === '{READY}'")
-    await page.touch("touchEnd", [])
-    async with fingers_down(page, (0.5, 0.5)):
+    await fresh.until(f"{STATE} === '{READY}'")
+    await fresh.touch("touchEnd", [])
+    async with fingers_down(fresh, (0.5, 0.5)):
         ((x, _),) = await contacts(era, 1)
         assert x == pytest.approx(0.5 * LENGTH, abs=1e-3)
     assert await contacts(era, 0) == []
@@ -317,9 +335,9 @@ async def test_buttons_arm_disarm_stop_and_clear(page: Page, era: Client) -> Non
     assert page.complaints == []
 
 
-async def test_lease_is_renewed_while_the_page_is_open(page: Page, era: Client) -> None:
+async def test_lease_is_renewed_while_the_page_is_open(fresh: Page, era: Client) -> None:
     """Closing the page disarms, because its user could not stop any more."""
-    await arm(page, era)
+    await arm(fresh, era)
 
     def left() -> float:
         return era.status().lease_left_s or 0.0
@@ -327,25 +345,25 @@ async def test_lease_is_renewed_while_the_page_is_open(page: Page, era: Client) 
     await asyncio.to_thread(wait_for, lambda: left() < 4.2)
     await asyncio.to_thread(wait_for, lambda: left() > 4.5)  # by itself it only falls
     era.subscribe("state")
-    await page.call("Page.navigate", url="about:blank")
+    await fresh.call("Page.navigate", url="about:blank")
     await until_state(era, READY)
     causes = {told.data["cause"] for told in era.events(timeout=0.1)}
     assert any(re.match(r"disarmed by '(http|web:\d+) 127", cause) for cause in causes)
 
 
-async def test_space_bar_stops_with_any_focus(page: Page, era: Client) -> None:
+async def test_space_bar_stops_with_any_focus(fresh: Page, era: Client) -> None:
     """It has no other effect there."""
     for focus in ("body", "#disarm", "#motion", "#log", "#plate", "#effects button"):
-        await arm(page, era)
-        await page.evaluate(f"document.querySelector({focus!r}).focus()")
-        scrolled = await page.evaluate("scrollY")
-        await page.press(" ", "Space")
+        await arm(fresh, era)
+        await fresh.evaluate(f"document.querySelector({focus!r}).focus()")
+        scrolled = await fresh.evaluate("scrollY")
+        await fresh.press(" ", "Space")
         await until_state(era, STOPPED)
-        assert await page.evaluate("document.querySelector('#motion').checked") is False, focus
-        log = await page.evaluate("document.querySelector('#log').innerText")
+        assert await fresh.evaluate("document.querySelector('#motion').checked") is False, focus
+        log = await fresh.evaluate("document.querySelector('#log').innerText")
         assert "disarmed by 'g" not in log, focus
-        assert await page.evaluate("scrollY") == scrolled, focus
-        await settled(page, era)
+        assert await fresh.evaluate("scrollY") == scrolled, focus
+        await settled(fresh, era)
 
 
 async def test_stop_button_is_uncovered_on_every_screen(page: Page) -> None:
@@ -389,13 +407,13 @@ async def test_text_has_enough_contrast(page: Page, era: Client, is_dark: bool) 
     assert looked > 60
 
 
-async def test_elements_have_roles_names_and_tab_order(page: Page) -> None:
+async def test_elements_have_roles_names_and_tab_order(fresh: Page) -> None:
     """For screen readers and the keyboard."""
-    await page.until(
+    await fresh.until(
         "document.querySelector('meter')?.ariaLabel", lambda name: "ERA" in (name or "")
     )
-    await page.call("Accessibility.enable")
-    nodes = (await page.call("Accessibility.getFullAXTree"))["nodes"]
+    await fresh.call("Accessibility.enable")
+    nodes = (await fresh.call("Accessibility.getFullAXTree"))["nodes"]
     named = {
         (node["role"]["value"], node["name"]["value"])
         for node in nodes
@@ -427,35 +445,35 @@ async def test_elements_have_roles_names_and_tab_order(page: Page) -> None:
         ("meter", "channel 0, ERA SW: 0 %"),
     } <= {(role, name.removesuffix(" space")) for role, name in named}
     order = []
-    await page.evaluate("document.activeElement.blur()")
+    await fresh.evaluate("document.activeElement.blur()")
     for _ in range(7):
-        await page.press("Tab")
+        await fresh.press("Tab")
         order.append(
-            await page.evaluate("document.activeElement.id || document.activeElement.className")
+            await fresh.evaluate("document.activeElement.id || document.activeElement.className")
         )
     assert order[:5] == ["skip", "arm", "stop", "plate", "motion"]
-    live = await page.evaluate(
+    live = await fresh.evaluate(
         "[...document.querySelectorAll('[role=alert], [role=status]')].map(e => e.id)"
     )
     assert {"banner", "problem"} <= set(live)
 
 
 @pytest.mark.long
-async def test_page_is_still_with_reduced_motion(page: Page, era: Client) -> None:
+async def test_page_is_still_with_reduced_motion(fresh: Page, era: Client) -> None:
     """No animation; the picture of a steady vibration does not change."""
-    await page.call(
+    await fresh.call(
         "Emulation.setEmulatedMedia",
         features=[{"name": "prefers-reduced-motion", "value": "reduce"}],
     )
-    await arm(page, era)
-    async with fingers_down(page, PLACES[1]):
-        await page.until("document.querySelectorAll('.era.driven').length")
+    await arm(fresh, era)
+    async with fingers_down(fresh, PLACES[1]):
+        await fresh.until("document.querySelectorAll('.era.driven').length")
         # The swell rises for 0.6 s; what moves by itself would never be the same twice.
-        await page.until(
+        await fresh.until(
             "new Promise(done => { const draw = () => document.querySelector('#field').toDataURL();"
             "const first = draw(); setTimeout(() => done(first === draw()), 300); })"
         )
-    assert await page.evaluate("document.getAnimations().length") == 0
+    assert await fresh.evaluate("document.getAnimations().length") == 0
 
 
 async def test_names_are_shown_as_text(page: Page, era: Client) -> None:

@@ -19,7 +19,7 @@ SECONDS, TOUCHES = 1.0, 100
 
 @pytest.fixture(scope="module")
 def measured(table_cache: Path, tmp_path_factory: pytest.TempPathFactory) -> run.Found:
-    """Taps at 100 Hz over TCP, every part a process of its own; the daemon waits for a busy machine."""
+    """Taps at 100 Hz over TCP, every part a process of its own; the daemon is a patient one."""
     file = tmp_path_factory.mktemp("latency") / "table.npz"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(table_cache))

@@ -114,6 +114,16 @@ class Voice:
         transition = _along(self.ending, time, self.transition.at(time), 0j)
         return replace(self, transition=transition, has_ended=True)
 
+    def scaled(self, time: float, factor: float, ramp: float) -> "Voice":
+        """Return it led to a factor of its level along a ramp [s], its ending scaled too."""
+        transition = self.transition
+        led = Transition(time, ramp, transition.at(time), transition.last * factor)
+        ending = self.ending
+        if ending is not None:
+            knots = tuple((round(level * factor), phase) for level, phase in ending.knots)
+            ending = replace(ending, knots=knots)
+        return replace(self, transition=led, ending=ending)
+
 
 def _along(envelope: Envelope, time: float, first: complex, last: complex) -> Transition:
     knots = tuple(amplitude_of(*knot) for knot in envelope.knots)
@@ -125,7 +135,8 @@ class _Layer:
     """What a layer plays: ends [s] by valid_for; waiting: a set that starts at a time [s]."""
 
     token: int = 0
-    ramp: float = 0.0
+    ramp: int = 0  # of the wire, as valid_for
+    valid_for: int = 0
     ends: float = math.inf
     waiting: tuple[float, LayerSet, int] | None = None
 
@@ -182,9 +193,35 @@ class Playback:
             tuple(voice for voice in voices if voice.silent_from > time) for voices in self._playing
         ]
 
+    def scale(self, time: float, factor: float, ramp: float) -> None:
+        """Take all tones that last to a factor of their level along a ramp [s], endings too."""
+        self.advance(time)
+        self._playing = [
+            tuple(
+                voice if voice.has_ended else voice.scaled(time, factor, ramp) for voice in voices
+            )
+            for voices in self._playing
+        ]
+
     def voices_of(self, channel: int) -> tuple[Voice, ...]:
         """Return the voices of a channel, the oldest first."""
         return self._playing[channel]
+
+    def playing(self, layer: int) -> LayerSet:
+        """Return the set to which the voices of a layer lead, without envelopes; empty: silent."""
+        commands = tuple(
+            Command(
+                channel,
+                _FREQUENCY.to_wire(voice.frequency),
+                _LEVEL.to_wire(abs(voice.transition.last)),
+                _PHASE.to_wire(math.degrees(cmath.phase(voice.transition.last))),
+            )
+            for channel, voices in enumerate(self._playing)
+            for voice in voices
+            if voice.layer == layer and not voice.has_ended
+        )
+        known = self._layers.get(layer, _Layer()) if commands else _Layer()
+        return LayerSet(layer, known.ramp, known.valid_for, commands)
 
     def level(self, channel: int, time: float) -> float:
         """Return the largest amplitude of a channel; voices of one frequency interfere."""
@@ -194,6 +231,10 @@ class Playback:
             amplitude = voice.transition.at(time) * turned
             sums[voice.frequency] = sums.get(voice.frequency, 0j) + amplitude
         return sum(map(abs, sums.values()))
+
+    def settled(self, channel: int) -> float:
+        """Return the sum of the amplitudes to which the voices of a channel lead."""
+        return sum(abs(voice.transition.last) for voice in self._playing[channel])
 
     def peak(self, channel: int, time: float) -> float:
         """Return a bound of the amplitude from a time on: all voices at their largest at once."""
@@ -210,6 +251,12 @@ class Playback:
             voice.layer for voices in self._playing for voice in voices if not voice.has_ended
         }
         return {number: self._layers[number].token for number in sorted(lasting)}
+
+    @property
+    def next_due(self) -> float:
+        """Time of the next end of `valid_for`, or start of a set that waits [s]; infinite: none."""
+        due = self._next_due()
+        return math.inf if due is None else due[0]
 
     @property
     def silent_from(self) -> float:
@@ -236,7 +283,7 @@ class Playback:
 
     def _end(self, layer: int, time: float) -> None:
         """Let a layer fall silent by its endings."""
-        ramp = self._layers.pop(layer).ramp
+        ramp = _RAMP.from_wire(self._layers.pop(layer).ramp)
         self._playing = [
             tuple(voice.ended(time, ramp) if voice.layer == layer else voice for voice in voices)
             for voices in self._playing
@@ -251,7 +298,7 @@ class Playback:
         if not commands:
             self._layers.pop(one.layer, None)
             return
-        self._layers[one.layer] = _Layer(token, ramp, _end_of(one, time))
+        self._layers[one.layer] = _Layer(token, one.ramp, one.valid_for, _end_of(one, time))
 
 
 def _end_of(one: LayerSet, time: float) -> float:

@@ -41,3 +41,13 @@ def best_first(scores: ArrayLike) -> IntArray:
         is_near = (below == above) | (below >= above - NEARLY * np.abs(above))
     run = np.concatenate([[0], np.cumsum(~is_near)])[: len(order)]
     return np.asarray(order[np.lexsort((order, run))])
+
+
+def best_few(scores: ArrayLike, count: int) -> IntArray:
+    """The first of `best_first`, up to count, without an order of the rest."""
+    values = np.asarray(scores)
+    if len(values) <= count:
+        return best_first(values)
+    least = np.partition(values, -count)[-count]
+    among = np.flatnonzero(values >= least - 2 * NEARLY * np.abs(least))
+    return np.asarray(among[best_first(values[among])[:count]])

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, nnls
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.calibration.parameters import Parameter, responses_at
+from model.calibration.parameters import Parameter, response_slopes, responses_at
 from model.calibration.variable_projection import (
-    jacobian_of,
     modal_assurance,
     project_gains,
+    projection_slopes,
     row_rms,
 )
 from model.rig.rig import Rig
@@ -36,6 +36,7 @@ _PEAK = 3.0  # times the median of a row; twice that is rare on a plate
 _ROUNDS = 8
 _LEAST_LEFT = 0.1  # of a value's noise: residuals with less tell nothing of it
 _STEPS = 60  # of one search; a plate that fits takes ten
+_HOLD = 1e3  # by which a mean of scales is held
 _SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
 
 
@@ -118,20 +119,33 @@ def _search(
     free, free_scales = problem.free, problem.free_scales
     count = int(free.sum())
 
+    # Gains determine a common scale; the mean is held.
+    is_mean_held = bool(free_scales.all())
+
     def unpack(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        full = np.broadcast_to(x, (*z.shape[:-1], len(x))).copy()
-        sensors = np.broadcast_to(scales, (*z.shape[:-1], len(scales))).copy()
-        full[..., free], sensors[..., free_scales] = z[..., :count], z[..., count:]
+        full, sensors = x.copy(), scales.copy()
+        full[free], sensors[free_scales] = z[:count], z[count:]
         return full, sensors
 
     def residual(z: FloatArray) -> FloatArray:
-        left = _residual(problem, *unpack(z), weight)[..., weight > 0]
+        full, sensors = unpack(z)
+        left = _residual(problem, full, sensors, weight)[weight > 0]
         parts = [left.real, left.imag]
-        if free_scales.all():
-            # Gains determine a common scale; the mean is held.
-            mean = unpack(z)[1].mean(axis=-1, keepdims=True)
-            parts.append(1e3 * (mean - scales.mean()))
-        return np.concatenate(parts, axis=-1)
+        if is_mean_held:
+            parts.append(_HOLD * (sensors.mean(keepdims=True) - scales.mean()))
+        return np.concatenate(parts)
+
+    def jacobian(z: FloatArray) -> FloatArray:
+        full, sensors = unpack(z)
+        plain, by_x = response_slopes(problem.plate, problem.rig, problem.parameters, full)
+        by_scale = plain * np.eye(len(scales))[free_scales, None, None]
+        slopes = np.concatenate([by_x[free] * sensors, by_scale])
+        _, slopes = projection_slopes(plain * sensors, slopes, problem.values, weight)
+        rows = slopes[:, weight > 0]
+        parts = [rows.real, rows.imag]
+        if is_mean_held:
+            parts.append(np.repeat([[0.0], [_HOLD / len(scales)]], [count, len(scales)], axis=0))
+        return np.concatenate(parts, axis=1).T
 
     start = np.concatenate([x[free], scales[free_scales]])
     if len(start) == 0:
@@ -140,7 +154,7 @@ def _search(
     found = least_squares(
         residual,
         np.clip(start, lower + 1e-9, upper - 1e-9),
-        jacobian_of(residual, lower, upper),
+        jacobian,
         bounds=(lower, upper),
         loss=loss,
         x_scale="jac",
@@ -193,9 +207,8 @@ def _bounds(
 def _residual(
     problem: Problem, x: FloatArray, scales: FloatArray, weight: FloatArray
 ) -> ComplexArray:
-    """Weighted residual (..., f, e, s) with the best gains; zero where nothing was measured."""
-    model = _model(problem, x) * scales[..., None, None, :]
-    return project_gains(model, problem.values, weight)[1]
+    """Weighted residual (f, e, s) with the best gains; zero where nothing was measured."""
+    return project_gains(_model(problem, x) * scales, problem.values, weight)[1]
 
 
 def _model(problem: Problem, x: FloatArray) -> ComplexArray:

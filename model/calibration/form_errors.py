@@ -161,7 +161,7 @@ class FormModel:
         def bent_by(stiffness: ComplexArray) -> ComplexArray:
             return np.asarray(np.swapaxes(seen_modes @ (stiffness @ q), 1, 2))
 
-        slope = self._slope(parameters, x)
+        slope = [p.slope(float(at)) for p, at in zip(parameters, x, strict=True)]
         found = [
             -bent_by(bending) * slope[0] / values[0],
             -1j * bent_by(self.loss_ratios * elastic) * slope[1],
@@ -202,14 +202,6 @@ class FormModel:
         derivatives[len(x) :] *= self.std[:, None, None, None]
         scale = -(omega**2)[:, :, None]
         return scale * response, scale * derivatives
-
-    @staticmethod
-    def _slope(parameters: Sequence[Parameter], x: FloatArray) -> list[float]:
-        """Derivatives of the values by x."""
-        return [
-            p.value(float(at)) if p.is_factor else p.step
-            for p, at in zip(parameters, x, strict=True)
-        ]
 
 
 def form_model(rig: Rig, points: FloatArray, frequencies: FloatArray) -> FormModel:

@@ -46,9 +46,13 @@ class Parameter:
         """The value in its unit."""
         return self.prior * math.exp(x) if self.is_factor else self.step * x
 
+    def slope(self, x: float) -> float:
+        """Derivative of the value by x."""
+        return self.value(x) if self.is_factor else self.step
+
     def standard_error(self, x: float, error: float) -> float:
         """Standard error of the value from that of x."""
-        return self.value(x) * error if self.is_factor else self.step * error
+        return self.slope(x) * error
 
     @property
     def name(self) -> str:
@@ -104,16 +108,28 @@ def parameters_of(rig: Rig) -> tuple[Parameter, ...]:
 def responses_at(
     plate: ParametricPlate, rig: Rig, parameters: Sequence[Parameter], x: FloatArray
 ) -> ComplexArray:
-    """Responses (..., f, e, p) of a rig with the values of x (..., n).
+    """Responses (f, e, p) of a rig with the values of x (n,).
 
     parameters: as `parameters_of` orders them.
     """
-    prior = np.array([parameter.prior for parameter in parameters])
-    step = np.array([parameter.step for parameter in parameters])
-    is_factor = np.array([parameter.is_factor for parameter in parameters])
-    values = np.where(is_factor, prior * np.exp(np.where(is_factor, x, 0.0)), step * x)
-    eras = values[..., 2:].reshape(*values.shape[:-1], -1, 3)
-    return plate.receptances(values[..., 0], values[..., 1]).responses(eras, rig.masses)
+    modulus, loss_factor, eras = _values(parameters, x)
+    return plate.receptances(modulus, loss_factor).responses(eras, rig.masses)
+
+
+def response_slopes(
+    plate: ParametricPlate, rig: Rig, parameters: Sequence[Parameter], x: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """Responses as `responses_at`, and their derivatives by x (n, f, e, p)."""
+    modulus, loss_factor, eras = _values(parameters, x)
+    responses, slopes = plate.response_slopes(modulus, loss_factor, eras, rig.masses)
+    own = [p.slope(float(at)) for p, at in zip(parameters, x, strict=True)]
+    return responses, slopes * np.array(own)[:, None, None, None]
+
+
+def _values(parameters: Sequence[Parameter], x: FloatArray) -> tuple[float, float, FloatArray]:
+    """Modulus, loss factor, and stiffness, damping and bolt mass of each ERA (e, 3)."""
+    values = [p.value(float(at)) for p, at in zip(parameters, x, strict=True)]
+    return values[0], values[1], np.array(values[2:]).reshape(-1, 3)
 
 
 def rig_with(rig: Rig, parameters: Sequence[Parameter], x: FloatArray) -> Rig:

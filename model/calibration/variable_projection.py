@@ -3,18 +3,14 @@
     d_fes = g_fe a_fes + noise
 
 d measured, a of the model, g the gain at frequency f of ERA e. Gains enter linearly: the best ones
-follow from any model, so that only its parameters are searched (Golub and Pereyra, SIAM J. Numer.
-Anal. 10, 1973).
+follow from any model, so that only its parameters are searched, with the derivatives of gains and
+residual by these (Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
 """
-
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
-
-_STEP = float(np.sqrt(np.finfo(float).eps))  # of a difference, relative
 
 
 def project_gains(
@@ -27,20 +23,16 @@ def project_gains(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return gains (f, e) that minimize sum |weight (values - gain model)|², and that residual.
 
-    model (..., f, e, s); values, weight (f, e, s), weight zero where nothing was measured; the
-    result has the leading dimensions of model. expected (..., e):
+    model, values, weight (f, e, s), weight zero where nothing was measured. expected (e,):
     magnitudes known beforehand to a relative standard deviation `tolerance`; they add
     ((|gain| - expected) / (tolerance expected))² to each row. Without them the gain of a row
     without values is NaN.
     """
     values = np.where(weight > 0, values, 0)
-    squares = weight**2
-    inner = np.einsum("...s,...s->...", model, squares * values.conj()).conj()
-    power = np.einsum("...s,...s->...", model.real**2 + model.imag**2, squares)
+    inner, power = _inner_and_power(model, values, weight)
     if expected is None:
         gains = np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan)
     else:
-        expected = expected[..., None, :]
         precision = 1 / (tolerance * expected) ** 2
         size = np.abs(inner)
         magnitude = (size + precision * expected) / (power + precision)
@@ -49,22 +41,50 @@ def project_gains(
     return gains, residual
 
 
-def jacobian_of(
-    residuals: Callable[[FloatArray], FloatArray], lower: FloatArray, upper: FloatArray
-) -> Callable[[FloatArray], FloatArray]:
-    """Jacobian (m, n) of residuals by forward differences, all of them in one call.
+def projection_slopes(
+    model: ComplexArray,
+    slopes: ComplexArray,
+    values: ComplexArray,
+    weight: FloatArray,
+    *,
+    expected: FloatArray | None = None,
+    expected_slopes: FloatArray | None = None,
+    tolerance: float = 0.0,
+) -> tuple[ComplexArray, ComplexArray]:
+    """Derivatives (n, f, e) of the gains of `project_gains`, and (n, f, e, s) of the residual.
 
-    residuals: from (..., n) to (..., m). Steps that would leave the bounds (n,) go backwards.
+    slopes (n, f, e, s), expected_slopes (n, e): derivatives of model and expected.
     """
+    values = np.where(weight > 0, values, 0)
+    inner, power = _inner_and_power(model, values, weight)
+    gains, _ = project_gains(model, values, weight, expected=expected, tolerance=tolerance)
+    gains = np.nan_to_num(gains)
+    by_inner = np.einsum("nfes,fes->nfe", slopes.conj(), weight**2 * values)
+    by_power = 2 * np.einsum("nfes,fes->nfe", slopes, weight**2 * model.conj()).real
+    if expected is None or expected_slopes is None:
+        by_gain = (by_inner - gains * by_power) / np.where(power > 0, power, 1)
+    else:
+        precision = 1 / (tolerance * expected) ** 2
+        by_expected = expected_slopes[:, None]
+        size = np.where(np.abs(inner) > 0, np.abs(inner), 1)
+        phase_factor = np.where(np.abs(inner) > 0, inner / size, 1)
+        turned = phase_factor.conj() * by_inner
+        by_precision = -2 * precision / expected * by_expected
+        by_magnitude = turned.real - precision * by_expected
+        by_magnitude -= np.abs(gains) * (by_power + by_precision)
+        by_magnitude /= power + precision
+        by_gain = phase_factor * (by_magnitude + 1j * np.abs(gains) / size * turned.imag)
+    return by_gain, -weight * (by_gain[..., None] * model + gains[..., None] * slopes)
 
-    def jacobian(z: FloatArray) -> FloatArray:
-        step = _STEP * np.where(z < 0, -1.0, 1.0) * np.maximum(1.0, np.abs(z))
-        leaves = (z + step > upper) | (z + step < lower)
-        moved = z + np.diag(np.where(leaves, -step, step))
-        found = residuals(np.vstack([z, moved]))
-        return np.asarray(((found[1:] - found[0]) / (np.diagonal(moved) - z)[:, None]).T)
 
-    return jacobian
+def _inner_and_power(
+    model: ComplexArray, values: ComplexArray, weight: FloatArray
+) -> tuple[ComplexArray, FloatArray]:
+    """Weighted inner products of model and values, and squares of the model, (f, e)."""
+    squares = weight**2
+    inner = np.einsum("fes,fes->fe", model.conj(), squares * values)
+    power = np.einsum("fes,fes->fe", model.real**2 + model.imag**2, squares)
+    return np.asarray(inner), np.asarray(power)
 
 
 def row_rms(values: ComplexArray, used: NDArray[np.bool_] | None = None) -> FloatArray:

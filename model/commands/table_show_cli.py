@@ -153,20 +153,22 @@ def _show_summary(summary: dict[str, Any]) -> None:
     def percent(key: str) -> str:
         return "-" if summary[key] is None else f"{100 * summary[key]:.3g} %"
 
-    def decibels(key: str) -> str:
-        return "-" if summary[key] is None else f"{summary[key]:.1f} dB"
-
     low, high = summary["frequency_range_hz"]
     measured_to = summary["threshold_measured_to_hz"]
     beyond = f", extrapolated above {measured_to:g} Hz" if high > measured_to else ""
     threshold = f"{summary['threshold']}{beyond}"
     length, width, thickness = (1000 * side for side in summary["plate_m"])
+
+    def with_error(key: str) -> str:
+        value, error = summary[f"{key}_db"], summary[f"{key}_error_db"]
+        return "-" if value is None else f"{value:.1f} ± {error:.1f} dB"
+
     contrast = [
         (
             f"contrast to {others} other{'s' if others > 1 else ''}",
-            f"median {decibels(f'robust_felt_contrast_{others}_quiet_median_db')}, one in ten "
-            f"below {decibels(f'robust_felt_contrast_{others}_quiet_tenth_percentile_db')}; "
-            f"as modelled {decibels(f'felt_contrast_{others}_quiet_median_db')}",
+            f"median {with_error(f'robust_felt_contrast_{others}_quiet_median')}, one in ten "
+            f"below {with_error(f'robust_felt_contrast_{others}_quiet_tenth_percentile')}; "
+            f"as modelled {with_error(f'felt_contrast_{others}_quiet_median')}",
         )
         for others in (1, 2, 3)
     ]
@@ -205,9 +207,14 @@ def _show_summary(summary: dict[str, Any]) -> None:
 
 
 def _show_map(cells: "WeakCells", *, listed: bool) -> None:
+    import numpy as np
+
     from model.table.weak_cells import text_map
 
     print("felt contrast of nine of ten plates, dB, to the median other finger; * marks weak cells")
+    if np.isfinite(cells.errors_db).any():
+        median, tenth = np.sqrt(np.nanmean(cells.errors_db**2, axis=1))
+        print(f"± {median:.1f} dB by the choice of other fingers, to one in ten ± {tenth:.1f} dB")
     for line in text_map(cells):
         print(line)
     if listed:

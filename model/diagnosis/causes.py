@@ -97,7 +97,6 @@ def explain(
     values: ComplexArray,
     *,
     drives: Sequence[int],
-    floor: FloatArray | None,
     model_error: float,
 ) -> list[Explanation]:
     """Find what explains values (f, e, s) best, most likely first; see `match_plate`."""
@@ -117,7 +116,7 @@ def explain(
         found = solved(cause, factor)
         if found is None:
             return None
-        return match_plate(*found, values, drives=drives, floor=floor, model_error=model_error)
+        return match_plate(*found, values, drives=drives, model_error=model_error)
 
     scores = []
     for cause in causes_of(rig):

@@ -6,7 +6,6 @@ from model.choice import best_of
 from model.diagnosis.causes import Explanation
 from model.diagnosis.plate_difference import NOTICEABLE_DB
 from model.diagnosis.plate_match import MAX_FIT_ERROR
-from model.diagnosis.polarity import UNDECIDED
 from model.diagnosis.verdict import MAX_DEVIATION, ChannelState, ChannelVerdict, Verdict
 from model.quantities import in_display_unit, percent
 
@@ -201,8 +200,7 @@ def _row(channel: ChannelVerdict, state: ChannelState) -> str:
                 f"confidence {channel.confidence:.3f}): {remedy}"
             )
         case "inverted":
-            either = " (or the other half)" if channel.confidence <= UNDECIDED else ""
-            return f"INVERTED: {wiring} has the opposite sign of the others{either}: {remedy}"
+            return f"INVERTED: {wiring} has the opposite sign of the others: {remedy}"
         case "out of phase":
             return f"OUT OF PHASE: {wiring} is off by {channel.phase:+.0f}°: {remedy}"
         case _:

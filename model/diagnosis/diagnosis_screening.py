@@ -17,23 +17,17 @@ from model.vibration.parametric_plate import ParametricPlate
 
 _DEAD = 0.03  # of the response that the rig predicts
 _FAINT = 0.3  # of it: dead if its shape is not that of an ERA either
-_NOISY = 3.0  # times the floor
 _NO_SHAPE = 0.6  # MAC
 _SENSOR_SCALE = (0.7, 1.4)
 LEAST_SENSORS, _LEAST_FREQUENCIES = 3, 4
 
 
 def dead_channels(rig: Rig, plate: ParametricPlate, observation: Observation) -> NDArray[np.bool_]:
-    """Mask (e,) of driven channels with a response far below the model's or near the floor."""
-    size = np.abs(observation.values)
-    share = size / np.abs(plate.responses(rig))
+    """Mask (e,) of driven channels with a response far below the model's."""
+    share = np.abs(observation.values / plate.responses(rig))
     dead = np.zeros(len(rig.eras), dtype=bool)
     for channel in np.flatnonzero(observation.measured):
-        finite = np.isfinite(size[:, channel])
-        dead[channel] = np.median(share[:, channel][finite]) < _DEAD
-        if observation.floor is not None:
-            over = (size[:, channel] / np.maximum(observation.floor, 1e-300))[finite]
-            dead[channel] |= bool(np.median(over) < _NOISY)
+        dead[channel] = np.nanmedian(share[:, channel]) < _DEAD
     return dead
 
 

@@ -18,8 +18,14 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.parameters import Parameter, parameters_of, responses_at, rig_with
-from model.calibration.variable_projection import jacobian_of, project_gains, row_rms
+from model.calibration.parameters import (
+    Parameter,
+    parameters_of,
+    response_slopes,
+    responses_at,
+    rig_with,
+)
+from model.calibration.variable_projection import project_gains, projection_slopes, row_rms
 from model.choice import best_of
 from model.rig.rig import Rig
 from model.vibration.parametric_plate import ParametricPlate
@@ -67,15 +73,14 @@ def match_plate(
     values: ComplexArray,
     *,
     drives: Sequence[int],
-    floor: FloatArray | None = None,
     model_error: float = MODEL_ERROR,
     starts: tuple[tuple[float, float], ...] = ((0.0, 0.0),),
 ) -> Match:
     """Fit the rig's plate to values (f, e, s) of channels.
 
     plate: of the rig at those points and frequencies; drives (e,): index of the ERA that each
-    channel drives; model_error: relative to a row's rms; floor (s,): noise in the unit of values;
-    starts: logarithms of factors on the modulus and on all stiffnesses from which to search.
+    channel drives; model_error: relative to a row's rms; starts: logarithms of factors on the
+    modulus and on all stiffnesses from which to search.
     """
     parameters = parameters_of(rig)
     center = np.array([parameter.start for parameter in parameters])
@@ -83,27 +88,58 @@ def match_plate(
     rows: NDArray[np.bool_] = np.asarray(np.isfinite(values).any(axis=2))
     used = np.flatnonzero(rows.any(axis=0))
     size = row_rms(values)
-    noise = model_error * size[:, :, None] * np.ones(values.shape[2])
-    if floor is not None:
-        noise = np.hypot(noise, floor)
-    weight = np.where(np.isfinite(values), 1 / noise, 0)
+    weight = np.isfinite(values) / (model_error * size[:, :, None])
     count = len(parameters)
     driven = list(drives)
 
     def responses(x: FloatArray) -> ComplexArray:
-        return np.asarray(responses_at(plate, rig, parameters, x)[..., driven, :])
+        return np.asarray(responses_at(plate, rig, parameters, x)[:, driven])
+
+    def expected(z: FloatArray) -> FloatArray:
+        gains = np.ones(values.shape[1])
+        gains[used] = np.exp(_GAIN_STD * z[count:])
+        return gains
 
     def residuals(z: FloatArray) -> FloatArray:
-        model = responses(center + std * z[..., :count])
-        gains = np.ones((*z.shape[:-1], values.shape[1]))
-        gains[..., used] = np.exp(_GAIN_STD * z[..., count:])
+        gains = expected(z)
+        projected, left = project_gains(
+            responses(center + std * z[:count]),
+            values,
+            weight,
+            expected=gains,
+            tolerance=_GAIN_TOLERANCE,
+        )
+        left = _robust(left[weight > 0])
+        wander = _robust(((np.abs(projected) / gains - 1) / _GAIN_TOLERANCE)[rows])
+        return np.concatenate([left.real, left.imag, wander, z])
+
+    def jacobian(z: FloatArray) -> FloatArray:
+        gains = expected(z)
+        model, by_x = response_slopes(plate, rig, parameters, center + std * z[:count])
+        model = model[:, driven]
+        slopes = np.zeros((len(z), *model.shape), dtype=complex)
+        slopes[:count] = by_x[:, :, driven] * std[:, None, None, None]
+        gain_slopes = np.zeros((len(z), len(gains)))
+        gain_slopes[count + np.arange(len(used)), used] = _GAIN_STD * gains[used]
         projected, left = project_gains(
             model, values, weight, expected=gains, tolerance=_GAIN_TOLERANCE
         )
-        expected = gains[..., None, :]
-        wander = ((np.abs(projected) - expected) / (_GAIN_TOLERANCE * expected))[..., rows]
-        left = _robust(left[..., weight > 0])
-        return np.concatenate([left.real, left.imag, _robust(wander), z], axis=-1)
+        by_gain, by_left = projection_slopes(
+            model,
+            slopes,
+            values,
+            weight,
+            expected=gains,
+            expected_slopes=gain_slopes,
+            tolerance=_GAIN_TOLERANCE,
+        )
+        size = np.abs(projected)
+        by_size = (projected.conj() * by_gain).real / size
+        by_wander = (by_size - size * gain_slopes[:, None] / gains) / gains / _GAIN_TOLERANCE
+        wander = (size / gains - 1) / _GAIN_TOLERANCE
+        of_left = _robust_slopes(left[weight > 0], by_left[:, weight > 0])
+        of_wander = _robust_slopes(wander[rows], by_wander[:, rows])
+        return np.hstack([of_left.real, of_left.imag, of_wander, np.eye(len(z))]).T
 
     bounds = np.array([[p.lower, p.upper] for p in parameters])
     bounds = (bounds - center[:, None]) / std[:, None]
@@ -120,7 +156,7 @@ def match_plate(
         least_squares(
             residuals,
             guess,
-            jacobian_of(residuals, lower, upper),
+            jacobian,
             bounds=(lower, upper),
             x_scale="jac",
             max_nfev=_STEPS,
@@ -138,7 +174,7 @@ def match_plate(
     _, residual = project_gains(
         model, values, weight, expected=np.nan_to_num(gains, nan=1.0), tolerance=_GAIN_TOLERANCE
     )
-    share = (np.abs(residual) * noise / size[:, :, None])[weight > 0]
+    share = (model_error * np.abs(residual))[weight > 0]
     return Match(
         fitted,
         parameters,
@@ -153,7 +189,16 @@ def match_plate(
 
 
 def _robust(left: NDArray[_Number]) -> NDArray[_Number]:
-    """Residuals [standard deviations] whose squares are a soft L1 loss."""
-    share = np.abs(left) / _ROBUST
-    half = 2 * (np.sqrt(1 + share**2) - 1)
-    return np.asarray(left * np.sqrt(half) / np.maximum(share, 1e-12))
+    """Residuals [standard deviations] (m,) whose squares are a soft L1 loss."""
+    return np.asarray(left * np.sqrt(2 / (1 + _hypotenuse(left))))
+
+
+def _robust_slopes(left: NDArray[_Number], slopes: NDArray[_Number]) -> NDArray[_Number]:
+    """Derivatives of `_robust` for those of its argument, (n, m)."""
+    root = _hypotenuse(left)
+    grown = (left.conj() * slopes).real / (2 * _ROBUST**2 * root * (1 + root))
+    return np.asarray(np.sqrt(2 / (1 + root)) * (slopes - left * grown))
+
+
+def _hypotenuse(left: NDArray[_Number]) -> FloatArray:
+    return np.asarray(np.sqrt(1 + (np.abs(left) / _ROBUST) ** 2))

@@ -22,7 +22,7 @@ from model.diagnosis.diagnosis_screening import (
 from model.diagnosis.observation import Observation
 from model.diagnosis.plate_difference import PlateDifference, plate_difference
 from model.diagnosis.plate_match import MAX_FIT_ERROR, MODEL_ERROR, Match, match_plate
-from model.diagnosis.polarity import ChannelPhase, phases_of_drive, signs_of_pairs
+from model.diagnosis.polarity import ChannelPhase, phases_of_drive
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
 from model.vibration.parametric_plate import ParametricPlate, parametric_plate
@@ -126,7 +126,7 @@ def diagnose(
             observation.frequencies,
         )
     shape_match = match_shapes(rig, plate, values)
-    match, drives, error = _best_match(rig, plate, values, shape_match, observation)
+    match, drives, error = _best_match(rig, plate, values, shape_match)
     off = off_scale(observation, values, match)
     if off and len(observation.sensors) - len(off) >= LEAST_SENSORS:
         wrong = np.isin(observation.sensors, [name for name, _ in off])
@@ -143,13 +143,12 @@ def diagnose(
             observation.frequencies,
             values,
             drives=drives,
-            floor=observation.floor,
             model_error=error,
         )
         tried = [match, *(each.match for each in explanations)]
         fitted = tried[best_of([-each.cost for each in tried])]
     shapes = match_responses(fitted.responses, values)
-    phases = _phases(rig, observation, fitted, dead)
+    phases = _phases(observation, fitted, dead)
     channels = tuple(
         _channel(
             rig, number, observation, shapes, drives, fitted, phases[number], bool(dead[number])
@@ -176,7 +175,6 @@ def _best_match(
     plate: ParametricPlate,
     values: ComplexArray,
     shape_match: ShapeMatch,
-    observation: Observation,
 ) -> tuple[Match, tuple[int, ...], float]:
     """Best plate, wiring and model error; the rig's wiring unless another is clearly better."""
     own = tuple(range(len(rig.eras)))
@@ -188,7 +186,6 @@ def _best_match(
             plate,
             values,
             drives=drives,
-            floor=observation.floor,
             model_error=error,
             starts=starts,
         )
@@ -209,16 +206,11 @@ def _best_match(
     return match, drives, error
 
 
-def _phases(
-    rig: Rig, observation: Observation, match: Match, dead: NDArray[np.bool_]
-) -> list[ChannelPhase]:
+def _phases(observation: Observation, match: Match, dead: NDArray[np.bool_]) -> list[ChannelPhase]:
+    if not observation.has_phases:
+        return [ChannelPhase()] * len(dead)
     predicted = np.where(dead[None, :, None], np.nan, match.predicted)
-    if observation.has_phases:
-        return phases_of_drive(observation, predicted)
-    groups: dict[str, list[int]] = {}
-    for number, era in enumerate(rig.eras):
-        groups.setdefault(rig.wiring[era.name].amplifier, []).append(number)
-    return signs_of_pairs(observation, predicted, list(groups.values()))
+    return phases_of_drive(observation, predicted)
 
 
 def _channel(

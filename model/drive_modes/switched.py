@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, Float32Array, IntArray
-from model.choice import NEARLY, best_first
+from model.choice import NEARLY, best_few
 from model.drive_modes.forms import SILENT, Forms, Weights
 from model.drive_modes.sources import all_combinations
 
@@ -88,7 +88,7 @@ def find_switched(forms: Forms, min_score: float) -> list[tuple[float, Weights]]
         )
 
     alone = score(target, variance, quiet)
-    kept = best_first(alone)[:ALTERNATIVES]
+    kept = best_few(alone, ALTERNATIVES)
     found: list[tuple[float, tuple[int, ...]]] = [
         (float(alone[s]), (s,)) for s in kept.tolist() if alone[s] > 0
     ]
@@ -109,7 +109,7 @@ def find_switched(forms: Forms, min_score: float) -> list[tuple[float, Weights]]
             variance[:, some] + variance[:, more],
             quiet[:, some] + quiet[:, more],
         )
-        for at in best_first(values)[:ALTERNATIVES].tolist():
+        for at in best_few(values, ALTERNATIVES).tolist():
             if values[at] > 0:
                 found.append((float(values[at]), (int(some[at]), int(more[at]))))
         best = max(best, float(values.max()))
@@ -117,7 +117,7 @@ def find_switched(forms: Forms, min_score: float) -> list[tuple[float, Weights]]
         one, other, bound = one[left], other[left], bound[left]
     found = [each for each in found if each[0] > least]
     found.sort(key=lambda each: each[1])
-    order = best_first([value for value, _ in found])[:ALTERNATIVES].tolist()
+    order = best_few([value for value, _ in found], ALTERNATIVES).tolist()
     return [
         (float(np.sqrt(value)), _drive(sources, eras, f))
         for value, sources in (found[each] for each in order)

@@ -17,8 +17,8 @@ Ask: TypeAlias = Callable[[Sequence[Question]], Iterator[Contrasts | None]]
 """Answers questions with quiet fingers in order, None where the level is not reached."""
 
 _CHUNK = 16
-_MIN_FIELDS = 150
-"""Fields of ERAs at frequencies from which on a process saves more time than its start takes."""
+_MIN_WORK = 300_000
+"""Questions times fields of ERAs from which on a process saves more time than its start takes."""
 
 
 def ask_here(table: LocalizationTable) -> Ask:
@@ -31,11 +31,16 @@ def ask_here(table: LocalizationTable) -> Ask:
 
 
 @contextmanager
-def ask_on_processes(table: LocalizationTable, count: int | None = None) -> Iterator[Ask]:
-    """Answers on a number of processes: by default those of the machine, one for small tables."""
+def ask_on_processes(
+    table: LocalizationTable, *, questions: int, count: int | None = None
+) -> Iterator[Ask]:
+    """Answers on a number of processes, by default those that the machine has.
+
+    questions: about how many there will be; few are answered in this process.
+    """
     if count is None:
-        is_small = len(table.frequencies) * len(table.eras) < _MIN_FIELDS
-        count = 1 if is_small else processor_count()
+        fields = len(table.frequencies) * len(table.eras)
+        count = processor_count() if questions * fields >= _MIN_WORK else 1
     if count == 1:
         yield ask_here(table)
         return

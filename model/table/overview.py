@@ -23,8 +23,9 @@ from model.files.array_file import whole_or_nothing
 from model.finger.grid import Grid
 from model.table.contact_sets import CONTACT_SETS, contrast_distribution
 from model.table.many_answers import Ask, ask_here, ask_on_processes
+from model.table.mirrored_questions import ask_once, mirror_images
 from model.table.table import LocalizationTable
-from model.table.weak_cells import WeakCells, find_weak_cells, map_grid
+from model.table.weak_cells import WeakCells, find_weak_cells, map_grid, pair_questions
 from model.version import code_version
 
 MAX_KEPT_OVERVIEWS = 200  # of some kilobytes; the oldest go first
@@ -55,7 +56,7 @@ def find_overview(
     ask: answers the questions, in this process by default; progress: called with the number of
     finished cells and sets, and the total.
     """
-    ask = ask or ask_here(table)
+    ask = ask_once(ask or ask_here(table), table)
     cells = map_grid(table).cell_count
     total = cells + 2 * CONTACT_SETS
     found = find_weak_cells(table, ask=ask, progress=lambda done, _: progress(done, total))
@@ -70,6 +71,12 @@ def find_overview(
     return Overview(found, contrasts)
 
 
+def question_count(table: LocalizationTable) -> int:
+    """About how many questions `find_overview` asks."""
+    pairs = sum(len(each) for each in pair_questions(table))
+    return pairs // len(mirror_images(table)) + 2 * CONTACT_SETS
+
+
 def _report_sets(
     progress: Callable[[int, int], None], done: int, *, before: int, total: int
 ) -> None:
@@ -82,7 +89,7 @@ def kept_overview(
     *,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Overview:
-    """Read the overview of a table from the user's cache, or compute it on all processors.
+    """Read the overview of a table from the user's cache, or compute it.
 
     path: the table's file.
     """
@@ -91,7 +98,7 @@ def kept_overview(
     kept = folder / f"overview-{digest}.json"
     with suppress(OSError, ValueError, KeyError, TypeError, InputError):
         return _read(kept, map_grid(table), table)
-    with ask_on_processes(table) as ask:
+    with ask_on_processes(table, questions=question_count(table)) as ask:
         overview = find_overview(table, ask=ask, progress=progress)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -109,6 +116,7 @@ def _write(path: Path, overview: Overview) -> None:
     content = {
         "median_db": cells.median_db.tolist(),
         "tenth_db": cells.tenth_db.tolist(),
+        "errors_db": cells.errors_db.tolist(),
         "contrasts": [each.tolist() for each in overview.contrasts],
     }
     with whole_or_nothing(path) as stream:
@@ -118,9 +126,12 @@ def _write(path: Path, overview: Overview) -> None:
 def _read(path: Path, grid: Grid, table: LocalizationTable) -> Overview:
     content = json.loads(path.read_bytes())
     contrasts = [np.array(each, dtype=float).reshape(2, -1) for each in content["contrasts"]]
-    median, tenth = (np.array(content[key], dtype=float) for key in ("median_db", "tenth_db"))
-    if not (len(contrasts) == 3 and median.shape == tenth.shape == (grid.cell_count,)):
+    keys = ("median_db", "tenth_db", "errors_db")
+    median, tenth, errors = (np.array(content[key], dtype=float) for key in keys)
+    count = grid.cell_count
+    shapes = [each.shape for each in (median, tenth, errors)]
+    if not (len(contrasts) == 3 and shapes == [(count,), (count,), (2, count)]):
         raise ValueError("an overview must have a value for each cell")
     return Overview(
-        WeakCells(grid, grid.centres(table.plate), median, tenth, contrasts[0]), contrasts
+        WeakCells(grid, grid.centres(table.plate), median, tenth, errors, contrasts[0]), contrasts
     )

@@ -9,6 +9,7 @@ from model.drive_modes.sources import all_combinations
 from model.finger.perception import FELT_DB_SL, highest_measured
 from model.table.overview import Overview
 from model.table.table import LocalizationTable
+from model.table.weak_cells import sampling_error
 
 PAIRS = 20_000
 MIN_SIMILARITY = 0.95
@@ -18,7 +19,8 @@ MIN_SIMILARITY = 0.95
 def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:
     """Summarize a table; felt contrast [dB]: median and tenth percentile over contact sets.
 
-    Robust contrasts are those of nine of ten plates, the others those of the plate as modelled.
+    Robust contrasts are those of nine of ten plates, the others those of the plate as modelled;
+    beside each one standard deviation by the choice of the sets.
     """
     weak = overview.cells
     available = table.available_level_db_sl
@@ -43,7 +45,9 @@ def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:
         for kind, contrasts in zip(("robust_felt", "felt"), found, strict=True):
             for name, percentile in (("median", 50), ("tenth_percentile", 10)):
                 value = float(np.percentile(contrasts, percentile)) if len(contrasts) else None
+                error = sampling_error(contrasts, percentile) if len(contrasts) else None
                 summary[f"{kind}_contrast_{others}_quiet_{name}_db"] = value
+                summary[f"{kind}_contrast_{others}_quiet_{name}_error_db"] = error
     summary["alike_pattern_pairs_share"] = similar_share(table)
     summary["mesh_name"] = str(table.mesh)
     summary["discretisation_error_percent"] = 100 * float(table.discretisation_error.max())

@@ -1,23 +1,26 @@
 """Felt contrast that the cells of a plate have to other fingers.
 
 For the centre of each cell as the target, the contrast that nine of ten plates give to another
-finger at random places, the same for all cells, at least 5 cm away. A cell is *feasible* if the
+finger at random places at least 5 cm away. A cell is *feasible* if the
 median other finger leaves 12 dB at 20 dB SL: turned down to 12 dB SL, which is felt well, the other
 finger is then at its threshold. It is *weak* if more than one other finger in ten leaves less.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import FloatArray
 from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL
+from model.structure.plate import Plate
 from model.table.many_answers import Ask, Contrasts, ask_here
+from model.table.mirrored_questions import mirror_images
 from model.table.question import Question
 from model.table.table import LocalizationTable
 
@@ -42,14 +45,16 @@ _MAX_GRID = Grid(8, 6)
 class WeakCells:
     """Median and tenth percentile of felt contrast [dB] from each cell to other fingers, (cells,).
 
-    -inf where the level is not reached, NaN on a plate too small for two fingers. pairs_db: robust
-    and nominal felt contrast [dB] of all pairs that reach it, (2, pairs).
+    -inf where the level is not reached, NaN on a plate too small for two fingers. errors_db: one
+    standard deviation of both by the choice of the other fingers, (2, cells). pairs_db: robust and
+    nominal felt contrast [dB] of all pairs that reach it, (2, pairs).
     """
 
     grid: Grid
     centres: FloatArray
     median_db: FloatArray
     tenth_db: FloatArray
+    errors_db: FloatArray
     pairs_db: FloatArray
 
     @property
@@ -69,6 +74,8 @@ class WeakCells:
             "centres_m": self.centres.tolist(),
             "median_contrast_db": _finite(self.median_db),
             "tenth_percentile_contrast_db": _finite(self.tenth_db),
+            "median_contrast_error_db": _finite(self.errors_db[0]),
+            "tenth_percentile_contrast_error_db": _finite(self.errors_db[1]),
             "is_weak": self.weak.tolist(),
             "is_feasible": self.feasible.tolist(),
         }
@@ -78,6 +85,22 @@ def are_apart(contacts: FloatArray) -> bool:
     """Whether all of two or more contacts (n, 2) [m] are MIN_DISTANCE apart."""
     gaps = np.linalg.norm(contacts[:, None] - contacts, axis=-1)
     return bool(gaps[np.triu_indices(len(contacts), 1)].min() >= MIN_DISTANCE)
+
+
+def sampling_error(values: ArrayLike, percent: float) -> float:
+    """One standard deviation of a percentile of a random sample (n,), NaN where it is not finite.
+
+    Half the distance between the order statistics that are one standard deviation of the number of
+    values below the percentile away from it, whatever the values' distribution. Equal values count
+    once, as those of questions that mirror each other.
+    """
+    sample = np.asarray(values, dtype=float)
+    share, count = percent / 100, len(np.unique(sample))
+    if count == 0:
+        return math.nan
+    ranks = np.clip(share + np.array([-1, 1]) * math.sqrt(share * (1 - share) / count), 0, 1)
+    low, high = np.quantile(sample, ranks, method="inverted_cdf")
+    return float(high - low) / 2 if np.isfinite([low, high]).all() else math.nan
 
 
 def map_grid(table: LocalizationTable) -> Grid:
@@ -98,7 +121,7 @@ def find_weak_cells(
     """
     grid = map_grid(table)
     centres = grid.centres(table.plate)
-    found = np.full((2, len(centres)), np.nan)
+    found, errors = np.full((2, 2, len(centres)), np.nan)
     asked = pair_questions(table)
     answers = (ask or ask_here(table))([question for some in asked for question in some])
     pairs: list[Contrasts] = []
@@ -110,20 +133,35 @@ def find_weak_cells(
         if contrasts:
             # A sample with -inf cannot be interpolated.
             found[:, cell] = np.percentile(contrasts, [50, 10], method="inverted_cdf")
+            errors[:, cell] = [sampling_error(contrasts, percent) for percent in (50, 10)]
         progress(cell + 1, len(centres))
     median, tenth = found
-    return WeakCells(grid, centres, median, tenth, np.array(pairs, dtype=float).reshape(-1, 2).T)
+    values = np.array(pairs, dtype=float).reshape(-1, 2).T
+    return WeakCells(grid, centres, median, tenth, errors, values)
 
 
 def pair_questions(table: LocalizationTable) -> list[list[Question]]:
-    """For each cell of `map_grid` as the target, those with each other finger at a distance."""
-    size = np.array([table.plate.length, table.plate.width])
-    corner = np.stack(np.meshgrid(*(np.arange(n) for n in STRATA)), axis=-1).reshape(-1, 1, 2)
-    drawn = np.random.default_rng(0).uniform(0, 1, corner.shape)
-    drawn = (corner + drawn) / (2 * np.array(STRATA))
-    mirrored = np.abs(drawn - [[0, 0], [1, 0], [0, 1], [1, 1]])
-    places = size * mirrored.reshape(-1, 2)
-    return [_questions(centre, places) for centre in map_grid(table).centres(table.plate)]
+    """For each cell of `map_grid` as the target, those with each other finger at a distance.
+
+    Places of the other finger are drawn for each cell, the same for cells that mirror each other
+    where the plate does.
+    """
+    grid, plate = map_grid(table), table.plate
+    centres = grid.centres(plate)
+    images = mirror_images(table)
+    along_x, along_y = (True, False) in images, (False, True) in images
+
+    def seed(x: int, y: int) -> list[int]:
+        return [
+            min(x, grid.nx - 1 - x) if along_x else x,
+            min(y, grid.ny - 1 - y) if along_y else y,
+        ]
+
+    return [
+        _questions(centres[x + y * grid.nx], _places(plate, seed(x, y)))
+        for y in range(grid.ny)
+        for x in range(grid.nx)
+    ]
 
 
 def text_map(weak: WeakCells) -> Iterator[str]:
@@ -135,6 +173,16 @@ def text_map(weak: WeakCells) -> Iterator[str]:
             f"{'-' if not np.isfinite(value) else format(value, '.0f'):>4}{'*' if mark else ' '}"
             for value, mark in zip(median, marks, strict=True)
         ).rstrip()
+
+
+def _places(plate: Plate, seed: list[int]) -> FloatArray:
+    """Random places all over a plate, with all their mirror images, (n, 2) [m]."""
+    corner = np.stack(np.meshgrid(*(np.arange(n) for n in STRATA)), axis=-1).reshape(-1, 1, 2)
+    drawn = np.random.default_rng(seed).uniform(0, 1, corner.shape)
+    drawn = (corner + drawn) / (2 * np.array(STRATA))
+    mirrored = np.abs(drawn - [[0, 0], [1, 0], [0, 1], [1, 1]])
+    size = np.array([plate.length, plate.width])
+    return np.asarray(size * mirrored.reshape(-1, 2))
 
 
 def _questions(target: FloatArray, places: FloatArray) -> list[Question]:

@@ -29,7 +29,7 @@ from model.structure.point_load import Load, footprints_of
 class FreeReceptances:
     """Receptances [m/N] of a free plate for forces at its h attachments.
 
-    between (..., f, h, h): at these; to_points (..., f, p, h); omega (f,) [rad/s].
+    between (f, h, h): at these; to_points (f, p, h); omega (f,) [rad/s].
     """
 
     between: ComplexArray
@@ -37,21 +37,26 @@ class FreeReceptances:
     omega: FloatArray
 
     def responses(self, eras: FloatArray, loads: Sequence[Load]) -> ComplexArray:
-        """Acceleration per base displacement [1/s²] of each ERA without its gain, (..., f, e, p).
+        """Acceleration per base displacement [1/s²] of each ERA without its gain, (f, e, p).
 
-        eras (..., e, 3): stiffness, damping and bolt mass of those at the first attachments; loads:
-        at the others, in their order.
+        eras (e, 3): stiffness, damping and bolt mass of those at the first attachments; loads: at
+        the others, in their order.
         """
-        k, c, m = (eras[..., None, :, number] for number in range(3))
-        omega = self.omega[:, None]
-        stiffness = dynamic_stiffness(k, c, m, omega)
-        rest = attached_stiffness((), loads, self.omega)
-        rest = np.broadcast_to(rest, (*stiffness.shape[:-1], rest.shape[-1]))
-        stiffness = np.concatenate([stiffness, rest], axis=-1)
-        applied = on_diagonal(dynamic_stiffness(k, c, 0.0, omega), rows=stiffness.shape[-1])
+        stiffness, base = self.attached(eras, loads)
+        applied = on_diagonal(base, rows=stiffness.shape[-1])
         forces = coupled_forces(self.between, stiffness, applied)
         scaled = -(self.omega**2)[:, None, None] * forces
         return np.asarray(np.swapaxes(self.to_points @ scaled, -1, -2))
+
+    def attached(
+        self, eras: FloatArray, loads: Sequence[Load]
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Dynamic stiffness of ERAs and loads (f, h), and of the ERAs to their base (f, e)."""
+        k, c, m = eras.T
+        omega = self.omega[:, None]
+        at_eras = dynamic_stiffness(k, c, m, omega)
+        stiffness = np.concatenate([at_eras, attached_stiffness((), loads, self.omega)], axis=1)
+        return stiffness, dynamic_stiffness(k, c, 0.0, omega)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,33 +91,64 @@ class ParametricPlate:
         return free.responses(eras, rig.masses)
 
     def receptances(
-        self,
-        modulus: FloatArray | float,
-        loss_factor: FloatArray | float,
-        *,
-        thickness: FloatArray | float | None = None,
+        self, modulus: float, loss_factor: float, *, thickness: float | None = None
     ) -> FreeReceptances:
-        """Receptances of the free plate for values (...), by default with its own thickness [m]."""
-        thicker = np.asarray(1.0 if thickness is None else thickness / self.plate.thickness)
-        stiffer = np.asarray(modulus) / self.plate.material.E * thicker**3
-        elasticity = ModalElasticity.of(self.plate, self.eigenvalues, self.losses, self.dispersion)
-        loss = np.asarray(loss_factor)[..., None, None] * elasticity.loss_ratios(self.omega)
-        complex_eigenvalues = (1 + 1j * loss) * elasticity.eigenvalues + elasticity.further(
-            self.omega
-        )
-        elastic = np.asarray(stiffer)[..., None, None] * complex_eigenvalues
-        inertia = thicker[..., None, None] * (self.omega**2)[:, None]
-        modal = np.asarray(1 / (elastic - inertia))
+        """Receptances of the free plate, by default with its own thickness [m]."""
+        thicker = 1.0 if thickness is None else thickness / self.plate.thickness
+        elastic, _ = self._elastic(modulus * thicker**3, loss_factor)
+        modal = 1 / (elastic - thicker * (self.omega**2)[:, None])
         # Real products of both parts: the shapes are real.
-        found = np.empty((*modal.shape[:-1], self._products.shape[1]), dtype=complex)
+        found = np.empty((len(modal), self._products.shape[1]), dtype=complex)
         found.real, found.imag = modal.real @ self._products, modal.imag @ self._products
         h = len(self.attachment_shapes)
         between, to_points = np.split(found, [h * h], axis=-1)
         return FreeReceptances(
-            between.reshape(*between.shape[:-1], h, h),
-            to_points.reshape(*to_points.shape[:-1], len(self.shapes), h),
-            self.omega,
+            between.reshape(-1, h, h), to_points.reshape(-1, len(self.shapes), h), self.omega
         )
+
+    def response_slopes(
+        self, modulus: float, loss_factor: float, eras: FloatArray, loads: Sequence[Load]
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Responses of ERAs (e, 3) and loads (f, e, p), and their derivatives (2 + 3 e, f, e, p).
+
+        As `FreeReceptances.responses`. Derivatives are by modulus [1/Pa], loss factor and the
+        stiffness, damping and bolt mass of one ERA after the other [m/N, m/(N s), 1/kg]. With
+        T = A (1 + Z A)^-1, changes dA and dZ change T by (1 - T Z) dA (1 - Z T) - T dZ T.
+        """
+        free = self.receptances(modulus, loss_factor)
+        stiffness, base = free.attached(eras, loads)
+        count = base.shape[1]
+        system = np.eye(stiffness.shape[1]) + stiffness[:, :, None] * free.between
+        forces = np.linalg.inv(system)  # on the plate, by those applied
+        to_points = free.to_points @ forces
+        moved = (free.between @ forces)[:, :, :count] * base[:, None]  # (f, h, e)
+        elastic, lossless = self._elastic(modulus, loss_factor)
+        omega = self.omega[:, None]
+        modal = 1 / (elastic - omega**2)
+        # Shapes at points where all else is held by its attachments, and forces on modes (f, r, e).
+        held = self.shapes - (to_points * stiffness[:, None]) @ self.attachment_shapes
+        driven = self.attachment_shapes.T @ (forces[:, :, :count] * base[:, None])
+        found = [
+            held @ ((-(modal**2) * by)[:, :, None] * driven)
+            for by in (elastic / modulus, 1j * lossless)
+        ]
+        for era in range(count):
+            seen = to_points[:, :, era, None]
+            extension = np.eye(count)[era] - moved[:, era, None]
+            by_spring = seen * extension
+            by_mass = (omega**2)[:, :, None] * seen * moved[:, era, None]
+            found += [by_spring, 1j * omega[:, :, None] * by_spring, by_mass]
+        scale = -(omega**2)[:, :, None]
+        responses = scale * to_points[:, :, :count] * base[:, None]
+        return np.swapaxes(responses, 1, 2), np.swapaxes(scale * np.array(found), 2, 3)
+
+    def _elastic(self, modulus: float, loss_factor: float) -> tuple[ComplexArray, FloatArray]:
+        """Complex stiffness of each mode (f, r) [rad²/s²], and by how much it turns with loss."""
+        elasticity = ModalElasticity.of(self.plate, self.eigenvalues, self.losses, self.dispersion)
+        stiffer = modulus / self.plate.material.E
+        turned = elasticity.loss_ratios(self.omega) * elasticity.eigenvalues
+        lossy = elasticity.eigenvalues + 1j * loss_factor * turned
+        return stiffer * (lossy + elasticity.further(self.omega)), stiffer * turned
 
     @cached_property
     def _products(self) -> FloatArray:

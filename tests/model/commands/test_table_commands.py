@@ -176,7 +176,9 @@ def test_show_prints_summary_map_and_a_query_that_has_an_answer(
     start = next(
         number for number, line in enumerate(lines) if line.startswith("felt contrast of nine")
     )
-    cells = lines[start + 1 : start + 4]
+    errors = re.findall(r"± ([\d.]+) dB", lines[start + 1])
+    assert [0 < float(error) < 10 for error in errors] == [True, True]
+    cells = lines[start + 2 : start + 5]
     assert [len(line.split()) for line in cells] == [4, 4, 4]
     stars = sum(line.count("*") for line in cells)
     assert sum(line.startswith("(0.") for line in lines) == stars > 0

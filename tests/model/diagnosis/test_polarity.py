@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from model.diagnosis.observation import Observation, Pair
-from model.diagnosis.polarity import phases_of_drive, signs_of_pairs
+from model.diagnosis.observation import Observation
+from model.diagnosis.polarity import phases_of_drive
 
 
 @pytest.mark.parametrize(
@@ -24,19 +24,3 @@ def test_phases_of_drive_inverts_beyond_a_quarter_turn(degrees: float, sign: int
     assert phase.degrees == pytest.approx(degrees, abs=1e-6)
     assert phase.sign == sign
     assert phase.confidence == pytest.approx(1.0)
-
-
-def test_signs_of_pairs_follow_a_chain() -> None:
-    """The first against the second, the second with the third: the first is the odd one out."""
-    rng = np.random.default_rng(1)
-    predicted = rng.standard_normal((4, 3, 6)) + 1j * rng.standard_normal((4, 3, 6))
-    pairs = [
-        pair
-        for f, (one, two, three) in enumerate(predicted)
-        for pair in (Pair(float(f), (0, 1), one - two), Pair(float(f), (1, 2), -two - three))
-    ]
-    observation = Observation(
-        tuple("ABCDEF"), np.zeros((6, 2)), np.arange(4.0), predicted, has_phases=False, pairs=pairs
-    )
-    found = signs_of_pairs(observation, predicted, [[0, 1, 2]])
-    assert [phase.sign for phase in found] == [-1, 1, 1]

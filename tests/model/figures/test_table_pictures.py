@@ -41,6 +41,7 @@ def test_weak_cells_figure_crosses_out_weak_cells(table):
         np.zeros((2, 2)),
         median_db=np.array([20.0, 9.0]),
         tenth_db=np.array([11.0, -np.inf]),
+        errors_db=np.zeros((2, 2)),
         pairs_db=np.empty((2, 0)),
     )
     left, right = weak_cells_figure(table, weak).axes[:2]

@@ -15,7 +15,13 @@ from model.table.file import save_table
 from model.table.many_answers import ask_on_processes
 from model.table.overview import Overview, find_overview, kept_overview
 from model.table.summary import similar_share, summarize
-from model.table.weak_cells import WeakCells, find_weak_cells, map_grid, text_map
+from model.table.weak_cells import (
+    WeakCells,
+    find_weak_cells,
+    map_grid,
+    sampling_error,
+    text_map,
+)
 from paper_plate import make_paper_rig
 from small_table import small_table, with_strokes
 
@@ -40,17 +46,17 @@ def test_weak_cells_of_a_symmetric_plate_are_symmetric(table):
 def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
     """Half of a cell's contrasts are below its median, a tenth below the other.
 
-    Other fingers are in each of 4 by 4 fields, at least 5 cm from the cell.
+    Its other fingers are in different ones of 4 by 4 fields, at least 5 cm from the cell.
     """
     rng = np.random.default_rng(0)
     drawn: dict[tuple[float, float], list[float]] = {}
-    tried = set()
+    tried: dict[tuple[float, float], list[tuple[float, float]]] = {}
 
     def at_random(questions):
         for question in questions:
             (target,), (other,) = question.targets, question.quiet
             assert math.dist(target, other) >= 0.05
-            tried.add(other)
+            tried.setdefault(target, []).append(other)
             drawn.setdefault(target, []).append(float(rng.uniform(0, 30)))
             yield drawn[target][-1], None
 
@@ -61,17 +67,38 @@ def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
             below = (np.array(contrasts) < value).mean()
             assert below == pytest.approx(share, abs=1.5 / len(contrasts))
     size = (table.plate.length, table.plate.width)
-    counts, *_ = np.histogram2d(
-        *np.array(sorted(tried)).T, bins=(4, 4), range=[(0, side) for side in size]
-    )
-    assert (counts == 1).all()
+    for target, others in tried.items():
+        counts, *_ = np.histogram2d(
+            *np.array(others).T, bins=(4, 4), range=[(0, side) for side in size]
+        )
+        assert counts.max() == 1
+        assert counts.sum() >= 16 - 4  # a place within 5 cm is in the target's field or beside it
+        (x, y) = target
+        mirrored = np.array(tried[min(tried, key=lambda at: math.dist(at, (size[0] - x, y)))])
+        np.testing.assert_allclose(
+            sorted(size[0] - mirrored[:, 0]), sorted(x for x, _ in others), atol=1e-12
+        )
+
+
+def test_sampling_error_is_how_much_a_percentile_of_random_samples_varies():
+    """Of 5000 samples of 64 normal values the median is within 0.157, the tenth within 0.214.
+
+    The standard deviation of a percentile is sqrt(p (1 - p) / n) over the density there. Copies of
+    the values tell nothing more.
+    """
+    samples = np.random.default_rng(0).normal(size=(5000, 64))
+    for percent, expected in ((50, 0.1567), (10, 0.2137)):
+        stated = np.array([sampling_error(each, percent) for each in samples])
+        assert stated.mean() == pytest.approx(expected, rel=0.15)
+        assert sampling_error(np.tile(samples[0], 4), percent) == stated[0]
+    assert math.isnan(sampling_error([-np.inf, -np.inf, 1.0, 2.0], 50))
 
 
 @pytest.mark.long
 def test_overview_is_the_same_on_processes(table, monkeypatch):
     """Questions are drawn and counted in the same order, whoever answers them."""
     monkeypatch.setattr("model.table.contact_sets.CONTACT_SETS", 20)
-    with ask_on_processes(table, 2) as ask:
+    with ask_on_processes(table, questions=100, count=2) as ask:
         found = find_overview(table, ask=ask)
     here = find_overview(table)
     np.testing.assert_array_equal(found.cells.median_db, here.cells.median_db)
@@ -90,6 +117,7 @@ def test_overview_is_computed_once_for_a_table_file(table, tmp_path, monkeypatch
             map_grid(table).centres(table.plate),
             np.array([-np.inf, np.nan, *range(10)]),
             np.zeros(12),
+            np.array([[np.nan, *range(11)], range(12)]),
             np.array([[12.0, 13.0], [15.0, 16.0]]),
         )
         return Overview(cells, [cells.pairs_db, np.zeros((2, 3)), np.empty((2, 0))])
@@ -129,6 +157,7 @@ def test_weak_and_feasible_follow_from_twelve_decibels():
         np.zeros((4, 2)),
         median_db=np.array([20.4, 12.0, -np.inf, 9.0]),
         tenth_db=np.array([12.0, 11.9, -np.inf, 5.0]),
+        errors_db=np.zeros((2, 4)),
         pairs_db=np.empty((2, 0)),
     )
     assert weak.feasible.tolist() == [True, True, False, False]
@@ -167,7 +196,8 @@ def test_summary_counts_levels_and_shares(table):
     lower = 10 ** ((12.0 - levels[5:7].mean()) / 20)  # six of twelve cells are below 12 dB SL then
     quieter = with_strokes(table, lower)
     values = np.array([20.0, 12.0, 9.0, -np.inf, *[np.nan] * 8])
-    weak = WeakCells(table.grid, np.zeros((12, 2)), values, values - 0.1, one_to_hundred)
+    errors = np.zeros((2, 12))
+    weak = WeakCells(table.grid, np.zeros((12, 2)), values, values - 0.1, errors, one_to_hundred)
     summary = summarize(quieter, Overview(weak, [one_to_hundred] * 3))
     assert summary["frequency_range_hz"] == [60.0, 250.0]
     expected = {

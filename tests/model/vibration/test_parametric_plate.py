@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from extrapolated import extrapolated_slopes
 from model.rig.rig import Rig
 from model.spectral.mesh import SpectralMesh
 from model.structure.point_load import PointLoad
@@ -102,3 +103,19 @@ def test_receptances_of_a_plate_serve_any_eras_and_fingers(plate):
     found = free.responses(eras, other.masses)[: len(FREQUENCIES)]
     exact = parametric_plate(other, POINTS, FREQUENCIES).responses(other)
     assert np.linalg.norm(found - exact) / np.linalg.norm(exact) < 1e-4
+
+
+def test_response_slopes_are_exact(plate):
+    """By modulus, loss factor and values of four ERAs beside a finger, to 1e-7 of the largest."""
+    eras = np.array([(era.stiffness, era.damping, era.bolt_mass + 0.01) for era in RIG.eras])
+    at = np.concatenate([[RIG.plate.material.E, RIG.plate.loss_factor], eras.ravel()])
+
+    def responses(shares: np.ndarray) -> np.ndarray:
+        modulus, loss, *own = shares * at
+        return plate.receptances(modulus, loss).responses(np.reshape(own, (4, 3)), RIG.masses)
+
+    found, slopes = plate.response_slopes(at[0], at[1], eras, RIG.masses)
+    np.testing.assert_allclose(found, responses(np.ones(14)), atol=1e-12 * np.abs(found).max())
+    exact = extrapolated_slopes(responses, np.ones(14), step=1e-3)
+    for own, true, size in zip(slopes, exact, at, strict=True):
+        np.testing.assert_allclose(size * own, true, atol=1e-7 * np.abs(true).max())

@@ -1,0 +1,412 @@
+"""One simulated amplifier of protocol 3: requests in, replies out; time is passed in.
+
+Requests and replies are the values of their records (`drivers.protocol.table`), integers of the
+wire. Events happen at their own time: a watchdog that expired between two calls expired when it was
+due, and what plays is a description in time (`drivers.playback`), not samples.
+
+Not modelled: the rise time of high voltage, the voltage waveform of a tone, and the distortion
+where the sum of layers is limited.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from typing import Protocol
+
+from drivers.playback import Playback
+from drivers.protocol.definition import token_after
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import LayerSet
+from drivers.protocol.table import (
+    FAULTS,
+    FEATURES,
+    MESSAGES,
+    NO_CHANNEL,
+    QUANTITIES,
+    STATES,
+    STATUS_FLAGS,
+)
+from sim.amplifier.set_intake import SetIntake, derated
+from sim.amplifier.state_table import TRANSITIONS
+from sim.amplifier.thermal_model import DERATE_ABOVE, DERATED, FAULT_ABOVE, GOOD_BELOW, ThermalState
+
+SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expires
+LAYERS = 8
+VOICES = 16
+_FAULTS_KEPT = 16
+_HIGH_VOLTAGE = 1800.0  # V
+_CAPACITANCE = 1e-9  # F; of an actuator
+_DISCHARGE = 0.02  # s; time constant of the supply once it is off
+_DERATING_RAMP = 0.02  # s; no click
+_FRACTIONS = 16  # of a fade at which its sum with others is looked at
+_ENABLED = "OPERATION_ENABLED"
+_ENDING = ("SWITCHED_ON", "FAULT_REACTION_ACTIVE")
+_LATCHED = ("QUICK_STOP_ACTIVE", "FAULT")
+_SENSING = ("GetSensors", "Measure", "GetReading")
+_Q = QUANTITIES
+
+
+class SensorPort(Protocol):
+    """Sensors that an amplifier reports."""
+
+    def handle(self, name: str, values: Values, now: float) -> Values:
+        """Reply to a request at a time [s]; raises Refusal."""
+
+    def changed(self, moment: float) -> None:
+        """Note that what plays changes at a time [s]."""
+
+    def forget(self) -> None:
+        """Forget the reading, as without supply."""
+
+
+def capabilities(channels: int, *, is_output: bool = False) -> Values:
+    """Capabilities of a simulated amplifier with this number of channels.
+
+    is_output: full level is a linear amplifier's output, else the stroke of a motion.
+    """
+    features = ("events", "interlock", "electrical", "address", *(("output",) if is_output else ()))
+    low = _Q["frequency"].to_wire(10.0)  # the guard's floor: below it a plate only rocks
+    high, full = _Q["frequency"].maximum, _Q["level"].maximum
+    limits = {"frequency_min": low, "frequency_max": high, "level_max": full}
+    return {
+        **{"channels": channels, "layers": LAYERS, "voices": VOICES, "set_words": 4096},
+        **{"knots": _Q["knots"].maximum, "features": sum(1 << FEATURES[each] for each in features)},
+        **limits,
+        **{"frequency_step": 1, "level_step": 1, "phase_step": 1, "slew": _Q["slew"].maximum},
+        **{"ramp_max": _Q["ramp"].maximum},
+        **{f"watchdog_{end}": getattr(_Q["watchdog"], f"{end}imum") for end in ("min", "max")},
+        **{"envelope_step_min": 10, "envelope_step_max": _Q["envelope_step"].maximum},
+        "limits": [dict(limits) for _ in range(channels)],
+    }
+
+
+class Amplifier:
+    """An amplifier with a name and a number of channels; times [s] of any one clock.
+
+    listeners: called with the values of every Event, and its time [s]. capabilities: others hold
+    from the next restart. session: held while armed, or the one that ended last.
+    """
+
+    def __init__(self, name: str, *, channels: int, is_output: bool = False) -> None:
+        self.identity: Values = {
+            **{"versions": 1 << 2, "vendor": "era-haptics", "product": "simulated amplifier"},
+            **{"serial_number": f"SIM-{name}", "firmware": "1"},
+        }
+        self.capabilities = capabilities(channels, is_output=is_output)
+        self.state = "SWITCH_ON_DISABLED"
+        self.fault = "NONE"
+        self.session = 0
+        self.latch = 0
+        self.listeners: list[Callable[[Values, float], None]] = []
+        self._faults: deque[tuple[str, int | None, float]] = deque(maxlen=_FAULTS_KEPT)
+        self._heat = ThermalState(since=-math.inf)
+        self._is_interlock_open = False
+        self._sensing: SensorPort | None = None
+        self._start()
+
+    def attach(self, sensing: SensorPort) -> None:
+        """Give it sensors."""
+        self._sensing = sensing
+        self.capabilities = {
+            **self.capabilities,
+            "features": self.capabilities["features"] | 1 << FEATURES["sensors"],
+        }
+
+    def _start(self) -> None:
+        """Reset all but the temperature and the fault history."""
+        can = self.capabilities
+        self.playback = Playback(can["channels"], can["voices"])
+        self._intake = SetIntake(can)
+        self._watchdog = 0.0
+        self._last_fed = 0.0
+        self._silent_from = -math.inf  # end of the last silencing ramp
+        self._is_limited = False
+        self.is_derated = False
+
+    @property
+    def next_event(self) -> float:
+        """Time of the next event [s], until which what plays is known."""
+        due = self.playback.next_due
+        if self.state != _ENABLED:
+            return min(due, self._silent_from if self.state in _ENDING else math.inf)
+        hot = self._heat.when(FAULT_ABOVE if self.is_derated else DERATE_ABOVE)
+        return min(due, self._last_fed + self._watchdog, hot)
+
+    def tick(self, now: float) -> None:
+        """Process the events due by now, in order."""
+        while (moment := self.next_event) <= now:
+            if moment == self.playback.next_due:
+                self.playback.advance(moment)
+                self._changed(moment)
+            elif self.state == _ENABLED and moment == self._last_fed + self._watchdog:
+                self.trip("WATCHDOG", moment)
+            elif self.state != _ENABLED:
+                fell_silent = self.state == "FAULT_REACTION_ACTIVE"
+                self._enter("FAULT" if fell_silent else "SWITCH_ON_DISABLED", moment)
+            else:
+                self._handle_overtemperature(moment)
+        self.playback.advance(now)
+        if self.is_derated and self._heat.at(now) < GOOD_BELOW:
+            self.is_derated = False
+
+    def handle(self, name: str, values: Values, now: float) -> Values:
+        """Return the values of the reply to a request at a time [s].
+
+        Raises Refusal, which means that nothing was applied.
+        """
+        self.tick(now)
+        message, following = MESSAGES[name], TRANSITIONS.get((self.state, name))
+        if following is None or (name == "Arm" and self._is_interlock_open):
+            raise Refusal(f"{name} must not come in state {self.state}", "WRONG_STATE")
+        if message.feeds and self._is_foreign(values["session"], name):
+            raise Refusal(f"{name} must have the session that is held", "WRONG_SESSION")
+        reply = self._carry_out(name, values, following, now)
+        if message.feeds and self.state == _ENABLED:
+            self._last_fed = now
+        # After feeding the watchdog, so that the status shows it full.
+        return self.status(now) if reply is None else reply
+
+    def status(self, now: float) -> Values:
+        """Return the values of the status at a time [s] up to which it has been ticked."""
+        levels = [
+            min(self.playback.level(channel, now), 1.0) for channel in range(len(self._channels))
+        ]
+        left = self._last_fed + self._watchdog - now if self.state == _ENABLED else 0.0
+        is_on = self.state in ("SWITCHED_ON", _ENABLED) or any(levels)
+        decayed = math.exp(min(0.0, (self._silent_from - now) / _DISCHARGE))
+        flags = {
+            "high_voltage": is_on,
+            "interlock_open": self._is_interlock_open,
+            "limited": self._is_limited,
+        }
+        self._is_limited = False
+        tokens = self.playback.tokens
+        layers = self.capabilities["layers"]
+        return {
+            **{"state": STATES[self.state], "fault": FAULTS[self.fault]},
+            "flags": sum(1 << STATUS_FLAGS[each] for each, is_set in flags.items() if is_set),
+            **{"latch": self.latch, "watchdog_left": _Q["watchdog_left"].to_wire(max(left, 0.0))},
+            "temperature": _Q["temperature"].to_wire(self._heat.at(now)),
+            "voltage": round(_HIGH_VOLTAGE if is_on else _HIGH_VOLTAGE * decayed),
+            **{"token": self._intake.committed, "channels": len(levels), "layers": layers},
+            "levels": [_Q["level"].to_wire(level) for level in levels],
+            "tokens": [tokens.get(layer, 0) for layer in range(layers)],
+        }
+
+    def trip(self, fault: str, moment: float, *, channel: int | None = None) -> None:
+        """Enter a fault: silent within the shortest ramp, then high voltage off, latched.
+
+        While disarmed it is only added to the fault history.
+        """
+        self._faults.appendleft((fault, channel, moment))
+        if self.state in (_ENABLED, "SWITCHED_ON", "QUICK_STOP_ACTIVE"):
+            self._silence(moment, ramp=SILENCING_RAMP)
+            self.fault = fault
+            self.latch = token_after(self.latch)
+            self._enter("FAULT_REACTION_ACTIVE", moment, channel=channel)
+
+    def set_interlock(self, moment: float, *, is_open: bool) -> None:
+        """Open or close the interlock, with its consequences."""
+        if is_open and self.state != "SWITCH_ON_DISABLED":
+            self.trip("INTERLOCK", moment)
+        self._is_interlock_open = is_open
+
+    def set_temperature(self, temperature: float, moment: float) -> None:
+        """Set the temperature [°C], with its consequences."""
+        self._heat = ThermalState(moment, temperature, self._heat.final)
+        if temperature > DERATE_ABOVE and not self.is_derated:
+            self._handle_overtemperature(moment)
+        if temperature > FAULT_ABOVE:
+            self._handle_overtemperature(moment)
+
+    def restart(self, moment: float) -> None:
+        """Power-cycle: silent at once, disarmed, without sets."""
+        self._heat = ThermalState(moment, self._heat.at(moment))
+        self.fault = "NONE"
+        self._start()
+        if self._sensing is not None:
+            self._sensing.forget()
+        self._enter("SWITCH_ON_DISABLED", moment)
+
+    def _carry_out(self, name: str, values: Values, following: str, now: float) -> Values | None:
+        """Execute an allowed request; None where the reply is the status."""
+        match name:
+            case "GetCaps":
+                return self.capabilities
+            case "GetFaults":
+                return self._fault_list(now)
+            case "Arm":
+                self._arm(values["session"], values["watchdog"], now)
+            case "Disarm" | "Stop":
+                if name == "Stop":
+                    self.latch = token_after(self.latch)
+                ramp = min(values["ramp"], self.capabilities["ramp_max"])
+                self._silence(now, ramp=_Q["ramp"].from_wire(ramp))
+                self._enter(following, now)
+                self.tick(now)
+            case "Silence":
+                self._silence(now, ramp=_Q["ramp"].from_wire(values["ramp"]))
+            case "Clear":
+                self._clear(values["latch"], following, now)
+            case "Set":
+                return self._take(values, now)
+            case "Commit":
+                layers = self._intake.commit(values["token"], now)
+                if layers is not None:
+                    self._play(layers, values["token"], now)
+            case "GetAchieved":
+                return self._achieved_of(values["layer"])
+            case "GetMeasured":
+                return {"count": len(self._channels), "channels": list(self._measured(now))}
+            case "SetAddress":
+                if values["serial_number"] != self.identity["serial_number"]:
+                    raise Refusal("serial number must be this amplifier's")
+            case _ if name in _SENSING:
+                if self._sensing is None:
+                    raise Refusal("no sensors are there", "UNKNOWN_TYPE")
+                return self._sensing.handle(name, values, now)
+        return None
+
+    @property
+    def _channels(self) -> range:
+        return range(self.playback.channels)
+
+    def _fault_list(self, now: float) -> Values:
+        listed = [
+            {
+                "fault": FAULTS[fault],
+                "channel": NO_CHANNEL if channel is None else channel,
+                "age": _Q["age"].to_wire(now - at),
+            }
+            for fault, channel, at in self._faults
+        ]
+        return {"count": len(listed), "faults": listed}
+
+    def _is_foreign(self, session: int, name: str) -> bool:
+        """Whether a session is not the one that is held, or to arm, has ended."""
+        if self.state == _ENABLED:
+            return session != self.session
+        return name == "Arm" and session == self.session
+
+    def _arm(self, session: int, watchdog: int, now: float) -> None:
+        low, high = self.capabilities["watchdog_min"], self.capabilities["watchdog_max"]
+        if not low <= watchdog <= high:
+            raise Refusal(f"watchdog must be {low} to {high}, got {watchdog}")
+        self._watchdog = _Q["watchdog"].from_wire(watchdog)
+        if self.state == _ENABLED:  # the same again: its reply was lost
+            return
+        # Arming starts at level zero, even if the last session left a fade.
+        self._silence(now, ramp=SILENCING_RAMP)
+        self._intake.forget()
+        self.session = session
+        self._last_fed = now
+        self._enter(_ENABLED, now)
+
+    def _clear(self, latch: int, following: str, now: float) -> None:
+        if self.state in _LATCHED and latch != self.latch:
+            raise Refusal(f"latch must be {self.latch}, got {latch}", "WRONG_LATCH")
+        if self._silent_from <= now and self._is_cause_gone(now):
+            self.fault = "NONE"
+            self._enter(following, now)
+
+    def _take(self, part: Values, now: float) -> Values:
+        """Take a part of a set, and play it where it is whole and says so."""
+        token = part["token"]
+        is_played = token == self._intake.committed
+        layers = None if is_played else self._intake.add(part, now)
+        if layers is not None and part["now"]:
+            self._intake.commit(token, now)
+            self._play(layers, token, now)
+            is_played = True
+        is_staged = layers is not None and not is_played
+        return {
+            **{"token": token, "exact": not self.is_derated},
+            **{"staged": is_staged, "played": is_played},
+            "missing": 0 if is_staged or is_played else self._intake.missing,
+        }
+
+    def _play(self, layers: Sequence[LayerSet], token: int, now: float) -> None:
+        wanted = derated(layers, DERATED) if self.is_derated else layers
+        self.playback.commit(wanted, token, now)
+        self._is_limited |= any(self._exceeds_full(channel, now) for channel in self._channels)
+        self._changed(now)
+
+    def _achieved_of(self, layer: int) -> Values:
+        if layer >= self.capabilities["layers"]:
+            raise Refusal(f"layer must be 0 to {self.capabilities['layers'] - 1}, got {layer}")
+        playing = self.playback.playing(layer)
+        commands = [
+            {
+                **{"channel": each.channel, "frequency": each.frequency},
+                **{"level": each.level, "phase": each.phase},
+            }
+            for each in playing.commands
+        ]
+        return {
+            **{"token": self.playback.tokens.get(layer, 0), "layer": layer},
+            **{"count": len(commands), "commands": commands},
+            **{"ramp": playing.ramp, "valid_for": playing.valid_for},
+        }
+
+    def _measured(self, now: float) -> Iterator[Values]:
+        """Yield what a capacitor of a typical actuator draws at the present levels."""
+        for channel in self._channels:
+            level = min(self.playback.level(channel, now), 1.0)
+            # Force goes with the voltage squared, at half the frequency.
+            voltage = _HIGH_VOLTAGE * math.sqrt(level / 2)
+            frequencies = [voice.frequency for voice in self.playback.voices_of(channel)]
+            omega = math.pi * max(frequencies, default=0.0)
+            yield {
+                "channel_voltage": _Q["channel_voltage"].to_wire(voltage),
+                "channel_current": _Q["channel_current"].to_wire(omega * _CAPACITANCE * voltage),
+            }
+
+    def _exceeds_full(self, channel: int, now: float) -> bool:
+        """Whether a channel's sum exceeds full level by a step or more from now on."""
+        times = {now}
+        for voice in self.playback.voices_of(channel):
+            length = voice.transition.end - now
+            times.update(now + length * part / _FRACTIONS for part in range(1, _FRACTIONS + 1))
+        most = 1 + _Q["level"].step
+        return any(self.playback.level(channel, at) > most for at in times if at >= now)
+
+    def _silence(self, moment: float, *, ramp: float) -> None:
+        """Silence every channel within the ramp [s], and discard what is staged."""
+        self.playback.silence(moment, ramp)
+        self._silent_from = max(self.playback.silent_from, moment)
+        self._intake.drop()
+        self._changed(moment)
+
+    def _enter(self, state: str, moment: float, *, channel: int | None = None) -> None:
+        """Enter a state, and notify the listeners of a change."""
+        if state == self.state:
+            return
+        self.state = state
+        event = {
+            **{"state": STATES[state], "fault": FAULTS[self.fault], "latch": self.latch},
+            "channel": NO_CHANNEL if channel is None else channel,
+        }
+        for listener in self.listeners:
+            listener(event, moment)
+
+    def _changed(self, moment: float) -> None:
+        """Note that what plays changes."""
+        if self._sensing is not None:
+            self._sensing.changed(moment)
+        squares = (self.playback.settled(channel) ** 2 for channel in self._channels)
+        self._heat = self._heat.driven(moment, load=sum(squares) / len(self._channels))
+
+    def _handle_overtemperature(self, moment: float) -> None:
+        """Derate at the lower threshold, trip at the higher."""
+        if self.is_derated:
+            self.trip("OVER_TEMPERATURE", moment)
+            return
+        self.is_derated = True
+        self.playback.scale(moment, DERATED, _DERATING_RAMP)
+        self._changed(moment)
+
+    def _is_cause_gone(self, now: float) -> bool:
+        """Whether the cause of the fault no longer persists."""
+        if self.fault == "INTERLOCK":
+            return not self._is_interlock_open
+        return self.fault != "OVER_TEMPERATURE" or self._heat.at(now) < GOOD_BELOW

@@ -253,6 +253,11 @@ class Playback:
         return {number: self._layers[number].token for number in sorted(lasting)}
 
     @property
+    def waiting(self) -> tuple[LayerSet, ...]:
+        """Sets of layers that start when onsets have ended."""
+        return tuple(layer.waiting[1] for layer in self._layers.values() if layer.waiting)
+
+    @property
     def next_due(self) -> float:
         """Time of the next end of `valid_for`, or start of a set that waits [s]; infinite: none."""
         due = self._next_due()
@@ -264,6 +269,27 @@ class Playback:
         ends = [voice.silent_from for voices in self._playing for voice in voices]
         waits = any(layer.waiting is not None for layer in self._layers.values())
         return math.inf if waits else max(ends, default=-math.inf)
+
+    @property
+    def ends_by(self) -> float:
+        """Latest time at which all is silent by itself [s]; infinite without `valid_for`."""
+        latest = [voice.silent_from for voices in self._playing for voice in voices]
+        ends = [end for end in latest if end < math.inf]
+        for number, layer in self._layers.items():
+            if layer.waiting is not None:
+                return math.inf
+            fades = [
+                voice.ended(layer.ends, _RAMP.from_wire(layer.ramp)).transition.end
+                for voices in self._playing
+                for voice in voices
+                if voice.layer == number and not voice.has_ended and layer.ends < math.inf
+            ]
+            ends += fades or [layer.ends]
+        return max(ends, default=-math.inf)
+
+    def is_settled(self, time: float) -> bool:
+        """Whether nothing changes from a time on [s] but by the ends of layers."""
+        return all(voice.transition.end <= time for voices in self._playing for voice in voices)
 
     def _next_due(self) -> tuple[float, int] | None:
         dues = (

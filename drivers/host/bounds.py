@@ -1,0 +1,254 @@
+"""What a set may lead to at the worst: level, power and rise of a channel over all its layers.
+
+A set plays from an unknown moment in the next tenth of a second, over what sounds then. Along a
+straight line in the complex plane a magnitude is a convex function of the way, so that sums are
+largest where each transition is at one of its points.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from drivers.playback import Playback, Transition, Voice, amplitude_of
+from drivers.protocol.sets import Command, Envelope, LayerSet
+from drivers.protocol.table import QUANTITIES
+
+_RAMP, _STEP = QUANTITIES["ramp"], QUANTITIES["envelope_step"]
+_FREQUENCY = QUANTITIES["frequency"]
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """Magnitudes after a commit, in full levels: at its start, then a step [s] apart.
+
+    is_cosine: between the two along a raised cosine, else along straight lines.
+    """
+
+    step: float
+    magnitudes: tuple[float, ...]
+    is_cosine: bool
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """Times of the magnitudes [s] after the commit."""
+        return tuple(self.step * index for index in range(len(self.magnitudes)))
+
+    def at(self, time: float) -> float:
+        """Return an upper bound of the magnitude at a time [s] after the commit."""
+        steps = time / self.step if self.step else math.inf
+        if steps >= len(self.magnitudes) - 1:
+            return self.magnitudes[-1]
+        index = int(steps)
+        way = steps - index
+        if self.is_cosine:
+            way = (1 - math.cos(math.pi * way)) / 2
+        return self.magnitudes[index] * (1 - way) + self.magnitudes[index + 1] * way
+
+
+class ChannelBounds:
+    """What a channel may play once a set is committed, from a time on [s].
+
+    steady: sum of the largest magnitudes of voices that the set does not change; paths: of those
+    that it changes or starts; rise: of the level, at the most [full levels/s].
+    """
+
+    def __init__(
+        self,
+        voices: Sequence[Voice],
+        layers: Mapping[int, LayerSet],
+        waiting: Sequence[LayerSet],
+        channel: int,
+        time: float,
+    ) -> None:
+        self.steady = sum(
+            max(map(abs, _course(command)))
+            for one in waiting
+            for command in one.commands
+            if command.channel == channel and one.layer not in layers
+        )
+        self.paths: list[Path] = []
+        self._rises: dict[float, list[tuple[float, float]]] = {}  # by frequency: rise, change
+        commands = {
+            number: next((each for each in one.commands if each.channel == channel), None)
+            for number, one in layers.items()
+        }
+        continued: set[int] = set()
+        for voice in voices:
+            if voice.has_ended or voice.layer not in layers:
+                self.steady += max(voice.transition.peak(time), _peak(voice.ending))
+                self._note_change(voice, time)
+                continue
+            one, command = layers[voice.layer], commands[voice.layer]
+            if command is not None and is_continued(voice, command):
+                continued.add(voice.layer)
+                self._continue(voice, one, command, time)
+            else:
+                self._fade(voice, one, command, time)
+        for number, command in commands.items():
+            if command is not None and is_driven(command) and number not in continued:
+                self._start(layers[number], command)
+
+    @property
+    def rise(self) -> float:
+        """Steepest rise of the level [full levels/s]; of one frequency also by interference."""
+        return sum(
+            several[0][0] if len(several) == 1 else sum(change for _, change in several)
+            for several in self._rises.values()
+        )
+
+    def at(self, time: float) -> float:
+        """Return the level at a time [s] after the commit, at the most."""
+        return self.steady + sum([path.at(time) for path in self.paths])
+
+    def within(self, since: float, until: float) -> float:
+        """Return the level between two times [s] after the commit, at the most."""
+        return self.steady + sum([max(path.at(since), path.at(until)) for path in self.paths])
+
+    def _continue(self, voice: Voice, one: LayerSet, command: Command, time: float) -> None:
+        course = _course(command)
+        starts = _points(voice.transition, time)
+        farthest = max(starts, key=lambda start: abs(course[0] - start))
+        step, is_cosine = _step(one, command), not _knots(command.onset)
+        self.paths.append(_path(max(map(abs, starts)), command, step))
+        self._note(voice.frequency, (farthest, *course), step, is_cosine=is_cosine)
+        self._note_ending(voice.frequency, command)
+
+    def _fade(self, voice: Voice, one: LayerSet, command: Command | None, time: float) -> None:
+        starts = _points(voice.transition, time)
+        highest = max(starts, key=abs)
+        ending = voice.ending
+        skips = command is not None and (is_driven(command) or command.skip_ending)
+        if ending is not None and not skips:
+            step, points = _STEP.from_wire(ending.step), (highest, *_knots(ending), 0j)
+            is_cosine = not ending.knots
+        else:
+            step, points, is_cosine = _RAMP.from_wire(one.ramp), (highest, 0j), True
+        self.paths.append(Path(step, tuple(map(abs, points)), is_cosine))
+        self._note(voice.frequency, points, step, is_cosine=is_cosine)
+
+    def _start(self, one: LayerSet, command: Command) -> None:
+        frequency = _FREQUENCY.from_wire(command.frequency)
+        step, is_cosine = _step(one, command), not _knots(command.onset)
+        self.paths.append(_path(0.0, command, step))
+        self._note(frequency, (0j, *_course(command)), step, is_cosine=is_cosine)
+        self._note_ending(frequency, command)
+
+    def _note_ending(self, frequency: float, command: Command) -> None:
+        """Note the ending of a command, which may rise, in place of what comes before it."""
+        if command.ending is None:
+            return
+        level = amplitude_of(command.level, command.phase)
+        rise, change = _steepest_of_ending(level, command.ending)
+        several = self._rises[frequency]
+        before = several.pop()
+        several.append((max(before[0], rise), max(before[1], change)))
+
+    def _note_change(self, voice: Voice, time: float) -> None:
+        """Note a voice that the set does not change."""
+        transition, rise, change = voice.transition, 0.0, 0.0
+        if transition.end > time:
+            change = transition.slope(time)
+            rise = 0.0 if transition.last == 0 and not transition.knots else change
+        if voice.ending is not None and not voice.has_ended:
+            for start in _points(transition, time):
+                ending = _steepest_of_ending(start, voice.ending)
+                rise, change = max(rise, ending[0]), max(change, ending[1])
+        if change:
+            self._rises.setdefault(voice.frequency, []).append((rise, change))
+
+    def _note(
+        self, frequency: float, points: Sequence[complex], step: float, *, is_cosine: bool
+    ) -> None:
+        self._rises.setdefault(frequency, []).append(_steepest(points, step, is_cosine=is_cosine))
+
+
+def worst(channels: Sequence[ChannelBounds]) -> tuple[list[float], float]:
+    """Return the largest level of each channel and the largest sum of their squares.
+
+    Between two points all magnitudes are convex functions of the way, and so are their sums where
+    all go the same way; else each may be at either end.
+    """
+    paths = [path for channel in channels for path in channel.paths]
+    times = sorted({at for path in paths for at in path.times} | {0.0})
+    corners = [[channel.at(time) for channel in channels] for time in times]
+    for since, until in pairwise(times):
+        ways = {path.step if path.is_cosine else None for path in paths if since < path.times[-1]}
+        if len(ways) > 1:
+            corners.append([channel.within(since, until) for channel in channels])
+    levels = [max(each) for each in zip(*corners, strict=True)]
+    return levels, max(sum(level**2 for level in each) for each in corners)
+
+
+def is_driven(command: Command) -> bool:
+    """Whether a command starts or continues a voice."""
+    return command.level > 0 or command.onset is not None
+
+
+def is_continued(voice: Voice, command: Command) -> bool:
+    """Whether a command continues a voice of its layer."""
+    same = voice.frequency == _FREQUENCY.from_wire(command.frequency)
+    return command.keep_phase and same and is_driven(command)
+
+
+def all_bounds(playback: Playback, layers: Sequence[LayerSet], time: float) -> list[ChannelBounds]:
+    """Return what each channel may play if these layers are committed at a time [s] or later."""
+    named = {one.layer: one for one in layers if not one.renew}
+    return [
+        ChannelBounds(playback.voices_of(channel), named, playback.waiting, channel, time)
+        for channel in range(playback.channels)
+    ]
+
+
+def _steepest_of_ending(first: complex, ending: Envelope) -> tuple[float, float]:
+    points = (first, *_knots(ending), 0j)
+    return _steepest(points, _STEP.from_wire(ending.step), is_cosine=not ending.knots)
+
+
+def _knots(envelope: Envelope | None) -> tuple[complex, ...]:
+    return () if envelope is None else tuple(amplitude_of(*knot) for knot in envelope.knots)
+
+
+def _peak(envelope: Envelope | None) -> float:
+    return max(map(abs, _knots(envelope)), default=0.0)
+
+
+def _course(command: Command) -> tuple[complex, ...]:
+    """Return the amplitudes through which a command leads, the last one lasting."""
+    return (*_knots(command.onset), amplitude_of(command.level, command.phase))
+
+
+def _path(first: float, command: Command, step: float) -> Path:
+    """Return the magnitudes of a command from a first one on; the last covers its ending."""
+    *others, last = map(abs, _course(command))
+    last = max(last, _peak(command.ending))
+    return Path(step, (first, *others, last), is_cosine=not others)
+
+
+def _step(one: LayerSet, command: Command) -> float:
+    if command.onset is None:
+        return _RAMP.from_wire(one.ramp)
+    return _STEP.from_wire(command.onset.step)
+
+
+def _points(transition: Transition, time: float) -> tuple[complex, ...]:
+    """Return points between which the amplitude is from a time [s] on."""
+    if time >= transition.end:
+        return (transition.last,)
+    passed = int((time - transition.start) / transition.step) if transition.knots else 0
+    return (transition.at(time), *transition.knots[passed:], transition.last)
+
+
+def _steepest(points: Sequence[complex], step: float, *, is_cosine: bool) -> tuple[float, float]:
+    """Return the steepest rise of the magnitude, and the fastest change, along points."""
+    rise = change = 0.0
+    for one, other in pairwise(points):
+        if one == other:
+            continue
+        fastest = abs(other - one) / step if step else math.inf
+        change = max(change, fastest)
+        # The way rises only where its end is farther out than the foot of the perpendicular.
+        if ((other - one) * other.conjugate()).real > 0:
+            rise = max(rise, fastest)
+    factor = math.pi / 2 if is_cosine else 1.0
+    return rise * factor, change * factor

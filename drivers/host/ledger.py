@@ -1,0 +1,276 @@
+"""What one amplifier was sent and may play: the only maker of the sets that go over its wire.
+
+A set is checked when its turn on the line has come, as the wire rounds it, against what plays then
+over the sum of all layers. What was sent and is not confirmed is one doubt: until it is resolved
+only silence is admitted. Times [s] are of any one clock.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from numbers import Integral, Real
+
+from drivers.contents import Layer, Shape, Tone
+from drivers.errors import CommandRefused
+from drivers.guard.budget import COMMIT_DELAY, Budget, Vibration
+from drivers.host.bounds import all_bounds, is_driven, worst
+from drivers.host.limits import RATE_CEILING, wire_limits
+from drivers.playback import Playback
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, Envelope, LayerSet
+from drivers.protocol.table import QUANTITIES
+from registry.limits import GuardLimits
+
+TOLERANCE = 1 + 1e-9
+"""Factor by which a sum of floats may exceed a limit."""
+_LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
+_RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
+_STEP, _FREQUENCY = QUANTITIES["envelope_step"], QUANTITIES["frequency"]
+_SLACK = 1e-6  # of a step; sums of floats
+
+
+class Ledger:
+    """The ledger of one amplifier, at first silent.
+
+    limits: configured; capabilities: values of its record. Raises CommandError for limits that
+    leave nothing to play.
+    """
+
+    def __init__(self, limits: GuardLimits, capabilities: Values) -> None:
+        self.limits = wire_limits(limits, capabilities)
+        self.capabilities = capabilities
+        self._budget = Budget(replace(limits, rate=min(limits.rate, RATE_CEILING)))
+        self.playback = Playback(capabilities["channels"], capabilities["voices"])
+        self.lag = 0.0  # s; by which what plays may be later than `playback` says
+        self._doubt: tuple[int, tuple[LayerSet, ...], float, Vibration | None] | None = None
+
+    @property
+    def doubt(self) -> int:
+        """Token of the set that was committed and is not confirmed; 0: none."""
+        return 0 if self._doubt is None else self._doubt[0]
+
+    def forget(self) -> None:
+        """Start anew: the amplifier is silent, armed or not."""
+        self.playback = Playback(self.capabilities["channels"], self.capabilities["voices"])
+        self.lag, self._doubt = 0.0, None
+
+    def admit(self, layers: Sequence[Layer], now: float) -> tuple[LayerSet, ...]:
+        """Return layers as the wire has them, `valid_for` shortened to what time is left.
+
+        Raises CommandRefused with channel and reason; nothing changes then.
+        """
+        numbers = [layer.number for layer in layers]
+        if len(set(numbers)) < len(numbers):
+            raise CommandRefused(f"a layer must occur once in a set, got {numbers}")
+        wanted = tuple(self._on_wire(layer) for layer in layers)
+        if not any(is_vibrating(one) for one in wanted):
+            left = self._budget.fade_left(now)
+            return tuple(_within_ramp(one, left) for one in wanted)
+        if self._doubt is not None:
+            raise CommandRefused(f"set {self.doubt} must be confirmed first; read the status")
+        late = now - self.lag
+        self.playback.advance(late)
+        self._check_sums(wanted, late)
+        return self._within_budget(wanted, now)
+
+    def sent(self, token: int, layers: tuple[LayerSet, ...], now: float) -> None:
+        """Note that a set may play from now on: it was committed, and is in doubt."""
+        lasts = max((self._lasts(one) for one in layers), default=0.0)
+        is_vibration = any(is_vibrating(one) for one in layers)
+        before = self._budget.sent(now, lasts=lasts) if is_vibration else None
+        self._doubt = token, layers, now, before
+
+    def confirmed(self, now: float) -> None:
+        """Note at a time [s] that the set in doubt plays, since it was sent at the earliest."""
+        if self._doubt is None:
+            return
+        token, layers, sent_at, _ = self._doubt
+        self._doubt = None
+        if self.playback.is_settled(sent_at - self.lag):
+            self.lag = 0.0
+        self.lag = max(self.lag, now - sent_at)
+        self.playback.commit(layers, token, sent_at)
+        self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
+
+    def refused(self) -> None:
+        """Note that the set in doubt was not played."""
+        if self._doubt is not None:
+            self._budget.restore(self._doubt[3])
+            self._doubt = None
+
+    def silenced(self, ramp: float, sent_at: float, now: float) -> None:
+        """Note that all layers fall silent along a ramp [s], by a request sent at a time [s]."""
+        self._doubt = None
+        self.lag = max(self.lag, now - sent_at)
+        self.playback.silence(sent_at, ramp)
+        self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
+
+    def resolve(self, token: int, now: float) -> None:
+        """Resolve the doubt by the token that the amplifier says it committed last."""
+        if token == self.doubt:
+            self.confirmed(now)
+        else:
+            self.refused()
+
+    def _on_wire(self, layer: Layer) -> LayerSet:
+        """Return a layer in integers of the wire; CommandRefused for what the wire cannot have."""
+        can = self.capabilities
+        if not _is_integer(layer.number, can["layers"] - 1):
+            raise CommandRefused(f"layer must be 0 to {can['layers'] - 1}, got {layer.number!r}")
+        ramp_max = _RAMP.from_wire(can["ramp_max"])
+        for name, value, highest in (
+            ("ramp", layer.ramp, ramp_max),
+            ("valid_for", layer.valid_for, _VALID_FOR.high),
+        ):
+            if not (is_finite(value) and 0 <= value <= highest):
+                raise CommandRefused(f"{name} must be 0 to {highest:g} s, got {value!r} s")
+        if layer.renew and (layer.tones or layer.after):
+            raise CommandRefused("renew must be without tones and after")
+        if layer.after and not layer.tones:
+            raise CommandRefused("after must be with tones")
+        channels = [tone.channel for tone in layer.tones]
+        for tone in layer.tones:
+            if not _is_integer(tone.channel, can["channels"] - 1):
+                text = f"channel must be 0 to {can['channels'] - 1}, got {tone.channel!r}"
+                raise CommandRefused(text, channel=tone.channel)
+            if channels.count(tone.channel) > 1:
+                text = f"channel {tone.channel} must occur once in a layer"
+                raise CommandRefused(text, channel=tone.channel)
+        return LayerSet(
+            int(layer.number),
+            min(math.ceil(layer.ramp * _RAMP.per_unit - _SLACK), can["ramp_max"]),
+            max(_VALID_FOR.to_wire(layer.valid_for), 1) if layer.valid_for else 0,
+            tuple(self._command(tone) for tone in layer.tones),
+            after=bool(layer.after),
+            renew=bool(layer.renew),
+        )
+
+    def _command(self, tone: Tone) -> Command:
+        limits = self.limits
+        level = self._level(tone.level, "level", tone.channel)
+        if not is_finite(tone.phase):
+            raise _refused(tone.channel, f"phase must be a finite number, got {tone.phase!r}")
+        is_idle = level == 0 and tone.onset is None
+        if not is_finite(tone.frequency):
+            text = f"frequency must be a finite number, got {tone.frequency!r}"
+            raise _refused(tone.channel, text)
+        frequency = limits.frequency_min if is_idle else round(tone.frequency * _FREQUENCY.per_unit)
+        if not limits.frequency_min <= frequency <= limits.frequency_max:
+            low, high = map(_FREQUENCY.from_wire, (limits.frequency_min, limits.frequency_max))
+            text = f"frequency must be {low:g} to {high:g} Hz, got {tone.frequency:g} Hz"
+            raise _refused(tone.channel, text)
+        return Command(
+            int(tone.channel),
+            frequency,
+            level,
+            _PHASE.to_wire(float(tone.phase)),
+            bool(tone.keep_phase),
+            bool(tone.skip_ending),
+            self._envelope(tone.onset, tone.channel),
+            self._envelope(tone.ending, tone.channel),
+        )
+
+    def _level(self, level: float, name: str, channel: int) -> int:
+        highest = _LEVEL.from_wire(self.limits.level)
+        if not (is_finite(level) and 0 <= level <= highest * TOLERANCE):
+            raise _refused(channel, f"{name} must be 0 to {highest:g}, got {level!r}")
+        return min(_LEVEL.to_wire(float(level)), self.limits.level)
+
+    def _envelope(self, shape: Shape | None, channel: int) -> Envelope | None:
+        if shape is None:
+            return None
+        can = self.capabilities
+        low, high = (
+            _STEP.from_wire(can[name]) for name in ("envelope_step_min", "envelope_step_max")
+        )
+        if not (is_finite(shape.step) and low <= shape.step <= high):
+            text = f"step of an envelope must be {low:g} to {high:g} s, got {shape.step!r} s"
+            raise _refused(channel, text)
+        if len(shape.knots) > can["knots"]:
+            text = f"knots of an envelope must be at most {can['knots']}, got {len(shape.knots)}"
+            raise _refused(channel, text)
+        knots = tuple(
+            (self._level(abs(knot), "level of a knot", channel), _phase_of(knot))
+            for knot in shape.knots
+        )
+        return Envelope(math.ceil(shape.step * _STEP.per_unit - _SLACK), knots)
+
+    def _check_sums(self, layers: Sequence[LayerSet], late: float) -> None:
+        bounds = all_bounds(self.playback, layers, late)
+        levels, power = worst(bounds)
+        highest = _LEVEL.from_wire(self.limits.level)
+        for channel, (bound, level) in enumerate(zip(bounds, levels, strict=True)):
+            if bound.rise > self.limits.slew * TOLERANCE:
+                text = (
+                    f"level must rise by at most {self.limits.slew:g} per second, got "
+                    f"{bound.rise:g} per second; use a longer ramp"
+                )
+                raise _refused(channel, text)
+            if level > highest * TOLERANCE:
+                text = (
+                    f"level of all layers must be at most {highest:g}, got {level:g}; lower the "
+                    "levels, or let what plays end first"
+                )
+                raise _refused(channel, text)
+        if power > self.limits.power * TOLERANCE:
+            raise CommandRefused(
+                f"sum of squared levels must be at most {self.limits.power:g}, got {power:g}; "
+                "lower the levels or drive fewer channels at once"
+            )
+
+    def _within_budget(self, layers: tuple[LayerSet, ...], now: float) -> tuple[LayerSet, ...]:
+        """Shorten `valid_for` to the on-time and duty that are left."""
+        fade = max(self._fade(one) for one in layers)
+        remaining = self._budget.remaining(now, fade=fade, delay=COMMIT_DELAY)
+        if remaining == math.inf:
+            return layers
+        left = math.floor(min(remaining, _VALID_FOR.high) * _VALID_FOR.per_unit)
+        if left <= 0:
+            raise CommandRefused("on-time or duty limit reached; pause the vibration")
+        return tuple(
+            replace(one, valid_for=min(one.valid_for or left, left)) if is_vibrating(one) else one
+            for one in layers
+        )
+
+    def _fade(self, one: LayerSet) -> float:
+        """Return how long a layer takes to end [s]: along its ramp or its longest ending."""
+        endings = [
+            _STEP.from_wire(command.ending.step) * (len(command.ending.knots) + 1)
+            for command in one.commands
+            if command.ending is not None
+        ]
+        return max(_RAMP.from_wire(one.ramp), *endings, 0.0)
+
+    def _lasts(self, one: LayerSet) -> float:
+        if not is_vibrating(one):
+            return self._fade(one)
+        return self._fade(one) + (_VALID_FOR.from_wire(one.valid_for) or math.inf)
+
+
+def is_vibrating(one: LayerSet) -> bool:
+    """Whether a layer plays after its set, so that it spends time and rate."""
+    return one.renew or any(is_driven(command) for command in one.commands)
+
+
+def is_finite(value: object) -> bool:
+    """Whether a value is a finite real number."""
+    return isinstance(value, Real) and math.isfinite(value)
+
+
+def _is_integer(value: object, highest: int) -> bool:
+    return isinstance(value, Integral) and 0 <= int(value) <= highest
+
+
+def _refused(channel: int, text: str) -> CommandRefused:
+    return CommandRefused(f"channel {channel}: {text}", channel=channel)
+
+
+def _phase_of(knot: complex) -> int:
+    return _PHASE.to_wire(math.degrees(math.atan2(knot.imag, knot.real)))
+
+
+def _within_ramp(one: LayerSet, left: float) -> LayerSet:
+    """Return a silent layer with its ramp shortened to a time that is left [s]."""
+    if _RAMP.from_wire(one.ramp) <= left:
+        return one
+    return replace(one, ramp=math.floor(left * _RAMP.per_unit))

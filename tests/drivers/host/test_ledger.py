@@ -1,0 +1,241 @@
+"""The ledger: what it admits stays within the limits whenever it is played, and what it refuses."""
+
+import cmath
+import math
+import random
+from dataclasses import replace
+
+import pytest
+
+from drivers.contents import Layer, Shape, Tone
+from drivers.errors import CommandError, CommandRefused
+from drivers.host.ledger import Ledger
+from drivers.playback import Playback
+from registry.limits import GuardLimits
+from sim.amplifier.contract import capabilities
+
+WIDE = GuardLimits(20.0, 1000.0, 1.0)
+CAN = capabilities(3)
+
+
+def tone(channel: int = 0, level: float = 0.5, frequency: float = 100.0, **other: object) -> Tone:
+    """A tone of 100 Hz at half level unless told otherwise."""
+    return Tone(channel, frequency, level, **other)  # type: ignore[arg-type]
+
+
+def play(ledger: Ledger, token: int, at: float, *layers: Layer) -> None:
+    """Admit, send and confirm a set without delay."""
+    ledger.sent(token, ledger.admit(layers, at), at)
+    ledger.confirmed(at)
+
+
+def refusal(ledger: Ledger, *layers: Layer, at: float = 1.0) -> CommandRefused:
+    """The error with which layers are refused."""
+    with pytest.raises(CommandRefused) as raised:
+        ledger.admit(layers, at)
+    return raised.value
+
+
+BAD = {
+    "frequency": tone(1, frequency=1001.0),
+    "frequency below": tone(1, frequency=19.9),
+    "frequency nan": tone(1, frequency=math.nan),
+    "level": tone(1, level=1.0001),
+    "level nan": tone(1, level=math.nan),
+    "level negative": tone(1, level=-0.1),
+    "phase": replace(tone(1), phase=math.inf),
+    "channel": tone(3),
+    "knot": tone(1, onset=Shape(0.01, (1.1j,))),
+    "step": tone(1, ending=Shape(0.0001, (0.1,))),
+    "knots": tone(1, onset=Shape(0.01, (0.1,) * 33)),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_tone_that_must_not_be_played_is_refused_with_its_channel(case: str) -> None:
+    """Beside a good one, in the second layer."""
+    bad = BAD[case]
+    assert refusal(Ledger(WIDE, CAN), Layer(0, (tone(),)), Layer(1, (bad,))).channel == bad.channel
+
+
+@pytest.mark.parametrize(
+    "layer",
+    [
+        *(Layer(8, (tone(),)), Layer(-1, (tone(),)), Layer(0, (tone(),), ramp=1.001)),
+        *(Layer(0, (tone(),), ramp=math.nan), Layer(0, (tone(),), valid_for=60.1)),
+        *(Layer(0, (tone(),), renew=True), Layer(0, (), after=True), Layer(0, (tone(), tone()))),
+    ],
+)
+def test_layer_that_cannot_be_is_refused(layer: Layer) -> None:
+    """Numbers, times and flags of a layer, and a channel twice."""
+    assert refusal(Ledger(WIDE, CAN), layer)
+
+
+def test_values_are_rounded_to_the_safe_side() -> None:
+    """Ramps upward, levels to the nearest, valid_for never to 0, which means without end."""
+    layer = Layer(0, (tone(level=0.33336, frequency=99.99),), ramp=0.0101, valid_for=1e-5)
+    (one,) = Ledger(WIDE, CAN).admit([layer], 0.0)
+    assert (one.ramp, one.valid_for) == (11, 1)
+    assert (one.commands[0].level, one.commands[0].frequency) == (3334, 2000)
+
+
+def test_least_limit_holds() -> None:
+    """Of the rig (0.8), the amplifier (0.9) and a channel (0.7, for each)."""
+    can = {**capabilities(2), "level_max": 9000}
+    can["limits"][1]["level_max"] = 7000
+    ledger = Ledger(replace(WIDE, level=0.8), can)
+    assert refusal(ledger, Layer(0, (tone(0, level=0.71),))).channel == 0
+    assert ledger.admit([Layer(0, (tone(0, level=0.7),))], 1.0)
+
+
+@pytest.mark.parametrize("name", ["slew", "power", "on_time", "duty", "rate"])
+def test_limits_that_leave_nothing_are_refused(name: str) -> None:
+    """Zero and NaN of each."""
+    for value in (0.0, math.nan):
+        with pytest.raises(CommandError):
+            Ledger(replace(WIDE, **{name: value}), CAN)
+
+
+def test_layers_are_bounded_together() -> None:
+    """0.6 in one layer leaves 0.4 for another; once it has faded, 0.9 is admitted."""
+    ledger = Ledger(WIDE, CAN)
+    play(ledger, 1, 0.0, Layer(0, (tone(level=0.6),)))
+    assert refusal(ledger, Layer(1, (tone(level=0.41, frequency=200),))).channel == 0
+    assert ledger.admit([Layer(1, (tone(level=0.4, frequency=200),))], 1.0)
+    play(ledger, 2, 1.0, Layer(0, ()))
+    assert refusal(ledger, Layer(1, (tone(level=0.9, frequency=200),)), at=1.01)
+    assert ledger.admit([Layer(1, (tone(level=0.9, frequency=200),))], 1.03)
+
+
+def test_cross_fade_at_full_level_is_admitted() -> None:
+    """Gains of a raised cosine add up to one, in power to less than one."""
+    ledger = Ledger(replace(WIDE, power=1.0), CAN)
+    play(ledger, 1, 0.0, Layer(0, (tone(0, 1.0),)))
+    assert ledger.admit([Layer(0, (tone(0, 1.0, 200.0),))], 1.0)
+    assert ledger.admit([Layer(0, (tone(1, 1.0, 200.0),))], 1.0)
+
+
+def test_power_is_that_of_all_layers_and_channels() -> None:
+    """0.5 in two layers of one channel: 1, in two channels: a half."""
+    ledger = Ledger(replace(WIDE, power=0.6), CAN)
+    play(ledger, 1, 0.0, Layer(0, (tone(0),)))
+    assert refusal(ledger, Layer(1, (tone(0, frequency=200),)))
+    assert ledger.admit([Layer(1, (tone(1, frequency=200),))], 1.0)
+
+
+def test_rise_is_bounded() -> None:
+    """pi/2 · 0.5 / 0.1 s = 7.85 per second along a ramp; 10 by a knot; a fade never rises."""
+    ramp = Layer(0, (tone(),), ramp=0.1)
+    assert Ledger(replace(WIDE, slew=7.86), CAN).admit([ramp], 0.0)
+    ledger = Ledger(replace(WIDE, slew=7.85), CAN)
+    assert refusal(ledger, ramp).channel == 0
+    shaped = Layer(0, (tone(level=0.2, onset=Shape(0.01, (0.1, 0.2))),))
+    assert refusal(ledger, shaped).channel == 0
+    ledger = Ledger(replace(WIDE, slew=10.01), CAN)
+    assert ledger.admit([shaped], 0.0)
+    play(ledger, 1, 0.0, ramp)
+    assert ledger.admit([Layer(0, (), ramp=0.001)], 1.0)
+
+
+def test_doubt_admits_silence_only_until_it_is_resolved() -> None:
+    """By confirmation, or by a status with another token; nothing is kept of refused sets."""
+    ledger = Ledger(WIDE, CAN)
+    layer = Layer(0, (tone(),))
+    ledger.sent(7, ledger.admit([layer], 0.0), 0.0)
+    assert (ledger.doubt, bool(refusal(ledger, layer))) == (7, True)
+    assert ledger.admit([Layer(0, ())], 1.0)
+    ledger.resolve(6, 1.0)
+    assert (ledger.doubt, ledger.playback.level(0, 1.0)) == (0, 0.0)
+    ledger.sent(8, ledger.admit([layer], 1.0), 1.0)
+    ledger.resolve(8, 1.01)
+    assert ledger.playback.level(0, 2.0) == pytest.approx(0.5)
+
+
+def test_on_time_and_duty_shorten_what_is_admitted() -> None:
+    """On-time 2 s: 1.98 s and a ramp of 20 ms; after 1.5 s of it the rest less 100 ms of way."""
+    ledger = Ledger(replace(WIDE, on_time=2.0), CAN)
+    layer = Layer(0, (tone(),))
+    (one,) = ledger.admit([layer], 0.0)
+    assert one.valid_for == 1980
+    play(ledger, 1, 0.0, layer)
+    (one,) = ledger.admit([Layer(1, (tone(1),))], 1.5)
+    assert one.valid_for == 380
+    assert refusal(ledger, Layer(0, renew=True), at=1.9)
+    (silent,) = ledger.admit([Layer(0, (), ramp=1.0)], 1.9)
+    assert silent.ramp <= 100
+
+
+def test_rate_is_limited_with_the_time_from_which_it_is_allowed() -> None:
+    """Three sets a second; silence is never refused."""
+    ledger = Ledger(replace(WIDE, rate=3.0), CAN)
+    for number in range(3):
+        play(ledger, number + 1, 0.1 * number, Layer(0, (tone(),)))
+    error = refusal(ledger, Layer(0, (tone(),)), at=0.5)
+    assert error.until == pytest.approx(1.1)
+    assert ledger.admit([Layer(0, ())], 0.5)
+    assert ledger.admit([Layer(0, (tone(),))], 1.11)
+
+
+def random_layer(random_: random.Random, number: int) -> Layer:
+    """A layer of up to three tones of three frequencies, with shapes, fades and ends."""
+
+    def shape() -> Shape | None:
+        if random_.random() < 0.6:
+            return None
+        knots = [cmath.rect(random_.random() * 0.5, random_.uniform(-3, 3)) for _ in range(3)]
+        return Shape(random_.choice((0.002, 0.01)), tuple(knots[: random_.randrange(4)]))
+
+    tones = tuple(
+        Tone(
+            channel,
+            random_.choice((100.0, 150.0, 200.0)),
+            random_.choice((0.0, 0.2, 0.4, 0.7)),
+            random_.uniform(-180, 180),
+            keep_phase=random_.random() < 0.5,
+            skip_ending=random_.random() < 0.3,
+            onset=shape(),
+            ending=shape(),
+        )
+        for channel in random_.sample(range(3), random_.randrange(4))
+    )
+    ramp = random_.choice((0.005, 0.02, 0.08))
+    valid_for = random_.choice((0.0, 0.05, 0.2))
+    return Layer(number, tones, ramp, valid_for, after=bool(tones) and random_.random() < 0.2)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_what_is_admitted_stays_within_the_limits_whenever_it_is_played(seed: int) -> None:
+    """Random sets, each played up to 10 ms after it was sent: level, power and rise every 0.5 ms.
+
+    A jump of a ramp counts within one step of the sampling.
+    """
+    random_ = random.Random(seed)
+    limits = replace(WIDE, level=0.9, power=1.2, slew=random_.choice((60.0, 150.0, math.inf)))
+    ledger, plays = Ledger(limits, CAN), Playback(3, 16)
+    now, step, admitted = 0.0, 0.0005, 0
+    before = [0.0] * 3
+    for token in range(1, 120):
+        numbers = random_.sample(range(3), random_.choice((1, 1, 2)))
+        try:
+            layers = ledger.admit([random_layer(random_, number) for number in numbers], now)
+        except CommandRefused:
+            layers = ()
+        commit = now + random_.choice((0.0, 0.001, 0.01))
+        until = now + random_.choice((0.012, 0.03, 0.1))
+        if layers:
+            admitted += 1
+            ledger.sent(token, layers, now)
+        while now < until:
+            now += step
+            if layers and now >= commit:
+                plays.commit(layers, token, commit)
+                layers = ()
+            plays.advance(now)
+            levels = [plays.level(channel, now) for channel in range(3)]
+            assert max(levels) <= 0.9 * (1 + 1e-6)
+            assert sum(level**2 for level in levels) <= 1.2 * (1 + 1e-6)
+            rises = [(new - old) / step for new, old in zip(levels, before, strict=True)]
+            assert max(rises) <= limits.slew * (1 + 1e-6)
+            before = levels
+        ledger.confirmed(min(commit + 0.001, until))
+    assert admitted > 20

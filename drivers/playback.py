@@ -56,6 +56,17 @@ class Transition:
         index = int(steps)
         return points[index] + (points[index + 1] - points[index]) * (steps - index)
 
+    def reached(self, time: float, spread: float) -> complex:
+        """Return the amplitude at a time, or the farthest from 0 within a spread [s] around it."""
+        if not spread or time - spread >= self.end:
+            return self.at(time)
+        since, until = max(time - spread, self.start), max(time + spread, self.start)
+        moments = (self.start + self.step * (index + 1) for index in range(len(self.knots)))
+        between = [
+            knot for moment, knot in zip(moments, self.knots, strict=True) if since < moment < until
+        ]
+        return max((self.at(since), *between, self.at(until)), key=abs)
+
     def peak(self, time: float) -> float:
         """Return the largest magnitude from a time on."""
         passed = math.floor((time - self.start) / self.step) if self.step else len(self.knots)
@@ -100,18 +111,21 @@ class Voice:
         """Time of silence [s]; infinite for a tone that lasts."""
         return math.inf if self.transition.last else self.transition.end
 
-    def faded(self, time: float, ramp: float) -> "Voice":
-        """Return it falling silent along a ramp [s], or as it does if that is sooner."""
+    def faded(self, time: float, ramp: float, spread: float = 0.0) -> "Voice":
+        """Return it falling silent along a ramp [s], or as it does if that is sooner.
+
+        spread [s]: see `Playback`.
+        """
         if self.silent_from <= time + ramp:
             return replace(self, has_ended=True)
-        transition = Transition(time, ramp, self.transition.at(time), 0j)
+        transition = Transition(time, ramp, self.transition.reached(time, spread), 0j)
         return replace(self, transition=transition, has_ended=True)
 
-    def ended(self, time: float, ramp: float) -> "Voice":
+    def ended(self, time: float, ramp: float, spread: float = 0.0) -> "Voice":
         """Return it falling silent along its ending, or along a ramp [s] without one."""
         if self.ending is None or self.has_ended:
-            return self.faded(time, ramp)
-        transition = _along(self.ending, time, self.transition.at(time), 0j)
+            return self.faded(time, ramp, spread)
+        transition = _along(self.ending, time, self.transition.reached(time, spread), 0j)
         return replace(self, transition=transition, has_ended=True)
 
     def scaled(self, time: float, factor: float, ramp: float) -> "Voice":
@@ -145,11 +159,14 @@ class _Layer:
 class Playback:
     """Voices of all channels, and the layers that they belong to; silent at first.
 
-    voices: how many a channel has for tones that are not cut short.
+    voices: how many a channel has for tones that are not cut short. spread [s]: by which commits
+    may come sooner or later; fades begin at the largest amplitude within it, so that levels are
+    upper bounds.
     """
 
     channels: int
     voices: int
+    spread: float = 0.0
     _playing: list[tuple[Voice, ...]] = field(init=False)
     _layers: dict[int, _Layer] = field(default_factory=dict)
 
@@ -175,7 +192,8 @@ class Playback:
         self.advance(time)
         self._layers.clear()
         self._playing = [
-            tuple(voice.faded(time, ramp) for voice in voices) for voices in self._playing
+            tuple(voice.faded(time, ramp, self.spread) for voice in voices)
+            for voices in self._playing
         ]
 
     def advance(self, time: float) -> None:
@@ -270,6 +288,15 @@ class Playback:
         waits = any(layer.waiting is not None for layer in self._layers.values())
         return math.inf if waits else max(ends, default=-math.inf)
 
+    def ramp_of(self, layer: int) -> float:
+        """Return the ramp [s] along which a layer ends by itself."""
+        return _RAMP.from_wire(self._layers[layer].ramp) if layer in self._layers else 0.0
+
+    def end_of(self, layer: int) -> float:
+        """Return when a layer ends by itself [s]; infinite without `valid_for`."""
+        known = self._layers.get(layer)
+        return math.inf if known is None else known.ends
+
     @property
     def ends_by(self) -> float:
         """Latest time at which all is silent by itself [s]; infinite without `valid_for`."""
@@ -311,7 +338,10 @@ class Playback:
         """Let a layer fall silent by its endings."""
         ramp = _RAMP.from_wire(self._layers.pop(layer).ramp)
         self._playing = [
-            tuple(voice.ended(time, ramp) if voice.layer == layer else voice for voice in voices)
+            tuple(
+                each.ended(time, ramp, self.spread) if each.layer == layer else each
+                for each in voices
+            )
             for voices in self._playing
         ]
 
@@ -319,7 +349,8 @@ class Playback:
         commands = {command.channel: command for command in one.commands}
         ramp = _RAMP.from_wire(one.ramp)
         for channel, voices in enumerate(self._playing):
-            after = tuple(_after(voices, one.layer, commands.get(channel), time, ramp))
+            command = commands.get(channel)
+            after = tuple(_after(voices, one.layer, command, time, ramp, self.spread))
             self._playing[channel] = _within(after, time, self.voices)
         if not commands:
             self._layers.pop(one.layer, None)
@@ -332,7 +363,12 @@ def _end_of(one: LayerSet, time: float) -> float:
 
 
 def _after(
-    voices: Sequence[Voice], layer: int, command: Command | None, time: float, ramp: float
+    voices: Sequence[Voice],
+    layer: int,
+    command: Command | None,
+    time: float,
+    ramp: float,
+    spread: float,
 ) -> Iterator[Voice]:
     """Yield the voices of a channel once a command of a layer plays; None silences the layer."""
     is_driven = command is not None and (command.level > 0 or command.onset is not None)
@@ -342,13 +378,13 @@ def _after(
             yield voice
         elif is_driven and command is not None and _continues(voice, command):
             continued = True
-            first = voice.transition.at(time)
+            first = voice.transition.reached(time, spread)
             transition = _towards(command, time, ramp, first)
             yield replace(voice, transition=transition, ending=command.ending)
         elif is_driven or (command is not None and command.skip_ending):
-            yield voice.faded(time, ramp)
+            yield voice.faded(time, ramp, spread)
         else:
-            yield voice.ended(time, ramp)
+            yield voice.ended(time, ramp, spread)
     if is_driven and command is not None and not continued:
         transition = _towards(command, time, ramp, 0j)
         frequency = _FREQUENCY.from_wire(command.frequency)

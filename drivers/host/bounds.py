@@ -6,7 +6,7 @@ largest where each transition is at one of its points.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -15,7 +15,7 @@ from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
 
 _RAMP, _STEP = QUANTITIES["ramp"], QUANTITIES["envelope_step"]
-_FREQUENCY = QUANTITIES["frequency"]
+_FREQUENCY, _VALID_FOR = QUANTITIES["frequency"], QUANTITIES["valid_for"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,12 +60,16 @@ class ChannelBounds:
         waiting: Sequence[LayerSet],
         channel: int,
         time: float,
+        *,
+        ramps: Mapping[int, float],
+        ending_soon: Collection[int],
     ) -> None:
+        self._ramps = ramps
         self.steady = sum(
             max(map(abs, _course(command)))
             for one in waiting
             for command in one.commands
-            if command.channel == channel and one.layer not in layers
+            if command.channel == channel
         )
         self.paths: list[Path] = []
         self._rises: dict[float, list[tuple[float, float]]] = {}  # by frequency: rise, change
@@ -75,9 +79,13 @@ class ChannelBounds:
         }
         continued: set[int] = set()
         for voice in voices:
-            if voice.has_ended or voice.layer not in layers:
+            if voice.has_ended or voice.layer not in layers or voice.layer in ending_soon:
                 self.steady += max(voice.transition.peak(time), _peak(voice.ending))
                 self._note_change(voice, time)
+                if voice.layer in ending_soon and not voice.has_ended:
+                    ramp = _RAMP.from_wire(layers[voice.layer].ramp)
+                    highest = voice.transition.peak(time)
+                    self._note(voice.frequency, (highest, 0j), ramp, is_cosine=True)
                 continue
             one, command = layers[voice.layer], commands[voice.layer]
             if command is not None and is_continued(voice, command):
@@ -110,9 +118,9 @@ class ChannelBounds:
         starts = _points(voice.transition, time)
         farthest = max(starts, key=lambda start: abs(course[0] - start))
         step, is_cosine = _step(one, command), not _knots(command.onset)
-        self.paths.append(_path(max(map(abs, starts)), command, step))
+        self.paths.append(_path(max(map(abs, starts)), one, command, step))
         self._note(voice.frequency, (farthest, *course), step, is_cosine=is_cosine)
-        self._note_ending(voice.frequency, command)
+        self._note_ending(voice.frequency, command, starts)
 
     def _fade(self, voice: Voice, one: LayerSet, command: Command | None, time: float) -> None:
         starts = _points(voice.transition, time)
@@ -130,19 +138,18 @@ class ChannelBounds:
     def _start(self, one: LayerSet, command: Command) -> None:
         frequency = _FREQUENCY.from_wire(command.frequency)
         step, is_cosine = _step(one, command), not _knots(command.onset)
-        self.paths.append(_path(0.0, command, step))
+        self.paths.append(_path(0.0, one, command, step))
         self._note(frequency, (0j, *_course(command)), step, is_cosine=is_cosine)
-        self._note_ending(frequency, command)
+        self._note_ending(frequency, command, (0j,))
 
-    def _note_ending(self, frequency: float, command: Command) -> None:
-        """Note the ending of a command, which may rise, in place of what comes before it."""
+    def _note_ending(self, frequency: float, command: Command, starts: Sequence[complex]) -> None:
+        """Note the ending of a command, which may rise, from wherever its way is by then."""
         if command.ending is None:
             return
-        level = amplitude_of(command.level, command.phase)
-        rise, change = _steepest_of_ending(level, command.ending)
-        several = self._rises[frequency]
-        before = several.pop()
-        several.append((max(before[0], rise), max(before[1], change)))
+        for start in (*starts, *_course(command)):
+            rise, change = _steepest_of_ending(start, command.ending)
+            before = self._rises[frequency].pop()
+            self._rises[frequency].append((max(before[0], rise), max(before[1], change)))
 
     def _note_change(self, voice: Voice, time: float) -> None:
         """Note a voice that the set does not change."""
@@ -150,12 +157,15 @@ class ChannelBounds:
         if transition.end > time:
             change = transition.slope(time)
             rise = 0.0 if transition.last == 0 and not transition.knots else change
+        if voice.ending is None and not voice.has_ended:
+            ends = (transition.peak(time), 0j), self._ramps[voice.layer]
+            change = max(change, _steepest(*ends, is_cosine=True)[1])
         if voice.ending is not None and not voice.has_ended:
             for start in _points(transition, time):
                 ending = _steepest_of_ending(start, voice.ending)
                 rise, change = max(rise, ending[0]), max(change, ending[1])
-        if change:
-            self._rises.setdefault(voice.frequency, []).append((rise, change))
+        # Also where it does not change: another voice of its frequency may cease to cancel it.
+        self._rises.setdefault(voice.frequency, []).append((rise, change))
 
     def _note(
         self, frequency: float, points: Sequence[complex], step: float, *, is_cosine: bool
@@ -191,11 +201,27 @@ def is_continued(voice: Voice, command: Command) -> bool:
     return command.keep_phase and same and is_driven(command)
 
 
-def all_bounds(playback: Playback, layers: Sequence[LayerSet], time: float) -> list[ChannelBounds]:
-    """Return what each channel may play if these layers are committed at a time [s] or later."""
+def all_bounds(
+    playback: Playback, layers: Sequence[LayerSet], time: float, *, until: float
+) -> list[ChannelBounds]:
+    """Return what each channel may play if layers are committed between two times [s]."""
     named = {one.layer: one for one in layers if not one.renew}
+    # They may have begun to end by themselves when the set comes.
+    ending_soon = [number for number in named if playback.end_of(number) <= until]
+    sounding = {
+        voice.layer for channel in range(playback.channels) for voice in playback.voices_of(channel)
+    }
+    # A layer without `valid_for` ends by a set alone, which silences along a ramp of its own.
+    ramps = {
+        number: playback.ramp_of(number) if playback.end_of(number) < math.inf else math.inf
+        for number in sounding
+    }
     return [
-        ChannelBounds(playback.voices_of(channel), named, playback.waiting, channel, time)
+        ChannelBounds(
+            *(playback.voices_of(channel), named, playback.waiting, channel, time),
+            ramps=ramps,
+            ending_soon=ending_soon,
+        )
         for channel in range(playback.channels)
     ]
 
@@ -218,11 +244,18 @@ def _course(command: Command) -> tuple[complex, ...]:
     return (*_knots(command.onset), amplitude_of(command.level, command.phase))
 
 
-def _path(first: float, command: Command, step: float) -> Path:
-    """Return the magnitudes of a command from a first one on; the last covers its ending."""
+def _path(first: float, one: LayerSet, command: Command, step: float) -> Path:
+    """Return the magnitudes of a command from a first one on; the last covers its ending.
+
+    An ending that may begin amid the way is covered all along.
+    """
     *others, last = map(abs, _course(command))
-    last = max(last, _peak(command.ending))
-    return Path(step, (first, *others, last), is_cosine=not others)
+    ending = _peak(command.ending)
+    path = Path(step, (first, *others, max(last, ending)), is_cosine=not others)
+    if one.valid_for and _VALID_FOR.from_wire(one.valid_for) < path.times[-1]:
+        magnitudes = tuple(max(each, ending) for each in path.magnitudes)
+        return Path(step, magnitudes, path.is_cosine)
+    return path
 
 
 def _step(one: LayerSet, command: Command) -> float:

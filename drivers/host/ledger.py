@@ -64,13 +64,10 @@ class Ledger:
             raise CommandRefused(f"a layer must occur once in a set, got {numbers}")
         wanted = tuple(self._on_wire(layer) for layer in layers)
         if not any(is_vibrating(one) for one in wanted):
-            left = self._budget.fade_left(now)
-            return tuple(_within_ramp(one, left) for one in wanted)
+            return self._silence(wanted, now)
         if self._doubt is not None:
             raise CommandRefused(f"set {self.doubt} must be confirmed first; read the status")
-        late = now - self.lag
-        self.playback.advance(late)
-        self._check_sums(wanted, late)
+        self._check_sums(wanted, now)
         return self._within_budget(wanted, now)
 
     def sent(self, token: int, layers: tuple[LayerSet, ...], now: float) -> None:
@@ -88,7 +85,7 @@ class Ledger:
         self._doubt = None
         if self.playback.is_settled(sent_at - self.lag):
             self.lag = 0.0
-        self.lag = max(self.lag, now - sent_at)
+        self.lag = self.playback.spread = max(self.lag, now - sent_at)
         self.playback.commit(layers, token, sent_at)
         self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
 
@@ -101,7 +98,7 @@ class Ledger:
     def silenced(self, ramp: float, sent_at: float, now: float) -> None:
         """Note that all layers fall silent along a ramp [s], by a request sent at a time [s]."""
         self._doubt = None
-        self.lag = max(self.lag, now - sent_at)
+        self.lag = self.playback.spread = max(self.lag, now - sent_at)
         self.playback.silence(sent_at, ramp)
         self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
 
@@ -195,8 +192,26 @@ class Ledger:
         )
         return Envelope(math.ceil(shape.step * _STEP.per_unit - _SLACK), knots)
 
-    def _check_sums(self, layers: Sequence[LayerSet], late: float) -> None:
-        bounds = all_bounds(self.playback, layers, late)
+    def _silence(self, layers: tuple[LayerSet, ...], now: float) -> tuple[LayerSet, ...]:
+        """Return silent layers, their ramps within the time that is left, endings only if safe."""
+        left = self._budget.fade_left(now)
+        silent = tuple(_within_ramp(one, left) for one in layers)
+        try:
+            if self._doubt is None:
+                self._check_sums(silent, now)
+                return silent
+        except CommandRefused:
+            pass
+        commands = tuple(
+            Command(channel, self.limits.frequency_min, 0, 0, skip_ending=True)
+            for channel in range(self.capabilities["channels"])
+        )
+        return tuple(replace(one, commands=commands) for one in silent)
+
+    def _check_sums(self, layers: Sequence[LayerSet], now: float) -> None:
+        late = now - self.lag
+        self.playback.advance(late)
+        bounds = all_bounds(self.playback, layers, late, until=now + COMMIT_DELAY)
         levels, power = worst(bounds)
         highest = _LEVEL.from_wire(self.limits.level)
         for channel, (bound, level) in enumerate(zip(bounds, levels, strict=True)):

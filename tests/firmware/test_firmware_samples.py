@@ -91,7 +91,7 @@ def test_sets_cross_fade_along_raised_cosines(replaying: Path) -> None:
 def square_law(replaying: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The firmware of electrostatic actuators; skipped where `replaying` is."""
     folder = tmp_path_factory.mktemp("square_law")
-    return build_firmware(folder, "era-replay", "CFLAGS=-O2 -DSQUARE_LAW=1")
+    return build_firmware(folder, "era-replay", "CFLAGS=-O0 -DSQUARE_LAW=1")
 
 
 @pytest.mark.long

@@ -27,7 +27,7 @@ BROKEN_BY_CONFORMANCE = {"enabled", "limits", "token", "credit", "stop", "voices
 """Rules for hosts that it breaks on purpose."""
 
 
-@pytest.mark.parametrize("wire", shortly(ALL, ["can+slcan"]))
+@pytest.mark.parametrize("wire", shortly(ALL, ["serial"]))
 def test_sound_amplifier_passes_and_breaks_no_rule(wire: str, coarse_rig: Rig) -> None:
     """In half a minute of traffic; skipped are checks for which there is nothing to check."""
     witness = witness_of_one(KINDS[wire])

@@ -4,7 +4,7 @@ import re
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.codec.serial_line.exchanges import decode_request, encode_request
@@ -75,6 +75,7 @@ def test_refusal_has_the_channel() -> None:
 NUMBERS = st.one_of(st.floats(), st.integers(), st.none(), st.text(max_size=3))
 
 
+@settings(max_examples=20)
 @given(
     st.builds(
         CommandSet,

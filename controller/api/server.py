@@ -29,6 +29,7 @@ from controller.api.jsonrpc import (
 from controller.api.methods import METHODS, TouchParams
 from controller.api.schema import Message
 from controller.api.turns import Turns
+from controller.api.waiting_touches import supersedes
 from controller.group.tasks import CoalescedCalls
 from drivers import clock
 from drivers.errors import CommandRefused, DriverError, LinkError
@@ -57,7 +58,7 @@ class _Call:
     error: RpcError | None = None
 
     def is_superseded_by(self, other: "_Call | None") -> bool:
-        """Whether both are touch frames of one source without an id: only the newest counts.
+        """Whether both are touch frames of one source without an id, and the newer one is enough.
 
         A frame holds all fingers of its source, hence no lift is lost.
         """
@@ -67,6 +68,7 @@ class _Call:
             and isinstance(self.params, TouchParams)
             and isinstance(other.params, TouchParams)
             and self.params.source == other.params.source
+            and supersedes(other.params, self.params)
         )
 
 

@@ -4,8 +4,10 @@ import asyncio
 import logging
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from itertools import chain
 
 from controller.api.methods import TouchParams
+from controller.api.waiting_touches import add_frame
 from controller.daemon.config import API_SOURCES, TouchInput
 from controller.sources.touch import Touch, TouchFrame
 from drivers import clock
@@ -72,12 +74,15 @@ class TouchInputs:
 
 
 class ApiTouches:
-    """Touch frames of API clients: the newest of each source, delivered once per loop iteration."""
+    """Touch frames of API clients, delivered once per loop iteration.
+
+    Of each source the newest, and those before it with a finger that the newest does not have.
+    """
 
     def __init__(self, plate: Plate, deliver: Callable[[TouchFrame], None]) -> None:
         self._plate = plate
         self._deliver = deliver
-        self._newest: dict[str, TouchFrame] = {}
+        self._waiting: dict[str, list[TouchFrame]] = {}
         self._sources: dict[object, dict[str, float]] = {}  # time [s] of the last frame
         self._is_scheduled = False
 
@@ -105,22 +110,21 @@ class ApiTouches:
             for point in params.touches
         )
         origin = f"{API_SOURCES}:{client_name}"
-        self._newest[source] = TouchFrame(source, now, touches, origin=origin)
-        self._schedule()
+        self._deliver_soon(TouchFrame(source, now, touches, origin=origin))
 
     def lift_all(self, client: object, *, now: float) -> None:
         """Lift all fingers of a client at a time [s]."""
         for source in self._sources.pop(client, ()):
-            self._newest[source] = TouchFrame(source, now, ())
-            self._schedule()
+            self._deliver_soon(TouchFrame(source, now, ()))
 
-    def _schedule(self) -> None:
+    def _deliver_soon(self, frame: TouchFrame) -> None:
+        add_frame(self._waiting.setdefault(frame.source, []), frame)
         if not self._is_scheduled:
             self._is_scheduled = True
-            asyncio.get_running_loop().call_soon(self._deliver_newest)
+            asyncio.get_running_loop().call_soon(self._deliver_waiting)
 
-    def _deliver_newest(self) -> None:
+    def _deliver_waiting(self) -> None:
         self._is_scheduled = False
-        newest, self._newest = self._newest, {}
-        for frame in newest.values():
+        waiting, self._waiting = self._waiting, {}
+        for frame in chain.from_iterable(waiting.values()):
             self._deliver(frame)

@@ -33,6 +33,7 @@ from controller.api.methods import (
 )
 from controller.api.rate_limit import RateLimiter
 from controller.api.schema import MAX_RATE, Message, Topic
+from controller.api.waiting_touches import add_frame
 from controller.gateway.daemon_link import DaemonLink
 from controller.gateway.outbox import Outbox
 
@@ -86,7 +87,7 @@ class Session:
         self._topics: set[str] = set()
         self._pending: set[asyncio.Task[None]] = set()
         self._pending_stops: set[asyncio.Task[None]] = set()
-        self._touches: dict[str, TouchParams] = {}  # the newest frame of each source, to be sent
+        self._touches: dict[str, list[TouchParams]] = {}  # frames of each source, to be sent
         self._touching: set[str] = set()  # sources with fingers on the plate
         self._touch_task: asyncio.Task[None] | None = None
         self._is_closed = False
@@ -186,21 +187,24 @@ class Session:
                 self.publish(topic, frame)
 
     def _touch(self, request: Request) -> None:
-        """Keep the newest frame of a source; one frame at a time is sent to the daemon."""
+        """Keep the frames of a source that count; one at a time is sent to the daemon."""
         params = touch_params(request, self.name)
         sources = self._touches.keys() | self._touching
         if params.source not in sources and len(sources) >= MAX_TOUCH_SOURCES:
             raise RpcError(ErrorCode.BUSY, "too many touch sources", remedy="use one or two")
-        self._touches[params.source] = params
+        add_frame(self._touches.setdefault(params.source, []), params)
         self._respond(request, {})
         if self._touch_task is None or self._touch_task.done():
             self._touch_task = self._start(self._send_touches())
 
     async def _send_touches(self) -> None:
-        """Send the newest frames to the daemon until none is left."""
+        """Send frames to the daemon until none is left."""
         while self._touches:
             source = next(iter(self._touches))
-            params = self._touches.pop(source)
+            waiting = self._touches.pop(source)
+            params = waiting.pop(0)
+            if waiting:
+                self._touches[source] = waiting
             if params.touches:
                 self._touching.add(source)
             else:

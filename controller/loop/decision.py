@@ -188,9 +188,9 @@ class Decider:
         """Whether the last contact has lifted and silence has not been commanded yet."""
         return not self._tracker.contacts and not self._playing.is_silent
 
-    def update(self, frame: TouchFrame) -> Change:
-        """Apply a touch frame to the contacts."""
-        change = self._tracker.update(frame)
+    def update(self, frame: TouchFrame, *, keeps_taps: bool = False) -> Change:
+        """Apply a touch frame to the contacts; keeps_taps: as of `ContactTracker.update`."""
+        change = self._tracker.update(frame, keeps_taps=keeps_taps)
         self._note(change, frame.time)
         return change
 

@@ -252,7 +252,9 @@ class Controller:
 
     def deliver(self, frame: TouchFrame) -> None:
         """Process a touch frame; to be called in the loop's thread."""
-        change = self._decider.update(frame)
+        # Contacts that came since the last cycle have not been decided yet.
+        is_undecided = self.group_state is GroupState.ARMED and self._wake.is_set()
+        change = self._decider.update(frame, keeps_taps=is_undecided)
         self._follow(change)
         for reason in change.rejected:
             self._rejects.count(reason, f"touch of {frame.source}")

@@ -18,6 +18,12 @@ CONTACT_TIMEOUT = 0.150
 # s; no sensor may stay silent for longer under a resting finger.
 MAX_CONTACT_TIMEOUT = 60.0
 
+# s; no finger leaves the plate so soon: its frames were held up and came together.
+MAX_GLIMPSE = 0.005
+
+# s; how long such a contact is kept, so that a click is decided, loaded and felt.
+TAP_TIME = 0.060
+
 
 class ContactKey(NamedTuple):
     """Identifies a contact: its source and the id within that source."""
@@ -93,6 +99,7 @@ class ContactTracker:
         self._plate = plate
         self._contacts: dict[ContactKey, Contact] = {}
         self._sources: dict[str, _Source] = {}
+        self._taps: dict[ContactKey, float] = {}  # s; when contacts end that are lifted already
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
@@ -101,23 +108,33 @@ class ContactTracker:
 
     @property
     def next_expiry(self) -> float | None:
-        """When [s] the first source with contacts times out unless a frame of it arrives."""
-        return min((source.expiry for source in self._sources.values()), default=None)
+        """When [s] the first contacts are lifted unless a frame of their source arrives."""
+        ends = [source.expiry for source in self._sources.values()]
+        return min([*ends, *self._taps.values()], default=None)
 
     def expiry_of(self, key: ContactKey) -> float:
         """Return when [s] a contact is lifted unless a frame arrives; -inf for none of that key."""
-        return self._sources[key.source].expiry if key in self._contacts else -math.inf
+        if key not in self._contacts:
+            return -math.inf
+        return min(self._sources[key.source].expiry, self._taps.get(key, math.inf))
 
-    def update(self, frame: TouchFrame) -> Change:
-        """Apply a frame, which replaces the previous one of its source."""
+    def update(self, frame: TouchFrame, *, keeps_taps: bool = False) -> Change:
+        """Apply a frame, which replaces the previous one of its source.
+
+        keeps_taps: whether a contact is kept for a while whose lift comes together with it.
+        """
         rejected: list[str] = []
         touches: dict[ContactKey, Touch] = {}
         if math.isfinite(frame.time):
             touches = _valid_touches(frame, rejected)
         elif frame.touches:
             rejected.append("no_time")
+        if keeps_taps:
+            self._keep_taps(frame)
         up = self._lift(
-            key for key in self._contacts if key.source == frame.source and key not in touches
+            key
+            for key in self._contacts
+            if key.source == frame.source and (key in touches) == (key in self._taps)
         )
         self._sources[frame.source] = _source_of(frame)
         down: list[Contact] = []
@@ -146,8 +163,10 @@ class ContactTracker:
         # Same expression as next_expiry, so both round alike. Frames dated in the future are
         # treated as received now.
         expired = [name for name, source in self._sources.items() if source.expiry <= now]
-        up = self._lift(key for key in self._contacts if key.source in expired) if expired else ()
-        if expired:
+        ended = [key for key, end in self._taps.items() if end <= now]
+        up: tuple[Contact, ...] = ()
+        if expired or ended:
+            up = self._lift(key for key in self._contacts if key.source in expired or key in ended)
             self._forget_sources()
         for name, source in self._sources.items():
             if source.received > now:
@@ -191,9 +210,20 @@ class ContactTracker:
     def _origin_of(self, key: ContactKey) -> str:
         return self._sources[key.source].origin
 
+    def _keep_taps(self, frame: TouchFrame) -> None:
+        """Keep contacts that have just come down and are not in a frame any more."""
+        ids = {touch.id for touch in frame.touches}
+        for key, contact in self._contacts.items():
+            is_lifted = key.source == frame.source and key.id not in ids
+            if is_lifted and frame.time - contact.since < MAX_GLIMPSE:
+                self._taps.setdefault(key, contact.since + TAP_TIME)
+
     def _lift(self, keys: Iterable[ContactKey]) -> tuple[Contact, ...]:
         """Remove contacts and return them."""
-        return tuple(self._contacts.pop(key) for key in tuple(keys))
+        lifted = tuple(self._contacts.pop(key) for key in tuple(keys))
+        for contact in lifted:
+            self._taps.pop(contact.key, None)
+        return lifted
 
     def _forget_sources(self) -> None:
         """Forget sources without contacts."""

@@ -32,6 +32,7 @@ class Served:
     hub: Hub
     calls: list[str] = field(default_factory=list)
     touches: list[tuple[str, float]] = field(default_factory=list)  # source, and first finger's x
+    fingers: list[tuple[int, ...]] = field(default_factory=list)  # their ids, frame by frame
     may_arm: asyncio.Event = field(default_factory=asyncio.Event)
     disconnected: list[Connection] = field(default_factory=list)
     clients: set[Connection] = field(default_factory=set)
@@ -88,6 +89,8 @@ async def serving(folder: Path) -> AsyncIterator[Served]:
         def handle(client: Connection, params: Message) -> Message | Awaitable[Message]:
             served.calls.append(name)
             served.clients.add(client)
+            if isinstance(params, TouchParams):
+                served.fingers.append(tuple(each.id for each in params.touches))
             if isinstance(params, TouchParams) and params.touches:
                 served.touches.append((params.source, params.touches[0].x_m))
             if name == "subscribe":
@@ -252,6 +255,22 @@ async def test_touch_frame_is_superseded_by_the_next_of_its_source(served: Serve
     assert [(await wire.line())["id"] for _ in range(4)] == [7, None, None, 8]
     before = [("a", 0.03), ("b", 0.04), ("a", 0.05), ("a", 0.06), ("a", 0.07)]
     assert served.touches == [*before, ("a", 0.08), ("a", 0.09), ("a", 0.1)]
+
+
+async def test_touch_frame_with_a_finger_that_the_next_has_not_is_served(served: Served) -> None:
+    """A tap whose frames come together is not lost; one more finger supersedes."""
+
+    def touch(*ids: int) -> bytes:
+        touches = ",".join(f'{{"id":{id},"x_m":0.{id},"y_m":0.1}}' for id in ids)
+        params = f'{{"source":"a","touches":[{touches}]}}'
+        return f'{{"jsonrpc":"2.0","method":"touch","params":{params}}}\n'.encode()
+
+    wire = await served.connect()
+    frames = [(1,), (2,), (2, 3), (3,), ()]
+    wire.writer.write(b"".join(touch(*ids) for ids in frames))
+    wire.call("stop", id=8)
+    assert (await wire.line())["id"] == 8
+    assert served.fingers == [(1,), (2, 3), (3,), ()]
 
 
 async def test_control_loop_runs_between_iterations(

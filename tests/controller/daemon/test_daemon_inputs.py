@@ -52,6 +52,18 @@ async def test_newest_touches_of_each_source_are_delivered() -> None:
     assert frames[0].touches[0].x == pytest.approx(0.999)
 
 
+async def test_touches_before_a_lift_are_delivered() -> None:
+    """Frames with a finger that the next one does not have come before it, in their order."""
+    frames: list[TouchFrame] = []
+    touches = ApiTouches(PLATE, frames.append)
+    for places in (((0.1, 0.1),), ((0.2, 0.1),), (), ((0.1, 0.1), (0.3, 0.1)), ((0.1, 0.1),), ()):
+        touches.add("client", params("me", *places), client_name="1", now=1)
+    await asyncio.sleep(0)
+    assert [[each.x for each in frame.touches] for frame in frames] == [
+        pytest.approx(xs) for xs in ([0.5], [0.25, 0.75], [0.25], [])
+    ]
+
+
 async def test_touches_of_leaving_client_are_lifted() -> None:
     """An empty frame for each of its sources with fingers down, and for no others."""
     frames: list[TouchFrame] = []

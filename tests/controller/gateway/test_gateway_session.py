@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from starlette.datastructures import Address
 
-from controller.api.methods import RequestedBy
+from controller.api.methods import RequestedBy, TouchParams
 from controller.api.schema import Message
 from controller.gateway.daemon_link import DaemonLink
 from controller.gateway.session import Session
@@ -30,6 +30,10 @@ class Socket:
         ]
         self.may_leave = asyncio.Event()
         self.sent: list[dict[str, Any]] = []
+
+    def request(self, method: str, params: dict[str, Any]) -> None:
+        """Have one more request sent, without an id."""
+        self._requests.append({"jsonrpc": "2.0", "method": method, "params": params})
 
     async def receive(self) -> dict[str, Any]:
         """The next message."""
@@ -102,6 +106,32 @@ async def test_arm_of_a_browser_that_leaves_arms_nothing() -> None:
     (arm, _), (disarm, params) = await run_session(Socket("arm"))
     assert (arm, disarm) == ("arm", "disarm")
     assert params.lease == "a-lease"  # type: ignore[attr-defined]
+
+
+async def test_fingers_that_come_and_go_during_a_round_trip_reach_the_daemon() -> None:
+    """The newest frame, and before it each with a finger that the next one does not have."""
+    socket, daemon = Socket(), Daemon()
+    session = Session(
+        socket,  # type: ignore[arg-type]
+        daemon,  # type: ignore[arg-type]
+        current=lambda topic: None,
+        clock=asyncio.get_running_loop().time,
+    )
+    for ids in ((), (1,), (1, 2), (), (3,), (3, 4)):
+        touches = [{"id": id, "x_m": 0.1, "y_m": 0.1} for id in ids]
+        params = {"source": "page", "touches": touches}
+        socket.request("touch", params)
+    running = asyncio.create_task(session.run())
+    await iterate()
+    daemon.may_respond.set()
+    await iterate()
+    socket.may_leave.set()
+    await asyncio.wait_for(running, 10)
+    frames = [params for method, params in daemon.calls if method == "touch"]
+    assert all(isinstance(params, TouchParams) for params in frames)
+    sent = [[each.id for each in params.touches] for params in frames]  # type: ignore[attr-defined]
+    assert sent[-3:] == [[1, 2], [3, 4], []]  # lifted at the end
+    assert sent[0] in ([], [1, 2])
 
 
 async def test_stops_of_browsers_are_merged_and_none_is_refused() -> None:

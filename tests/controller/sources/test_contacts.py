@@ -299,3 +299,40 @@ def test_tracker_invariants_for_any_sequence(events: list[TouchFrame | float]) -
     tracker.expire(latest)
     tracker.expire(latest + 1.0)
     assert tracker.contacts == ()
+
+
+def test_tracker_keeps_a_tap_whose_frames_come_together() -> None:
+    """For 60 ms from its down, once, and only where taps are kept; another finger there is new."""
+    tracker = ContactTracker(PLATE)
+    for keeps_taps, left in ((False, []), (True, [1])):
+        tracker.update(frame(1.0, (1, 0.5, 0.5)))
+        change = tracker.update(frame(1.001), keeps_taps=keeps_taps)
+        assert (ids(tracker), len(change.up)) == (left, 1 - len(left))
+    key = ContactKey("a", 1)
+    assert tracker.next_expiry == tracker.expiry_of(key) == pytest.approx(1.060)
+    assert not tracker.update(frame(1.030), keeps_taps=True)
+    assert not tracker.expire(1.059)
+    assert [each.key for each in tracker.expire(1.0601).up] == [key]
+    assert tracker.next_expiry is None
+
+    tracker.update(frame(2.0, (1, 0.5, 0.5)))
+    tracker.update(frame(2.0), keeps_taps=True)
+    change = tracker.update(frame(2.01, (1, 0.1, 0.5)), keeps_taps=True)
+    assert ([each.x for each in change.up], [each.since for each in change.down]) == (
+        [0.15],
+        [2.01],
+    )
+    assert tracker.update(frame(2.02), keeps_taps=True).up  # 10 ms are no glimpse
+
+
+def test_tracker_keeps_no_tap_that_is_rejected_evicted_or_out_of_time() -> None:
+    """A touch off the plate, one too many, and a source that times out lift at once."""
+    tracker = ContactTracker(PLATE)
+    tracker.update(frame(1.0, (1, 0.5, 0.5)))
+    assert tracker.update(frame(1.0, (1, 1.5, 0.5)), keeps_taps=True).up
+    tracker.update(frame(2.0, (1, 0.5, 0.5)))
+    tracker.update(frame(2.0, timeout=0.02), keeps_taps=True)
+    assert tracker.expire(2.021).up
+    tracker.update(frame(3.0, *((number, 0.5, 0.5) for number in range(MAX_CONTACTS))))
+    tracker.update(frame(3.0), keeps_taps=True)
+    assert len(tracker.update(frame(3.0, (1, 0.5, 0.5), source="b"), keeps_taps=True).up) == 1

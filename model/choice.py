@@ -5,10 +5,15 @@ is another one on another processor. So scores within a small distance of the be
 it, and the first of them is chosen.
 """
 
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import IntArray
+
+_Item = TypeVar("_Item")
 
 NEARLY = 1e-5
 """Distance from the best, relative to it, within which scores count as equal."""
@@ -51,3 +56,24 @@ def best_few(scores: ArrayLike, count: int) -> IntArray:
     least = np.partition(values, -count)[-count]
     among = np.flatnonzero(values >= least - 2 * NEARLY * np.abs(least))
     return np.asarray(among[best_first(values[among])[:count]])
+
+
+def best_rows(scores: ArrayLike, count: int) -> IntArray:
+    """Indices (count, ...) along the first axis of the highest scores, the highest first."""
+    left = np.array(scores)
+    found = []
+    for _ in range(count):
+        best = best_along(left, axis=0)[None]
+        np.put_along_axis(left, best, -np.inf, axis=0)
+        found.append(best)
+    return np.concatenate(found)
+
+
+def best_by(items: Sequence[_Item], score: Callable[[_Item], float]) -> _Item:
+    """The first of the items with the highest scores."""
+    return items[best_of([score(each) for each in items])]
+
+
+def ranked_by(items: Sequence[_Item], score: Callable[[_Item], float]) -> list[_Item]:
+    """Items in the order of `best_first`."""
+    return [items[each] for each in best_first([score(each) for each in items])]

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from controller.demo.touch_row import TouchRow
+from model.choice import ranked_by
 from model.figures.fingertips import draw_fingertip, draw_level_scale, draw_levels
 from model.table.table import LocalizationTable
 
@@ -19,7 +20,7 @@ def choose_rows(rows: Sequence[TouchRow]) -> list[TouchRow]:
     One finger alone is shown at most once.
     """
     by_count: dict[int, list[TouchRow]] = {}
-    for row in sorted(rows, key=_contrast, reverse=True):
+    for row in ranked_by(rows, _contrast):
         if row.measured_level_db_sl is not None:
             by_count.setdefault(len(row.quiet), []).append(row)
     chosen = by_count.pop(0, [])[:1]

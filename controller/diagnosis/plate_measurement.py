@@ -19,6 +19,7 @@ from drivers.errors import CommandError, CommandRefused
 from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import Reading, ReadingState
 from model.arrays import ComplexArray, FloatArray
+from model.choice import best_first, best_of
 from model.errors import InputError
 from model.identification.measured_plate import MeasuredPlate
 from model.identification.measurement import Measurement, Repeat
@@ -133,7 +134,7 @@ class PlateSelfMeasurement:
         for step in tones.steps:
             heard.append(await self._hear(step, tones, sensors, level=self._level))
             self._on_step(len(heard), count)
-        loudest = int(np.argmax([np.nanmax(np.abs(each.responses)) for each in heard]))
+        loudest = best_of([np.nanmax(np.abs(each.responses)) for each in heard])
         half = await self._hear(tones.steps[loudest], tones, sensors, level=self._level / 2)
         self._on_step(count - 1, count)
         last = await self._hear(tones.steps[0], tones, sensors, level=self._level)
@@ -279,7 +280,7 @@ class PlateSelfMeasurement:
         """The loudest tones of a step and of its repetition: noise hides changes of the others."""
         sizes = np.linalg.norm(np.nan_to_num(first.responses), axis=0)
         found = []
-        for n in np.argsort(-sizes)[:_COMPARED]:
+        for n in best_first(sizes)[:_COMPARED]:
             known = np.isfinite(first.responses[:, n])
             values = first.responses[known, n], again.responses[known, n]
             found.append(Repeat(self._rig.eras[n].name, float(first.frequencies[n]), *values))

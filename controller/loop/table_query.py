@@ -166,7 +166,7 @@ def band_of_table(band: tuple[float, float], frequencies: FloatArray) -> tuple[f
     if low < high and ((frequencies >= low) & (frequencies <= high)).any():
         return band
     middle = np.sqrt(low * high)
-    nearest = float(frequencies[np.argmin(np.abs(np.log(frequencies / middle)))])
+    nearest = float(frequencies[best_of(-np.abs(np.log(frequencies / middle)))])
     return nearest, nearest
 
 

@@ -35,7 +35,7 @@ from model.calibration.held_out import hold_out, initial_responses, relative_err
 from model.calibration.parameters import Parameter, parameters_of, starts
 from model.calibration.responses import Responses
 from model.calibration.variable_projection import row_rms
-from model.choice import best_first, best_of
+from model.choice import best_by, best_of, ranked_by
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.vibration.parametric_plate import ParametricPlate, parametric_plate
@@ -122,10 +122,10 @@ def _problem(
 def _best_fit(problem: Problem) -> Fit:
     """Fit from several starts, since a fit finds only the nearest minimum; return the best."""
     possible = starts(problem.parameters)
-    order = best_first([-misfit(problem, x) for x in possible])[:_STARTS]
+    nearest = ranked_by(possible, lambda x: -misfit(problem, x))[:_STARTS]
     ones = np.ones(problem.values.shape[2])
-    fits = [solve(problem, possible[each], ones) for each in order]
-    return fits[best_of([-misfit(problem, fit.x) for fit in fits])]
+    fits = [solve(problem, each, ones) for each in nearest]
+    return best_by(fits, lambda fit: -misfit(problem, fit.x))
 
 
 def _identified(problem: Problem, model: FormModel, start: Fit) -> tuple[Problem, FormFit]:

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from model.choice import best_rows
 from model.design.places import DesignPlate, Places
 from model.finger.perception import STRONG_DB_SL, detection_threshold
 from model.structure.actuator import Era
@@ -163,7 +164,7 @@ class Scorer:
         if q == 1:
             return np.asarray(bound.max(axis=0), dtype=float)
         kept = min(BEST_FREQUENCIES, f)
-        rows = np.argpartition(-bound, kept - 1, axis=0)[:kept]
+        rows = best_rows(bound, kept)
         some = (rows, np.arange(s))
         c, w = c[some], w[some]
         R = power[rows[..., None], quiet]  # (kept, s, q, n, n)

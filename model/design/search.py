@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.arrays import FloatArray, IntArray
-from model.choice import best_of
+from model.choice import best_by, best_of
 from model.design.area import Area, Within, candidates_of, everywhere
 from model.design.contacts import ContactRule
 from model.design.places import DesignPlate, Places
@@ -156,7 +156,7 @@ class LayoutSearch:
     def add(self, layout: Sequence[int]) -> tuple[int, ...]:
         """Add the best candidate."""
         tried = [(*layout, each) for each in self._open(layout)]
-        return tried[best_of([self.value(each) for each in tried])]
+        return best_by(tried, self.value)
 
     def exchange(self, layout: Sequence[int], *, sweeps: int = MAX_SWEEPS) -> tuple[int, ...]:
         """Move one ERA after the other to the best candidate, until none gains."""
@@ -168,7 +168,7 @@ class LayoutSearch:
                 continue
             rest = best[:number] + best[number + 1 :]
             tried = [(*best[:number], each, *best[number + 1 :]) for each in self._open(rest)]
-            found = tried[best_of([self.value(each) for each in tried])] if tried else best
+            found = best_by(tried, self.value) if tried else best
             gains = self.value(found) > self.value(best) + _GAIN
             best, unchanged = (found, 0) if gains else (best, unchanged + 1)
             if unchanged >= len(best) - self._k:

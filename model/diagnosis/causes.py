@@ -17,7 +17,7 @@ from scipy.optimize import minimize_scalar
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.variable_projection import modal_assurance
-from model.choice import best_first
+from model.choice import best_by, ranked_by
 from model.diagnosis.plate_match import Match, match_plate
 from model.errors import InputError
 from model.fem.plate_mesh import stretched
@@ -127,14 +127,13 @@ def explain(
                 model = other_plate.responses(other)[:, list(drives)]
                 tried.append((_misfit(values, model), factor))
         if tried:
-            scores.append((*min(tried), cause))
-    scores.sort(key=lambda each: each[0])
+            scores.append((*best_by(tried, lambda each: -each[0]), cause))
     fits = []
-    for _, factor, cause in scores[:_FITTED_CAUSES]:
+    for _, factor, cause in ranked_by(scores, lambda each: -each[0])[:_FITTED_CAUSES]:
         match = matched(cause, factor)
         if match is not None:
             fits.append((cause, factor, match))
-    fits.sort(key=lambda each: each[2].cost)
+    fits = ranked_by(fits, lambda each: -each[2].cost)
     fits[:_REFINED_CAUSES] = [
         (cause, *_refined(cause, factor, match, matched))
         for cause, factor, match in fits[:_REFINED_CAUSES]
@@ -152,7 +151,7 @@ def explain(
         )
         for (cause, factor, match), weight in zip(fits, weights / weights.sum(), strict=True)
     ]
-    return [explained[each] for each in best_first([each.share for each in explained])]
+    return ranked_by(explained, lambda each: each.share)
 
 
 def _refined(
@@ -180,8 +179,7 @@ def _refined(
         method="bounded",
         options={"maxiter": _REFINEMENTS, "xatol": 3e-3},
     )
-    best = min(known, key=lambda each: known[each].cost)
-    return best, known[best]
+    return best_by([*known.items()], lambda each: -each[1].cost)
 
 
 def _misfit(values: ComplexArray, model: ComplexArray) -> float:

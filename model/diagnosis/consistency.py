@@ -22,7 +22,7 @@ from model.calibration.calibration_screening import (
 from model.calibration.parameters import parameters_of, responses_at
 from model.calibration.responses import Responses
 from model.calibration.variable_projection import project_gains, row_rms
-from model.choice import best_of
+from model.choice import best_by
 from model.diagnosis.assignment import ShapeMatch, match_shapes
 from model.diagnosis.observation import Observation
 from model.diagnosis.plate_match import MAX_FIT_ERROR, Match, match_plate
@@ -123,7 +123,7 @@ def _check_quantity(
 
     level = float(np.median(size[known]))
     own = distance(1.0, 0)
-    nearest = _QUANTITIES[best_of([-distance(each.factor, each.power) for each in _QUANTITIES])]
+    nearest = best_by(_QUANTITIES, lambda each: -distance(each.factor, each.power))
     gap = distance(nearest.factor, nearest.power)
     if abs(level) < np.log(_MAX_GAIN) or own < gap:
         return
@@ -150,7 +150,7 @@ def _check_phases_and_places(
             (match_plate(rig, plate, values, drives=drives, starts=starts), drives)
             for drives in dict.fromkeys([own, shapes.nearest])
         ]
-        return found[best_of([-each.cost for each, _ in found])]
+        return best_by(found, lambda each: -each[0].cost)
 
     match, drives = best(observation.values)
     other, _ = best(observation.values.conj())

@@ -26,7 +26,7 @@ from model.calibration.parameters import (
     rig_with,
 )
 from model.calibration.variable_projection import project_gains, projection_slopes, row_rms
-from model.choice import best_of
+from model.choice import best_by
 from model.rig.rig import Rig
 from model.vibration.parametric_plate import ParametricPlate
 
@@ -165,7 +165,7 @@ def match_plate(
         )
         for guess in initial
     ]
-    best = found[best_of([-float(each.cost) for each in found])]
+    best = best_by(found, lambda each: -float(each.cost))
     x = center + std * best.x[:count]
     gains = np.full(values.shape[1], np.nan)
     gains[used] = np.exp(_GAIN_STD * best.x[count:])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
-from model.choice import best_of
+from model.choice import best_by
 from model.diagnosis.assignment import ShapeMatch, match_responses, match_shapes
 from model.diagnosis.causes import Explanation, explain
 from model.diagnosis.diagnosis_screening import (
@@ -146,7 +146,7 @@ def diagnose(
             model_error=error,
         )
         tried = [match, *(each.match for each in explanations)]
-        fitted = tried[best_of([-each.cost for each in tried])]
+        fitted = best_by(tried, lambda each: -each.cost)
     shapes = match_responses(fitted.responses, values)
     phases = _phases(observation, fitted, dead)
     channels = tuple(

@@ -102,6 +102,7 @@ def find_switched(forms: Forms, min_score: float) -> list[tuple[float, Weights]]
     while len(one) > 0:
         if len(one) > BATCH:
             order = np.argpartition(-bound, BATCH)
+            order[:BATCH].sort()  # a partition's own order is another one on another processor
             one, other, bound = one[order], other[order], bound[order]
         some, more = one[:BATCH], other[:BATCH]
         values = score(

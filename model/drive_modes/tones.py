@@ -4,6 +4,7 @@ import cmath
 from collections.abc import Sequence
 
 from model.arrays import FloatArray
+from model.choice import NEARLY
 from model.drive_modes.forms import Weights
 from model.structure.actuator import Era
 from model.vibration.excitation import Excitation, Tone
@@ -14,7 +15,8 @@ ROUNDING = 1e-6  # of single precision
 def excitation_of(
     drive: Weights, eras: Sequence[Era], frequencies: FloatArray, *, gain: float
 ) -> Excitation:
-    """Tones by ERA, at a gain of up to 1; at each frequency the strongest has phase zero.
+    """Tones by ERA, at a gain of up to 1; at each frequency the strongest, the first of
+    those nearly as strong, has phase zero.
 
     frequencies (f,) [Hz]: by the drive's indices.
     """
@@ -22,7 +24,8 @@ def excitation_of(
     for index, weight in drive.tones():
         # Python's own numbers: those of numpy take ten times as long, one by one.
         values = weight.tolist()
-        strongest = max(values, key=abs)
+        nearly_largest = (1 - NEARLY) * max(map(abs, values))
+        strongest = next(value for value in values if abs(value) >= nearly_largest)
         factor = strongest.conjugate() / abs(strongest)
         frequency = float(frequencies[index])
         for era, value in zip(eras, values, strict=True):

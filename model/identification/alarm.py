@@ -15,6 +15,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from model.arrays import FloatArray
+from model.choice import best_of
 from model.identification.derivatives import by_mass_at
 from model.identification.kalman import State, Updated
 from model.identification.settled import Touched
@@ -88,14 +89,14 @@ class Alarm:
         last = list(self._recent)[::-1]
         along, confirmed = self._along(last)
         if confirmed.max() > _ALONG:
-            return last[: int(np.argmax(along)) + 1][::-1]
+            return last[: best_of(along) + 1][::-1]
         squares = np.cumsum([each.nis for each in last])
         numbers = np.cumsum([each.count for each in last])
         largest = np.maximum.accumulate([each.nis for each in last])
         unlikely = chdtrc(numbers, squares) < _UNLIKELY_TOGETHER
         rest = chdtrc(np.maximum(numbers - taken.count, 1), squares - largest) < _UNLIKELY_REST
         if np.any(unlikely & rest):
-            return last[: int(np.argmax(squares - _REFERENCE * numbers)) + 1][::-1]
+            return last[: best_of(squares - _REFERENCE * numbers) + 1][::-1]
         return None
 
     @property

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import linalg, stats
 
 from model.arrays import FloatArray
-from model.choice import best_first
+from model.choice import best_first, ranked_by
 from model.identification.alarm import places_on
 from model.identification.alterations import Alteration, Altered, Crack, Hand, scores
 from model.identification.derivatives import by_mass_at
@@ -82,7 +82,7 @@ def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
     tried += _by_mass(before, patterns)
     for alteration in _ALTERATIONS:
         tried += _by_alteration(before, patterns, alteration)
-    tried.sort(key=lambda each: each.cost)
+    tried = ranked_by(tried, lambda each: -each.cost)
     names = list(dict.fromkeys(each.name for each in tried))
     # Hands and cracks may still be far from their least cost.
     followed = {*names[:_FOLLOWED], *(each.name for each in _ALTERATIONS)}
@@ -95,7 +95,7 @@ def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
         measured = each.altered or patterns
         after = update(each.prior, measured, iterations=_ITERATIONS, start=x)
         tried[number] = replace(each, after=after)
-    tried.sort(key=lambda each: each.cost)
+    tried = ranked_by(tried, lambda each: -each.cost)
     best = tried[0]
     others = [each.cost for each in tried if each.name != best.name]
     lead = min(others) - best.cost

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import FloatArray
-from model.choice import best_first, best_of
+from model.choice import NEARLY, best_by, best_first, ranked_by
 from model.identification.derivatives import by_mass_at
 from model.identification.fit import Linearised, Problem, solve
 from model.identification.forward import ForwardModel
@@ -124,7 +124,7 @@ def _simple(problem: Problem) -> Linearised:
         start = np.zeros(space.size)
         start[space.groups["thickness"]] = thickness
         found = solve(problem, start, free)
-        if best is None or found.cost < best.cost:
+        if best is None or found.cost < (1 - NEARLY) * best.cost:
             best = found
         if best.residuals @ best.residuals < _GOOD * len(best.residuals):
             break
@@ -144,7 +144,7 @@ def _with_mass(problem: Problem, x: FloatArray, *, number: int) -> list[Linearis
         starts.append(moved)
     free = space.of(*LOCATED)
     found = [solve(problem, each, free) for each in starts]
-    return [found[each] for each in best_first([-each.cost for each in found])]
+    return ranked_by(found, lambda each: -each.cost)
 
 
 def _scan(problem: Problem, x: FloatArray, own: int) -> list[tuple[FloatArray, float]]:
@@ -180,7 +180,7 @@ def _in_full(problem: Problem, starts: list[Linearised]) -> Fitted:
     """Fit everything to the noise as it is, from the two best starts."""
     free = problem.model.space.uncertain
     found = [solve(problem, each.x, free) for each in starts[:2]]
-    return Fitted(problem, found[best_of([-each.cost for each in found])])
+    return Fitted(problem, best_by(found, lambda each: -each.cost))
 
 
 def _another_mass(setting: Setting, found: Fitted) -> Fitted:

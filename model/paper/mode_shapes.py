@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 from model.arrays import FloatArray, lattice
+from model.choice import best_of
 from model.fem.mesh import Mesh
 from model.figures.drawing import draw_eras, draw_shape, raster
 from model.files.csv_file import Column, Columns
@@ -123,7 +124,7 @@ def _shapes_figure(
 
 def _scaled(shape: FloatArray) -> FloatArray:
     """A mode shape with its largest deflection at +1: sign and size of a mode are free."""
-    return np.asarray(shape / shape[np.abs(shape).argmax()])
+    return np.asarray(shape / shape[best_of(np.abs(shape))])
 
 
 def _draw_table(axes: Axes, columns: Columns) -> None:

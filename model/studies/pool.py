@@ -96,6 +96,8 @@ class LayoutPool:
     def _block(self, era_count: int, rng: np.random.Generator, *, in_order: bool) -> Numbers:
         """Random layouts (_BLOCK, era_count) without repeated positions."""
         keys = rng.random((_BLOCK, len(self._candidates)))
-        block = keys.argpartition(era_count, axis=1)[:, :era_count]
-        block = rng.permuted(block, axis=1) if in_order else np.sort(block, axis=1)
+        # A partition's own order is another one on another processor.
+        block = np.sort(keys.argpartition(era_count, axis=1)[:, :era_count], axis=1)
+        if in_order:
+            block = rng.permuted(block, axis=1)
         return np.asarray(block, dtype=np.int32)

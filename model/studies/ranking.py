@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import FloatArray, IntArray
-from model.choice import best_first
+from model.choice import best_by, best_first, ranked_by
 from model.design.judge import Judged
 from model.rig.rig import Rig
 from model.studies.cases import OWN, VACANT, Cases
@@ -119,9 +119,12 @@ class Ranking:
         In a study of placement that is the best.
         """
         counts, factors = era_counts(self.cases), self.cases.stiffness_factors
-        least = self.judged[self.best].mean_db - GOOD_ENOUGH_DB
-        good = [case for case, answers in self.judged.items() if answers.mean_db >= least]
-        return min(good, key=lambda case: (counts[case], factors[case], -self.judged[case].mean_db))
+        enough = self.judged[self.best].mean_db - GOOD_ENOUGH_DB
+        good = [case for case, answers in self.judged.items() if answers.mean_db >= enough]
+        effort = {case: (counts[case], factors[case]) for case in good}
+        least = min(effort.values())
+        easiest = [case for case in good if effort[case] == least]
+        return best_by(easiest, lambda case: self.judged[case].mean_db)
 
     def best_by(self, values: FloatArray | IntArray) -> dict[float, int]:
         """The best case for each distinct value (n,) of those that support the plate."""
@@ -137,7 +140,7 @@ def rank(scored: Scored, judged: Mapping[int, Judged], *, finalists: int) -> Ran
     first = [int(case) for case in scored.supported_order[:finalists]]
     least = min(judged[case].mean_db for case in first)
     head = [case for case, answers in judged.items() if answers.mean_db >= least]
-    head.sort(key=lambda case: -judged[case].mean_db)
+    head = ranked_by(head, lambda case: judged[case].mean_db)
     rest = scored.order[~np.isin(scored.order, head)]
     return Ranking(scored, judged, np.array([*head, *rest.tolist()]), len(head))
 

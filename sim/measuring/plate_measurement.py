@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from model.arrays import FloatArray
+from model.choice import best_first
 from model.identification.forward import Sensor
 from model.identification.measured_plate import DeviceSettings, MeasuredPlate, Progress
 from model.identification.measurement import Measurement, Repeat
@@ -122,7 +123,7 @@ def _repeats(desk: Desk, found: Measured, multisine: Multisine, run: Run) -> tup
     size = np.linalg.norm(bases, axis=1, keepdims=True)
     first, again = first / size, again / size
     names = ", ".join(name for name, _ in desk.eras)
-    loudest = np.argsort(-np.linalg.norm(first, axis=1))[:_COMPARED]
+    loudest = best_first(np.linalg.norm(first, axis=1))[:_COMPARED]
     return tuple(
         Repeat(names, float(multisine.frequencies[n]), first[n], again[n]) for n in loudest
     )

@@ -15,9 +15,6 @@ from model.finger.fingertip import fingertips_on
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 
-# Of the frequency, for the change with thickness: well within a resonance of loss factor 0.001.
-_STEP = 1e-4
-
 
 @dataclass(frozen=True, eq=False)
 class Places:
@@ -56,7 +53,8 @@ class DesignPlate:
         self._points = points.reshape(-1, 2)
         self.weights: Float32Array = weights.astype(np.float32)
         self.groups = _grouped([len(each) for each in sets], numbers.ravel())
-        to_tips = self._receptances(centres, 1.0)[1].reshape(len(frequencies), *weights.shape, -1)
+        _, to_points = self._free.receptances(centres, self._points, frequencies, loads=rig.masses)
+        to_tips = to_points.swapaxes(1, 2).reshape(len(frequencies), *weights.shape, -1)
         every = np.arange(len(centres))
         self.own = to_tips[:, every, :, every].swapaxes(0, 1).astype(np.complex64)
 
@@ -69,25 +67,21 @@ class DesignPlate:
         """Solve for ERAs at places [m] (c, 2)."""
         at = np.atleast_2d(at)
         feet = np.column_stack([at, np.full(len(at), self.era.foot)])
-        between, to_tips = self._receptances(feet, 1.0)
-        both = between.astype(np.complex64), to_tips.astype(np.complex64)
+        given = feet, self._points, self.frequencies
+        found = _at_tips(*self._free.receptances(*given, loads=self.rig.masses))
         std = self.rig.uncertainty.thickness
         if std == 0:
-            return Places(at, *both, None, None)
-        # A(w, h) = A(w / h, 1) / h³: dA / d ln h = -3 A - w dA/dw.
-        lower = self._receptances(feet, 1.0 - _STEP)
-        changes = (
-            (std * (-3 * own - (own - below) / _STEP)).astype(np.complex64)
-            for own, below in zip((between, to_tips), lower, strict=True)
-        )
-        return Places(at, *both, *changes)
+            return Places(at, *found, None, None)
+        between, to_points = self._free.receptance_slopes(*given, loads=self.rig.masses)
+        return Places(at, *found, *_at_tips(std * between, std * to_points))
 
-    def _receptances(self, at: FloatArray, factor: float) -> tuple[ComplexArray, ComplexArray]:
-        """Between places (f, c, c) and to points (f, m p, c), at frequencies times a factor."""
-        between, to_points = self._free.receptances(
-            at, self._points, factor * self.frequencies, loads=self.rig.masses
-        )
-        return between, np.ascontiguousarray(to_points.swapaxes(1, 2))
+
+def _at_tips(
+    between: ComplexArray, to_points: ComplexArray
+) -> tuple[Complex64Array, Complex64Array]:
+    """Between places (f, c, c), and at points (f, m p, c) of fingertips."""
+    to_tips = np.ascontiguousarray(to_points.swapaxes(1, 2))
+    return between.astype(np.complex64), to_tips.astype(np.complex64)
 
 
 def _grouped(sizes: Sequence[int], numbers: IntArray) -> tuple[IntArray, ...]:

@@ -8,9 +8,10 @@ their number, independent of the mesh.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from typing import TypeAlias
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from model.reduction.finite_element_modes import finite_element_modes
 from model.reduction.free_modes import RESIDUAL_ORDER, FreeModes, PointSolutions
 from model.reduction.layered_modes import layered_modes
 from model.reduction.spectral_modes import spectral_modes
-from model.reduction.truncation import truncation_weights
+from model.reduction.truncation import truncation_slopes, truncation_weights
 from model.spectral.mesh import SpectralMesh
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
@@ -31,6 +32,8 @@ from model.structure.low_rank import coupled_forces, on_diagonal
 from model.structure.modal_elasticity import ModalElasticity, loss_factors
 from model.structure.plate import Plate
 from model.structure.point_load import Load, footprints_of
+
+_Functions: TypeAlias = Callable[[int], tuple[ComplexArray, ComplexArray]]
 
 FREQUENCY_MARGIN = 2.0
 """Modes are kept up to this multiple of frequency_max."""
@@ -67,7 +70,8 @@ class FreePlate:
         attached = self.modes.solve_at(footprints_of(eras, loads))
         stiffness = attached_stiffness(eras, loads, omega)
         applied = on_diagonal(drive_forces(eras, omega), rows=stiffness.shape[1])
-        forces = coupled_forces(self._between(attached, omega), stiffness, applied)
+        between = _between(attached, partial(self._modal_receptance, omega))
+        forces = coupled_forces(between, stiffness, applied)
         modal_receptance, weights = self._modal_receptance(omega, RESIDUAL_ORDER)
         modal = modal_receptance[:, :, None] * (attached.shapes.T @ forces)
         residual = (weights[:, :, None, None] * forces[:, None]).reshape(len(omega), -1, len(eras))
@@ -90,25 +94,60 @@ class FreePlate:
         `acceleration`.
         """
         omega = self._omega(frequencies)
+        field = self._field(places, points, loads)
+        free = field(partial(self._modal_receptance, omega))
+        return _loaded(*free, attached_stiffness((), loads, omega))
+
+    def receptance_slopes(
+        self,
+        places: FloatArray,
+        points: FloatArray,
+        frequencies: FloatArray,
+        *,
+        loads: Sequence[Load] = (),
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Derivatives of `receptances` by the logarithm of the thickness, loads as they are.
+
+        Of a thin plate, whose stiffness goes as the cube of it.
+        """
+        omega = self._omega(frequencies)
+        field = self._field(places, points, loads)
+        by_between, by_points = field(partial(self._thickness_slopes, omega))
+        if loads:
+            # With F = D (I + R_ll D)^-1 R_l., dR changes the receptance by (1 - F)^T dR (1 - F).
+            between, to_points = field(partial(self._modal_receptance, omega))
+            n, stiffness = len(places), attached_stiffness((), loads, omega)
+            held = -coupled_forces(
+                between[:, n:, n:], stiffness, stiffness[:, :, None] * between[:, n:, :n]
+            )
+            forces = coupled_forces(
+                between[:, n:, n:], stiffness, stiffness[:, :, None] * to_points[:, n:]
+            )
+            own = np.concatenate([np.broadcast_to(np.eye(n), (len(omega), n, n)), held], axis=1)
+            own = own.swapaxes(1, 2)
+            by_points = own @ by_points - own @ by_between[:, :, n:] @ forces
+            by_between = own @ by_between @ own.swapaxes(1, 2)
+        return by_between, by_points
+
+    def _field(
+        self, places: FloatArray, points: FloatArray, loads: Sequence[Load]
+    ) -> Callable[[_Functions], tuple[ComplexArray, ComplexArray]]:
+        """What functions of frequency give between places and loads, and from these to points.
+
+        functions: from a number of terms to those of modes (f, r) and truncated ones (f, terms).
+        """
         attached = self.modes.solve_at(np.vstack([as_footprints(places), footprints_of(loads)]))
-        count = len(attached.shapes)
-        modal_receptance, weights = self._modal_receptance(omega, RESIDUAL_ORDER)
         basis = self.modes.basis(attached, points)
         shapes, residual = np.split(basis, [len(self.modes.eigenvalues)], axis=1)
-        to_points = _apply(shapes, modal_receptance[:, :, None] * attached.shapes.T)
-        to_points += np.tensordot(
-            weights, residual.reshape(-1, RESIDUAL_ORDER, count).T, axes=(1, 1)
-        )
-        between = self._between(attached, omega)
-        if loads:
-            # R - R_pl D (I + R_ll D)^-1 R_lp; places p, loads l, all receptances symmetric.
-            n = len(places)
-            stiffness = attached_stiffness((), loads, omega)
-            reaction = stiffness[:, :, None] * between[:, n:, :n]
-            forces = coupled_forces(between[:, n:, n:], stiffness, reaction).swapaxes(1, 2)
-            to_points = to_points[:, :n] - forces @ to_points[:, n:]
-            between = between[:, :n, :n] - forces @ between[:, n:, :n]
-        return between, to_points
+        by_term = residual.reshape(-1, RESIDUAL_ORDER, len(attached.shapes)).T
+
+        def field(functions: _Functions) -> tuple[ComplexArray, ComplexArray]:
+            modal, weights = functions(RESIDUAL_ORDER)
+            to_points = _apply(shapes, modal[:, :, None] * attached.shapes.T)
+            to_points += np.tensordot(weights, by_term, axes=(1, 1))
+            return _between(attached, functions), to_points
+
+        return field
 
     @cached_property
     def _elasticity(self) -> ModalElasticity:
@@ -126,11 +165,18 @@ class FreePlate:
         receptance = 1 / (self._elasticity.stiffness(omega) - (omega**2)[:, None])
         return np.asarray(receptance, dtype=complex), np.asarray(weights / loss, dtype=complex)
 
-    def _between(self, attached: PointSolutions, omega: FloatArray) -> ComplexArray:
-        """Receptance between attachments, (f, n, n)."""
-        modal_receptance, weights = self._modal_receptance(omega, 2 * RESIDUAL_ORDER)
-        modal = (modal_receptance[:, None, :] * attached.shapes) @ attached.shapes.T
-        return np.asarray(modal + np.tensordot(weights, attached.truncated_terms, axes=1))
+    def _thickness_slopes(self, omega: FloatArray, terms: int) -> tuple[ComplexArray, ComplexArray]:
+        """Derivatives of `_modal_receptance` by the logarithm of the thickness h.
+
+        With stiffness as h³ and mass as h, weights as h^-3 at omega² / h².
+        """
+        stiffness = self._elasticity.stiffness(omega)
+        modal, weights = self._modal_receptance(omega, terms)
+        loss = np.asarray(1 + 1j * loss_factors(self.plate, omega))
+        shifted = np.asarray(omega**2 / loss + self.shift, dtype=complex)
+        slopes = truncation_slopes(shifted, self.modes.largest_truncated, terms)
+        by_weights = -3 * weights - 2 * (omega**2 / loss**2)[:, None] * slopes
+        return -(3 * stiffness - (omega**2)[:, None]) * modal**2, by_weights
 
     def _omega(self, frequencies: FloatArray) -> FloatArray:
         """omega [rad/s] of frequencies [Hz]; raises InputError for those out of range."""
@@ -142,6 +188,31 @@ class FreePlate:
                 f"solved, got {frequencies.max():g} Hz; solve it with a higher frequency_max"
             )
         return 2 * np.pi * frequencies
+
+
+def _between(attached: PointSolutions, functions: _Functions) -> ComplexArray:
+    """Receptance between attachments, or its derivative, of functions of frequency (f, n, n)."""
+    modal, weights = functions(2 * RESIDUAL_ORDER)
+    by_modes = (modal[:, None, :] * attached.shapes) @ attached.shapes.T
+    return np.asarray(by_modes + np.tensordot(weights, attached.truncated_terms, axes=1))
+
+
+def _loaded(
+    between: ComplexArray, to_points: ComplexArray, stiffness: ComplexArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """Receptances with the last attachments loaded by dynamic stiffnesses (f, l), of the others.
+
+    R - R_pl D (I + R_ll D)^-1 R_lp; places p, loads l, all receptances symmetric.
+    """
+    n = between.shape[1] - stiffness.shape[1]
+    if n == between.shape[1]:
+        return between, to_points
+    reaction = stiffness[:, :, None] * between[:, n:, :n]
+    forces = coupled_forces(between[:, n:, n:], stiffness, reaction).swapaxes(1, 2)
+    return (
+        between[:, :n, :n] - forces @ between[:, n:, :n],
+        to_points[:, :n] - forces @ to_points[:, n:],
+    )
 
 
 def _apply(basis: FloatArray, coordinates: ComplexArray) -> ComplexArray:

@@ -2,15 +2,12 @@
 
 import hashlib
 import time
-import zipfile
-from contextlib import suppress
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.errors import InputError
 from model.files.kept_arrays import keep_arrays, kept_arrays
 from model.studies.cases import Cases
 from model.studies.solve import CaseResults, empty_results
@@ -19,9 +16,6 @@ SAVE_INTERVAL = 5.0  # s; a kill loses no more, and large studies are not held u
 
 _DIGEST_SIZE = 16
 _TYPES = {"cases": "|u1", "expected_db": "<f8", "statistics": "<f8", "active": "<u8"}
-_EARLIER = {"cases", "statistics", "active", "sha256"}
-
-
 _Row: TypeAlias = tuple[float, NDArray[np.float64], NDArray[np.uint64]]
 
 
@@ -33,11 +27,7 @@ class FinishedCases:
     """
 
     def __init__(self, folder: Path, problem_digest: str) -> None:
-        """problem_digest: of `StudyProblem.digest`; the file's name has its beginning.
-
-        Raises InputError for a folder with a file of a version that knew no contrast.
-        """
-        _refuse_earlier(folder)
+        """problem_digest: of `StudyProblem.digest`; the file's name has its beginning."""
         self.path = folder / f"finished-{problem_digest[:16]}.npz"
         self._problem_digest = problem_digest
         self._rows: dict[bytes, _Row] = {}
@@ -88,17 +78,6 @@ class FinishedCases:
         }
         keep_arrays(self.path, self._problem_digest, arrays)
         self._saved_at = time.monotonic()
-
-
-def _refuse_earlier(folder: Path) -> None:
-    for path in sorted(folder.glob("finished-*.npz")):
-        with suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
-            names = {name.removesuffix(".npy") for name in archive.namelist()}
-            if names == _EARLIER:
-                raise InputError(
-                    f"{path}: finished layouts must have an expected contrast, got a file of an "
-                    "earlier version; delete it or choose another folder"
-                )
 
 
 def _digest(cases: Cases, case: int) -> bytes:

@@ -134,34 +134,6 @@ def test_build_resumes_when_it_was_ended(
     assert [left.name for left in tmp_path.iterdir()] == ["t.npz"]
 
 
-def test_build_interrupted_at_once_names_no_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """There is none to resume from."""
-
-    def interrupted(*arguments: object, **options: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("model.table.build.build_in_parts", interrupted)
-    result = CliRunner().invoke(app, ["table", "build", RIG, "-o", str(tmp_path / "t.npz"), *QUICK])
-    assert "interrupted" in result.stderr
-    assert ".parts" not in result.stderr
-
-
-def test_build_says_what_answers_of_a_rig_of_voltage_leave_out(tmp_path: Path) -> None:
-    """Tables know no voltages."""
-    text = Path(RIG).read_text("utf-8")
-    linear = re.sub(
-        r"channel: \d",
-        lambda found: f"{found[0]}, voltage: {{response: [[10, 2, 0], [1000, 2, 0]]}}",
-        text,
-    )
-    path = tmp_path / "rig.yaml"
-    path.write_text(linear, encoding="utf-8")
-    assert "second harmonic" in table("build", path, "-o", tmp_path / "t.npz", *QUICK).stdout
-    assert "voltage" not in table("build", RIG, "-o", tmp_path / "u.npz", *QUICK).stdout
-
-
 def test_show_prints_summary_map_and_a_query_that_has_an_answer(
     built: Path, tmp_path: Path
 ) -> None:

@@ -81,27 +81,6 @@ def test_regions_off_the_plate_are_refused(tmp_path, shape) -> None:
         load_contacts_file(path, PLATE)
 
 
-@pytest.mark.parametrize(
-    ("text", "said"), [("", "regions or sets"), ("sets: []", r"1: sets.*at least 1")]
-)
-def test_empty_contacts_name_what_is_expected(tmp_path, text, said) -> None:
-    """The keys of an empty file, the least number of an empty list."""
-    path = tmp_path / "contacts.yaml"
-    path.write_text(text)
-    with pytest.raises(InputError, match=said) as refused:
-        load_contacts_file(path, PLATE)
-    assert "config init" not in str(refused.value)
-
-
-def test_empty_area_names_what_is_expected(tmp_path) -> None:
-    """An empty file is refused, with the keys that it must have."""
-    path = tmp_path / "where.yaml"
-    path.write_text("")
-    with pytest.raises(InputError, match="polygons") as refused:
-        area_of(str(path), PLATE)
-    assert "config init" not in str(refused.value)
-
-
 def test_contacts_in_regions_of_a_layout(tmp_path) -> None:
     """Fingers are in the regions, so many of them, so far apart; effects are passed over."""
     path = tmp_path / "layout.yaml"
@@ -123,6 +102,8 @@ def test_contacts_in_regions_of_a_layout(tmp_path) -> None:
 @pytest.mark.parametrize(
     "text",
     [
+        "",
+        "sets: []",
         "regions: {}",
         "quiet: [3, 1]\nregions: {a: {circle: {at: [0.1, 0.1], radius: 0.02}}}",
         "regions: {a: {on_press: click}}",
@@ -139,9 +120,12 @@ def test_files_of_contacts_that_say_nothing_are_refused(tmp_path, text) -> None:
         load_contacts_file(path, PLATE)
 
 
-@pytest.mark.parametrize("name", ["nowhere.png", "broken.png", "nowhere.yaml", "inside"])
+@pytest.mark.parametrize(
+    "name", ["nowhere.png", "broken.png", "nowhere.yaml", "empty.yaml", "inside"]
+)
 def test_area_that_cannot_be_read_is_refused(tmp_path, name) -> None:
     """A missing file, a picture that is none, a word that is neither."""
     (tmp_path / "broken.png").write_bytes(b"not a picture")
+    (tmp_path / "empty.yaml").touch()
     with pytest.raises(InputError):
         area_of(str(tmp_path / name), PLATE)

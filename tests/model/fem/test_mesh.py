@@ -30,17 +30,6 @@ def test_interpolation_is_exact_for_polynomials_of_the_element(mesh):
     )
 
 
-@pytest.mark.parametrize("mesh", MESHES, ids=str)
-def test_connectivity_lists_nodes_row_by_row(mesh):
-    """The first and last node of an element are its lower left and upper right corner."""
-    x, y = mesh.lines
-    lower_left = mesh.nodes[mesh.connectivity[:, 0]]
-    upper_right = mesh.nodes[mesh.connectivity[:, -1]]
-    expected = [(a, b) for b in y[:-1] for a in x[:-1]]
-    np.testing.assert_allclose(lower_left, expected, atol=1e-15)
-    np.testing.assert_allclose(upper_right, [(a, b) for b in y[1:] for a in x[1:]], atol=1e-15)
-
-
 def test_mesh_strips_lie_along_every_edge():
     """Strips of 3 mm are the first and last elements; those between share the rest evenly."""
     mesh = Mesh(4, 3, 0.3, 0.2, ELEMENTS["Q5"], 0.003)

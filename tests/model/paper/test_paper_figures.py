@@ -145,10 +145,3 @@ def test_paper_figures_refuses_an_unknown_number(number):
     """Figures 1 to 5, 8 and 9 are sketches; others are not there."""
     with pytest.raises(InputError, match=r"^figure .* 6, 7, 10"):
         list(paper_figures(make_paper_rig(12, 9), number))
-
-
-def test_figure_12_refuses_a_rig_of_one_era():
-    """Figure 12 drives a diagonal pair; a rig of one ERA has none."""
-    rig = make_paper_rig(12, 9)
-    with pytest.raises(InputError, match="at least two"):
-        list(paper_figures(replace(rig, eras=rig.eras[:1]), "12"))

@@ -94,18 +94,6 @@ def test_plate_in_time_has_them(rig: Rig) -> None:
         assert error < 0.01
 
 
-def test_fingerprint_tells_plates_with_other_modes_apart(rig: Rig) -> None:
-    """A table of a plate as its theory has it is not one of the plate that was identified."""
-    prints = {
-        replace(
-            rig, plate=replace(rig.plate, loss_exponent=exponent, mode_deviations=modes)
-        ).fingerprint
-        for exponent in (0.0, 0.4)
-        for modes in ((), DEVIATIONS)
-    }
-    assert len(prints) == 4
-
-
 @pytest.mark.parametrize(
     "values",
     [{"loss_exponent": 3.0}, {"loss_exponent": float("nan")}, {"mode_deviations": ((0.9, 0.0),)}],

@@ -15,8 +15,6 @@ from model.reduction.reduced_plate import reduce_plate
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.structure.point_load import footprints_of
-from model.table.build import build_table
-from model.table.file import load_table, save_table
 from model.transients.base_motion import BaseMotions, Term
 from model.transients.time_response import plate_in_time
 
@@ -56,16 +54,6 @@ def test_acceleration_is_scaled_by_the_gain_of_its_era(coarse_rig: Rig, uneven: 
     )
 
 
-def test_particular_solution_is_scaled_by_the_gain_of_its_era(coarse_rig: Rig, uneven: Rig) -> None:
-    """A steady tone's particular solution is the ungained one times the gain at its frequency."""
-    reduced = reduce_plate(coarse_rig.plate, coarse_rig.mesh, footprints_of(coarse_rig.eras))
-    s = np.array([2j * math.pi * 125.0])
-    plain, _ = plate_in_time(reduced, coarse_rig.eras).particular([1], s, [1e-4], [0j])
-    gained, _ = plate_in_time(reduced, uneven.eras).particular([1], s, [1e-4], [0j])
-    gain = uneven.eras[1].gain(np.array(125.0))
-    np.testing.assert_allclose(gained, gain * plain, rtol=1e-9, atol=1e-12 * abs(plain).max())
-
-
 def test_particular_solution_is_the_same_for_negative_frequency(
     coarse_rig: Rig, uneven: Rig
 ) -> None:
@@ -77,18 +65,6 @@ def test_particular_solution_is_the_same_for_negative_frequency(
         plate.driven(BaseMotions([(), (tone,)]), [0], [0.0]).state(0, 0.0123) for tone in tones
     )
     np.testing.assert_allclose(back, expected, atol=1e-9 * np.abs(expected).max())
-
-
-def test_table_file_keeps_gains_and_fingerprint(
-    coarse_rig: Rig, uneven: Rig, tmp_path: Path
-) -> None:
-    """Gains change the fingerprint, and come back from a table's file."""
-    assert uneven.fingerprint != coarse_rig.fingerprint
-    table = build_table(uneven, frequencies=np.array([100.0, 110.0]))
-    save_table(table, tmp_path / "table.npz")
-    back = load_table(tmp_path / "table.npz")
-    assert back.eras[1].gains == GAINS
-    assert back.fingerprint == uneven.fingerprint
 
 
 def test_load_rig_reads_gains_and_refuses_invalid_rows(tmp_path: Path) -> None:

@@ -10,20 +10,9 @@ from model.rig.layouts import (
     candidate_places,
     diagonal_pair,
     edge_pair,
-    named_layouts,
 )
 from model.structure.actuator import Era
 from paper_plate import LENGTH, WIDTH, make_paper_rig
-
-
-def test_four_era_layouts_are_distinct_and_on_the_plate():
-    """No two layouts are alike, no two ERAs of one share a place, and all are on the plate."""
-    assert len(FOUR_ERA_LAYOUTS) >= 5
-    assert len({layout.name for layout in FOUR_ERA_LAYOUTS}) == len(FOUR_ERA_LAYOUTS)
-    assert len({frozenset(layout.places) for layout in FOUR_ERA_LAYOUTS}) == len(FOUR_ERA_LAYOUTS)
-    for layout in FOUR_ERA_LAYOUTS:
-        assert len(set(layout.places)) == 4
-        assert all(0 <= share <= 1 for place in layout.places for share in place)
 
 
 def test_corners_layout_is_that_of_the_paper():
@@ -32,17 +21,6 @@ def test_corners_layout_is_that_of_the_paper():
     corners = next(layout for layout in FOUR_ERA_LAYOUTS if layout.name == "corners")
     expected = [(era.x, era.y) for era in rig.eras]
     np.testing.assert_allclose(corners.positions(rig.plate), expected)
-
-
-@pytest.mark.parametrize("count", range(1, 7))
-def test_candidate_places_of_13_by_13_include_named_layouts(count):
-    """Every twelfth of a side: each named place is one of the candidates."""
-    candidates = candidate_places(13, 13)
-    assert len(candidates) == 169
-    for layout in named_layouts(count):
-        for place in layout.places:
-            assert np.abs(candidates - place).max(axis=1).min() < 1e-12
-        assert len(layout.places) == count
 
 
 @pytest.mark.parametrize("nx", [0, 1, 101])

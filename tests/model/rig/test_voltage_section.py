@@ -84,12 +84,6 @@ def test_invalid_sections_are_refused(sw: str, key: str) -> None:
     assert list(problems(text(sw))) == [key]
 
 
-def test_all_eras_of_an_amplifier_have_the_section_or_none() -> None:
-    """One without it is named."""
-    missing = text().replace(f", voltage: {PLAIN}}}", "}", 1)
-    assert list(problems(missing)) == ["eras.SW.voltage"]
-
-
 def test_slew_needs_a_bias() -> None:
     """The square of a ramp is steeper than the ramp."""
     limited = text(f"{{{ROWS}, law: quadratic}}").replace("[60, 260]", "[60, 260], slew: 10")

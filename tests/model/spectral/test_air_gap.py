@@ -9,17 +9,14 @@ from benchmarks.layers.gap import air_pressure, cell_middles
 from long_form import in_turn
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
-from model.reduction.reduced_plate import reduce_free_plate
-from model.reduction.supported_modes import supported_modes
 from model.rig.file import parse_rig
 from model.spectral.air_motion import air_motion
 from model.spectral.layered_class import LayeredPlate
 from model.spectral.mesh import SpectralMesh
 from model.structure.actuator import Era
-from model.structure.air_gap import DENSITY, HEAT_RATIO, PRESSURE, VISCOSITY, AirGap
+from model.structure.air_gap import HEAT_RATIO, PRESSURE, VISCOSITY, AirGap
 from model.structure.material import Material
 from model.structure.plate import Plate
-from model.structure.point_load import footprints_of
 from model.vibration.direct import direct_responder
 from model.vibration.natural_modes import natural_modes
 
@@ -81,56 +78,12 @@ def test_a_slow_square_squeezes_as_reynolds_equation_says():
     assert damping == pytest.approx(0.4217 * VISCOSITY * side**4 / depth**3, rel=0.01)
 
 
-def test_a_wave_carries_the_air_that_flows_under_it():
-    """rho / (k² d) of a wave k: 1.75 kg/m² under a panel of 47.5 N m and 6.3 kg/m² at 150 Hz.
-
-    A wide strip of many wavelengths without viscosity; the frequency falls by 11 %.
-    """
-    gap = AirGap(2e-3)
-    k = (6.3 * (2 * np.pi * 150) ** 2 / 47.5) ** 0.25
-    mass = DENSITY / (k**2 * gap.depth)
-    assert mass == pytest.approx(1.75, abs=0.02)
-    assert 1 - np.sqrt(6.3 / (6.3 + mass)) == pytest.approx(0.11, abs=0.01)
-    length, waves = 4.0, 24
-    plate = Plate(length, 1.0, 2.5e-3, GLASS, air_gap=gap)
-    of = LayeredPlate(plate, (90, 0), 150.0).functions((-1, 1))
-    air, m = air_motion(of, gap), of.deflections
-    k = np.pi * (2 * waves) / length
-    shape = np.sin(k * (of.x.points - length / 2))[:, None]
-    q = of.x.polynomial_products(shape, -1)[:, 0]
-    omega2 = (2 * np.pi * 150) ** 2
-    full = 1e9 * air.stiffness - omega2 * DENSITY * np.diag(air.inertia)
-    force = full[:m, :m] - full[:m, m:] @ np.linalg.solve(full[m:, m:], full[m:, :m])
-    found = -(q @ force @ q) / (omega2 * (q @ q))
-    # sin(k x) has p = 0 at its own nodes, so that open ends fit.
-    assert found == pytest.approx(DENSITY / (k**2 * gap.depth), rel=0.01)
-
-
 def test_a_sealed_gap_is_a_spring_of_gas():
     """gamma p0 / d of fast and p0 / d of slow even motion; an open gap has no stiffness."""
     for depth, frequency, modulus in ((20e-3, 400.0, HEAT_RATIO * PRESSURE), (5e-5, 1.0, PRESSURE)):
         of, force = force_of(AirGap(depth, closed=True), frequency, (1, 1))
         assert of.of_w[0] > 1
         assert force[0, 0].real == pytest.approx(modulus / depth, rel=0.02)
-
-
-def test_air_lowers_frequencies_and_its_friction_damps():
-    """Every mode of a plate over an open gap is lower and lossier, and less over a deeper one."""
-    eras = [
-        Era(name, x, y, stiffness=17e3, damping=0.0, bolt_mass=0.0, stroke=1e-4)
-        for name, x, y in (("a", 0, 0), ("b", 0.375, 0), ("c", 0, 0.225), ("d", 0.375, 0.225))
-    ]
-    mesh = SpectralMesh(10, 8, PLATE.length, PLATE.width)
-    found = []
-    for gap in (None, AirGap(5e-3), AirGap(2e-3)):
-        free = solve_free_plate(replace(PLATE, air_gap=gap), mesh, frequency_max=500.0)
-        reduced = reduce_free_plate(free, footprints_of(eras, ()))
-        found.append(supported_modes(reduced, eras, frequency_max=400.0))
-    none, deep, narrow = ((each.natural_frequencies[:6], each.damping_ratios[:6]) for each in found)
-    assert (none[0] > deep[0]).all()
-    assert (deep[0] > narrow[0]).all()
-    assert (none[1] < deep[1]).all()
-    assert (deep[1] < narrow[1]).all()
 
 
 def test_a_free_plate_over_a_sealed_gap_moves_up_and_down_on_its_air():

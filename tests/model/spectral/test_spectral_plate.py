@@ -15,7 +15,7 @@ from model.fem.symmetry import CLASSES
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.reduction.spectral_modes import spectral_modes
-from model.rig.meshes import mesh_from_dict, mesh_of
+from model.rig.meshes import mesh_of
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
@@ -248,9 +248,3 @@ def test_degrees_and_accuracies_out_of_range_are_refused(text):
     """Degrees below 4 and above 200, accuracies below 0.05 % and above 10 %, other spellings."""
     with pytest.raises(InputError):
         mesh_of(text, PAPER, frequency_max=500.0)
-
-
-def test_spectral_mesh_survives_a_file():
-    """As a table's header keeps it."""
-    mesh = mesh_of("12x9 Legendre", PAPER, frequency_max=500.0)
-    assert mesh_from_dict(mesh.to_dict()) == mesh

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
-from model.fem.mesh import Mesh
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.structure.actuator import Era
@@ -90,20 +89,6 @@ def _steady_amplitude(plant, shapes, era: Era, frequency: float) -> float:
     plant.skip(3.0)
     _, values = plant.advance(3.1, sample_rate=20_000.0, shapes=shapes)
     return float(np.sqrt(2 * np.mean(values**2)))
-
-
-def test_the_foot_moves_the_response_far_more_than_the_mesh():
-    """A foot of 5 mm at a corner instead of a point: 10 to 30 %, as another solver finds (19 %)."""
-    rig = make_paper_rig(24, 18)
-    mesh = Mesh.accurate(rig.plate, frequency_max=320.0)
-    free = solve_free_plate(rig.plate, mesh, frequency_max=320.0)
-    frequencies = np.linspace(60.0, 320.0, 27)
-    points = np.random.default_rng(2).uniform(0.05, 0.95, (20, 2)) * [0.3048, 0.2286]
-    point, foot = (
-        free.acceleration([replace(era, foot=each) for era in rig.eras], frequencies, points)
-        for each in (0.0, 0.005)
-    )
-    assert 0.1 < np.linalg.norm(foot - point) / np.linalg.norm(point) < 0.3
 
 
 @pytest.mark.parametrize("foot", [-1e-3, math.nan])

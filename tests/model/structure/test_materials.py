@@ -9,7 +9,7 @@ from model.errors import InputError
 from model.structure.actuator import Era
 from model.structure.laminate import Layer
 from model.structure.material import Material
-from model.structure.materials import KNOWN_MATERIALS, material
+from model.structure.materials import material
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 from paper_plate import make_paper_rig
@@ -33,12 +33,6 @@ def test_material_has_the_printed_numbers(name):
     """E, rho and nu are those of the source, in SI units."""
     known = material(name)
     assert (known.E, known.rho, known.nu) == PRINTED[name]
-
-
-def test_known_materials_have_sources():
-    """All of them are checked above, and each has its source and variation."""
-    assert KNOWN_MATERIALS.keys() == PRINTED.keys()
-    assert all(known.source and known.variation for known in KNOWN_MATERIALS.values())
 
 
 @pytest.mark.parametrize("written", ["Soda-lime glass", "soda_lime_glass", " SODA-LIME-GLASS "])

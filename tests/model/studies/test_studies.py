@@ -12,7 +12,6 @@ from model.design.contacts import anywhere
 from model.errors import InputError
 from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
-from model.files.kept_arrays import keep_arrays
 from model.structure.actuator import Era
 from model.structure.point_load import PointLoad
 from model.studies import solve
@@ -20,7 +19,7 @@ from model.studies.finished import FinishedCases
 from model.studies.kinds import count_cases, placement_cases
 from model.studies.run import CHUNK, run_study
 from model.studies.solve import DRIVES, CaseResults, solve_cases, study_problem
-from model.studies.workers import on_processes, useful_processes
+from model.studies.workers import on_processes
 from model.vibration.activation import MEDIAN, cumulative_statistics
 from paper_plate import make_paper_rig
 from studies import FREQUENCIES, chunks_of, same_to_the_bit, small_study
@@ -94,15 +93,6 @@ def test_acceleration_of_unequal_eras_equals_the_direct_solve():
     np.testing.assert_allclose(fast, direct, rtol=1e-4, atol=1e-4 * np.abs(direct).max())
 
 
-def test_a_small_study_starts_no_processes(study):
-    """A few hundred layouts are solved sooner than a process has started; many share the work."""
-    problem, cases = study
-    assert useful_processes(problem, cases, 8) == 1
-    many = cases.take(np.zeros(4_000_000, dtype=int))
-    assert 1 < useful_processes(problem, many, 8) <= 8
-    assert useful_processes(problem, many, 2) == 2
-
-
 def test_statistics_include_point_masses(study):
     """A point mass of the rig is there in every layout, as in the direct solve."""
     problem, cases = study
@@ -133,25 +123,6 @@ def test_pairs_are_skipped_for_one_era_and_all_for_two():
     np.testing.assert_array_equal(by_drive["all"][0], by_drive["1"][0])
     np.testing.assert_array_equal(by_drive["all"][1], by_drive["2"][1])
     assert np.isfinite(results.statistics[1:, DRIVES.index("2")]).all()
-
-
-def test_run_study_orders_chunks_and_counts_progress(study, results, tmp_path):
-    """Results are in order however chunks complete; each case counts once as progress."""
-    problem, cases = study
-
-    def backwards(problem, chunks):
-        yield from reversed(list(on_processes(1)(problem, chunks)))
-
-    progress = []
-    run = run_study(
-        problem,
-        cases,
-        workers=backwards,
-        finished=FinishedCases(tmp_path, problem.digest),
-        progress=progress.append,
-    )
-    assert same_to_the_bit({0: run.results}, {0: results})
-    assert (sum(progress), run.solved_count, run.cached_count) == (len(cases), len(cases), 0)
 
 
 def test_run_study_resumes_after_an_interrupt(study, results, tmp_path):
@@ -227,17 +198,6 @@ def test_finished_cases_of_another_problem_are_not_used(
     ours = FinishedCases(tmp_path, problem.digest).path
     ours.rename(FinishedCases(tmp_path, other).path)
     assert not FinishedCases(tmp_path, other).find(cases)[0].any()
-
-
-def test_finished_cases_of_a_version_without_contrast_are_refused(tmp_path):
-    """A folder with statistics only is named once, whatever the problem; damage is passed over."""
-    rows = {"cases": np.zeros((1, 16), dtype=np.uint8), "statistics": np.ones((1, 3, 6))}
-    path = tmp_path / "finished-0123456789abcdef.npz"
-    keep_arrays(path, "a", rows | {"active": np.zeros((1, 3), dtype=np.uint64)})
-    with pytest.raises(InputError, match=path.name):
-        FinishedCases(tmp_path, "b" * 64)
-    path.write_bytes(b"PK")
-    FinishedCases(tmp_path, "b" * 64)
 
 
 def test_finished_cases_are_found_by_layout_and_stiffness(study, results, tmp_path):

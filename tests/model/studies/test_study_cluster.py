@@ -75,33 +75,6 @@ def test_cluster_judges_finalists_as_one_process_does(address, monkeypatch):
     }
 
 
-@pytest.mark.long
-def test_cluster_replaces_killed_workers(address):
-    """Both workers killed when the first chunk is there: the rest comes all the same, bit by bit.
-
-    With them goes the solved plate, which the scheduler has solved once more.
-    """
-    problem, cases = small_study(layouts=60)
-    chunks = chunks_of(cases, 2)
-    before = worker_pids(address)
-    solving = on_cluster(Cluster(address))(problem, chunks)
-    there = dict([next(solving)])
-    for pid in before:
-        os.kill(pid, signal.SIGKILL)
-    there |= dict(solving)
-    assert same_to_the_bit(there, dict(on_processes(1)(problem, chunks)))
-    assert not set(before) & set(worker_pids(address))
-
-
-@pytest.mark.long
-def test_cluster_refuses_workers_with_other_code(address, monkeypatch):
-    """A study made by other code than the workers have is not mixed with theirs."""
-    problem, cases = small_study(layouts=4)
-    monkeypatch.setattr(cluster, "code_version", lambda: OTHER)
-    with pytest.raises(InputError, match="same era-haptics"):
-        dict(on_cluster(Cluster(address))(problem, chunks_of(cases, 4)))
-
-
 def test_cluster_without_workers_is_refused():
     """Waiting for ever for a worker to come is no answer."""
     from distributed import LocalCluster

@@ -9,7 +9,6 @@ from dense_contrast import GAINS, dense_score
 from model.design.contacts import anywhere
 from model.design.judge import Judged
 from model.design.support import SupportRule
-from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.studies import finalists
 from model.studies.cases import OWN, VACANT, Cases
@@ -18,7 +17,7 @@ from model.studies.kinds import count_cases, placement_cases, stiffness_cases
 from model.studies.outcome import all_columns, ranking_summary
 from model.studies.ranking import Scored, rank, score_order
 from model.studies.solve import DRIVES, CaseResults, StudyProblem, empty_results, solve_cases
-from model.studies.supported import check_supported_cases, support_of
+from model.studies.supported import support_of
 from model.vibration.activation import MEDIAN
 from paper_plate import make_paper_rig
 
@@ -102,6 +101,7 @@ def test_study_ranks_layouts_as_dense_systems_do(rig) -> None:
     assert scored.support.problem(0) == "tips over"
 
 
+@pytest.mark.long
 def test_study_orders_layouts_as_an_independent_optimiser_does(rig, monkeypatch) -> None:
     """Eight ERAs evenly around beat eight at corners and mid-edges, those the paper's corners.
 
@@ -136,14 +136,6 @@ def test_support_of_cases_is_that_of_a_design(rig, stiffness, lowest) -> None:
     assert found.is_supported.tolist() == [each == 0 for each in shortfalls]
     problems = {found.problem(case) for case in range(len(cases))}
     assert {None, "tips over"} <= problems
-
-
-def test_check_supported_cases_refuses_a_study_without_any(rig) -> None:
-    """One and two ERAs tip over; with a case of four the study has something to recommend."""
-    cases = cases_of(rig, {"one": CORNERS[:1], "two": ONE_SIDE, "four": CORNERS})
-    check_supported_cases(support_of(rig, cases, lowest=20.0))
-    with pytest.raises(InputError):
-        check_supported_cases(support_of(rig, cases.take(range(2)), lowest=20.0))
 
 
 def test_finalists_are_the_first_and_those_that_pictures_show() -> None:

@@ -88,21 +88,6 @@ def test_responses_of_each_era_make_those_of_a_drive(frequency: float) -> None:
     assert found.quiet_db_sl == pytest.approx(fine.quiet_db_sl, abs=1.0)
 
 
-def test_fingers_lag_otherwise_than_the_plate_alone() -> None:
-    """By more than half a decibel at some frequency."""
-    table, question = small_table(), Question((TARGET,), (QUIET,))
-    lags = []
-    for fingertip in (table.fingertip, None):
-        levels = EffectLevels(replace(table, fingertip=fingertip))
-        lags.append(
-            [
-                levels.gains_db(excitation(f), question, ramp=0.01, duration=0.04).targets[0]
-                for f in table.frequencies.tolist()
-            ]
-        )
-    assert np.abs(np.subtract(*lags)).max() > 0.5
-
-
 def test_shaped_gain_is_that_of_a_raised_cosine() -> None:
     """By quadrature: the mean square of ((1 - cos) / 2)^2 over 40 ms, then 1 up to the end."""
     times = (np.arange(100_000) + 0.5) / 100_000 * 0.2

@@ -13,7 +13,6 @@ from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold
 from model.rig.uncertainty import Uncertainty
 from model.structure.fingertip import FingertipLoad
-from model.structure.point_load import PointLoad
 from model.table.build import build_table
 from model.table.exact_plates import Plates, draw_plates, felt_on
 from model.table.question import Question
@@ -110,23 +109,6 @@ def test_answers_for_fingers_that_press_differently_agree_with_the_direct_solve(
     assert np.abs(np.subtract(alike, solved)).max() > 0.4
 
 
-def test_felt_on_includes_measured_gains_bolts_and_masses():
-    """Contrast on each plate is that of the direct solve."""
-    rig = smooth_rig()
-    measured = ((1.0, 0.0), (0.6, 0.8), (1.3, -0.5), (0.8, 0.2))
-    eras = tuple(
-        replace(era, gains=((100.0, *gain),), bolt_mass=0.012)
-        for era, gain in zip(rig.eras, measured, strict=True)
-    )
-    rig = replace(rig, eras=eras, masses=(PointLoad(0.2, 0.05, mass=0.03),))
-    table = build_table(rig, frequencies=np.array([110.0, 250.0]))
-    question = Question((TARGET,), QUIET, drive_mode="phased")
-    pattern = table.query(question)
-    found = 20 * np.log10(felt_on(table, question, pattern.excitation, PLATES).contrast.felt[0])
-    solved = [directly(rig, pattern, number)[0] for number in range(3)]
-    np.testing.assert_allclose(found, solved, atol=0.15)
-
-
 def test_discretisation_error_enters_the_contrast_of_plates():
     """An error that drowns one finger's response trades places with it; twice the error is 6 dB.
 
@@ -203,27 +185,6 @@ def test_promises_are_kept_on_nine_of_ten_plates(mode):
     assert 0.85 <= np.mean(level_kept) <= 0.95
     assert 0.85 <= np.mean(contrast_kept) <= 0.95
     assert np.mean(typical) == pytest.approx(0.0, abs=0.4)
-
-
-def test_more_uncertainty_promises_less():
-    """With nothing unknown the promise is the nominal figure; expected_stds twice as large cost."""
-    rig, places = smooth_rig(), contact_sets(6, fingers=3, seed=5)
-    promises = []
-    for scale in (0.0, 0.5, 1.0, 1.5):
-        known = Uncertainty(
-            0.05 * scale, 5 * scale, 0.02 * scale, 0.1 * scale, 1.5**scale, 0.5 * scale
-        )
-        table = build_table(replace(rig, uncertainty=known), frequencies=FREQUENCIES)
-        patterns = [
-            table.query(Question((target,), tuple(quiet), drive_mode="phased"))
-            for target, *quiet in places
-        ]
-        promises.append([pattern.robust_felt_contrast_db for pattern in patterns])
-        if scale == 0.0:
-            nominal = [pattern.felt_contrast_db for pattern in patterns]
-            np.testing.assert_allclose(promises[0], nominal, atol=1.5)
-    assert (np.diff(promises, axis=0) < 0.5).all()
-    assert (np.diff(np.mean(promises, axis=1)) < -0.5).all()
 
 
 def test_percentile_is_that_of_numpy():

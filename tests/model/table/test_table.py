@@ -1,7 +1,5 @@
 """Patterns of a localization table against the direct solve of every tone."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -13,7 +11,6 @@ from model.finger.perception import detection_threshold
 from model.structure.fingertip import FingertipLoad
 from model.table.question import Question
 from model.vibration.peak import tone_amplitudes
-from paper_plate import make_paper_rig
 from paper_table import contact_sets, smooth_rig, smooth_table
 
 TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18),)
@@ -76,14 +73,3 @@ def test_query_scales_the_drive_with_the_level():
     assert less.excitation.keys() == loud.excitation.keys()
     for name, tone in less.excitation.items():
         assert tone.amplitude == pytest.approx(loud.excitation[name].amplitude * 10 ** (-1 / 20))
-
-
-def test_fingerprint_is_of_the_physics():
-    """Rewiring, a material's name and whole numbers keep it, another stiffness does not."""
-    rig = make_paper_rig(12, 9)
-    material = replace(rig.plate.material, name="other")
-    same = replace(rig, wiring={}, amplifiers={}, plate=replace(rig.plate, material=material))
-    whole = replace(rig, eras=(replace(rig.eras[0], stiffness=17000, x=0), *rig.eras[1:]))
-    assert same.fingerprint == whole.fingerprint == rig.fingerprint
-    softer = replace(rig, eras=(replace(rig.eras[0], stiffness=16000.0), *rig.eras[1:]))
-    assert softer.fingerprint != rig.fingerprint

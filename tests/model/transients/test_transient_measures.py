@@ -154,16 +154,3 @@ def test_residual_db_equals_sampled_plate(plate):
     expected = 10 * math.log10(left / steady)
     found = transients.residual_db({"SE": tone}, ramped_ending({"SE": tone}, rig.eras, ramp=ramp))
     assert found == pytest.approx(expected, abs=0.1)
-
-
-def test_residual_db_adds_powers_of_two_frequencies(plate):
-    """What is left of two tones lies between what is left of each, weighted by their powers."""
-    rig, in_time = plate
-    transients = Transients(in_time)
-    low, high = {"SW": Tone(90.0, 1e-4)}, {"NE": Tone(300.0, 1e-4)}
-    alone = [
-        transients.residual_db(each, ramped_ending(each, rig.eras, ramp=0.02))
-        for each in (low, high)
-    ]
-    both = transients.residual_db(low | high, ramped_ending(low | high, rig.eras, ramp=0.02))
-    assert min(alone) < both < max(alone)

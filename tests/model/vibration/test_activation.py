@@ -26,14 +26,6 @@ def free_plate():
     return solve_free_plate(plate, Mesh.accurate(plate, frequency_max=500.0), frequency_max=320.0)
 
 
-def test_cumulative_statistics_add_eras_as_complex_numbers():
-    """Two ERAs in opposition leave a null, which magnitudes added would fill."""
-    acceleration = np.array([[[1.0 + 2j, 3.0], [-1.0 - 2j, 3.0]], [[2.0, 1j], [0.0, 0.0]]])
-    first, _, both = cumulative_statistics(acceleration)[:, [0, 4]]  # least and most of two points
-    np.testing.assert_allclose(both, [0 + 2, 6 + 1])
-    np.testing.assert_allclose(first, [3 + 1, 5**0.5 + 2])
-
-
 def test_cumulative_statistics_sum_over_frequencies():
     """Row by row against numpy's percentiles of Eq. 28 written out as loops."""
     rng = np.random.default_rng(1)

@@ -82,18 +82,6 @@ def test_mitc4_converges_to_the_same_field(whole):
     assert errors[-1].max() < 0.04
 
 
-@pytest.mark.long
-def test_response_converges_for_eras_within_the_plate():
-    """A force within an element bends it sharply; the automatic mesh is still within 1 %."""
-    rig = make_paper_rig(12, 9)
-    inside = zip(rig.eras, [(0.051, 0.017), (0.29, 0.08), (0.12, 0.1), (0.2, 0.15)], strict=True)
-    moved = replace(rig, eras=tuple(replace(era, x=x, y=y) for era, (x, y) in inside))
-    automatic = mesh_of("auto", rig.plate, frequency_max=500.0, stiffness=17e3)
-    error = study_convergence(moved, [automatic], frequencies=np.array([110.0, 250.0])).errors[0]
-    assert np.abs(error.frequency).max() < 1e-3
-    assert error.response.max() < 1e-2
-
-
 def test_places_and_feet_count_more_than_the_mesh(study):
     """On the paper's plate, from another solver: 0.1 mm changes 0.4 to 0.9 %, 5 mm of foot 19 %.
 

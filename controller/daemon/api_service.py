@@ -124,12 +124,12 @@ class ApiService:
 
     def holds_lease(self, client: Connection) -> bool:
         """Whether a client armed or renewed the current lease: it is never evicted."""
-        return client in self._holders and self._valid_lease.current(clock.now()) is not None
+        return client in self._holders and self._lease.current(clock.now()) is not None
 
     def status(self) -> StatusResult:
         """Return the status of daemon, plate and amplifiers."""
         machine, view, now = self._supervisor.machine, self._publisher.view, clock.now()
-        lease = self._valid_lease.current(now)
+        lease = self._lease.current(now)
         pattern = view.pattern_event() if machine.state is _ENABLED else None
         is_unwatched = any(map(is_known_unwatched, self._amplifiers.values()))
         return StatusResult(
@@ -172,7 +172,7 @@ class ApiService:
         )
 
     async def _arm(self, client: Connection, params: ArmParams) -> ArmResult:
-        is_over = self._valid_lease.current(clock.now()) is None
+        is_over = self._lease.current(clock.now()) is None
         if self._supervisor.machine.state is _ENABLED and is_over:
             await self._handle(_LEASE_OVER)  # before its timer: what plays is not inherited
         machine, now = self._supervisor.machine, clock.now()
@@ -181,16 +181,16 @@ class ApiService:
         if machine.state is DaemonState.SWITCHED_ON:
             raise RpcError(ErrorCode.LEASE, "another client is arming", remedy="wait, or disarm")
         duration = min(params.lease_s, self.longest_lease)
-        lease = self._valid_lease.grant(params.owner, duration=duration, now=now)
+        lease = self._lease.grant(params.owner, duration=duration, now=now)
         try:
             await self._handle(
                 DaemonEvent(Trigger.ARM, f"armed by {params.owner!a}", "era disarm, or era stop")
             )
         except BaseException:
-            self._end_lease(lease.token)
+            self._disarm_for(lease.token, "arming failed")
             raise
         if self._supervisor.machine.state is not _ENABLED:
-            self._end_lease(lease.token)
+            self._disarm_for(lease.token, "arming failed")
             raise _wrong_state(self._supervisor.machine)
         # Arming may have taken longer than the lease, so its time starts now.
         lease = self._lease.restart(lease.token, now=clock.now())
@@ -201,7 +201,7 @@ class ApiService:
         return ArmResult(lease=lease.token, lease_s=lease.duration)
 
     def _renew(self, client: Connection, params: RenewParams) -> RenewResult:
-        lease = self._valid_lease.renew(params.lease, now=clock.now())
+        lease = self._lease.renew(params.lease, now=clock.now())
         self._holders.add(client)
         self._schedule_lease_check()
         return RenewResult(lease_s=lease.duration)
@@ -209,7 +209,7 @@ class ApiService:
     async def _disarm(self, client: Connection, params: DisarmParams) -> Empty:
         machine = self._supervisor.machine
         if params.lease is not None:
-            self._valid_lease.check(params.lease, now=clock.now())
+            self._lease.check(params.lease, now=clock.now())
         if machine.state in ENERGISED:
             cause = f"disarmed by {params.client or client.name!a}"
             await self._handle(DaemonEvent(Trigger.DISARM, cause))
@@ -303,18 +303,11 @@ class ApiService:
         self._publisher.hub.unsubscribe(client, params.topics)
         return Empty()
 
-    @property
-    def _valid_lease(self) -> LeaseHolder:
-        """The lease, which ends with the armed state."""
-        if self._supervisor.machine.state not in ENERGISED:
-            self._lease.end()
-        return self._lease
-
-    def _end_lease(self, token: str) -> None:
-        """End a lease unless another has replaced it."""
-        held = self._lease.current(clock.now())
-        if held is not None and held.token == token:
-            self._lease.end()
+    def end_lease(self) -> None:
+        """End the lease: only the armed state has one."""
+        self._lease.end()
+        if self._expiry is not None:
+            self._expiry.cancel()
 
     def _schedule_lease_check(self) -> None:
         """Check the lease when it expires."""
@@ -328,18 +321,21 @@ class ApiService:
 
     def _check_holder(self, client: Connection, token: str) -> None:
         """Disarm if the client disconnected before it received its lease."""
-        held = self._valid_lease.current(clock.now())
-        if held is not None and held.token == token and client.has_left:
-            self._supervisor.post(
-                DaemonEvent(Trigger.LEASE_LOST, "the arming client disconnected", "arm again")
-            )
+        if client.has_left:
+            self._disarm_for(token, "the arming client disconnected")
+
+    def _disarm_for(self, token: str, cause: str) -> None:
+        """Disarm, which ends the lease, unless it has ended or another has replaced it."""
+        if not self._lease.is_granted(token):
+            return
+        if self._supervisor.machine.state in ENERGISED:
+            self._supervisor.post(DaemonEvent(Trigger.LEASE_LOST, cause, "arm again"))
+        else:  # never armed
+            self.end_lease()
 
     def _check_lease(self) -> None:
         # Checked again, should anything here fail.
         self._expiry = asyncio.get_running_loop().call_later(_LEASE_RECHECK, self._check_lease)
-        if self._valid_lease.expires_at is None:
-            self._expiry.cancel()
-            return
         if self._lease.current(clock.now()) is not None:
             self._schedule_lease_check()
             return

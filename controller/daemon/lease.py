@@ -26,6 +26,10 @@ class LeaseHolder:
         """The lease that has not expired, or None."""
         return self._lease if self._lease and now < self._lease.expires_at else None
 
+    def is_granted(self, token: str) -> bool:
+        """Whether a lease was granted and has not been ended, even if it has expired."""
+        return self._lease is not None and self._lease.token == token
+
     @property
     def expires_at(self) -> float | None:
         """When the lease expires unless renewed [s]; None without a lease."""
@@ -45,7 +49,7 @@ class LeaseHolder:
 
     def restart(self, token: str, *, now: float) -> Lease:
         """Restart the granted lease, even if it has expired; raises RpcError if it was ended."""
-        if self._lease is None or self._lease.token != token:
+        if self._lease is None or not self.is_granted(token):
             raise RpcError(ErrorCode.LEASE, "lease was ended meanwhile", remedy="arm again")
         self._lease = replace(self._lease, expires_at=now + self._lease.duration)
         return self._lease

@@ -75,9 +75,10 @@ class Supervisor:
     """Keeps the amplifiers of a controller connected, and armed only as the state machine allows.
 
     The controller must be created with `observe(observer)` of this supervisor and the same
-    amplifiers. state_changed are called at every transition; link_changed receives the kind of
-    change, the lost amplifiers ("lost" only) and a message; alive is called after each cycle of the
-    control loop and periodically while there is no link.
+    amplifiers. state_changed are called a moment after every transition, disarmed within each one
+    from a state in which amplifiers have or get high voltage to another; link_changed receives the
+    kind of change, the lost amplifiers ("lost" only) and a message; alive is called after each
+    cycle of the control loop and periodically while there is no link.
     """
 
     def __init__(
@@ -87,12 +88,14 @@ class Supervisor:
         state_changed: Sequence[StateObserver],
         link_changed: Callable[[LinkChange, Sequence[str], str], None],
         alive: Callable[[], None],
+        disarmed: Callable[[], None] = lambda: None,
     ) -> None:
         self.machine = StateMachine()
         self._amplifiers = amplifiers
         self._state_observers = (_log_transition, *state_changed)
         self._link_observer = link_changed
         self._alive_observer = alive
+        self._disarmed = disarmed
         self.started = asyncio.Event()  # the amplifiers are open, or searched for
         self._is_closing = False
         self._reports = DeferredCalls()
@@ -208,14 +211,16 @@ class Supervisor:
             self.machine, actions = step(before, event, clock.now())
         except Exception as error:
             self.machine, actions = failed(before, failure_text(error)), (Action.STOP,)
-        call_guarded(partial(self._report_transition, before))
+        self._report_transition(before)
         return actions
 
     def _report_transition(self, before: StateMachine) -> None:
-        """Notify the observers of a new state, deferred."""
+        """Notify of a disarmed plate at once, and the observers of a new state, deferred."""
+        if before.state in ENERGISED and self.machine.state not in ENERGISED:
+            call_guarded(self._disarmed)
         if self.machine.state is not before.state:
             for observer in self._state_observers:
-                self._reports.add(partial(observer, before, self.machine))
+                call_guarded(partial(self._reports.add, partial(observer, before, self.machine)))
 
     def _link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
         report = partial(self._link_observer, change, lost, message)
@@ -231,7 +236,7 @@ class Supervisor:
     async def _fail(self, error: Exception) -> None:
         """Stop all amplifiers after an unexpected exception, which is a fault."""
         before, self.machine = self.machine, failed(self.machine, failure_text(error))
-        call_guarded(partial(self._report_transition, before))
+        self._report_transition(before)
         await asyncio.shield(self._spawn(self._stop()))
         if self.machine.state is DaemonState.COMM_LOST and self._control_loop is not None:
             self._control_loop.cancel()  # so that amplifiers are reopened

@@ -1,13 +1,17 @@
 """The arming lease: duration, owner, token."""
 
+import asyncio
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.methods import ArmParams
 from controller.daemon.lease import LeaseHolder
-from daemon_bench import ready_daemon
+from controller.daemon.states import ENERGISED, DaemonEvent, Trigger
+from daemon_bench import error_code, ready_daemon, until_state
 
 
 async def test_client_that_arms_after_the_end_of_a_lease_inherits_nothing(
@@ -27,6 +31,47 @@ async def test_client_that_arms_after_the_end_of_a_lease_inherits_nothing(
             await other.arm("you", lease_s=60)
             assert (await other.status()).state == "OPERATION_ENABLED"
         assert "READY_TO_SWITCH_ON" in states
+
+
+@pytest.mark.parametrize("trigger", [Trigger.DISARM, Trigger.LEASE_LOST, Trigger.FAULT])
+async def test_lease_ends_within_the_transition_from_armed(
+    tmp_path: Path, trigger: Trigger
+) -> None:
+    """Not with the next look at it; its token is refused from that moment on."""
+    async with ready_daemon(tmp_path) as (bench, era):
+        leases, supervisor = bench.daemon._api._lease, bench.daemon._supervisor
+        lease = await era.arm("me", lease_s=60)
+        await era.status()
+        assert leases.is_granted(lease.lease)
+        supervisor.post(DaemonEvent(trigger, "a test"))
+        assert supervisor.machine.state not in ENERGISED
+        assert not leases.is_granted(lease.lease)
+        assert await error_code(era.renew(lease.lease)) is ErrorCode.LEASE
+
+
+async def test_arming_that_is_cancelled_leaves_nothing_armed_without_a_lease(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its lease ends with the transition to disarmed, before another client may arm."""
+    async with ready_daemon(tmp_path) as (bench, era):
+        api, controller, released = bench.daemon._api, bench.daemon._controller, asyncio.Event()
+        arm = controller.arm
+
+        async def slow() -> None:
+            await released.wait()
+            await arm()
+
+        monkeypatch.setattr(controller, "arm", slow)
+        client = SimpleNamespace(has_left=False)
+        arming = asyncio.create_task(api._arm(client, ArmParams(owner="me", lease_s=60)))  # type: ignore[arg-type]
+        await until_state(era, "SWITCHED_ON")
+        arming.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await arming
+        assert bench.daemon._supervisor.machine.state not in ENERGISED
+        assert api._lease.expires_at is None
+        released.set()
+        await until_state(era, "READY_TO_SWITCH_ON")
 
 
 def test_lease_lasts_its_duration_from_each_renewal() -> None:

@@ -56,11 +56,11 @@ class Transition:
         index = int(steps)
         return points[index] + (points[index + 1] - points[index]) * (steps - index)
 
-    def reached(self, time: float, spread: float) -> complex:
-        """Return the amplitude at a time, or the farthest from 0 within a spread [s] around it."""
-        if not spread or time - spread >= self.end:
+    def reached(self, time: float, uncertainty: float) -> complex:
+        """Return the amplitude at a time, or the largest within an uncertainty [s] around it."""
+        if not uncertainty or time - uncertainty >= self.end:
             return self.at(time)
-        since, until = max(time - spread, self.start), max(time + spread, self.start)
+        since, until = max(time - uncertainty, self.start), max(time + uncertainty, self.start)
         moments = (self.start + self.step * (index + 1) for index in range(len(self.knots)))
         between = [
             knot for moment, knot in zip(moments, self.knots, strict=True) if since < moment < until
@@ -111,21 +111,21 @@ class Voice:
         """Time of silence [s]; infinite for a tone that lasts."""
         return math.inf if self.transition.last else self.transition.end
 
-    def faded(self, time: float, ramp: float, spread: float = 0.0) -> "Voice":
+    def faded(self, time: float, ramp: float, uncertainty: float = 0.0) -> "Voice":
         """Return it falling silent along a ramp [s], or as it does if that is sooner.
 
-        spread [s]: see `Playback`.
+        uncertainty [s]: see `Playback`.
         """
         if self.silent_from <= time + ramp:
             return replace(self, has_ended=True)
-        transition = Transition(time, ramp, self.transition.reached(time, spread), 0j)
+        transition = Transition(time, ramp, self.transition.reached(time, uncertainty), 0j)
         return replace(self, transition=transition, has_ended=True)
 
-    def ended(self, time: float, ramp: float, spread: float = 0.0) -> "Voice":
+    def ended(self, time: float, ramp: float, uncertainty: float = 0.0) -> "Voice":
         """Return it falling silent along its ending, or along a ramp [s] without one."""
         if self.ending is None or self.has_ended:
-            return self.faded(time, ramp, spread)
-        transition = _along(self.ending, time, self.transition.reached(time, spread), 0j)
+            return self.faded(time, ramp, uncertainty)
+        transition = _along(self.ending, time, self.transition.reached(time, uncertainty), 0j)
         return replace(self, transition=transition, has_ended=True)
 
     def scaled(self, time: float, factor: float, ramp: float) -> "Voice":
@@ -159,14 +159,14 @@ class _Layer:
 class Playback:
     """Voices of all channels, and the layers that they belong to; silent at first.
 
-    voices: how many a channel has for tones that are not cut short. spread [s]: by which commits
-    may come sooner or later; fades begin at the largest amplitude within it, so that levels are
-    upper bounds.
+    voices: how many a channel has for tones that are not cut short. uncertainty [s]: by which
+    commits may come sooner or later; fades begin at the largest amplitude within it, so that levels
+    are upper bounds.
     """
 
     channels: int
     voices: int
-    spread: float = 0.0
+    uncertainty: float = 0.0
     _playing: list[tuple[Voice, ...]] = field(init=False)
     _layers: dict[int, _Layer] = field(default_factory=dict)
 
@@ -192,7 +192,7 @@ class Playback:
         self.advance(time)
         self._layers.clear()
         self._playing = [
-            tuple(voice.faded(time, ramp, self.spread) for voice in voices)
+            tuple(voice.faded(time, ramp, self.uncertainty) for voice in voices)
             for voices in self._playing
         ]
 
@@ -339,7 +339,7 @@ class Playback:
         ramp = _RAMP.from_wire(self._layers.pop(layer).ramp)
         self._playing = [
             tuple(
-                each.ended(time, ramp, self.spread) if each.layer == layer else each
+                each.ended(time, ramp, self.uncertainty) if each.layer == layer else each
                 for each in voices
             )
             for voices in self._playing
@@ -350,7 +350,7 @@ class Playback:
         ramp = _RAMP.from_wire(one.ramp)
         for channel, voices in enumerate(self._playing):
             command = commands.get(channel)
-            after = tuple(_after(voices, one.layer, command, time, ramp, self.spread))
+            after = tuple(_after(voices, one.layer, command, time, ramp, self.uncertainty))
             self._playing[channel] = _within(after, time, self.voices)
         if not commands:
             self._layers.pop(one.layer, None)
@@ -368,7 +368,7 @@ def _after(
     command: Command | None,
     time: float,
     ramp: float,
-    spread: float,
+    uncertainty: float,
 ) -> Iterator[Voice]:
     """Yield the voices of a channel once a command of a layer plays; None silences the layer."""
     is_driven = command is not None and (command.level > 0 or command.onset is not None)
@@ -378,13 +378,13 @@ def _after(
             yield voice
         elif is_driven and command is not None and _continues(voice, command):
             continued = True
-            first = voice.transition.reached(time, spread)
+            first = voice.transition.reached(time, uncertainty)
             transition = _towards(command, time, ramp, first)
             yield replace(voice, transition=transition, ending=command.ending)
         elif is_driven or (command is not None and command.skip_ending):
-            yield voice.faded(time, ramp, spread)
+            yield voice.faded(time, ramp, uncertainty)
         else:
-            yield voice.ended(time, ramp, spread)
+            yield voice.ended(time, ramp, uncertainty)
     if is_driven and command is not None and not continued:
         transition = _towards(command, time, ramp, 0j)
         frequency = _FREQUENCY.from_wire(command.frequency)

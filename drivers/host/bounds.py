@@ -208,13 +208,13 @@ def all_bounds(
     named = {one.layer: one for one in layers if not one.renew}
     # They may have begun to end by themselves when the set comes.
     ending_soon = [number for number in named if playback.end_of(number) <= until]
-    sounding = {
+    audible = {
         voice.layer for channel in range(playback.channels) for voice in playback.voices_of(channel)
     }
     # A layer without `valid_for` ends by a set alone, which silences along a ramp of its own.
     ramps = {
         number: playback.ramp_of(number) if playback.end_of(number) < math.inf else math.inf
-        for number in sounding
+        for number in audible
     }
     return [
         ChannelBounds(

@@ -62,13 +62,13 @@ class Ledger:
         numbers = [layer.number for layer in layers]
         if len(set(numbers)) < len(numbers):
             raise CommandRefused(f"a layer must occur once in a set, got {numbers}")
-        wanted = tuple(self._on_wire(layer) for layer in layers)
-        if not any(is_vibrating(one) for one in wanted):
-            return self._silence(wanted, now)
+        requested = tuple(self._on_wire(layer) for layer in layers)
+        if not any(is_vibrating(one) for one in requested):
+            return self._silence(requested, now)
         if self._doubt is not None:
             raise CommandRefused(f"set {self.doubt} must be confirmed first; read the status")
-        self._check_sums(wanted, now)
-        return self._within_budget(wanted, now)
+        self._check_sums(requested, now)
+        return self._within_budget(requested, now)
 
     def sent(self, token: int, layers: tuple[LayerSet, ...], now: float) -> None:
         """Note that a set may play from now on: it was committed, and is in doubt."""
@@ -85,7 +85,7 @@ class Ledger:
         self._doubt = None
         if self.playback.is_settled(sent_at - self.lag):
             self.lag = 0.0
-        self.lag = self.playback.spread = max(self.lag, now - sent_at)
+        self.lag = self.playback.uncertainty = max(self.lag, now - sent_at)
         self.playback.commit(layers, token, sent_at)
         self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
 
@@ -98,7 +98,7 @@ class Ledger:
     def silenced(self, ramp: float, sent_at: float, now: float) -> None:
         """Note that all layers fall silent along a ramp [s], by a request sent at a time [s]."""
         self._doubt = None
-        self.lag = self.playback.spread = max(self.lag, now - sent_at)
+        self.lag = self.playback.uncertainty = max(self.lag, now - sent_at)
         self.playback.silence(sent_at, ramp)
         self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
 

@@ -367,8 +367,8 @@ class Amplifier:
         for voice in self.playback.voices_of(channel):
             length = voice.transition.end - now
             times.update(now + length * part / _FRACTIONS for part in range(1, _FRACTIONS + 1))
-        most = 1 + _Q["level"].step
-        return any(self.playback.level(channel, at) > most for at in times if at >= now)
+        highest = 1 + _Q["level"].step
+        return any(self.playback.level(channel, at) > highest for at in times if at >= now)
 
     def _silence(self, moment: float, *, ramp: float) -> None:
         """Silence every channel within the ramp [s], and discard what is staged."""

@@ -1,0 +1,69 @@
+"""Comparison of an amplifier's status with what it was sent.
+
+Levels of voices that change are bounded from above alone: their commit is known as an interval.
+"""
+
+from collections.abc import Mapping
+
+from drivers.host.feeding import Feeding
+from drivers.host.ledger import Ledger
+from drivers.protocol.records import Values
+from drivers.protocol.table import QUANTITIES, STATES, STATUS_FLAGS
+
+MAX_CONTRADICTIONS = 2
+"""Contradictions in a row that are a fault; a single one may be a moment between two sets."""
+
+_LEVEL, _LEFT = QUANTITIES["level"], QUANTITIES["watchdog_left"]
+_STEPS = 2
+
+
+def problem_of(
+    status: Values, ledger: Ledger, feeding: Feeding, *, sent_at: float, now: float, fed: bool
+) -> str | None:
+    """Describe what a status contradicts; None if it agrees. The doubt is resolved before.
+
+    sent_at, now [s]: of the request and its reply; fed: whether the request feeds the watchdog.
+    """
+    if status["state"] != STATES["OPERATION_ENABLED"]:
+        return f"state must be OPERATION_ENABLED, got {name_of(STATES, status['state'])}"
+    if not status["flags"] >> STATUS_FLAGS["high_voltage"] & 1:
+        return "high voltage must be on, got off"
+    if not fed:
+        left = feeding.problem(_LEFT.from_wire(status["watchdog_left"]), sent_at, now)
+        if left is not None:
+            return left
+    return _token_problem(status, ledger, now) or _level_problem(status, ledger, sent_at, now)
+
+
+def _token_problem(status: Values, ledger: Ledger, now: float) -> str | None:
+    playback = ledger.playback
+    playback.advance(now - ledger.lag)
+    if playback.next_due <= now:  # a layer may have ended, or not yet
+        return None
+    expected = playback.tokens
+    for layer, token in enumerate(status["tokens"]):
+        expected_token = expected.get(layer, 0)
+        if token != expected_token:
+            return f"token of layer {layer} must be {expected_token}, got {token}"
+    return None
+
+
+def _level_problem(status: Values, ledger: Ledger, sent_at: float, now: float) -> str | None:
+    playback, late = ledger.playback, sent_at - ledger.lag
+    if len(status["levels"]) != playback.channels:
+        return f"levels must be {playback.channels}, got {len(status['levels'])}"
+    step = max(ledger.capabilities["level_step"], 1)
+    for channel, level in enumerate(status["levels"]):
+        voices = playback.voices_of(channel)
+        highest = _LEVEL.to_wire(min(sum(voice.transition.peak(late) for voice in voices), 1.0))
+        lowest = 0
+        if all(voice.transition.end <= late for voice in voices) and playback.next_due > now:
+            lowest = _LEVEL.to_wire(min(playback.level(channel, now), 1.0))
+        if not lowest - _STEPS * step <= level <= highest + _STEPS * step:
+            return f"level of channel {channel} must be {lowest} to {highest} (1e-4), got {level}"
+    return None
+
+
+def name_of(names: Mapping[str, int], number: int) -> str:
+    """Return the name of a number of the table, or the number."""
+    return next((name for name, each in names.items() if each == number), str(number))

@@ -1,0 +1,363 @@
+"""One physical line: requests of all amplifiers on it, one at a time, by priority.
+
+The pump is a function, called by whoever submits, receives or is the timer; nothing waits for a
+turn in a task of its own. A request is made when its turn has come, so that it is checked once,
+against what really went out before. Times [s] are of the event loop's clock.
+"""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Protocol
+
+from drivers import clock
+from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout, Preempted
+from drivers.host.wire import Broken, Event, More, Nak, Wire
+from drivers.protocol.records import Values
+from drivers.protocol.table import REACTION
+
+REPLY_TIMEOUT = 0.030  # s; a heartbeat and three of these are less than three heartbeats of 50 ms
+ATTEMPTS = 3
+GRACE = 0.008  # s; how long a stop waits for the reply to another request
+MAX_WAIT = 0.05  # s; after which a request goes before newer sets and heartbeats
+BUSY_PAUSE = 0.005  # s; before a request goes again to a busy amplifier
+_LATE = 0.005  # s; a timer later than this means that this process was delayed
+_LOOKS = 4  # at the port for a reply, where this process was delayed
+SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
+
+
+class Priority(IntEnum):
+    """Priority of a request: the smaller is sent first."""
+
+    STOP = 0
+    SILENCE = 1
+    HEARTBEAT = 2
+    SET = 3
+    ARM = 4
+    CLEAR = 5
+    OTHER = 6
+    READING = 7
+
+    @property
+    def is_stop_class(self) -> bool:
+        """Whether it silences the amplifier: sent and repeated before all others."""
+        return self <= Priority.SILENCE
+
+
+_SUPERSEDED = {
+    # A queued heartbeat would feed the watchdog of an amplifier that did not receive the stop.
+    Priority.STOP: (Priority.HEARTBEAT, Priority.SET, Priority.ARM, Priority.CLEAR),
+    Priority.SILENCE: (Priority.SET, Priority.ARM),
+}
+
+
+class Port(Protocol):
+    """An open port; what it receives goes to `Line.received`, its loss to `Line.lose`."""
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether it has not taken all bytes yet."""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes, as soon as the port takes them; raises LinkError."""
+
+    def poll(self) -> None:
+        """Hand over what has come and was not read yet."""
+
+
+class Member(Protocol):
+    """An amplifier as its line sees it."""
+
+    @property
+    def address(self) -> int:
+        """Its address."""
+
+    def note_sent(self, name: str, values: Values, now: float) -> None:
+        """Note a request that may have reached it."""
+
+    def note_heard(self) -> None:
+        """Note that it has replied, whatever."""
+
+    def note_silence(self, cause: str) -> None:
+        """Note that it has not replied to all attempts of a request."""
+
+    def note_event(self, values: Values) -> None:
+        """Note what it told unasked."""
+
+    def may_send(self, name: str, values: Values) -> LinkError | None:
+        """Return why a request must not go out now; None if it may."""
+
+
+@dataclass(eq=False, slots=True)
+class Job:
+    """A request from its queueing to its result.
+
+    make: name and values of each attempt, in its turn; raises CommandRefused. attempts: left.
+    """
+
+    member: Member
+    priority: Priority
+    make: Callable[[], tuple[str, Values]]
+    attempts: int
+    timeout: float
+    number: int
+    queued_at: float
+    result: "asyncio.Future[Values]"
+    not_before: float = 0.0
+    due: float = 0.0
+    looks: int = 0
+
+    def rank(self, now: float) -> int:
+        """Place in the queue at a time [s]."""
+        if self.priority is Priority.READING:
+            return self.priority
+        rank = min(self.priority, Priority.ARM)
+        return min(rank, Priority.HEARTBEAT) if now - self.queued_at > MAX_WAIT else rank
+
+
+@dataclass
+class LineStatistics:
+    """Counts of a line: repeated requests, those without a reply in time, and refused ones."""
+
+    retries: int = 0
+    timeouts: int = 0
+    refusals: int = 0
+
+
+class Line:
+    """A line, open from its construction until it is lost or closed."""
+
+    def __init__(self, wire: Wire, port: Port, name: str) -> None:
+        self.wire = wire
+        self.name = name
+        self.statistics = LineStatistics()
+        self.loss: str | None = None
+        self.members: dict[int, Member] = {}
+        self._port = port
+        self._queue: list[Job] = []
+        self._current: Job | None = None
+        self._number = 0
+        self._timer: asyncio.TimerHandle | None = None
+        self._loop = asyncio.get_running_loop()
+        self._is_pumping = False
+
+    def submit(
+        self,
+        member: Member,
+        priority: Priority,
+        make: Callable[[], tuple[str, Values]],
+        *,
+        timeout: float = REPLY_TIMEOUT,
+        attempts: int = ATTEMPTS,
+    ) -> "asyncio.Future[Values]":
+        """Queue a request of an amplifier; the future has the values of its reply.
+
+        Or raises LinkError, LinkTimeout, FrameError, CommandRefused; Preempted where another
+        request came first.
+        """
+        for queued in [*self._queue]:
+            if queued.member is member and queued.priority in _SUPERSEDED.get(priority, ()):
+                self._fail(queued, Preempted(SUPERSEDED))
+        self._number += 1
+        future = self._loop.create_future()
+        job = Job(*(member, priority, make, attempts, timeout, self._number, clock.now(), future))
+        if self.loss is not None:
+            future.set_exception(LinkError(self.loss))
+        else:
+            self._queue.append(job)
+            self._preempt()
+            self.pump()
+        return future
+
+    def broadcast(self, name: str, values: Values) -> float:
+        """Send a request to every amplifier of the line, at once; when [s] it was sent.
+
+        Only on a line that is free: there is no reply. Raises LinkError.
+        """
+        now = clock.now()
+        self._write(0, name, values, now)
+        return now
+
+    @property
+    def is_free(self) -> bool:
+        """Whether no request is on the line."""
+        return self._current is None
+
+    def received(self, data: bytes) -> None:
+        """Take bytes from the port."""
+        for arrival in self.wire.received(data):
+            if isinstance(arrival, Event):
+                if (member := self.members.get(arrival.address)) is not None:
+                    member.note_event(arrival.values)
+                continue
+            job = self._current
+            if job is None:
+                continue
+            if isinstance(arrival, More):
+                self._port.write(arrival.data)
+                continue
+            self._current = None
+            job.member.note_heard()
+            if isinstance(arrival, Nak):
+                self._refused(job, arrival)
+            elif isinstance(arrival, Broken):
+                self._fail(job, FrameError(f"{self.name}: {arrival.reason}"))
+            elif not job.result.done():
+                job.result.set_result(arrival.values)
+        self.pump()
+
+    def lose(self, cause: str) -> None:
+        """Fail every request: the port is lost, or closed."""
+        self.loss = cause
+        current, self._current = self._current, None
+        for job in (current, *self._queue):
+            if job is not None:
+                self._fail(job, LinkError(cause))
+        self._queue.clear()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def pump(self) -> None:
+        """Put the next request on the line, if it is free."""
+        if self._is_pumping:
+            return
+        self._is_pumping = True
+        try:
+            while self.loss is None and self._current is None and self._queue:
+                job = self._next()
+                if job is None:
+                    break
+                self._queue.remove(job)
+                if not job.result.done():
+                    self._start(job)
+        finally:
+            self._is_pumping = False
+        self._schedule()
+
+    def _next(self) -> Job | None:
+        """Return the job whose turn it is; None while all pause, or a stop does."""
+        now = clock.now()
+        first = min(self._queue, key=lambda job: (job.rank(now), job.number))
+        if first.not_before <= now or first.priority.is_stop_class:
+            return first if first.not_before <= now else None
+        ready = [job for job in self._queue if job.not_before <= now]
+        return min(ready, key=lambda job: (job.rank(now), job.number), default=None)
+
+    def _start(self, job: Job) -> None:
+        try:
+            name, values = job.make()
+            if (reason := job.member.may_send(name, values)) is not None:
+                raise reason
+            now = clock.now()
+            job.due = now + self._write(job.member.address, name, values, now) + job.timeout
+            job.attempts -= 1
+            job.looks = 0
+            self._current = job
+        except Exception as error:  # no caller may wait for ever
+            self._fail(job, error)
+
+    def _write(self, address: int, name: str, values: Values, now: float) -> float:
+        """Send a request, the only way out, and note it for all that it reaches.
+
+        Returns how much longer than a local one it takes [s].
+        """
+        data = self.wire.request(address, name, values)
+        for member in self.members.values():
+            if address in (0, member.address):
+                member.note_sent(name, values, now)
+        self._port.write(data)
+        return max(self.wire.round_trip(name, len(data) // 2) + REACTION - REPLY_TIMEOUT, 0.0)
+
+    def _refused(self, job: Job, nak: Nak) -> None:
+        self.statistics.refusals += 1
+        if nak.code == "BUSY" and job.attempts > 0:
+            self._repeat(job, pause=BUSY_PAUSE)
+            return
+        channel = "" if nak.channel is None else f", channel {nak.channel}"
+        text = f"{self.name}: the amplifier refused the request: {nak.code}{channel}"
+        self._fail(job, CommandRefused(text, channel=nak.channel))
+
+    def _repeat(self, job: Job, *, pause: float = 0.0) -> None:
+        """Queue a request again, unless another one of its amplifier comes before it."""
+        overtaken = any(
+            other.member is job.member and job.priority in _SUPERSEDED.get(other.priority, ())
+            for other in self._queue
+        )
+        if overtaken:
+            self._fail(job, Preempted(SUPERSEDED))
+        else:
+            self.statistics.retries += 1
+            job.not_before = clock.now() + pause if pause else 0.0
+            self._queue.append(job)
+
+    def _fail(self, job: Job, error: Exception) -> None:
+        """End a request with an error, unless its caller has gone."""
+        if job in self._queue:
+            self._queue.remove(job)
+        if not job.result.done():
+            job.result.set_exception(error)
+            job.result.exception()  # retrieved, where nobody waits for it
+
+    def _preempt(self) -> None:
+        """Shorten the time of the request on the line for one that must not wait."""
+        current = self._current
+        if current is None or current.priority.is_stop_class:
+            return
+        waiting = [job.priority for job in self._queue if job.priority < current.priority]
+        if current.priority is Priority.READING and min(waiting, default=8) <= Priority.SET:
+            current.due = clock.now()
+        elif min(waiting, default=8) <= Priority.SILENCE:
+            current.due = min(current.due, clock.now() + GRACE)
+
+    def _schedule(self) -> None:
+        """Have the timer look again by the next time that matters; it is never cancelled."""
+        times = [job.not_before for job in self._queue if job.not_before]
+        if self._current is not None:
+            times = [self._current.due]
+        if not times:
+            return
+        due = min(times)
+        if self._timer is None or self._timer.when() > due:
+            if self._timer is not None:
+                self._timer.cancel()
+            self._timer = self._loop.call_at(due, self._look)
+
+    def _look(self) -> None:
+        """Give up the request on the line if it is due, once the port was read once more."""
+        self._timer = None
+        now = clock.now()
+        job = self._current
+        if job is None or now < job.due:
+            self.pump()
+            return
+        was_delayed = now - job.due > _LATE
+        job.looks += 1
+        self._port.poll()
+        if self._current is not job:
+            return
+        if job.looks == 1 or (was_delayed and job.looks < _LOOKS):
+            job.due = now + (_LATE if was_delayed else 0.0)
+            self._schedule()
+            return
+        self._current = None
+        self.wire.withdraw()
+        self._not_answered(job)
+        self.pump()
+
+    def _not_answered(self, job: Job) -> None:
+        preempting = any(other.priority.is_stop_class for other in self._queue)
+        if preempting and not job.priority.is_stop_class:
+            job.attempts += 1
+            self._repeat(job)
+            return
+        self.statistics.timeouts += 1
+        cause = f"{self.name}: no reply within {1e3 * job.timeout:g} ms"
+        if self._port.is_blocked:
+            cause += "; check flow control and the adapter: the port takes no bytes"
+        if job.attempts > 0:
+            self._repeat(job)
+            return
+        job.member.note_silence(cause)
+        self._fail(job, LinkTimeout(f"{cause}; check that the amplifier is switched on"))

@@ -1,0 +1,69 @@
+"""A kind of wire without I/O: requests of a host as bytes, and received bytes as what came.
+
+A wire carries one request at a time. What arrives is matched by it: a reply to an earlier request
+is counted as unexpected, and damaged bytes as invalid.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, TypeAlias
+
+from drivers.protocol.records import Values
+from drivers.statistics import WireCounters
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """The values of the reply to the request on the wire."""
+
+    values: Values
+
+
+@dataclass(frozen=True, slots=True)
+class Nak:
+    """The amplifier refused the request: name of the code, and the channel at fault."""
+
+    code: str
+    channel: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Broken:
+    """The reply to the request is none of the protocol: why."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A change that an amplifier tells unasked: its address, the values of the Event."""
+
+    address: int
+    values: Values
+
+
+@dataclass(frozen=True, slots=True)
+class More:
+    """The request goes on with these bytes, as on Modbus."""
+
+    data: bytes
+
+
+Arrival: TypeAlias = Reply | Nak | Broken | Event | More
+
+
+class Wire(Protocol):
+    """The host's side of a kind of wire."""
+
+    counters: WireCounters
+
+    def request(self, address: int, name: str, values: Values) -> bytes:
+        """Return the bytes of a request, which is on the wire from now on; address 0: of all."""
+
+    def received(self, data: bytes) -> list[Arrival]:
+        """Return what these bytes complete."""
+
+    def withdraw(self) -> None:
+        """Take the request off the wire: its reply will be unexpected."""
+
+    def round_trip(self, name: str, words: int) -> float:
+        """Return how long a request of this many words and its longest reply take [s]."""

@@ -1,0 +1,105 @@
+"""The amplifiers' side of a serial line in protocol 3, without I/O: bytes in, bytes out.
+
+On a shared line amplifiers have one address each, and send no events.
+"""
+
+from collections.abc import Callable, Mapping
+
+from drivers.codec.serial_line.frame import NEUTRAL, REPLY, Frame, FrameReader, encode_frame
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.serial_payload import (
+    BROADCAST,
+    HELLO,
+    pack_identity,
+    pack_words,
+    unpack_words,
+)
+from drivers.protocol.table import (
+    BY_NUMBER,
+    EVENT,
+    EVENT_RECORD,
+    NAK,
+    NAK_RECORD,
+    NO_CHANNEL,
+    REFUSALS,
+    VERSION,
+)
+from sim.amplifier.contract import Amplifier
+
+
+class SerialAmplifiers:
+    """Amplifiers by their addresses on one line; send: called with the bytes for the host."""
+
+    def __init__(self, amplifiers: Mapping[int, Amplifier], send: Callable[[bytes], None]) -> None:
+        self._amplifiers = dict(amplifiers)
+        self._send = send
+        self._reader = FrameReader()
+        self._events = 0
+        if len(amplifiers) == 1:
+            for amplifier in amplifiers.values():
+                amplifier.listeners.append(self._send_event)
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take bytes from the host at a time [s]."""
+        for frame in self._reader.feed(data):
+            if frame.is_reply:  # an echo
+                continue
+            if frame.address == BROADCAST:
+                self._broadcast(frame, now)
+            elif frame.address in self._amplifiers:
+                self._send(encode_frame(self._answer(frame, now)))
+
+    def _answer(self, frame: Frame, now: float) -> Frame:
+        """Return the reply to a request, a Nak where it is refused."""
+        amplifier = self._amplifiers[frame.address]
+        try:
+            if frame.type == HELLO:
+                payload = pack_identity(amplifier.identity)
+                return frame._replace(kind=HELLO | REPLY, payload=payload, version=NEUTRAL)
+            payload = self._payload(frame, amplifier, now)
+        except Refusal as refusal:
+            channel = NO_CHANNEL if refusal.channel is None else refusal.channel
+            nak = {"request": frame.type, "code": REFUSALS[refusal.code], "channel": channel}
+            payload = pack_words(NAK_RECORD.pack(nak))
+            version = NEUTRAL if refusal.code == "UNSUPPORTED_VERSION" else VERSION
+            return frame._replace(kind=NAK | REPLY, payload=payload, version=version)
+        return frame._replace(kind=frame.kind | REPLY, payload=payload)
+
+    def _payload(self, frame: Frame, amplifier: Amplifier, now: float) -> bytes:
+        name, values = _request(frame)
+        reply = amplifier.handle(name, values, now)
+        self._note_address(frame.address, name, values)
+        return pack_words(BY_NUMBER[frame.type].reply.pack(reply))
+
+    def _broadcast(self, frame: Frame, now: float) -> None:
+        message = BY_NUMBER.get(frame.type)
+        if message is None or not message.is_broadcast:
+            return
+        for address, amplifier in [*self._amplifiers.items()]:
+            try:
+                name, values = _request(frame)
+                amplifier.handle(name, values, now)
+                self._note_address(address, name, values)
+            except Refusal:
+                continue
+
+    def _note_address(self, address: int, name: str, values: Values) -> None:
+        """Note the address that an amplifier has taken."""
+        if name == "SetAddress":
+            self._amplifiers[values["address"]] = self._amplifiers.pop(address)
+
+    def _send_event(self, event: Values, now: float) -> None:
+        self._events = (self._events + 1) & 0xFFFF
+        (address,) = self._amplifiers
+        payload = pack_words(EVENT_RECORD.pack(event))
+        self._send(encode_frame(Frame(EVENT, address, self._events, payload, VERSION)))
+
+
+def _request(frame: Frame) -> tuple[str, Values]:
+    """Read a request; raises Refusal."""
+    if frame.version != VERSION:
+        raise Refusal(f"version must be {VERSION}, got {frame.version}", "UNSUPPORTED_VERSION")
+    message = BY_NUMBER.get(frame.type)
+    if message is None:
+        raise Refusal(f"type {frame.type} is unknown", "UNKNOWN_TYPE")
+    return message.name, message.request.unpack(unpack_words(frame.payload), is_strict=True)

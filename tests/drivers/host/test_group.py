@@ -1,0 +1,353 @@
+"""Lines, amplifiers and their group on serial lines of protocol 3, in virtual time.
+
+What a person would feel is read from the simulated amplifiers themselves.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from drivers.codec.serial_line.frame import FrameReader, encode_frame
+from drivers.contents import Layer, Shape, Tone
+from drivers.errors import CommandRefused, LinkDegraded, LinkError, LinkTimeout, Preempted
+from drivers.host.amplifier import Amplifier
+from drivers.host.group import Group
+from drivers.protocol.records import Values
+from drivers.protocol.serial_payload import pack_words, unpack_words
+from drivers.protocol.table import MESSAGES, STATES
+from virtual_loop import run_virtual
+from words_line import Alter, MemoryLine, unaltered
+
+
+def tone(channel: int = 0, level: float = 0.5, **other: object) -> Tone:
+    """A tone of 100 Hz at half level unless told otherwise."""
+    return Tone(channel, 100.0, level, **other)  # type: ignore[arg-type]
+
+
+def layer(number: int, *tones: Tone, **other: object) -> Layer:
+    """A layer with a ramp of 1 ms."""
+    return Layer(number, tones, 0.001, **other)  # type: ignore[arg-type]
+
+
+def with_group(
+    test: Callable[[Group, list[MemoryLine]], Awaitable[None]], *lines: tuple[str, ...]
+) -> None:
+    """Run a test with an armed group of amplifiers, by their names on each line."""
+
+    async def run() -> None:
+        ends = [MemoryLine(*names) for names in lines]
+        hosts = {name: host for end in ends for name, host in end.hosts.items()}
+        group = Group(hosts, draw=lambda low, high: 77)
+        await group.open()
+        await group.arm()
+        await test(group, ends)
+
+    run_virtual(run())
+
+
+def losing(*types: str, count: int = 1) -> Alter:
+    """Loses so many frames of these messages, in whichever direction."""
+    numbers = {MESSAGES[name].number for name in types}
+    left = count
+
+    def alter(data: bytes) -> list[tuple[float, bytes]]:
+        nonlocal left
+        (frame,) = FrameReader().feed(data)
+        if frame.type in numbers and left > 0:
+            left -= 1
+            return []
+        return unaltered(data)
+
+    return alter
+
+
+LINES = {"alone": (("a",),), "each its own": (("a",), ("b",)), "shared": (("a", "b"),)}
+
+
+@pytest.mark.parametrize("lines", LINES)
+def test_layers_play_together_and_leave_each_other_alone(lines: str) -> None:
+    """A second layer adds 0.2; the first falls silent while the second plays on, on all at once."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        names = [*group.amplifiers]
+        await group.apply({name: [layer(0, tone())] for name in names})
+        second = layer(1, Tone(0, 150.0, 0.2), Tone(1, 150.0, 0.1))
+        await group.apply({name: [second] for name in names})
+        await asyncio.sleep(0.002)
+        for end in ends:
+            assert all(end.levels(name) == [0.7, 0.1] for name in end.hosts)
+        origins = [
+            {round(voice.origin, 4) for voice in far.playback.voices_of(1)}
+            for end in ends
+            for far in end.far.values()
+        ]
+        assert all(each == origins[0] and len(each) == 1 for each in origins)
+        staged = await group.apply({name: [layer(0)] for name in names})
+        await asyncio.sleep(0.002)
+        assert all(end.levels(name) == [0.2, 0.1] for end in ends for name in end.hosts)
+        assert all(each.is_exact for each in staged.values())
+
+    with_group(test, *LINES[lines])
+
+
+def test_refused_on_one_means_committed_on_none() -> None:
+    """The ledger of the second refuses a channel it does not have; the first plays on."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        await group.apply({name: [layer(0, tone())] for name in "ab"})
+        with pytest.raises(CommandRefused) as raised:
+            await group.apply({"a": [layer(0, tone(level=0.9))], "b": [layer(0, tone(2))]})
+        assert (raised.value.channel, group.is_armed) == (2, True)
+        await asyncio.sleep(0.002)
+        assert [ends[0].levels("a"), ends[1].levels("b")] == [[0.5, 0.0]] * 2
+        await group.apply({name: [layer(0, tone(level=0.3))] for name in "ab"})
+
+    with_group(test, ("a",), ("b",))
+
+
+def test_set_of_many_parts_arrives_whole() -> None:
+    """Two channels with onsets and endings of 32 knots are four frames."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        shape = Shape(0.001, tuple(0.01 * n + 0j for n in range(32)))
+        tones = [tone(channel, 0.4, onset=shape, ending=shape) for channel in (0, 1)]
+        ends[0].sent.clear()
+        await group.apply({"a": [layer(0, *tones)]})
+        assert [each for _, each in ends[0].sent] == ["1:5"] * 3 + ["1:6"]
+        await asyncio.sleep(0.04)
+        assert ends[0].levels("a") == [0.4, 0.4]
+
+    with_group(test, ("a",))
+
+
+@pytest.mark.parametrize("name", ["Set", "Commit"])
+@pytest.mark.parametrize("way", ["inward", "outward"])
+def test_lost_frame_is_repeated_and_played_once(name: str, way: str) -> None:
+    """The request or its reply; the tone counts from the one commit."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        setattr(ends[0], way, losing(name))
+        await group.apply({"a": [layer(0, tone())]})
+        await asyncio.sleep(0.002)
+        assert ends[0].levels("a") == [0.5, 0.0]
+        assert ends[0].line.statistics.retries == 1
+        assert len(ends[0].far["a"].playback.voices_of(0)) == 1
+
+    with_group(test, ("a",))
+
+
+def test_lost_broadcast_is_made_good() -> None:
+    """Both amplifiers of a line play although the broadcast of the commit was lost."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        ends[0].inward = losing("Commit")
+        await group.apply({name: [layer(0, tone())] for name in "ab"})
+        await asyncio.sleep(0.002)
+        assert [ends[0].levels(name) for name in "ab"] == [[0.5, 0.0]] * 2
+
+    with_group(test, ("a", "b"))
+
+
+def test_degraded_amplifier_gets_nothing_that_plays_or_feeds() -> None:
+    """After three requests without reply; a status ends it."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        (host,) = group.amplifiers.values()
+        ends[0].outward = lambda data: []
+        with pytest.raises(LinkTimeout):
+            await host.ping()
+        for request in (host.ping, lambda: host.stage(1, [layer(0, tone())])):
+            with pytest.raises(LinkDegraded):
+                await request()
+        ends[0].outward = unaltered
+        await host.read_status()
+        await host.ping()
+
+    with_group(test, ("a",))
+
+
+def test_amplifier_without_reply_stops_the_others() -> None:
+    """Silent along 5 ms, the mute one by its watchdog; until when it may play is told."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        await group.apply({name: [layer(0, tone())] for name in "ab"})
+        began = ends[0].loop.time()
+        ends[1].inward = lambda data: []
+        with pytest.raises(LinkError):
+            await group.beat()
+        assert not group.is_armed
+        stopped = await group.stop()
+        assert (stopped["a"].is_confirmed, stopped["b"].is_confirmed) == (True, False)
+        assert began + 0.25 <= stopped["b"].may_play_until <= began + 0.4
+        assert ends[0].levels("a") == [0.0, 0.0]
+        await asyncio.sleep(stopped["b"].may_play_until - ends[1].loop.time())
+        assert ends[1].levels("b") == [0.0, 0.0]
+
+    with_group(test, ("a",), ("b",))
+
+
+def test_stop_overtakes_what_is_queued() -> None:
+    """With a set on the line and ten readings queued: silent within 20 ms, none is committed."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        (host,) = group.amplifiers.values()
+        await group.apply({"a": [layer(0, tone())]})
+        ends[0].outward = lambda data: [(0.004, data)]
+        reads = [asyncio.ensure_future(host.read_status()) for _ in range(10)]
+        applying = asyncio.ensure_future(group.apply({"a": [layer(0, tone(level=0.9))]}))
+        await asyncio.sleep(0.001)
+        began = ends[0].loop.time()
+        stopped = await group.stop()
+        assert stopped["a"].is_confirmed
+        sent = next(at for at, each in ends[0].sent if each == "1:8" and at >= began)
+        assert sent - began <= 0.009
+        with pytest.raises(Preempted):
+            await applying
+        await asyncio.gather(*reads)
+        assert ends[0].levels("a") == [0.0, 0.0]
+
+    with_group(test, ("a",))
+
+
+def test_stop_between_stage_and_commit_commits_nothing() -> None:
+    """The staged set is dropped by the amplifier, too."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        (host,) = group.amplifiers.values()
+        await host.stage(9, [layer(0, tone())])
+        assert (await group.stop())["a"].is_confirmed
+        with pytest.raises(CommandRefused):
+            await host.commit(9)
+        assert ends[0].levels("a") == [0.0, 0.0]
+
+    with_group(test, ("a",))
+
+
+def lying(reply: Callable[[Values], Values]) -> Alter:
+    """Alters every status that is sent to the host."""
+    record = MESSAGES["GetStatus"].reply
+
+    def alter(data: bytes) -> list[tuple[float, bytes]]:
+        (frame,) = FrameReader().feed(data)
+        if frame.type not in (8, 9):
+            return unaltered(data)
+        values = reply(record.unpack(unpack_words(frame.payload), is_strict=False))
+        payload = pack_words(record.pack(values))
+        return unaltered(encode_frame(frame._replace(payload=payload)))
+
+    return alter
+
+
+LIES: dict[str, Callable[[Values], Values]] = {
+    "levels that stay": lambda status: {**status, "levels": [1, 0]},
+    "no levels": lambda status: {**status, "channels": 0, "levels": []},
+    "an old latch": lambda status: {**status, "latch": 0},
+    "still armed": lambda status: {**status, "state": STATES["OPERATION_ENABLED"]},
+    "only disarmed": lambda status: {**status, "state": STATES["SWITCH_ON_DISABLED"]},
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_stop_is_confirmed_by_nothing_less_than_a_new_latch_and_all_levels(lie: str) -> None:
+    """Whatever of it is missing: not confirmed, within 0.5 s, with the time that it may play."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        await group.apply({"a": [layer(0, tone())]})
+        ends[0].outward = lying(LIES[lie])
+        began = ends[0].loop.time()
+        stopped = (await group.stop())["a"]
+        assert not stopped.is_confirmed
+        assert stopped.cause
+        assert ends[0].loop.time() - began < 0.5
+        assert stopped.may_play_until > began
+
+    with_group(test, ("a",))
+
+
+def test_watchdog_is_fed_by_the_group_alone() -> None:
+    """Beats keep it playing; without them it is silent after 0.255 s."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        await group.apply({"a": [layer(0, tone())]})
+        for _ in range(20):
+            await asyncio.sleep(0.05)
+            await group.beat()
+        assert ends[0].levels("a") == [0.5, 0.0]
+        await asyncio.sleep(0.256)
+        assert ends[0].levels("a") == [0.0, 0.0]
+        with pytest.raises(CommandRefused):
+            await group.beat()
+
+    with_group(test, ("a",))
+
+
+def test_contradictions_twice_in_a_row_are_a_fault() -> None:
+    """A derated channel: half of the level once is passed over, twice stops."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        await group.apply({"a": [layer(0, tone())]})
+        await asyncio.sleep(0.01)
+        ends[0].far["a"].set_temperature(71.0, ends[0].loop.time())
+        await asyncio.sleep(0.03)
+        await group.beat()
+        with pytest.raises(CommandRefused):
+            await group.beat()
+        assert not group.is_armed
+
+    with_group(test, ("a",))
+
+
+def test_host_that_drives_already_is_seen_and_left_alone() -> None:
+    """Its heartbeats raise the watchdog unasked; without them the amplifier is taken over."""
+
+    async def run() -> None:
+        end = MemoryLine("a")
+        far = end.far["a"]
+        far.handle("Arm", {"session": 5, "watchdog": 2000}, end.loop.time())
+
+        async def feed() -> None:
+            while True:
+                await asyncio.sleep(0.07)
+                far.handle("Ping", {"session": 5}, end.loop.time())
+
+        other = asyncio.ensure_future(feed())
+        with pytest.raises(LinkError):
+            await end.hosts["a"].open()
+        assert far.state == "OPERATION_ENABLED"
+        other.cancel()
+        await end.hosts["a"].open()
+        assert far.state != "OPERATION_ENABLED"
+
+    run_virtual(run())
+
+
+IDENTITIES: Values = {"versions": 0b11, "serial_number": "SIM-b"}
+
+
+@pytest.mark.parametrize("name", IDENTITIES)
+def test_another_amplifier_or_version_is_refused(name: str) -> None:
+    """An amplifier of version 2, and one of another serial number."""
+
+    async def run() -> None:
+        end = MemoryLine("a")
+        end.far["a"].identity[name] = IDENTITIES[name]
+        host = Amplifier(end.line, 1, end.hosts["a"].limits, name="a", serial_number="SIM-a")
+        with pytest.raises(LinkError):
+            await host.open()
+
+    run_virtual(run())
+
+
+def test_late_replies_are_credited_to_nothing() -> None:
+    """A reply after 70 ms: its request was repeated, and it is counted as unexpected."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        (host,) = group.amplifiers.values()
+        delays = iter([0.07])
+        ends[0].outward = lambda data: [(next(delays, 0.0002), data)]
+        await host.ping()
+        await asyncio.sleep(0.1)
+        assert ends[0].line.wire.counters.unexpected_frames == 1
+
+    with_group(test, ("a",))

@@ -93,6 +93,7 @@ LONG = {
 SHORT = [check for check in CHECKS if check.name not in LONG]
 
 
+@pytest.mark.parametrize("url", shortly(["sim", *PROCESS_WIRES], ["serial"]), indirect=True)
 @pytest.mark.parametrize("check", SHORT, ids=[check.name for check in SHORT])
 async def test_conformance_check_passes(check: Check, amplifier: Amplifier, url: str) -> None:
     """Checks of `era amp conformance`; each says itself what it proves."""

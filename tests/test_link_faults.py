@@ -25,6 +25,7 @@ from drivers.operation.garbage_collection import no_long_collections
 from drivers.operation.watchdog import HEARTBEAT, MIN_HEARTBEATS_PER_WATCHDOG, loss_detection_time
 from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault, Feature
 from drivers.registry import open_backend
+from long_form import shortly
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from reconnection import reconnect
@@ -39,9 +40,11 @@ REACTION = 0.005  # s; the ramp to silence after the watchdog
 LIMITS = GuardLimits(40.0, 500.0, 1.0)
 REPLY_TIMEOUT = 0.5  # s; where no reply is lost
 FOUR = (0.2,) * 4  # levels
+SHORT_WIRES = ("serial", "modbus+rtu", "can+slcan", "modbus+rtu, 19 200 baud")
+"""One of each family, and the slowest; `make test-long` takes the others."""
 
 
-@pytest.fixture(params=list(WIRES))
+@pytest.fixture(params=shortly(WIRES, SHORT_WIRES))
 async def far(request: pytest.FixtureRequest, coarse_rig: Rig) -> AsyncIterator[FarSide]:
     """The paper's amplifier behind each wire, in real time."""
     async with far_side(WIRES[request.param], coarse_rig, seed=7) as far:
@@ -106,7 +109,7 @@ def over_every_wire(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[
     new = [*inspect.signature(run).parameters.values()][:2]
     run.__signature__ = inspect.Signature([*new, *own])  # type: ignore[attr-defined]
     run.__name__, run.__doc__ = test.__name__, test.__doc__
-    marked: Callable[..., None] = pytest.mark.parametrize("wire", WIRES)(run)
+    marked: Callable[..., None] = pytest.mark.parametrize("wire", shortly(WIRES, SHORT_WIRES))(run)
     return marked
 
 
@@ -258,7 +261,7 @@ async def test_unplugged_wire_is_detected_within_60_ms(far: FarSide) -> None:
             await reconnect(host.amplifier, tries=200)
 
 
-@pytest.mark.parametrize("name", WIRES)
+@pytest.mark.parametrize("name", shortly(WIRES, SHORT_WIRES))
 def test_wire_recovers_after_overlapping_faults(name: str, coarse_rig: Rig) -> None:
     """Unplugged for 0.2 s, and 0.1 s later for 0.3 s: usable after 0.4 s."""
 
@@ -310,7 +313,7 @@ def in_virtual_time(
 
 
 @pytest.mark.parametrize("kind", ["hang", "drop"])
-@pytest.mark.parametrize("name", [*WIRES, *SLOW_WIRES])
+@pytest.mark.parametrize("name", shortly([*WIRES, *SLOW_WIRES], SHORT_WIRES))
 def test_silent_amplifier_is_detected_within_three_heartbeats(
     name: str, kind: FaultKind, coarse_rig: Rig
 ) -> None:
@@ -328,7 +331,7 @@ def test_silent_amplifier_is_detected_within_three_heartbeats(
     in_virtual_time(name, coarse_rig, use)
 
 
-@pytest.mark.parametrize("name", [*WIRES, *SLOW_WIRES])
+@pytest.mark.parametrize("name", shortly([*WIRES, *SLOW_WIRES], SHORT_WIRES))
 def test_loss_during_a_set_is_detected_within_loss_detection_time(
     name: str, coarse_rig: Rig
 ) -> None:
@@ -351,7 +354,7 @@ def test_loss_during_a_set_is_detected_within_loss_detection_time(
     in_virtual_time(name, coarse_rig, use)
 
 
-@pytest.mark.parametrize("name", [*WIRES, *SLOW_WIRES])
+@pytest.mark.parametrize("name", shortly([*WIRES, *SLOW_WIRES], SHORT_WIRES))
 def test_slow_wire_is_not_lost(name: str, coarse_rig: Rig) -> None:
     """Sets and heartbeats that occupy the whole wire are not repeated."""
 

@@ -23,7 +23,7 @@ def _unlogged() -> Iterator[None]:
 def test_stop_is_true_while_frames_are_lost_late_and_doubled() -> None:
     """On every wire and in every scene: what is confirmed silent is silent, and stays so."""
     tally = Tally()
-    disturbed_stops(range(4 * len(WIRES)), tally=tally)
+    disturbed_stops(range(3 * len(WIRES)), tally=tally)
     assert tally.found == []
     for wire in WIRES:
         assert tally.counts[wire, "confirmed_silent"] > tally.counts[wire, "stops"] / 4
@@ -36,7 +36,7 @@ def test_stop_is_true_while_frames_are_lost_late_and_doubled() -> None:
 def test_stop_is_true_with_an_exception_on_its_way() -> None:
     """Raised at any line of drivers or controller that runs while all is being stopped."""
     tally = Tally()
-    stops_with_exceptions(range(4 * len(WIRES)), tally=tally)
+    stops_with_exceptions(range(3 * len(WIRES)), tally=tally)
     assert tally.found == []
     assert tally.total("confirmed_silent") > tally.total("stops") / 4
 

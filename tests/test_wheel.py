@@ -137,6 +137,7 @@ def test_wheel_of_a_platform_brings_its_engine(wheel: Path, tmp_path: Path) -> N
     assert Path(done.stdout.strip()) == tmp_path / "installed/sim/soft_amp/engine.so"
 
 
+@pytest.mark.long
 def test_sdist_holds_what_is_needed_to_test_and_document_it(sdist: Path) -> None:
     """No caches and nothing built; tests, pages and examples are there."""
     with tarfile.open(sdist) as archive:

@@ -53,13 +53,18 @@ def test_unknown_name_lists_the_known_ones() -> None:
     [
         ("Client", "scipy matplotlib sim pymodbus"),
         ("load_rig", "matplotlib sim controller"),
-        pytest.param("SolvedPlate", "matplotlib controller", marks=pytest.mark.long),
-        pytest.param("draw_map", "matplotlib.pyplot", marks=pytest.mark.long),
         ("plugins.backends", "model controller sim numpy scipy pymodbus can serial"),
-        ("plugins.touch_sources", "sim numpy scipy matplotlib pythonosc"),
-        ("plugins.effects", "sim scipy matplotlib drivers.backend"),
-        ("plugins.materials", "sim controller drivers numpy"),
-        ("plugins.elements", "sim controller drivers scipy matplotlib"),
+        *(
+            pytest.param(*row, marks=pytest.mark.long)
+            for row in (
+                ("SolvedPlate", "matplotlib controller"),
+                ("draw_map", "matplotlib.pyplot"),
+                ("plugins.touch_sources", "sim numpy scipy matplotlib pythonosc"),
+                ("plugins.effects", "sim scipy matplotlib drivers.backend"),
+                ("plugins.materials", "sim controller drivers numpy"),
+                ("plugins.elements", "sim controller drivers scipy matplotlib"),
+            )
+        ),
     ],
 )
 def test_name_loads_only_what_it_needs(module: str, not_loaded: str) -> None:

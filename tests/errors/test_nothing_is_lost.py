@@ -102,36 +102,26 @@ def outcome_of(command: str) -> tuple[int, str]:
     return status, err.getvalue()
 
 
-@pytest.fixture(scope="module")
-def endings(
-    shelf: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[dict[str, tuple[int, str]], dict[str, bytes], dict[str, bytes]]:
-    """Outcomes of all commands when interrupted, and the files before and after."""
-    folder = tmp_path_factory.mktemp("interrupted")
-    furnish(folder, shelf)
-    for command in WRITING:
-        target = folder / command.split("-o ")[1].split()[0]
+@pytest.mark.parametrize(
+    "commands",
+    [
+        {command: WRITING[command] for command in QUICK if command in WRITING},
+        pytest.param(WRITING | LONG, marks=pytest.mark.long),
+    ],
+    ids=["some", "all"],
+)
+def test_interrupted_commands_keep_previous_output(home: Path, commands: dict[str, str]) -> None:
+    """The exit status is 130, without a traceback, and the files are unchanged."""
+    for command in commands:
+        target = home / [*command.split("-o "), "-"][1].split()[0]
         if target.suffix:
             target.write_bytes(b"")
-    before = files(folder)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(folder / ".cache"))
-        ended = interrupted(WRITING | LONG, folder)
-    return ended, before, files(folder)
-
-
-@pytest.mark.parametrize("command", WRITING | LONG)
-def test_interrupted_command_keeps_previous_output(
-    command: str,
-    endings: tuple[dict[str, tuple[int, str]], dict[str, bytes], dict[str, bytes]],
-) -> None:
-    """The exit status is 130, without a traceback, and the files are unchanged."""
-    ended, before, after = endings
-    status, said = ended[command]
-    assert status == 130, said
-    assert "Traceback" not in said
-    assert "error" not in said
-    assert after == before
+    before = files(home)
+    for status, said in interrupted(commands, home).values():
+        assert status == 130, said
+        assert "Traceback" not in said
+        assert "error" not in said
+    assert files(home) == before
 
 
 @pytest.mark.parametrize("command", shortly([*WRITING, "config init out.yaml"], QUICK))

@@ -39,6 +39,7 @@ from daemon_process import (
 )
 from drivers.protocol.messages import AmplifierState, Apply, Disarm, Fault, GetStatus, Nak
 from journal import Journal, energised, loudness, silent_from
+from long_form import shortly
 from model.rig.file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.far_ends.wires import Wire
@@ -280,7 +281,7 @@ async def test_daemon_plays_on_and_stops_without_descriptors(tmp_path: Path) -> 
 
 
 async def test_daemon_combines_reloads_when_many_are_requested(tmp_path: Path) -> None:
-    """During 200 SIGHUPs it plays on and leaks no descriptor; the last change is applied."""
+    """During 20 SIGHUPs it plays on and leaks no descriptor; the last change is applied."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         environment = {"NOTIFY_SOCKET": str(tmp_path / "notify")}
@@ -296,15 +297,15 @@ async def test_daemon_combines_reloads_when_many_are_requested(tmp_path: Path) -
             before = len(descriptors(test.pid))
 
             async def hang_up() -> None:
-                for number in range(200):
-                    if number == 199:
+                for number in range(20):
+                    if number == 19:
                         with (tmp_path / "daemon.yaml").open("a", encoding="utf-8") as file:
                             file.write("level_db_sl: 10\n")
                     os.kill(test.pid, signal.SIGHUP)
                     await asyncio.sleep(0.001)
 
             hanging_up = asyncio.create_task(hang_up())
-            await test.plays_on("200 SIGHUPs")
+            await test.plays_on("20 SIGHUPs")
             await hanging_up
             await until(lambda: len(descriptors(test.pid)) <= before)
             quiet = False
@@ -315,7 +316,7 @@ async def test_daemon_combines_reloads_when_many_are_requested(tmp_path: Path) -
             effects = (await test.era.effects()).effects
             assert {each.parameters["level"] for each in effects} == {10}
         asyncio.get_running_loop().remove_reader(manager)
-    assert 1 <= sum(b"RELOADING=1" in each for each in notices) <= 100
+    assert 1 <= sum(b"RELOADING=1" in each for each in notices) <= 10
 
 
 @pytest.mark.parametrize(
@@ -365,7 +366,7 @@ async def test_daemon_exits_when_terminated_over_dead_link(tmp_path: Path) -> No
         assert test.silent_in_time()
 
 
-@pytest.mark.parametrize("wire", ["serial", "modbus+tcp", "can+slcan"])  # links alone: all
+@pytest.mark.parametrize("wire", shortly(["serial", "modbus+tcp", "can+slcan"], ["serial"]))
 async def test_cut_cable_is_reported(tmp_path: Path, wire: str) -> None:
     """Clients get COMM_LOST; reconnected, the daemon stays disarmed and silent."""
     rig = load_rig(write_rig(tmp_path / "bench.yaml"))

@@ -21,6 +21,7 @@ from controller.sources.touch import Touch, TouchFrame
 from drivers.amplifier import Amplifier
 from drivers.errors import DriverError
 from drivers.registry import open_backend
+from long_form import in_turn
 from memory_machine import live_in_memory
 from model.fem.mesh import Mesh
 from model.rig.file import load_rig
@@ -144,8 +145,10 @@ async def test_sixteen_channels_of_four_amplifiers_start_together(arranged: str)
         assert skew <= (1e-9 if arranged.startswith("one bus") else MAX_SKEW)
 
 
-@pytest.mark.parametrize("lost", ["a", "c"])
-@pytest.mark.parametrize("arranged", ["one bus, serial", "one bus, slcan", "four lines, mixed"])
+@pytest.mark.parametrize(
+    ("arranged", "lost"),
+    in_turn(["one bus, serial", "four lines, mixed", "one bus, slcan"], ["a", "c"]),
+)
 @in_virtual_time
 async def test_loss_of_one_of_four_silences_all(arranged: str, lost: str) -> None:
     """Whichever hangs is silent by its watchdog, the others once that has elapsed, and all stay so.

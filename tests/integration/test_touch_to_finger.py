@@ -14,6 +14,7 @@ import pytest
 from felt_assertions import CHECKS, Truth, response_differences, rounding
 from felt_chain import Chain, Played
 from heard import Heard
+from long_form import shortly
 from model.finger.grid import Grid
 from model.rig.file import load_rig
 from model.table.build import build_table
@@ -47,6 +48,7 @@ SHORT = Stream(PLACES, [*STREAM.changes[:1], (0.8, {}), (1.1, {})])
 # Envelopes take 59 ms on Modbus RTU at 115 200 baud, 29 ms on CAN; a touch waits 30 ms.
 PLAIN = {"modbus-rtu"}
 WIRES = ("serial", "modbus-tcp", "modbus-rtu", "slcan", "socketcand", "sim")
+SHORTLY = ("serial", "modbus-rtu", "socketcand")
 
 SWAPPED = (
     ("amplifier: main, channel: 1", "amplifier: main, channel: 9"),
@@ -90,7 +92,7 @@ def played(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Callable[[
 
 
 @pytest.mark.parametrize("check", CHECKS)
-@pytest.mark.parametrize("wire", WIRES)
+@pytest.mark.parametrize("wire", shortly(WIRES, SHORTLY))
 def test_fingers_feel_the_commanded_pattern(
     played: Callable[[str], Played], truth: Truth, wire: str, check: str
 ) -> None:
@@ -105,7 +107,7 @@ def _drives(heard: Heard) -> list[Mapping[str, object]]:
     return [pattern["drive"] for pattern in heard.patterns]
 
 
-@pytest.mark.parametrize("wire", WIRES[1:])
+@pytest.mark.parametrize("wire", shortly(WIRES[1:], SHORTLY))
 def test_plate_response_is_equal_over_all_wires(
     played: Callable[[str], Played], truth: Truth, wire: str
 ) -> None:

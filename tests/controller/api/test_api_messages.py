@@ -206,9 +206,9 @@ def test_line_of_any_bytes_is_a_request_or_refused(line: bytes) -> None:
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
     lambda inner: (
-        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
+        st.lists(inner, max_size=2) | st.dictionaries(st.text(max_size=3), inner, max_size=2)
     ),
-    max_leaves=8,
+    max_leaves=4,
 )
 
 

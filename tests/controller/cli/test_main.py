@@ -259,7 +259,11 @@ print(len(paths), *sorted(heavy & {name.partition(".")[0] for name in sys.module
     [
         ("", set()),
         # typer describes the options of a command with pydantic where that is installed.
-        ("all", {"asyncio", "ssl", "pydantic", "pydantic_core", "annotated_types"}),
+        pytest.param(
+            "all",
+            {"asyncio", "ssl", "pydantic", "pydantic_core", "annotated_types"},
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_help_loads_commands_and_typer_alone(which: str, others: set[str]) -> None:

@@ -10,6 +10,7 @@ from controller.daemon.states import DaemonState
 from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import Reply, Status
 from lies import Lie, achieved, status
+from long_form import in_turn, shortly
 from stop_chain import WIRES
 from supervised_chain import ENABLED, supervised_chain
 from virtual_loop import run_virtual
@@ -53,14 +54,11 @@ LIES: dict[str, tuple[Callable[[], Lie], str]] = {
 }
 
 
-@pytest.mark.parametrize(
-    ("names", "moves"), [(ONE, False), (TWO, True)], ids=["one-rest", "two-touches"]
-)
-@pytest.mark.parametrize("name", LIES)
-def test_lie_ends_in_fault_and_silence(name: str, names: tuple[str, ...], moves: bool) -> None:
+@pytest.mark.parametrize(("name", "names"), in_turn(LIES, [ONE, TWO]))
+def test_lie_ends_in_fault_and_silence(name: str, names: tuple[str, ...]) -> None:
     """Within about two heartbeats or sets, with its reason; all amplifiers are silent then."""
     lie, reason = LIES[name]
-    moves = moves and name != "watchdog frozen"  # sets feed it before it can run down
+    moves = names is TWO and name != "watchdog frozen"  # sets feed it before it can run down
 
     async def main() -> None:
         async with supervised_chain("serial", names) as chain:
@@ -98,7 +96,7 @@ def test_dead_weak_channel_ends_in_fault(level: float, names: tuple[str, ...]) -
 @pytest.mark.parametrize(
     ("names", "shaped"), [(ONE, False), (TWO, True)], ids=["one-ramps", "two-envelopes"]
 )
-@pytest.mark.parametrize("wire", WIRES)
+@pytest.mark.parametrize("wire", shortly(WIRES, ["serial", "socketcand"]))
 def test_honest_amplifiers_are_never_a_fault(
     wire: str, names: tuple[str, ...], shaped: bool
 ) -> None:

@@ -22,9 +22,9 @@ from model.table.table import LocalizationTable
 from paper_table import smooth_rig
 from pressed_layout import WIRES, Felt, Pressed
 
-PRESSES = {"modbus-rtu": 10}
+PRESSES = {"modbus-rtu": 6}
 """Equal presses, each at another phase of the heartbeats; on the other wires `FEW`."""
-FEW = 4
+FEW = 3
 PLACE, CENTRE = (0.09, 0.07), (0.09, 0.10)
 Way = Callable[[float], tuple[float, float]]
 

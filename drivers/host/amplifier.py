@@ -107,7 +107,7 @@ class Amplifier:
         """Read identity and capabilities; raises LinkError."""
         identity = await self._request("Hello", {}, Priority.OTHER, timeout=OPEN_TIMEOUT)
         if not speaks(identity, VERSION):
-            spoken = [str(bit + 1) for bit in range(16) if identity["versions"] >> bit & 1]
+            spoken = [str(version) for version in range(16) if speaks(identity, version)]
             raise LinkError(
                 f"amplifier {self.name} speaks protocol {', '.join(spoken) or 'none'}, needs "
                 f"{VERSION}; update it"

@@ -54,5 +54,5 @@ def unpack_identity(payload: bytes) -> Values:
 
 
 def speaks(identity: Values, version: int) -> bool:
-    """Whether an amplifier speaks a version: bit 0 is version 1."""
-    return bool(identity["versions"] >> version - 1 & 1)
+    """Whether an amplifier speaks a version: bit n is version n."""
+    return bool(identity["versions"] >> version & 1)

@@ -89,7 +89,7 @@ class Amplifier:
 
     def __init__(self, name: str, *, channels: int, is_output: bool = False) -> None:
         self.identity: Values = {
-            **{"versions": 1 << 2, "vendor": "era-haptics", "product": "simulated amplifier"},
+            **{"versions": 1 << 3, "vendor": "era-haptics", "product": "simulated amplifier"},
             **{"serial_number": f"SIM-{name}", "firmware": "1"},
         }
         self.capabilities = capabilities(channels, is_output=is_output)

@@ -1,47 +1,83 @@
-"""A serial line of protocol 3 in virtual time: hosts' lines and simulated amplifiers on it."""
+"""A line of protocol 3 in virtual time, of any kind of wire: hosts and simulated amplifiers."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
 
 from drivers.codec.serial_line.frame import FrameReader
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.line import Line
 from drivers.host.serial_wire import SerialWire
+from drivers.host.wire import Wire
+from drivers.protocol.table import BY_NUMBER
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)
 
-Alter = Callable[[bytes], list[tuple[float, bytes]]]
-"""What becomes of bytes on their way: delays [s] and bytes, none for lost ones."""
+Alter = Callable[[str, bytes], list[tuple[float, bytes]]]
+"""What becomes of bytes of a message, by its name, on their way: delays [s] and bytes, none lost.
+
+A reply has the name of its request.
+"""
 
 
-def unaltered(data: bytes) -> list[tuple[float, bytes]]:
+def unaltered(name: str, data: bytes) -> list[tuple[float, bytes]]:
     """Bytes as they are, after 0.2 ms."""
     return [(0.0002, data)]
+
+
+class FarEnd(Protocol):
+    """The amplifiers' side of a wire."""
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take bytes from the host at a time [s]."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of wire: the host's side, and the amplifiers' side with the function it sends by.
+
+    request_of: address and number of the message that begins with these bytes of the host; None
+    where they go on with the one before.
+    """
+
+    wire: Callable[[], Wire]
+    far_end: Callable[[Mapping[int, Amplifier], Callable[[bytes], None]], FarEnd]
+    request_of: Callable[[bytes], tuple[int, int] | None]
+
+
+def _serial_request(data: bytes) -> tuple[int, int]:
+    (frame,) = FrameReader().feed(data)
+    return frame.address, frame.type
+
+
+KINDS: Mapping[str, Kind] = {
+    "serial": Kind(lambda: SerialWire(921_600, sequence=0), SerialAmplifiers, _serial_request),
+}
 
 
 class MemoryLine:
     """Simulated amplifiers at addresses 1, 2, ... of a line, and the host's amplifiers on it.
 
-    inward, outward: what becomes of bytes for the amplifiers, and for the host; sent: the frames of
-    the host, with their times.
+    inward, outward: what becomes of bytes for the amplifiers, and for the host; sent: the requests
+    of the host as address:number, with their times.
     """
 
     is_blocked = False
 
-    def __init__(self, *names: str, channels: int = 2, baud: int = 921_600) -> None:
+    def __init__(self, kind: str, *names: str, channels: int = 2) -> None:
         self.loop = asyncio.get_running_loop()
         self.far = {each: Amplifier(each, channels=channels) for each in names}
         self.inward: Alter = unaltered
         self.outward: Alter = unaltered
         self.sent: list[tuple[float, str]] = []
-        self._reader = FrameReader()
-        self._end = SerialAmplifiers(
-            dict(enumerate(self.far.values(), 1)), lambda data: self._send(data, self.outward)
-        )
-        self.line = Line(SerialWire(baud, sequence=0), self, "line")
+        self._kind = KINDS[kind]
+        self._sending = self._handling = ""
+        self._end = self._kind.far_end(dict(enumerate(self.far.values(), 1)), self._send)
+        self.line = Line(self._kind.wire(), self, "line")
         self.hosts = {
             each: Host(self.line, address, LIMITS, name=each)
             for address, each in enumerate(names, 1)
@@ -49,19 +85,22 @@ class MemoryLine:
 
     def write(self, data: bytes) -> None:
         """Send bytes of the host."""
-        for frame in self._reader.feed(data):
-            self.sent.append((self.loop.time(), f"{frame.address}:{frame.type}"))
-        for delay, altered in self.inward(data):
-            self.loop.call_later(delay, self._arrived, altered)
+        if (request := self._kind.request_of(data)) is not None:
+            address, number = request
+            self.sent.append((self.loop.time(), f"{address}:{number}"))
+            self._sending = BY_NUMBER[number].name if number in BY_NUMBER else "Hello"
+        for delay, altered in self.inward(self._sending, data):
+            self.loop.call_later(delay, self._arrived, self._sending, altered)
 
     def poll(self) -> None:
         """All that has come was handed over."""
 
-    def _arrived(self, data: bytes) -> None:
+    def _arrived(self, name: str, data: bytes) -> None:
+        self._handling = name
         self._end.receive(data, self.loop.time())
 
-    def _send(self, data: bytes, alter: Alter) -> None:
-        for delay, altered in alter(data):
+    def _send(self, data: bytes) -> None:
+        for delay, altered in self.outward(self._handling, data):
             self.loop.call_later(delay, self.line.received, altered)
 
     def levels(self, name: str) -> list[float]:

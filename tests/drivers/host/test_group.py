@@ -1,4 +1,4 @@
-"""Lines, amplifiers and their group on serial lines of protocol 3, in virtual time.
+"""Lines, amplifiers and their group on every kind of wire of protocol 3, in virtual time.
 
 What a person would feel is read from the simulated amplifiers themselves.
 """
@@ -8,16 +8,20 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
-from drivers.codec.serial_line.frame import FrameReader, encode_frame
 from drivers.contents import Layer, Shape, Tone
 from drivers.errors import CommandRefused, LinkDegraded, LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.protocol.records import Values
-from drivers.protocol.serial_payload import pack_words, unpack_words
-from drivers.protocol.table import MESSAGES, STATES
+from drivers.protocol.table import STATES
 from virtual_loop import run_virtual
-from words_line import Alter, MemoryLine, unaltered
+from words_line import KINDS, Alter, MemoryLine, unaltered
+
+
+@pytest.fixture(params=KINDS)
+def wire(request: pytest.FixtureRequest) -> str:
+    """Every kind of wire."""
+    return str(request.param)
 
 
 def tone(channel: int = 0, level: float = 0.5, **other: object) -> Tone:
@@ -31,12 +35,12 @@ def layer(number: int, *tones: Tone, **other: object) -> Layer:
 
 
 def with_group(
-    test: Callable[[Group, list[MemoryLine]], Awaitable[None]], *lines: tuple[str, ...]
+    test: Callable[[Group, list[MemoryLine]], Awaitable[None]], wire: str, *lines: tuple[str, ...]
 ) -> None:
-    """Run a test with an armed group of amplifiers, by their names on each line."""
+    """Run a test with an armed group of amplifiers, by their names on each line of a kind."""
 
     async def run() -> None:
-        ends = [MemoryLine(*names) for names in lines]
+        ends = [MemoryLine(wire, *names) for names in lines]
         hosts = {name: host for end in ends for name, host in end.hosts.items()}
         group = Group(hosts, draw=lambda low, high: 77)
         await group.open()
@@ -46,18 +50,16 @@ def with_group(
     run_virtual(run())
 
 
-def losing(*types: str, count: int = 1) -> Alter:
+def losing(*names: str, count: int = 1) -> Alter:
     """Loses so many frames of these messages, in whichever direction."""
-    numbers = {MESSAGES[name].number for name in types}
     left = count
 
-    def alter(data: bytes) -> list[tuple[float, bytes]]:
+    def alter(name: str, data: bytes) -> list[tuple[float, bytes]]:
         nonlocal left
-        (frame,) = FrameReader().feed(data)
-        if frame.type in numbers and left > 0:
+        if name in names and left > 0:
             left -= 1
             return []
-        return unaltered(data)
+        return unaltered(name, data)
 
     return alter
 
@@ -66,7 +68,7 @@ LINES = {"alone": (("a",),), "each its own": (("a",), ("b",)), "shared": (("a", 
 
 
 @pytest.mark.parametrize("lines", LINES)
-def test_layers_play_together_and_leave_each_other_alone(lines: str) -> None:
+def test_layers_play_together_and_leave_each_other_alone(wire: str, lines: str) -> None:
     """A second layer adds 0.2; the first falls silent while the second plays on, on all at once."""
 
     async def test(group: Group, ends: list[MemoryLine]) -> None:
@@ -88,10 +90,10 @@ def test_layers_play_together_and_leave_each_other_alone(lines: str) -> None:
         assert all(end.levels(name) == [0.2, 0.1] for end in ends for name in end.hosts)
         assert all(each.is_exact for each in staged.values())
 
-    with_group(test, *LINES[lines])
+    with_group(test, wire, *LINES[lines])
 
 
-def test_refused_on_one_means_committed_on_none() -> None:
+def test_refused_on_one_means_committed_on_none(wire: str) -> None:
     """The ledger of the second refuses a channel it does not have; the first plays on."""
 
     async def test(group: Group, ends: list[MemoryLine]) -> None:
@@ -103,10 +105,10 @@ def test_refused_on_one_means_committed_on_none() -> None:
         assert [ends[0].levels("a"), ends[1].levels("b")] == [[0.5, 0.0]] * 2
         await group.apply({name: [layer(0, tone(level=0.3))] for name in "ab"})
 
-    with_group(test, ("a",), ("b",))
+    with_group(test, wire, ("a",), ("b",))
 
 
-def test_set_of_many_parts_arrives_whole() -> None:
+def test_set_of_many_parts_arrives_whole(wire: str) -> None:
     """Two channels with onsets and endings of 32 knots are four frames."""
 
     async def test(group: Group, ends: list[MemoryLine]) -> None:
@@ -118,12 +120,12 @@ def test_set_of_many_parts_arrives_whole() -> None:
         await asyncio.sleep(0.04)
         assert ends[0].levels("a") == [0.4, 0.4]
 
-    with_group(test, ("a",))
+    with_group(test, wire, ("a",))
 
 
 @pytest.mark.parametrize("name", ["Set", "Commit"])
 @pytest.mark.parametrize("way", ["inward", "outward"])
-def test_lost_frame_is_repeated_and_played_once(name: str, way: str) -> None:
+def test_lost_frame_is_repeated_and_played_once(wire: str, name: str, way: str) -> None:
     """The request or its reply; the tone counts from the one commit."""
 
     async def test(group: Group, ends: list[MemoryLine]) -> None:
@@ -134,10 +136,10 @@ def test_lost_frame_is_repeated_and_played_once(name: str, way: str) -> None:
         assert ends[0].line.statistics.retries == 1
         assert len(ends[0].far["a"].playback.voices_of(0)) == 1
 
-    with_group(test, ("a",))
+    with_group(test, wire, ("a",))
 
 
-def test_lost_broadcast_is_made_good() -> None:
+def test_lost_broadcast_is_made_good(wire: str) -> None:
     """Both amplifiers of a line play although the broadcast of the commit was lost."""
 
     async def test(group: Group, ends: list[MemoryLine]) -> None:
@@ -146,15 +148,15 @@ def test_lost_broadcast_is_made_good() -> None:
         await asyncio.sleep(0.002)
         assert [ends[0].levels(name) for name in "ab"] == [[0.5, 0.0]] * 2
 
-    with_group(test, ("a", "b"))
+    with_group(test, wire, ("a", "b"))
 
 
-def test_degraded_amplifier_gets_nothing_that_plays_or_feeds() -> None:
+def test_degraded_amplifier_gets_nothing_that_plays_or_feeds(wire: str) -> None:
     """After three requests without reply; a status ends it."""
 
     async def test(group: Group, ends: list[MemoryLine]) -> None:
         (host,) = group.amplifiers.values()
-        ends[0].outward = lambda data: []
+        ends[0].outward = lambda name, data: []
         with pytest.raises(LinkTimeout):
             await host.ping()
         for request in (host.ping, lambda: host.stage(1, [layer(0, tone())])):
@@ -164,16 +166,16 @@ def test_degraded_amplifier_gets_nothing_that_plays_or_feeds() -> None:
         await host.read_status()
         await host.ping()
 
-    with_group(test, ("a",))
+    with_group(test, wire, ("a",))
 
 
-def test_amplifier_without_reply_stops_the_others() -> None:
+def test_amplifier_without_reply_stops_the_others(wire: str) -> None:
     """Silent along 5 ms, the mute one by its watchdog; until when it may play is told."""
 
     async def test(group: Group, ends: list[MemoryLine]) -> None:
         await group.apply({name: [layer(0, tone())] for name in "ab"})
         began = ends[0].loop.time()
-        ends[1].inward = lambda data: []
+        ends[1].inward = lambda name, data: []
         with pytest.raises(LinkError):
             await group.beat()
         assert not group.is_armed
@@ -184,16 +186,16 @@ def test_amplifier_without_reply_stops_the_others() -> None:
         await asyncio.sleep(stopped["b"].may_play_until - ends[1].loop.time())
         assert ends[1].levels("b") == [0.0, 0.0]
 
-    with_group(test, ("a",), ("b",))
+    with_group(test, wire, ("a",), ("b",))
 
 
-def test_stop_overtakes_what_is_queued() -> None:
+def test_stop_overtakes_what_is_queued(wire: str) -> None:
     """With a set on the line and ten readings queued: silent within 20 ms, none is committed."""
 
     async def test(group: Group, ends: list[MemoryLine]) -> None:
         (host,) = group.amplifiers.values()
         await group.apply({"a": [layer(0, tone())]})
-        ends[0].outward = lambda data: [(0.004, data)]
+        ends[0].outward = lambda name, data: [(0.004, data)]
         reads = [asyncio.ensure_future(host.read_status()) for _ in range(10)]
         applying = asyncio.ensure_future(group.apply({"a": [layer(0, tone(level=0.9))]}))
         await asyncio.sleep(0.001)
@@ -207,10 +209,10 @@ def test_stop_overtakes_what_is_queued() -> None:
         await asyncio.gather(*reads)
         assert ends[0].levels("a") == [0.0, 0.0]
 
-    with_group(test, ("a",))
+    with_group(test, wire, ("a",))
 
 
-def test_stop_between_stage_and_commit_commits_nothing() -> None:
+def test_stop_between_stage_and_commit_commits_nothing(wire: str) -> None:
     """The staged set is dropped by the amplifier, too."""
 
     async def test(group: Group, ends: list[MemoryLine]) -> None:
@@ -221,22 +223,7 @@ def test_stop_between_stage_and_commit_commits_nothing() -> None:
             await host.commit(9)
         assert ends[0].levels("a") == [0.0, 0.0]
 
-    with_group(test, ("a",))
-
-
-def lying(reply: Callable[[Values], Values]) -> Alter:
-    """Alters every status that is sent to the host."""
-    record = MESSAGES["GetStatus"].reply
-
-    def alter(data: bytes) -> list[tuple[float, bytes]]:
-        (frame,) = FrameReader().feed(data)
-        if frame.type not in (8, 9):
-            return unaltered(data)
-        values = reply(record.unpack(unpack_words(frame.payload), is_strict=False))
-        payload = pack_words(record.pack(values))
-        return unaltered(encode_frame(frame._replace(payload=payload)))
-
-    return alter
+    with_group(test, wire, ("a",))
 
 
 LIES: dict[str, Callable[[Values], Values]] = {
@@ -249,12 +236,16 @@ LIES: dict[str, Callable[[Values], Values]] = {
 
 
 @pytest.mark.parametrize("lie", LIES)
-def test_stop_is_confirmed_by_nothing_less_than_a_new_latch_and_all_levels(lie: str) -> None:
+def test_stop_is_confirmed_by_nothing_less_than_a_new_latch_and_all_levels(
+    wire: str, lie: str
+) -> None:
     """Whatever of it is missing: not confirmed, within 0.5 s, with the time that it may play."""
 
     async def test(group: Group, ends: list[MemoryLine]) -> None:
         await group.apply({"a": [layer(0, tone())]})
-        ends[0].outward = lying(LIES[lie])
+        far = ends[0].far["a"]
+        status = far.status
+        far.status = lambda now: LIES[lie](status(now))
         began = ends[0].loop.time()
         stopped = (await group.stop())["a"]
         assert not stopped.is_confirmed
@@ -262,10 +253,10 @@ def test_stop_is_confirmed_by_nothing_less_than_a_new_latch_and_all_levels(lie: 
         assert ends[0].loop.time() - began < 0.5
         assert stopped.may_play_until > began
 
-    with_group(test, ("a",))
+    with_group(test, wire, ("a",))
 
 
-def test_watchdog_is_fed_by_the_group_alone() -> None:
+def test_watchdog_is_fed_by_the_group_alone(wire: str) -> None:
     """Beats keep it playing; without them it is silent after 0.255 s."""
 
     async def test(group: Group, ends: list[MemoryLine]) -> None:
@@ -279,10 +270,10 @@ def test_watchdog_is_fed_by_the_group_alone() -> None:
         with pytest.raises(CommandRefused):
             await group.beat()
 
-    with_group(test, ("a",))
+    with_group(test, wire, ("a",))
 
 
-def test_contradictions_twice_in_a_row_are_a_fault() -> None:
+def test_contradictions_twice_in_a_row_are_a_fault(wire: str) -> None:
     """A derated channel: half of the level once is passed over, twice stops."""
 
     async def test(group: Group, ends: list[MemoryLine]) -> None:
@@ -295,14 +286,14 @@ def test_contradictions_twice_in_a_row_are_a_fault() -> None:
             await group.beat()
         assert not group.is_armed
 
-    with_group(test, ("a",))
+    with_group(test, wire, ("a",))
 
 
-def test_host_that_drives_already_is_seen_and_left_alone() -> None:
+def test_host_that_drives_already_is_seen_and_left_alone(wire: str) -> None:
     """Its heartbeats raise the watchdog unasked; without them the amplifier is taken over."""
 
     async def run() -> None:
-        end = MemoryLine("a")
+        end = MemoryLine(wire, "a")
         far = end.far["a"]
         far.handle("Arm", {"session": 5, "watchdog": 2000}, end.loop.time())
 
@@ -322,15 +313,15 @@ def test_host_that_drives_already_is_seen_and_left_alone() -> None:
     run_virtual(run())
 
 
-IDENTITIES: Values = {"versions": 0b11, "serial_number": "SIM-b"}
+IDENTITIES: Values = {"versions": 0b110, "serial_number": "SIM-b"}
 
 
 @pytest.mark.parametrize("name", IDENTITIES)
-def test_another_amplifier_or_version_is_refused(name: str) -> None:
+def test_another_amplifier_or_version_is_refused(wire: str, name: str) -> None:
     """An amplifier of version 2, and one of another serial number."""
 
     async def run() -> None:
-        end = MemoryLine("a")
+        end = MemoryLine(wire, "a")
         end.far["a"].identity[name] = IDENTITIES[name]
         host = Amplifier(end.line, 1, end.hosts["a"].limits, name="a", serial_number="SIM-a")
         with pytest.raises(LinkError):
@@ -339,15 +330,15 @@ def test_another_amplifier_or_version_is_refused(name: str) -> None:
     run_virtual(run())
 
 
-def test_late_replies_are_credited_to_nothing() -> None:
+def test_late_replies_are_credited_to_nothing(wire: str) -> None:
     """A reply after 70 ms: its request was repeated, and it is counted as unexpected."""
 
     async def test(group: Group, ends: list[MemoryLine]) -> None:
         (host,) = group.amplifiers.values()
         delays = iter([0.07])
-        ends[0].outward = lambda data: [(next(delays, 0.0002), data)]
+        ends[0].outward = lambda name, data: [(next(delays, 0.0002), data)]
         await host.ping()
         await asyncio.sleep(0.1)
         assert ends[0].line.wire.counters.unexpected_frames == 1
 
-    with_group(test, ("a",))
+    with_group(test, wire, ("a",))

@@ -1,26 +1,28 @@
 """`era rig identify`: the plate on the table, by its own ERAs and the sensors of its amplifiers."""
 
 import json
-import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from controller.cli.plate_by_amplifiers import (
+    measured_by_amplifiers,
+    measured_json,
+    measured_line,
+    require_untouched,
+    rig_of_file,
+)
 from model.commands.next_line import next_line
 from model.commands.options import JsonOption
-from model.counting import counted
 from model.errors import InputError
 
 if TYPE_CHECKING:
-    from model.config.document import Document
     from model.identification.measured_plate import DeviceSettings, MeasuredPlate
     from model.rig.rig import Rig
 
 REFUSED = 1
-_REPLY_TIMEOUT = 0.5  # s; a measurement may be slow, and silence is the task of the watchdog
 
 
 def identify(
@@ -131,16 +133,18 @@ def identify(
         )
     check_place(output, example="rig2.yaml")
     check_ending(output, ".yaml", ".yml", what="a rig file")
-    with _rig_of(rig_file) as (document, rig):
+    with rig_of_file(rig_file) as (document, rig):
         source = Path(document.source)
         for taken in (rig_file, source):
             if output.resolve() == taken.resolve():
                 raise InputError(f"--output must differ from {taken}; choose another name")
-        _require_untouched(is_known=untouched, has_terminal=not as_json)
+        require_untouched(is_known=untouched, has_terminal=not as_json)
         if settings is not None:
             measured = _measured_by_device(rig, settings, is_shown=not as_json)
         else:
-            measured = _measured(rig, url or [], level=level, is_quick=quick, is_shown=not as_json)
+            measured = measured_by_amplifiers(
+                rig, url or [], level=level, is_quick=quick, is_shown=not as_json
+            )
     started = time.perf_counter()
     try:
         found = fit(rig, measured.measurement, seed=seed)
@@ -149,7 +153,7 @@ def identify(
         raise typer.Exit(REFUSED) from error
     expected = expected_contrast(found)
     rows = [
-        _head(rig, measured),
+        measured_line(rig, measured),
         *measured.notes,
         *identification_report.parameter_rows(found),
         *identification_report.fit_rows(found),
@@ -165,7 +169,7 @@ def identify(
         files.append(str(output))
     elapsed = time.perf_counter() - started
     if as_json:
-        report = identification_report.as_json(found, expected) | _as_json(measured)
+        report = identification_report.as_json(found, expected) | measured_json(measured)
         print(json.dumps(report | {"solve_time_s": elapsed, "files": files}))
     else:
         print("\n".join(rows))
@@ -180,73 +184,6 @@ def identify(
     if not as_json:
         print(f"\nwrote {', '.join(files)}; computed in {elapsed:.1f} s")
         print(next_line("era", "table", "build", output, "-o", output.with_suffix(".npz")))
-
-
-@contextmanager
-def _rig_of(path: Path) -> "Iterator[tuple[Document, Rig]]":
-    """Read a rig's file, or that which a daemon's file names while its daemon cannot run.
-
-    Raises InputError, also where the daemon runs: it holds the amplifiers.
-    """
-    from controller.daemon.config import daemon_config_of, is_daemon_document, rig_file_of
-    from controller.daemon.socket_lock import SocketLock
-    from model.config.document import read_document
-    from model.rig.file import rig_of
-
-    document = read_document(path)
-    if not is_daemon_document(document):
-        yield document, rig_of(document)
-        return
-    config, rig_file = daemon_config_of(document), rig_file_of(document)
-    assert rig_file is not None  # noqa: S101  else a problem was reported
-    lock = SocketLock(config.socket)
-    try:
-        yield read_document(rig_file), config.rig
-    finally:
-        lock.release()
-
-
-def _require_untouched(*, is_known: bool, has_terminal: bool) -> None:
-    """Raise InputError, or typer.Abort, unless somebody says that nothing touches the plate."""
-    if is_known:
-        return
-    if not (has_terminal and sys.stdin.isatty()):
-        raise InputError(
-            "nothing may touch the plate while it is identified; look, and say so with --yes"
-        )
-    typer.confirm("Nothing touches the plate, and will not for a minute?", abort=True, err=True)
-
-
-def _measured(
-    rig: "Rig", urls: list[str], *, level: float | None, is_quick: bool, is_shown: bool
-) -> "MeasuredPlate":
-    """Measure by the rig's amplifiers, with a progress bar on a terminal."""
-    import asyncio
-    from contextlib import ExitStack
-
-    from controller.cli.amplifier_urls import urls_of
-    from controller.diagnosis.plate_measurement import PlateSelfMeasurement
-    from drivers.amplifier import Amplifier
-    from drivers.registry import open_backend
-    from model.commands.progress import progress_bar
-
-    at = urls_of(rig, urls)
-
-    async def measure() -> "MeasuredPlate":
-        with ExitStack() as shown:
-            on_step = shown.enter_context(progress_bar("steps")) if is_shown else _ignore
-            amplifiers = {
-                name: Amplifier(
-                    open_backend(at[name], rig.voltage_of(name)), reply_timeout=_REPLY_TIMEOUT
-                )
-                for name in rig.amplifiers
-            }
-            found = await PlateSelfMeasurement(
-                rig, amplifiers, level=level, is_quick=is_quick, on_step=on_step
-            ).run()
-            return found.as_measured
-
-    return asyncio.run(measure())
 
 
 def _measured_by_device(
@@ -271,29 +208,3 @@ def _refuse(given: Mapping[str, object], *, rule: str) -> None:
 
 def _ignore(done: int, of: int) -> None:
     """Show nothing."""
-
-
-def _head(rig: "Rig", measured: "MeasuredPlate") -> str:
-    """What was measured, in one line."""
-    measurement = measured.measurement
-    low, high = measurement.tones[0], measurement.tones[-1]
-    return (
-        f"{counted(len(rig.eras), 'ERA')}, {counted(len(measurement.sensors), 'sensor')}, "
-        f"{counted(len(measurement.tones), 'tone')} from {low:g} to {high:g} Hz at a level of "
-        f"{measured.level:.3g}, {counted(len(measurement.values), 'response')} in "
-        f"{measured.duration:.1f} s"
-    )
-
-
-def _as_json(measured: "MeasuredPlate") -> dict[str, object]:
-    """How it was measured, for programs."""
-    measurement = measured.measurement
-    return {
-        "sensors": list(measured.sensors),
-        "sensors_unused": list(measured.notes),
-        "frequencies_hz": measurement.tones.tolist(),
-        "level": measured.level,
-        "responses": len(measurement.values),
-        "measure_time_s": measured.duration,
-        **measured.details,
-    }

@@ -2,12 +2,26 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from controller.cli.identify import identify
+from controller.cli.plate_by_amplifiers import (
+    measured_by_amplifiers,
+    measured_json,
+    measured_line,
+    require_untouched,
+    rig_of_file,
+)
+from model.commands.options import JsonOption
 from model.counting import counted
+from model.errors import InputError
+
+if TYPE_CHECKING:
+    from model.diagnosis.observation import Observation
+    from model.identification.measured_plate import MeasuredPlate
+    from model.rig.rig import Rig
 
 rig_app = typer.Typer(no_args_is_help=True, help="Check and identify a rig.")
 
@@ -19,10 +33,29 @@ rig_app.command()(identify)
 
 @rig_app.command()
 def check(
-    rig_file: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g. RIG.yaml.")],
-    measured: Annotated[
-        Path, typer.Option(metavar="FILE", help="Responses of each channel: .csv or .uff.")
+    rig_file: Annotated[
+        Path, typer.Argument(metavar="RIG", help="Rig file, or the daemon's file that names it.")
     ],
+    measured: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Responses of each channel: .csv or .uff."),
+    ] = None,
+    url: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[NAME=]URL", help="Amplifier whose sensors measure the plate, here and now."
+        ),
+    ] = None,
+    level: Annotated[
+        float | None,
+        typer.Option(help="Level of every tone with --url, by default 0.1 of full stroke."),
+    ] = None,
+    untouched: Annotated[
+        bool,
+        typer.Option(
+            "--yes", help="Nothing touches the plate, and nothing will: do not ask on a terminal."
+        ),
+    ] = False,
     without_phases: Annotated[
         bool,
         typer.Option(
@@ -33,52 +66,79 @@ def check(
     mesh: Annotated[
         str | None, typer.Option(metavar="NxM", help="Mesh instead of the one in the rig file.")
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object and nothing else.")
-    ] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Check whether a rig is wired and built as its file says.
 
-    Reads measured responses. Exit status 1 if the check fails.
+    With --url the amplifiers play small tones and their own sensors listen; with --measured
+    responses are read from a file. Exit status 1 if the check fails.
     """
     import time
+    from dataclasses import replace
 
-    from model.calibration.responses import responses_of
-    from model.calibration.responses_file import read_functions
     from model.diagnosis import diagnosis_report
-    from model.diagnosis.observation import Observation
     from model.diagnosis.verdict import diagnose
-    from model.rig.file import load_rig
 
-    rig = load_rig(rig_file, mesh=mesh)
+    if (measured is None) == (url is None):
+        raise InputError("give --url, of an amplifier with sensors, or --measured, a file")
+    details: dict[str, object] = {}
+    rows: list[str] = []
+    if url is not None:
+        if mesh is not None:
+            raise InputError("--mesh is of --measured; write mesh into the rig file")
+        rig, plate, observation = _measured(
+            rig_file, url, level=level, is_untouched=untouched, is_shown=not as_json
+        )
+        details, rows = measured_json(plate), [measured_line(rig, plate), *plate.notes]
+    else:
+        if level is not None:
+            raise InputError("--level is of --url; leave it out beside --measured")
+        rig, observation = _read(cast("Path", measured), rig_file, mesh=mesh)
+    if without_phases:
+        observation = replace(observation, has_phases=False)
     started = time.perf_counter()
-    responses = responses_of(read_functions(measured), rig)
-    observation = Observation(**vars(responses), has_phases=not without_phases)
     verdict = diagnose(rig, observation)
     elapsed = time.perf_counter() - started
     if as_json:
         exactly_known = [*rig.uncertainty.exactly_known]
         answer = {"exactly_known": exactly_known, "elapsed_s": elapsed}
-        print(json.dumps({**diagnosis_report.as_json(verdict), **answer}))
+        print(json.dumps({**diagnosis_report.as_json(verdict), **details, **answer}))
     else:
         low, high = verdict.frequencies.min(), verdict.frequencies.max()
-        print(
+        rows.append(
             f"{rig_file}: {counted(verdict.sensor_count, 'sensor')}, "
             f"{counted(len(verdict.frequencies), 'frequency', plural='frequencies')} "
             f"from {low:g} to {high:g} Hz, {elapsed:.1f} s"
         )
         if note := rig.uncertainty.note:
-            print(note)
-        print()
-        print(
-            "\n".join(
-                [
-                    *diagnosis_report.channel_table(verdict),
-                    "",
-                    *diagnosis_report.verdict_rows(verdict),
-                    *diagnosis_report.difference_rows(verdict),
-                ]
-            )
-        )
+            rows.append(note)
+        rows += ["", *diagnosis_report.channel_table(verdict), ""]
+        rows += diagnosis_report.verdict_rows(verdict)
+        rows += diagnosis_report.difference_rows(verdict)
+        print("\n".join(rows))
     if not verdict.is_well:
         raise typer.Exit(FAILED)
+
+
+def _measured(
+    rig_file: Path, urls: list[str], *, level: float | None, is_untouched: bool, is_shown: bool
+) -> "tuple[Rig, MeasuredPlate, Observation]":
+    """Measure the plate by the sensors of its amplifiers."""
+    from controller.diagnosis.plate_observation import observation_of
+
+    with rig_of_file(rig_file) as (_, rig):
+        require_untouched(is_known=is_untouched, has_terminal=is_shown)
+        plate = measured_by_amplifiers(rig, urls, level=level, is_quick=False, is_shown=is_shown)
+    return rig, plate, observation_of(plate.measurement, rig)
+
+
+def _read(measured: Path, rig_file: Path, *, mesh: str | None) -> "tuple[Rig, Observation]":
+    """Read what was measured from a file."""
+    from model.calibration.responses import responses_of
+    from model.calibration.responses_file import read_functions
+    from model.diagnosis.observation import Observation
+    from model.rig.file import load_rig
+
+    rig = load_rig(rig_file, mesh=mesh)
+    responses = responses_of(read_functions(measured), rig)
+    return rig, Observation(**vars(responses), has_phases=True)

@@ -1,0 +1,120 @@
+"""Measuring the plate on the table by the amplifiers of its rig, as commands do."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from model.errors import InputError
+
+if TYPE_CHECKING:
+    from model.config.document import Document
+    from model.identification.measured_plate import MeasuredPlate
+    from model.rig.rig import Rig
+
+_REPLY_TIMEOUT = 0.5  # s; a measurement may be slow, and silence is the task of the watchdog
+
+
+@contextmanager
+def rig_of_file(path: Path) -> "Iterator[tuple[Document, Rig]]":
+    """Read a rig's file, or that which a daemon's file names while its daemon cannot run.
+
+    Raises InputError, also where the daemon runs: it holds the amplifiers.
+    """
+    from controller.daemon.config import daemon_config_of, is_daemon_document, rig_file_of
+    from controller.daemon.socket_lock import SocketLock
+    from model.config.document import read_document
+    from model.rig.file import rig_of
+
+    document = read_document(path)
+    if not is_daemon_document(document):
+        yield document, rig_of(document)
+        return
+    config, rig_file = daemon_config_of(document), rig_file_of(document)
+    assert rig_file is not None  # noqa: S101  else a problem was reported
+    lock = SocketLock(config.socket)
+    try:
+        yield read_document(rig_file), config.rig
+    finally:
+        lock.release()
+
+
+def require_untouched(*, is_known: bool, has_terminal: bool) -> None:
+    """Raise InputError, or typer.Abort, unless somebody says that nothing touches the plate."""
+    if is_known:
+        return
+    if not (has_terminal and sys.stdin.isatty()):
+        raise InputError(
+            "nothing may touch the plate while it is measured; look, and say so with --yes"
+        )
+    typer.confirm("Nothing touches the plate, and will not for a minute?", abort=True, err=True)
+
+
+def measured_by_amplifiers(
+    rig: "Rig", urls: list[str], *, level: float | None, is_quick: bool, is_shown: bool
+) -> "MeasuredPlate":
+    """Measure by the rig's amplifiers, with a progress bar on a terminal.
+
+    urls: `[NAME=]URL` in place of those of the rig; level: of every tone, None for the usual one;
+    is_quick: every tone on one ERA only. Raises DriverError and InputError.
+    """
+    import asyncio
+
+    from controller.cli.amplifier_urls import urls_of
+    from controller.diagnosis.plate_measurement import PlateSelfMeasurement
+    from drivers.amplifier import Amplifier
+    from drivers.registry import open_backend
+    from model.commands.progress import progress_bar
+
+    at = urls_of(rig, urls)
+
+    async def measure() -> "MeasuredPlate":
+        with ExitStack() as shown:
+            on_step = shown.enter_context(progress_bar("steps")) if is_shown else _ignore
+            amplifiers = {
+                name: Amplifier(
+                    open_backend(at[name], rig.voltage_of(name)), reply_timeout=_REPLY_TIMEOUT
+                )
+                for name in rig.amplifiers
+            }
+            found = await PlateSelfMeasurement(
+                rig, amplifiers, level=level, is_quick=is_quick, on_step=on_step
+            ).run()
+            return found.as_measured
+
+    return asyncio.run(measure())
+
+
+def measured_line(rig: "Rig", measured: "MeasuredPlate") -> str:
+    """What was measured, in one line."""
+    from model.counting import counted
+
+    measurement = measured.measurement
+    low, high = measurement.tones[0], measurement.tones[-1]
+    return (
+        f"{counted(len(rig.eras), 'ERA')}, {counted(len(measurement.sensors), 'sensor')}, "
+        f"{counted(len(measurement.tones), 'tone')} from {low:g} to {high:g} Hz at a level of "
+        f"{measured.level:.3g}, {counted(len(measurement.values), 'response')} in "
+        f"{measured.duration:.1f} s"
+    )
+
+
+def measured_json(measured: "MeasuredPlate") -> dict[str, object]:
+    """How it was measured, for programs."""
+    measurement = measured.measurement
+    return {
+        "sensors": list(measured.sensors),
+        "sensors_unused": list(measured.notes),
+        "frequencies_hz": measurement.tones.tolist(),
+        "level": measured.level,
+        "responses": len(measurement.values),
+        "measure_time_s": measured.duration,
+        **measured.details,
+    }
+
+
+def _ignore(done: int, of: int) -> None:
+    """Show nothing."""

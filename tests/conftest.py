@@ -160,8 +160,9 @@ def pytest_sessionfinish() -> None:
 
 @pytest.fixture
 def plain_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures laid out in a moment, for commands that write some beside what is tested."""
+    """Pictures drawn in a moment, for commands that write some beside what is tested."""
     monkeypatch.setattr("matplotlib.figure.Figure.set_layout_engine", lambda *_, **__: None)
+    monkeypatch.setattr("model.figures.drawing._DPI", 20)
 
 
 @pytest.fixture(scope="session")

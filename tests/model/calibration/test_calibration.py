@@ -1,17 +1,22 @@
 """Fitting a rig to responses of a plate that is known, solved without the fit's own model."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
+import perturbed_plate
 from model.calibration.calibrate import calibrate
 from model.calibration.calibration_result import Calibration
 from model.calibration.responses import Responses
 from model.errors import InputError
 from model.rig.rig import Rig
 from paper_plate import make_paper_rig
-from perturbed_plate import FREQUENCIES, NAMES, POINTS, measured, perturbed
+from perturbed_plate import NAMES, POINTS, perturbed
+
+FREQUENCIES = np.arange(40.0, 501.0, 40.0)
+measured = partial(perturbed_plate.measured, frequencies=FREQUENCIES)
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +28,7 @@ def rig() -> Rig:
 @pytest.fixture(scope="module")
 def truth(rig: Rig) -> Rig:
     """What was measured."""
-    return perturbed(rig)
+    return perturbed(rig, frequencies=FREQUENCIES)
 
 
 @pytest.fixture(scope="module")

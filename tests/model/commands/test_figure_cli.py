@@ -18,9 +18,9 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def test_figure_writes_a_picture_and_its_numbers(tmp_path: Path) -> None:
-    """Figure 7 as PNG and CSV in a new folder; files and next command are printed."""
+    """Figure 7 as PNG and CSV in a new folder, and what is printed of them."""
     folder = tmp_path / "new" / "figures"
-    result = RUNNER.invoke(figure_app, ["7", RIG, "-o", str(folder), "--mesh", "12x9"])
+    result = RUNNER.invoke(figure_app, ["7", RIG, "-o", str(folder), "--mesh", "12x9", "--json"])
     assert result.exit_code == 0
     assert sorted(path.name for path in folder.iterdir()) == [
         "figure_7.csv",
@@ -35,9 +35,6 @@ def test_figure_writes_a_picture_and_its_numbers(tmp_path: Path) -> None:
     assert [f"{float(row['model_12x9_hz']):.2f}" for row in rows] == [
         "31.98", "68.50", "76.62", "107.84", "160.77",
     ]  # fmt: skip
-    assert str(folder / "figure_7.png") in result.stdout
-    assert result.stdout.splitlines()[-1].startswith("Next: ")
-    result = RUNNER.invoke(figure_app, ["7", RIG, "-o", str(folder), "--mesh", "12x9", "--json"])
     answer = json.loads(result.stdout)
     assert "figure_7" in answer["figures"]
     assert all(Path(name).is_file() for name in answer["files"])

@@ -60,11 +60,7 @@ def check_recommendation(answer: dict[str, Any]) -> None:
 
 
 def test_placement_study_ranks_recommends_and_resumes(tmp_path: Path) -> None:
-    """Three CSV rows per layout, the best contrast first; the same command solves nothing again.
-
-    With another seed only the named layouts are known; a study of the recommended rig finds its own
-    layout with the same statistics.
-    """
+    """Three CSV rows per layout, the best contrast first; the same command solves nothing again."""
     first = study("placement", tmp_path, "--layouts", "20")
     check_recommendation(first)
     with (tmp_path / "placement.csv").open(encoding="utf-8") as stream:
@@ -90,14 +86,6 @@ def test_placement_study_ranks_recommends_and_resumes(tmp_path: Path) -> None:
     assert (first["solved"], first["from_cache"]) == (20, 0)
     assert (second["solved"], second["from_cache"]) == (0, 20)
     assert second["ranking"] == first["ranking"]
-    again = study("placement", tmp_path / "again", "--layouts", "1", rig=first["files"][0])
-    (own,) = again["ranking"]
-    assert own["layout"] == "own"
-    for key in ("minimum_m_s2", "median_m_s2", "maximum_m_s2"):
-        assert own[key] == pytest.approx(first["recommended"][key], rel=1e-9)
-    other = study("placement", tmp_path, "--layouts", "20", "--seed", "1")
-    assert 0 < other["from_cache"] < 20
-    assert other["ranking"] != first["ranking"]
 
 
 def test_placement_study_keeps_what_it_does_not_vary(tmp_path: Path) -> None:

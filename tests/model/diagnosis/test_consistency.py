@@ -67,7 +67,9 @@ def test_plate_of_another_length_is_refused_by_its_length(
     Of few sizes and causes; whole searches are tested with diagnoses.
     """
     monkeypatch.setattr(causes, "_SIZES", (0.82, 1.21))
-    monkeypatch.setattr(causes, "_REFINEMENTS", 4)
+    monkeypatch.setattr(causes, "_FITTED_CAUSES", 3)
+    monkeypatch.setattr(causes, "_REFINED_CAUSES", 1)
+    monkeypatch.setattr(causes, "_REFINEMENTS", 3)
     plate = replace(rig.plate, length=1.2 * rig.plate.length)
     eras = tuple(replace(era, x=1.2 * era.x) for era in rig.eras)
     longer = replace(rig, plate=plate, eras=eras, mesh=Mesh(16, 12, plate.length, plate.width))

@@ -6,38 +6,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.identification.hidden import Hidden, draw
+from benchmarks.identification.hidden import Hidden
 from benchmarks.identification.thin_plate import Mounted
 from model.errors import InputError
 from model.identification import learned_table
 from model.identification.forward import Sensor
-from model.identification.identify import identify
+from model.identification.identify import Identification
 from model.identification.in_service import Known
 from model.identification.learned_table import LearnedTable
-from model.identification.measurement import Measurement
-from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.table.build import build_table
 from model.table.table import LocalizationTable
-from settled_patterns import FREQUENCIES, settled_patterns
+from settled_patterns import settled_patterns
 
 TONES = np.array([85.0, 150.0, 215.0, 330.0])
 POINTS = np.array([[0.06, 0.05], [0.15, 0.11], [0.26, 0.17], [0.22, 0.04]])
 
 
 @pytest.fixture(scope="module")
-def hidden() -> Hidden:
-    """A plate with places and a mass of its own."""
-    return draw("form", 1)
-
-
-@pytest.fixture(scope="module")
-def rig(hidden: Hidden) -> Rig:
+def rig(found: Identification) -> Rig:
     """The paper's rig as identified on it."""
-    written = load_rig(example_rig_path())
-    values = hidden.measured(FREQUENCIES, np.random.default_rng(1))
-    return identify(written, Measurement.of(sensors_of(written), FREQUENCIES, values)).rig
+    return found.rig
 
 
 @pytest.fixture(scope="module")

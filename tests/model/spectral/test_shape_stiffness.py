@@ -24,9 +24,9 @@ LAYERS = (
     Layer(GLASS, 0.0006),
 )
 SANDWICH = equivalent_plate(Laminate(LAYERS), length=0.3, width=0.21, frequency=200.0)
-DEGREES = (16, 14)
+DEGREES = (13, 11)
 SPECTRAL = SpectralMesh(*DEGREES, 0.3, 0.21)
-ELEMENTARY = Mesh(6, 5, 0.3, 0.21, ELEMENTS["Q5"])
+ELEMENTARY = Mesh(5, 4, 0.3, 0.21, ELEMENTS["Q5"])
 STEP = 2e-3
 
 

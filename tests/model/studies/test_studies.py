@@ -12,6 +12,7 @@ from model.design.contacts import anywhere
 from model.errors import InputError
 from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
+from model.rig.layouts import candidate_places
 from model.structure.actuator import Era
 from model.structure.point_load import PointLoad
 from model.studies import solve
@@ -246,7 +247,7 @@ def test_study_problem_refuses_invalid_frequencies(study, frequencies):
 def test_study_problem_too_large_for_memory_is_refused(study):
     """3600 places at 27 frequencies: 27 x 3600 x (3600 + 432) complex numbers are 6.3 GB."""
     problem, _ = study
-    cases = placement_cases(problem.rig, layouts=10, seed=0, raster=(60, 60))
+    places = candidate_places(60, 60) * [problem.rig.plate.length, problem.rig.plate.width]
     frequencies = np.arange(60.0, 321.0, 10.0)
     with pytest.raises(InputError, match=r"6\.3 GB; take fewer --candidates"):
-        replace(problem, positions=cases.positions, frequencies=frequencies).solve()
+        replace(problem, positions=places, frequencies=frequencies).solve()

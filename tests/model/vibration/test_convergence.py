@@ -29,7 +29,7 @@ def automatic():
 def study(automatic):
     """Of the paper's mesh of MITC4 and of the automatic one."""
     meshes = [Mesh(12, 9, LENGTH, WIDTH), automatic.mesh]
-    limited = replace(automatic, limits=replace(automatic.limits, frequency_max=350.0))
+    limited = replace(automatic, limits=replace(automatic.limits, frequency_max=260.0))
     return study_convergence(limited, meshes, frequencies=default_frequencies(automatic))
 
 

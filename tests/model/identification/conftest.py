@@ -1,0 +1,26 @@
+"""A hidden plate, and the paper's rig identified on it."""
+
+import numpy as np
+import pytest
+
+from benchmarks.identification.hidden import Hidden, draw
+from model.identification.forward import Sensor
+from model.identification.identify import Identification, identify
+from model.identification.measurement import Measurement
+from model.rig.file import example_rig_path, load_rig
+from settled_patterns import FREQUENCIES
+
+
+@pytest.fixture(scope="session")
+def hidden() -> Hidden:
+    """A plate with places and a mass of its own."""
+    return draw("form", 1)
+
+
+@pytest.fixture(scope="session")
+def found(hidden: Hidden) -> Identification:
+    """The paper's rig identified on it."""
+    rig = load_rig(example_rig_path())
+    sensors = [Sensor(era.name, era.name) for era in rig.eras]
+    values = hidden.measured(FREQUENCIES, np.random.default_rng(1))
+    return identify(rig, Measurement.of(sensors, FREQUENCIES, values))

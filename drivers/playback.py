@@ -9,7 +9,7 @@ clock and never go back; levels and frequencies are of protocol 3.
 
 import cmath
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 
@@ -19,14 +19,15 @@ from drivers.protocol.table import QUANTITIES, SHORTENED_FADE
 _LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
 _RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
 _STEP, _FREQUENCY = QUANTITIES["envelope_step"], QUANTITIES["frequency"]
+_PER_FULL, _PER_DEGREE, _PER_HERTZ = _LEVEL.per_unit, _PHASE.per_unit, _FREQUENCY.per_unit
 
 
 def amplitude_of(level: int, phase: int) -> complex:
     """Return the complex amplitude in full levels of a level and phase of the wire."""
-    return cmath.rect(_LEVEL.from_wire(level), math.radians(_PHASE.from_wire(phase)))
+    return cmath.rect(level / _PER_FULL, math.radians(phase / _PER_DEGREE))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # frozen, each takes three times as long to make, and every set makes many
 class Transition:
     """From one complex amplitude to another, from start [s] on.
 
@@ -39,11 +40,12 @@ class Transition:
     first: complex
     last: complex
     knots: tuple[complex, ...] = ()
+    end: float = field(init=False)
+    """Time from which the amplitude is the last [s]."""
 
-    @property
-    def end(self) -> float:
-        """Time from which the amplitude is the last [s]."""
-        return self.start + self.step * (len(self.knots) + 1)
+    def __post_init__(self) -> None:
+        """Note the end, which is looked at often."""
+        self.end = self.start + self.step * (len(self.knots) + 1)
 
     def at(self, time: float) -> complex:
         """Return the amplitude at a time not before start."""
@@ -58,7 +60,9 @@ class Transition:
 
     def reached(self, time: float, uncertainty: float) -> complex:
         """Return the amplitude at a time, or the largest within an uncertainty [s] around it."""
-        if not uncertainty or time - uncertainty >= self.end:
+        if time - uncertainty >= self.end:
+            return self.last
+        if not uncertainty:
             return self.at(time)
         since, until = max(time - uncertainty, self.start), max(time + uncertainty, self.start)
         moments = (self.start + self.step * (index + 1) for index in range(len(self.knots)))
@@ -169,6 +173,8 @@ class Playback:
     uncertainty: float = 0.0
     _playing: list[tuple[Voice, ...]] = field(init=False)
     _layers: dict[int, _Layer] = field(default_factory=dict)
+    _due: float = math.inf  # s; see `next_due`
+    _changes_at: float = math.inf  # s; before, advancing changes nothing
 
     def __post_init__(self) -> None:
         """Start silent."""
@@ -186,6 +192,7 @@ class Playback:
             layer.waiting = (start, one, token) if start > time else None
             if start <= time:
                 self._start(one, token, time)
+        self._note_changes()
 
     def silence(self, time: float, ramp: float) -> None:
         """Fade all layers along a ramp [s], without endings; nothing waits any longer."""
@@ -195,9 +202,12 @@ class Playback:
             tuple(voice.faded(time, ramp, self.uncertainty) for voice in voices)
             for voices in self._playing
         ]
+        self._note_changes()
 
     def advance(self, time: float) -> None:
         """Carry out what is due by a time: ends of `valid_for`, sets that wait, faded voices."""
+        if time < self._changes_at:
+            return
         while (due := self._next_due()) is not None and due[0] <= time:
             at, number = due
             layer = self._layers[number]
@@ -208,8 +218,20 @@ class Playback:
             else:
                 self._end(number, at)
         self._playing = [
-            tuple(voice for voice in voices if voice.silent_from > time) for voices in self._playing
+            tuple([each for each in voices if each.transition.last or each.transition.end > time])
+            for voices in self._playing
         ]
+        self._note_changes()
+
+    def _note_changes(self) -> None:
+        """Note when a voice has faded, or a layer ends or starts, next; plain loops: it is hot."""
+        due = self._next_due()
+        first = self._due = math.inf if due is None else due[0]
+        for voices in self._playing:
+            for voice in voices:
+                if not voice.transition.last and voice.transition.end < first:
+                    first = voice.transition.end
+        self._changes_at = first
 
     def scale(self, time: float, factor: float, ramp: float) -> None:
         """Take all tones that last to a factor of their level along a ramp [s], endings too."""
@@ -220,6 +242,12 @@ class Playback:
             )
             for voices in self._playing
         ]
+        self._note_changes()
+
+    @property
+    def all_voices(self) -> Sequence[tuple[Voice, ...]]:
+        """Voices by channel, the oldest first."""
+        return self._playing
 
     def voices_of(self, channel: int) -> tuple[Voice, ...]:
         """Return the voices of a channel, the oldest first."""
@@ -273,13 +301,12 @@ class Playback:
     @property
     def waiting(self) -> tuple[LayerSet, ...]:
         """Sets of layers that start when onsets have ended."""
-        return tuple(layer.waiting[1] for layer in self._layers.values() if layer.waiting)
+        return tuple([layer.waiting[1] for layer in self._layers.values() if layer.waiting])
 
     @property
     def next_due(self) -> float:
         """Time of the next end of `valid_for`, or start of a set that waits [s]; infinite: none."""
-        due = self._next_due()
-        return math.inf if due is None else due[0]
+        return self._due
 
     @property
     def silent_from(self) -> float:
@@ -316,14 +343,19 @@ class Playback:
 
     def is_settled(self, time: float) -> bool:
         """Whether nothing changes from a time on [s] but by the ends of layers."""
-        return all(voice.transition.end <= time for voices in self._playing for voice in voices)
+        for voices in self._playing:
+            for voice in voices:
+                if voice.transition.end > time:
+                    return False
+        return True
 
     def _next_due(self) -> tuple[float, int] | None:
-        dues = (
-            (min(layer.ends, layer.waiting[0] if layer.waiting else math.inf), number)
-            for number, layer in self._layers.items()
-        )
-        return min((due for due in dues if due[0] < math.inf), default=None)
+        first: tuple[float, int] | None = None
+        for number, layer in self._layers.items():
+            due = layer.ends if layer.waiting is None else min(layer.ends, layer.waiting[0])
+            if due < math.inf and (first is None or due < first[0]):
+                first = due, number
+        return first
 
     def _onsets_end(self, layer: int, time: float) -> float:
         ends = (
@@ -350,8 +382,12 @@ class Playback:
         ramp = _RAMP.from_wire(one.ramp)
         for channel, voices in enumerate(self._playing):
             command = commands.get(channel)
-            after = tuple(_after(voices, one.layer, command, time, ramp, self.uncertainty))
-            self._playing[channel] = _within(after, time, self.voices)
+            if command is None and not voices:
+                continue
+            after = _after(voices, one.layer, command, time, ramp, self.uncertainty)
+            if len(after) > self.voices:
+                after = _within(after, time, self.voices)
+            self._playing[channel] = tuple(after)
         if not commands:
             self._layers.pop(one.layer, None)
             return
@@ -369,30 +405,32 @@ def _after(
     time: float,
     ramp: float,
     uncertainty: float,
-) -> Iterator[Voice]:
-    """Yield the voices of a channel once a command of a layer plays; None silences the layer."""
+) -> list[Voice]:
+    """Return the voices of a channel once a command of a layer plays; None silences the layer."""
     is_driven = command is not None and (command.level > 0 or command.onset is not None)
     continued = False
+    after: list[Voice] = []
     for voice in voices:
         if voice.layer != layer or voice.has_ended:
-            yield voice
+            after.append(voice)
         elif is_driven and command is not None and _continues(voice, command):
             continued = True
             first = voice.transition.reached(time, uncertainty)
             transition = _towards(command, time, ramp, first)
-            yield replace(voice, transition=transition, ending=command.ending)
+            after.append(replace(voice, transition=transition, ending=command.ending))
         elif is_driven or (command is not None and command.skip_ending):
-            yield voice.faded(time, ramp, uncertainty)
+            after.append(voice.faded(time, ramp, uncertainty))
         else:
-            yield voice.ended(time, ramp, uncertainty)
+            after.append(voice.ended(time, ramp, uncertainty))
     if is_driven and command is not None and not continued:
         transition = _towards(command, time, ramp, 0j)
-        frequency = _FREQUENCY.from_wire(command.frequency)
-        yield Voice(layer, frequency, time, transition, ending=command.ending)
+        frequency = command.frequency / _PER_HERTZ
+        after.append(Voice(layer, frequency, time, transition, False, command.ending))
+    return after
 
 
 def _continues(voice: Voice, command: Command) -> bool:
-    return command.keep_phase and voice.frequency == _FREQUENCY.from_wire(command.frequency)
+    return command.keep_phase and voice.frequency == command.frequency / _PER_HERTZ
 
 
 def _towards(command: Command, time: float, ramp: float, first: complex) -> Transition:
@@ -402,11 +440,11 @@ def _towards(command: Command, time: float, ramp: float, first: complex) -> Tran
     return _along(command.onset, time, first, last)
 
 
-def _within(voices: Sequence[Voice], time: float, max_voices: int) -> tuple[Voice, ...]:
+def _within(voices: Sequence[Voice], time: float, max_voices: int) -> list[Voice]:
     """Cut the oldest fades short where a channel has more voices than there are."""
     uncut = [voice for voice in voices if voice.silent_from > time + SHORTENED_FADE]
     fades = sorted(
         (voice for voice in uncut if voice.has_ended), key=attrgetter("transition.start")
     )
     cut = fades[: max(len(uncut) - max_voices, 0)]
-    return tuple(voice.faded(time, SHORTENED_FADE) if voice in cut else voice for voice in voices)
+    return [voice.faded(time, SHORTENED_FADE) if voice in cut else voice for voice in voices]

@@ -26,7 +26,7 @@ class Budget:
 
     def __init__(self, limits: GuardLimits) -> None:
         self._limits = limits
-        self._is_unlimited = limits.on_time == float("inf") and limits.duty >= 1
+        self.is_unlimited = limits.on_time == float("inf") and limits.duty >= 1
         self._duty_time = limits.duty * DUTY_WINDOW if limits.duty < 1 else float("inf")
         allowed = max(1, int(limits.rate * _RATE_WINDOW))
         # Sets that were delayed on their way arrive closer together than they were sent.
@@ -49,7 +49,7 @@ class Budget:
                 "the limit stops runaway loops",
                 until=self._sent[0] + self._window,
             )
-        if self._is_unlimited:
+        if self.is_unlimited:
             return float("inf")
         is_vibrating = self._start is not None and now < self._end
         spent = fade + (delay if is_vibrating else 0.0)

@@ -14,7 +14,7 @@ from drivers.playback import Playback, Transition, Voice, amplitude_of
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
 
-_RAMP, _STEP = QUANTITIES["ramp"], QUANTITIES["envelope_step"]
+_RAMP, _STEP, _LEVEL = QUANTITIES["ramp"], QUANTITIES["envelope_step"], QUANTITIES["level"]
 _FREQUENCY, _VALID_FOR = QUANTITIES["frequency"], QUANTITIES["valid_for"]
 
 
@@ -32,7 +32,7 @@ class Path:
     @property
     def times(self) -> tuple[float, ...]:
         """Times of the magnitudes [s] after the commit."""
-        return tuple(self.step * index for index in range(len(self.magnitudes)))
+        return tuple([self.step * index for index in range(len(self.magnitudes))])
 
     def at(self, time: float) -> float:
         """Return an upper bound of the magnitude at a time [s] after the commit."""
@@ -188,6 +188,43 @@ def worst(channels: Sequence[ChannelBounds]) -> tuple[list[float], float]:
             corners.append([channel.within(since, until) for channel in channels])
     levels = [max(each) for each in zip(*corners, strict=True)]
     return levels, max(sum(level**2 for level in each) for each in corners)
+
+
+def plain_bounds(
+    playback: Playback, layers: Sequence[LayerSet], time: float, *, until: float
+) -> tuple[list[float], list[float]] | None:
+    """Return levels of all channels before and after a cross-fade along one ramp.
+
+    Between the two they are convex, and so are sums of their squares, so that `worst` is at one of
+    the ends. None where envelopes, several ramps or ends of layers make it less plain.
+    """
+    ramp = layers[0].ramp
+    named: list[int] = []
+    after = [0.0] * playback.channels
+    for one in layers:
+        if one.ramp != ramp or one.after or playback.end_of(one.layer) <= until:
+            return None
+        if not one.renew:
+            named.append(one.layer)
+        for command in one.commands:
+            if command.onset is not None or command.ending is not None:
+                return None
+            after[command.channel] += command.level / _LEVEL.per_unit
+    if playback.waiting:
+        return None
+    before = [0.0] * playback.channels
+    for channel, voices in enumerate(playback.all_voices):
+        for voice in voices:
+            transition = voice.transition
+            if transition.knots or voice.ending is not None:
+                return None
+            peak = abs(transition.last)
+            if transition.first and time < transition.end:
+                peak = max(peak, abs(transition.first))
+            before[channel] += peak
+            if voice.has_ended or voice.layer not in named:
+                after[channel] += peak
+    return before, after
 
 
 def is_driven(command: Command) -> bool:

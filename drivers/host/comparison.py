@@ -52,15 +52,16 @@ def _level_problem(status: Values, ledger: Ledger, sent_at: float, now: float) -
     playback, late = ledger.playback, sent_at - ledger.lag
     if len(status["levels"]) != playback.channels:
         return f"levels must be {playback.channels}, got {len(status['levels'])}"
-    step = max(ledger.capabilities["level_step"], 1)
+    tolerance = _STEPS * max(ledger.capabilities["level_step"], 1)
     for channel, level in enumerate(status["levels"]):
-        voices = playback.voices_of(channel)
-        highest = _LEVEL.to_wire(min(sum(voice.transition.peak(late) for voice in voices), 1.0))
-        lowest = 0
-        if all(voice.transition.end <= late for voice in voices) and playback.next_due > now:
-            lowest = _LEVEL.to_wire(min(playback.level(channel, now), 1.0))
-        if not lowest - _STEPS * step <= level <= highest + _STEPS * step:
-            return f"level of channel {channel} must be {lowest} to {highest} (1e-4), got {level}"
+        highest, is_settled = 0.0, playback.next_due > now
+        for voice in playback.voices_of(channel):
+            highest += voice.transition.peak(late)
+            is_settled = is_settled and voice.transition.end <= late
+        high = round(min(highest, 1.0) * _LEVEL.per_unit)
+        low = round(min(playback.level(channel, now), 1.0) * _LEVEL.per_unit) if is_settled else 0
+        if not low - tolerance <= level <= high + tolerance:
+            return f"level of channel {channel} must be {low} to {high} (1e-4), got {level}"
     return None
 
 

@@ -8,12 +8,12 @@ only silence is admitted. Times [s] are of any one clock.
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from numbers import Integral, Real
+from numbers import Integral
 
 from drivers.contents import Layer, Shape, Tone
 from drivers.errors import CommandRefused
 from drivers.guard.budget import COMMIT_DELAY, Budget, Vibration
-from drivers.host.bounds import all_bounds, is_driven, worst
+from drivers.host.bounds import all_bounds, plain_bounds, worst
 from drivers.host.limits import RATE_CEILING, wire_limits
 from drivers.playback import Playback
 from drivers.protocol.records import Values
@@ -60,9 +60,12 @@ class Ledger:
         Raises CommandRefused with channel and reason; nothing changes then.
         """
         numbers = [layer.number for layer in layers]
-        if len(set(numbers)) < len(numbers):
-            raise CommandRefused(f"a layer must occur once in a set, got {numbers}")
-        requested = tuple(self._on_wire(layer) for layer in layers)
+        if len(set(numbers)) < len(numbers) or not numbers:
+            raise CommandRefused(f"a set must have each layer once, at least one, got {numbers}")
+        try:
+            requested = tuple([self._on_wire(layer) for layer in layers])
+        except (TypeError, ValueError) as error:
+            raise CommandRefused(f"a set must have numbers in its range: {error}") from error
         if not any(is_vibrating(one) for one in requested):
             return self._silence(requested, now)
         if self._doubt is not None:
@@ -87,7 +90,8 @@ class Ledger:
             self.lag = 0.0
         self.lag = self.playback.uncertainty = max(self.lag, now - sent_at)
         self.playback.commit(layers, token, sent_at)
-        self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
+        if not self._budget.is_unlimited:
+            self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
 
     def refused(self) -> None:
         """Note that the set in doubt was not played."""
@@ -100,7 +104,8 @@ class Ledger:
         self._doubt = None
         self.lag = self.playback.uncertainty = max(self.lag, now - sent_at)
         self.playback.silence(sent_at, ramp)
-        self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
+        if not self._budget.is_unlimited:
+            self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
 
     def resolve(self, token: int, now: float) -> None:
         """Resolve the doubt by the token that the amplifier says it committed last."""
@@ -119,7 +124,7 @@ class Ledger:
             ("ramp", layer.ramp, ramp_max),
             ("valid_for", layer.valid_for, _VALID_FOR.high),
         ):
-            if not (is_finite(value) and 0 <= value <= highest):
+            if not 0 <= value <= highest:  # nor NaN
                 raise CommandRefused(f"{name} must be 0 to {highest:g} s, got {value!r} s")
         if layer.renew and (layer.tones or layer.after):
             raise CommandRefused("renew must be without tones and after")
@@ -137,50 +142,45 @@ class Ledger:
             int(layer.number),
             min(math.ceil(layer.ramp * _RAMP.per_unit - _SLACK), can["ramp_max"]),
             max(_VALID_FOR.to_wire(layer.valid_for), 1) if layer.valid_for else 0,
-            tuple(self._command(tone) for tone in layer.tones),
+            tuple([self._command(tone) for tone in layer.tones]),
             after=bool(layer.after),
             renew=bool(layer.renew),
         )
 
     def _command(self, tone: Tone) -> Command:
-        limits = self.limits
-        level = self._level(tone.level, "level", tone.channel)
-        if not is_finite(tone.phase):
-            raise _refused(tone.channel, f"phase must be a finite number, got {tone.phase!r}")
-        is_idle = level == 0 and tone.onset is None
-        if not is_finite(tone.frequency):
-            text = f"frequency must be a finite number, got {tone.frequency!r}"
-            raise _refused(tone.channel, text)
-        frequency = limits.frequency_min if is_idle else round(tone.frequency * _FREQUENCY.per_unit)
+        limits, channel = self.limits, int(tone.channel)
+        level = self._level(tone.level, "level", channel)
+        for name, value in (("frequency", tone.frequency), ("phase", tone.phase)):
+            if not math.isfinite(value):
+                raise _refused(channel, f"{name} must be a finite number, got {value!r}")
+        onset, ending = tone.onset, tone.ending
+        frequency = round(tone.frequency * _FREQUENCY.per_unit)
+        if level == 0 and onset is None:
+            frequency = limits.frequency_min
         if not limits.frequency_min <= frequency <= limits.frequency_max:
             low, high = map(_FREQUENCY.from_wire, (limits.frequency_min, limits.frequency_max))
             text = f"frequency must be {low:g} to {high:g} Hz, got {tone.frequency:g} Hz"
-            raise _refused(tone.channel, text)
+            raise _refused(channel, text)
         return Command(
-            int(tone.channel),
-            frequency,
-            level,
-            _PHASE.to_wire(float(tone.phase)),
-            bool(tone.keep_phase),
-            bool(tone.skip_ending),
-            self._envelope(tone.onset, tone.channel),
-            self._envelope(tone.ending, tone.channel),
+            *(channel, frequency, level, _PHASE.to_wire(float(tone.phase))),
+            keep_phase=bool(tone.keep_phase),
+            skip_ending=bool(tone.skip_ending),
+            onset=None if onset is None else self._envelope(onset, channel),
+            ending=None if ending is None else self._envelope(ending, channel),
         )
 
     def _level(self, level: float, name: str, channel: int) -> int:
-        highest = _LEVEL.from_wire(self.limits.level)
-        if not (is_finite(level) and 0 <= level <= highest * TOLERANCE):
+        highest = self.limits.level / _LEVEL.per_unit
+        if not 0 <= level <= highest * TOLERANCE:  # nor NaN
             raise _refused(channel, f"{name} must be 0 to {highest:g}, got {level!r}")
-        return min(_LEVEL.to_wire(float(level)), self.limits.level)
+        return min(round(level * _LEVEL.per_unit), self.limits.level)
 
-    def _envelope(self, shape: Shape | None, channel: int) -> Envelope | None:
-        if shape is None:
-            return None
+    def _envelope(self, shape: Shape, channel: int) -> Envelope:
         can = self.capabilities
         low, high = (
             _STEP.from_wire(can[name]) for name in ("envelope_step_min", "envelope_step_max")
         )
-        if not (is_finite(shape.step) and low <= shape.step <= high):
+        if not low <= shape.step <= high:
             text = f"step of an envelope must be {low:g} to {high:g} s, got {shape.step!r} s"
             raise _refused(channel, text)
         if len(shape.knots) > can["knots"]:
@@ -209,9 +209,11 @@ class Ledger:
         return tuple(replace(one, commands=commands) for one in silent)
 
     def _check_sums(self, layers: Sequence[LayerSet], now: float) -> None:
-        late = now - self.lag
+        late, until = now - self.lag, now + COMMIT_DELAY
         self.playback.advance(late)
-        bounds = all_bounds(self.playback, layers, late, until=now + COMMIT_DELAY)
+        if self.limits.slew == math.inf and self._is_plain_and_within(layers, late, until):
+            return
+        bounds = all_bounds(self.playback, layers, late, until=until)
         levels, power = worst(bounds)
         highest = _LEVEL.from_wire(self.limits.level)
         for channel, (bound, level) in enumerate(zip(bounds, levels, strict=True)):
@@ -232,6 +234,18 @@ class Ledger:
                 f"sum of squared levels must be at most {self.limits.power:g}, got {power:g}; "
                 "lower the levels or drive fewer channels at once"
             )
+
+    def _is_plain_and_within(self, layers: Sequence[LayerSet], late: float, until: float) -> bool:
+        """Whether a cross-fade that needs no closer look is within the limits: nearly every set."""
+        ends = plain_bounds(self.playback, layers, late, until=until)
+        if ends is None:
+            return False
+        highest = _LEVEL.from_wire(self.limits.level) * TOLERANCE
+        if max(map(max, ends)) > highest:
+            return False
+        if self.limits.power == math.inf:
+            return True
+        return all(math.hypot(*levels) ** 2 <= self.limits.power * TOLERANCE for levels in ends)
 
     def _within_budget(self, layers: tuple[LayerSet, ...], now: float) -> tuple[LayerSet, ...]:
         """Shorten `valid_for` to the on-time and duty that are left."""
@@ -264,16 +278,13 @@ class Ledger:
 
 def is_vibrating(one: LayerSet) -> bool:
     """Whether a layer plays after its set, so that it spends time and rate."""
-    return one.renew or any(is_driven(command) for command in one.commands)
-
-
-def is_finite(value: object) -> bool:
-    """Whether a value is a finite real number."""
-    return isinstance(value, Real) and math.isfinite(value)
+    if one.renew:
+        return True
+    return any(command.level > 0 or command.onset is not None for command in one.commands)
 
 
 def _is_integer(value: object, highest: int) -> bool:
-    return isinstance(value, Integral) and 0 <= int(value) <= highest
+    return (type(value) is int or isinstance(value, Integral)) and 0 <= int(value) <= highest
 
 
 def _refused(channel: int, text: str) -> CommandRefused:

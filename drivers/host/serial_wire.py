@@ -18,6 +18,7 @@ from drivers.protocol.serial_payload import (
     unpack_words,
 )
 from drivers.protocol.table import (
+    BY_NUMBER,
     EVENT,
     EVENT_RECORD,
     MAX_WORDS,
@@ -75,12 +76,12 @@ class SerialWire:
 
     def _arrival(self, frame: Frame) -> Arrival | None:
         self.counters.frames_in += 1
-        if frame.type == EVENT and not frame.is_reply:
+        if frame.kind == EVENT:
             return self._event(frame)
         pending = self._pending
         if (
             pending is None
-            or not frame.is_reply
+            or not frame.kind & REPLY
             or (frame.address, frame.sequence) != (pending.address, pending.sequence)
         ):
             self.counters.unexpected_frames += 1
@@ -111,11 +112,11 @@ def _reply(frame: Frame, request: Frame) -> Arrival:
         values = NAK_RECORD.unpack(words, is_strict=False)
         channel = None if values["channel"] == NO_CHANNEL else values["channel"]
         return Nak(_CODES.get(values["code"], f"code {values['code']}"), channel)
-    if frame.type != request.type:
+    if frame.kind != request.kind | REPLY:
         return Broken(f"type of the reply must be {request.type}, got {frame.type}")
     if frame.version != request.version:
         return Broken(f"version of the reply must be {request.version}, got {frame.version}")
     if request.version == NEUTRAL:
         return Reply(unpack_identity(frame.payload))
-    record = next(each.reply for each in MESSAGES.values() if each.number == request.type)
+    record = BY_NUMBER[request.kind].reply
     return Reply(record.unpack(unpack_words(frame.payload), is_strict=False))

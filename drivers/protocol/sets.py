@@ -55,14 +55,23 @@ def pack_layers(layers: Iterable[LayerSet]) -> list[int]:
     """Return the stream of a set; ValueError for a number out of range."""
     words: list[int] = []
     for layer in layers:
-        count = len(layer.commands)
-        LAYER.append({name: getattr(layer, name, count) for name in LAYER.names}, words)
+        head = {
+            **{"layer": layer.layer, "after": layer.after, "renew": layer.renew},
+            **{"count": len(layer.commands), "ramp": layer.ramp, "valid_for": layer.valid_for},
+        }
+        LAYER.append(head, words)
         for command in layer.commands:
-            shapes = (command.onset, command.ending)
-            values = {name: getattr(command, name) for name in COMMAND.names}
-            values["onset"], values["ending"] = (shape is not None for shape in shapes)
+            values = {
+                **{"channel": command.channel, "frequency": command.frequency},
+                **{"level": command.level, "phase": command.phase},
+                **{"keep_phase": command.keep_phase, "skip_ending": command.skip_ending},
+                "onset": command.onset is not None,
+                "ending": command.ending is not None,
+            }
             COMMAND.append(values, words)
-            for shape in filter(None, shapes):
+            for shape in (command.onset, command.ending):
+                if shape is None:
+                    continue
                 ENVELOPE.append({"knots": len(shape.knots), "step": shape.step}, words)
                 for level, phase in shape.knots:
                     KNOT.append({"level": level, "phase": phase}, words)

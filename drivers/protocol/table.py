@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from drivers.protocol.definition import WireQuantity
-from drivers.protocol.records import Bits, Number, Real, Record, Rest, Rows, Text
+from drivers.protocol.records import Bits, Number, Numbers, Real, Record, Rest, Rows, Text
 
 VERSION: Final = 3
 MAX_WORDS: Final = 120
@@ -133,8 +133,8 @@ _STATUS = Record(
     *_numbers("state:code", "fault:code", "flags", "latch", "watchdog_left"),
     *_numbers("temperature", "voltage", "token:played_token"),
     Bits((("channels", 8), ("layers", 8))),
-    Rows("levels", "channels", Record(*_numbers("level"))),
-    Rows("tokens", "layers", Record(*_numbers("token:played_token"))),
+    Numbers("levels", "channels", QUANTITIES["level"]),
+    Numbers("tokens", "layers", QUANTITIES["played_token"]),
 )
 _CAPABILITIES = Record(
     *_numbers("channels:channel_count", "layers:layer_count", "voices", "set_words", "knots"),
@@ -239,7 +239,7 @@ _MESSAGES = (
         17,
         Record(
             *_numbers("reading", "window", "tones:tone_count"),
-            Rows("frequencies", "tones", Record(*_numbers("frequency"))),
+            Numbers("frequencies", "tones", QUANTITIES["frequency"]),
         ),
         _READING,
     ),

@@ -30,6 +30,9 @@ CONVERSION = ROOT / "drivers" / "voltage" / "backend.py"
 # Sends what the guard has made past the queue of an amplifier, and frames damaged on purpose.
 CONFORMANCE = ROOT / "drivers" / "conformance"
 
+# The host of protocol 3: one class makes requests of sets, kinds of wire their bytes.
+HOST = ROOT / "drivers" / "host"
+
 # Messages that carry something an amplifier would play.
 CARRIERS = {"Stage", "Apply", "LoadEnvelope"}
 
@@ -116,8 +119,27 @@ def test_only_backends_use_encoders() -> None:
         if name.startswith(("encode_", "pack_"))
     }
     assert users
-    above = [file for file in users if not {"backends", "codec"} & set(file.parts)]
-    assert {file.parent for file in above} == {CONFORMANCE / "raw"}
+    wires = {file for file in users if file.parent == HOST and file.name.endswith("_wire.py")}
+    below = {"backends", "codec", "protocol"}
+    above = [file for file in users - wires if not below & set(file.parts)]
+    assert {file.parent for file in above} == {CONFORMANCE / "raw", HOST}
+    assert [file.name for file in above if file.parent == HOST] == ["amplifier.py"]
+
+
+def test_only_what_a_ledger_admits_is_packed() -> None:
+    """The host of protocol 3 makes the words of sets in one place, of what `admit` returned."""
+    (packed,) = (
+        ast.unparse(call.args[0])
+        for file in ON_THE_WAY
+        for name, call in calls(file, "pack_layers")
+        if name == "pack_layers"
+    )
+    admitted = [
+        ast.unparse(node.targets[0])
+        for node in nodes(HOST / "amplifier.py")
+        if isinstance(node, ast.Assign) and ".ledger.admit(" in ast.unparse(node.value)
+    ]
+    assert admitted == [packed]
 
 
 def test_only_the_conversion_changes_checked_sets() -> None:

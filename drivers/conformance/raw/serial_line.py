@@ -4,6 +4,7 @@ import asyncio
 import struct
 from collections.abc import Sequence
 
+from drivers.amplifier import WATCHDOG
 from drivers.backends.serial_line.line import SerialLine, serial_line
 from drivers.backends.urls.serial_line import SerialUrl
 from drivers.codec.serial_line.exchanges import encode_request, is_event
@@ -14,6 +15,7 @@ from drivers.conformance.raw.line import NO_REPLY, REPLY, RawLine, RawRequest
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Apply,
+    Arm,
     Broadcast,
     GetStatus,
     Hello,
@@ -76,6 +78,11 @@ class SerialRaw(RawLine):
         beat, played = self._frame(ping), self._frame(apply)
         found = [
             self._made("a Ping with a wrong CRC", _damaged(encode_frame(beat)), NO_REPLY),
+            self._made(
+                "a Ping with a wrong last byte of the CRC",
+                _damaged(encode_frame(beat), -2),
+                NO_REPLY,
+            ),
             self._made("an Apply with a damaged bit", _damaged(encode_frame(played), 12), NO_REPLY),
             self._made(
                 "a Ping to another address", beat._replace(address=_OTHER_ADDRESS), NO_REPLY
@@ -153,9 +160,10 @@ class SerialRaw(RawLine):
 
     def broadcasts(self, ping: Ping, apply: Apply) -> Sequence[RawRequest]:
         """See `RawLine`."""
+        arm = Arm(WATCHDOG, session=ping.session)
         return [
             self._made(f"a broadcast {type(one).__name__}", self._to_all(one), NO_REPLY)
-            for one in (ping, apply, GetStatus())
+            for one in (ping, apply, arm, GetStatus())
         ]
 
     @property

@@ -24,6 +24,7 @@ from model.arrays import ComplexArray, FloatArray, IntArray, lattice
 from model.calibration.parameters import Parameter
 from model.fem.element_slopes import element_slopes
 from model.fem.mesh import Mesh
+from model.reduction.place_slopes import place_slopes
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.spectral.shape_stiffness import stiffness_slopes
@@ -40,7 +41,6 @@ POISSON = 0.015  # of Poisson's ratio
 FOREIGN_MASS = 0.01  # of the plate's, spread over the cells below
 _MASS_CELLS = (8, 6)
 _MODE_SHIFT = 0.003  # of an eigenvalue: theory and mesh
-_STEP = 1e-4  # m, of differences
 
 
 def mass_scale_error(rig: Rig) -> float:
@@ -216,17 +216,6 @@ def form_model(rig: Rig, points: FloatArray, frequencies: FloatArray) -> FormMod
     elasticity = ModalElasticity.of(plate, eigenvalues, reduced.losses, reduced.dispersion)
     omega = 2 * np.pi * frequencies
 
-    def slopes(places: FloatArray) -> FloatArray:
-        # Inwards from an edge.
-        found = []
-        for direction in range(2):
-            step = np.zeros(places.shape[1])
-            step[direction] = _STEP
-            sign = np.where(places[:, direction] > sides[direction] / 2, -1.0, 1.0)[:, None]
-            moved = reduced.at(places + sign * step)
-            found.append((moved - reduced.at(places)) / (sign * _STEP))
-        return np.array(found)
-
     natural = np.sqrt(np.maximum(eigenvalues, 0))
     low = np.flatnonzero(
         (natural > 0.1 * plate.lowest_bending_frequency * 2 * math.pi)
@@ -255,9 +244,9 @@ def form_model(rig: Rig, points: FloatArray, frequencies: FloatArray) -> FormMod
         omega,
         np.einsum("fj,jr,jq->frq", loads, mass_shapes, mass_shapes, optimize=True),
         reduced.at(at_eras),
-        slopes(at_eras),
+        place_slopes(reduced.at, at_eras, sides).swapaxes(0, 1),
         reduced.at(points),
-        slopes(points),
+        place_slopes(reduced.at, points, sides).swapaxes(0, 1),
         reduced.at(cells),
         _stiffening(rig, reduced.unknowns(), math.sqrt(plate.lowest_bending_frequency * high)),
         ratios[:, :, None] * ratios[:, None, :],

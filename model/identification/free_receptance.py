@@ -10,7 +10,6 @@ z = w² / q, T_j the sums over the truncated modes (`model.reduction.truncation`
     h dA / d ln q = sum phi phi' (-q lambda g²) + sum T_j (-(c + z dc / dz) / q).
 
 A plate's stiffness is taken as E h³ and its mass as h: see `model.vibration.parametric_plate`.
-Shapes at a place that moves are differences of those beside it, of second order, inwards at edges.
 """
 
 from dataclasses import dataclass
@@ -21,9 +20,9 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.reduction.free_modes import RESIDUAL_ORDER, FreeModes
 from model.reduction.free_plate import FreePlate
+from model.reduction.place_slopes import place_slopes
 from model.reduction.truncation import truncation_slopes, truncation_weights
 
-_STEP = 1e-5  # of a side: errors of the slopes of polynomials below 1e-6
 _TERMS = 2 * RESIDUAL_ORDER
 
 
@@ -50,25 +49,12 @@ def places_of(free: FreePlate, footprints: FloatArray, movable: IntArray) -> Pla
     if not len(movable):
         return Places(footprints, shapes, products, np.zeros((len(products), 0, len(footprints))))
     sides = np.array([free.plate.length, free.plate.width])
-    beside, factors = [], []
-    for point in footprints[movable]:
-        for axis in range(2):
-            step = _STEP * sides[axis]
-            inner = -1 if point[axis] > sides[axis] / 2 else 1
-            is_edge = min(point[axis], sides[axis] - point[axis]) < 2 * step
-            steps = (inner, 2 * inner) if is_edge else (1, -1)
-            for each in steps:
-                moved = point.copy()
-                moved[axis] += each * step
-                beside.append(moved)
-            own = (-1.5 * inner, 2.0 * inner, -0.5 * inner) if is_edge else (0.0, 0.5, -0.5)
-            factors.append(np.array(own) / step)
-    around = np.array(beside)
-    near = between(modes, around, footprints)
-    near = near.reshape(len(near), -1, 2, len(footprints))
-    at, first, second = np.array(factors).T[:, :, None]
-    own_rows = np.repeat(products[:, movable], 2, axis=1)
-    slopes = at * own_rows + first * near[:, :, 0] + second * near[:, :, 1]
+
+    def field(points: FloatArray) -> FloatArray:
+        return between(modes, points, footprints).swapaxes(0, 1)
+
+    by_place = place_slopes(field, footprints[movable], sides)
+    slopes = np.moveaxis(by_place, 2, 0).reshape(len(products), -1, len(footprints))
     return Places(footprints, shapes, products, slopes)
 
 

@@ -8,9 +8,11 @@ import pytest
 
 from benchmarks.identification.hidden import Hidden, finger_stiffness
 from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
-from model.identification.alterations import AlteredPlate, Crack, Hand
+from extrapolated import extrapolated_slopes
+from model.identification.alterations import Alteration, Altered, AlteredPlate, Crack, Hand
 from model.identification.identify import Identification
 from model.identification.in_service import LivePlate, Report
+from model.identification.settled import Touched
 from settled_patterns import settled_patterns
 
 HAND = np.array([0.25, 0.05])
@@ -112,3 +114,23 @@ def test_responses_change_as_on_finite_elements(
         ours.append(now.responses - plate.responses[0])
         true.append(hidden.sensor_gain[:, None] * (after - before))
     assert np.linalg.norm(np.subtract(ours, true)) < error * np.linalg.norm(true)
+
+
+@pytest.mark.parametrize("alteration", [Hand(), Crack()], ids=["hand", "crack"])
+def test_numbers_change_with_place_and_values_of_an_alteration(
+    hidden: Hidden, found: Identification, alteration: Alteration
+) -> None:
+    """As extrapolated differences of the numbers, to 0.2 % of each column's largest."""
+    model = found.fitted.problem.model
+    (pattern,) = settled_patterns(hidden, hidden.mounted, count=1, start=0)
+    altered = Altered(Touched.of(model, pattern, 0.5), alteration)
+    p, fingers = model.space.size, np.zeros(4 * len(pattern.fingers))
+    start = np.array([0.3, -0.4, *alteration.start(1.0)])
+
+    def numbers(theta: Reals) -> Reals:
+        return altered.predicted(np.concatenate([found.posterior.x, theta]), fingers)[0]
+
+    _, columns = altered.predicted(np.concatenate([found.posterior.x, start]), fingers)
+    exact = extrapolated_slopes(numbers, start, step=1e-2)
+    for own, true in zip(columns[:, p : p + alteration.size].T, exact, strict=True):
+        np.testing.assert_allclose(own, true, atol=2e-3 * np.abs(true).max())

@@ -1,5 +1,7 @@
 """Formatting of quantities and shares."""
 
+import math
+
 _DISPLAY_UNITS = {"m": (1e3, "mm"), "Pa": (1e-9, "GPa"), "N/m": (1e-3, "kN/m"), "kg": (1e3, "g")}
 
 
@@ -10,6 +12,20 @@ def in_display_unit(value: float, unit: str, *, digits: int = 3) -> str:
     if "e+" in shown:  # a plate of a metre is 1000 mm
         shown = f"{value * factor:.0f}"
     return f"{shown} {shown_unit}".strip()
+
+
+def with_error(value: float, error: float, unit: str = "", *, sign: str = "") -> str:
+    """Format a value with its standard error, two digits of which are shown: `74.02 ± 0.87 GPa`.
+
+    Units as `in_display_unit`; sign: "+" shows that of values above zero, too.
+    """
+    factor, shown_unit = _DISPLAY_UNITS.get(unit, (1.0, unit))
+    value, error = value * factor, error * factor
+    if not (math.isfinite(error) and error > 0):
+        return f"{value:{sign}.5g} ± {error:.2g} {shown_unit}".strip()
+    exponent = int(f"{error:.1e}".partition("e")[2])
+    decimals = max(0, 1 - exponent)
+    return f"{value:{sign}.{decimals}f} ± {error:.{decimals}f} {shown_unit}".strip()
 
 
 def percent(share: float) -> str:

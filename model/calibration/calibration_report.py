@@ -7,7 +7,7 @@ import numpy as np
 
 from model.calibration.calibration_result import Calibration, FittedParameter
 from model.counting import counted
-from model.quantities import in_display_unit, percent
+from model.quantities import in_display_unit, percent, with_error
 from model.rig.rig import Rig
 
 
@@ -56,7 +56,7 @@ def finding_rows(calibration: Calibration) -> list[str]:
     rows = [f"sensor {name}: no signal, left out" for name in calibration.dead_sensors]
     rows += [f"ERA {name}: no motion; gains unchanged" for name in calibration.dead_eras]
     rows += [
-        f"sensor {scale.name}: scale {scale.scale:.4g} ± {scale.standard_error:.1g} of the others"
+        f"sensor {scale.name}: scale {with_error(scale.scale, scale.standard_error)} of the others"
         for scale in calibration.scales
     ]
     if calibration.outlier_count:
@@ -160,7 +160,6 @@ def _change(fitted: FittedParameter) -> str:
     if fitted.standard_error is None:
         return f"{before}  (not identified)"
     note = "  (at its bound)" if fitted.at_bound else ""
-    after = in_display_unit(fitted.value, parameter.unit, digits=5)
-    error = in_display_unit(fitted.standard_error, parameter.unit, digits=2)
+    after = with_error(fitted.value, fitted.standard_error, parameter.unit)
     share = f" ({100 * (fitted.value / parameter.prior - 1):+.1f} %)" if parameter.prior else ""
-    return f"{before} -> {after} ± {error}{share}{note}"
+    return f"{before} -> {after}{share}{note}"

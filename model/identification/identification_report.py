@@ -7,7 +7,7 @@ from typing import Any
 
 from model.identification.identify import MAX_CHI2, Identification
 from model.identification.promise import ExpectedContrast
-from model.quantities import percent
+from model.quantities import percent, with_error
 
 _SHOWN = 2.0  # standard errors from the rig's value, beyond which a form error is listed
 
@@ -45,10 +45,8 @@ class Estimate:
 
     def __str__(self) -> str:
         unit = self.unit if self.unit in ("", "°") else f" {self.unit}"
-        return (
-            f"{self.name}: {self.difference:+.2f} ± {self.error:.2g}{unit} "
-            f"(before ± {self.before:.2g}{unit})"
-        )
+        found = with_error(self.difference, self.error, sign="+")
+        return f"{self.name}: {found}{unit} (before ± {self.before:.2g}{unit})"
 
 
 def estimates(found: Identification) -> list[Estimate]:

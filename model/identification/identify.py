@@ -14,6 +14,7 @@ from model.identification.posterior import Posterior
 from model.identification.priors import Priors
 from model.identification.stages import Fitted, Setting, chi2, fit_in_stages
 from model.identification.values import Values
+from model.quantities import with_error
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
@@ -72,7 +73,7 @@ class Identification:
         """One line for each parameter: its value less the rig's and the standard deviation."""
         space, posterior = self.posterior.space, self.posterior
         return [
-            f"{name}: {std * x:+.3g} ± {after:.2g} (before ± {std:.2g})"
+            f"{name}: {with_error(std * x, after, sign='+')} (before ± {std:.2g})"
             for name, std, x, after in zip(
                 space.names, space.std, posterior.x, posterior.std, strict=True
             )

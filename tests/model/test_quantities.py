@@ -1,8 +1,10 @@
 """Formatting of quantities and shares."""
 
+import math
+
 import pytest
 
-from model.quantities import in_display_unit, percent
+from model.quantities import in_display_unit, percent, with_error
 
 
 @pytest.mark.parametrize(
@@ -33,3 +35,22 @@ def test_in_display_unit_scales_to_giga_kilo_or_milli(
 def test_percent_has_two_significant_digits(share: float, expected: str) -> None:
     """Whole per cents from ten on, below with two digits."""
     assert percent(share) == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "unit", "expected"),
+    [
+        (74.0241e9, 0.8712e9, "Pa", "74.02 ± 0.87 GPa"),
+        (0.0130284, 2.72e-5, "", "0.013028 ± 0.000027"),
+        (0.0119941, 0.000996, "kg", "12.0 ± 1.0 g"),
+        (1231.4, 217.0, "Hz", "1231 ± 217 Hz"),
+        (1.25, math.inf, "", "1.25 ± inf"),
+        (1.0, 0.0, "m", "1000 ± 0 mm"),
+    ],
+)
+def test_with_error_shows_no_digit_below_two_of_the_error(
+    value: float, error: float, unit: str, expected: str
+) -> None:
+    """Value and error have the same decimals, in the unit of plates."""
+    assert with_error(value, error, unit) == expected
+    assert with_error(value, error, unit, sign="+") == f"+{expected}"

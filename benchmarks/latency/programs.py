@@ -110,9 +110,6 @@ def module(name: str) -> tuple[str, ...]:
     return (sys.executable, "-m", f"benchmarks.latency.{name}")
 
 
-ERA = Path(sys.executable).with_name("era")
-
-
 def _is_made_urgent(process: int, rank: Rank) -> bool:
     """Set the priority of a process; False if not permitted."""
     nice = DEVICE_NICE if rank is Rank.DEVICE else DAEMON_NICE

@@ -1,15 +1,16 @@
 """The daemon with answers of the table that it remembers: what a set costs beside its answer.
 
-    python -m benchmarks.latency.remembered CONFIG
+    python -m benchmarks.latency.remembered SECONDS CONFIG
 
-A question is computed when it is first asked. Fingers within 0.1 mm ask the same.
+SECONDS as for `benchmarks.latency.daemon`. A question is computed when it is first asked. Fingers
+within 0.1 mm ask the same.
 """
 
 import sys
 from collections.abc import Sequence
 from typing import Any
 
-from controller.cli.main import main
+from benchmarks.latency.daemon import run_daemon
 from controller.loop import selection, table_query
 from controller.loop.table_query import TableAnswer
 from controller.sources.contacts import Contact
@@ -34,5 +35,4 @@ _known: dict[tuple[tuple[float, float], ...], TableAnswer] = {}
 
 if __name__ == "__main__":
     vars(selection)["query_table"] = _remembering_query
-    sys.argv[1:1] = ["daemon"]
-    sys.exit(main())
+    sys.exit(run_daemon())

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.latency.machine import Others
 from benchmarks.latency.match import Command, Expected, Matched, match, read_commands
-from benchmarks.latency.programs import ERA, TIMEOUT, Ended, Program, Rank, module
+from benchmarks.latency.programs import TIMEOUT, Ended, Program, Rank, module
 from benchmarks.latency.touches import WANDERS, Work
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
@@ -35,16 +35,16 @@ FLOODERS = 4  # of one kind
 STOPS = 300  # measured per case with flooders
 _SETTLE = 1.0  # s
 
-DAEMON: Sequence[object] = (ERA, "daemon")
-"""The command that is measured, without its file, unless a case has its own."""
+DAEMON: Sequence[object] = module("daemon")
+"""The program that is measured, without its arguments, unless a case has its own."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A case: touches; whether the machine is loaded; touch_wait [ms] of the daemon, None for the
-    baseline; wire: `tcp` or `pty`; flooders: kind of those that run meanwhile, of
-    `benchmarks.latency.clients.FLOODS`, after which stops are measured; rig: its file; unmeasured:
-    number of touches at the beginning; daemon: its command, without its file."""
+    """A case: touches; whether the machine is loaded; touch_wait [ms]: longest of a touch for
+    its shaped onset, None for the baseline; wire: `tcp` or `pty`; flooders: kind of those that run
+    meanwhile, of `benchmarks.latency.clients.FLOODS`, after which stops are measured; rig: its
+    file; unmeasured: number of touches at the beginning; daemon: its program, without arguments."""
 
     name: str
     work: Work
@@ -131,8 +131,8 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
             port, tested = int(plain.line()), plain
         else:
             port = _free_port()
-            config = _daemon_file(folder, urls, table_file, port, case.touch_wait)
-            tested = Program(all_, *(case.daemon or DAEMON), config, rank=Rank.SERVICE)
+            arguments = (1e-3 * case.touch_wait, _daemon_file(folder, urls, table_file, port))
+            tested = Program(all_, *(case.daemon or DAEMON), *arguments, rank=Rank.SERVICE)
             daemon = _client(all_, path, tested)
             all_.enter_context(daemon.armed("latency"))
         panel = Program(
@@ -145,8 +145,7 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
         programs = [far, tested, panel]
         if case.flooders is not None:
             for _ in range(FLOODERS):
-                arguments = (*module("clients"), "flooder", case.flooders, path)
-                flooder = Program(all_, *arguments)
+                flooder = Program(all_, *module("clients"), "flooder", case.flooders, path)
                 flooder.line()
                 programs.append(flooder)
         if case.is_loaded:
@@ -232,9 +231,7 @@ def _capabilities(rig: Rig, touch_wait: float) -> PlaybackCapabilities:
     return playback_capabilities(rig, opened, max_loading_time=touch_wait * 1e-3)
 
 
-def _daemon_file(
-    folder: Path, urls: Sequence[str], table: Path, port: int, touch_wait: float
-) -> Path:
+def _daemon_file(folder: Path, urls: Sequence[str], table: Path, port: int) -> Path:
     rig = folder / "rig.yaml"
     text = rig.read_text("utf-8")
     for url in urls:
@@ -242,7 +239,7 @@ def _daemon_file(
     rig.write_text(text, "utf-8")
     path = folder / "daemon.yaml"
     path.write_text(
-        f"rig: rig.yaml\nsocket: socket\ntable: {table}\ntouch_wait: {touch_wait:g} ms\n"
+        f"rig: rig.yaml\nsocket: socket\ntable: {table}\n"
         f"touch:\n  - {{name: panel, url: 'tuio:127.0.0.1:{port}'}}\nlog: {{level: warning}}\n",
         "utf-8",
     )

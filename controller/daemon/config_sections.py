@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, Strict
 
 from controller.api.schema import MAX_LEASE, MIN_LEASE
-from controller.loop.envelopes import MAX_LOADING_TIME
 from model.config.sections import Quantity, Section
 from model.config.units import LENGTH, RATIO, TIME
 from model.drive_modes import DRIVE_MODES
@@ -42,9 +41,6 @@ def loopback_address(text: str) -> str:
         )
     return text
 
-
-MAX_TOUCH_WAIT = 0.1
-"""Upper bound of touch_wait [s]: a longer delay is felt as a separate event."""
 
 File = Annotated[str, Field(min_length=1, max_length=4096), AfterValidator(_file)]
 LevelDbSl = Annotated[float, Quantity(RATIO, at_least=-20, at_most=60)]
@@ -96,9 +92,6 @@ class DaemonSection(Section):
     mode: Annotated[str, AfterValidator(_mode)] | None = None
     learn: File | None = None
     level_db_sl: LevelDbSl = STRONG_DB_SL
-    touch_wait: Annotated[float, Quantity(TIME, at_least=0, at_most=MAX_TOUCH_WAIT)] = (
-        MAX_LOADING_TIME
-    )
     layout: File | None = None
     touch: Annotated[list[TouchSection], Field(max_length=16, default_factory=list)]
     serial_numbers: Annotated[dict[Identifier, str], Field(max_length=64, default_factory=dict)]

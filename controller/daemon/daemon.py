@@ -115,7 +115,6 @@ class Daemon:
             intent_source=self._layout,
             timing=timing,
             drive_mode=config.section.mode,
-            max_loading_time=config.section.touch_wait,
             is_supervised=config.section.supervised,
         )
         if config.learn is not None:

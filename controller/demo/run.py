@@ -9,7 +9,6 @@ from controller.demo.far_end import SIM_OPTIONS, simulated_plate
 from controller.demo.picture import choose_rows, touches_figure
 from controller.demo.recorder import TouchRecorder
 from controller.demo.touch_row import TouchRow
-from controller.loop.envelopes import MAX_LOADING_TIME
 from controller.loop.loop import Controller
 from controller.sources.capture import RecordedDatagram, replay_capture
 from controller.sources.tuio import TuioSource
@@ -51,14 +50,12 @@ async def run_demo(
     touches: Sequence[RecordedDatagram],
     on_row: Callable[[TouchRow], None],
     seed: int | None = 0,
-    touch_wait: float = MAX_LOADING_TIME,
 ) -> list[TouchRow]:
     """Play recorded touches into a controller, over a wire, onto a simulated plate.
 
     wire: one of WIRES; touches: of a TUIO capture; on_row: called with each row when complete;
-    seed: of the plate within the rig's uncertainty, None for the rig's own; touch_wait [s]: for
-    shaped onsets at most. Return all rows in order of time. Raises LinkError if the far end is
-    lost.
+    seed: of the plate within the rig's uncertainty, None for the rig's own. Return all rows in
+    order of time. Raises LinkError if the far end is lost.
     """
     rig = load_rig(rig_file)
     async with simulated_plate(
@@ -79,7 +76,6 @@ async def run_demo(
             sources=[tuio],
             observer=recorder.observer,
             timing=Timing(table),
-            max_loading_time=touch_wait,
             watchdog=WATCHDOG,
         )
         await controller.open()

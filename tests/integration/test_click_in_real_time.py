@@ -25,7 +25,7 @@ from model.finger.perception import detection_threshold
 from model.rig.file import load_rig
 from model.table.build import build_table
 from model.table.file import save_table
-from patient_daemon import PROGRAM
+from patient_daemon import LOADING
 from rig_files import write_rig
 from touch_stream import LENGTH, WIDTH
 from tuio_panel import free_port
@@ -40,7 +40,10 @@ LAYOUT = "effects: {it: {kind: click}}\nelsewhere: it\n"
 
 @asynccontextmanager
 async def panel(folder: Path, far_end: FarEndProcess) -> AsyncIterator[tuple[AsyncClient, int]]:
-    """A daemon with the layout and default settings, ready to be armed; and its TUIO port."""
+    """A daemon with the layout, ready to be armed; and its TUIO port.
+
+    Touches may wait for their onsets for longer than usual, or a busy machine gets a plain ramp.
+    """
     (url,) = far_end.urls.values()
     rig_file = write_rig(folder / "rig.yaml", ('main: {url: "sim://"}', f'main: {{url: "{url}"}}'))
     table = build_table(load_rig(rig_file), frequencies=np.arange(80.0, 321.0, 40.0))
@@ -49,11 +52,10 @@ async def panel(folder: Path, far_end: FarEndProcess) -> AsyncIterator[tuple[Asy
     port = free_port()
     (folder / "daemon.yaml").write_text(
         "rig: rig.yaml\ntable: table.npz\nsocket: era.sock\nlayout: layout.yaml\n"
-        "touch_wait: 100 ms\n"  # or a busy machine gets a plain ramp, and is told so
         f'touch:\n  - {{name: panel, url: "tuio:127.0.0.1:{port}?timeout=60"}}\n',
         encoding="utf-8",
     )
-    process = await asyncio.create_subprocess_exec(*PROGRAM, "daemon", folder / "daemon.yaml")
+    process = await asyncio.create_subprocess_exec(*LOADING, "0.1", folder / "daemon.yaml")
     try:
         end = time.monotonic() + PATIENCE
         while not (folder / "era.sock").is_socket():

@@ -10,7 +10,7 @@ from benchmarks.latency.report import check_case
 from model.rig.file import example_rig_path, load_rig
 from model.table.file import save_table
 from model.table.table_cache import cached_table
-from patient_daemon import PROGRAM
+from patient_daemon import LOADING
 
 pytestmark = pytest.mark.real_time
 
@@ -23,7 +23,7 @@ def measured(table_cache: Path, tmp_path_factory: pytest.TempPathFactory) -> run
     file = tmp_path_factory.mktemp("latency") / "table.npz"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(table_cache))
-        patch.setattr(run, "DAEMON", (*PROGRAM, "daemon"))
+        patch.setattr(run, "DAEMON", LOADING)
         table, _ = cached_table(load_rig(example_rig_path()))
         save_table(table, file)
         return run.measure(check_case("tcp", SECONDS, seed=1), file, table)

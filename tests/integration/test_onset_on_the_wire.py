@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from controller.demo.run import run_demo
+from controller.loop.loop import Controller
 from controller.sources import contacts
 from controller.sources.capture import RecordedDatagram
 from controller.sources.touch import Touch, TouchFrame
@@ -38,6 +39,7 @@ def touches():
 def test_onset_contrast_matches_prediction(touches, monkeypatch):
     """Within 2 dB over the first 100 ms, and far above what the amplifier's own ramp would give."""
     wait_long(monkeypatch)
+    monkeypatch.setitem(Controller.__init__.__kwdefaults__, "max_loading_time", 5.0)
     monkeypatch.setattr(contacts, "CONTACT_TIMEOUT", 60.0)
     rig_file = example_rig_path()
     rig = load_rig(rig_file)
@@ -50,7 +52,6 @@ def test_onset_contrast_matches_prediction(touches, monkeypatch):
             touches=touches,
             on_row=lambda row: None,
             seed=None,
-            touch_wait=5.0,
         )
     )
     (row,) = [row for row in rows if row.reason is None]

@@ -50,7 +50,7 @@ def test_config_has_defaults_for_all_keys_but_rig(folder: Path) -> None:
     assert config.urls == {"main": f"sim://{folder}/rig.yaml?amplifier=main"}
     assert config.touch == ()
     assert (config.table, config.layout, config.dump_folder, config.log_file) == (None,) * 4
-    assert (config.section.longest_lease, config.section.touch_wait) == (60.0, 0.010)
+    assert config.section.longest_lease == 60.0
     assert config.socket == default_socket()
     assert config.rig_text == example_rig_path().read_text("utf-8")
 
@@ -86,8 +86,7 @@ def test_config_reports_all_problems_at_once(folder: Path) -> None:
         '  - {name: d, url: "tuio:3333", calibration: {matrix: [[1,0,0],[1,0,0]]}}\n'
         "log: {level: loud}\n"
         "dashboard: 0.0.0.0:80\n"
-        "longest_lease: 61 s\n"
-        "touch_wait: 101 ms\n",
+        "longest_lease: 61 s\n",
         rig="rigg.yaml",
     )
     assert problems(path) == [
@@ -103,7 +102,6 @@ def test_config_reports_all_problems_at_once(folder: Path) -> None:
         (11, "log.level"),
         (12, "dashboard"),
         (13, "longest_lease"),
-        (14, "touch_wait"),
     ]
 
 

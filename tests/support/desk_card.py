@@ -9,7 +9,7 @@ from benchmarks.desk_plate.desk_plate import DeskPlate
 from model.arrays import Float32Array, FloatArray
 from sim.measuring.sound_card import SoundCard
 
-BLOCK = 480
+BLOCK = 4800
 
 
 class DeskCard(SoundCard):

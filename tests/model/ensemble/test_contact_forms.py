@@ -13,18 +13,25 @@ from model.ensemble.draws import draw
 from model.ensemble.thickness import responses_of_thicknesses, thickness_nodes
 from model.ensemble.tone_responses import NOMINAL, Tones, tone_responses
 from model.fem.assembly import assemble
+from model.fem.elements import ELEMENTS
 from model.fem.harmonic import direct_acceleration
+from model.fem.mesh import Mesh
 from model.finger.disc import FIVE_POINTS
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.uncertainty import Uncertainty
 from model.structure.fingertip import FingertipLoad
 from model.structure.point_load import PointLoad, footprints_of
+from paper_plate import LENGTH, WIDTH
 from paper_table import smooth_rig
 
 PLACES = np.array([[0.09, 0.07], [0.25, 0.18], [0.03, 0.19]])
 FREQUENCIES = np.array([60.0, 145.0, 260.0, 430.0])
-RIG = replace(smooth_rig(), masses=(PointLoad(0.2, 0.05, mass=0.03),))
+RIG = replace(
+    smooth_rig(),
+    mesh=Mesh(4, 3, LENGTH, WIDTH, ELEMENTS["Q5"]),
+    masses=(PointLoad(0.2, 0.05, mass=0.03),),
+)
 POINTS = PLACES[:, None] + FINGERTIP_RADIUS * FIVE_POINTS.points
 
 

@@ -16,7 +16,7 @@ from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from sim.measuring.desk import Desk
 from sim.measuring.loopback import latency
-from sim.measuring.measure import measure
+from sim.measuring.measure import Measured, measure
 from sim.measuring.multisine import Multisine, default_frequencies
 from sim.measuring.stepped import check_by_steps
 from sim.sensors.sensor_file import WiredSensor
@@ -53,6 +53,13 @@ def sines(desk: Desk, frequencies: np.ndarray = FREQUENCIES) -> Multisine:
     return Multisine(frequencies, len(desk.eras) + 1, RATE, LEVEL)
 
 
+@pytest.fixture(scope="module")
+def undisturbed(rig: Rig, truth: Truth) -> Measured:
+    """The plate measured with nothing wrong."""
+    desk = Desk(rig, SENSORS)
+    return measure(desk, card(truth), sines(desk))
+
+
 def test_multisine_has_its_level_and_orthogonal_runs() -> None:
     """No sample above the level in any run; at each line the runs form a unitary matrix."""
     multisine = Multisine(default_frequencies(40, 500), 5, RATE, LEVEL)
@@ -66,13 +73,14 @@ def test_multisine_has_its_level_and_orthogonal_runs() -> None:
         np.testing.assert_allclose(matrix @ matrix.conj().T, 5 * np.eye(5), atol=1e-6)
 
 
-def test_measured_responses_are_those_of_the_plate(rig: Rig, truth: Truth) -> None:
+def test_measured_responses_are_those_of_the_plate(
+    rig: Rig, truth: Truth, undisturbed: Measured
+) -> None:
     """Against its own closed form: hidden delay and filter are taken out, and the delay is told.
 
     What is left is the ringing of the start, 1 s before.
     """
-    desk = Desk(rig, SENSORS)
-    found = measure(desk, card(truth), sines(desk))
+    found = undisturbed
     model = DeskModel(truth, np.array(PLACES)).under()
     strokes = np.array([era.stroke for era in rig.eras])
     exact = model.response(FREQUENCIES).swapaxes(1, 2) / strokes[:, None]
@@ -95,25 +103,25 @@ def test_stepped_tones_agree(rig: Rig, truth: Truth) -> None:
     assert check.phase_deg[0] < 1.0
 
 
-def test_lost_block_repeats_its_run(rig: Rig, truth: Truth) -> None:
+def test_lost_block_repeats_its_run(rig: Rig, truth: Truth, undisturbed: Measured) -> None:
     """128 samples are missing in run 1, which nothing reports: it is played again."""
     desk = Desk(rig, SENSORS)
     sound = card(truth, lost=[1])
     found = measure(desk, sound, sines(desk))
     assert (found.repeated, sound.runs) == (1, 6)
-    again = measure(desk, card(truth), sines(desk))
-    difference = found.responses.values - again.responses.values
-    assert np.linalg.norm(difference) < 0.01 * np.linalg.norm(again.responses.values)
+    difference = found.responses.values - undisturbed.responses.values
+    assert np.linalg.norm(difference) < 0.01 * np.linalg.norm(undisturbed.responses.values)
 
 
-def test_delay_that_differs_between_runs_repeats_a_run(rig: Rig, truth: Truth) -> None:
+def test_delay_that_differs_between_runs_repeats_a_run(
+    rig: Rig, truth: Truth, undisturbed: Measured
+) -> None:
     """As where a block of inputs was lost between two; the runs would not be orthogonal."""
     desk = Desk(rig, SENSORS)
     found = measure(desk, card(truth, late=[2]), sines(desk))
-    again = measure(desk, card(truth), sines(desk))
-    difference = found.responses.values - again.responses.values
+    difference = found.responses.values - undisturbed.responses.values
     assert found.repeated == 1
-    assert np.linalg.norm(difference) < 0.01 * np.linalg.norm(again.responses.values)
+    assert np.linalg.norm(difference) < 0.01 * np.linalg.norm(undisturbed.responses.values)
 
 
 def test_losses_that_were_none_repeat_nothing(rig: Rig, truth: Truth) -> None:

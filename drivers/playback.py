@@ -48,9 +48,11 @@ class Transition:
         self.end = self.start + self.step * (len(self.knots) + 1)
 
     def at(self, time: float) -> complex:
-        """Return the amplitude at a time not before start."""
+        """Return the amplitude at a time [s], before start the first one."""
         if time >= self.end:
             return self.last
+        if time <= self.start:
+            return self.first
         steps = (time - self.start) / self.step
         if not self.knots:
             return self.first + (self.last - self.first) * (1 - math.cos(math.pi * steps)) / 2

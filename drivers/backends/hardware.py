@@ -33,6 +33,9 @@ class Port(Protocol):
         They replace the unsent rest of earlier ones.
         """
 
+    def poll(self) -> None:
+        """Hand over what has come and was not read yet."""
+
     def close(self) -> None:
         """Close it; no callback is called afterwards."""
 

@@ -207,6 +207,9 @@ class MemoryPort:
     def is_blocked(self) -> bool:
         return False
 
+    def poll(self) -> None:
+        """All that has come was handed over."""
+
     def write(self, data: bytes) -> None:
         if self._is_closed or self._is_hung_up:
             raise LinkError(f"serial line {self._terminal.port} was lost")

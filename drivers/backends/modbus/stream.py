@@ -65,6 +65,9 @@ class _Connection(asyncio.Protocol):
     def is_blocked(self) -> bool:
         return self._transport.get_write_buffer_size() > 0
 
+    def poll(self) -> None:
+        """Nothing to do: the loop reads before it runs timers that are due later."""
+
     def write(self, data: bytes) -> None:
         if self._transport.get_write_buffer_size() > _UNSENT_MAX:
             raise LinkTimeout(f"{self._endpoint}: write blocked; check the network")

@@ -67,6 +67,10 @@ class WatchedPort:
         """Whether the port has not taken all bytes yet."""
         return self._writer.is_blocked
 
+    def poll(self) -> None:
+        """Hand over what has come and was not read yet; a reader thread has done so."""
+        self._readable()
+
     def close(self) -> None:
         """Stop reading and writing; `wait_closed` closes the port."""
         self._ignore()

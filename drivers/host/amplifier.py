@@ -1,6 +1,7 @@
 """One amplifier of protocol 3, whatever its wire: who it is, and its requests."""
 
 import asyncio
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -83,6 +84,7 @@ class Amplifier:
         self._ledger: Ledger | None = None
         self._admitted: Staged | None = None
         self._contradictions = 0
+        self._other_host_at = -math.inf  # when it was heard last
         line.members[address] = self
 
     @property
@@ -261,10 +263,25 @@ class Amplifier:
         for listener in self.listeners:
             listener(values)
 
+    def note_other_host(self) -> None:
+        """Note that another host drives it: it must feed the watchdog within its longest time."""
+        self._other_host_at = clock.now()
+
+    def check_other_host(self) -> None:
+        """Raise LinkError if another host drives it."""
+        if clock.now() - self._other_host_at <= _WATCHDOG.high:
+            raise self._driven_by_another()
+
     def may_send(self, name: str, values: Values) -> LinkError | None:
-        """Return why a request must not go out now: nothing that plays or feeds while degraded."""
+        """Return why a request must not go out now.
+
+        Nothing that plays or feeds while it is degraded, or beside another host.
+        """
         message = MESSAGES.get(name)
-        if self.silence_cause is None or message is None or not message.feeds:
+        if message is None or not message.feeds:
+            return None
+        self.check_other_host()
+        if self.silence_cause is None:
             return None
         return LinkDegraded(
             f"{self.silence_cause}. The amplifier may play its last set until its watchdog has "
@@ -324,11 +341,13 @@ class Amplifier:
         while clock.now() < end and status["state"] == _ENABLED:
             await asyncio.sleep(LISTENING / 10)
             status = await self.read_status()
+            self.check_other_host()
             if status["watchdog_left"] > left:
-                raise LinkError(
-                    f"amplifier {self.name} is driven by another host; end that one first"
-                )
+                raise self._driven_by_another()
             left = status["watchdog_left"]
+
+    def _driven_by_another(self) -> LinkError:
+        return LinkError(f"amplifier {self.name} is driven by another host; end that one first")
 
 
 def is_stopping(status: Values, before: int | None) -> bool:

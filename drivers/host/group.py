@@ -44,6 +44,8 @@ class Group:
 
         None stays armed if one fails. One session, so that a broadcast reaches all of a line.
         """
+        for amplifier in self.amplifiers.values():
+            amplifier.check_other_host()  # before a disarm of what failed would end its vibration
         before = self._silences
         session = self._draw(_SESSION.minimum, _SESSION.maximum)
         try:

@@ -13,7 +13,7 @@ from typing import Protocol
 
 from drivers import clock
 from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout, Preempted
-from drivers.host.wire import Broken, Event, More, Nak, Wire
+from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Wire
 from drivers.protocol.records import Values
 from drivers.protocol.table import REACTION
 
@@ -84,6 +84,9 @@ class Member(Protocol):
 
     def note_event(self, values: Values) -> None:
         """Note what it told unasked."""
+
+    def note_other_host(self) -> None:
+        """Note that another host drives it."""
 
     def may_send(self, name: str, values: Values) -> LinkError | None:
         """Return why a request must not go out now; None if it may."""
@@ -187,9 +190,13 @@ class Line:
     def received(self, data: bytes) -> None:
         """Take bytes from the port."""
         for arrival in self.wire.received(data):
-            if isinstance(arrival, Event):
-                if (member := self.members.get(arrival.address)) is not None:
+            if isinstance(arrival, Event | OtherHost):
+                if (member := self.members.get(arrival.address)) is None:
+                    continue
+                if isinstance(arrival, Event):
                     member.note_event(arrival.values)
+                else:
+                    member.note_other_host()
                 continue
             job = self._current
             if job is None:
@@ -268,7 +275,7 @@ class Line:
             if address in (0, member.address):
                 member.note_sent(name, values, now)
         self._port.write(data)
-        return max(self.wire.round_trip(name, len(data) // 2) + REACTION - REPLY_TIMEOUT, 0.0)
+        return max(self.wire.round_trip(name, len(data)) + REACTION - REPLY_TIMEOUT, 0.0)
 
     def _refused(self, job: Job, nak: Nak) -> None:
         self.statistics.refusals += 1

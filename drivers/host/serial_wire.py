@@ -8,7 +8,7 @@ from drivers.codec.serial_line.frame import (
     encode_frame,
     frame_length,
 )
-from drivers.host.wire import Arrival, Broken, Event, Nak, Reply
+from drivers.host.wire import Arrival, Broken, Event, Reply, read_nak
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.serial_payload import (
     BROADCAST,
@@ -24,15 +24,11 @@ from drivers.protocol.table import (
     MAX_WORDS,
     MESSAGES,
     NAK,
-    NAK_RECORD,
-    NO_CHANNEL,
-    REFUSALS,
     VERSION,
 )
 from drivers.statistics import WireCounters
 
 _BITS = 10  # of a byte, with start and stop
-_CODES = {number: name for name, number in REFUSALS.items()}
 
 
 class SerialWire:
@@ -67,12 +63,12 @@ class SerialWire:
         """Take the request off the wire: its reply will be unexpected."""
         self._pending = None
 
-    def round_trip(self, name: str, words: int) -> float:
-        """Return how long a request of this many words and its longest reply take [s]."""
+    def round_trip(self, name: str, length: int) -> float:
+        """Return how long a request of this many bytes and its longest reply take [s]."""
         if not self._baud:
             return 0.0
         reply_bytes = 2 * MAX_WORDS if name != "Hello" else 140
-        return _BITS * (frame_length(2 * words) + frame_length(reply_bytes)) / self._baud
+        return _BITS * (length + frame_length(reply_bytes)) / self._baud
 
     def _arrival(self, frame: Frame) -> Arrival | None:
         self.counters.frames_in += 1
@@ -108,10 +104,7 @@ class SerialWire:
 def _reply(frame: Frame, request: Frame) -> Arrival:
     """Read the reply to a request; raises Refusal."""
     if frame.kind == NAK | REPLY:
-        words = unpack_words(frame.payload)
-        values = NAK_RECORD.unpack(words, is_strict=False)
-        channel = None if values["channel"] == NO_CHANNEL else values["channel"]
-        return Nak(_CODES.get(values["code"], f"code {values['code']}"), channel)
+        return read_nak(unpack_words(frame.payload))
     if frame.kind != request.kind | REPLY:
         return Broken(f"type of the reply must be {request.type}, got {frame.type}")
     if frame.version != request.version:

@@ -4,11 +4,15 @@ A wire carries one request at a time. What arrives is matched by it: a reply to 
 is counted as unexpected, and damaged bytes as invalid.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
 from drivers.protocol.records import Values
+from drivers.protocol.table import NAK_RECORD, NO_CHANNEL, REFUSALS
 from drivers.statistics import WireCounters
+
+_CODES = {number: name for name, number in REFUSALS.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,13 +46,27 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True)
+class OtherHost:
+    """Another host drives the amplifier at an address: its request was heard."""
+
+    address: int
+
+
+@dataclass(frozen=True, slots=True)
 class More:
     """The request goes on with these bytes, as on Modbus."""
 
     data: bytes
 
 
-Arrival: TypeAlias = Reply | Nak | Broken | Event | More
+Arrival: TypeAlias = Reply | Nak | Broken | Event | OtherHost | More
+
+
+def read_nak(words: Sequence[int]) -> Nak:
+    """Read the words of a Nak; raises Refusal."""
+    values = NAK_RECORD.unpack(words, is_strict=False)
+    channel = None if values["channel"] == NO_CHANNEL else values["channel"]
+    return Nak(_CODES.get(values["code"], f"code {values['code']}"), channel)
 
 
 class Wire(Protocol):
@@ -65,5 +83,5 @@ class Wire(Protocol):
     def withdraw(self) -> None:
         """Take the request off the wire: its reply will be unexpected."""
 
-    def round_trip(self, name: str, words: int) -> float:
-        """Return how long a request of this many words and its longest reply take [s]."""
+    def round_trip(self, name: str, length: int) -> float:
+        """Return how long a request of this many bytes and its longest reply take [s]."""

@@ -5,12 +5,23 @@ states, faults and refusals, and the times of the contract, stand here too. What
 is written in docs/decisions/0061-protocol-3.md.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from drivers.protocol.definition import WireQuantity
-from drivers.protocol.records import Bits, Number, Numbers, Real, Record, Rest, Rows, Text
+from drivers.protocol.records import (
+    Bits,
+    Number,
+    Numbers,
+    Real,
+    Record,
+    Refusal,
+    Rest,
+    Rows,
+    Text,
+    Values,
+)
 
 VERSION: Final = 3
 MAX_WORDS: Final = 120
@@ -247,3 +258,17 @@ _MESSAGES = (
 )
 MESSAGES: Mapping[str, Message] = {message.name: message for message in _MESSAGES}
 BY_NUMBER: Mapping[int, Message] = {message.number: message for message in _MESSAGES}
+
+
+def read_request(number: int, words: Sequence[int]) -> tuple[str, Values]:
+    """Read the name and the values of a request with a message's number; raises Refusal."""
+    message = BY_NUMBER.get(number)
+    if message is None:
+        raise Refusal(f"type {number} is unknown", "UNKNOWN_TYPE")
+    return message.name, message.request.unpack(words, is_strict=True)
+
+
+def nak_of(refusal: Refusal, number: int) -> list[int]:
+    """Return the words of the Nak to a request with a message's number."""
+    channel = NO_CHANNEL if refusal.channel is None else refusal.channel
+    return NAK_RECORD.pack({"request": number, "code": REFUSALS[refusal.code], "channel": channel})

@@ -19,10 +19,9 @@ from drivers.protocol.table import (
     EVENT,
     EVENT_RECORD,
     NAK,
-    NAK_RECORD,
-    NO_CHANNEL,
-    REFUSALS,
     VERSION,
+    nak_of,
+    read_request,
 )
 from sim.amplifier.contract import Amplifier
 
@@ -58,9 +57,7 @@ class SerialAmplifiers:
                 return frame._replace(kind=HELLO | REPLY, payload=payload, version=NEUTRAL)
             payload = self._payload(frame, amplifier, now)
         except Refusal as refusal:
-            channel = NO_CHANNEL if refusal.channel is None else refusal.channel
-            nak = {"request": frame.type, "code": REFUSALS[refusal.code], "channel": channel}
-            payload = pack_words(NAK_RECORD.pack(nak))
+            payload = pack_words(nak_of(refusal, frame.type))
             version = NEUTRAL if refusal.code == "UNSUPPORTED_VERSION" else VERSION
             return frame._replace(kind=NAK | REPLY, payload=payload, version=version)
         return frame._replace(kind=frame.kind | REPLY, payload=payload)
@@ -99,7 +96,4 @@ def _request(frame: Frame) -> tuple[str, Values]:
     """Read a request; raises Refusal."""
     if frame.version != VERSION:
         raise Refusal(f"version must be {VERSION}, got {frame.version}", "UNSUPPORTED_VERSION")
-    message = BY_NUMBER.get(frame.type)
-    if message is None:
-        raise Refusal(f"type {frame.type} is unknown", "UNKNOWN_TYPE")
-    return message.name, message.request.unpack(unpack_words(frame.payload), is_strict=True)
+    return read_request(frame.type, unpack_words(frame.payload))

@@ -5,14 +5,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+from drivers.codec.can_bus.segments import REQUEST, unpack_frames
 from drivers.codec.serial_line.frame import FrameReader
 from drivers.host.amplifier import Amplifier as Host
+from drivers.host.can_wire import CanWire
 from drivers.host.line import Line
 from drivers.host.serial_wire import SerialWire
 from drivers.host.wire import Wire
 from drivers.protocol.table import BY_NUMBER
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier
+from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)
@@ -54,7 +57,14 @@ def _serial_request(data: bytes) -> tuple[int, int]:
     return frame.address, frame.type
 
 
+def _can_request(data: bytes) -> tuple[int, int]:
+    frame = unpack_frames(data)[-1]
+    first = next(each for each in unpack_frames(data) if each.id == frame.id)
+    return frame.id - REQUEST, first.data[2]
+
+
 KINDS: Mapping[str, Kind] = {
+    "can": Kind(lambda: CanWire(500_000, sequence=0), CanAmplifiers, _can_request),
     "serial": Kind(lambda: SerialWire(921_600, sequence=0), SerialAmplifiers, _serial_request),
 }
 

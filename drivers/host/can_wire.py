@@ -1,0 +1,148 @@
+"""The host's side of a CAN bus: frames of words, matched by node and sequence number.
+
+Its bytes are packed frames (`drivers.codec.can_bus.segments`), for a port that takes frames.
+"""
+
+from collections import deque
+
+from drivers import clock
+from drivers.codec.can_bus.frame import BLOCK, CANOPEN, CanFrame, cob_id
+from drivers.codec.can_bus.segments import (
+    NODE_MAX,
+    NUMBER_MAX,
+    PACKED,
+    REPLY,
+    REQUEST,
+    Assembler,
+    Message,
+    frames_of,
+    pack_frames,
+    segments,
+    unpack_frames,
+)
+from drivers.codec.can_bus.timing import CanTimes
+from drivers.host.wire import Arrival, Broken, Event, OtherHost, Reply, read_nak
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.serial_payload import BROADCAST, HELLO
+from drivers.protocol.table import (
+    BY_NUMBER,
+    EVENT,
+    EVENT_RECORD,
+    IDENTITY,
+    MAX_WORDS,
+    MESSAGES,
+    NAK,
+)
+from drivers.statistics import WireCounters
+
+_KEPT = 3 * frames_of(MAX_WORDS)  # frames sent last, which an adapter may echo
+_START: int = CANOPEN["nmt"]["start"]
+
+
+class CanWire:
+    """A bus at a bit rate [bit/s]; sequence: before the first request to a node, 0 to 255."""
+
+    def __init__(self, bitrate: int, *, sequence: int) -> None:
+        self.counters = WireCounters()
+        self._frame_time = CanTimes(bitrate).frame(BLOCK)
+        self._sequence = sequence
+        self._numbers: dict[int, int] = {}  # last ones by node
+        self._sent: deque[CanFrame] = deque(maxlen=_KEPT)
+        self._pending: tuple[int, int, int] | None = None  # node, number, type
+        self._replies = Assembler(self.counters)
+        self._events: dict[int, Assembler] = {}
+
+    def request(self, address: int, name: str, values: Values) -> bytes:
+        """Return the frames of a request, which is on the wire from now on; address 0: of all.
+
+        Hello sets the node operational first.
+        """
+        number, kind, words = 0, HELLO, list[int]()
+        if address != BROADCAST:
+            number = self._numbers.get(address, self._sequence) % NUMBER_MAX + 1
+            self._numbers[address] = number
+        if name != "Hello":
+            kind, words = MESSAGES[name].number, MESSAGES[name].request.pack(values)
+        frames = [CanFrame(REQUEST + address, data) for data in segments(number, kind, words)]
+        self._sent.extend(frames)
+        if name == "Hello":
+            frames.insert(0, CanFrame(cob_id("nmt"), bytes((_START, address))))
+        self._pending = None if address == BROADCAST else (address, number, kind)
+        self._replies = Assembler(self.counters)
+        self.counters.frames_out += len(frames)
+        return pack_frames(frames)
+
+    def received(self, data: bytes) -> list[Arrival]:
+        """Return what these frames complete."""
+        arrivals = [self._arrival(frame) for frame in unpack_frames(data)]
+        return [arrival for arrival in arrivals if arrival is not None]
+
+    def withdraw(self) -> None:
+        """Take the request off the wire: its reply will be unexpected."""
+        self._pending = None
+
+    def round_trip(self, name: str, length: int) -> float:
+        """Return how long a request of this many bytes and its longest reply take [s]."""
+        return (length // PACKED + frames_of(MAX_WORDS)) * self._frame_time
+
+    def _arrival(self, frame: CanFrame) -> Arrival | None:
+        node = frame.id & NODE_MAX
+        kind = frame.id - node
+        if node and kind == REPLY:
+            return self._from_amplifier(node, frame.data)
+        if node and kind == REQUEST and frame not in self._sent:
+            return self._from_host(node, frame.data)
+        return None  # of other devices, or an echo
+
+    def _from_amplifier(self, node: int, data: bytes) -> Arrival | None:
+        if data[:1] == b"\0":
+            events = self._events.setdefault(node, Assembler(self.counters, is_numbered=False))
+            message = events.add(data, clock.now())
+            return None if message is None else self._event(node, message)
+        if (
+            self._pending is None
+            or data[:1] != bytes((self._pending[1],))
+            or (node != self._pending[0])
+        ):
+            self.counters.frames_in += 1
+            self.counters.unexpected_frames += data[1:2] == b"\0"
+            return None
+        message = self._replies.add(data, clock.now())
+        if message is None:
+            return None
+        kind, self._pending = self._pending[2], None
+        try:
+            return _reply(message, kind)
+        except Refusal as refusal:
+            return Broken(str(refusal))
+
+    def _from_host(self, node: int, data: bytes) -> OtherHost | None:
+        """Note a frame of another host; one that reads or stops does not drive the amplifier."""
+        self.counters.frames_in += 1
+        if len(data) != BLOCK or data[1] != 0:
+            return None
+        self.counters.unexpected_frames += 1
+        self._numbers[node] = data[0]  # the amplifier discards what is older
+        message = BY_NUMBER.get(data[2])
+        return OtherHost(node) if message is not None and message.feeds else None
+
+    def _event(self, node: int, message: Message) -> Event | None:
+        try:
+            if message.type != EVENT:
+                raise Refusal(f"type must be {EVENT}, got {message.type}")
+            values = EVENT_RECORD.unpack(message.words, is_strict=False)
+        except Refusal:
+            self.counters.invalid_frames += 1
+            return None
+        self.counters.events += 1
+        return Event(node, values)
+
+
+def _reply(message: Message, kind: int) -> Arrival:
+    """Read the reply to a request of a type; raises Refusal."""
+    if message.type == NAK:
+        return read_nak(message.words)
+    if message.type != kind:
+        return Broken(f"type of the reply must be {kind}, got {message.type}")
+    record = IDENTITY if kind == HELLO else BY_NUMBER[kind].reply
+    return Reply(record.unpack(message.words, is_strict=False))

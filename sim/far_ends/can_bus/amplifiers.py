@@ -1,0 +1,236 @@
+"""The amplifiers' side of a CAN bus in protocol 3, without I/O.
+
+Frames come and go packed (`drivers.codec.can_bus.segments`), those of a message together.
+"""
+
+import struct
+from collections.abc import Callable, Mapping
+
+from drivers.codec.can_bus.frame import CANOPEN, CanFrame, cob_id
+from drivers.codec.can_bus.segments import (
+    NODE_MAX,
+    REPLY,
+    REQUEST,
+    Assembler,
+    Message,
+    pack_frames,
+    segments,
+    unpack_frames,
+)
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.serial_payload import HELLO
+from drivers.protocol.table import (
+    BY_NUMBER,
+    EVENT,
+    EVENT_RECORD,
+    IDENTITY,
+    NAK,
+    QUANTITIES,
+    nak_of,
+    read_request,
+)
+from drivers.statistics import WireCounters
+from sim.amplifier.contract import SILENCING_RAMP, Amplifier
+from sim.far_ends.can_bus.sdo import SdoServer
+from sim.far_ends.can_bus.word_objects import FAULT_NAMES, WordObjects
+
+Send = Callable[[bytes], None]
+
+_NMT: Mapping[str, int] = CANOPEN["nmt"]
+_NMT_STATES: Mapping[str, int] = CANOPEN["nmt_states"]
+_OPERATIONAL, _STOPPED = _NMT_STATES["OPERATIONAL"], _NMT_STATES["STOPPED"]
+_BOOT_UP, _PRE_OPERATIONAL = _NMT_STATES["BOOT_UP"], _NMT_STATES["PRE_OPERATIONAL"]
+_NMT_LENGTH = 2
+_POLL = 0.05  # s; between looks whether a heartbeat is wanted again
+
+
+class CanAmplifiers:
+    """Amplifiers by their nodes on one bus; send: called with their frames."""
+
+    def __init__(self, amplifiers: Mapping[int, Amplifier], send: Send) -> None:
+        self.counters = WireCounters()
+        self._nodes = {
+            node: _Node(amplifier, node, send, self.counters)
+            for node, amplifier in amplifiers.items()
+        }
+        self._broadcasts = Assembler(self.counters, is_numbered=False)
+
+    def start(self, now: float) -> None:
+        """Boot all nodes at a time [s]."""
+        for node in self._nodes.values():
+            node.boot(now)
+
+    @property
+    def next_event(self) -> float:
+        """Time of the next heartbeat or event [s]."""
+        return min(node.next_event for node in self._nodes.values())
+
+    def tick(self, now: float) -> None:
+        """Send the heartbeats and events due by now [s]."""
+        for node in self._nodes.values():
+            node.tick(now)
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take frames of other devices at a time [s]."""
+        for frame in unpack_frames(data):
+            self._receive(frame, now)
+
+    def _receive(self, frame: CanFrame, now: float) -> None:
+        number = frame.id & NODE_MAX
+        node, kind = self._nodes.get(number), frame.id - number
+        if frame.id == cob_id("nmt"):
+            if len(frame.data) == _NMT_LENGTH:
+                for each in self._nodes.values():
+                    if frame.data[1] in (0, each.number):
+                        each.command(frame.data[0], now)
+        elif frame.id == REQUEST:
+            if (message := self._broadcasts.add(frame.data, now)) is not None:
+                self._broadcast(message, now)
+        elif node is not None and kind == REQUEST:
+            node.request(frame.data, now)
+            if node.number != number:
+                self._nodes[node.number] = self._nodes.pop(number)
+        elif node is not None and kind == cob_id("sdo_request"):
+            node.read(frame.data, now)
+
+    def _broadcast(self, message: Message, now: float) -> None:
+        known = BY_NUMBER.get(message.type)
+        if known is not None and known.is_broadcast:
+            for node in [*self._nodes.values()]:
+                node.obey(message, now)
+            self._nodes = {node.number: node for node in self._nodes.values()}
+
+
+class _Node:
+    """An amplifier at a node number."""
+
+    def __init__(
+        self, amplifier: Amplifier, number: int, send: Send, counters: WireCounters
+    ) -> None:
+        self._amplifier = amplifier
+        self._send = send
+        self._counters = counters
+        self._now = 0.0
+        self._state = _PRE_OPERATIONAL
+        self._was_faulty = False
+        self._heartbeat_due = 0.0
+        self._take_number(number)
+        amplifier.listeners.append(self._tell)
+
+    def _take_number(self, number: int) -> None:
+        self.number = number
+        self._requests = Assembler(self._counters)
+        self._objects = WordObjects(self._amplifier, number, lambda: self._now)
+        self._sdo = SdoServer(
+            read=self._objects.read,
+            write=self._objects.write,
+            send=lambda data: self._put(cob_id("sdo_answer", number), data),
+        )
+
+    @property
+    def next_event(self) -> float:
+        """Time of the next heartbeat or event [s]."""
+        return min(self._heartbeat_due, self._amplifier.next_event)
+
+    def tick(self, now: float) -> None:
+        """Send what is due by now."""
+        self._amplifier.tick(now)
+        while self._heartbeat_due <= now:
+            interval = self._objects.heartbeat
+            if interval:
+                self._put(cob_id("heartbeat", self.number), bytes([self._state]))
+            self._heartbeat_due += interval / 1000 if interval else _POLL
+
+    def boot(self, now: float) -> None:
+        """Begin anew, not operational; what the amplifier plays is its own."""
+        self._objects.reset()
+        self._sdo.reset()
+        self._requests = Assembler(self._counters)
+        self._state = _PRE_OPERATIONAL
+        self._put(cob_id("heartbeat", self.number), bytes([_BOOT_UP]))
+        self._heartbeat_due = now + self._objects.heartbeat / 1000
+
+    def command(self, command: int, now: float) -> None:
+        """Take a command of network management."""
+        if command == _NMT["start"]:
+            self._state = _OPERATIONAL
+        elif command == _NMT["stop"]:
+            self._leave(_STOPPED, now)
+        elif command == _NMT["pre_operational"]:
+            self._leave(_PRE_OPERATIONAL, now)
+        elif command == _NMT["reset_communication"]:
+            self._leave(_PRE_OPERATIONAL, now)
+            self.boot(now)
+        elif command == _NMT["reset_node"]:
+            self._amplifier.restart(now)
+            self.boot(now)
+
+    def read(self, data: bytes, now: float) -> None:
+        """Take a frame to the objects."""
+        self._now = now
+        if self._state != _STOPPED:
+            self._sdo.receive(data)
+
+    def request(self, data: bytes, now: float) -> None:
+        """Take a frame of a request, and reply to the message that it completes."""
+        if self._state != _OPERATIONAL:
+            return
+        message = self._requests.add(data, now)
+        if message is None:
+            return
+        sender = self.number
+        try:
+            kind, words = message.type, self._words(message, now)
+        except Refusal as refusal:
+            kind, words = NAK, nak_of(refusal, message.type)
+        self._put(REPLY + sender, *segments(message.number, kind, words))
+        if self.number != sender:
+            self.boot(now)
+
+    def obey(self, message: Message, now: float) -> None:
+        """Carry out a broadcast, without a reply."""
+        if self._state != _OPERATIONAL:
+            return
+        sender = self.number
+        try:
+            self._words(message, now)
+        except Refusal:
+            return
+        if self.number != sender:
+            self.boot(now)
+
+    def _words(self, message: Message, now: float) -> list[int]:
+        """Carry out a request; returns the words of its reply. Raises Refusal."""
+        if message.type == HELLO:
+            return IDENTITY.pack(self._amplifier.identity)
+        name, values = read_request(message.type, message.words)
+        if name == "SetAddress" and values["address"] > NODE_MAX:
+            raise Refusal(f"address must be 1 to {NODE_MAX}, got {values['address']}")
+        reply = self._amplifier.handle(name, values, now)
+        if name == "SetAddress":
+            self._take_number(values["address"])
+        return BY_NUMBER[message.type].reply.pack(reply)
+
+    def _leave(self, state: int, now: float) -> None:
+        """Stop what plays, then leave the state in which there are requests."""
+        if self._amplifier.state == "OPERATION_ENABLED":
+            ramp = QUANTITIES["ramp"].to_wire(SILENCING_RAMP)
+            self._amplifier.handle("Stop", {"ramp": ramp}, now)
+        self._state = state
+
+    def _tell(self, event: Values, now: float) -> None:
+        """Send an event, with an emergency where a fault comes or goes."""
+        if self._state == _OPERATIONAL:
+            self._put(REPLY + self.number, *segments(0, EVENT, EVENT_RECORD.pack(event)))
+        fault = FAULT_NAMES[event["fault"]]
+        is_faulty = fault != "NONE"
+        if (is_faulty or self._was_faulty) and self._state != _STOPPED:
+            known = CANOPEN["emergencies"][fault]
+            state = event["state"] | event["fault"] << 4
+            head = (known["code"], known["error_register"], state, event["channel"])
+            self._put(cob_id("emergency", self.number), struct.pack("<HBBB3x", *head))
+        self._was_faulty = is_faulty
+
+    def _put(self, can_id: int, *data: bytes) -> None:
+        """Send frames of one identifier."""
+        self._send(pack_frames(CanFrame(can_id, each) for each in data))

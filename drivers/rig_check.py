@@ -1,7 +1,4 @@
-"""Check of a rig's amplifiers by their URLs alone; nothing is opened.
-
-An entry point of the group `era_haptics.rig_checks`, for `era config check`.
-"""
+"""Check of a rig's amplifiers by their URLs alone, for `era config check`; nothing is opened."""
 
 import math
 from collections.abc import Mapping, Sequence

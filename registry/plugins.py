@@ -180,12 +180,6 @@ def failed_plugin(error: BaseException) -> EntryPoint | None:
     return next((plugins[top] for top in tops if top in plugins), None)
 
 
-def package_remedy(point: EntryPoint) -> str:
-    """Remedy for a plug-in that cannot be used."""
-    package = _package(point)
-    return f"reinstall {package}" if package == _OURS else f"repair or remove {package}"
-
-
 def _failed(point: EntryPoint, error: BaseException) -> str:
     return f"{_plugin(point)} failed ({type(error).__name__}: {error}); {_REMEDY}"
 

@@ -5,7 +5,6 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +22,9 @@ from controller.sources.tuio import TuioSource
 from drivers.backends.serial_line.backend import SerialBackend
 from drivers.errors import CommandError
 from drivers.registry import known_schemes, open_backend
-from model.config.kinds import kind_called
 from model.errors import InputError
 from model.fem.element_registry import element_names, element_of
 from model.fem.elements import ELEMENTS
-from model.rig.kind import RIG
 from model.structure.materials import KNOWN_MATERIALS, known_material, material_names
 from registry.plugins import failure_text
 
@@ -163,18 +160,6 @@ KINDS = [
         ending=":",
         rest="a:1",
     ),
-    Kind(
-        "config_kinds",
-        "kind of configuration",
-        "class Fine:\n    recognises = check = example = schema = print\nTHING = Fine()\n",
-        "an instance of ConfigKind",
-        kind_called,
-        ("rig", RIG),
-        fails="class Fine:\n    check = example = schema = print\n"
-        "    def recognises(self, document): return document.missing\n"
-        "THING = Fine()\n",
-        use=lambda found: found.recognises({}),
-    ),
 ]
 
 of_every_kind = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.group)
@@ -291,14 +276,12 @@ def test_own_error_is_not_attributed_to_a_plugin(install: Install) -> None:
 
 
 def test_command_attributes_the_failure_of_a_plugin(
-    install: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    install: Install, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Bad input (2), not a bug of this project (70)."""
-    kind = next(kind for kind in KINDS if kind.group == "config_kinds")
+    kind = next(kind for kind in KINDS if kind.group == "backends")
     module = install("bad", kind, "fine", kind.fails)
-    path = tmp_path / "rig.yaml"
-    path.write_text("a: 1\n", "utf-8")
-    assert run(["config", "check", str(path)], entry_points(group="era_haptics.commands")) == 2
+    assert run(["amp", "stop", "fine://a:1"]) == 2
     error = capsys.readouterr().err
     assert f"plug-in {module}:THING of package bad" in error
     assert "bug" not in error

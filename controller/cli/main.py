@@ -1,8 +1,7 @@
 """The `era` command: assembles the commands of all packages and maps errors to exit statuses.
 
-A package provides commands by the entry-point group `era_haptics.commands`: a module with `app`, a
-typer application whose commands appear under `era`, and `EXIT_STATUS`, the exit status by error
-class. No package is known here by name.
+A package provides commands by a module with `app`, a typer application whose commands appear under
+`era`, and `EXIT_STATUS`, the exit status by error class.
 """
 
 import errno
@@ -12,7 +11,8 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points, version
+from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
@@ -21,7 +21,13 @@ from typer.core import TyperGroup
 from typer.main import get_group
 
 from model.errors import reworded
-from registry.plugins import failed_plugin, failure_text, package_remedy
+from registry.plugins import failed_plugin, failure_text
+
+COMMANDS = (
+    *("controller.cli.demo", "controller.cli.daemon", "drivers.cli", "controller.gateway.cli"),
+    *("model.cli", "controller.report.cli", "sim.cli"),
+)
+"""Modules with commands, by name: packages beside this one do not import each other."""
 
 BAD_INPUT = 2
 BUG = 70  # EX_SOFTWARE of sysexits.h
@@ -41,8 +47,7 @@ def main() -> int:
     # While modules load nothing is armed, and a KeyboardInterrupt could be swallowed.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: os._exit(INTERRUPTED))
-    modules = entry_points(group="era_haptics.commands")
-    return run(sys.argv[1:], modules, on_loaded=_interrupt_on_signals)
+    return run(sys.argv[1:], COMMANDS, on_loaded=_interrupt_on_signals)
 
 
 def _interrupt_on_signals() -> None:
@@ -53,7 +58,7 @@ def _interrupt_on_signals() -> None:
 
 def run(
     arguments: Sequence[str],
-    modules: Iterable[EntryPoint],
+    modules: Iterable[str] = COMMANDS,
     *,
     on_loaded: Callable[[], None] = lambda: None,
 ) -> int:
@@ -62,7 +67,7 @@ def run(
     on_loaded: called once the modules are loaded.
     """
     debug, arguments = _take_debug(arguments)
-    group, statuses = load_commands(modules, debug=debug)
+    group, statuses = load_commands(modules)
     try:
         on_loaded()
         status = _invoke(group, arguments)
@@ -87,28 +92,16 @@ def _take_debug(arguments: Sequence[str]) -> tuple[bool, list[str]]:
     return len(kept) < end, [*kept, *arguments[end:]]
 
 
-def load_commands(modules: Iterable[EntryPoint], *, debug: bool) -> tuple[TyperGroup, ExitStatus]:
-    """Return one group with the commands of all modules; skip one that cannot be loaded."""
+def load_commands(modules: Iterable[str] = COMMANDS) -> tuple[TyperGroup, ExitStatus]:
+    """Return one group with the commands of all modules, and the exit status by error class."""
     app = typer.Typer(no_args_is_help=True)
     app.callback()(_root)
     group = _group(app)
     statuses: ExitStatus = {}
-    for entry in modules:
-        try:
-            module = entry.load()
-            commands = _group(module.app).commands
-            repeated = ", ".join(sorted(commands.keys() & group.commands.keys()))
-            if repeated:
-                raise RuntimeError(f"another package has these commands too: {repeated}")
-            statuses.update(module.EXIT_STATUS)
-            group.commands.update(commands)
-        except Exception as error:
-            if debug:
-                traceback.print_exc()
-            _print_error(
-                f"warning: skipped the commands of {entry.value}, which cannot be loaded "
-                f"({type(error).__name__}: {error}); {package_remedy(entry)}"
-            )
+    for name in modules:
+        module = import_module(name)
+        statuses.update(module.EXIT_STATUS)
+        group.commands.update(_group(module.app).commands)
     return group, statuses
 
 

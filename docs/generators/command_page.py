@@ -1,12 +1,11 @@
 """The reference in docs/reference/commands.md: every command with its arguments and options.
 
 `python docs/generators/command_page.py docs/reference/commands.md` writes it anew between the
-page's two marks, from the commands themselves. Commands of other installed packages are left out.
+page's two marks, from the commands themselves.
 """
 
 import sys
 from collections.abc import Iterator
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import typer
@@ -16,19 +15,11 @@ from controller.cli.main import load_commands
 from page_part import insert
 
 WRITER = "docs/generators/command_page.py"
-_DISTRIBUTION = "era-haptics"
-
-
-def own_commands() -> TyperGroup:
-    """Those that come with era-haptics."""
-    entries = entry_points(group="era_haptics.commands")
-    own = [entry for entry in entries if entry.dist and entry.dist.name == _DISTRIBUTION]
-    return load_commands(own, debug=False)[0]
 
 
 def command_reference() -> str:
     """All commands by name, groups after the single ones, as Markdown."""
-    group = own_commands()
+    group, _ = load_commands()
     context = typer.Context(group, info_name="era")
     return "\n".join(_group(group, context))
 

@@ -1,16 +1,16 @@
 """Kinds of configuration files for `era config`: rigs, and those of other packages.
 
-A kind is an entry point of the group `era_haptics.config_kinds` that leads to a `ConfigKind`. The
-keys of a file determine its kind.
+The keys of a file determine its kind.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from pkgutil import resolve_name
+from typing import Any, Protocol, cast
 
 from model.config.document import Document
 from model.errors import InputError
-from registry.plugins import Instance, PluginRegistry
+from registry.suggestions import did_you_mean
 
 DEFAULT_KIND = "rig"
 
@@ -23,7 +23,6 @@ class CheckedFile:
     warnings: Sequence[str] = ()
 
 
-@runtime_checkable
 class ConfigKind(Protocol):
     """One kind of configuration file."""
 
@@ -40,19 +39,27 @@ class ConfigKind(Protocol):
         """The JSON schema for editors."""
 
 
-_KINDS: PluginRegistry[ConfigKind] = PluginRegistry(
-    "kind of configuration", "era_haptics.config_kinds", Instance(ConfigKind), error=InputError
-)
+_KINDS = {
+    "daemon": "controller.daemon.config_kind:DAEMON",
+    "layout": "controller.effects.layout_kind:LAYOUT",
+    DEFAULT_KIND: "model.rig.kind:RIG",
+}
+"""Where each is, by name: this package does not import those above it."""
 
 
 def kind_called(name: str) -> ConfigKind:
     """Return the kind of a name; raises InputError for an unknown one."""
-    return _KINDS.find(name)
+    if name not in _KINDS:
+        suggested = did_you_mean(name, _KINDS)
+        raise InputError(
+            f"unknown kind of configuration {name[:40]!r}; {suggested}known are {', '.join(_KINDS)}"
+        )
+    return cast(ConfigKind, resolve_name(_KINDS[name]))
 
 
 def kind_of(document: Document) -> ConfigKind:
     """Return the kind of a document: a rig unless another kind recognises it."""
-    for name in _KINDS.names():
+    for name in _KINDS:
         if name != DEFAULT_KIND and (kind := kind_called(name)).recognises(document):
             return kind
     return kind_called(DEFAULT_KIND)

@@ -1,19 +1,17 @@
 """A plate measured for its identification, and who measures it.
 
-The controller measures by a rig's amplifiers. Others are entry points of the group
-`era_haptics.plate_measurements` that lead to a `PlateMeasurer`.
+The controller measures by a rig's amplifiers, `sim` by a sound card.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from pkgutil import resolve_name
+from typing import Protocol
 
 from model.arrays import FloatArray
-from model.errors import InputError
 from model.identification.measurement import Measurement
 from model.rig.rig import Rig
-from registry.plugins import Instance, PluginRegistry
 
 Progress = Callable[[int, int], None]
 """Called with what is done and all."""
@@ -51,7 +49,6 @@ class DeviceSettings:
     seed: int
 
 
-@runtime_checkable
 class PlateMeasurer(Protocol):
     """Plays on all ERAs of a rig and measures its plate."""
 
@@ -59,11 +56,11 @@ class PlateMeasurer(Protocol):
         """Raises InputError, LinkError."""
 
 
-_MEASURERS: PluginRegistry[PlateMeasurer] = PluginRegistry(
-    "plate measurement", "era_haptics.plate_measurements", Instance(PlateMeasurer), error=InputError
-)
+_MEASURER = "sim.measuring.plate_measurement:measure_plate"
+"""By name: this package does not import the one beside it."""
 
 
 def measure_by_device(rig: Rig, settings: DeviceSettings, *, progress: Progress) -> MeasuredPlate:
     """Measure a plate by a sound card."""
-    return _MEASURERS.find("sound")(rig, settings, progress=progress)
+    measure: PlateMeasurer = resolve_name(_MEASURER)
+    return measure(rig, settings, progress=progress)

@@ -1,23 +1,18 @@
-"""Checks of a rig's amplifiers by packages that know wires.
-
-A check is an entry point of the group `era_haptics.rig_checks` that leads to a `RigCheck`.
-"""
+"""The check of a rig's amplifiers by the package that knows wires."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Protocol, runtime_checkable
+from pkgutil import resolve_name
+from typing import Protocol
 from urllib.parse import quote
 
 from model.config.document import Document, Problem
-from model.errors import InputError
 from model.rig.parts import limits_of
 from model.rig.rig import Rig
 from model.rig.sections import LimitsSection
 from registry.limits import GuardLimits
-from registry.plugins import Instance, PluginRegistry
 
 
-@runtime_checkable
 class RigCheck(Protocol):
     """Checks URLs without opening any."""
 
@@ -30,9 +25,8 @@ class RigCheck(Protocol):
         """
 
 
-_CHECKS: PluginRegistry[RigCheck] = PluginRegistry(
-    "rig check", "era_haptics.rig_checks", Instance(RigCheck), error=InputError
-)
+_CHECK = "drivers.rig_check:check_links"
+"""By name: this package does not import the one beside it."""
 
 
 def check_amplifiers(document: Document, rig: Rig | None) -> tuple[list[Problem], list[str]]:
@@ -40,16 +34,13 @@ def check_amplifiers(document: Document, rig: Rig | None) -> tuple[list[Problem]
     urls = _urls(document)
     wired = Counter(channel.amplifier for channel in rig.wiring.values()) if rig else Counter()
     limits = rig.limits if rig else limits_of(LimitsSection())
-    problems: list[Problem] = []
-    warnings: list[str] = []
-    for name in _CHECKS.names():
-        wrong, warned = _CHECKS.find(name)(urls, channels=wired, limits=limits)
-        problems += [
-            document.problem(("amplifiers", amplifier, "url"), what)
-            for amplifier, what in wrong.items()
-        ]
-        warnings += warned
-    return problems, warnings
+    check: RigCheck = resolve_name(_CHECK)
+    wrong, warnings = check(urls, channels=wired, limits=limits)
+    problems = [
+        document.problem(("amplifiers", amplifier, "url"), what)
+        for amplifier, what in wrong.items()
+    ]
+    return problems, [*warnings]
 
 
 def _urls(document: Document) -> dict[str, str]:

@@ -1,19 +1,15 @@
-"""Checks of a table by what is measured, provided by packages that know the hardware.
-
-A check is an entry point of the group `era_haptics.table_checks` that leads to a `TableCheck`.
-"""
+"""The check of a table by what is measured, by the package that knows sound cards."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from pkgutil import resolve_name
+from typing import Protocol
 
-from model.errors import InputError
 from model.rig.rig import Channel, Rig
 from model.table.promise_at_sensors import MeasuredVerification
 from model.table.table import LocalizationTable
 from registry.limits import GuardLimits
-from registry.plugins import Instance, PluginRegistry
 
 
 @dataclass(frozen=True)
@@ -33,7 +29,6 @@ class CheckSettings:
     level: float | None
 
 
-@runtime_checkable
 class TableCheck(Protocol):
     """Plays promises of a table and measures them."""
 
@@ -48,9 +43,8 @@ class TableCheck(Protocol):
         """Raises InputError, LinkError."""
 
 
-_CHECKS: PluginRegistry[TableCheck] = PluginRegistry(
-    "table check", "era_haptics.table_checks", Instance(TableCheck), error=InputError
-)
+_CHECK = "sim.measuring.table_check:check_table"
+"""By name: this package does not import the one beside it."""
 
 
 def check_by_measuring(
@@ -61,7 +55,8 @@ def check_by_measuring(
     progress: Callable[[int, int], None],
 ) -> MeasuredVerification:
     """Measure promises by the sound card's check."""
-    return _CHECKS.find("sound")(table, rig, settings, progress=progress)
+    check: TableCheck = resolve_name(_CHECK)
+    return check(table, rig, settings, progress=progress)
 
 
 def plain_rig(table: LocalizationTable, *, level: float) -> Rig:

@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.testing import CliRunner
 
-from command_page import own_commands
+from controller.cli.main import load_commands
 from model.cli import app
 from model.table import contact_sets
 
@@ -35,7 +35,7 @@ def test_page_lists_every_command_with_its_options() -> None:
     """The names on the page are those of the program."""
     parts = re.split(r"^### ", PAGE, flags=re.MULTILINE)[1:]
     listed = {part.splitlines()[0]: part for part in parts}
-    known = dict(commands(own_commands()))
+    known = dict(commands(load_commands()[0]))
     assert {name for name in listed if name.startswith("era ")} == set(known)
     for name, command in known.items():
         named = set(re.findall(r"^\| `(?:-\w, )?(--[a-z-]+)", listed[name], re.MULTILINE))
@@ -46,7 +46,7 @@ def test_page_lists_every_command_with_its_options() -> None:
 
 def test_no_list_of_commands_cuts_a_summary_off() -> None:
     """`era --help` and that of each group, on a terminal of 80 columns, which click fills to 78."""
-    era = own_commands()
+    era = load_commands()[0]
     groups = [era, *(one for one in era.commands.values() if isinstance(one, TyperGroup))]
     assert len(groups) > 5
     for one in groups:

@@ -6,7 +6,6 @@ import json
 import signal
 import socket
 import time
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -183,8 +182,7 @@ async def test_check_reads_files_without_amplifier(
 
     async def check(path: Path) -> int:
         # In a thread, for the command has an event loop of its own.
-        commands = entry_points(group="era_haptics.commands")
-        return await asyncio.to_thread(run, ["daemon", str(path), "--check"], commands)
+        return await asyncio.to_thread(run, ["daemon", str(path), "--check"])
 
     async with far_end(tmp_path) as far:
         save_table(daemon_table(), tmp_path / "table.npz")

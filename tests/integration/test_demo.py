@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from functools import partial
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -102,8 +101,7 @@ def demo(environment, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
 
     def run_demo(*arguments):
-        commands = entry_points(group="era_haptics.commands")
-        status = run(["demo", *map(str, arguments), "--out", str(tmp_path), "--json"], commands)
+        status = run(["demo", *map(str, arguments), "--out", str(tmp_path), "--json"])
         printed = capsys.readouterr()
         return status, printed.out, printed.err
 

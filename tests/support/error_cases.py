@@ -22,7 +22,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +61,6 @@ _PREPARED = {
     "layout.yaml": "effects:\n  tick: {kind: click}\n"
     "regions:\n  ok: {circle: {at: [0.1, 0.1], radius: 0.02}, on_press: tick}\n",
 }
-_COMMANDS = entry_points(group="era_haptics.commands")
 _SOCKET, _DAEMON = "era.sock", "running"
 
 
@@ -130,7 +128,7 @@ def provoke(case: Case, folder: Path, shelf: Path) -> Outcome:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             program, *arguments = shlex.split(case.run)
             assert program == "era"
-            status = run(arguments, _COMMANDS)
+            status = run(arguments)
     text = err.getvalue().replace(str(folder), HOME)
     if case.blur:
         text = re.sub(case.blur, "...", text)
@@ -239,7 +237,7 @@ def filled(shelf: Path) -> Iterator[None]:
     (shelf / "rig.yaml").write_text(RIG, encoding="utf-8")
     table = f"table build {shelf}/rig.yaml -o {shelf}/table.npz --frequencies 60:120:30 --grid 4x3"
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        assert run(shlex.split(table), entry_points(group="era_haptics.commands")) == 0
+        assert run(shlex.split(table)) == 0
     (shelf / "rig.yaml").unlink()
     for name in ("measured.csv", "measured.uff", "touches.tuio"):
         (shelf / name).write_bytes((ROOT / "examples" / name).read_bytes())

@@ -202,11 +202,9 @@ def _settle(files: list[int], folder: str, environment: dict[str, str], new_sess
 
 def _load() -> None:
     """Load what any of them needs."""
-    from importlib.metadata import entry_points
-
     from controller.cli.main import load_commands
 
-    load_commands(entry_points(group="era_haptics.commands"), debug=False)
+    load_commands()
     for name in _LOADED:
         import_module(name)
     gc.collect()

@@ -1,10 +1,9 @@
-"""The `era` command: commands of packages, errors and their exit statuses."""
+"""The `era` command: commands of modules, errors and their exit statuses."""
 
 import os
 import signal
 import subprocess
 import sys
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from textwrap import dedent
 
@@ -12,7 +11,7 @@ import pytest
 
 from controller.cli.main import main, run
 
-GROUP = "era_haptics.commands"
+MODULE = "era_test_commands"
 
 COMMANDS = """
     import os
@@ -68,25 +67,18 @@ COMMANDS = """
 
 
 @pytest.fixture
-def entries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[EntryPoint]:
-    """A package with commands, installed for one test."""
-    return [entry(tmp_path, monkeypatch, "era_test_commands", COMMANDS)]
-
-
-def entry(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, source: str) -> EntryPoint:
-    """An entry point to a module of this source, which is forgotten after the test."""
-    (folder / f"{name}.py").write_text(dedent(source), encoding="utf-8")
-    monkeypatch.syspath_prepend(folder)
-    monkeypatch.delitem(sys.modules, name, raising=False)
-    return EntryPoint(name=name, value=name, group=GROUP)
+def entries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """A module with commands, which is forgotten after the test."""
+    (tmp_path / f"{MODULE}.py").write_text(dedent(COMMANDS), encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, MODULE, raising=False)
+    return [MODULE]
 
 
 def process(folder: Path, *arguments: str, **environment: str) -> "subprocess.Popen[str]":
     """A process that runs the test commands of a folder."""
     script = (
-        "import sys; from importlib.metadata import EntryPoint; import controller.cli.main as m; "
-        f"m.entry_points = lambda group: [EntryPoint('t', 'era_test_commands', {GROUP!r})]; "
-        "sys.exit(m.main())"
+        f"import controller.cli.main as m; m.COMMANDS = [{MODULE!r}]; raise SystemExit(m.main())"
     )
     return subprocess.Popen(
         [sys.executable, "-c", script, *arguments],
@@ -98,7 +90,7 @@ def process(folder: Path, *arguments: str, **environment: str) -> "subprocess.Po
 
 
 def test_run_runs_a_command_and_returns_zero(
-    entries: list[EntryPoint], capsys: pytest.CaptureFixture[str]
+    entries: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Commands and groups of a package are at the root, with their options."""
     assert run(["good", "--number", "5"], entries) == 0
@@ -129,7 +121,7 @@ def test_run_runs_a_command_and_returns_zero(
     ],
 )
 def test_run_reports_an_error_in_one_line_with_its_status(
-    entries: list[EntryPoint],
+    entries: list[str],
     capsys: pytest.CaptureFixture[str],
     arguments: list[str],
     status: int,
@@ -146,7 +138,7 @@ def test_run_reports_an_error_in_one_line_with_its_status(
 
 @pytest.mark.parametrize("arguments", [[], ["parts"]])
 def test_run_shows_the_help_without_a_command(
-    entries: list[EntryPoint], capsys: pytest.CaptureFixture[str], arguments: list[str]
+    entries: list[str], capsys: pytest.CaptureFixture[str], arguments: list[str]
 ) -> None:
     """As it is, not as an error message."""
     assert run(arguments, entries) == 2
@@ -158,7 +150,7 @@ def test_run_shows_the_help_without_a_command(
     [["--debug", "ends", "bug"], ["ends", "--debug", "bug"], ["ends", "bug", "--debug"]],
 )
 def test_run_shows_the_traceback_with_debug(
-    entries: list[EntryPoint], capsys: pytest.CaptureFixture[str], arguments: list[str]
+    entries: list[str], capsys: pytest.CaptureFixture[str], arguments: list[str]
 ) -> None:
     """The option is accepted anywhere; the traceback has no colour."""
     assert run(arguments, entries) == 70
@@ -167,38 +159,8 @@ def test_run_shows_the_traceback_with_debug(
     assert "\x1b" not in written.err
 
 
-@pytest.mark.parametrize(
-    "source",
-    [
-        "import no_such_dependency",
-        "this is no Python",
-        "import typer; app = typer.Typer()",
-        "EXIT_STATUS = {}",
-        "import typer; app = typer.Typer(); EXIT_STATUS = {}; app.command()(lambda good: 0)"
-        "; app.command('good')(lambda: 0)",
-        "import typer; app = typer.Typer(); EXIT_STATUS = {}; app.command('q')(lambda x: 0)"
-        "; app.command('r')(lambda x, *y: 0); raise ValueError(1)",
-    ],
-)
-def test_run_skips_a_package_that_cannot_be_loaded(
-    entries: list[EntryPoint],
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    source: str,
-) -> None:
-    """Also one that repeats a command; a warning names it."""
-    broken = entry(tmp_path, monkeypatch, "era_test_broken", source)
-    assert run(["good"], [*entries, broken]) == 0
-    written = capsys.readouterr()
-    assert written.out.startswith("number 1 ")
-    assert written.err.startswith("era: warning: ")
-    assert "era_test_broken" in written.err
-    assert written.err.count("\n") == 1
-
-
 def test_run_prints_help_and_version(
-    entries: list[EntryPoint], capsys: pytest.CaptureFixture[str]
+    entries: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """On standard output; the program is called era however it was started."""
     assert run(["--version"], entries) == 0
@@ -234,21 +196,20 @@ def test_main_limits_linear_algebra_to_one_thread(
 
 LOADED = """
 import contextlib, io, sys
-from importlib.metadata import entry_points, packages_distributions
+from importlib.metadata import packages_distributions
 from controller.cli.main import load_commands
 from controller.cli.main import run
 
-points = entry_points(group="era_haptics.commands")
 if "all" in sys.argv:
     def help_of(command, path):
         yield path
         for name, part in getattr(command, "commands", {}).items():
             yield from help_of(part, [*path, name])
-    paths = list(help_of(load_commands(points, debug=True)[0], []))
+    paths = list(help_of(load_commands()[0], []))
 else:
     paths = [[]]
 with contextlib.redirect_stdout(io.StringIO()):
-    assert [run([*path, "--help"], points) for path in paths] == [0] * len(paths)
+    assert [run([*path, "--help"]) for path in paths] == [0] * len(paths)
 heavy = {"asyncio", "ssl", *packages_distributions()}
 print(len(paths), *sorted(heavy & {name.partition(".")[0] for name in sys.modules}))
 """
@@ -287,7 +248,5 @@ def test_main_loads_every_package_of_the_project(
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # keep those of pytest
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         monkeypatch.setenv(variable, "1")  # main sets them; restored after the test
-    installed = {point.name for point in entry_points(group=GROUP)}
-    assert {"controller", "daemon", "drivers", "gateway", "model", "sim"} <= installed
     assert main() == 0
     assert capsys.readouterr().err == ""

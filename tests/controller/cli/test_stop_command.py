@@ -1,6 +1,5 @@
 """`era stop` and what it says of amplifiers."""
 
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,7 @@ def test_stop_exits_with_3_and_names_amplifiers_unless_all_are_silent(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Success only if every amplifier is confirmed silent, or else the unconfirmed ones."""
-    modules = entry_points(group="era_haptics.commands", name="daemon")
+    modules = ["controller.cli.daemon"]
     with ScriptedDaemon(tmp_path) as daemon:
         command = ["stop", "--socket", str(daemon.socket)]
         assert run(command, modules) == 0

@@ -2,7 +2,6 @@
 
 import asyncio
 import socket
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -135,7 +134,7 @@ async def test_replay_capture_raises_when_the_system_refuses() -> None:
 
 def test_era_touch_sends_a_capture(tmp_path: Path) -> None:
     """To the UDP port of the daemon's source; fingers and a capture exclude each other."""
-    commands = entry_points(group="era_haptics.commands", name="daemon")
+    commands = ["controller.cli.daemon"]
     path = tmp_path / "taps.tuio"
     write_capture(path, [RecordedDatagram(0.0, b"one"), RecordedDatagram(0.0, b"two")])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:

@@ -2,7 +2,6 @@
 
 import json
 import re
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,7 @@ def era(capsys):
     """Run one command line in this process; returns its exit status and what it printed."""
 
     def call(*arguments):
-        status = run([str(a) for a in arguments], entry_points(group="era_haptics.commands"))
+        status = run([str(a) for a in arguments])
         printed = capsys.readouterr()
         return status, printed.out, printed.err
 

@@ -20,7 +20,7 @@ from typed_page import Edited, Interrupted, PageError, Seen, Step, Typed, Writte
 _PROGRESS = re.compile(r"^\d+ of \d+ [a-z ]+\n", re.MULTILINE)
 """Lines that appear where a command takes long; how many depends on the machine."""
 
-PATIENCE = 60.0  # s; for one command, on a machine that is busy with other things
+PATIENCE = 300.0  # s; for one command, on a machine that is busy with other things
 LOOK_AGAIN = 0.05  # s
 PORTS = {
     "3333": socket.SOCK_DGRAM,

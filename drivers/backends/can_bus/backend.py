@@ -58,6 +58,7 @@ from drivers.protocol.messages import (
 from drivers.statistics import WireCounters
 
 _BROADCAST_TIMEOUT = 0.03  # s; for room in the transmit queue
+_ADDRESS_TIMEOUT = 0.5  # s; for an SDO reply to a new address, while nothing plays
 _MAX_SDO_RESPONSES = 40  # of one job
 _FRAMES_APART = 8  # from a heartbeat to its order: that long the bus may be busy
 _START = CANOPEN["nmt"]["start"]
@@ -179,7 +180,7 @@ class CanBackend(WireBackend):
         """
         if isinstance(request, SetAddress):
             give = partial(ObjectClient.set_address, request=request)
-            await self._objects_job(give, request, _BROADCAST_TIMEOUT)
+            await self._objects_job(give, request, _ADDRESS_TIMEOUT)
             reset = CanFrame(cob_id("nmt"), bytes([_RESET_COMMUNICATION, self._url.node]))
             await self._send([reset], request, _BROADCAST_TIMEOUT)
             return

@@ -28,6 +28,13 @@ elsewhere: null
 ON_PAD, ON_QUIET = (0.1, 0.1), (0.25, 0.1)
 
 
+@pytest.fixture
+def resting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fingers that stay until they lift: a busy machine may repeat their frames too late."""
+    monkeypatch.setattr("controller.sources.contacts.CONTACT_TIMEOUT", 60.0)
+
+
+@pytest.mark.usefixtures("resting")
 async def test_daemon_plays_effects_by_region_and_by_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -52,6 +59,7 @@ async def test_daemon_plays_effects_by_region_and_by_name(
         await era.arm("me", lease_s=60)
         async with holding(era, ON_PAD):
             assert await level_of("hum") == pytest.approx(17, abs=3)
+        await era.touch([])
         async with holding(era, ON_QUIET):
             await until(lambda: [each.effect for each in view.contact_statuses()] == [None])
             await until(lambda: not any(bench.far.device.status().levels))
@@ -76,6 +84,7 @@ async def test_daemon_plays_effects_by_region_and_by_name(
             assert (await era.status()).silence_reason is None
 
 
+@pytest.mark.usefixtures("resting")
 async def test_click_ends_on_wire_while_finger_rests(tmp_path: Path) -> None:
     """The amplifier plays, then falls silent, though the contact has not changed."""
     text = LAYOUT.replace("on_press: hum", "on_press: click")

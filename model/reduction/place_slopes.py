@@ -1,9 +1,9 @@
 """Derivatives of fields of a plate by the places of the points where they are taken.
 
-They are differences of second order, inwards at edges. Polynomials have their derivatives in closed
-form, but means over footprints that an edge cuts and the compliance of unresolved waves beside an
-edge have none that is shorter than all that they are made of. Over this step differences are right
-to 1e-6, and rounding changes them by 3e-8.
+Differences of second order, inwards at edges. Closed forms would be simple for polynomials, but a
+footprint that an edge cuts adds integrals along that edge, and the compliance of unresolved waves
+is fitted, with limits beside edges. Over this step differences are right to 1e-6 of the largest,
+and the rounding of another processor changes them by 3e-8.
 """
 
 from collections.abc import Callable

@@ -137,10 +137,9 @@ def rank(scored: Scored, judged: Mapping[int, Judged], *, finalists: int) -> Ran
 
     judged: answers by case, those of the first finalists among them.
     """
-    first = [int(case) for case in scored.supported_order[:finalists]]
-    least = min(judged[case].mean_db for case in first)
-    head = [case for case, answers in judged.items() if answers.mean_db >= least]
-    head = ranked_by(head, lambda case: judged[case].mean_db)
+    ranked = ranked_by([*judged], lambda case: judged[case].mean_db)
+    last = max(ranked.index(int(case)) for case in scored.supported_order[:finalists])
+    head = ranked[: last + 1]
     rest = scored.order[~np.isin(scored.order, head)]
     return Ranking(scored, judged, np.array([*head, *rest.tolist()]), len(head))
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from drivers import clock
 from drivers.contents import Layer
-from drivers.errors import CommandError, CommandRefused, LinkDegraded, LinkError
+from drivers.errors import CommandError, CommandRefused, DriverError, LinkDegraded, LinkError
 from drivers.host.comparison import MAX_CONTRADICTIONS, name_of, problem_of
 from drivers.host.feeding import Feeding
 from drivers.host.ledger import Ledger
@@ -231,7 +231,7 @@ class Amplifier:
                                 return Stopped(True, clock.now())
                             await asyncio.sleep(_INTERVAL)
                             status = await self.read_status()
-                    except (LinkError, CommandRefused) as error:
+                    except DriverError as error:
                         cause = str(error)
                     await asyncio.sleep(ramp + _INTERVAL)
         except TimeoutError:

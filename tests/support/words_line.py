@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 from drivers.codec.can_bus.segments import REQUEST, unpack_frames
@@ -10,12 +11,15 @@ from drivers.codec.serial_line.frame import FrameReader
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.can_wire import CanWire
 from drivers.host.line import Line
+from drivers.host.modbus_wire import ModbusWire
 from drivers.host.serial_wire import SerialWire
 from drivers.host.wire import Wire
+from drivers.protocol.serial_payload import HELLO
 from drivers.protocol.table import BY_NUMBER
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
+from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)
@@ -63,9 +67,27 @@ def _can_request(data: bytes) -> tuple[int, int]:
     return frame.id - REQUEST, first.data[2]
 
 
+def _modbus_request(data: bytes) -> tuple[int, int] | None:
+    """Of unit, function and address: a write, or the read of the identity."""
+    unit, function, box, low = data[:4]
+    if function == 16:
+        return unit, box
+    return (unit, HELLO) if (box, low) == (4, 41) else None
+
+
 KINDS: Mapping[str, Kind] = {
     "can": Kind(lambda: CanWire(500_000, sequence=0), CanAmplifiers, _can_request),
     "serial": Kind(lambda: SerialWire(921_600, sequence=0), SerialAmplifiers, _serial_request),
+    "rtu": Kind(
+        lambda: ModbusWire(115_200, is_rtu=True, number=0),
+        partial(ModbusAmplifiers, is_rtu=True),
+        _modbus_request,
+    ),
+    "tcp": Kind(
+        lambda: ModbusWire(0, is_rtu=False, number=0),
+        partial(ModbusAmplifiers, is_rtu=False),
+        lambda data: _modbus_request(data[6:]),
+    ),
 }
 
 

@@ -14,7 +14,6 @@ from pymodbus.pdu.register_message import (
     ReadInputRegistersRequest,
     ReadWriteMultipleRegistersRequest,
     WriteMultipleRegistersRequest,
-    WriteSingleRegisterRequest,
 )
 
 from drivers.codec.modbus.exchanges import Read, Write
@@ -79,8 +78,6 @@ def _pdu(read: Read | None, write: Write | None) -> ModbusPDU:
             write_address=write.address,
             write_registers=registers,
         )
-    if len(registers) == 1:
-        return WriteSingleRegisterRequest(address=write.address, registers=registers)
     return WriteMultipleRegistersRequest(address=write.address, registers=registers)
 
 
@@ -88,13 +85,15 @@ class ResponseReader:
     """Finds the response to a request in the received bytes, and counts everything else.
 
     A response has the unit, function and length of the request, over TCP its transaction number,
-    over RTU a valid CRC, and echoes address and count of a write.
+    over RTU a valid CRC, and echoes address and count of a write. unawaited: transactions whose
+    responses are passed over.
     """
 
     def __init__(self, *, is_rtu: bool, counters: WireCounters) -> None:
         self._is_rtu = is_rtu
         self._counters = counters
         self._buffer = bytearray()
+        self.unawaited: set[int] = set()
 
     def clear(self) -> None:
         """Discard partial data."""
@@ -110,6 +109,9 @@ class ResponseReader:
         while (frame := split(to)) is not None:
             self._counters.frames_in += 1
             transaction, unit, pdu = frame
+            if transaction in self.unawaited:
+                self.unawaited.remove(transaction)
+                continue
             response = None
             if to is not None and (transaction, unit) == (to.transaction, to.unit):
                 response = _response(pdu, to)
@@ -180,9 +182,7 @@ def _response(pdu: bytes, to: RequestAdu) -> ModbusResponse | None:
     if to.read is not None:
         return ModbusResponse(tuple(message.registers))
     assert to.write is not None  # noqa: S101  at least one
-    written = to.write.registers
-    echo = tuple(message.registers) if len(written) == 1 else message.count
-    is_echo = echo == (written if len(written) == 1 else len(written))
+    is_echo = message.count == len(to.write.registers)
     return ModbusResponse() if is_echo and message.address == to.write.address else None
 
 

@@ -12,6 +12,7 @@ from drivers.contents import Layer, Shape, Tone
 from drivers.errors import CommandRefused, LinkDegraded, LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
+from drivers.host.wire import Broken
 from drivers.protocol.records import Values
 from drivers.protocol.table import STATES
 from virtual_loop import run_virtual
@@ -89,6 +90,8 @@ def test_layers_play_together_and_leave_each_other_alone(wire: str, lines: str) 
         await asyncio.sleep(0.002)
         assert all(end.levels(name) == [0.2, 0.1] for end in ends for name in end.hosts)
         assert all(each.is_exact for each in staged.values())
+        assert all(end.line.statistics.retries == 0 for end in ends)
+        assert all(end.line.wire.counters.unexpected_frames == 0 for end in ends)
 
     with_group(test, wire, *LINES[lines])
 
@@ -252,6 +255,19 @@ def test_stop_is_confirmed_by_nothing_less_than_a_new_latch_and_all_levels(
         assert stopped.cause
         assert ends[0].loop.time() - began < 0.5
         assert stopped.may_play_until > began
+
+    with_group(test, wire, ("a",))
+
+
+def test_stop_is_repeated_after_a_reply_that_is_none(wire: str) -> None:
+    """The first reply to it cannot be read; the second confirms it."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        host_side = ends[0].line.wire
+        received, broken = host_side.received, iter([[Broken("cut")]])
+        host_side.received = lambda data: next(broken, None) or received(data)
+        assert (await group.stop())["a"].is_confirmed
+        assert [each for _, each in ends[0].sent][-2:] == ["1:8", "1:8"]
 
     with_group(test, wire, ("a",))
 

@@ -1,0 +1,203 @@
+"""The host's side of Modbus, RTU and TCP: a message is written, then its reply is read.
+
+Message n is written from register 256 n on (tag, words), its reply read from 256 n + 128 on (tag,
+result, words). Responses are matched by the transaction number over TCP, by unit, function and
+length over RTU, and by the tag.
+"""
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from drivers.codec.modbus.adu import ModbusResponse, RequestAdu, ResponseReader, build_adu
+from drivers.codec.modbus.exchanges import Read, Write
+from drivers.host.wire import Arrival, Broken, More, Nak, Reply, read_nak
+from drivers.protocol.definition import WireQuantity
+from drivers.protocol.records import Number, Numbers, Real, Record, Refusal, Rest, Rows, Values
+from drivers.protocol.serial_payload import BROADCAST
+from drivers.protocol.table import MAX_WORDS, MESSAGES, QUANTITIES
+from drivers.statistics import WireCounters
+
+_BOX = 256  # registers of a message
+_REPLY = 128  # offset of its reply
+_REPLY_HEAD = 2  # registers: tag, result
+_TEXTS = ("vendor", "product", "serial_number", "firmware")
+_TEXT_SIZE = 32  # bytes
+_IDENTITY = Read(1065, 2 + len(_TEXTS) * _TEXT_SIZE // 2)
+_ANSWERS_SIZE = 21  # bytes on RTU of the response to a write, of a read and its response
+_BITS = 11  # of a byte, with start, parity and stop
+_GAP = 3.5  # characters of silence before a frame
+_SHORTEST_GAP = 0.00175  # s; by the standard above 19 200 baud
+_GATEWAY = (10, 11)  # no path to the amplifier, or no response from it
+_EXCEPTIONS: Mapping[int, str] = {
+    1: "UNKNOWN_TYPE",
+    2: "UNKNOWN_TYPE",
+    3: "BAD_LENGTH",
+    5: "BUSY",
+    6: "BUSY",
+}
+_WIDEST = QUANTITIES["channel_count"].maximum, QUANTITIES["layer_count"].maximum
+
+
+@dataclass(slots=True)
+class _Request:
+    """A request and its transaction on the wire; tag: 0 for one that only reads."""
+
+    name: str
+    unit: int
+    tag: int
+    adu: RequestAdu
+
+
+class ModbusWire:
+    """A line at a speed [baud], 0 for a network; number: of the last tag and transaction.
+
+    silence: before each frame of a serial line [s], kept by its port.
+    """
+
+    def __init__(self, baud: int, *, is_rtu: bool, number: int) -> None:
+        self.counters = WireCounters()
+        self.silence = max(_GAP * _BITS / baud, _SHORTEST_GAP) if baud else 0.0
+        self._baud = baud
+        self._is_rtu = is_rtu
+        self._number = number
+        self._request: _Request | None = None
+        self._reader = ResponseReader(is_rtu=is_rtu, counters=self.counters)
+        self._sizes: dict[int, tuple[int, int]] = {}  # channels and layers of each unit
+
+    def request(self, address: int, name: str, values: Values) -> bytes:
+        """Return the frame of a request, which is on the wire from now on; address 0: of all.
+
+        Over TCP a request of all is a frame to each unit that was sent something before.
+        """
+        self.withdraw()
+        if address == BROADCAST:
+            if self._is_rtu:
+                return self._written(BROADCAST, name, values).adu.frame
+            adus = [self._written(unit, name, values).adu for unit in self._sizes]
+            self._reader.unawaited = {adu.transaction for adu in adus}
+            return b"".join(adu.frame for adu in adus)
+        self._sizes.setdefault(address, _WIDEST)
+        if name == "Hello":
+            self._request = _Request(name, address, 0, self._adu(address, _IDENTITY, None))
+        else:
+            self._request = self._written(address, name, values)
+        return self._request.adu.frame
+
+    def received(self, data: bytes) -> list[Arrival]:
+        """Return what these bytes complete."""
+        request = self._request
+        adu = None if request is None else request.adu
+        arrivals: list[Arrival] = []
+        for response in self._reader.feed(data, adu):
+            if self._request is None or self._request.adu is not adu:  # a second response
+                self.counters.unexpected_frames += 1
+            elif (arrival := self._arrival(self._request, response)) is not None:
+                arrivals.append(arrival)
+        return arrivals
+
+    def withdraw(self) -> None:
+        """Take the request off the wire: its reply will be unexpected."""
+        self._request = None
+        if self._is_rtu:
+            self._reader.clear()
+
+    def round_trip(self, name: str, length: int) -> float:
+        """Return how long a request of this many bytes and its longest reply take [s].
+
+        Two transactions, with the silences before all four frames.
+        """
+        if not self._baud:
+            return 0.0
+        replies = (_reply_registers(name, *size) for size in self._sizes.values() or (_WIDEST,))
+        characters = length + _ANSWERS_SIZE + 2 * max(replies)
+        return _BITS * characters / self._baud + 4 * self.silence
+
+    def _adu(self, unit: int, read: Read | None, write: Write | None) -> RequestAdu:
+        self._number = self._number % 0xFFFF + 1
+        self.counters.frames_out += 1
+        transaction = 0 if self._is_rtu else self._number
+        return build_adu(read, write, unit=unit, transaction=transaction, is_rtu=self._is_rtu)
+
+    def _written(self, unit: int, name: str, values: Values) -> _Request:
+        """Return a request whose write goes first."""
+        message = MESSAGES[name]
+        tag = self._number % 0xFFFF + 1
+        write = Write(message.number * _BOX, (tag, *message.request.pack(values)))
+        return _Request(name, unit, tag, self._adu(unit, None, write))
+
+    def _arrival(self, request: _Request, response: ModbusResponse) -> Arrival | None:
+        """Return what a response to the transaction on the wire means."""
+        if response.exception in _GATEWAY:  # as no response
+            return None
+        if response.exception:
+            self._request = None
+            if (refusal := _EXCEPTIONS.get(response.exception)) is not None:
+                return Nak(refusal, None)
+            return Broken(f"Modbus exception {response.exception}")
+        if request.adu.read is None:
+            first = MESSAGES[request.name].number * _BOX + _REPLY
+            read = Read(first, _reply_registers(request.name, *self._sizes[request.unit]))
+            request.adu = self._adu(request.unit, read, None)
+            return More(request.adu.frame)
+        tag, result, *words = response.registers
+        if request.name != "Hello" and tag != request.tag:
+            self.counters.unexpected_frames += 1
+            return None
+        self._request = None
+        try:
+            if request.name == "Hello":
+                return Reply(_identity(response.registers))
+            if result:
+                return read_nak((0, *divmod(result, 256)))
+            values = MESSAGES[request.name].reply.unpack(words, is_strict=False)
+        except Refusal as error:
+            return Broken(str(error))
+        if request.name == "GetCaps":
+            self._sizes[request.unit] = values["channels"], values["layers"]
+        return Reply(values)
+
+
+def _reply_registers(name: str, channels: int, layers: int) -> int:
+    """Return how many registers the reply of an amplifier with these can have."""
+    if name == "Hello":
+        return _IDENTITY.count
+    if name == "GetCaps":
+        channels, _ = _WIDEST
+    rows = {"channels": channels, "layers": layers}
+    if name in ("GetAchieved", "GetMeasured"):
+        rows["count"] = channels
+    return _REPLY_HEAD + min(_width(MESSAGES[name].reply, rows), MAX_WORDS)
+
+
+def _width(record: Record, rows: Mapping[str, int]) -> int:
+    """Return the most words of a record; rows: how many there are, by the name of their count."""
+    width = 0
+    for field in record.fields:
+        match field:
+            case Rows(count=str(counted), record=row):
+                width += rows.get(counted, MAX_WORDS) * _width(row, rows)
+            case Numbers(count=counted):
+                width += rows.get(counted, MAX_WORDS)
+            case Rest():
+                width += MAX_WORDS
+            case Number(quantity=WireQuantity(wire="u32")) | Real():
+                width += 2
+            case _:
+                width += 1
+    return width
+
+
+def _identity(registers: tuple[int, ...]) -> Values:
+    """Read the identity: tag, versions, texts padded with zeros; raises Refusal."""
+    raw = struct.pack(f">{len(registers)}H", *registers)
+    identity: Values = {"versions": registers[1]}
+    for at, name in enumerate(_TEXTS):
+        text = raw[4 + at * _TEXT_SIZE :][:_TEXT_SIZE].rstrip(b"\0")
+        try:
+            identity[name] = text.decode("utf-8")
+        except UnicodeDecodeError:
+            raise Refusal(f"{name} must be UTF-8") from None
+        if not identity[name].isprintable():
+            raise Refusal(f"{name} must not have control characters")
+    return identity

@@ -1,0 +1,200 @@
+"""The host's side of Modbus: bytes written by hand, and responses that belong to no request."""
+
+import pytest
+
+from drivers.host.modbus_wire import ModbusWire
+from drivers.host.wire import Broken, More, Nak, Reply
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, LayerSet, pack_layers
+from sim.amplifier.contract import Amplifier
+from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
+
+LAYER = LayerSet(0, 20, 500, (Command(3, 2200, 2000, -9000),))
+SET: Values = {
+    **{"session": 9, "token": 7, "index": 0, "parts": 1, "now": 1},
+    "stream": pack_layers([LAYER]),
+}
+# Unit 1; tag 1. The CRCs are those of minimalmodbus.
+ARM = ("Arm", {"session": 9, "watchdog": 250})
+BYTES = {
+    "status": (
+        ("GetStatus", {}),
+        "01 10 0900 0001 02 0001 FE90",
+        "01 10 0900 0001 0255",
+        "01 04 0980 002B B261",
+    ),
+    "arm": (
+        ARM,
+        "01 10 0300 0003 06 0001 0009 00FA 8445",
+        "01 10 0300 0003 804C",
+        "01 04 0380 002B B1B9",
+    ),
+    "set": (  # session, token, part; head, ramp, valid_for; channel 3, 110 Hz, 0.2, -90 degrees
+        ("Set", SET),
+        "01 10 0500 000B 16 0001 0009 0007 0003 0001 0014 01F4 0030 0898 07D0 DCD8 3229",
+        "01 10 0500 000B 8102",
+        "01 04 0580 0005 312D",
+    ),
+}
+# After an Arm and its read a Set has tag 3: its token 7, exact and played, no part missing.
+TAKEN = "01 04 0A 0003 0000 0007 0005 0000 604C"
+REFUSED = "01 04 0A 0003 0407 0000 0000 0000 B2BE"  # BAD_CHANNEL, channel 7
+# State 4, no fault, high voltage, latch 0, 250 ms, 25 °C, 1800 V, token 0, 4 channels, 8 layers.
+STATUS = "0004 0000 0001 0000 00FA 00FA 0708 0000 0408"
+
+
+class Peer:
+    """An amplifier of four channels at unit 1, its bytes kept."""
+
+    def __init__(self, *, is_rtu: bool) -> None:
+        self.sent: list[bytes] = []
+        self.amplifier = Amplifier("a", channels=4)
+        self.end = ModbusAmplifiers({1: self.amplifier}, self.sent.append, is_rtu=is_rtu)
+
+    def reply(self, data: bytes, now: float = 0.0) -> bytes:
+        """The bytes with which it responds."""
+        self.sent.clear()
+        self.end.receive(data, now)
+        return b"".join(self.sent)
+
+
+def reply_to(wire: ModbusWire, peer: Peer, name: str, values: Values) -> Reply | Nak | Broken:
+    """What becomes of a request to a peer, in its two transactions."""
+    (more,) = wire.received(peer.reply(wire.request(1, name, values)))
+    assert isinstance(more, More)
+    (arrival,) = wire.received(peer.reply(more.data))
+    assert isinstance(arrival, Reply | Nak | Broken)
+    return arrival
+
+
+@pytest.mark.parametrize("case", BYTES)
+def test_request_has_the_bytes_written_by_hand(case: str) -> None:
+    """Write, its response, read; over TCP with 2 transactions of one tag, and no CRC."""
+    (name, values), *frames = BYTES[case]
+    write, echo, read = map(bytes.fromhex, frames)
+    wire, peer = ModbusWire(115_200, is_rtu=True, number=0), Peer(is_rtu=True)
+    assert wire.request(1, name, values) == write
+    if name != "Set":
+        assert peer.reply(write) == echo
+    assert wire.received(echo) == [More(read)]
+
+    wire = ModbusWire(0, is_rtu=False, number=0)
+    over_tcp = [
+        number.to_bytes(2) + bytes(2) + (len(frame) - 2).to_bytes(2) + frame[:-2]
+        for number, frame in ((1, write), (1, echo), (2, read))
+    ]
+    assert wire.request(1, name, values) == over_tcp[0]
+    assert wire.received(over_tcp[1]) == [More(over_tcp[2])]
+
+
+def test_replies_have_the_bytes_written_by_hand() -> None:
+    """The status of Arm with zeros behind it, what was taken of a set, and a refused one."""
+    wire, peer = ModbusWire(115_200, is_rtu=True, number=0), Peer(is_rtu=True)
+    (more,) = wire.received(peer.reply(wire.request(1, *ARM)))
+    assert isinstance(more, More)
+    response = peer.reply(more.data)
+    assert response[:-2] == bytes.fromhex(f"01 04 56 0001 0000 {STATUS}") + bytes(64)
+    assert [type(each) for each in wire.received(response)] == [Reply]
+    (more,) = wire.received(peer.reply(wire.request(1, "Set", SET)))
+    assert isinstance(more, More)
+    assert peer.reply(more.data) == bytes.fromhex(TAKEN)
+    taken = {"token": 7, "exact": 1, "staged": 0, "played": 1, "missing": 0}
+    assert wire.received(bytes.fromhex(TAKEN)) == [Reply(taken)]
+
+    wire = ModbusWire(115_200, is_rtu=True, number=2)
+    bad = {**SET, "token": 8, "stream": [1, 20, 500, 0x0070, 2200, 2000, 0]}
+    (more,) = wire.received(peer.reply(wire.request(1, "Set", bad)))
+    assert isinstance(more, More)
+    assert peer.reply(more.data) == bytes.fromhex(REFUSED)
+    assert wire.received(bytes.fromhex(REFUSED)) == [Nak("BAD_CHANNEL", 7)]
+
+
+@pytest.mark.parametrize("is_rtu", [True, False])
+def test_identity_is_that_of_every_version(is_rtu: bool) -> None:
+    """66 registers from 1065 on, read at once."""
+    wire, peer = ModbusWire(0, is_rtu=is_rtu, number=0), Peer(is_rtu=is_rtu)
+    request = wire.request(1, "Hello", {})
+    assert request[-8 if is_rtu else -6 :][:6] == bytes.fromhex("01 04 0429 0042")
+    assert wire.received(peer.reply(request)) == [Reply(peer.amplifier.identity)]
+
+
+def test_as_many_registers_are_read_as_the_reply_can_have() -> None:
+    """Of 4 channels and 8 layers: status 2 + 9 + 4 + 8, achieved 2 + 4 + 4 · 4; faults any."""
+    wire, peer = ModbusWire(0, is_rtu=True, number=0), Peer(is_rtu=True)
+    counts = {"GetStatus": 43, "GetCaps": 68, "GetAchieved": 70, "GetFaults": 122}
+    after = {"GetStatus": 23, "GetCaps": 68, "GetAchieved": 22, "GetFaults": 122}
+    for expected in (counts, after):
+        for name, count in expected.items():
+            values = {"layer": 0} if name == "GetAchieved" else {}
+            (more,) = wire.received(peer.reply(wire.request(1, name, values)))
+            assert isinstance(more, More)
+            assert more.data[4:6] == count.to_bytes(2)
+        assert isinstance(reply_to(wire, peer, "GetCaps", {}), Reply)
+
+
+@pytest.mark.parametrize("is_rtu", [True, False])
+def test_late_responses_are_credited_to_nothing(is_rtu: bool) -> None:
+    """Of an earlier read, of an earlier write, doubled, of another unit; the reply still counts."""
+    wire, peer = ModbusWire(0, is_rtu=is_rtu, number=0), Peer(is_rtu=is_rtu)
+    (more,) = wire.received(peer.reply(wire.request(1, "GetStatus", {})))
+    assert isinstance(more, More)
+    late = peer.reply(more.data)
+    wire.withdraw()
+    echo = peer.reply(wire.request(1, "GetStatus", {}))
+    assert wire.received(late) == []
+    (more,) = wire.received(echo + echo)
+    assert isinstance(more, More)
+    assert wire.received(late + echo) == []
+    assert wire.counters.unexpected_frames == 4
+    response = peer.reply(more.data)
+    of_unit_2 = ModbusWire(0, is_rtu=is_rtu, number=2)
+    assert of_unit_2.request(2, "GetStatus", {})
+    assert of_unit_2.received(echo) == []
+    assert [type(each) for each in wire.received(late + response + response)] == [Reply]
+    assert wire.counters.unexpected_frames == 6
+
+
+@pytest.mark.parametrize(
+    ("exception", "expected"),
+    [
+        (1, [Nak("UNKNOWN_TYPE", None)]),
+        (2, [Nak("UNKNOWN_TYPE", None)]),
+        (3, [Nak("BAD_LENGTH", None)]),
+        (4, [Broken("Modbus exception 4")]),
+        (6, [Nak("BUSY", None)]),
+        (10, []),
+        (11, []),
+    ],
+)
+def test_exceptions_are_refusals_or_no_response(exception: int, expected: list[object]) -> None:
+    """Those of a gateway are none: another attempt is made after the usual time."""
+    wire = ModbusWire(0, is_rtu=False, number=0)
+    wire.request(1, "GetStatus", {})
+    assert wire.received(bytes([0, 1, 0, 0, 0, 3, 1, 0x90, exception])) == expected
+
+
+def test_request_of_all_units_has_no_reply() -> None:
+    """Unit 0 on a line; over TCP a write to each unit that is known, whose responses pass."""
+    commit = ("Commit", {"session": 9, "token": 7})
+    wire = ModbusWire(0, is_rtu=True, number=0)
+    frame = wire.request(0, *commit)
+    assert frame[:-2] == bytes.fromhex("00 10 0600 0003 06 0001 0009 0007")
+
+    wire = ModbusWire(0, is_rtu=False, number=0)
+    for unit in (1, 2):
+        wire.request(unit, "GetStatus", {})
+    frames = wire.request(0, *commit)
+    assert [frames[6], frames[13:15], frames[25], len(frames)] == [1, b"\0\x03", 2, 38]
+    for number in (3, 4):
+        echo = bytes([0, number, 0, 0, 0, 6, number - 2, 16, 6, 0, 0, 3])
+        assert wire.received(echo) == []
+    assert wire.counters.unexpected_frames == 0
+
+
+def test_times_on_a_line_are_those_of_its_characters() -> None:
+    """A set of 22 words: 55 + 8 + 8 + 5 + 2 · 5 characters of 11 bits, four silences."""
+    wire = ModbusWire(115_200, is_rtu=True, number=0)
+    assert wire.round_trip("Set", 55) == pytest.approx(86 * 11 / 115_200 + 4 * 0.00175)
+    slow = ModbusWire(9600, is_rtu=True, number=0)
+    assert slow.silence == pytest.approx(3.5 * 11 / 9600)
+    assert ModbusWire(0, is_rtu=False, number=0).round_trip("Set", 55) == 0

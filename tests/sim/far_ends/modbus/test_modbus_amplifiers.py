@@ -1,0 +1,213 @@
+"""The amplifiers' side of Modbus in protocol 3: registers, exceptions, and masters not ours."""
+
+import asyncio
+import os
+import struct
+import tty
+from collections.abc import Callable
+
+import minimalmodbus
+import pytest
+from pymodbus.client import AsyncModbusTcpClient
+
+from drivers.protocol.table import MESSAGES, REFUSALS, STATES
+from sim.amplifier.contract import Amplifier
+from sim.far_ends.modbus.frames import FRAME_TIMEOUT, crc
+from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
+
+STATUS = 256 * 9 + 128
+
+
+class Port:
+    """Amplifiers of four channels at units 1 and 2 of a line; PDUs in, PDUs out."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.sent: list[bytes] = []
+        self.amplifiers = {unit: Amplifier(str(unit), channels=4) for unit in (1, 2)}
+        self.end = ModbusAmplifiers(self.amplifiers, self.sent.append, is_rtu=True)
+
+    def ask(self, pdu: bytes, unit: int = 1) -> bytes | None:
+        """The response to a PDU, None without one."""
+        self.sent.clear()
+        body = bytes([unit]) + pdu
+        self.end.receive(body + struct.pack("<H", crc(body)), self.now)
+        self.end.pause(self.now + 2 * FRAME_TIMEOUT)
+        return self.sent[0][1:-2] if self.sent else None
+
+    def write(self, address: int, *registers: int, unit: int = 1) -> bytes | None:
+        """Write registers."""
+        count = len(registers)
+        head = struct.pack(">BHHB", 16, address, count, 2 * count & 0xFF)
+        return self.ask(head + struct.pack(f">{count}H", *registers), unit)
+
+    def read(self, address: int, count: int, unit: int = 1, function: int = 3) -> tuple[int, ...]:
+        """Read registers; the code of an exception alone."""
+        pdu = self.ask(struct.pack(">BHH", function, address, count), unit)
+        assert pdu is not None
+        return tuple(pdu[1:]) if pdu[0] & 0x80 else struct.unpack(f">{count}H", pdu[2:])
+
+
+def test_present_state_is_read_without_a_write() -> None:
+    """Disarmed, then armed, with functions 3 and 4, in part too; the tag is that of the write."""
+    port = Port()
+    assert port.read(STATUS, 3) == (0, 0, STATES["SWITCH_ON_DISABLED"])
+    port.write(0x300, 5, 9, 250)
+    assert port.read(0x380, 3) == (5, 0, STATES["OPERATION_ENABLED"])
+    assert port.read(STATUS + 2, 1, function=4) == (STATES["OPERATION_ENABLED"],)
+    port.now = 0.1
+    assert port.read(STATUS + 6, 1) == (150,)
+    assert port.read(0x380 + 6, 1) == (250,)
+    port.write(0x900, 6)
+    port.now = 0.2
+    assert port.read(STATUS, 7) == (6, 0, 4, 0, 1, 0, 50)
+
+
+def test_refusal_is_a_result_and_no_exception() -> None:
+    """A word too many for a status is told once; a set without a session is not armed."""
+    port = Port()
+    assert port.write(0x900, 7, 0) == bytes.fromhex("10 0900 0002")
+    assert port.read(STATUS, 3) == (7, REFUSALS["BAD_LENGTH"] << 8 | 255, 0)
+    assert port.read(STATUS, 3) == (7, 0, STATES["SWITCH_ON_DISABLED"])
+    port.write(0x600, 8, 9, 1)
+    assert port.read(0x680, 122) == (8, REFUSALS["WRONG_STATE"] << 8 | 255, *[0] * 120)
+
+
+EXCEPTIONS: dict[str, tuple[Callable[[Port], object], object]] = {
+    "write one register": (lambda port: port.ask(bytes.fromhex("06 0900 0001")), b"\x86\1"),
+    "write and read": (
+        lambda port: port.ask(bytes.fromhex("17 0980 0001 0900 0001 02 0001")),
+        b"\x97\1",
+    ),
+    "identification": (lambda port: port.ask(bytes.fromhex("2B 0E 01 00")), b"\xab\1"),
+    "no message": (lambda port: port.write(0x1300, 1), b"\x90\2"),
+    "message 0": (lambda port: port.write(0, 1), b"\x90\2"),
+    "not from its tag on": (lambda port: port.write(0x901, 1), b"\x90\2"),
+    "into the reply": (lambda port: port.write(0x980, 1), b"\x90\2"),
+    "into the identity": (lambda port: port.write(1065, 1), b"\x90\2"),
+    "122 registers": (lambda port: port.write(0x500, *range(122)), b"\x90\2"),
+    "bytes that are not two a register": (
+        lambda port: port.ask(bytes.fromhex("10 0900 0002 02 0001")),
+        b"\x90\3",
+    ),
+    "nothing read": (lambda port: port.read(STATUS, 0), (3,)),
+    "126 registers read": (lambda port: port.read(STATUS, 126), (3,)),
+    "what is written": (lambda port: port.read(0x900, 1), (2,)),
+    "beyond the reply": (lambda port: port.read(STATUS, 123), (2,)),
+    "before the identity": (lambda port: port.read(1064, 2), (2,)),
+    "beyond the identity": (lambda port: port.read(1065, 67), (2,)),
+    "beyond the last register": (lambda port: port.read(65535, 2), (2,)),
+}
+
+
+@pytest.mark.parametrize("case", EXCEPTIONS)
+def test_exceptions_are_those_that_modbus_defines(case: str) -> None:
+    """1 for a function, 2 for an address, 3 for a count; the state is as before."""
+    port = Port()
+    ask, expected = EXCEPTIONS[case]
+    assert ask(port) == expected
+    assert port.read(STATUS, 3) == (0, 0, STATES["SWITCH_ON_DISABLED"])
+
+
+def test_broadcast_reaches_all_units_and_has_no_response() -> None:
+    """A stop silences both; to arm is for one unit alone; other units are silent."""
+    port = Port()
+    for unit in (1, 2):
+        port.write(0x300, 1, 9, 250, unit=unit)
+    assert port.write(0x800, 2, 5, unit=0) is None
+    port.now = 0.01
+    for unit in (1, 2):
+        assert port.read(STATUS + 2, 1, unit) == (STATES["QUICK_STOP_ACTIVE"],)
+        assert port.read(0x880, 2, unit) == (0, 0)
+        port.write(0xB00, 3, 1, unit=unit)
+    assert port.write(0x300, 4, 8, 250, unit=0) is None
+    assert port.read(STATUS + 2, 1, 2) == (STATES["SWITCH_ON_DISABLED"],)
+    assert port.write(0x900, 5, unit=3) is None
+
+
+def test_address_is_taken_once_its_reply_was_read() -> None:
+    """By the amplifier of this serial number; after a broadcast at once."""
+    port = Port()
+    serial = MESSAGES["SetAddress"].request.pack({"address": 9, "serial_number": "SIM-2"})
+    port.write(0xF00, 1, *serial)
+    assert port.read(0xF80, 2) == (1, REFUSALS["BAD_VALUE"] << 8 | 255)
+    assert port.write(0xF00, 2, *serial, unit=2) is not None
+    assert port.read(STATUS, 1, 2) == (0,)
+    assert port.read(0xF80, 2, 2) == (2, 0)
+    assert port.write(0x900, 3, unit=2) is None
+    assert port.write(0x900, 3, unit=9) is not None
+    again = MESSAGES["SetAddress"].request.pack({"address": 4, "serial_number": "SIM-1"})
+    assert port.write(0xF00, 4, *again, unit=0) is None
+    assert [port.write(0x900, 5, unit=unit) is None for unit in (1, 4, 9)] == [True, False, False]
+
+
+def drive(master: minimalmodbus.Instrument) -> None:
+    """Identity, status, arm, a set of one tone, a refusal, stop; every function it has."""
+    assert master.read_string(1067, 16, functioncode=4).rstrip("\0") == "era-haptics"
+    assert master.read_register(STATUS + 2, functioncode=3) == STATES["SWITCH_ON_DISABLED"]
+    assert master.read_register(STATUS + 7, 1, functioncode=4, signed=True) == 25.0
+    master.write_registers(0x300, [1, 9, 2000])
+    master.write_registers(0x500, [2, 9, 7, 3, 1, 0, 0, 0x30, 2200, 2000, 0])
+    assert master.read_registers(0x580, 5) == [2, 0, 7, 5, 0]
+    levels = STATUS + 2 + 9
+    assert master.read_registers(levels, 4, functioncode=4) == [0, 0, 0, 2000]
+    assert master.read_register(STATUS + 2 + 7) == 7
+    with pytest.raises(minimalmodbus.IllegalRequestError):
+        master.write_register(0x900, 1, functioncode=6)
+    master.write_registers(0x800, [3, 0])
+    assert master.read_registers(levels, 4) == [0, 0, 0, 0]
+
+
+async def test_minimalmodbus_drives_it_over_a_serial_line() -> None:
+    """A master that is not ours, through a pseudo-terminal."""
+    loop = asyncio.get_running_loop()
+    ours, theirs = os.openpty()
+    try:
+        tty.setraw(theirs)
+        end = ModbusAmplifiers(
+            {1: Amplifier("a", channels=4)}, lambda data: os.write(ours, data) and None, is_rtu=True
+        )
+        loop.add_reader(ours, lambda: end.receive(os.read(ours, 4096), loop.time()))
+        master = minimalmodbus.Instrument(os.ttyname(theirs), 1)
+        assert master.serial is not None
+        master.serial.timeout = 0.5  # s; it waits so long for the rest of what is an exception
+        try:
+            await asyncio.to_thread(drive, master)
+        finally:
+            master.serial.close()
+    finally:
+        loop.remove_reader(ours)
+        os.close(ours)
+        os.close(theirs)
+
+
+async def test_pymodbus_reads_its_status_over_tcp() -> None:
+    """Two units behind one port, one of them armed."""
+    loop = asyncio.get_running_loop()
+    amplifiers = {unit: Amplifier(str(unit), channels=4) for unit in (1, 2)}
+    amplifiers[2].handle("Arm", {"session": 9, "watchdog": 2000}, loop.time())
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        end = ModbusAmplifiers(amplifiers, writer.write, is_rtu=False)
+        while data := await reader.read(4096):
+            end.receive(data, loop.time())
+        writer.close()
+        await writer.wait_closed()
+        ended.set()
+
+    ended = asyncio.Event()
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    client = AsyncModbusTcpClient("127.0.0.1", port=server.sockets[0].getsockname()[1])
+    try:
+        assert await client.connect()
+        for unit, state in ((1, 1), (2, 4)):
+            status = await client.read_holding_registers(STATUS, count=23, device_id=unit)
+            assert status.registers[:4] == [0, 0, state, 0]
+            assert status.registers[10] == 0x0408
+        wrong = await client.read_input_registers(0x900, count=1, device_id=1)
+        assert wrong.exception_code == 2
+    finally:
+        client.close()
+        await ended.wait()
+        server.close()
+        await server.wait_closed()

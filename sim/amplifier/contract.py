@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
-from drivers.playback import Playback
+from drivers.playback import Playback, Voice
 from drivers.protocol.definition import token_after
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import LayerSet
@@ -26,9 +26,11 @@ from drivers.protocol.table import (
     STATES,
     STATUS_FLAGS,
 )
+from sim.amplifier.outputs import output_of
 from sim.amplifier.set_intake import SetIntake, derated
 from sim.amplifier.state_table import TRANSITIONS
 from sim.amplifier.thermal_model import DERATE_ABOVE, DERATED, FAULT_ABOVE, GOOD_BELOW, ThermalState
+from sim.waveform import Output
 
 SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expires
 LAYERS = 8
@@ -116,12 +118,26 @@ class Amplifier:
         """Reset all but the temperature and the fault history."""
         can = self.capabilities
         self.playback = Playback(can["channels"], can["voices"])
+        self._voices: list[tuple[Voice, ...]] = [()] * can["channels"]  # of these outputs
+        self._outputs: list[Output] = [()] * can["channels"]
         self._intake = SetIntake(can)
         self._watchdog = 0.0
         self._last_fed = 0.0
         self._silent_from = -math.inf  # end of the last silencing ramp
         self._is_limited = False
         self.is_derated = False
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """The output of each channel from now on, without further events.
+
+        That of a channel is the same object until it changes.
+        """
+        for channel, voices in enumerate(self.playback.all_voices):
+            if self._voices[channel] is not voices:
+                self._voices[channel] = voices
+                self._outputs[channel] = output_of(voices)
+        return tuple(self._outputs)
 
     @property
     def next_event(self) -> float:

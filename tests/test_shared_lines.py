@@ -14,6 +14,7 @@ from drivers.errors import LinkError
 from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.protocol.messages import AmplifierState, Reply, Request, Status
 from drivers.registry import open_backend
+from long_form import shortly
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from reconnection import reconnect
@@ -23,7 +24,7 @@ from virtual_loop import VirtualLoop, in_virtual_time
 from wires import SHARED_WIRES, FarSide, far_side, on_two_amplifiers, tones
 
 
-@pytest.fixture(params=list(SHARED_WIRES))
+@pytest.fixture(params=shortly(SHARED_WIRES, ["serial", "modbus+rtu", "can+slcan"]))
 def wire(request: pytest.FixtureRequest) -> Wire:
     """Each wire that several amplifiers can share."""
     return SHARED_WIRES[request.param]

@@ -118,6 +118,7 @@ def test_calibration_finds_the_true_parameters(rig: Rig, measured: Path, tmp_pat
     assert np.median(np.abs(gains / true_gains - 1)) < 0.01
 
 
+@pytest.mark.long
 def test_calibrate_prints_changes_with_findings_and_files(measured: Path, tmp_path: Path) -> None:
     """Old and new values with uncertainty, findings, the self-check, files and a next step."""
     new, picture = tmp_path / "new.yaml", tmp_path / "fit.png"

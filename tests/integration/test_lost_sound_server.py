@@ -1,4 +1,7 @@
-"""A sound server that is killed while the daemon plays through a software amplifier."""
+"""A sound server that is killed while the daemon plays through a software amplifier.
+
+Its short form has no daemon: tests/sim/soft_amp/test_soft_amp_sound.py.
+"""
 
 import asyncio
 import os
@@ -16,7 +19,8 @@ from patient_daemon import wait_long
 from sound_card import SoftAmp, capture_on, jack_server
 
 pytestmark = [
-    pytest.mark.real_time,
+    pytest.mark.long,
+    pytest.mark.alone,
     pytest.mark.skipif(
         not (shutil.which("jackd") and shutil.which("cc")), reason="needs jackd2 and a C compiler"
     ),

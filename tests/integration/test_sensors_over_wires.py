@@ -14,6 +14,7 @@ from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.operation.keep_alive import keep_alive
 from drivers.protocol.messages import Feature, ReadingState, SensorUnit
 from drivers.registry import open_backend
+from long_form import shortly
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from model.vibration.direct import direct_responder
@@ -46,7 +47,7 @@ async def settled(amplifier: Amplifier, *commands: DriveCommand) -> CheckedAmpli
     return checked
 
 
-@pytest.mark.parametrize("wire", WIRES)
+@pytest.mark.parametrize("wire", shortly(WIRES, ["serial", "modbus+rtu", "can+slcan"]))
 def test_tones_are_those_of_a_direct_solution(wire: str, coarse_rig: Rig) -> None:
     """Two tones at once on two ERAs, at every foot and an accelerometer: within 1 % and 1 degree.
 
@@ -106,7 +107,7 @@ def test_phases_count_from_the_commit(coarse_rig: Rig) -> None:
     assert all(abs(other / first - 1) < 0.01 for other in others)
 
 
-@pytest.mark.parametrize("wire", WIRES)
+@pytest.mark.parametrize("wire", shortly(WIRES, ["serial", "modbus+rtu", "can+slcan"]))
 def test_sensors_are_described_and_many_tones_read(wire: str, coarse_rig: Rig) -> None:
     """Sixteen tones at five sensors take several replies; raw samples hold the same tone."""
     frequencies = [90.0 + 10 * n for n in range(16)]
@@ -154,7 +155,7 @@ def test_sensors_are_described_and_many_tones_read(wire: str, coarse_rig: Rig) -
     run_virtual(run())
 
 
-@pytest.mark.parametrize("wire", WIRES)
+@pytest.mark.parametrize("wire", shortly(WIRES, ["serial", "modbus+rtu", "can+slcan"]))
 def test_measuring_is_refused_without_sensors(
     wire: str, coarse_rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -199,7 +200,7 @@ def test_object_of_sensors_with_a_byte_too_many_is_an_error(
     run_virtual(run())
 
 
-@pytest.mark.parametrize("wire", WIRES)
+@pytest.mark.parametrize("wire", shortly(WIRES, ["serial", "modbus+rtu", "can+slcan"]))
 @pytest.mark.parametrize(("sensor", "sample"), [(32, 0), (-1, 0), (0, 1 << 32)])
 def test_sensors_and_samples_out_of_range_are_not_sent(
     wire: str, sensor: int, sample: int, coarse_rig: Rig

@@ -47,7 +47,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
     return Truth(rig, table, STREAM)
 
 
-@pytest.mark.parametrize("wire", shortly(WIRES, ["serial", "socketcand"]))
+@pytest.mark.parametrize("wire", shortly(WIRES, ["serial"]))
 async def test_processes_make_fingers_feel_the_commanded_pattern(
     wire: str, truth: Truth, tmp_path: Path
 ) -> None:

@@ -12,6 +12,7 @@ from drivers.guard import Guard
 from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.operation.keep_alive import keep_alive
 from drivers.registry import open_backend
+from long_form import shortly
 from memory_machine import live_in_memory
 from paper_table import smooth_rig
 from sim.bench.bench import Bench
@@ -24,7 +25,10 @@ TONES = (DriveCommand(0, 120.0, 0.5, 30.0), DriveCommand(2, 120.0, 0.25, -110.0)
 
 
 @pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("kind", ["serial", "modbus-tcp", "modbus-rtu", "socketcand", "slcan"])
+@pytest.mark.parametrize(
+    "kind",
+    shortly(["serial", "modbus-tcp", "modbus-rtu", "socketcand", "slcan"], ["serial", "slcan"]),
+)
 def test_voltage_over_a_wire(kind: str, law: str) -> None:
     """A set, an onset where there are any, heartbeats that are compared, and the voltage itself.
 

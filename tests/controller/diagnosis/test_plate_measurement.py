@@ -179,7 +179,11 @@ def test_identified_rig_is_the_truth_and_its_patterns_have_more_contrast(
 
 
 @pytest.mark.parametrize(
-    ("wire", "is_shared"), [("can+socketcand", True), ("serial", False)], ids=["bus", "two wires"]
+    ("wire", "is_shared"),
+    [
+        pytest.param("can+socketcand", True, id="bus"),
+        pytest.param("serial", False, id="two wires", marks=pytest.mark.long),
+    ],
 )
 def test_two_amplifiers_hear_each_other_where_they_start_together(
     wire: str, is_shared: bool, rig: Rig, truth: Rig

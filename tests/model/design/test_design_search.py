@@ -12,15 +12,11 @@ from model.design import search as search_module
 from model.design.area import Edge, Within, area_of, candidates_of, everywhere
 from model.design.contacts import ContactRule, anywhere
 from model.design.judge import judge
-from model.design.places import DesignPlate
-from model.design.score import Scorer
 from model.design.search import DesignProblem, LayoutSearch
 from model.design.support import SupportRule, static_loads
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.structure.actuator import Era
-
-FREQUENCIES = np.array([90.0, 170.0, 260.0])
 
 
 @cache
@@ -55,29 +51,6 @@ def test_search_finds_the_best_of_all_layouts_on_a_coarse_raster(monkeypatch) ->
     found = max(map(search.exchange, starts), key=search.value)
     assert len(dense) >= 20
     assert dense[tuple(sorted(found))] == pytest.approx(max(dense.values()), abs=0.05)
-
-
-def test_mirrored_plate_gives_the_mirrored_score() -> None:
-    """Contacts and ERAs mirrored together score the same."""
-    some = rig()
-    sets = anywhere(some.plate).pooled_sets(8, seed=1)
-    places = np.array([[0.0, 0.03], [0.2, 0.0], [0.3, 0.2], [0.1, 0.22]])
-    mirror = np.array([some.plate.length, 0.0]), np.array([-1.0, 1.0])
-    scores = []
-    for flip in (False, True):
-        plate = DesignPlate(
-            some, FREQUENCIES, [mirror[0] + mirror[1] * s if flip else s for s in sets]
-        )
-        scorer = Scorer(plate)
-        at = mirror[0] + mirror[1] * places if flip else places
-        scores.append(
-            np.sort(
-                np.concatenate(
-                    scorer.scores(plate.places(at), np.arange(4), scorer.mounts(some.eras))
-                )
-            )
-        )
-    assert scores[0] == pytest.approx(scores[1], abs=0.02)
 
 
 def problem(**changes) -> DesignProblem:

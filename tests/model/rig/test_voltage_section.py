@@ -2,17 +2,15 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from model.config.document import ConfigError, parse_document
+from model.config.document import ConfigError
 from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
 from model.finger.perception import detection_threshold
 from model.rig.file import parse_rig
-from model.rig.kind import RIG
 from model.rig.rig import Rig
 from model.rig.voltage_costs import second_harmonic, voltage_costs
 from model.table.build import build_table
@@ -133,24 +131,6 @@ def test_era_without_amplifier_supports_as_one_at_rest() -> None:
     )
     question = Question(((0.1, 0.06),), ((0.22, 0.16),), level_db_sl=10.0, drive_mode="phased")
     assert set(table.query(question).excitation) <= {"SW", "SE"}
-
-
-def test_check_says_what_voltage_costs(tmp_path: Path) -> None:
-    """Ramps, reach and highest level, cross-fades and harmonic, for each amplifier."""
-    quadratic = text(f"{{{ROWS}, law: quadratic}}", f"{{{WIDE}, law: quadratic, bias: 0.4}}")
-    checked = RIG.check(parse_document(str(tmp_path / "rig.yaml"), quadratic))
-    (warning,) = [each for each in checked.warnings if each.startswith("main plays voltage")]
-    assert "cross-fades" in warning
-    assert "second harmonic" in warning
-    assert "NE, NW" in checked.line
-    assert "`static`" in warning
-    linear = RIG.check(parse_document(str(tmp_path / "rig.yaml"), text()))
-    (warning,) = [each for each in linear.warnings if each.startswith("main plays voltage")]
-    assert "cross-fades" not in warning
-    assert "harmonic" not in warning
-    assert "`static`" not in warning
-    assert "mounted" in warning
-    assert "first 100 ms" in warning
 
 
 def test_check_says_how_far_the_mean_force_deflects() -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.layers.elasticity import wave_number
+from long_form import in_turn
 from model.errors import InputError
 from model.structure.equivalent import bending, equivalent_plate
 from model.structure.laminate import Bond, Laminate, Layer
@@ -81,8 +82,9 @@ def test_equivalent_plate_keeps_rotary_inertia():
     assert plate.material.rho * plate.thickness**3 / 12 == pytest.approx(inertia, rel=0.02)
 
 
-@pytest.mark.parametrize("modulus", [0.1e6, 1e6, 10e6, 1e9])
-@pytest.mark.parametrize("frequency", [40.0, 150.0, 500.0, 2000.0])
+@pytest.mark.parametrize(
+    ("modulus", "frequency"), in_turn([0.1e6, 1e6, 10e6, 1e9], [40.0, 150.0, 500.0, 2000.0])
+)
 def test_waves_equal_elasticity(modulus, frequency):
     """Frequency of a wave within 0.5 % for adhesives from gel to epoxy, over the limits of a rig.
 

@@ -16,7 +16,6 @@ from drivers.backends.modbus.line import modbus_line
 from drivers.backends.urls.modbus import ModbusUrl
 from drivers.codec.modbus.exchanges import Read, Write
 from drivers.errors import FrameError, LinkError, LinkTimeout
-from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
     AmplifierEvent,
@@ -57,7 +56,6 @@ from vendor_pages import (
 
 PATIENCE = 60.0  # s; for a busy machine
 SHORT = 0.02  # s; without a reply
-MAP = PROTOCOL.modbus
 
 
 @pytest.fixture(params=["TCP", "RTU"])

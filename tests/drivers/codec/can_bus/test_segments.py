@@ -113,7 +113,8 @@ def test_frames_of_number_0_begin_anew_with_each_first() -> None:
     """An event that lost its end is followed by a whole one."""
     whole = Assembler(WireCounters(), is_numbered=False)
     first, second = segments(0, 30, [4, 0, 255, 1])
-    assert [whole.add(data, 0.0) for data in (second, first, first)] == [None] * 3
+    lost, _ = segments(0, 30, [5, 0, 255, 1])
+    assert [whole.add(data, 0.0) for data in (second, lost, first)] == [None] * 3
     assert whole.add(second, 0.0) == Message(0, 30, (4, 0, 255, 1))
 
 

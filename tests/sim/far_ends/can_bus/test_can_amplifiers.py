@@ -1,0 +1,260 @@
+"""Amplifiers of protocol 3 on a CAN bus: bytes by hand, a foreign reader, and damage.
+
+Frames are written as identifier and data in hexadecimal digits.
+"""
+
+import random
+from collections.abc import Iterator
+from types import SimpleNamespace
+
+import canopen
+import pytest
+from canopen.sdo.client import SdoClient
+from canopen.sdo.exceptions import SdoAbortedError
+
+from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.segments import pack_frames, unpack_frames
+from sim.amplifier.contract import Amplifier
+from sim.far_ends.can_bus import sdo
+from sim.far_ends.can_bus.amplifiers import CanAmplifiers
+
+START = (0x000, "0100")
+ARM = (0x201, "010003023412fa00")  # session 1234, 250 ms
+SET = (  # session 1234, token 7: layer 0 along 0 ms, channel 0 at 100 Hz and half level
+    (0x201, "0200050a34120700"),
+    (0x201, "0201020001000000"),
+    (0x201, "020200000000d007"),
+    (0x201, "0203881300000000"),
+)
+COMMIT = (0x200, "0000060234120700")
+STOP = (0x201, "0300080105000000")  # along 5 ms
+
+
+class Bus:
+    """Amplifiers of one channel from node 1 on, and the frames that they have sent."""
+
+    def __init__(self, *names: str) -> None:
+        self.far = [Amplifier(name, channels=1) for name in names]
+        self.sent: list[tuple[int, str]] = []
+        self.end = CanAmplifiers(dict(enumerate(self.far, 1)), self._note)
+        self.end.start(0.0)
+
+    def _note(self, data: bytes) -> None:
+        self.sent.extend((frame.id, frame.data.hex()) for frame in unpack_frames(data))
+
+    def put(self, now: float, *frames: tuple[int, str]) -> list[tuple[int, str]]:
+        """Send frames at a time [s]; returns what comes back at once."""
+        self.sent.clear()
+        self.end.receive(pack_frames(CanFrame(i, bytes.fromhex(data)) for i, data in frames), now)
+        return [*self.sent]
+
+    def level(self, at: float, of: int = 0) -> float:
+        """What an amplifier plays."""
+        self.end.tick(at)
+        return self.far[of].playback.level(0, at)
+
+
+@pytest.fixture
+def bus() -> Bus:
+    """One amplifier, operational."""
+    bus = Bus("a")
+    bus.put(0.0, START)
+    return bus
+
+
+def test_heartbeats_show_the_state_of_the_node() -> None:
+    """Boot-up, then every 50 ms: pre-operational 7f, operational 05, stopped 04."""
+    bus = Bus("a")
+    assert bus.sent == [(0x701, "00")]
+    beats = []
+    for at, command in ((0.01, "8001"), (0.06, "0100"), (0.11, "0201")):
+        bus.put(at, (0x000, command))
+        bus.end.tick(at + 0.045)
+        beats += bus.sent
+    assert beats == [(0x701, "7f"), (0x701, "05"), (0x701, "04")]
+    assert bus.end.next_event == pytest.approx(0.2)
+
+
+def test_node_replies_only_in_operation() -> None:
+    """Neither before it is started nor after another master has stopped it."""
+    status = (0x201, "0100090000000000")
+    bus = Bus("a")
+    assert bus.put(0.0, status) == []
+    assert len(bus.put(0.3, START, status)) == 7
+    assert bus.put(0.6, (0x000, "8001"), status) == []
+
+
+def test_status_has_the_bytes_of_the_decision(bus: Bus) -> None:
+    """18 words: disarmed, 25.0 degrees, one channel, eight layers, silent."""
+    assert bus.put(0.0, (0x201, "1100090000000000")) == [
+        (0x181, "1100091201000000"),
+        (0x181, "1101000000000000"),
+        (0x181, "1102fa0000000000"),
+        (0x181, "1103080100000000"),
+        *((0x181, f"110{index}000000000000") for index in (4, 5, 6)),
+    ]
+
+
+def test_set_is_played_by_a_broadcast(bus: Bus) -> None:
+    """Armed, staged by four frames in any order, committed without a reply."""
+    bus.put(0.0, ARM)
+    staged = bus.put(0.1, *reversed(SET))
+    assert [data for _, data in staged] == ["0200050307000600", "0201000000000000"]
+    assert bus.put(0.1, COMMIT) == []
+    assert bus.level(0.1) == 0.5
+
+
+@pytest.mark.parametrize("lost", range(4))
+def test_set_without_one_of_its_frames_is_not_played(bus: Bus, lost: int) -> None:
+    """No reply, nothing to commit; the repetition under a newer number is."""
+    bus.put(0.0, ARM)
+    kept = [*SET[:lost], *SET[lost + 1 :]]
+    assert bus.put(0.1, *kept, COMMIT) == []
+    assert bus.level(0.1) == 0.0
+    bus.put(0.11, *((can_id, f"03{data[2:]}") for can_id, data in SET), COMMIT)
+    assert bus.level(0.11) == 0.5
+
+
+def test_refusal_names_request_and_code(bus: Bus) -> None:
+    """Commit before Arm: state; type 29: unknown; Arm without a watchdog: length."""
+    assert bus.put(0.0, (0x201, "0100060234120700")) == [
+        (0x181, "01001f0306000500"),
+        (0x181, "0101ff0000000000"),
+    ]
+    for number, request, code in ((2, "1d00", 1), (3, "0301", 2)):
+        (_, first), _ = bus.put(0.0, (0x201, f"0{number}00{request}34120700"))
+        assert first == f"0{number}001f03{request[:2]}000{code}00"
+
+
+def test_watchdog_is_told_by_events_and_emergencies(bus: Bus) -> None:
+    """Error code 8130, register 11; reaction (6), then fault (7), number 1, latch 1."""
+    bus.put(0.0, ARM)
+    bus.sent.clear()
+    bus.end.tick(0.26)
+    assert [each for each in bus.sent if each[0] != 0x701] == [
+        *((0x181, "00001e0406000100"), (0x181, "0001ff0001000000")),
+        (0x081, "30811116ff000000"),
+        *((0x181, "00001e0407000100"), (0x181, "0001ff0001000000")),
+        (0x081, "30811117ff000000"),
+    ]
+    cleared = bus.put(0.3, (0x201, "02000b0101000000"))
+    assert [data for can_id, data in cleared if can_id == 0x081] == ["00000001ff000000"]
+
+
+@pytest.mark.parametrize("command", ["0201", "8000", "8200"])
+def test_master_that_takes_it_out_of_operation_stops_it(bus: Bus, command: str) -> None:
+    """Silent within 5 ms, latched."""
+    bus.put(0.0, ARM, *SET, COMMIT)
+    bus.put(0.1, (0x000, command))
+    assert bus.level(0.106) == 0.0
+    assert bus.far[0].state == "QUICK_STOP_ACTIVE"
+
+
+def test_heartbeat_of_the_host_feeds_nothing(bus: Bus) -> None:
+    """Ping does: silent 0.255 s after the last one."""
+    bus.put(0.0, ARM, *SET, COMMIT)
+    bus.put(0.2, (0x201, "04000c0134120000"))
+    bus.put(0.4, (0x77F, "05"))
+    assert [bus.level(at) for at in (0.44, 0.456)] == [0.5, 0.0]
+
+
+def test_broadcast_reaches_every_amplifier() -> None:
+    """Two play by one commit and fall silent by one stop."""
+    bus = Bus("a", "b")
+    bus.put(0.0, START)
+    for node in (1, 2):
+        bus.put(0.0, *((0x200 + node, data) for _, data in (ARM, *SET)))
+    bus.put(0.1, COMMIT)
+    assert [bus.level(0.1, of) for of in (0, 1)] == [0.5, 0.5]
+    bus.put(0.11, (0x200, "0000080105000000"))
+    assert [bus.level(0.12, of) for of in (0, 1)] == [0.0, 0.0]
+
+
+def test_broadcast_of_another_message_is_not_obeyed(bus: Bus) -> None:
+    """An Arm on identifier 200, and a commit there under a number."""
+    bus.put(0.0, (0x200, f"00{ARM[1][2:]}"))
+    assert bus.far[0].state == "SWITCH_ON_DISABLED"
+    bus.put(0.0, ARM, *SET, (0x200, f"03{COMMIT[1][2:]}"))
+    assert bus.level(0.0) == 0.0
+
+
+def test_amplifier_takes_another_node(bus: Bus) -> None:
+    """Node 9, by the serial number SIM-a; it replies as node 1, then boots as 9."""
+    # Five bytes of text, two a word, the first of them high.
+    frames = ("01000f0509000500", "010149532d4d0061")
+    sent = bus.put(0.0, *((0x201, data) for data in frames))
+    assert [can_id for can_id, _ in sent] == [0x181] * 7 + [0x709]
+    assert bus.put(0.2, START, (0x201, "0100090000000000")) == []
+    assert len(bus.put(0.3, (0x209, "0100090000000000"))) == 7
+
+
+def test_random_frames_change_nothing_but_counters(bus: Bus) -> None:
+    """20 000 of any length on identifiers of the node and others, while it plays."""
+    bus.put(0.0, ARM, *SET, COMMIT)
+    draw = random.Random(4)
+    ids = (0x200, 0x201, 0x201, 0x601, 0x701, 0x181, 0x081)
+    for at in range(20_000):
+        can_id = draw.choice((*ids, draw.randrange(1, 0x800)))
+        data = bytearray(draw.randbytes(draw.choice((8, 8, 8, draw.randrange(9)))))
+        if at % 2 and len(data) == 8 and can_id & 0x77F in (0x200, 0x201):
+            # As of a message of its session, which is not to be had by chance.
+            data[1:4] = draw.randrange(2), draw.choice((3, 5, 6, 7, 12, 30)), draw.randrange(6)
+        before = bus.end.counters.frames_in
+        bus.put(1e-6 * at, (can_id, data.hex()))
+        assert bus.end.counters.frames_in - before == (can_id in (0x200, 0x201))
+    assert bus.far[0].state == "OPERATION_ENABLED"
+    assert bus.level(0.1) == 0.5
+    assert bus.end.counters.invalid_frames > 1000
+
+
+class Reader(canopen.Network):
+    """The package `canopen` on the bus, without threads."""
+
+    def __init__(self, bus: Bus) -> None:
+        super().__init__()
+        self._bus = bus
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        """Put a frame on the bus, and hand over what comes back."""
+        for answer, reply in self._bus.put(0.0, (can_id, bytes(data).hex())):
+            self.notify(answer, bytearray.fromhex(reply), 0.0)
+
+
+@pytest.fixture
+def read(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> Iterator[SdoClient]:
+    """Its client of the objects of node 1."""
+    monkeypatch.setattr(sdo, "clock", SimpleNamespace(now=lambda: 0.0))
+    node = canopen.RemoteNode(1, canopen.ObjectDictionary())
+    node.associate_network(Reader(bus))
+    yield node.sdo
+    node.remove_network()
+
+
+def test_identity_is_read_by_a_foreign_master(read: SdoClient) -> None:
+    """1018: vendor 0, product 1, revision 1, crc32 of SIM-a; 2000: texts, and version 3 alone."""
+    numbers = [int.from_bytes(read.upload(0x1018, each), "little") for each in range(5)]
+    assert numbers == [4, 0, 1, 1, 0x3D504003]
+    texts = [read.upload(0x2000, each) for each in range(1, 5)]
+    assert texts == [b"era-haptics", b"simulated amplifier", b"SIM-a", b"1"]
+    assert [read.upload(0x2000, each) for each in (0, 5)] == [b"\x05", b"\x08\x00"]
+
+
+def test_words_of_capabilities_and_status_are_read(read: SdoClient) -> None:
+    """2001: 21 words from one channel, 8 layers, 16 voices on; 2002: 18 words, disarmed, 25 C."""
+    assert [read.upload(0x2001, each)[0] for each in range(4)] == [21, 1, 8, 16]
+    assert [read.upload(0x2002, each)[0] for each in (0, 1, 6)] == [18, 1, 250]
+
+
+def test_only_the_heartbeat_can_be_written(bus: Bus, read: SdoClient) -> None:
+    """1017 sets the interval; others are refused, as are objects that are not there."""
+    read.download(0x1017, 0, b"\x0a\x00")
+    assert read.upload(0x1017, 0) == b"\x0a\x00"
+    assert bus.end.next_event == pytest.approx(0.05)
+    for index, subindex, code in (
+        (0x1000, 0, 0x0601_0002),
+        (0x1017, 1, 0x0609_0011),
+        (0x1016, 1, 0x0602_0000),
+    ):
+        with pytest.raises(SdoAbortedError) as raised:
+            read.download(index, subindex, b"\0\0")
+        assert raised.value.code == code

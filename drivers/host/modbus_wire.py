@@ -70,7 +70,7 @@ class ModbusWire:
 
         Over TCP a request of all is a frame to each unit that was sent something before.
         """
-        self.withdraw()
+        self._request = None
         if address == BROADCAST:
             if self._is_rtu:
                 return self._written(BROADCAST, name, values).adu.frame
@@ -99,8 +99,7 @@ class ModbusWire:
     def withdraw(self) -> None:
         """Take the request off the wire: its reply will be unexpected."""
         self._request = None
-        if self._is_rtu:
-            self._reader.clear()
+        self._reader.clear()  # a damaged length would take the next responses
 
     def round_trip(self, name: str, length: int) -> float:
         """Return how long a request of this many bytes and its longest reply take [s].

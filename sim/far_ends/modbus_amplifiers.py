@@ -26,6 +26,9 @@ from sim.far_ends.modbus.pdu import (
     to_write,
 )
 
+FRAME_TIMEOUT = 0.02
+"""Longest pause [s] within an RTU frame: less than the 30 ms after which a host repeats it."""
+
 _BOX = 256  # registers of a message
 _REPLY = 128  # offset of its reply
 _REPLY_HEAD = 2  # registers: tag, result
@@ -51,6 +54,8 @@ class ModbusAmplifiers:
         self._send = send
         self._is_rtu = is_rtu
         self._reader: RtuReader | TcpReader = RtuReader() if is_rtu else TcpReader()
+        if is_rtu:
+            self._reader.timeout = FRAME_TIMEOUT
 
     def receive(self, data: bytes, now: float) -> None:
         """Take bytes from the host at a time [s]."""

@@ -189,6 +189,6 @@ def _response(pdu: bytes, to: RequestAdu) -> ModbusResponse | None:
 def _has_form(pdu: bytes, to: RequestAdu) -> bool:
     """Whether function and length are those of a response or exception."""
     if pdu[0] == to.function | _EXCEPTION:
-        return len(pdu) == 2
+        return len(pdu) == 2 and pdu[1] > 0  # an exception has a code
     is_long = to.read is None or pdu[1:2] == bytes([2 * to.read.count])
     return pdu[0] == to.function and len(pdu) == to.response_size and is_long

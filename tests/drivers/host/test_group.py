@@ -154,6 +154,24 @@ def test_lost_broadcast_is_made_good(wire: str) -> None:
     with_group(test, wire, ("a", "b"))
 
 
+@pytest.mark.parametrize("way", ["inward", "outward"])
+def test_doubled_frames_are_carried_out_once(wire: str, way: str) -> None:
+    """Of a set, a stop and all between them."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        setattr(ends[0], way, lambda name, data: [(0.0002, data), (0.0003, data)])
+        await group.apply({"a": [layer(0, tone())]})
+        await group.apply({"a": [layer(0, tone(level=0.4))]})
+        await group.beat()
+        await asyncio.sleep(0.01)
+        assert ends[0].levels("a") == [0.4, 0.0]
+        assert len(ends[0].far["a"].playback.voices_of(0)) == 1
+        assert (await group.stop())["a"].is_confirmed
+        assert ends[0].line.statistics.retries == 0
+
+    with_group(test, wire, ("a",))
+
+
 def test_degraded_amplifier_gets_nothing_that_plays_or_feeds(wire: str) -> None:
     """After three requests without reply; a status ends it."""
 

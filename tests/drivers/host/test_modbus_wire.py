@@ -8,6 +8,8 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
+from virtual_loop import run_virtual
+from words_line import MemoryLine, unaltered
 
 LAYER = LayerSet(0, 20, 500, (Command(3, 2200, 2000, -9000),))
 SET: Values = {
@@ -157,6 +159,7 @@ def test_late_responses_are_credited_to_nothing(is_rtu: bool) -> None:
 @pytest.mark.parametrize(
     ("exception", "expected"),
     [
+        (0, []),
         (1, [Nak("UNKNOWN_TYPE", None)]),
         (2, [Nak("UNKNOWN_TYPE", None)]),
         (3, [Nak("BAD_LENGTH", None)]),
@@ -167,10 +170,23 @@ def test_late_responses_are_credited_to_nothing(is_rtu: bool) -> None:
     ],
 )
 def test_exceptions_are_refusals_or_no_response(exception: int, expected: list[object]) -> None:
-    """Those of a gateway are none: another attempt is made after the usual time."""
+    """Those of a gateway, and one without a code, are none: the request is repeated."""
     wire = ModbusWire(0, is_rtu=False, number=0)
     wire.request(1, "GetStatus", {})
     assert wire.received(bytes([0, 1, 0, 0, 0, 3, 1, 0x90, exception])) == expected
+
+
+@pytest.mark.parametrize("is_rtu", [True, False])
+def test_reply_to_another_master_is_credited_to_nothing(is_rtu: bool) -> None:
+    """It wrote the same message before the reply was read; the next attempt has it."""
+    wire, peer = ModbusWire(0, is_rtu=is_rtu, number=0), Peer(is_rtu=is_rtu)
+    other = ModbusWire(0, is_rtu=is_rtu, number=500)
+    (more,) = wire.received(peer.reply(wire.request(1, "GetStatus", {})))
+    assert isinstance(more, More)
+    peer.reply(other.request(1, "GetStatus", {}))
+    assert wire.received(peer.reply(more.data)) == []
+    assert wire.counters.unexpected_frames == 1
+    assert isinstance(reply_to(wire, peer, "GetStatus", {}), Reply)
 
 
 def test_request_of_all_units_has_no_reply() -> None:
@@ -189,6 +205,26 @@ def test_request_of_all_units_has_no_reply() -> None:
         echo = bytes([0, number, 0, 0, 0, 6, number - 2, 16, 6, 0, 0, 3])
         assert wire.received(echo) == []
     assert wire.counters.unexpected_frames == 0
+
+
+def test_damaged_length_costs_one_attempt() -> None:
+    """A write that seems to go on for 255 bytes ends with the pause before its repetition."""
+
+    async def run() -> None:
+        end = MemoryLine("rtu", "a")
+        damaged = iter([True])
+
+        def lengthened(name: str, data: bytes) -> list[tuple[float, bytes]]:
+            if next(damaged, False):
+                data = data[:6] + b"\xff" + data[7:]
+            return unaltered(name, data)
+
+        await end.hosts["a"].open()
+        end.inward = lengthened
+        await end.hosts["a"].read_status()
+        assert end.line.statistics.retries == 1
+
+    run_virtual(run())
 
 
 def test_times_on_a_line_are_those_of_its_characters() -> None:

@@ -47,7 +47,7 @@ from controller.group.quick_stops import QuickStops
 from controller.learning.learning import Learning
 from controller.loop.loop import Controller
 from drivers import clock
-from drivers.amplifier import WATCHDOG, Amplifier
+from drivers.amplifier import Amplifier
 from drivers.errors import DriverError
 from model.table.table import LocalizationTable
 
@@ -142,7 +142,7 @@ class ApiService:
             assume_energised=machine.assume_energised(now)
             or (is_unwatched and machine.lost_for(now) is not None),
             lost_for_s=machine.lost_for(now),
-            watchdog_s=None if is_unwatched else WATCHDOG,
+            watchdog_s=None if is_unwatched else machine.watchdog,
             armed_by=lease.owner if lease else None,
             lease_left_s=lease.expires_at - now if lease else None,
             contacts=view.contact_statuses(),

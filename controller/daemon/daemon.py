@@ -30,8 +30,9 @@ from controller.learning.learning import Learning, observed
 from controller.loop.loop import Controller
 from controller.sources.touch import TouchFrame
 from drivers import clock
-from drivers.amplifier import Amplifier
+from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import DriverError
+from drivers.link.link import REPLY_TIMEOUT
 from drivers.operation.garbage_collection import no_long_collections, without_collections
 from drivers.registry import open_backend
 from drivers.threads import in_thread
@@ -48,7 +49,8 @@ _logger = logging.getLogger(__name__)
 class Daemon:
     """A daemon; create it within the event loop that runs it.
 
-    dashboard: HOST:PORT at which the gateway serves the page, or None.
+    dashboard: HOST:PORT at which the gateway serves the page, or None. reply_timeout, watchdog [s]:
+    of its amplifiers, longer ones for simulated amplifiers on a machine that is busy.
     """
 
     def __init__(
@@ -59,6 +61,8 @@ class Daemon:
         log: LogThread,
         manager: ServiceManager,
         dashboard: str | None,
+        reply_timeout: float = REPLY_TIMEOUT,
+        watchdog: float = WATCHDOG,
     ) -> None:
         self._config = config
         self._log = log
@@ -74,7 +78,11 @@ class Daemon:
         self._dumps = FaultDumps(self._recorder)
         backends = self._make_backends(config)
         amplifiers = {
-            name: Amplifier(backend, serial_number=config.section.serial_numbers.get(name))
+            name: Amplifier(
+                backend,
+                reply_timeout=reply_timeout,
+                serial_number=config.section.serial_numbers.get(name),
+            )
             for name, backend in backends.items()
         }
         self._supervisor = Supervisor(
@@ -88,6 +96,7 @@ class Daemon:
             link_changed=lambda *change: self._publisher.link_changed(*change),
             alive=lambda: manager.alive(clock.now()),
             disarmed=lambda: self._api.end_lease(),
+            watchdog=watchdog,
         )
         self._layout = ActiveLayout(config.effective_layout)
         self._publisher = EventPublisher(
@@ -116,6 +125,7 @@ class Daemon:
             timing=timing,
             drive_mode=config.section.mode,
             is_supervised=config.section.supervised,
+            watchdog=watchdog,
         )
         if config.learn is not None:
             self._learning = Learning(

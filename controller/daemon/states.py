@@ -88,7 +88,8 @@ class StateMachine:
 
     is_latched: an acknowledgement is required before arming; is_acknowledged: it was given, and the
     amplifiers are being read back; lost_at [s]: when the link was lost; is_reconnected: since then;
-    is_degraded: whether an amplifier does not reply while armed, so that nothing new is played.
+    is_degraded: whether an amplifier does not reply while armed, so that nothing new is played;
+    watchdog [s]: of armed amplifiers.
     """
 
     state: DaemonState = DaemonState.NOT_READY
@@ -99,6 +100,7 @@ class StateMachine:
     lost_at: float = 0.0
     is_reconnected: bool = False
     is_degraded: bool = False
+    watchdog: float = WATCHDOG
 
     def lost_for(self, now: float) -> float | None:
         """Time since the link was lost [s]; None while it is up."""
@@ -107,7 +109,7 @@ class StateMachine:
     def assume_energised(self, now: float) -> bool:
         """Whether a lost amplifier may still be playing: its watchdog may not have expired yet."""
         lost_for = self.lost_for(now)
-        return lost_for is not None and lost_for < WATCHDOG + _WATCHDOG_MARGIN
+        return lost_for is not None and lost_for < self.watchdog + _WATCHDOG_MARGIN
 
 
 class Transition(NamedTuple):
@@ -245,7 +247,9 @@ def failed(machine: StateMachine, cause: str) -> StateMachine:
     """Return the state machine after an unexpected exception: latched, and in FAULT if open."""
     if machine.state in (DaemonState.NOT_READY, DaemonState.COMM_LOST):
         return replace(machine, is_latched=True, is_acknowledged=False)
-    return StateMachine(DaemonState.FAULT, cause, ACKNOWLEDGE, is_latched=True)
+    return StateMachine(
+        DaemonState.FAULT, cause, ACKNOWLEDGE, is_latched=True, watchdog=machine.watchdog
+    )
 
 
 def _with_event(machine: StateMachine, event: DaemonEvent, now: float) -> StateMachine:

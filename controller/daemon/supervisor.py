@@ -41,7 +41,7 @@ from controller.group.quick_stops import QuickStops
 from controller.loop.loop import Controller
 from controller.loop.observer import Observer
 from drivers import clock
-from drivers.amplifier import Amplifier
+from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import (
     CommandRefused,
     DriverError,
@@ -78,7 +78,8 @@ class Supervisor:
     amplifiers. state_changed are called a moment after every transition, disarmed within each one
     from a state in which amplifiers have or get high voltage to another; link_changed receives the
     kind of change, the lost amplifiers ("lost" only) and a message; alive is called after each
-    cycle of the control loop and periodically while there is no link.
+    cycle of the control loop and periodically while there is no link. watchdog [s]: of armed
+    amplifiers.
     """
 
     def __init__(
@@ -89,8 +90,9 @@ class Supervisor:
         link_changed: Callable[[LinkChange, Sequence[str], str], None],
         alive: Callable[[], None],
         disarmed: Callable[[], None] = lambda: None,
+        watchdog: float = WATCHDOG,
     ) -> None:
-        self.machine = StateMachine()
+        self.machine = StateMachine(watchdog=watchdog)
         self._amplifiers = amplifiers
         self._state_observers = (_log_transition, *state_changed)
         self._link_observer = link_changed

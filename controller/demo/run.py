@@ -3,16 +3,24 @@
 import asyncio
 import contextlib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from controller.demo.far_end import SIM_OPTIONS, simulated_plate
+from controller.demo.far_end import (
+    REPLY_TIMEOUT,
+    SIM_OPTIONS,
+    WATCHDOG,
+    simulated_plate,
+)
 from controller.demo.picture import choose_rows, touches_figure
 from controller.demo.recorder import TouchRecorder
 from controller.demo.touch_row import TouchRow
 from controller.loop.loop import Controller
+from controller.loop.observer import Observer
 from controller.sources.capture import RecordedDatagram, replay_capture
 from controller.sources.tuio import TuioSource
 from drivers.amplifier import Amplifier
+from drivers.errors import CommandRefused
 from drivers.operation.garbage_collection import no_long_collections
 from drivers.registry import open_backend
 from model.figures import save_figure
@@ -22,14 +30,8 @@ from model.table.timing import Timing
 
 WIRES = (*SIM_OPTIONS, "sim")
 
-REPLY_TIMEOUT = 1.0
-"""Time [s] to wait for a reply: simulated amplifiers share a machine that may be busy."""
-
-WATCHDOG = 2.0
-"""Watchdog [s] of simulated amplifiers, the longest of the protocol, for the same reason."""
-
 CONTACT_TIMEOUT = 2.0
-"""Time [s] after which a recorded finger without news is lifted, also for that reason."""
+"""Time [s] after which a recorded finger without news is lifted, for a machine that is busy."""
 
 DECAY = 0.1
 """Time [s] for the plate to ring down after the last touch."""
@@ -64,6 +66,7 @@ async def run_demo(
         tuio = TuioSource(f"tuio:127.0.0.1:0?timeout={CONTACT_TIMEOUT:g}")
         await tuio.open()
         recorder = TouchRecorder(plate, on_row=on_row)
+        refused = asyncio.Event()
         controller = Controller(
             rig,
             table,
@@ -74,7 +77,7 @@ async def run_demo(
                 for name, url in plate.urls.items()
             },
             sources=[tuio],
-            observer=recorder.observer,
+            observer=noting_refusals(recorder.observer, refused),
             timing=Timing(table),
             watchdog=WATCHDOG,
         )
@@ -83,20 +86,47 @@ async def run_demo(
             with no_long_collections():
                 await controller.arm()
                 running = asyncio.create_task(controller.run())
+                arming = asyncio.create_task(keep_armed(controller, refused))
                 playing = asyncio.create_task(_play(touches, tuio, recorder))
+                tasks = (running, arming, playing)
                 try:
-                    await asyncio.wait({running, playing}, return_when=asyncio.FIRST_COMPLETED)
-                    for task in (running, playing):
+                    await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+                    for task in tasks:
                         if task.done():
                             task.result()
                 finally:
-                    running.cancel()
-                    playing.cancel()
-                    await asyncio.gather(running, playing, return_exceptions=True)
+                    for task in tasks:
+                        task.cancel()
+                    await asyncio.gather(*tasks, return_exceptions=True)
             await recorder.finish()
         finally:
             await controller.close()
     return recorder.rows
+
+
+def noting_refusals(observer: Observer, refused: asyncio.Event) -> Observer:
+    """An observer that also sets an event when an amplifier refuses something."""
+
+    def note(reason: str) -> None:
+        refused.set()
+        observer.refused(reason)
+
+    return replace(observer, refused=note)
+
+
+async def keep_armed(controller: Controller, refused: asyncio.Event) -> None:
+    """Arm simulated amplifiers again whose watchdogs have expired while the machine stalled.
+
+    refused: set when one refuses something.
+    """
+    while True:
+        await refused.wait()
+        refused.clear()
+        try:
+            await controller.arm()  # changes nothing where all still are
+        except CommandRefused:
+            await controller.clear()
+            await controller.arm()
 
 
 async def _play(

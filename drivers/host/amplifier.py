@@ -272,21 +272,17 @@ class Amplifier:
         if clock.now() - self._other_host_at <= _WATCHDOG.high:
             raise self._driven_by_another()
 
-    def may_send(self, name: str, values: Values) -> LinkError | None:
-        """Return why a request must not go out now.
-
-        Nothing that plays or feeds while it is degraded, or beside another host.
-        """
+    def check_request(self, name: str) -> None:
+        """Raise LinkError for what plays or feeds, while degraded or beside another host."""
         message = MESSAGES.get(name)
         if message is None or not message.feeds:
-            return None
+            return
         self.check_other_host()
-        if self.silence_cause is None:
-            return None
-        return LinkDegraded(
-            f"{self.silence_cause}. The amplifier may play its last set until its watchdog has "
-            "passed; nothing new is played until it replies"
-        )
+        if self.silence_cause is not None:
+            raise LinkDegraded(
+                f"{self.silence_cause}. The amplifier may play its last set until its watchdog has "
+                "passed; nothing new is played until it replies"
+            )
 
     async def _request(
         self, name: str, values: Values, priority: Priority, *, timeout: float = 0.03

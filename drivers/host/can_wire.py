@@ -99,11 +99,7 @@ class CanWire:
             events = self._events.setdefault(node, Assembler(self.counters, is_numbered=False))
             message = events.add(data, clock.now())
             return None if message is None else self._event(node, message)
-        if (
-            self._pending is None
-            or data[:1] != bytes((self._pending[1],))
-            or (node != self._pending[0])
-        ):
+        if self._pending is None or (node, *data[:1]) != self._pending[:2]:
             self.counters.frames_in += 1
             self.counters.unexpected_frames += data[1:2] == b"\0"
             return None

@@ -88,8 +88,8 @@ class Member(Protocol):
     def note_other_host(self) -> None:
         """Note that another host drives it."""
 
-    def may_send(self, name: str, values: Values) -> LinkError | None:
-        """Return why a request must not go out now; None if it may."""
+    def check_request(self, name: str) -> None:
+        """Raise LinkError where a request of this name must not go out now."""
 
 
 @dataclass(eq=False, slots=True)
@@ -255,8 +255,7 @@ class Line:
     def _start(self, job: Job) -> None:
         try:
             name, values = job.make()
-            if (reason := job.member.may_send(name, values)) is not None:
-                raise reason
+            job.member.check_request(name)
             now = clock.now()
             job.due = now + self._write(job.member.address, name, values, now) + job.timeout
             job.attempts -= 1

@@ -33,6 +33,7 @@ def test_page_and_daemon(tmp_path: Path) -> None:
                     assert state != "OPERATION_ENABLED"
                     next(daemon.events(timeout=60))
                 assert daemon.hello("test").rig.simulated
+                assert daemon.status().watchdog_s == 2.0
             process.send_signal(signal.SIGINT)
             assert process.wait(60) == 0
         finally:

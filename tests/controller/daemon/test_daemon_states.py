@@ -130,16 +130,22 @@ def test_step_ignores_reconnection_outside_comm_lost(state: DaemonState, trigger
         assert step(machine, DaemonEvent(trigger), ENERGISED_UNTIL + 1) == (machine, ())
 
 
+@pytest.mark.parametrize("watchdog", [0.25, 2.0])
 @pytest.mark.parametrize("latched", [False, True])
-def test_step_leaves_comm_lost_when_reconnected_and_watchdog_expired(latched: bool) -> None:
+def test_step_leaves_comm_lost_when_reconnected_and_watchdog_expired(
+    latched: bool, watchdog: float
+) -> None:
     """Both are required: a reconnection, and the watchdog time with its margin."""
-    lost = StateMachine(DaemonState.COMM_LOST, "unplugged", None, latched, False, LOST_AT)
-    waiting, actions = step(lost, DaemonEvent(Trigger.TICK), ENERGISED_UNTIL + 1)
+    until = LOST_AT + watchdog + 0.1
+    lost = StateMachine(
+        DaemonState.COMM_LOST, "unplugged", None, latched, False, LOST_AT, watchdog=watchdog
+    )
+    waiting, actions = step(lost, DaemonEvent(Trigger.TICK), until + 1)
     assert (waiting.state, actions) == (DaemonState.COMM_LOST, ())
-    early, actions = step(lost, DaemonEvent(Trigger.RECONNECTED), ENERGISED_UNTIL - 0.001)
+    early, actions = step(lost, DaemonEvent(Trigger.RECONNECTED), until - 0.001)
     assert (early.state, actions) == (DaemonState.COMM_LOST, ())
-    late, actions = step(early, DaemonEvent(Trigger.TICK), ENERGISED_UNTIL)
-    again, _ = step(lost, DaemonEvent(Trigger.RECONNECTED), ENERGISED_UNTIL)
+    late, actions = step(early, DaemonEvent(Trigger.TICK), until)
+    again, _ = step(lost, DaemonEvent(Trigger.RECONNECTED), until)
     assert late.state is again.state
     if latched:
         assert (late.state, actions) == (DaemonState.FAULT, ())
@@ -179,8 +185,8 @@ def test_step_reconnects_again_when_lost_twice() -> None:
 @pytest.mark.parametrize("state", DaemonState)
 def test_unexpected_exception_is_latched(state: DaemonState) -> None:
     """It is a fault where amplifiers are open, and elsewhere one once they are."""
-    after = failed(StateMachine(state), "a bug")
-    assert after.is_latched
+    after = failed(StateMachine(state, watchdog=2.0), "a bug")
+    assert (after.is_latched, after.watchdog) == (True, 2.0)
     if state in (DaemonState.NOT_READY, DaemonState.COMM_LOST):
         assert after.state is state
     else:

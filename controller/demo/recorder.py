@@ -111,6 +111,13 @@ class TouchRecorder:
         """Set the start of the recording to now."""
         self._start = clock.now()
 
+    def recovered(self) -> None:
+        """Note that the amplifiers are armed again: errors so far do not abort the demonstration.
+
+        The touches that they have spoiled say so.
+        """
+        self._errors.clear()
+
     async def finish(self) -> None:
         """Wait for the rows of all lifted touches; raises LinkError with the first error."""
         while self._tasks:

@@ -86,7 +86,9 @@ async def run_demo(
             with no_long_collections():
                 await controller.arm()
                 running = asyncio.create_task(controller.run())
-                arming = asyncio.create_task(keep_armed(controller, refused))
+                arming = asyncio.create_task(
+                    keep_armed(controller, refused, recovered=recorder.recovered)
+                )
                 playing = asyncio.create_task(_play(touches, tuio, recorder))
                 tasks = (running, arming, playing)
                 try:
@@ -114,10 +116,12 @@ def noting_refusals(observer: Observer, refused: asyncio.Event) -> Observer:
     return replace(observer, refused=note)
 
 
-async def keep_armed(controller: Controller, refused: asyncio.Event) -> None:
+async def keep_armed(
+    controller: Controller, refused: asyncio.Event, *, recovered: Callable[[], None]
+) -> None:
     """Arm simulated amplifiers again whose watchdogs have expired while the machine stalled.
 
-    refused: set when one refuses something.
+    refused: set when one refuses something; recovered: called when they are armed again.
     """
     while True:
         await refused.wait()
@@ -127,6 +131,7 @@ async def keep_armed(controller: Controller, refused: asyncio.Event) -> None:
         except CommandRefused:
             await controller.clear()
             await controller.arm()
+            recovered()
 
 
 async def _play(

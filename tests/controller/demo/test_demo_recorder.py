@@ -46,6 +46,22 @@ async def test_rows_of_an_aborted_demonstration_name_the_fault(tmp_path: Path) -
     assert [row.reason for row in rows] == ["too close to an edge", FAULT, FAULT]
 
 
+async def test_demonstration_that_is_armed_again_has_all_rows(tmp_path: Path) -> None:
+    """Touches before and after the fault; what was down at the fault names it."""
+    rows: list[TouchRow] = []
+    recorder = recorder_of(rows, tmp_path)
+    observer = recorder.observer
+    down, later = contact(1), contact(2)
+    observer.contacts_changed((down,), Change(down=(down,)))
+    observer.refused(f"{FAULT}; once the cause is gone, clear and arm again")
+    recorder.recovered()
+    observer.contacts_changed((), Change(up=(down,)))
+    observer.contacts_changed((later,), Change(down=(later,)))
+    observer.contacts_changed((), Change(up=(later,)))
+    await recorder.finish()
+    assert [row.reason == FAULT for row in recorder.rows] == [True, False]
+
+
 async def test_row_of_a_finger_alone_names_no_other_finger(tmp_path: Path) -> None:
     """A touch that lifts before anything was played for it was not beside another target."""
     rows: list[TouchRow] = []

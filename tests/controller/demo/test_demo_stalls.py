@@ -14,12 +14,17 @@ from virtual_loop import in_virtual_time
 async def test_amplifiers_are_armed_again_after_a_stall() -> None:
     """One whose watchdog has expired is in FAULT; the next touch is played all the same."""
     refused = asyncio.Event()
+    recovered: list[float] = []
     async with running(observer=noting_refusals(Observer(), refused)) as bench:
-        arming = asyncio.create_task(keep_armed(bench.controller, refused))
-        bench.far_end.amplifier.tick(asyncio.get_running_loop().time() + 3.0)
+        clock = asyncio.get_running_loop().time
+        arming = asyncio.create_task(
+            keep_armed(bench.controller, refused, recovered=lambda: recovered.append(clock()))
+        )
+        bench.far_end.amplifier.tick(clock() + 3.0)
         assert bench.far_end.state is AmplifierState.FAULT
         await asyncio.sleep(1.0)
         assert bench.far_end.state is AmplifierState.OPERATION_ENABLED
+        assert len(recovered) == 1
         bench.touch((1, 0.5, 0.5))
         await asyncio.sleep(0.05)
         assert any(bench.far_end.levels)

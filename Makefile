@@ -105,7 +105,7 @@ soak: .venv/installed-test
 	$(BIN)/python tests/support/soak.py $(SOAK)
 
 # True errors of responses in polynomials against their estimates, on 23 plates with 20 layouts;
-# some minutes. `make test` takes two plates with four.
+# some minutes. `make test` takes one plate with four.
 estimate-test: .venv/installed-test
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/support/error_estimates.py \
 		--write docs/measured/accuracy.md

@@ -27,7 +27,7 @@ def rig():
 
 def test_search_finds_the_best_of_all_layouts_on_a_coarse_raster(monkeypatch) -> None:
     """The best of some starts is the best of all triples of ERAs that a dense solve gives."""
-    monkeypatch.setitem(search_module.CANDIDATES, True, 8)
+    monkeypatch.setitem(search_module.CANDIDATES, True, 7)
     monkeypatch.setattr(search_module, "SEARCH_FREQUENCIES", 2)
     # Weights of any kind reach the level, so that it does not matter.
     strong = tuple(replace(era, stroke=0.01) for era in rig().eras)
@@ -66,7 +66,7 @@ def problem(**changes) -> DesignProblem:
 
 def test_further_eras_never_score_less(monkeypatch) -> None:
     """The best layout of ever more ERAs has ever more contrast, and moved places no less."""
-    monkeypatch.setitem(search_module.CANDIDATES, True, 24)
+    monkeypatch.setitem(search_module.CANDIDATES, True, 16)
     search = LayoutSearch(problem())
     layout, values = search.kept_layout(), []
     for _ in range(4):

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg, stats
+from scipy import linalg
+from scipy.special import chdtrc
 
 from model.arrays import FloatArray
 from model.choice import best_first, ranked_by
@@ -101,7 +102,7 @@ def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
     lead = min(others) - best.cost
     # What a crack leaves is the error of its model, which is of the first order.
     is_rough = best.is_coarse and lead > _FAR_AHEAD and best.cost < _ROUGHLY * best.after.count
-    if not is_rough and stats.chi2.sf(best.cost, best.after.count) < _UNLIKELY:
+    if not is_rough and chdtrc(best.after.count, best.cost) < _UNLIKELY:
         return Explanation("", 0.0, 0.0, before, resembles=best.name)
     if best.altered:
         theta = best.after.state.x[len(before.x) :]

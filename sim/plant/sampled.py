@@ -5,7 +5,6 @@ that moves along a straight line has a closed-form solution, and every corner ad
 """
 
 import numpy as np
-from scipy.signal import lfilter
 
 from model.arrays import ComplexArray, FloatArray
 from sim.plant.loaded_plates import LoadedPlate, carried_state
@@ -20,6 +19,9 @@ class SampledPlant:
     """
 
     def __init__(self, plant: Plant, *, rate: float) -> None:
+        from scipy.signal import lfilter  # takes half a second to load
+
+        self._filter = lfilter
         self.rate = rate
         self._plant = plant
         self._contacts = plant.contacts
@@ -53,7 +55,7 @@ class SampledPlant:
         factor = np.exp(plate.decay / self.rate)
         for mode, one in enumerate(factor):
             state = np.array([one * self._free[mode]])
-            free[:, mode], _ = lfilter([one], [1.0, -one], corners[:, mode], zi=state)
+            free[:, mode], _ = self._filter([one], [1.0, -one], corners[:, mode], zi=state)
         if len(bases):
             self._free, self._bases, self._slopes = free[-1], bases[-1], slopes[-1]
         points = plate.with_phalanges(shapes) @ plate.free_acceleration

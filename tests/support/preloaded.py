@@ -49,7 +49,6 @@ _LOADED = (
     "controller.gateway.serving",
     "drivers.amp_actions",
     "model.commands.progress",
-    "model.figures.table_pictures",
     "model.fem.modal",
     "model.studies.run",
     "model.table.build",

@@ -4,7 +4,6 @@ import asyncio
 from dataclasses import replace
 
 import numpy as np
-from scipy import signal
 
 from drivers import clock
 from drivers.amplifier import Amplifier
@@ -36,6 +35,8 @@ def resonator(frequencies: FloatArray, resonance: float, gain: float) -> Complex
 
 def moved(drive: FloatArray, times: FloatArray, resonance: float, gain: float) -> FloatArray:
     """Motion of the same resonator from rest, by its differential equation."""
+    from scipy import signal  # takes half a second to load
+
     omega = 2 * np.pi * resonance
     system = signal.lti([gain * omega**2], [1.0, 2 * DAMPING_RATIO * omega, omega**2])
     _, y, _ = signal.lsim(system, drive, times)

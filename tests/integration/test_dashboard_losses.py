@@ -78,8 +78,15 @@ async def test_lost_link_is_one_event_with_its_attempts(tab: Page, tmp_path: Pat
             assert "%" in await tab.evaluate(TILE)
 
 
-async def test_end_of_the_daemon_is_no_return_of_a_lost_link(tab: Page, tmp_path: Path) -> None:
-    """The end is an event of its own."""
+async def test_what_the_daemon_reports_is_shown(tab: Page, tmp_path: Path) -> None:
+    """In turn: why onsets are plain, while that holds; which amplifiers a stop did not silence.
+
+    That stands beside the button and in the list of events, until a stop is confirmed. The end of
+    the daemon after a loss is an event of its own.
+    """
+    summary = LatencySummary(count=0, median=None, p99=None, p999=None, histogram=[])
+    plain = "document.querySelector('#plain').innerText"
+    problem = "document.querySelector('#problem').innerText"
     states: list[tuple[DaemonStateName, str]] = [
         ("READY_TO_SWITCH_ON", ""),
         ("COMM_LOST", "amplifier main: cut"),
@@ -87,18 +94,12 @@ async def test_end_of_the_daemon_is_no_return_of_a_lost_link(tab: Page, tmp_path
     ]
     with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
         await open_dashboard(tab, gateway, DESKTOP)
-        for (old, _), (new, cause) in pairwise(states):
-            daemon.publish("state", StateEvent(old=old, new=new, cause=cause, remedy=None))
-            events = await tab.until(EVENTS, lambda events, cause=cause: cause in events[0])
-    assert "told to end" in events[0]
-    assert events[1].endswith("amplifier main: cut")
-
-
-async def test_stop_names_the_amplifiers_that_are_not_silent(tab: Page, tmp_path: Path) -> None:
-    """Beside the button and in the list of events, until a stop is confirmed."""
-    problem = "document.querySelector('#problem').innerText"
-    with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
-        await open_dashboard(tab, gateway, DESKTOP)
+        for reason in ("loading took 50 ms", None):
+            daemon.publish("latency", LatencyEvent(latency_ms=summary, ramp_only_reason=reason))
+            await tab.until(
+                plain,
+                lambda text, shown=reason or "": text.endswith(shown) and bool(text) == bool(shown),
+            )
         daemon.silence = UNCONFIRMED
         await tab.click("#stop")
         shown = await tab.until(problem, lambda text: "side" in text)
@@ -107,22 +108,11 @@ async def test_stop_names_the_amplifiers_that_are_not_silent(tab: Page, tmp_path
         daemon.silence = {}
         await tab.click("#stop")
         await tab.until(f"{problem} === ''")
-
-
-async def test_reason_for_plain_onsets_is_shown(tab: Page, tmp_path: Path) -> None:
-    """Beside the latencies, while it holds."""
-    summary = LatencySummary(count=0, median=None, p99=None, p999=None, histogram=[])
-    plain = "document.querySelector('#plain').innerText"
-    with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
-        await open_dashboard(tab, gateway, DESKTOP)
-        for because, shown in (
-            ("loading took 50 ms", "loading took 50 ms"),
-            (None, ""),
-        ):
-            daemon.publish("latency", LatencyEvent(latency_ms=summary, ramp_only_reason=because))
-            await tab.until(
-                plain, lambda text, shown=shown: text.endswith(shown) and bool(text) == bool(shown)
-            )
+        for (old, _), (new, cause) in pairwise(states):
+            daemon.publish("state", StateEvent(old=old, new=new, cause=cause, remedy=None))
+            events = await tab.until(EVENTS, lambda events, cause=cause: cause in events[0])
+        assert "told to end" in events[0]
+        assert events[1].endswith("amplifier main: cut")
 
 
 async def test_banner_shows_the_state_of_the_gateway(tab: Page, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ What a person would feel is read from the simulated amplifiers themselves.
 """
 
 import asyncio
+import random
 from collections.abc import Awaitable, Callable
 
 import pytest
@@ -275,6 +276,30 @@ def test_stop_is_confirmed_by_nothing_less_than_a_new_latch_and_all_levels(
         assert stopped.may_play_until > began
 
     with_group(test, wire, ("a",))
+
+
+def test_stop_is_never_said_to_be_silent_while_it_plays(wire: str) -> None:
+    """50 stops with lost, late and doubled frames; what is not confirmed ends when it is said."""
+    chance = random.Random(6)
+    confirmed = 0
+
+    def damaged(name: str, data: bytes) -> list[tuple[float, bytes]]:
+        copies = chance.choice((0, 1, 1, 2))
+        return [(chance.choice((0.0002, 0.004, 0.05)), data) for _ in range(copies)]
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        nonlocal confirmed
+        await group.apply({"a": [layer(0, tone())]})
+        ends[0].inward = ends[0].outward = damaged
+        stopped = (await group.stop())["a"]
+        confirmed += stopped.is_confirmed
+        if not stopped.is_confirmed:
+            await asyncio.sleep(stopped.may_play_until - ends[0].loop.time())
+        assert ends[0].levels("a") == [0.0, 0.0]
+
+    for _ in range(50):
+        with_group(test, wire, ("a",))
+    assert 10 < confirmed < 50
 
 
 def test_stop_is_repeated_after_a_reply_that_is_none(wire: str) -> None:

@@ -1,9 +1,7 @@
 """Repeated attempts and the report of the latency benchmark on a disturbed machine."""
 
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +9,7 @@ import pytest
 from benchmarks.latency.machine import busy_ticks
 from benchmarks.latency.match import Command, Matched, match, read_commands
 from benchmarks.latency.programs import Ended
-from benchmarks.latency.report import DOCS, HEAD_CELLS, cases, flooded_lines, report, write_report
+from benchmarks.latency.report import cases, flooded_lines, report
 from benchmarks.latency.run import Case, Disturbed, Failed, Found, attempt
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.schema import LatencySummary
@@ -70,24 +68,6 @@ def test_report_names_first_cause_only() -> None:
     assert all(why.startswith("COMM_LOST (load average") for why in failed.why)
 
 
-def test_report_has_all_cases_when_one_failed(tmp_path: Path) -> None:
-    """The page names the cause, and has a full row for every case, and a picture."""
-    (tmp_path / "pictures").mkdir()
-    (tmp_path / "measured").mkdir()
-    shutil.copy(DOCS / "measured" / "latency.md", tmp_path / "measured")
-    outcomes: list[Found | Failed] = [found(case, milliseconds=1.0) for case in CASES]
-    outcomes[0] = Failed(CASES[0], ("COMM_LOST at arming", "FAULT again"))
-    write_report(outcomes, seconds=4, seed=2, minutes=1.4, docs=tmp_path)
-    page = (tmp_path / "measured" / "latency.md").read_text("utf-8")
-    rows = [line for line in page.splitlines() if line.startswith("|")]
-    rows = rows[: 2 + len(CASES)]  # before those of the flooders
-    assert {row.count("|") for row in rows} == {HEAD_CELLS + 1}
-    assert [row.split("|")[1].strip() for row in rows[2:]] == [case.name for case in CASES]
-    assert "**No figures of *taps, loaded***: COMM_LOST at arming; then: FAULT again." in page
-    assert "--seconds 4 --seed 2" in page
-    assert (tmp_path / "pictures" / "latency.png").stat().st_size > 10_000
-
-
 def test_report_compares_each_quantile_with_its_target() -> None:
     """The targets of the first case are 2 ms (median), 5 ms (99th percentile), 10 ms (99.9th)."""
     slow = [found(CASES[0], milliseconds=6.0), found(CASES[1], milliseconds=3.0)]
@@ -117,16 +97,6 @@ def test_report_compares_growth_under_flooders_with_plain_asyncio(
     (row,) = (line for line in flooded_lines(outcomes).splitlines() if line.startswith("| keys"))
     assert row.split("|")[-2].strip() == verdict
     assert row.split("|")[5:7] == [f" {flooded - 3:.2f} ", " 2.00 "]
-
-
-def test_report_marks_a_case_disturbed_by_other_processes() -> None:
-    """Half a processor used by other processes marks a case as disturbed."""
-    quiet = [found(case, milliseconds=1.0, others=0.1) for case in CASES[:2]]
-    assert "was disturbed**" not in report(quiet, seconds=100, seed=1, minutes=9)
-    busy = [found(CASES[0], milliseconds=1.0, others=0.5), quiet[1]]
-    page = report(busy, seconds=100, seed=1, minutes=9)
-    assert "***taps, loaded* was disturbed**" in page
-    assert " 0.5 processors " in page
 
 
 def test_busy_ticks_excludes_idle_and_iowait() -> None:

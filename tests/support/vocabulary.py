@@ -138,34 +138,28 @@ def _definitions(tree: ast.Module) -> Iterator[tuple[str, int]]:
 
 
 def _replacement(name: str, file: str) -> str | None:
-    plain = name.strip("_")
-    if plain in ALLOWED:
-        return None
-    if (instead := _replacement_anywhere(plain)) is not None:
-        return instead
-    words = _words(plain)
-    if file.startswith(DRIVER_PACKAGES):
-        for pattern, instead in RETIRED_IN_DRIVERS.items():
-            if re.search(rf"(?:^|_)(?:{pattern})(?:_|$)", words):
-                return instead
-    if file.startswith(CONTACT_PACKAGES) and re.search(r"(?:^|_)leases?(?:_|$)", words):
-        return "contact_timeout"
-    return None
+    return _replacement_in(
+        name.strip("_"), file.startswith(DRIVER_PACKAGES), file.startswith(CONTACT_PACKAGES)
+    )
 
 
 @cache
-def _replacement_anywhere(plain: str) -> str | None:
+def _replacement_in(plain: str, is_in_drivers: bool, is_near_contacts: bool) -> str | None:
+    if plain in ALLOWED:
+        return None
     for pattern, instead in RETIRED.items():
         if re.fullmatch(pattern, plain):
             return instead
+    retired = [*RETIRED_WORDS.items(), *(RETIRED_IN_DRIVERS.items() if is_in_drivers else ())]
+    if is_near_contacts:
+        retired.append(("leases?", "contact_timeout"))
     words = _words(plain)
-    for pattern, instead in RETIRED_WORDS.items():
+    for pattern, instead in retired:
         if re.search(rf"(?:^|_)(?:{pattern})(?:_|$)", words):
             return instead
     return None
 
 
-@cache
 def _words(plain: str) -> str:
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", plain).lower()
 

@@ -176,7 +176,11 @@ def test_recording_fails_without_a_file_when_the_disk_is_full(home: Path) -> Non
     (home / "rig.yaml").write_text(RIG, encoding="utf-8")
     era = Path(sys.executable).with_name("era")
     with subprocess.Popen(
-        [era, "sim", "rig.yaml", "--serial", "--finger", "0.1,0.1", "--record", "run.wav"],
+        # -B: bytecode would be cut off, too, and Python does not notice
+        [
+            *(sys.executable, "-B", era, "sim", "rig.yaml", "--serial"),
+            *("--finger", "0.1,0.1", "--record", "run.wav"),
+        ],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

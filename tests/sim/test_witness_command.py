@@ -142,7 +142,8 @@ async def test_witness_relays_a_wire_until_interrupted(
         options = ("--slack", "5000", "--record", str(capture))
         code = "import sys; from controller.cli.main import main; sys.exit(main())"
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-P", "-c", code, "witness", far.url, *options),
+            # -B: bytecode would be cut off, too, and Python does not notice
+            *(sys.executable, "-B", "-P", "-c", code, "witness", far.url, *options),
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
             cwd=example_rig_path().parent.parent,

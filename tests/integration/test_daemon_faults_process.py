@@ -280,6 +280,7 @@ async def test_daemon_plays_on_and_stops_without_descriptors(tmp_path: Path) -> 
             await other.stop()
 
 
+@pytest.mark.long
 async def test_daemon_combines_reloads_when_many_are_requested(tmp_path: Path) -> None:
     """During 20 SIGHUPs it plays on and leaks no descriptor; the last change is applied."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:

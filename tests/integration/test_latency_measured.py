@@ -1,4 +1,7 @@
-"""What the latency benchmark measures from outside, beside what the daemon says of itself."""
+"""What the latency benchmark measures from outside, beside what the daemon says of itself.
+
+Its short form starts no process: test_latency_report.py.
+"""
 
 from pathlib import Path
 
@@ -12,7 +15,7 @@ from model.table.file import save_table
 from model.table.table_cache import cached_table
 from patient_daemon import LOADING
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.long, pytest.mark.alone]
 
 SECONDS, TOUCHES = 1.0, 100
 

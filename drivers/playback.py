@@ -166,8 +166,8 @@ class Playback:
     """Voices of all channels, and the layers that they belong to; silent at first.
 
     voices: how many a channel has for tones that are not cut short. uncertainty [s]: by which
-    commits may come sooner or later; fades begin at the largest amplitude within it, so that levels
-    are upper bounds.
+    commits may come sooner or later; fades begin at the largest amplitude within it, and layers end
+    as late as they can, so that levels are upper bounds.
     """
 
     channels: int
@@ -188,7 +188,7 @@ class Playback:
         for one in layers:
             layer = self._layers.setdefault(one.layer, _Layer())
             if one.renew:
-                layer.ends = _end_of(one, time)
+                layer.ends = _end_of(one, time) + self.uncertainty
                 continue
             start = self._onsets_end(one.layer, time) if one.after else time
             layer.waiting = (start, one, token) if start > time else None
@@ -219,8 +219,9 @@ class Playback:
                 self._start(one, token, at)
             else:
                 self._end(number, at)
+        faded = time - self.uncertainty
         self._playing = [
-            tuple([each for each in voices if each.transition.last or each.transition.end > time])
+            tuple([each for each in voices if each.transition.last or each.transition.end > faded])
             for voices in self._playing
         ]
         self._note_changes()
@@ -234,6 +235,20 @@ class Playback:
                 if not voice.transition.last and voice.transition.end < first:
                     first = voice.transition.end
         self._changes_at = first
+
+    def add_ends(self, layer: int, time: float) -> None:
+        """Add copies of the voices of a layer that end by themselves at a time [s].
+
+        For bounds, where a set may have come before that or after.
+        """
+        ramp = self.ramp_of(layer)
+        for channel, voices in enumerate(self._playing):
+            ends = [
+                each.ended(time, ramp, self.uncertainty)
+                for each in voices
+                if each.layer == layer and not each.has_ended
+            ]
+            self._playing[channel] = (*voices, *ends)
 
     def scale(self, time: float, factor: float, ramp: float) -> None:
         """Take all tones that last to a factor of their level along a ramp [s], endings too."""
@@ -393,7 +408,8 @@ class Playback:
         if not commands:
             self._layers.pop(one.layer, None)
             return
-        self._layers[one.layer] = _Layer(token, one.ramp, one.valid_for, _end_of(one, time))
+        ends = _end_of(one, time) + self.uncertainty
+        self._layers[one.layer] = _Layer(token, one.ramp, one.valid_for, ends)
 
 
 def _end_of(one: LayerSet, time: float) -> float:

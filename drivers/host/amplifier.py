@@ -1,22 +1,24 @@
 """One amplifier of protocol 3, whatever its wire: who it is, and its requests."""
 
 import asyncio
+import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from drivers import clock
 from drivers.contents import Layer
-from drivers.errors import CommandError, CommandRefused, DriverError, LinkDegraded, LinkError
+from drivers.errors import CommandError, CommandRefused, LinkDegraded, LinkError, Preempted
+from drivers.guard.budget import COMMIT_DELAY
 from drivers.host.comparison import MAX_CONTRADICTIONS, name_of, problem_of
 from drivers.host.feeding import Feeding
 from drivers.host.ledger import Ledger
-from drivers.host.line import Line, Priority
+from drivers.host.line import ATTEMPTS, REPLY_TIMEOUT, Line, Priority
 from drivers.protocol.definition import is_newer_token
 from drivers.protocol.records import Values
 from drivers.protocol.serial_payload import speaks
 from drivers.protocol.sets import LayerSet, pack_layers, parts
-from drivers.protocol.table import FAULTS, MESSAGES, QUANTITIES, STATES, VERSION
+from drivers.protocol.table import FAULTS, MAX_WORDS, MESSAGES, QUANTITIES, STATES, VERSION
 from registry.limits import GuardLimits
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms
@@ -29,6 +31,9 @@ _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _ENABLED = STATES["OPERATION_ENABLED"]
 _LATCHED = tuple(STATES[name] for name in ("QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT"))
+PART_BYTES = 2 * MAX_WORDS
+"""Of the longest part of a set."""
+_logger = logging.getLogger(__name__)
 _POSITIVE = ("frequency_step", "level_step", "phase_step")
 
 
@@ -46,11 +51,15 @@ class Stopped:
 
 @dataclass(frozen=True, slots=True)
 class Staged:
-    """A set that an amplifier has staged: as the wire has it; is_exact: to the word."""
+    """A set that an amplifier has staged, or plays at once: as the wire has it.
+
+    is_exact: to the word; until: when [s] it must have been committed.
+    """
 
     token: int
     layers: tuple[LayerSet, ...]
     is_exact: bool
+    until: float
 
 
 class Amplifier:
@@ -144,52 +153,99 @@ class Amplifier:
         self.ledger.forget()
         return status
 
-    async def stage(self, token: int, layers: Sequence[Layer]) -> Staged:
-        """Stage a set under a token, admitted by the ledger when its turn on the line has come.
+    async def stage(self, token: int, layers: Sequence[Layer], *, now: bool = False) -> Staged:
+        """Stage a set under a token, or play it at once.
 
-        Raises CommandRefused with the reason; Preempted where a stop came first.
+        It is admitted by the ledger when its turn on the line has come. Raises CommandRefused with
+        the reason; Preempted where a stop came first.
         """
         cuts: list[Values] = []
 
         def first() -> tuple[str, Values]:
-            admitted = self.ledger.admit(layers, clock.now())
-            stream = pack_layers(admitted)
-            if len(stream) > self.capabilities["set_words"]:
-                max_words = self.capabilities["set_words"]
-                raise CommandRefused(
-                    f"a set must have at most {max_words} words, got {len(stream)}"
-                )
-            cuts[:] = parts(stream, session=self.session, token=token, now=False)
-            self._admitted = Staged(token, admitted, is_exact=True)
+            if not cuts:
+                moment = clock.now()
+                admitted = self.ledger.admit(layers, moment, delay=self._commit_delay)
+                stream = pack_layers(admitted)
+                if len(stream) > self.capabilities["set_words"]:
+                    limit = self.capabilities["set_words"]
+                    text = f"a set must have at most {limit} words, got {len(stream)}"
+                    raise CommandRefused(text)
+                cuts[:] = parts(stream, session=self.session, token=token, now=now)
+                until = moment + self._commit_delay
+                self._admitted = Staged(token, admitted, is_exact=True, until=until)
             return "Set", cuts[0]
 
-        priority = (
-            Priority.SET
-            if any(layer.tones or layer.renew for layer in layers)
-            else (Priority.SILENCE)
-        )
+        is_silent = not any(layer.tones or layer.renew for layer in layers)
+        priority = Priority.SILENCE if is_silent else Priority.SET
         taken = await self.line.submit(self, priority, first)
         for part in cuts[1:]:
-            taken = await self._request("Set", part, priority)
+            taken = await self.line.submit(self, priority, self._made("Set", part, token))
         staged = self._admitted
         if staged is None or staged.token != token or not (taken["staged"] or taken["played"]):
-            raise CommandRefused(f"amplifier {self.name}: set {token} was not staged")
-        self._admitted = Staged(token, staged.layers, is_exact=bool(taken["exact"]))
-        return self._admitted
+            raise Preempted(f"amplifier {self.name}: set {token} was not staged")
+        if taken["played"]:
+            self._confirm(token)
+        return replace(staged, is_exact=bool(taken["exact"]))
 
     async def commit(self, token: int) -> Values:
-        """Play the staged set; returns the status, which shows its tokens."""
+        """Play the staged set; returns the status, which shows its tokens.
+
+        Raises Preempted where a stop or disarm came first, CommandRefused where it is too late for
+        what the ledger has admitted.
+        """
         values = {"session": self.session, "token": token}
-        return await self._request("Commit", values, Priority.SET)
+        make = self._made("Commit", values, token)
+        return await self._request("Commit", values, Priority.SET, make=make)
+
+    def _made(self, name: str, values: Values, token: int) -> Callable[[], tuple[str, Values]]:
+        """Return what makes a request of the set that is admitted, as long as it is."""
+
+        def make() -> tuple[str, Values]:
+            self.check_admitted(token)
+            return name, values
+
+        return make
+
+    def check_admitted(self, token: int) -> None:
+        """Raise Preempted or CommandRefused unless a set may be played now."""
+        admitted = self._admitted
+        if admitted is None or admitted.token != token:
+            raise Preempted(f"amplifier {self.name}: a stop, disarm or newer set came first")
+        if clock.now() > admitted.until:
+            raise CommandRefused(
+                f"amplifier {self.name}: set {token} must be committed within "
+                f"{self._commit_delay:.3g} s; the wire is too slow or too busy"
+            )
+
+    @property
+    def _commit_delay(self) -> float:
+        """Longest time [s] from the admission of a set until it is committed."""
+        waiting = len(self.line.members) * self.line.wire.round_trip("Set", PART_BYTES)
+        return max(COMMIT_DELAY, ATTEMPTS * waiting)
+
+    def _confirm(self, token: int) -> None:
+        """Note that the amplifier plays the set with this token, as it says."""
+        self.ledger.resolve(token, clock.now())
+        if self._admitted is not None and self._admitted.token == token:
+            self._admitted = None
 
     async def silence(self, ramp: float) -> Values:
         """Let all layers fall silent along a ramp [s]; it stays armed."""
-        values = {"session": self.session, "ramp": _RAMP.to_wire(ramp)}
+        values = {"session": self.session, "ramp": self.wire_ramp(ramp)}
         return await self._request("Silence", values, Priority.SILENCE)
 
-    async def disarm(self, ramp: float = DISARM_RAMP) -> Values:
-        """Ramp [s] to silence, then switch the high voltage off."""
-        return await self._request("Disarm", {"ramp": _RAMP.to_wire(ramp)}, Priority.SILENCE)
+    async def disarm(self, ramp: float = DISARM_RAMP) -> None:
+        """Ramp [s] to silence, then switch the high voltage off; read back until it is silent.
+
+        Raises CommandRefused if it is not silent soon after the ramp, or still armed.
+        """
+        status = await self._request("Disarm", {"ramp": self.wire_ramp(ramp)}, Priority.SILENCE)
+        end = clock.now() + ramp + CONFIRM_TIMEOUT
+        while status["state"] == _ENABLED or not self._is_silent(status):
+            if clock.now() > end or status["state"] == _ENABLED:
+                raise CommandRefused(f"amplifier {self.name} is not silent after a disarm")
+            await asyncio.sleep(_INTERVAL)
+            status = await self.read_status(Priority.SILENCE)
 
     async def ping(self) -> Values:
         """Feed the watchdog; returns the status. Raises CommandRefused if it is not armed."""
@@ -202,41 +258,61 @@ class Amplifier:
             )
         return status
 
-    async def read_status(self) -> Values:
+    async def read_status(self, priority: Priority = Priority.OTHER) -> Values:
         """Read the status, which feeds nothing."""
-        return await self._request("GetStatus", {}, Priority.OTHER)
+        return await self._request("GetStatus", {}, priority)
 
     async def clear(self, latch: int | None = None) -> Values:
-        """Acknowledge the stop or fault with this latch, None for the last one."""
+        """Acknowledge the stop or fault with this latch, None for the newest that was shown."""
         if latch is None:
-            latch = (await self.read_status())["latch"]
+            latch = (await self.read_status())["latch"] if self.latch is None else self.latch
         return await self._request("Clear", {"latch": latch}, Priority.CLEAR)
 
     async def stop(self, ramp: float = STOP_RAMP, *, timeout: float = CONFIRM_TIMEOUT) -> Stopped:
         """Stop along a ramp [s], latched; repeated until it is confirmed, or for a time [s].
 
-        Confirmed by a status in a latched state whose latch is newer than every one seen before,
-        with the levels of all channels at zero: another one may be old, kept on its way.
+        The time counts from when the first is sent. Confirmed by a status in a latched state whose
+        latch is newer than every one seen before, with the levels of all channels at zero: another
+        one may be old, kept on its way.
         """
-        cause = ""
+        cause, is_sent = "", False
+        values = {"ramp": self.wire_ramp(ramp)}
+        members = len(self.line.members)
+        # On a line that others share each has three exchanges: a stop and two statuses.
+        timeout += ATTEMPTS * members * self.line.wire.round_trip("GetStatus", PART_BYTES // 4)
+        waiting = timeout * (members + 1)  # on a line that others keep busy
         try:
-            async with asyncio.timeout(timeout):
+            async with asyncio.timeout(waiting) as limit:
+
+                def make() -> tuple[str, Values]:
+                    nonlocal is_sent
+                    if not is_sent:
+                        limit.reschedule(asyncio.get_running_loop().time() + timeout)
+                    is_sent = True
+                    return "Stop", values
+
                 while True:
                     before = self.latch
                     try:
-                        values = {"ramp": _RAMP.to_wire(ramp)}
-                        status = await self._request("Stop", values, Priority.STOP)
+                        status = await self._request("Stop", values, Priority.STOP, make=make)
                         while is_stopping(status, before):
                             if self._is_silent(status):
                                 return Stopped(True, clock.now())
                             await asyncio.sleep(_INTERVAL)
-                            status = await self.read_status()
-                    except DriverError as error:
-                        cause = str(error)
-                    await asyncio.sleep(ramp + _INTERVAL)
+                            status = await self.read_status(Priority.STOP)
+                    except Exception as error:  # whatever it is, the stop goes on
+                        cause = str(error) or type(error).__name__
+                    await asyncio.sleep(_RAMP.from_wire(values["ramp"]) + _INTERVAL)
         except TimeoutError:
             cause = cause or f"silence was not reported within {timeout:g} s"
         return Stopped(False, self.feeding.may_play_until, cause)
+
+    def wire_ramp(self, ramp: float) -> int:
+        """Return the nearest ramp that the amplifier has: silence is never refused for it."""
+        highest = self.capabilities.get("ramp_max", _RAMP.maximum)
+        if math.isnan(ramp):
+            return _RAMP.to_wire(STOP_RAMP)
+        return min(_RAMP.to_wire(min(max(ramp, 0.0), _RAMP.high)), int(highest))
 
     def note_sent(self, name: str, values: Values, now: float) -> None:
         """Note a request that may have reached it."""
@@ -246,9 +322,12 @@ class Amplifier:
         if message.feeds and (name == "Arm" or values["session"] == self.session):
             self.feeding.may = now
         admitted = self._admitted
-        if name == "Commit" and admitted is not None and values["token"] == admitted.token:
-            self.ledger.sent(admitted.token, admitted.layers, now)
+        if message.name in ("Stop", "Disarm", "Silence", "Arm"):
             self._admitted = None
+        elif admitted is not None and values.get("token") == admitted.token:
+            is_last = name == "Set" and values["now"] and values["index"] == values["parts"] - 1
+            if name == "Commit" or is_last:
+                self.ledger.sent(admitted.token, admitted.layers, now)
 
     def note_heard(self) -> None:
         """Note that it has replied, whatever."""
@@ -261,7 +340,10 @@ class Amplifier:
     def note_event(self, values: Values) -> None:
         """Hand an event on."""
         for listener in self.listeners:
-            listener(values)
+            try:
+                listener(values)
+            except Exception:
+                _logger.exception("amplifier %s: a listener failed", self.name)
 
     def note_other_host(self) -> None:
         """Note that another host drives it: it must feed the watchdog within its longest time."""
@@ -285,16 +367,23 @@ class Amplifier:
             )
 
     async def _request(
-        self, name: str, values: Values, priority: Priority, *, timeout: float = 0.03
+        self,
+        name: str,
+        values: Values,
+        priority: Priority,
+        *,
+        timeout: float = REPLY_TIMEOUT,
+        make: Callable[[], tuple[str, Values]] | None = None,
     ) -> Values:
+        """Send a request, and note the status that its reply may be; make: of each attempt."""
         sent_at = 0.0
 
-        def make() -> tuple[str, Values]:
+        def made() -> tuple[str, Values]:
             nonlocal sent_at
             sent_at = clock.now()
-            return name, values
+            return (name, values) if make is None else make()
 
-        reply = await self.line.submit(self, priority, make, timeout=timeout)
+        reply = await self.line.submit(self, priority, made, timeout=timeout)
         if name == "Hello" or MESSAGES[name].reply is not MESSAGES["GetStatus"].reply:
             return reply
         self._note_status(name, values, reply, sent_at)
@@ -311,7 +400,7 @@ class Amplifier:
         if name in ("Stop", "Disarm", "Silence"):
             self._ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
             return
-        self._ledger.resolve(status["token"], now)
+        self._confirm(status["token"])
         fed = name != "Arm" and MESSAGES[name].feeds
         if fed or name == "Arm":
             self.feeding.since = sent_at

@@ -65,24 +65,24 @@ class ChannelBounds:
         ending_soon: Collection[int],
     ) -> None:
         self._ramps = ramps
-        self.steady = sum(
-            max(map(abs, _course(command)))
-            for one in waiting
-            for command in one.commands
-            if command.channel == channel
-        )
+        self.steady = 0.0
         self.paths: list[Path] = []
         self._rises: dict[float, list[tuple[float, float]]] = {}  # by frequency: rise, change
         commands = {
             number: next((each for each in one.commands if each.channel == channel), None)
             for number, one in layers.items()
         }
+        for one in waiting:
+            for waits in one.commands:
+                if waits.channel == channel and is_driven(waits):
+                    self._add_later(one, waits, voices, time)
         continued: set[int] = set()
         for voice in voices:
-            if voice.has_ended or voice.layer not in layers or voice.layer in ending_soon:
+            is_kept = voice.layer not in layers or layers[voice.layer].after
+            if voice.has_ended or is_kept or voice.layer in ending_soon:
                 self.steady += max(voice.transition.peak(time), _peak(voice.ending))
                 self._note_change(voice, time)
-                if voice.layer in ending_soon and not voice.has_ended:
+                if voice.layer in layers and not voice.has_ended:
                     ramp = _RAMP.from_wire(layers[voice.layer].ramp)
                     highest = voice.transition.peak(time)
                     self._note(voice.frequency, (highest, 0j), ramp, is_cosine=True)
@@ -94,7 +94,11 @@ class ChannelBounds:
             else:
                 self._fade(voice, one, command, time)
         for number, command in commands.items():
-            if command is not None and is_driven(command) and number not in continued:
+            if command is None or not is_driven(command) or number in continued:
+                continue
+            if layers[number].after:
+                self._add_later(layers[number], command, voices, time)
+            else:
                 self._start(layers[number], command)
 
     @property
@@ -141,6 +145,27 @@ class ChannelBounds:
         self.paths.append(_path(0.0, one, command, step))
         self._note(frequency, (0j, *_course(command)), step, is_cosine=is_cosine)
         self._note_ending(frequency, command, (0j,))
+
+    def _add_later(
+        self, one: LayerSet, command: Command, voices: Sequence[Voice], time: float
+    ) -> None:
+        """Add a command that starts at another time, with the largest that it may reach.
+
+        It may continue a voice of its layer from wherever that is then, or let it fade.
+        """
+        frequency, course = command.frequency / _FREQUENCY.per_unit, _course(command)
+        starts = [0j]
+        for voice in voices:
+            if voice.layer == one.layer and not voice.has_ended:
+                points = _points(voice.transition, time)
+                faded = (max(points, key=abs), 0j)
+                self._note(voice.frequency, faded, _RAMP.from_wire(one.ramp), is_cosine=True)
+                starts += points if voice.frequency == frequency else ()
+        farthest = max(starts, key=lambda start: abs(course[0] - start))
+        step, is_cosine = _step(one, command), not _knots(command.onset)
+        self.steady += max(*map(abs, course), _peak(command.ending))
+        self._note(frequency, (farthest, *course), step, is_cosine=is_cosine)
+        self._note_ending(frequency, command, starts)
 
     def _note_ending(self, frequency: float, command: Command, starts: Sequence[complex]) -> None:
         """Note the ending of a command, which may rise, from wherever its way is by then."""

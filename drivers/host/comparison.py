@@ -38,7 +38,7 @@ def problem_of(
 def _token_problem(status: Values, ledger: Ledger, now: float) -> str | None:
     playback = ledger.playback
     playback.advance(now - ledger.lag)
-    if playback.next_due <= now:  # a layer may have ended, or not yet
+    if playback.next_due - 2 * ledger.lag <= now:  # a layer may have ended, or not yet
         return None
     expected = playback.tokens
     for layer, token in enumerate(status["tokens"]):
@@ -54,7 +54,7 @@ def _level_problem(status: Values, ledger: Ledger, sent_at: float, now: float) -
         return f"levels must be {playback.channels}, got {len(status['levels'])}"
     tolerance = _STEPS * max(ledger.capabilities["level_step"], 1)
     for channel, level in enumerate(status["levels"]):
-        highest, is_settled = 0.0, playback.next_due > now
+        highest, is_settled = 0.0, playback.next_due - 2 * ledger.lag > now
         for voice in playback.voices_of(channel):
             highest += voice.transition.peak(late)
             is_settled = is_settled and voice.transition.end <= late

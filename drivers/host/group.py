@@ -2,16 +2,18 @@
 
 import asyncio
 import random
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 from drivers.contents import Layer
 from drivers.errors import CommandRefused, LinkError, Preempted
 from drivers.host.amplifier import DISARM_RAMP, STOP_RAMP, WATCHDOG, Amplifier, Staged, Stopped
-from drivers.host.line import Line
+from drivers.host.comparison import name_of
+from drivers.host.line import Line, Priority
 from drivers.protocol.definition import token_after
 from drivers.protocol.records import Values
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.table import QUANTITIES, STATES
 
 _T = TypeVar("_T")
 _SESSION, _TOKEN = QUANTITIES["session"], QUANTITIES["token"]
@@ -42,49 +44,75 @@ class Group:
     async def arm(self, watchdog: float = WATCHDOG) -> None:
         """Switch the high voltage on at level zero on all amplifiers; watchdog [s].
 
-        None stays armed if one fails. One session, so that a broadcast reaches all of a line.
+        None of those that this has armed stays so if one fails. One session, so that a broadcast
+        reaches all of a line. If all are armed, nothing changes.
         """
+        if self.is_armed:
+            return
         for amplifier in self.amplifiers.values():
             amplifier.check_other_host()  # before a disarm of what failed would end its vibration
         before = self._silences
         session = self._draw(_SESSION.minimum, _SESSION.maximum)
+        members = [*self.amplifiers.values()]
+        task = asyncio.gather(
+            *(each.arm(session, watchdog) for each in members), return_exceptions=True
+        )
         try:
-            await _all(each.arm(session, watchdog) for each in self.amplifiers.values())
+            results = await asyncio.shield(task)
+            errors = [each for each in results if isinstance(each, BaseException)]
+            if errors:
+                raise errors[0]
             if self._silences != before:
                 raise Preempted("a stop or disarm came first; arm again if that is still wanted")
         except BaseException:
-            await self.disarm(STOP_RAMP)
+            results = await task
+            # One that has refused was not armed by this, but perhaps by another host.
+            await self._disarm(
+                each
+                for each, result in zip(members, results, strict=True)
+                if not isinstance(result, CommandRefused)
+            )
             raise
         self.is_armed = True
 
     async def apply(self, layers: Mapping[str, Sequence[Layer]]) -> Mapping[str, Staged]:
         """Play layers on the amplifiers of these names, all from one moment on.
 
-        Refused on one means committed on none, and CommandRefused. What goes wrong after the first
-        commit stops all amplifiers.
+        Refused on one means committed on none, and CommandRefused. A lost link, silence that fails,
+        and what goes wrong after the first commit stop all amplifiers. Silence alone is not staged.
         """
+        self._check_armed()
         before = self._silences
         self._token = token = token_after(self._token)
-        staged = await _all(
-            self.amplifiers[name].stage(token, several) for name, several in layers.items()
+        is_silent = not any(
+            one.tones or one.renew for several in layers.values() for one in several
         )
-        if self._silences != before or not self.is_armed:
-            raise Preempted("a stop or disarm came first")
+        is_committing = is_silent
         try:
-            statuses = await self._commit([*layers], token)
-            for name, status in zip(layers, statuses, strict=True):
-                if status["token"] != token:
-                    raise CommandRefused(
-                        f"amplifier {name}: token must be {token}, got {status['token']}"
-                    )
-        except BaseException:
-            if self._silences == before:
+            staged = await _all(
+                self.amplifiers[name].stage(token, several, now=is_silent)
+                for name, several in layers.items()
+            )
+            if self._silences != before or not self.is_armed:
+                raise Preempted("a stop or disarm came first")
+            is_committing = True
+            if not is_silent:
+                statuses = await self._commit([*layers], token)
+                for name, status, one in zip(layers, statuses, staged, strict=True):
+                    _check_plays(name, status, one)
+        except BaseException as error:
+            is_kept = isinstance(error, CommandRefused) and not is_committing
+            if self._silences == before and not is_kept:
                 await self.stop()
             raise
         return dict(zip(layers, staged, strict=True))
 
     async def beat(self) -> None:
-        """Feed the watchdog of every amplifier; what fails stops all of them."""
+        """Feed the watchdog of every amplifier; what fails stops all of them.
+
+        Raises CommandRefused, and feeds nothing, unless they are armed.
+        """
+        self._check_armed()
         before = self._silences
         try:
             await _all(amplifier.ping() for amplifier in self.amplifiers.values())
@@ -93,31 +121,52 @@ class Group:
                 await self.stop()
             raise
 
+    def _check_armed(self) -> None:
+        if not self.is_armed:
+            raise CommandRefused("the amplifiers must be armed; clear a stop, then arm")
+
     async def silence(self, ramp: float) -> None:
         """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed."""
         await _all(amplifier.silence(ramp) for amplifier in self.amplifiers.values())
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> None:
-        """Ramp [s] to silence and switch the high voltage off, on every amplifier that replies."""
+        """Ramp [s] to silence and switch the high voltage off, read back from every amplifier.
+
+        It goes on to its end if its caller is cancelled. Where one fails all are stopped.
+        """
         self.is_armed = False
         self._silences += 1
-        results = await asyncio.gather(
-            *(amplifier.disarm(ramp) for amplifier in self.amplifiers.values()),
-            return_exceptions=True,
+        await asyncio.shield(
+            asyncio.ensure_future(self._disarm(self.amplifiers.values(), ramp=ramp))
         )
-        for result in results:
-            if isinstance(result, BaseException):
-                raise result
+
+    async def _disarm(self, members: Iterable[Amplifier], *, ramp: float = STOP_RAMP) -> None:
+        results = await asyncio.gather(
+            *(amplifier.disarm(ramp) for amplifier in members), return_exceptions=True
+        )
+        errors = [each for each in results if isinstance(each, BaseException)]
+        if errors:
+            await self.stop()
+            raise errors[0]
 
     async def stop(self, ramp: float = STOP_RAMP) -> Mapping[str, Stopped]:
         """Stop every amplifier along a ramp [s], latched; what became of it, by name.
 
-        It goes on to its end if its caller is cancelled.
+        Those of one line by a broadcast first. It goes on to its end if its caller is cancelled.
         """
         self.is_armed = False
         self._silences += 1
-        task = asyncio.gather(*(each.stop(ramp) for each in self.amplifiers.values()))
-        stopped = await asyncio.shield(task)
+        members = [*self.amplifiers.values()]
+        for line in {each.line for each in members if len(each.line.members) > 1}:
+            values = {"ramp": members[0].wire_ramp(ramp)}
+            line.broadcast(Priority.STOP, partial(_same, "Stop", values)).add_done_callback(_seen)
+        task = asyncio.gather(*(each.stop(ramp) for each in members), return_exceptions=True)
+        stopped = [
+            Stopped(False, each.feeding.may_play_until, repr(result))
+            if isinstance(result, BaseException)
+            else result
+            for each, result in zip(members, await asyncio.shield(task), strict=True)
+        ]
         return dict(zip(self.amplifiers, stopped, strict=True))
 
     async def clear(self) -> None:
@@ -131,8 +180,9 @@ class Group:
             by_line.setdefault(self.amplifiers[name].line, []).append(self.amplifiers[name])
         requests: dict[Amplifier, Awaitable[Values]] = {}
         for line, several in by_line.items():
-            if len(several) > 1 and line.is_free:
-                line.broadcast("Commit", {"session": several[0].session, "token": token})
+            if len(several) > 1:
+                sent = line.broadcast(Priority.SET, partial(_commit_of, several, token))
+                sent.add_done_callback(_seen)
                 requests.update((each, _status_of(each, token)) for each in several)
             else:
                 requests.update((each, each.commit(token)) for each in several)
@@ -145,9 +195,42 @@ class Group:
         return max(each.feeding.may_play_until for each in self.amplifiers.values())
 
 
+def _same(name: str, values: Values) -> tuple[str, Values]:
+    return name, values
+
+
+def _commit_of(several: Sequence[Amplifier], token: int) -> tuple[str, Values]:
+    """Return the commit of all amplifiers of a line; raises unless each may play its set now."""
+    for amplifier in several:
+        amplifier.check_admitted(token)
+    return "Commit", {"session": several[0].session, "token": token}
+
+
+def _seen(sent: "asyncio.Future[Values]") -> None:
+    """Retrieve the error of a broadcast: what each amplifier says afterwards decides."""
+    if not sent.cancelled():
+        sent.exception()
+
+
+def _check_plays(name: str, status: Values, staged: Staged) -> None:
+    """Raise CommandRefused unless a status shows that a set plays, in each of its layers."""
+    for one in staged.layers:
+        is_lasting = any(command.level > 0 for command in one.commands) and not one.after
+        if is_lasting and status["tokens"][one.layer] != staged.token:
+            got = status["tokens"][one.layer]
+            raise CommandRefused(
+                f"amplifier {name}: token of layer {one.layer} must be {staged.token}, got {got}"
+            )
+    if status["token"] != staged.token or status["state"] != STATES["OPERATION_ENABLED"]:
+        raise CommandRefused(
+            f"amplifier {name}: token must be {staged.token} while armed, got {status['token']} in "
+            f"state {name_of(STATES, status['state'])}"
+        )
+
+
 async def _status_of(amplifier: Amplifier, token: int) -> Values:
     """Read the status after a broadcast, and commit again where that was lost."""
-    status = await amplifier.read_status()
+    status = await amplifier.read_status(Priority.SET)
     return status if status["token"] == token else await amplifier.commit(token)
 
 

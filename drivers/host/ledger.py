@@ -54,27 +54,35 @@ class Ledger:
         self.playback = Playback(self.capabilities["channels"], self.capabilities["voices"])
         self.lag, self._doubt = 0.0, None
 
-    def admit(self, layers: Sequence[Layer], now: float) -> tuple[LayerSet, ...]:
+    def admit(
+        self, layers: Sequence[Layer], now: float, *, delay: float = COMMIT_DELAY
+    ) -> tuple[LayerSet, ...]:
         """Return layers as the wire has them, `valid_for` shortened to what time is left.
 
-        Raises CommandRefused with channel and reason; nothing changes then.
+        delay [s]: within which they are committed. Raises CommandRefused with channel and reason;
+        nothing changes then.
         """
         numbers = [layer.number for layer in layers]
         if len(set(numbers)) < len(numbers) or not numbers:
             raise CommandRefused(f"a set must have each layer once, at least one, got {numbers}")
         try:
             requested = tuple([self._on_wire(layer) for layer in layers])
-        except (TypeError, ValueError) as error:
+        except (ArithmeticError, TypeError, ValueError) as error:
             raise CommandRefused(f"a set must have numbers in its range: {error}") from error
         if not any(is_vibrating(one) for one in requested):
-            return self._silence(requested, now)
+            return self._silence(requested, now, delay)
         if self._doubt is not None:
             raise CommandRefused(f"set {self.doubt} must be confirmed first; read the status")
-        self._check_sums(requested, now)
-        return self._within_budget(requested, now)
+        self._check_sums(requested, now, delay)
+        return self._within_budget(requested, now, delay)
 
     def sent(self, token: int, layers: tuple[LayerSet, ...], now: float) -> None:
-        """Note that a set may play from now on: it was committed, and is in doubt."""
+        """Note that a set may play from now on: it was committed, and is in doubt.
+
+        Again, where its commit is repeated: it may have played since the first time.
+        """
+        if self.doubt == token:
+            return
         lasts = max((self._lasts(one) for one in layers), default=0.0)
         is_vibration = any(is_vibrating(one) for one in layers)
         before = self._budget.sent(now, lasts=lasts) if is_vibration else None
@@ -86,9 +94,13 @@ class Ledger:
             return
         token, layers, sent_at, _ = self._doubt
         self._doubt = None
-        if self.playback.is_settled(sent_at - self.lag):
+        if self.playback.is_settled(sent_at - self.lag) and self.playback.next_due == math.inf:
             self.lag = 0.0
         self.lag = self.playback.uncertainty = max(self.lag, now - sent_at)
+        for one in layers:
+            ends = self.playback.end_of(one.layer)
+            if not one.renew and sent_at < ends and ends - 2 * self.lag <= now:
+                self.playback.add_ends(one.layer, sent_at)
         self.playback.commit(layers, token, sent_at)
         if not self._budget.is_unlimited:
             self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
@@ -192,13 +204,15 @@ class Ledger:
         )
         return Envelope(math.ceil(shape.step * _STEP.per_unit - _SLACK), knots)
 
-    def _silence(self, layers: tuple[LayerSet, ...], now: float) -> tuple[LayerSet, ...]:
+    def _silence(
+        self, layers: tuple[LayerSet, ...], now: float, delay: float
+    ) -> tuple[LayerSet, ...]:
         """Return silent layers, their ramps within the time that is left, endings only if safe."""
         left = self._budget.fade_left(now)
         silent = tuple(_within_ramp(one, left) for one in layers)
         try:
             if self._doubt is None:
-                self._check_sums(silent, now)
+                self._check_sums(silent, now, delay)
                 return silent
         except CommandRefused:
             pass
@@ -208,8 +222,8 @@ class Ledger:
         )
         return tuple(replace(one, commands=commands) for one in silent)
 
-    def _check_sums(self, layers: Sequence[LayerSet], now: float) -> None:
-        late, until = now - self.lag, now + COMMIT_DELAY
+    def _check_sums(self, layers: Sequence[LayerSet], now: float, delay: float) -> None:
+        late, until = now - self.lag, now + delay + self.lag  # ends are as late as they can be
         self.playback.advance(late)
         if self.limits.slew == math.inf and self._is_plain_and_within(layers, late, until):
             return
@@ -247,10 +261,12 @@ class Ledger:
             return True
         return all(math.hypot(*levels) ** 2 <= self.limits.power * TOLERANCE for levels in ends)
 
-    def _within_budget(self, layers: tuple[LayerSet, ...], now: float) -> tuple[LayerSet, ...]:
+    def _within_budget(
+        self, layers: tuple[LayerSet, ...], now: float, delay: float
+    ) -> tuple[LayerSet, ...]:
         """Shorten `valid_for` to the on-time and duty that are left."""
         fade = max(self._fade(one) for one in layers)
-        remaining = self._budget.remaining(now, fade=fade, delay=COMMIT_DELAY)
+        remaining = self._budget.remaining(now, fade=fade, delay=delay)
         if remaining == math.inf:
             return layers
         left = math.floor(min(remaining, _VALID_FOR.high) * _VALID_FOR.per_unit)

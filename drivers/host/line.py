@@ -94,12 +94,12 @@ class Member(Protocol):
 
 @dataclass(eq=False, slots=True)
 class Job:
-    """A request from its queueing to its result.
+    """A request from its queueing to its result; member: None for a broadcast.
 
     make: name and values of each attempt, in its turn; raises CommandRefused. attempts: left.
     """
 
-    member: Member
+    member: Member | None
     priority: Priority
     make: Callable[[], tuple[str, Values]]
     attempts: int
@@ -159,8 +159,28 @@ class Line:
         Or raises LinkError, LinkTimeout, FrameError, CommandRefused; Preempted where another
         request came first.
         """
+        return self._submit(member, priority, make, timeout, attempts)
+
+    def broadcast(
+        self, priority: Priority, make: Callable[[], tuple[str, Values]]
+    ) -> "asyncio.Future[Values]":
+        """Queue a request to every amplifier of the line; the future ends once it was sent.
+
+        There is no reply. Raises LinkError; Preempted where a stop came first.
+        """
+        return self._submit(None, priority, make, 0.0, 1)
+
+    def _submit(
+        self,
+        member: Member | None,
+        priority: Priority,
+        make: Callable[[], tuple[str, Values]],
+        timeout: float,
+        attempts: int,
+    ) -> "asyncio.Future[Values]":
         for queued in [*self._queue]:
-            if queued.member is member and queued.priority in _SUPERSEDED.get(priority, ()):
+            is_meant = member is None or queued.member is member
+            if is_meant and queued.priority in _SUPERSEDED.get(priority, ()):
                 self._fail(queued, Preempted(SUPERSEDED))
         self._number += 1
         future = self._loop.create_future()
@@ -172,20 +192,6 @@ class Line:
             self._preempt()
             self.pump()
         return future
-
-    def broadcast(self, name: str, values: Values) -> float:
-        """Send a request to every amplifier of the line, at once; when [s] it was sent.
-
-        Only on a line that is free: there is no reply. Raises LinkError.
-        """
-        now = clock.now()
-        self._write(0, name, values, now)
-        return now
-
-    @property
-    def is_free(self) -> bool:
-        """Whether no request is on the line."""
-        return self._current is None
 
     def received(self, data: bytes) -> None:
         """Take bytes from the port."""
@@ -202,10 +208,15 @@ class Line:
             if job is None:
                 continue
             if isinstance(arrival, More):
-                self._port.write(arrival.data)
+                try:
+                    self._port.write(arrival.data)
+                except LinkError as error:
+                    self.lose(str(error))
+                    return
                 continue
             self._current = None
-            job.member.note_heard()
+            if job.member is not None:
+                job.member.note_heard()
             if isinstance(arrival, Nak):
                 self._refused(job, arrival)
             elif isinstance(arrival, Broken):
@@ -255,8 +266,12 @@ class Line:
     def _start(self, job: Job) -> None:
         try:
             name, values = job.make()
-            job.member.check_request(name)
             now = clock.now()
+            if job.member is None:
+                self._write(0, name, values, now)
+                job.result.set_result({})
+                return
+            job.member.check_request(name)
             job.due = now + self._write(job.member.address, name, values, now) + job.timeout
             job.attempts -= 1
             job.looks = 0
@@ -288,9 +303,13 @@ class Line:
     def _repeat(self, job: Job, *, pause: float = 0.0) -> None:
         """Queue a request again, unless another one of its amplifier comes before it."""
         overtaken = any(
-            other.member is job.member and job.priority in _SUPERSEDED.get(other.priority, ())
+            other.member in (job.member, None)
+            and job.priority in _SUPERSEDED.get(other.priority, ())
             for other in self._queue
         )
+        # Behind those of the same priority, so that a mute amplifier does not keep others waiting.
+        self._number += 1
+        job.number = self._number
         if overtaken:
             self._fail(job, Preempted(SUPERSEDED))
         else:
@@ -365,5 +384,6 @@ class Line:
         if job.attempts > 0:
             self._repeat(job)
             return
-        job.member.note_silence(cause)
+        if job.member is not None:
+            job.member.note_silence(cause)
         self._fail(job, LinkTimeout(f"{cause}; check that the amplifier is switched on"))

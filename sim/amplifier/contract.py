@@ -261,6 +261,9 @@ class Amplifier:
                 self._enter(following, now)
                 self.tick(now)
             case "Silence":
+                if values["ramp"] > self.capabilities["ramp_max"]:
+                    limit = self.capabilities["ramp_max"]
+                    raise Refusal(f"ramp must be at most {limit}, got {values['ramp']}")
                 self._silence(now, ramp=_Q["ramp"].from_wire(values["ramp"]))
             case "Clear":
                 self._clear(values["latch"], following, now)

@@ -43,7 +43,7 @@ class SetIntake:
             if now - self._began <= STAGED_LIFE:
                 return self._staged[1]  # a part came again
             self._staged = None
-        if self._is_older_than_parts(token, now):
+        if self._is_older_than_kept(token, now):
             raise Refusal("token must be newer than that of the set under way", "BAD_TOKEN")
         stream = self._parts.add(part, now, self.capabilities["set_words"])
         if self._parts.began == now:
@@ -83,11 +83,14 @@ class SetIntake:
         self.drop()
         self.committed = 0
 
-    def _is_older_than_parts(self, token: int, now: float) -> bool:
-        under_way = self._parts.token if self._parts.count else 0
-        if not under_way or under_way == token or now - self._parts.began > STAGED_LIFE:
-            return False
-        return not is_newer_token(token, under_way)
+    def _is_older_than_kept(self, token: int, now: float) -> bool:
+        """Whether a token is older than that of the set under way, or of the staged one."""
+        kept = []
+        if self._parts.count and now - self._parts.began <= STAGED_LIFE:
+            kept.append(self._parts.token)
+        if self._staged is not None and now - self._began <= STAGED_LIFE:
+            kept.append(self._staged[0])
+        return any(token != other and not is_newer_token(token, other) for other in kept)
 
     def _check(self, layer: LayerSet) -> None:
         can = self.capabilities

@@ -106,10 +106,10 @@ class MemoryLine:
         self.inward: Alter = unaltered
         self.outward: Alter = unaltered
         self.sent: list[tuple[float, str]] = []
-        self._kind = KINDS[kind]
+        self.kind = KINDS[kind]
         self._sending = self._handling = ""
-        self._end = self._kind.far_end(dict(enumerate(self.far.values(), 1)), self._send)
-        self.line = Line(self._kind.wire(), self, "line")
+        self._end = self.kind.far_end(dict(enumerate(self.far.values(), 1)), self._send)
+        self.line = Line(self.kind.wire(), self, "line")
         self.hosts = {
             each: Host(self.line, address, LIMITS, name=each)
             for address, each in enumerate(names, 1)
@@ -117,7 +117,7 @@ class MemoryLine:
 
     def write(self, data: bytes) -> None:
         """Send bytes of the host."""
-        if (request := self._kind.request_of(data)) is not None:
+        if (request := self.kind.request_of(data)) is not None:
             address, number = request
             self.sent.append((self.loop.time(), f"{address}:{number}"))
             self._sending = BY_NUMBER[number].name if number in BY_NUMBER else "Hello"

@@ -5,7 +5,7 @@ What a person would feel is read from the simulated amplifiers themselves.
 
 import asyncio
 import random
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 
 import pytest
 
@@ -15,6 +15,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.host.wire import Broken
 from drivers.protocol.records import Values
+from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import STATES
 from virtual_loop import run_virtual
 from words_line import KINDS, Alter, MemoryLine, unaltered
@@ -401,3 +402,154 @@ def test_late_replies_are_credited_to_nothing(wire: str) -> None:
         assert ends[0].line.wire.counters.unexpected_frames == 1
 
     with_group(test, wire, ("a",))
+
+
+@pytest.mark.parametrize("alone", ["b", "abcd"])
+def test_stop_reaches_those_beside_a_mute_amplifier(alone: str) -> None:
+    """On one serial line: all that hear are silent within 10 ms, and the last is confirmed."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        (end,) = ends
+        await group.apply({name: [layer(0, tone())] for name in end.hosts})
+        muted = {end.hosts[name].address for name in alone}
+        end.inward = lambda name, data: [] if end.kind.request_of(data)[0] in muted else [(0, data)]  # type: ignore[index]
+        stopping = asyncio.ensure_future(group.stop())
+        await asyncio.sleep(0.01)
+        assert all(end.levels(name) == [0.0, 0.0] for name in end.hosts)
+        stopped = await stopping
+        assert stopped["e"].is_confirmed
+        assert not any(stopped[name].is_confirmed for name in alone)
+
+    with_group(test, "serial", tuple("abcde"))
+
+
+def test_ledger_knows_what_a_lost_broadcast_started(wire: str) -> None:
+    """The repeated commit is noted: what is too loud beside it is refused."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        ends[0].inward = losing("Commit")
+        await group.apply({name: [layer(0, tone(level=0.6))] for name in "ab"})
+        for name in "ab":
+            assert group.amplifiers[name].ledger.playback.tokens == {0: 78}
+        with pytest.raises(CommandRefused):
+            await group.apply({name: [layer(1, Tone(0, 150.0, 0.5))] for name in "ab"})
+        await group.beat()
+
+    with_group(test, wire, ("a", "b"))
+
+
+async def stopped_by_hand(group: Group) -> None:
+    """A stop."""
+    await group.stop()
+
+
+@pytest.mark.parametrize("end_by", [stopped_by_hand, Group.disarm])
+def test_nothing_is_fed_or_played_once_it_is_not_armed(
+    end_by: Callable[[Group], Awaitable[None]],
+) -> None:
+    """A beat and a set after a stop or disarm send nothing, also where that was not confirmed."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        await end_by(group)
+        ends[0].sent.clear()
+        for late in (group.beat(), group.apply({"a": [layer(0, tone())]})):
+            with pytest.raises(CommandRefused):
+                await late
+        assert ends[0].sent == []
+
+    with_group(test, "serial", ("a",))
+
+
+def test_disarm_goes_on_where_its_caller_is_cancelled() -> None:
+    """Behind a request that has no reply: silent and switched off all the same."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        await group.apply({"a": [layer(0, tone())]})
+        ends[0].outward = losing("GetStatus")
+        reading = asyncio.ensure_future(group.amplifiers["a"].read_status())
+        disarming = asyncio.ensure_future(group.disarm())
+        await asyncio.sleep(0.001)
+        disarming.cancel()
+        await asyncio.wait([reading, disarming])
+        await asyncio.sleep(0.1)
+        assert ends[0].levels("a") == [0.0, 0.0]
+        assert ends[0].far["a"].state == "SWITCH_ON_DISABLED"
+
+    with_group(test, "serial", ("a",))
+
+
+def test_disarm_that_is_ignored_stops() -> None:
+    """A far end that keeps playing after Disarm: an error, and silent by the stop."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        (far,) = ends[0].far.values()
+        handle = far.handle
+
+        def ignore(name: str, values: Values, now: float) -> Values:
+            return handle("GetStatus", {}, now) if name == "Disarm" else handle(name, values, now)
+
+        await group.apply({"a": [layer(0, tone())]})
+        far.handle = ignore  # type: ignore[method-assign]
+        with pytest.raises(CommandRefused):
+            await group.disarm()
+        assert ends[0].levels("a") == [0.0, 0.0]
+
+    with_group(test, "serial", ("a",))
+
+
+def test_silence_that_fails_on_one_stops_all() -> None:
+    """A finger was lifted and one amplifier does not hear it: nothing goes on playing."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        await group.apply({name: [layer(0, tone())] for name in "ab"})
+        ends[1].inward = losing("Set", count=3)
+        with pytest.raises(LinkError):
+            await group.apply({name: [layer(0)] for name in "ab"})
+        assert (ends[0].levels("a"), ends[1].levels("b")) == ([0.0, 0.0], [0.0, 0.0])
+        assert not group.is_armed
+
+    with_group(test, "serial", ("a",), ("b",))
+
+
+def test_set_that_would_be_committed_too_late_is_not() -> None:
+    """The ledger admitted it for a tenth of a second; its commit is lost until after that."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        ends[0].inward = losing("Commit", count=2)
+        ends[1].inward = losing("Set", count=2)
+        with pytest.raises(CommandRefused):
+            await group.apply({name: [layer(0, tone())] for name in "ab"})
+        assert (ends[0].levels("a"), group.is_armed) == ([0.0, 0.0], False)
+
+    with_group(test, "serial", ("a",), ("b",))
+
+
+def test_set_that_plays_in_part_stops() -> None:
+    """An amplifier that commits one of two layers says the token of the set all the same."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        far = ends[0].far["a"].playback
+        commit = far.commit
+
+        def first_alone(layers: Sequence[LayerSet], token: int, time: float) -> None:
+            commit(layers[:1], token, time)
+
+        far.commit = first_alone  # type: ignore[method-assign]
+        with pytest.raises(CommandRefused):
+            await group.apply({"a": [layer(0, tone()), layer(1, Tone(0, 150.0, 0.2))]})
+        assert (ends[0].levels("a"), group.is_armed) == ([0.0, 0.0], False)
+
+    with_group(test, "serial", ("a",))
+
+
+def test_listener_that_fails_loses_no_reply() -> None:
+    """An event and the reply of the stop that caused it come in one read."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        def fail(values: Values) -> None:
+            raise RuntimeError("listener")
+
+        group.amplifiers["a"].listeners.append(fail)
+        assert (await group.stop())["a"].is_confirmed
+
+    with_group(test, "serial", ("a",))

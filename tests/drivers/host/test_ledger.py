@@ -201,12 +201,14 @@ def random_layer(random_: random.Random, number: int) -> Layer:
     )
     ramp = random_.choice((0.005, 0.02, 0.08)) if tones else 0.08  # silence is never refused
     valid_for = random_.choice((0.0, 0.05, 0.2))
+    if valid_for and random_.random() < 0.1:
+        return Layer(number, renew=True, valid_for=valid_for)
     return Layer(number, tones, ramp, valid_for, after=bool(tones) and random_.random() < 0.2)
 
 
 @pytest.mark.parametrize("seed", range(12))
 def test_what_is_admitted_stays_within_the_limits_whenever_it_is_played(seed: int) -> None:
-    """Random sets, each played up to 10 ms after it was sent: level, power and rise every 0.5 ms.
+    """Random sets, each played up to 90 ms after it was sent: level, power and rise every 0.5 ms.
 
     A jump of a ramp counts within one step of the sampling.
     """
@@ -221,8 +223,8 @@ def test_what_is_admitted_stays_within_the_limits_whenever_it_is_played(seed: in
             layers = ledger.admit([random_layer(random_, number) for number in numbers], now)
         except CommandRefused:
             layers = ()
-        commit = now + random_.choice((0.0, 0.001, 0.01))
-        until = now + random_.choice((0.012, 0.03, 0.1))
+        commit = now + random_.choice((0.0, 0.001, 0.01, 0.09))
+        until = max(commit + 0.002, now + random_.choice((0.012, 0.03, 0.1)))
         if layers:
             admitted += 1
             ledger.sent(token, layers, now)

@@ -230,6 +230,17 @@ def test_set_is_staged_in_parts_and_committed_once() -> None:
     assert refused(amplifier, "Commit", {"session": 7, "token": 6}, 0.2) == "INCOMPLETE"
 
 
+def test_late_copy_of_an_older_set_discards_no_staged_one() -> None:
+    """Set 10 is staged, a copy of 9 comes late: refused, and 10 plays."""
+    amplifier = armed()
+    for token in (9, 10):
+        one = LayerSet(0, 0, 0, (tone(0, 2000, 1000 * token),))
+        assert amplifier.handle("Set", part_of(token, one, now=False), 0.05)["staged"]
+    late = part_of(9, LayerSet(0, 0, 0), now=False)
+    assert refused(amplifier, "Set", late) == "BAD_TOKEN"
+    assert amplifier.handle("Commit", {"session": 7, "token": 10}, 0.1)["levels"] == [10000, 0]
+
+
 def test_staged_set_expires_a_second_after_its_first_part() -> None:
     """At 1.01 s its commit is refused."""
     for late, at in ((False, 0.99), (True, 1.01)):

@@ -107,6 +107,16 @@ def test_layers_are_bounded_together() -> None:
     assert ledger.admit([Layer(1, (tone(level=0.9, frequency=200),))], 1.03)
 
 
+def test_set_that_waits_counts_with_its_ending() -> None:
+    """Level 0.1 with an ending through 0.8 waits: 0.3 beside it is refused, 0.15 is not."""
+    ledger = Ledger(WIDE, CAN)
+    onset, ending = Shape(0.05, (0.05,)), Shape(0.01, (0.8,))
+    play(ledger, 1, 0.0, Layer(0, (tone(level=0.05, onset=onset),)))
+    play(ledger, 2, 0.01, Layer(0, (tone(level=0.1, ending=ending),), after=True))
+    refusal(ledger, Layer(1, (tone(level=0.3, frequency=200),)), at=0.02)
+    assert ledger.admit([Layer(1, (tone(level=0.15, frequency=200),))], 0.02)
+
+
 def test_cross_fade_at_full_level_is_admitted() -> None:
     """Gains of a raised cosine add up to one, in power to less than one."""
     ledger = Ledger(replace(WIDE, power=1.0), CAN)

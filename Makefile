@@ -60,7 +60,7 @@ test-busy: .venv/installed-test
 		--dist loadfile --no-loadscope-reorder $(BUSY)
 
 # The model's tests, the typed pages and the demonstration with the arithmetic of four kinds of
-# processor, and what differs between their answers; an hour. Others: make test-kernels KERNELS=--answers
+# processor, and what differs between their answers; four minutes. Others: make test-kernels KERNELS=--answers
 test-kernels: .venv/installed-test
 	$(BIN)/python tests/support/kernels.py $(KERNELS)
 

@@ -27,6 +27,11 @@ def amplitude_of(level: int, phase: int) -> complex:
     return cmath.rect(level / _PER_FULL, math.radians(phase / _PER_DEGREE))
 
 
+def amplitudes_of(envelope: Envelope) -> tuple[complex, ...]:
+    """Return the complex amplitudes of the knots of an envelope in full levels."""
+    return tuple(amplitude_of(*knot) for knot in envelope.knots)
+
+
 @dataclass(slots=True)  # frozen, each takes three times as long to make, and every set makes many
 class Transition:
     """From one complex amplitude to another, from start [s] on.
@@ -138,16 +143,17 @@ class Voice:
         """Return it led to a factor of its level along a ramp [s], its ending scaled too."""
         transition = self.transition
         led = Transition(time, ramp, transition.at(time), transition.last * factor)
-        ending = self.ending
-        if ending is not None:
-            knots = tuple((round(level * factor), phase) for level, phase in ending.knots)
-            ending = replace(ending, knots=knots)
+        ending = None if self.ending is None else self.ending.scaled(factor)
         return replace(self, transition=led, ending=ending)
+
+    def is_continued_by(self, command: Command) -> bool:
+        """Whether a command of its layer continues it, unless it has ended."""
+        is_same = self.frequency == command.frequency / _PER_HERTZ
+        return command.keep_phase and is_same and command.is_driven
 
 
 def _along(envelope: Envelope, time: float, first: complex, last: complex) -> Transition:
-    knots = tuple(amplitude_of(*knot) for knot in envelope.knots)
-    return Transition(time, _STEP.from_wire(envelope.step), first, last, knots)
+    return Transition(time, _STEP.from_wire(envelope.step), first, last, amplitudes_of(envelope))
 
 
 @dataclass
@@ -425,13 +431,13 @@ def _after(
     uncertainty: float,
 ) -> list[Voice]:
     """Return the voices of a channel once a command of a layer plays; None silences the layer."""
-    is_driven = command is not None and (command.level > 0 or command.onset is not None)
+    is_driven = command is not None and command.is_driven
     continued = False
     after: list[Voice] = []
     for voice in voices:
         if voice.layer != layer or voice.has_ended:
             after.append(voice)
-        elif is_driven and command is not None and _continues(voice, command):
+        elif command is not None and voice.is_continued_by(command):
             continued = True
             first = voice.transition.reached(time, uncertainty)
             transition = _towards(command, time, ramp, first)
@@ -445,10 +451,6 @@ def _after(
         frequency = command.frequency / _PER_HERTZ
         after.append(Voice(layer, frequency, time, transition, False, command.ending))
     return after
-
-
-def _continues(voice: Voice, command: Command) -> bool:
-    return command.keep_phase and voice.frequency == command.frequency / _PER_HERTZ
 
 
 def _towards(command: Command, time: float, ramp: float, first: complex) -> Transition:

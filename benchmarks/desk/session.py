@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import IO, Any
 
 ERA = Path(sys.executable).with_name("era")
+PLATE = (sys.executable, "-m", "benchmarks.desk_plate", "rig.yaml", "--sensors", "sensors.csv")
 EXAMPLES = Path(__file__).parents[2] / "examples" / "desk"
 RATE, BLOCK = 48_000, 128
 _START = 60.0  # s; on a busy machine
@@ -74,17 +75,7 @@ def desk(folder: Path, *, seed: int, mesh: str = "8x6 Q3") -> Iterator[Desk]:
     (folder / "rig.yaml").write_text(text.replace("/tmp/plate", str(link)), "utf-8")
     (folder / "sensors.csv").write_text((EXAMPLES / "sensors.csv").read_text("utf-8"), "utf-8")
     server = ["jackd", "-n", name, "-S", "-r", "-d", "dummy", "-p", str(BLOCK), "-r", str(RATE)]
-    plate = [
-        sys.executable,
-        "-m",
-        "benchmarks.desk_plate",
-        "rig.yaml",
-        "--sensors",
-        "sensors.csv",
-        "--seed",
-        seed,
-    ]
-    plate += ["--mesh", mesh, "--truth", "truth.json", "--until-eof"]
+    plate = [*PLATE, "--seed", seed, "--mesh", mesh, "--truth", "truth.json", "--until-eof"]
     with contextlib.ExitStack() as stack:
         stack.enter_context(_own_server(name))
         log = stack.enter_context((folder / "desk.log").open("w"))

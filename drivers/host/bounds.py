@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from drivers.playback import Playback, Transition, Voice, amplitude_of
+from drivers.playback import Playback, Transition, Voice, amplitude_of, amplitudes_of
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
 
@@ -74,7 +74,7 @@ class ChannelBounds:
         }
         for one in waiting:
             for waits in one.commands:
-                if waits.channel == channel and is_driven(waits):
+                if waits.channel == channel and waits.is_driven:
                     self._add_later(one, waits, voices, time)
         continued: set[int] = set()
         for voice in voices:
@@ -88,13 +88,13 @@ class ChannelBounds:
                     self._note(voice.frequency, (highest, 0j), ramp, is_cosine=True)
                 continue
             one, command = layers[voice.layer], commands[voice.layer]
-            if command is not None and is_continued(voice, command):
+            if command is not None and voice.is_continued_by(command):
                 continued.add(voice.layer)
                 self._continue(voice, one, command, time)
             else:
                 self._fade(voice, one, command, time)
         for number, command in commands.items():
-            if command is None or not is_driven(command) or number in continued:
+            if command is None or not command.is_driven or number in continued:
                 continue
             if layers[number].after:
                 self._add_later(layers[number], command, voices, time)
@@ -121,7 +121,7 @@ class ChannelBounds:
         course = _course(command)
         starts = _points(voice.transition, time)
         farthest = max(starts, key=lambda start: abs(course[0] - start))
-        step, is_cosine = _step(one, command), not _knots(command.onset)
+        step, is_cosine = _way(one, command)
         self.paths.append(_path(max(map(abs, starts)), one, command, step))
         self._note(voice.frequency, (farthest, *course), step, is_cosine=is_cosine)
         self._note_ending(voice.frequency, command, starts)
@@ -130,7 +130,7 @@ class ChannelBounds:
         starts = _points(voice.transition, time)
         highest = max(starts, key=abs)
         ending = voice.ending
-        skips = command is not None and (is_driven(command) or command.skip_ending)
+        skips = command is not None and (command.is_driven or command.skip_ending)
         if ending is not None and not skips:
             step, points = _STEP.from_wire(ending.step), (highest, *_knots(ending), 0j)
             is_cosine = not ending.knots
@@ -141,7 +141,7 @@ class ChannelBounds:
 
     def _start(self, one: LayerSet, command: Command) -> None:
         frequency = _FREQUENCY.from_wire(command.frequency)
-        step, is_cosine = _step(one, command), not _knots(command.onset)
+        step, is_cosine = _way(one, command)
         self.paths.append(_path(0.0, one, command, step))
         self._note(frequency, (0j, *_course(command)), step, is_cosine=is_cosine)
         self._note_ending(frequency, command, (0j,))
@@ -162,7 +162,7 @@ class ChannelBounds:
                 self._note(voice.frequency, faded, _RAMP.from_wire(one.ramp), is_cosine=True)
                 starts += points if voice.frequency == frequency else ()
         farthest = max(starts, key=lambda start: abs(course[0] - start))
-        step, is_cosine = _step(one, command), not _knots(command.onset)
+        step, is_cosine = _way(one, command)
         self.steady += max(*map(abs, course), _peak(command.ending))
         self._note(frequency, (farthest, *course), step, is_cosine=is_cosine)
         self._note_ending(frequency, command, starts)
@@ -252,17 +252,6 @@ def plain_bounds(
     return before, after
 
 
-def is_driven(command: Command) -> bool:
-    """Whether a command starts or continues a voice."""
-    return command.level > 0 or command.onset is not None
-
-
-def is_continued(voice: Voice, command: Command) -> bool:
-    """Whether a command continues a voice of its layer."""
-    same = voice.frequency == _FREQUENCY.from_wire(command.frequency)
-    return command.keep_phase and same and is_driven(command)
-
-
 def all_bounds(
     playback: Playback, layers: Sequence[LayerSet], time: float, *, until: float
 ) -> list[ChannelBounds]:
@@ -270,9 +259,7 @@ def all_bounds(
     named = {one.layer: one for one in layers if not one.renew}
     # They may have begun to end by themselves when the set comes.
     ending_soon = [number for number in named if playback.end_of(number) <= until]
-    audible = {
-        voice.layer for channel in range(playback.channels) for voice in playback.voices_of(channel)
-    }
+    audible = {voice.layer for voices in playback.all_voices for voice in voices}
     # A layer without `valid_for` ends by a set alone, which silences along a ramp of its own.
     ramps = {
         number: playback.ramp_of(number) if playback.end_of(number) < math.inf else math.inf
@@ -280,11 +267,11 @@ def all_bounds(
     }
     return [
         ChannelBounds(
-            *(playback.voices_of(channel), named, playback.waiting, channel, time),
+            *(voices, named, playback.waiting, channel, time),
             ramps=ramps,
             ending_soon=ending_soon,
         )
-        for channel in range(playback.channels)
+        for channel, voices in enumerate(playback.all_voices)
     ]
 
 
@@ -294,7 +281,7 @@ def _steepest_of_ending(first: complex, ending: Envelope) -> tuple[float, float]
 
 
 def _knots(envelope: Envelope | None) -> tuple[complex, ...]:
-    return () if envelope is None else tuple(amplitude_of(*knot) for knot in envelope.knots)
+    return () if envelope is None else amplitudes_of(envelope)
 
 
 def _peak(envelope: Envelope | None) -> float:
@@ -320,10 +307,11 @@ def _path(first: float, one: LayerSet, command: Command, step: float) -> Path:
     return path
 
 
-def _step(one: LayerSet, command: Command) -> float:
+def _way(one: LayerSet, command: Command) -> tuple[float, bool]:
+    """Return the step [s] of a command's onset or ramp, and whether it is a raised cosine."""
     if command.onset is None:
-        return _RAMP.from_wire(one.ramp)
-    return _STEP.from_wire(command.onset.step)
+        return _RAMP.from_wire(one.ramp), True
+    return _STEP.from_wire(command.onset.step), not command.onset.knots
 
 
 def _points(transition: Transition, time: float) -> tuple[complex, ...]:

@@ -189,11 +189,6 @@ class Group:
         order = [self.amplifiers[name] for name in names]
         return await _all(_awaited(requests[each]) for each in order)
 
-    @property
-    def may_play_until(self) -> float:
-        """When the watchdog of every amplifier must have silenced it [s], if nothing feeds it."""
-        return max(each.feeding.may_play_until for each in self.amplifiers.values())
-
 
 def _same(name: str, values: Values) -> tuple[str, Values]:
     return name, values

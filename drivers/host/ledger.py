@@ -294,9 +294,7 @@ class Ledger:
 
 def is_vibrating(one: LayerSet) -> bool:
     """Whether a layer plays after its set, so that it spends time and rate."""
-    if one.renew:
-        return True
-    return any(command.level > 0 or command.onset is not None for command in one.commands)
+    return one.renew or any(command.is_driven for command in one.commands)
 
 
 def _is_integer(value: object, highest: int) -> bool:

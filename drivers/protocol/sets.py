@@ -21,6 +21,12 @@ class Envelope:
     step: int
     knots: tuple[tuple[int, int], ...]
 
+    def scaled(self, factor: float) -> "Envelope":
+        """Return it with the levels of all knots times a factor."""
+        return Envelope(
+            self.step, tuple((round(level * factor), phase) for level, phase in self.knots)
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Command:
@@ -34,6 +40,11 @@ class Command:
     skip_ending: bool = False
     onset: Envelope | None = None
     ending: Envelope | None = None
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether it starts or continues a tone; an onset may lead to level 0."""
+        return self.level > 0 or self.onset is not None
 
 
 @dataclass(frozen=True, slots=True)

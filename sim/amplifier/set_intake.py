@@ -108,8 +108,7 @@ class SetIntake:
             raise Refusal(text, "BAD_CHANNEL", channel)
         limits = can["limits"][channel]
         low, high = limits["frequency_min"], limits["frequency_max"]
-        is_driven = command.level > 0 or command.onset is not None
-        if is_driven and not low <= command.frequency <= high:
+        if command.is_driven and not low <= command.frequency <= high:
             text = f"frequency must be {low} to {high}, got {command.frequency}"
             raise Refusal(text, channel=channel)
         envelopes = [one for one in (command.onset, command.ending) if one is not None]
@@ -135,18 +134,12 @@ class SetIntake:
 def derated(layers: Sequence[LayerSet], factor: float) -> tuple[LayerSet, ...]:
     """Return the layers with all levels, also of knots, times a factor."""
 
-    def shaped(envelope: Envelope | None) -> Envelope | None:
-        if envelope is None:
-            return None
-        knots = tuple((round(level * factor), phase) for level, phase in envelope.knots)
-        return replace(envelope, knots=knots)
-
     def command_of(command: Command) -> Command:
         return replace(
             command,
             level=round(command.level * factor),
-            onset=shaped(command.onset),
-            ending=shaped(command.ending),
+            onset=command.onset and command.onset.scaled(factor),
+            ending=command.ending and command.ending.scaled(factor),
         )
 
     return tuple(

@@ -5,7 +5,6 @@ Its short forms have no server, or no plate: tests/sim/desk/test_measuring.py, t
 
 import shutil
 import subprocess
-import sys
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,7 +12,7 @@ import pytest
 
 from benchmarks.desk.chain import chain
 from benchmarks.desk.identified import identified_errors
-from benchmarks.desk.session import Desk, desk
+from benchmarks.desk.session import PLATE, Desk, desk
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.truth import draw_truth
 from model.calibration.responses import responses_of
@@ -75,16 +74,7 @@ def test_identified_plate_is_the_one_on_the_desk(plate: Desk) -> None:
 def test_second_plate_of_a_name_is_refused(plate: Desk) -> None:
     """It could not be told from the first, which would be measured in its place."""
     done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "benchmarks.desk_plate",
-            "rig.yaml",
-            "--sensors",
-            "sensors.csv",
-            "--mesh",
-            MESH,
-        ],
+        [*PLATE, "--mesh", MESH],
         cwd=plate.folder,
         env=plate.environment,
         capture_output=True,

@@ -4,7 +4,7 @@ import asyncio
 import logging
 import math
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import count, pairwise
 
 import pytest
 
@@ -305,9 +305,18 @@ async def test_lift_as_a_set_is_confirmed_precedes_a_due_heartbeat(later: int) -
 
 
 @in_virtual_time
-async def test_new_pattern_waits_until_all_amplifiers_reply() -> None:
+async def test_new_pattern_waits_until_all_amplifiers_reply(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The other amplifier, too, is sent nothing but heartbeats; then it is played at once."""
     async with running("a", "b") as bench:
+        step, steps = bench.controller.step, count()
+
+        async def counted() -> None:
+            assert next(steps) < 1000, "the loop must not run without pause"
+            await step()
+
+        monkeypatch.setattr(bench.controller, "step", counted)
         await bench.hold(FINGER, seconds=0.1)
         silent, other = bench.far_ends
 

@@ -12,8 +12,10 @@ from drivers.errors import CommandError, CommandRefused, LinkDegraded, LinkError
 from drivers.guard.budget import COMMIT_DELAY
 from drivers.host.comparison import MAX_CONTRADICTIONS, name_of, problem_of
 from drivers.host.feeding import Feeding
+from drivers.host.jobs import Priority
+from drivers.host.joint_start import JointStart
 from drivers.host.ledger import Ledger
-from drivers.host.line import ATTEMPTS, REPLY_TIMEOUT, Line, Priority
+from drivers.host.line import ATTEMPTS, REPLY_TIMEOUT, Line
 from drivers.protocol.definition import is_newer_token
 from drivers.protocol.records import Values
 from drivers.protocol.serial_payload import speaks
@@ -187,15 +189,16 @@ class Amplifier:
             self._confirm(token)
         return replace(staged, is_exact=bool(taken["exact"]))
 
-    async def commit(self, token: int) -> Values:
+    async def commit(self, token: int, *, start: JointStart | None = None) -> Values:
         """Play the staged set; returns the status, which shows its tokens.
 
+        start: together with the commits of other lines.
         Raises Preempted where a stop or disarm came first, CommandRefused where it is too late for
         what the ledger has admitted.
         """
         values = {"session": self.session, "token": token}
         make = self._made("Commit", values, token)
-        return await self._request("Commit", values, Priority.SET, make=make)
+        return await self._request("Commit", values, Priority.SET, make=make, start=start)
 
     def _made(self, name: str, values: Values, token: int) -> Callable[[], tuple[str, Values]]:
         """Return what makes a request of the set that is admitted, as long as it is."""
@@ -374,6 +377,7 @@ class Amplifier:
         *,
         timeout: float = REPLY_TIMEOUT,
         make: Callable[[], tuple[str, Values]] | None = None,
+        start: JointStart | None = None,
     ) -> Values:
         """Send a request, and note the status that its reply may be; make: of each attempt."""
         sent_at = 0.0
@@ -383,7 +387,7 @@ class Amplifier:
             sent_at = clock.now()
             return (name, values) if make is None else make()
 
-        reply = await self.line.submit(self, priority, made, timeout=timeout)
+        reply = await self.line.submit(self, priority, made, timeout=timeout, start=start)
         if name == "Hello" or MESSAGES[name].reply is not MESSAGES["GetStatus"].reply:
             return reply
         self._note_status(name, values, reply, sent_at)

@@ -81,6 +81,10 @@ class CanWire:
         """Take the request off the wire: its reply will be unexpected."""
         self._pending = None
 
+    def transit(self, words: int) -> float:
+        """Return how long a request of so many words takes to arrive [s]."""
+        return frames_of(words) * self._frame_time
+
     def round_trip(self, name: str, length: int) -> float:
         """Return how long a request of this many bytes and its longest reply take [s]."""
         return (length // PACKED + frames_of(MAX_WORDS)) * self._frame_time

@@ -10,7 +10,9 @@ from drivers.contents import Layer
 from drivers.errors import CommandRefused, LinkError, Preempted
 from drivers.host.amplifier import DISARM_RAMP, STOP_RAMP, WATCHDOG, Amplifier, Staged, Stopped
 from drivers.host.comparison import name_of
-from drivers.host.line import Line, Priority
+from drivers.host.jobs import Priority
+from drivers.host.joint_start import JointStart
+from drivers.host.line import Line
 from drivers.protocol.definition import token_after
 from drivers.protocol.records import Values
 from drivers.protocol.table import QUANTITIES, STATES
@@ -97,7 +99,8 @@ class Group:
                 raise Preempted("a stop or disarm came first")
             is_committing = True
             if not is_silent:
-                statuses = await self._commit([*layers], token)
+                until = min(one.until for one in staged)
+                statuses = await self._commit([*layers], token, until)
                 for name, status, one in zip(layers, statuses, staged, strict=True):
                     _check_plays(name, status, one)
         except BaseException as error:
@@ -159,7 +162,9 @@ class Group:
         members = [*self.amplifiers.values()]
         for line in {each.line for each in members if len(each.line.members) > 1}:
             values = {"ramp": members[0].wire_ramp(ramp)}
-            line.broadcast(Priority.STOP, partial(_same, "Stop", values)).add_done_callback(_seen)
+            line.submit(None, Priority.STOP, partial(_same, "Stop", values)).add_done_callback(
+                _seen
+            )
         task = asyncio.gather(*(each.stop(ramp) for each in members), return_exceptions=True)
         stopped = [
             Stopped(False, each.feeding.may_play_until, repr(result))
@@ -173,19 +178,24 @@ class Group:
         """Acknowledge the stops of all amplifiers; raises CommandRefused."""
         await _all(amplifier.clear() for amplifier in self.amplifiers.values())
 
-    async def _commit(self, names: Sequence[str], token: int) -> list[Values]:
-        """Commit on every line at one moment, by one broadcast where several share it."""
+    async def _commit(self, names: Sequence[str], token: int, until: float) -> list[Values]:
+        """Commit on every line at one moment, by one broadcast where several share it.
+
+        until: latest time [s] at which all must be sent.
+        """
         by_line: dict[Line, list[Amplifier]] = {}
         for name in names:
             by_line.setdefault(self.amplifiers[name].line, []).append(self.amplifiers[name])
+        start = JointStart(len(by_line), until) if len(by_line) > 1 else None
         requests: dict[Amplifier, Awaitable[Values]] = {}
         for line, several in by_line.items():
             if len(several) > 1:
-                sent = line.broadcast(Priority.SET, partial(_commit_of, several, token))
+                make = partial(_commit_of, several, token)
+                sent = line.submit(None, Priority.SET, make, start=start)
                 sent.add_done_callback(_seen)
                 requests.update((each, _status_of(each, token)) for each in several)
             else:
-                requests.update((each, each.commit(token)) for each in several)
+                requests.update((each, each.commit(token, start=start)) for each in several)
         order = [self.amplifiers[name] for name in names]
         return await _all(_awaited(requests[each]) for each in order)
 

@@ -8,11 +8,12 @@ against what really went out before. Times [s] are of the event loop's clock.
 import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum
+from functools import partial
 from typing import Protocol
 
-from drivers import clock
 from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout, Preempted
+from drivers.host.jobs import Job, JobQueue, Member, Priority
+from drivers.host.joint_start import JointStart
 from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Wire
 from drivers.protocol.records import Values
 from drivers.protocol.table import REACTION
@@ -20,36 +21,11 @@ from drivers.protocol.table import REACTION
 REPLY_TIMEOUT = 0.030  # s; a heartbeat and three of these are less than three heartbeats of 50 ms
 ATTEMPTS = 3
 GRACE = 0.008  # s; how long a stop waits for the reply to another request
-MAX_WAIT = 0.05  # s; after which a request goes before newer sets and heartbeats
 BUSY_PAUSE = 0.005  # s; before a request goes again to a busy amplifier
 _LATE = 0.005  # s; a timer later than this means that this process was delayed
 _LOOKS = 4  # at the port for a reply, where this process was delayed
+_COMMIT_WORDS = 2
 SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
-
-
-class Priority(IntEnum):
-    """Priority of a request: the smaller is sent first."""
-
-    STOP = 0
-    SILENCE = 1
-    HEARTBEAT = 2
-    SET = 3
-    ARM = 4
-    CLEAR = 5
-    OTHER = 6
-    READING = 7
-
-    @property
-    def is_stop_class(self) -> bool:
-        """Whether it silences the amplifier: sent and repeated before all others."""
-        return self <= Priority.SILENCE
-
-
-_SUPERSEDED = {
-    # A queued heartbeat would feed the watchdog of an amplifier that did not receive the stop.
-    Priority.STOP: (Priority.HEARTBEAT, Priority.SET, Priority.ARM, Priority.CLEAR),
-    Priority.SILENCE: (Priority.SET, Priority.ARM),
-}
 
 
 class Port(Protocol):
@@ -64,59 +40,6 @@ class Port(Protocol):
 
     def poll(self) -> None:
         """Hand over what has come and was not read yet."""
-
-
-class Member(Protocol):
-    """An amplifier as its line sees it."""
-
-    @property
-    def address(self) -> int:
-        """Its address."""
-
-    def note_sent(self, name: str, values: Values, now: float) -> None:
-        """Note a request that may have reached it."""
-
-    def note_heard(self) -> None:
-        """Note that it has replied, whatever."""
-
-    def note_silence(self, cause: str) -> None:
-        """Note that it has not replied to all attempts of a request."""
-
-    def note_event(self, values: Values) -> None:
-        """Note what it told unasked."""
-
-    def note_other_host(self) -> None:
-        """Note that another host drives it."""
-
-    def check_request(self, name: str) -> None:
-        """Raise LinkError where a request of this name must not go out now."""
-
-
-@dataclass(eq=False, slots=True)
-class Job:
-    """A request from its queueing to its result; member: None for a broadcast.
-
-    make: name and values of each attempt, in its turn; raises CommandRefused. attempts: left.
-    """
-
-    member: Member | None
-    priority: Priority
-    make: Callable[[], tuple[str, Values]]
-    attempts: int
-    timeout: float
-    number: int
-    queued_at: float
-    result: "asyncio.Future[Values]"
-    not_before: float = 0.0
-    due: float = 0.0
-    looks: int = 0
-
-    def rank(self, now: float) -> int:
-        """Place in the queue at a time [s]."""
-        if self.priority is Priority.READING:
-            return self.priority
-        rank = min(self.priority, Priority.ARM)
-        return min(rank, Priority.HEARTBEAT) if now - self.queued_at > MAX_WAIT else rank
 
 
 @dataclass
@@ -138,59 +61,38 @@ class Line:
         self.loss: str | None = None
         self.members: dict[int, Member] = {}
         self._port = port
-        self._queue: list[Job] = []
+        self._queue = JobQueue()
         self._current: Job | None = None
-        self._number = 0
         self._timer: asyncio.TimerHandle | None = None
         self._loop = asyncio.get_running_loop()
         self._is_pumping = False
 
     def submit(
         self,
-        member: Member,
+        member: Member | None,
         priority: Priority,
         make: Callable[[], tuple[str, Values]],
         *,
         timeout: float = REPLY_TIMEOUT,
-        attempts: int = ATTEMPTS,
+        start: JointStart | None = None,
     ) -> "asyncio.Future[Values]":
         """Queue a request of an amplifier; the future has the values of its reply.
 
         Or raises LinkError, LinkTimeout, FrameError, CommandRefused; Preempted where another
-        request came first.
+        request came first. member: None for a broadcast, which has no reply: the future ends once
+        it was sent. start: with the commits of other lines.
         """
-        return self._submit(member, priority, make, timeout, attempts)
-
-    def broadcast(
-        self, priority: Priority, make: Callable[[], tuple[str, Values]]
-    ) -> "asyncio.Future[Values]":
-        """Queue a request to every amplifier of the line; the future ends once it was sent.
-
-        There is no reply. Raises LinkError; Preempted where a stop came first.
-        """
-        return self._submit(None, priority, make, 0.0, 1)
-
-    def _submit(
-        self,
-        member: Member | None,
-        priority: Priority,
-        make: Callable[[], tuple[str, Values]],
-        timeout: float,
-        attempts: int,
-    ) -> "asyncio.Future[Values]":
-        for queued in [*self._queue]:
-            is_meant = member is None or queued.member is member
-            if is_meant and queued.priority in _SUPERSEDED.get(priority, ()):
-                self._fail(queued, Preempted(SUPERSEDED))
-        self._number += 1
         future = self._loop.create_future()
-        job = Job(*(member, priority, make, attempts, timeout, self._number, clock.now(), future))
+        now = self._loop.time()
+        job = Job(member, priority, make, ATTEMPTS, timeout, now, future, start)
         if self.loss is not None:
-            future.set_exception(LinkError(self.loss))
-        else:
-            self._queue.append(job)
-            self._preempt()
-            self.pump()
+            self._fail(job, LinkError(self.loss))
+            return future
+        for queued in self._queue.superseded_by(priority, member):
+            self._fail(queued, Preempted(SUPERSEDED))
+        self._queue.add(job)
+        self._preempt()
+        self.pump()
         return future
 
     def received(self, data: bytes) -> None:
@@ -229,10 +131,8 @@ class Line:
         """Fail every request: the port is lost, or closed."""
         self.loss = cause
         current, self._current = self._current, None
-        for job in (current, *self._queue):
-            if job is not None:
-                self._fail(job, LinkError(cause))
-        self._queue.clear()
+        for job in (*([] if current is None else [current]), *self._queue):
+            self._fail(job, LinkError(cause))
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -244,8 +144,8 @@ class Line:
         self._is_pumping = True
         try:
             while self.loss is None and self._current is None and self._queue:
-                job = self._next()
-                if job is None:
+                job = self._queue.next(self._loop.time())
+                if job is None or (job.start is not None and not self._may_start(job)):
                     break
                 self._queue.remove(job)
                 if not job.result.done():
@@ -254,19 +154,23 @@ class Line:
             self._is_pumping = False
         self._schedule()
 
-    def _next(self) -> Job | None:
-        """Return the job whose turn it is; None while all pause, or a stop does."""
-        now = clock.now()
-        first = min(self._queue, key=lambda job: (job.rank(now), job.number))
-        if first.not_before <= now or first.priority.is_stop_class:
-            return first if first.not_before <= now else None
-        ready = [job for job in self._queue if job.not_before <= now]
-        return min(ready, key=lambda job: (job.rank(now), job.number), default=None)
+    def _may_start(self, job: Job) -> bool:
+        """Whether a commit is to be sent now; the line is kept for it until all others are free."""
+        if not job.is_held and job.start is not None:
+            job.is_held = True
+            takes = self.wire.transit(_COMMIT_WORDS)
+            job.start.arrive(takes, job.result, partial(self._release, job))
+        return job.start is None
+
+    def _release(self, job: Job) -> None:
+        """Send a commit that was held, unless its result is known by now."""
+        job.start = None
+        self.pump()
 
     def _start(self, job: Job) -> None:
         try:
             name, values = job.make()
-            now = clock.now()
+            now = self._loop.time()
             if job.member is None:
                 self._write(0, name, values, now)
                 job.result.set_result({})
@@ -302,28 +206,23 @@ class Line:
 
     def _repeat(self, job: Job, *, pause: float = 0.0) -> None:
         """Queue a request again, unless another one of its amplifier comes before it."""
-        overtaken = any(
-            other.member in (job.member, None)
-            and job.priority in _SUPERSEDED.get(other.priority, ())
-            for other in self._queue
-        )
-        # Behind those of the same priority, so that a mute amplifier does not keep others waiting.
-        self._number += 1
-        job.number = self._number
-        if overtaken:
+        if self._queue.supersedes(job):
             self._fail(job, Preempted(SUPERSEDED))
         else:
             self.statistics.retries += 1
-            job.not_before = clock.now() + pause if pause else 0.0
-            self._queue.append(job)
+            job.not_before = self._loop.time() + pause if pause else 0.0
+            # Behind those of its priority, so that a mute amplifier does not keep others waiting.
+            self._queue.add(job)
 
     def _fail(self, job: Job, error: Exception) -> None:
         """End a request with an error, unless its caller has gone."""
-        if job in self._queue:
-            self._queue.remove(job)
+        self._queue.remove(job)
         if not job.result.done():
             job.result.set_exception(error)
             job.result.exception()  # retrieved, where nobody waits for it
+        if job.start is not None:
+            start, job.start = job.start, None
+            start.fail(error)
 
     def _preempt(self) -> None:
         """Shorten the time of the request on the line for one that must not wait."""
@@ -332,18 +231,15 @@ class Line:
             return
         waiting = [job.priority for job in self._queue if job.priority < current.priority]
         if current.priority is Priority.READING and min(waiting, default=8) <= Priority.SET:
-            current.due = clock.now()
+            current.due = self._loop.time()
         elif min(waiting, default=8) <= Priority.SILENCE:
-            current.due = min(current.due, clock.now() + GRACE)
+            current.due = min(current.due, self._loop.time() + GRACE)
 
     def _schedule(self) -> None:
         """Have the timer look again by the next time that matters; it is never cancelled."""
-        times = [job.not_before for job in self._queue if job.not_before]
-        if self._current is not None:
-            times = [self._current.due]
-        if not times:
+        due = self._queue.next_due if self._current is None else self._current.due
+        if due is None:
             return
-        due = min(times)
         if self._timer is None or self._timer.when() > due:
             if self._timer is not None:
                 self._timer.cancel()
@@ -352,7 +248,7 @@ class Line:
     def _look(self) -> None:
         """Give up the request on the line if it is due, once the port was read once more."""
         self._timer = None
-        now = clock.now()
+        now = self._loop.time()
         job = self._current
         if job is None or now < job.due:
             self.pump()

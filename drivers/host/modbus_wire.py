@@ -24,6 +24,7 @@ _REPLY_HEAD = 2  # registers: tag, result
 _TEXTS = ("vendor", "product", "serial_number", "firmware")
 _TEXT_SIZE = 32  # bytes
 _IDENTITY = Read(1065, 2 + len(_TEXTS) * _TEXT_SIZE // 2)
+_WRITE_SIZE = 9  # bytes on RTU of a write, without its registers
 _ANSWERS_SIZE = 21  # bytes on RTU of the response to a write, of a read and its response
 _BITS = 11  # of a byte, with start, parity and stop
 _GAP = 3.5  # characters of silence before a frame
@@ -100,6 +101,11 @@ class ModbusWire:
         """Take the request off the wire: its reply will be unexpected."""
         self._request = None
         self._reader.clear()  # a damaged length would take the next responses
+
+    def transit(self, words: int) -> float:
+        """Return how long a request of so many words takes to arrive [s]: its write."""
+        characters = _WRITE_SIZE + 2 * (1 + words)
+        return _BITS * characters / self._baud + self.silence if self._baud else 0.0
 
     def round_trip(self, name: str, length: int) -> float:
         """Return how long a request of this many bytes and its longest reply take [s].

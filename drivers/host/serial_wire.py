@@ -63,6 +63,10 @@ class SerialWire:
         """Take the request off the wire: its reply will be unexpected."""
         self._pending = None
 
+    def transit(self, words: int) -> float:
+        """Return how long a request of so many words takes to arrive [s]."""
+        return _BITS * frame_length(2 * words) / self._baud if self._baud else 0.0
+
     def round_trip(self, name: str, length: int) -> float:
         """Return how long a request of this many bytes and its longest reply take [s]."""
         if not self._baud:

@@ -83,5 +83,8 @@ class Wire(Protocol):
     def withdraw(self) -> None:
         """Take the request off the wire: its reply will be unexpected."""
 
+    def transit(self, words: int) -> float:
+        """Return how long a request of so many words takes to arrive [s]."""
+
     def round_trip(self, name: str, length: int) -> float:
         """Return how long a request of this many bytes and its longest reply take [s]."""

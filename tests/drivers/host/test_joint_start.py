@@ -1,0 +1,89 @@
+"""Commits of several lines: at one moment, or none of them."""
+
+import asyncio
+from collections.abc import Callable
+from itertools import combinations
+
+import pytest
+
+from drivers.contents import Layer, Tone
+from drivers.errors import DriverError
+from drivers.host.can_wire import CanWire
+from drivers.host.group import Group
+from drivers.host.modbus_wire import ModbusWire
+from drivers.host.serial_wire import SerialWire
+from drivers.host.wire import Wire
+from virtual_loop import run_virtual
+from words_line import MemoryLine
+
+LAYER = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)
+# By hand: a commit is a frame of 16 bytes of ten bits, of 15 of eleven after 3.5 characters, of one
+# CAN frame with eight bytes: 111 bits and at most 24 stuffed.
+LINES: dict[str, tuple[str, Callable[[], Wire], float]] = {
+    "slow serial": ("serial", lambda: SerialWire(19_200, sequence=0), 160 / 19_200),
+    "serial": ("serial", lambda: SerialWire(921_600, sequence=0), 160 / 921_600),
+    "rtu": ("rtu", lambda: ModbusWire(19_200, is_rtu=True, number=0), 203.5 / 19_200),
+    "tcp": ("tcp", lambda: ModbusWire(0, is_rtu=False, number=0), 0.0),
+    "slow can": ("can", lambda: CanWire(20_000, sequence=0), 135 / 20_000),
+}
+
+
+def timed_line(name: str, amplifier: str) -> MemoryLine:
+    """A line on which commits take as long as their bits."""
+    kind, wire, takes = LINES[name]
+    end = MemoryLine(kind, amplifier)
+    end.line.wire = wire()
+    end.inward = lambda message, data: [(takes if message == "Commit" else 0.0002, data)]
+    return end
+
+
+def started(end: MemoryLine) -> list[float]:
+    """When the tones of all amplifiers of a line began."""
+    return [voice.origin for far in end.far.values() for voice in far.playback.voices_of(0)]
+
+
+@pytest.mark.parametrize("names", [*combinations(LINES, 2)], ids="-".join)
+def test_commits_arrive_together_on_lines_of_any_speed_that_are_busy(
+    names: tuple[str, str],
+) -> None:
+    """Within 0.2 ms, while the second line carries a status whose reply takes 9 ms or more."""
+
+    async def run() -> None:
+        ends = [timed_line(name, each) for name, each in zip(names, "ab", strict=True)]
+        hosts = {name: host for end in ends for name, host in end.hosts.items()}
+        group = Group(hosts, draw=lambda low, high: 77)
+        await group.open()
+        await group.arm()
+        ends[1].outward = lambda name, data: [(0.009 if name == "GetStatus" else 0.0002, data)]
+
+        async def keep_busy() -> None:
+            await asyncio.sleep(0.0005)
+            await hosts["b"].read_status()
+
+        busy = asyncio.ensure_future(keep_busy())
+        await group.apply({name: [LAYER] for name in hosts})
+        await busy
+        first, second = [*started(ends[0]), *started(ends[1])]
+        assert abs(first - second) < 0.0002
+
+    run_virtual(run())
+
+
+def test_line_that_is_busy_for_too_long_commits_nothing() -> None:
+    """Three readings without reply take 270 ms, a set is admitted for 100: silent, not armed."""
+
+    async def run() -> None:
+        ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
+        hosts = {name: host for end in ends for name, host in end.hosts.items()}
+        group = Group(hosts, draw=lambda low, high: 77)
+        await group.open()
+        await group.arm()
+        ends[1].outward = lambda name, data: [] if name == "GetStatus" else [(0.0002, data)]
+        reads = [asyncio.ensure_future(hosts["b"].read_status()) for _ in range(3)]
+        with pytest.raises(DriverError):
+            await group.apply({name: [LAYER] for name in hosts})
+        await asyncio.gather(*reads, return_exceptions=True)
+        assert [started(end) for end in ends] == [[], []]
+        assert not group.is_armed
+
+    run_virtual(run())

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.setting import RIG
 from model.arrays import ComplexArray, FloatArray
-from model.fem.element_registry import element_of
+from model.fem.elements import element_of
 from model.fem.mesh import Mesh
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import load_rig

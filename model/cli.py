@@ -7,8 +7,7 @@ from model.commands.config_cli import config_app
 from model.commands.design_cli import design_app
 from model.commands.figure_cli import figure_app
 from model.commands.plate_cli import plate_app
-from model.commands.plate_conformance_cli import conformance
-from model.commands.plate_show_cli import elements, materials, show
+from model.commands.plate_show_cli import materials, show
 from model.commands.study_cli import study_app
 from model.commands.table_build_cli import build
 from model.commands.table_cli import query, table_app
@@ -19,8 +18,6 @@ from model.errors import InputError
 
 plate_app.command()(materials)
 plate_app.command()(show)
-plate_app.command()(elements)
-plate_app.command()(conformance)
 
 table_app.command()(build)
 table_app.command("show")(show_table)

@@ -23,8 +23,6 @@ from drivers.backends.serial_line.backend import SerialBackend
 from drivers.errors import CommandError
 from drivers.registry import known_schemes, open_backend
 from model.errors import InputError
-from model.fem.element_registry import element_names, element_of
-from model.fem.elements import ELEMENTS
 from model.structure.materials import KNOWN_MATERIALS, known_material, material_names
 from registry.plugins import failure_text
 
@@ -83,20 +81,6 @@ KINDS = [
         material_names,
         fails="from era_haptics.plugins.materials import KnownMaterial, Material\n"
         "THING = KnownMaterial(Material('fine', '1e9', 900.0, 0.3), '', '', '')\n",
-    ),
-    Kind(
-        "elements",
-        "element",
-        "from era_haptics.plugins.elements import Element\n"
-        "from numpy import eye\n"
-        "THING = Element('fine', (-1.0, 1.0), lambda *_: eye(12), lambda *_: eye(12))\n",
-        "an instance of Element",
-        element_of,
-        ("Q4", ELEMENTS["Q4"]),
-        element_names,
-        fails="from era_haptics.plugins.elements import Element\n"
-        "from numpy import eye\n"
-        "THING = Element('fine', (-1.0, 1.0), lambda *_: eye(3), lambda *_: eye(3))\n",
     ),
     Kind(
         "effects",

@@ -1,21 +1,24 @@
-"""`era plate materials`, `elements` and `show`."""
+"""`era plate materials` and `show`."""
 
 import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 from model.commands.options import JsonOption, RigArgument
-
-_Loaded = TypeVar("_Loaded")
 
 
 def materials(as_json: JsonOption = False) -> None:
     """List known materials with their sources."""
+    from model.errors import InputError
     from model.structure.materials import known_material, material_names
 
-    known, problems = _loaded(material_names(), known_material)
+    known, problems = {}, []
+    for name in material_names():
+        try:
+            known[name] = known_material(name)
+        except InputError as error:  # that of one plug-in does not hide the others
+            problems.append(str(error))
     if as_json:
         entries = [
             {
@@ -38,21 +41,8 @@ def materials(as_json: JsonOption = False) -> None:
         print(f"    variation  {one.variation}")
         print(f"    loss factor of the bare material, about  {one.loss_factor}")
     print("Any other is given by numbers: material: {E: 70 GPa, rho: 2700, nu: 0.33}")
-    _warn(problems)
-
-
-def elements(as_json: JsonOption = False) -> None:
-    """List the elements of meshes, as in mesh: 12x9 Q3."""
-    from model.fem.element_registry import element_names, element_of
-
-    known, problems = _loaded(element_names(), element_of)
-    if as_json:
-        rows = [{"name": name, "order": element.order} for name, element in known.items()]
-        print(json.dumps({"elements": rows, "problems": problems}))
-        return
-    for name, element in known.items():
-        print(f"{name}: order {element.order}, {(element.order + 1) ** 2} nodes")
-    _warn(problems)
+    for problem in problems:
+        print(f"era: warning: {problem}", file=sys.stderr)
 
 
 def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
@@ -84,26 +74,6 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     for mass in summary["point_masses"]:
         x, y = mass["at_m"]
         print(f"    carries {1e3 * mass['mass_kg']:g} g at ({x:g}, {y:g}) m")
-
-
-def _loaded(
-    names: Iterable[str], load: Callable[[str], _Loaded]
-) -> tuple[dict[str, _Loaded], list[str]]:
-    """Load by name; an error of one plug-in does not hide the others."""
-    from model.errors import InputError
-
-    loaded, problems = {}, []
-    for name in names:
-        try:
-            loaded[name] = load(name)
-        except InputError as error:
-            problems.append(str(error))
-    return loaded, problems
-
-
-def _warn(problems: Sequence[str]) -> None:
-    for problem in problems:
-        print(f"era: warning: {problem}", file=sys.stderr)
 
 
 def _print_laminate(laminate: dict[str, Any]) -> None:

@@ -62,7 +62,6 @@ def test_unknown_name_lists_the_known_ones() -> None:
                 ("plugins.touch_sources", "sim numpy scipy matplotlib pythonosc"),
                 ("plugins.effects", "sim scipy matplotlib drivers.backend"),
                 ("plugins.materials", "sim controller drivers numpy"),
-                ("plugins.elements", "sim controller drivers scipy matplotlib"),
             )
         ),
     ],

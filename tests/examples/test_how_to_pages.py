@@ -18,7 +18,6 @@ PAGES = ROOT / "docs" / "how-to"
 PIP = ROOT / "tests" / "support" / "built_pip.py"
 NAMES = [
     "add-a-material",
-    "add-an-element",
     "add-a-touch-source",
     "add-an-effect",
     "drive-a-signal-generator",

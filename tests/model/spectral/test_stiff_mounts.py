@@ -7,7 +7,7 @@ import pytest
 from scipy import special
 from scipy.integrate import trapezoid
 
-from model.fem.element_registry import element_of
+from model.fem.elements import element_of
 from model.fem.mesh import Mesh
 from model.reduction.free_plate import solve_free_plate
 from model.spectral.mesh import SpectralMesh

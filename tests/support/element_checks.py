@@ -1,6 +1,5 @@
-"""Conformance checks of plate elements.
+"""What the matrices of a plate element must keep.
 
-Run by `era plate conformance NAME` for installed elements, and by the tests for the project's own.
 All but the last use the element's matrices only; the last solves a plate.
 """
 

@@ -1,14 +1,15 @@
 """Opens lines and the amplifiers on them, of protocol 3, by their URLs."""
 
+import asyncio
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from drivers.backends.hardware import Port, number_below
-from drivers.backends.ports.opening import open_port
-from drivers.backends.urls.serial_line import SerialUrl
+from drivers.backends.hardware import Port
 from drivers.errors import LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
-from drivers.host.serial_wire import SerialWire
+from drivers.wires.address import WireAddress
+from drivers.wires.known import address_of
 from registry.limits import GuardLimits
 
 
@@ -16,58 +17,69 @@ from registry.limits import GuardLimits
 class _Opened:
     line: Line
     port: Port
-    baud: int
+    settings: Mapping[str, object]
+
+    async def close(self) -> None:
+        """Close it; what waits on the line fails."""
+        if self.line.loss is None:
+            self.line.lose(f"{self.line.name} was closed")
+        self.port.close()
+        await self.port.wait_closed()
 
 
 class Lines:
-    """The open lines of a host; amplifiers at one port share a line."""
+    """The open lines of a host; amplifiers at one port, connection or bus share a line."""
 
     def __init__(self) -> None:
         self._opened: dict[str, _Opened] = {}
+        self._changing: dict[str, asyncio.Lock] = {}  # held while a line is opened
 
     async def amplifier(
         self, url: str, limits: GuardLimits, *, name: str, serial_number: str | None = None
     ) -> Amplifier:
         """Return the amplifier of a URL, its line open, nothing sent.
 
-        Raises CommandError for a URL that is none, LinkError for a line that cannot be opened, or
-        an address that is taken.
+        A line that was lost is opened anew; amplifiers of the lost one stay lost. Raises
+        CommandError for a URL that is none, LinkError for a line that cannot be opened, or an
+        address that is taken.
         """
-        parsed = SerialUrl.parse(url)
-        opened = self._opened.get(parsed.port)
-        if opened is None:
-            opened = self._opened[parsed.port] = await _open(parsed)
-        if opened.baud != parsed.baud:
-            raise LinkError(
-                f"serial port {parsed.port}: baud must be {opened.baud} as for the other "
-                f"amplifiers on it, got {parsed.baud}"
-            )
-        if parsed.address in opened.line.members:
-            raise LinkError(f"address {parsed.address} on {parsed.port} must be used once")
+        address = address_of(url)
+        async with self._changing.setdefault(address.line, asyncio.Lock()):
+            opened = self._opened.get(address.line)
+            if opened is not None and opened.line.loss is not None:
+                del self._opened[address.line]
+                await opened.close()
+                opened = None
+            if opened is None:
+                opened = self._opened[address.line] = await _open(address)
+        for setting, value in opened.settings.items():
+            if (got := address.settings.get(setting)) != value:
+                raise LinkError(
+                    f"{address.line}: {setting} must be {value} as for the other amplifiers on "
+                    f"it, got {got}"
+                )
+        if address.number in opened.line.members:
+            raise LinkError(f"address {address.number} on {address.line} must be used once")
         return Amplifier(
-            opened.line, parsed.address, limits, name=name, serial_number=serial_number
+            opened.line, address.number, limits, name=name, serial_number=serial_number
         )
 
     async def close(self) -> None:
         """Close all lines; disarm before, or vibrations last until the watchdogs trip."""
         opened, self._opened = self._opened, {}
-        for each in opened.values():
-            each.line.lose(f"{each.line.name} was closed")
-            each.port.close()
-        for each in opened.values():
-            await each.port.wait_closed()
+        await asyncio.gather(*(each.close() for each in opened.values()))
 
 
-async def _open(url: SerialUrl) -> _Opened:
-    """Open the port of a URL; what comes before its line is made is lost."""
+async def _open(address: WireAddress) -> _Opened:
+    """Open the line of an address; what comes before it is made is lost, but not its loss."""
     lines: list[Line] = []
-    port = await open_port(
-        url.port,
-        baud=url.baud,
-        on_data=lambda data: lines[0].received(data) if lines else None,
-        on_loss=lambda cause: lines[0].lose(cause) if lines else None,
+    losses: list[str] = []
+    port = await address.open_port(
+        lambda data: lines[0].received(data) if lines else None,
+        lambda cause: lines[0].lose(cause) if lines else losses.append(cause),
     )
-    # A random start, so that a reply to an earlier host does not match.
-    wire = SerialWire(url.baud if url.is_local else 0, sequence=number_below(1 << 16))
-    lines.append(Line(wire, port, url.port))
-    return _Opened(lines[0], port, url.baud)
+    line = Line(address.make_wire(), port, address.line)
+    lines.append(line)
+    for cause in losses:
+        line.lose(cause)
+    return _Opened(line, port, address.settings)

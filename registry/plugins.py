@@ -109,6 +109,8 @@ class PluginRegistry(Generic[_T]):
             )
         name = scheme.lower()
         maker = self.find(name, within=url)
+        if name in self.own:
+            return maker(url)
         (point,) = _installed(self.group)[name]
         with self._attributed(point, url, but=(self.error,)):
             return maker(url)

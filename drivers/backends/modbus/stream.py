@@ -1,129 +1,24 @@
 """Transport of a Modbus line: a TCP connection or a serial port."""
 
-import asyncio
-import contextlib
-import ipaddress
-import socket
 from collections.abc import Callable
-from typing import cast
 
 from drivers.backends.hardware import Port
 from drivers.backends.ports.opening import open_port
+from drivers.backends.ports.tcp import open_connection
 from drivers.backends.urls.modbus import ModbusUrl
-from drivers.errors import LinkError, LinkTimeout, system_message
-from drivers.threads import in_thread
-
-_CONNECT_TIMEOUT = 1.0  # s; a hundred times the delay within a building
-_UNSENT_MAX = 4096  # bytes; sixteen unsent frames mean a blocked connection
 
 
 async def open_stream(
     line: ModbusUrl, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
 ) -> Port:
     """Open a line; LinkError with a remedy."""
-    if line.device:
-        return await open_port(
-            line.device,
-            baud=line.baud,
-            parity=line.parity,
-            stop=line.stop,
-            on_data=on_data,
-            on_loss=on_loss,
-        )
-    return await _connect(line, on_data, on_loss)
-
-
-class _Connection(asyncio.Protocol):
-    """A TCP connection."""
-
-    def __init__(
-        self, endpoint: str, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
-    ) -> None:
-        self._endpoint = endpoint
-        self._on_data = on_data
-        self._on_loss = on_loss
-        self._is_closed = False
-        self._transport: asyncio.Transport  # set when connected
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast(asyncio.Transport, transport)
-
-    def data_received(self, data: bytes) -> None:
-        if not self._is_closed:
-            self._on_data(data)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        if not self._is_closed:
-            self._is_closed = True
-            why = str(exc) if exc else "closed by the other side"
-            self._on_loss(
-                f"the Modbus connection to {self._endpoint} was lost ({why}): check the amplifier "
-                "and the network, then open the amplifier again"
-            )
-
-    @property
-    def is_blocked(self) -> bool:
-        return self._transport.get_write_buffer_size() > 0
-
-    def poll(self) -> None:
-        """Nothing to do: the loop reads before it runs timers that are due later."""
-
-    def write(self, data: bytes) -> None:
-        if self._transport.get_write_buffer_size() > _UNSENT_MAX:
-            raise LinkTimeout(f"{self._endpoint}: write blocked; check the network")
-        self._transport.write(data)
-
-    def close(self) -> None:
-        self._is_closed = True
-        self._transport.abort()  # discards unsent bytes
-
-    async def wait_closed(self) -> None:
-        """Return at once: abort does not block."""
-
-
-async def _connect(
-    line: ModbusUrl, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
-) -> Port:
-    try:
-        async with asyncio.timeout(_CONNECT_TIMEOUT):
-            return await _first_to_answer(
-                line, lambda: _Connection(line.endpoint, on_data, on_loss)
-            )
-    except TimeoutError:
-        raise LinkError(
-            f"{line.endpoint}: no connection within {_CONNECT_TIMEOUT:g} s; check the address, the "
-            "network and that the amplifier is switched on"
-        ) from None
-    except OSError as error:
-        raise LinkError(
-            f"{line.endpoint}: Modbus connection refused; check the address and the port, and that "
-            f"the amplifier is switched on (the system says: {system_message(error)})"
-        ) from error
-
-
-async def _first_to_answer(line: ModbusUrl, make: Callable[[], _Connection]) -> Port:
-    """Connect to the first address of a host that accepts; raises OSError."""
-    *others, last = await _addresses(line.host)
-    loop = asyncio.get_running_loop()
-    for address in others:
-        with contextlib.suppress(OSError):
-            return (await loop.create_connection(make, address, line.port))[1]
-    return (await loop.create_connection(make, last, line.port))[1]
-
-
-async def _addresses(host: str) -> list[str]:
-    """Resolve a host name to at least one address; raises OSError."""
-    try:
-        return [str(ipaddress.ip_address(host))]
-    except ValueError:
-        # asyncio resolves in a thread that delays the end of the program.
-        found = await in_thread(
-            lambda: socket.getaddrinfo(host, None, type=socket.SOCK_STREAM), name=f"era-name {host}"
-        )
-        return [_with_zone(*address) for *_, address in found]
-
-
-def _with_zone(address: str | int, *numbers: str | int | bytes) -> str:
-    """Append the zone of a link-local IPv6 address."""
-    *_, zone = numbers  # of an IPv4 address the port, 0
-    return f"{address}%{zone!s}" if zone else str(address)
+    if not line.device:
+        return await open_connection(line.host, line.port, on_data, on_loss)
+    return await open_port(
+        line.device,
+        baud=line.baud,
+        parity=line.parity,
+        stop=line.stop,
+        on_data=on_data,
+        on_loss=on_loss,
+    )

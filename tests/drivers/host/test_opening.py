@@ -1,4 +1,4 @@
-"""Amplifiers of protocol 3 by their URLs, on real pseudo-terminals."""
+"""Amplifiers of protocol 3 by their URLs, on real terminals, TCP connections and CAN adapters."""
 
 import asyncio
 
@@ -6,42 +6,89 @@ import pytest
 
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, LinkError
+from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
 from registry.limits import GuardLimits
-from sim.amplifier.contract import Amplifier
-from sim.far_ends.serial_amplifiers import SerialAmplifiers
-from sim.transport.pseudo_terminal import make_terminal
+from word_wires import WORD_WIRES
 
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)
+CUT = [name for name in WORD_WIRES if "python-can" not in name]
 
 
-async def test_group_plays_over_a_pseudo_terminal_and_stops() -> None:
-    """Two amplifiers on one line: 0.5 on both, silent after the stop; a lost line is told."""
-    far = {address: Amplifier(str(address), channels=1) for address in (1, 2)}
-    loop = asyncio.get_running_loop()
-    terminal = make_terminal(lambda data: end.receive(data, loop.time()), unpluggable=False)
-    end = SerialAmplifiers(far, terminal.write)
-    terminal.listen()
-    lines = Lines()
-    amplifiers = {
-        str(address): await lines.amplifier(
-            f"serial://{terminal.port}?address={address}", LIMITS, name=str(address)
-        )
-        for address in far
-    }
-    group = Group(amplifiers)
-    await group.open()
-    await group.arm()
-    layers = [Layer(0, (Tone(0, 100.0, 0.5),), 0.0)]
-    await group.apply(dict.fromkeys(amplifiers, layers))
-    assert [each.playback.level(0, loop.time()) for each in far.values()] == [0.5, 0.5]
-    stopped = await group.stop()
-    assert all(each.is_confirmed for each in stopped.values())
-    terminal.close()
-    with pytest.raises(LinkError):
-        await amplifiers["1"].read_status()
-    await lines.close()
+async def read_for_ever(amplifier: Amplifier) -> None:
+    """Read the status until an error, for five seconds at most."""
+    async with asyncio.timeout(5.0):
+        while True:
+            await amplifier.read_status()
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("wire", WORD_WIRES)
+async def test_group_plays_over_a_wire_and_stops(wire: str) -> None:
+    """Two amplifiers on one line: 0.5 on both after one commit, silent after the stop."""
+    async with WORD_WIRES[wire](2) as far:
+        lines = Lines()
+        amplifiers = {
+            str(number): await lines.amplifier(far.url(number), LIMITS, name=str(number))
+            for number in far.amplifiers
+        }
+        assert len({each.line for each in amplifiers.values()}) == 1
+        group = Group(amplifiers)
+        await group.open()
+        await group.arm(2.0)
+        layers = [Layer(0, (Tone(0, 100.0, 0.5),), 0.0)]
+        await group.apply(dict.fromkeys(amplifiers, layers))
+        levels = [far.level(number) for number in far.amplifiers]
+        assert levels == pytest.approx([0.5, 0.5], abs=1e-9)
+        await group.beat()
+        stopped = await group.stop()
+        assert all(each.is_confirmed for each in stopped.values())
+        assert [far.level(number) for number in far.amplifiers] == [0.0, 0.0]
+        await lines.close()
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("wire", CUT)
+async def test_cut_line_is_lost_once_and_opened_again(wire: str) -> None:
+    """Requests of both amplifiers fail with the same message, and those of a new line do not."""
+    async with WORD_WIRES[wire](2) as far:
+        lines = Lines()
+        both = [
+            await lines.amplifier(far.url(number), LIMITS, name="a") for number in far.amplifiers
+        ]
+        for amplifier in both:
+            await amplifier.open()
+        far.unplug()
+        messages = set()
+        for amplifier in both:
+            with pytest.raises(LinkError) as lost:
+                await read_for_ever(amplifier)
+            messages.add(str(lost.value))
+        assert messages == {both[0].line.loss}
+        assert "was lost" in messages.pop()
+        if wire in ("serial+tcp", "modbus+tcp"):  # whose server listens on
+            again = await lines.amplifier(far.url(1), LIMITS, name="a")
+            await again.open()
+            assert again.line is not both[0].line
+        else:
+            with pytest.raises(LinkError, match=r"cannot be opened|refused"):
+                await lines.amplifier(far.url(1), LIMITS, name="a")
+        await lines.close()
+
+
+async def test_ports_are_for_one_program_alone() -> None:
+    """A second host of the same terminal is refused, and a second user of the same address."""
+    async with WORD_WIRES["serial"](1) as far:
+        first, second = Lines(), Lines()
+        await first.amplifier(far.url(1), LIMITS, name="a")
+        with pytest.raises(LinkError, match="in use by another program"):
+            await second.amplifier(far.url(1), LIMITS, name="a")
+        with pytest.raises(LinkError, match="used once"):
+            await first.amplifier(far.url(1), LIMITS, name="b")
+        with pytest.raises(LinkError, match="baud must be 921600"):
+            await first.amplifier(far.url(2) + "&baud=115200", LIMITS, name="b")
+        await first.close()
 
 
 @pytest.mark.parametrize(
@@ -50,9 +97,16 @@ async def test_group_plays_over_a_pseudo_terminal_and_stops() -> None:
         ("serial:///dev/none-such?address=1", LinkError),
         ("serial:///dev/ttyS0?address=248", CommandError),
         ("serial://nonsense", CommandError),
+        ("modbus+tcp://127.0.0.1:1/1", LinkError),
+        ("can+slcan:///dev/none-such#1", LinkError),
+        ("can+slcan:///dev/ttyACM0?bitrate=300000#1", CommandError),
+        ("can+socketcand://127.0.0.1:1/can0#1", LinkError),
+        ("can+socketcan://none-such0#1", LinkError),
+        ("can+python-can://none-such/0#1", LinkError),
+        ("carrier+pigeon://roof", CommandError),
     ],
 )
 async def test_line_that_cannot_be_opened_is_refused(url: str, error: type[Exception]) -> None:
-    """No such port, an address that cannot be, no URL."""
+    """No such port or server, an address that cannot be, an unknown wire."""
     with pytest.raises(error):
         await Lines().amplifier(url, LIMITS, name="a")

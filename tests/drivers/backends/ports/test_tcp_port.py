@@ -1,4 +1,4 @@
-"""Modbus TCP connections with faults of the network or the server."""
+"""TCP connections with faults of the network or the server."""
 
 import asyncio
 import socket
@@ -7,9 +7,8 @@ import sys
 
 import pytest
 
-from drivers.backends.modbus import stream
-from drivers.backends.modbus.stream import open_stream
-from drivers.backends.urls.modbus import ModbusUrl
+from drivers.backends.ports import tcp
+from drivers.backends.ports.tcp import open_connection
 from drivers.errors import LinkError, LinkTimeout
 
 MEGABYTE = 1 << 20
@@ -19,13 +18,11 @@ async def test_connection_timeout_has_a_remedy(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The connection is neither accepted nor refused."""
-    monkeypatch.setattr(stream, "_CONNECT_TIMEOUT", 0.0)
+    monkeypatch.setattr(tcp, "_CONNECT_TIMEOUT", 0.0)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
         with pytest.raises(LinkError, match=rf"127.0.0.1:{port}: .*check the address"):
-            await open_stream(
-                ModbusUrl.parse(f"modbus+tcp://127.0.0.1:{port}/1"), lambda _: None, lambda _: None
-            )
+            await open_connection("127.0.0.1", port, lambda _: None, lambda _: None)
 
 
 async def test_first_address_that_accepts_is_used(
@@ -35,10 +32,8 @@ async def test_first_address_that_accepts_is_used(
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
         found = [(0, 0, 0, "", (address, 0)) for address in ("127.0.0.2", "127.0.0.1")]
-        monkeypatch.setattr(stream.socket, "getaddrinfo", lambda *args, **kwargs: found)
-        connection = await open_stream(
-            ModbusUrl.parse(f"modbus+tcp://amplifier.test:{port}/1"), lambda _: None, lambda _: None
-        )
+        monkeypatch.setattr(tcp.socket, "getaddrinfo", lambda *args, **kwargs: found)
+        connection = await open_connection("amplifier.test", port, lambda _: None, lambda _: None)
         taken, _ = listening.accept()
         taken.close()
         connection.close()
@@ -52,23 +47,21 @@ async def test_link_local_address_keeps_its_zone(
     """RFC 4007."""
     of_name = ("fe80::1", 0, 0, 3), ("fd00::1", 0, 0, 0), ("192.0.2.1", 0)
     found = [(0, 0, 0, "", address) for address in of_name]
-    monkeypatch.setattr(stream.socket, "getaddrinfo", lambda *args, **kwargs: found)
-    assert await stream._addresses("amplifier.test") == ["fe80::1%3", "fd00::1", "192.0.2.1"]
+    monkeypatch.setattr(tcp.socket, "getaddrinfo", lambda *args, **kwargs: found)
+    assert await tcp._addresses("amplifier.test") == ["fe80::1%3", "fd00::1", "192.0.2.1"]
 
 
 def test_unresolved_name_does_not_delay_the_end_of_the_program() -> None:
     """Even if the name server does not reply."""
     program = """
 import asyncio, socket, threading
-from drivers.backends.modbus import stream
-from drivers.backends.urls.modbus import ModbusUrl
+from drivers.backends.ports import tcp
 from drivers.errors import LinkError
 
 socket.getaddrinfo = lambda *args, **kwargs: threading.Event().wait()
-stream._CONNECT_TIMEOUT = 0.05
-url = ModbusUrl.parse("modbus+tcp://amplifier.test/1")
+tcp._CONNECT_TIMEOUT = 0.05
 try:
-    asyncio.run(stream.open_stream(url, lambda _: None, lambda _: None))
+    asyncio.run(tcp.open_connection("amplifier.test", 502, lambda _: None, lambda _: None))
 except LinkError as problem:
     print(problem)
 """
@@ -82,9 +75,7 @@ async def test_blocked_connection_is_a_timeout_before_memory_fills() -> None:
     """Closing discards unsent data."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
-        connection = await open_stream(
-            ModbusUrl.parse(f"modbus+tcp://127.0.0.1:{port}/1"), lambda _: None, lambda _: None
-        )
+        connection = await open_connection("127.0.0.1", port, lambda _: None, lambda _: None)
         connection.write(bytes(64 * MEGABYTE))
         with pytest.raises(LinkTimeout, match="check the network"):
             connection.write(b"x")

@@ -1,0 +1,32 @@
+"""Nodes on a CAN bus, whatever the adapter; frames come and go packed.
+
+How they are packed: `drivers.codec.can_bus.segments`.
+"""
+
+from drivers.backends.hardware import number_below
+from drivers.backends.urls.can_bus import CanBusUrl, CanUrl
+from drivers.codec.can_bus.segments import NUMBER_MAX
+from drivers.errors import CommandError
+from drivers.host.can_wire import CanWire
+from drivers.wires.address import WireAddress
+
+
+class CanAddress(WireAddress):
+    """A node on a CAN bus; its kinds differ in how the bus is opened."""
+
+    def __init__(self, url: str) -> None:
+        parsed = CanUrl.parse(url)
+        if parsed.bus.fd:
+            raise CommandError(f"{url!r}: fd must be left out; frames are those of classic CAN")
+        self.bus: CanBusUrl = parsed.bus
+        self.line, self.number = str(parsed.bus), parsed.node
+        self.settings = {
+            "protocol": "CAN",
+            "bitrate": parsed.bus.bitrate,
+            "baud": parsed.bus.baud,
+            "options": parsed.bus.options,
+        }
+
+    def make_wire(self) -> CanWire:
+        """Make the wire; a random start, so that a reply to an earlier host does not match."""
+        return CanWire(self.bus.bitrate, sequence=number_below(NUMBER_MAX + 1))

@@ -1,0 +1,45 @@
+"""Wires by the scheme of a URL: those of this project, and entry points of installed packages.
+
+Entry points are of the group `era_haptics.wires`, named by scheme; each is a class derived from
+`WireAddress`, and made with the URL.
+"""
+
+from collections.abc import Callable
+
+from drivers.errors import CommandError
+from drivers.wires.address import WireAddress
+from drivers.wires.modbus import ModbusAddress
+from drivers.wires.python_can import PythonCanAddress
+from drivers.wires.serial_line import SerialAddress
+from drivers.wires.slcan import SlcanAddress
+from drivers.wires.socketcand import SocketcandAddress
+from registry.plugins import Derived, PluginRegistry
+
+_WIRES: PluginRegistry[Callable[[str], WireAddress]] = PluginRegistry(
+    "wire",
+    "era_haptics.wires",
+    Derived(WireAddress),
+    error=CommandError,
+    own={
+        "can+python-can": PythonCanAddress,
+        "can+slcan": SlcanAddress,
+        "can+socketcan": PythonCanAddress,
+        "can+socketcand": SocketcandAddress,
+        "modbus+rtu": ModbusAddress,
+        "modbus+tcp": ModbusAddress,
+        "serial": SerialAddress,
+        "serial+tcp": SerialAddress,
+    },
+    ending="://",
+    example="serial:///dev/ttyUSB0?baud=921600",
+)
+
+
+def known_schemes() -> tuple[str, ...]:
+    """Return the URL schemes, our own first."""
+    return _WIRES.names()
+
+
+def address_of(url: str) -> WireAddress:
+    """Parse the URL of an amplifier; CommandError for an unknown or invalid one."""
+    return _WIRES.make(url)

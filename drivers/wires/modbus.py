@@ -1,0 +1,51 @@
+"""Modbus: modbus+tcp://HOST:PORT/UNIT and modbus+rtu:///dev/ttyS1?baud=115200#UNIT."""
+
+from collections.abc import Callable
+
+from drivers.backends.hardware import Port, number_below
+from drivers.backends.ports.opening import open_port
+from drivers.backends.ports.tcp import open_connection
+from drivers.backends.urls.modbus import ModbusUrl
+from drivers.host.modbus_wire import ModbusWire
+from drivers.wires.address import WireAddress
+from drivers.wires.silent_port import SilentPort
+
+
+class ModbusAddress(WireAddress):
+    """A unit over TCP, on a serial port of this machine, or behind a serial server."""
+
+    def __init__(self, url: str) -> None:
+        parsed = ModbusUrl.parse(url)
+        self.line, self.number = parsed.endpoint, parsed.unit
+        self.settings = {
+            "protocol": "Modbus RTU" if parsed.is_rtu else "Modbus TCP",
+            "baud": parsed.baud,
+            "parity": parsed.parity,
+            "stop": parsed.stop,
+        }
+        self._url = parsed
+
+    def make_wire(self) -> ModbusWire:
+        """Make the wire; a random start, so that a reply to an earlier host does not match."""
+        url = self._url
+        return ModbusWire(url.baud, is_rtu=url.is_rtu, number=number_below(1 << 16))
+
+    async def open_port(
+        self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+    ) -> Port:
+        """Open the port; raises LinkError."""
+        url = self._url
+        if not url.device:
+            return await open_connection(url.host, url.port, on_data, on_loss)
+        port = SilentPort(self.make_wire().silence, url.bits_per_byte / url.baud, on_data)
+        await port.open(
+            lambda heard: open_port(
+                url.device,
+                baud=url.baud,
+                parity=url.parity,
+                stop=url.stop,
+                on_data=heard,
+                on_loss=on_loss,
+            )
+        )
+        return port

@@ -1,0 +1,82 @@
+"""A serial port that keeps the line silent before each frame, as Modbus RTU has it."""
+
+import asyncio
+import contextlib
+from collections.abc import Awaitable, Callable
+from typing import final
+
+from drivers.backends.hardware import Port
+from drivers.errors import LinkError
+
+_FRAME_MAX = 256  # bytes
+_BROADCAST = b"\0"
+
+
+@final
+class SilentPort:
+    """A port that sends a frame once the line was silent for a time [s]; implements `Port`.
+
+    byte_time [s]; on_data: called with what is received. A frame waits at most for the longest
+    other one, so that noise does not keep a stop waiting. Of those that wait a newer one replaces
+    the older: its request was given up. Broadcasts stay, which have no reply to wait for.
+    """
+
+    def __init__(self, silence: float, byte_time: float, on_data: Callable[[bytes], None]) -> None:
+        self._silence, self._byte_time, self._on_data = silence, byte_time, on_data
+        self._loop = asyncio.get_running_loop()
+        self._free_from = self._loop.time() + silence
+        self._waiting: list[tuple[float, bytes]] = []  # until when [s] at most, frame
+        self._timer: asyncio.TimerHandle | None = None
+        self._port: Port  # set once open
+
+    async def open(self, open_port: Callable[[Callable[[bytes], None]], Awaitable[Port]]) -> None:
+        """Open the port below, by a function of what takes its data; raises LinkError."""
+        self._port = await open_port(self._heard)
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether it has not taken all bytes yet."""
+        return self._port.is_blocked
+
+    def write(self, data: bytes) -> None:
+        """Send a frame as soon as the line was silent; raises LinkError."""
+        latest = self._loop.time() + _FRAME_MAX * self._byte_time + self._silence
+        kept = [each for each in self._waiting if each[1].startswith(_BROADCAST)]
+        self._waiting = [*kept, (latest, data)]
+        self._send()
+
+    def poll(self) -> None:
+        """Hand over what has come and was not read yet."""
+        self._port.poll()
+
+    def close(self) -> None:
+        """Close it; no callback is called afterwards."""
+        self._waiting.clear()
+        self._port.close()
+
+    async def wait_closed(self) -> None:
+        """Wait until it is closed."""
+        await self._port.wait_closed()
+
+    def _heard(self, data: bytes) -> None:
+        self._free_from = max(self._free_from, self._loop.time() + self._silence)
+        self._on_data(data)
+
+    def _send(self) -> None:
+        """Send what may go now; the timer sends the rest."""
+        while self._waiting:
+            latest, frame = self._waiting[0]
+            due = min(self._free_from, latest)
+            now = self._loop.time()
+            if now < due:
+                if self._timer is None:
+                    self._timer = self._loop.call_at(due, self._due)
+                return
+            del self._waiting[0]
+            self._free_from = now + len(frame) * self._byte_time + self._silence
+            self._port.write(frame)
+
+    def _due(self) -> None:
+        self._timer = None
+        with contextlib.suppress(LinkError):  # the loss of the port is reported by itself
+            self._send()

@@ -8,7 +8,14 @@ from dataclasses import dataclass, replace
 
 from drivers import clock
 from drivers.contents import Layer
-from drivers.errors import CommandError, CommandRefused, LinkDegraded, LinkError, Preempted
+from drivers.errors import (
+    CommandError,
+    CommandRefused,
+    LinkDegraded,
+    LinkError,
+    LinkTimeout,
+    Preempted,
+)
 from drivers.guard.budget import COMMIT_DELAY
 from drivers.host.comparison import MAX_CONTRADICTIONS, name_of, problem_of
 from drivers.host.feeding import Feeding
@@ -28,6 +35,7 @@ STOP_RAMP = 0.005  # s; the shortest without a step
 DISARM_RAMP = 0.05  # s; long enough to avoid a click
 OPEN_TIMEOUT = 0.5  # s; for boards that restart when their port is opened
 CONFIRM_TIMEOUT = 0.3  # s; three replies of the slowest wire
+_SECOND_REPLY = 0.02  # s; for one of another amplifier at the same address
 LISTENING = 0.3  # s; to an amplifier that is found armed
 _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
@@ -96,6 +104,7 @@ class Amplifier:
         self._admitted: Staged | None = None
         self._contradictions = 0
         self._other_host_at = -math.inf  # when it was heard last
+        self._are_several = False
         line.members[address] = self
 
     @property
@@ -118,7 +127,14 @@ class Amplifier:
 
     async def identify(self) -> None:
         """Read identity and capabilities; raises LinkError."""
-        identity = await self._request("Hello", {}, Priority.OTHER, timeout=OPEN_TIMEOUT)
+        self._are_several = False
+        try:
+            identity = await self._request("Hello", {}, Priority.OTHER, timeout=OPEN_TIMEOUT)
+            await asyncio.sleep(_SECOND_REPLY)
+        except LinkTimeout:
+            self._check_alone()
+            raise
+        self._check_alone()
         if not speaks(identity, VERSION):
             spoken = [str(version) for version in range(16) if speaks(identity, version)]
             raise LinkError(
@@ -139,6 +155,14 @@ class Amplifier:
             raise LinkError(f"amplifier {self.name}: watchdog_min must be below watchdog_max")
         self._ledger = Ledger(self.limits, can)
         self.identity, self.capabilities, self._serial_number = identity, can, serial
+
+    def _check_alone(self) -> None:
+        """Raise LinkError where several replied."""
+        if self._are_several:
+            raise LinkError(
+                f"amplifier {self.name}: several amplifiers reply at address {self.address} on "
+                f"{self.line.name}; give each its own: era amp address --serial-number"
+            )
 
     async def arm(self, session: int, watchdog: float = WATCHDOG) -> Values:
         """Switch the high voltage on at level zero; watchdog [s]. Returns the status."""
@@ -351,6 +375,10 @@ class Amplifier:
     def note_other_host(self) -> None:
         """Note that another host drives it: it must feed the watchdog within its longest time."""
         self._other_host_at = clock.now()
+
+    def note_several(self) -> None:
+        """Note that others have its address too; `identify` says so."""
+        self._are_several = True
 
     def check_other_host(self) -> None:
         """Raise LinkError if another host drives it."""

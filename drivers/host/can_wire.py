@@ -21,7 +21,7 @@ from drivers.codec.can_bus.segments import (
     unpack_frames,
 )
 from drivers.codec.can_bus.timing import CanTimes
-from drivers.host.wire import Arrival, Broken, Event, OtherHost, Reply, read_nak
+from drivers.host.wire import Arrival, Broken, Event, OtherHost, Reply, Several, read_nak
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.serial_payload import BROADCAST, HELLO
 from drivers.protocol.table import (
@@ -32,10 +32,13 @@ from drivers.protocol.table import (
     MAX_WORDS,
     MESSAGES,
     NAK,
+    VERSION,
 )
 from drivers.statistics import WireCounters
 
 _KEPT = 3 * frames_of(MAX_WORDS)  # frames sent last, which an adapter may echo
+_READ_VERSIONS = bytes((0x40, 0x00, 0x20, 5, 0, 0, 0, 0))  # upload of 2000:5, CiA 301 7.2.4.3.5
+_VERSIONS_READ = bytes((0x4B, 0x00, 0x20, 5))  # two bytes of data follow
 _START: int = CANOPEN["nmt"]["start"]
 
 
@@ -49,13 +52,15 @@ class CanWire:
         self._numbers: dict[int, int] = {}  # last ones by node
         self._sent: deque[CanFrame] = deque(maxlen=_KEPT)
         self._pending: tuple[int, int, int] | None = None  # node, number, type
+        self._asked = BROADCAST  # node of the last request
         self._replies = Assembler(self.counters)
         self._events: dict[int, Assembler] = {}
 
     def request(self, address: int, name: str, values: Values) -> bytes:
         """Return the frames of a request, which is on the wire from now on; address 0: of all.
 
-        Hello sets the node operational first.
+        Hello sets the node operational first, and reads its versions from an object, which one of
+        another version has too.
         """
         number, kind, words = 0, HELLO, list[int]()
         if address != BROADCAST:
@@ -66,8 +71,10 @@ class CanWire:
         frames = [CanFrame(REQUEST + address, data) for data in segments(number, kind, words)]
         self._sent.extend(frames)
         if name == "Hello":
-            frames.insert(0, CanFrame(cob_id("nmt"), bytes((_START, address))))
+            start = CanFrame(cob_id("nmt"), bytes((_START, address)))
+            frames[:0] = start, CanFrame(cob_id("sdo_request", address), _READ_VERSIONS)
         self._pending = None if address == BROADCAST else (address, number, kind)
+        self._asked = address
         self._replies = Assembler(self.counters)
         self.counters.frames_out += len(frames)
         return pack_frames(frames)
@@ -96,6 +103,8 @@ class CanWire:
             return self._from_amplifier(node, frame.data)
         if node and kind == REQUEST and frame not in self._sent:
             return self._from_host(node, frame.data)
+        if kind == cob_id("sdo_answer") and frame.data.startswith(_VERSIONS_READ):
+            return self._other_version(node, frame.data)
         return None  # of other devices, or an echo
 
     def _from_amplifier(self, node: int, data: bytes) -> Arrival | None:
@@ -103,6 +112,9 @@ class CanWire:
             events = self._events.setdefault(node, Assembler(self.counters, is_numbered=False))
             message = events.add(data, clock.now())
             return None if message is None else self._event(node, message)
+        if node == self._asked and self._replies.contradicts(data):
+            self._replies.add(data, clock.now())  # which discards the message
+            return Several(node)
         if self._pending is None or (node, *data[:1]) != self._pending[:2]:
             self.counters.frames_in += 1
             self.counters.unexpected_frames += data[1:2] == b"\0"
@@ -115,6 +127,14 @@ class CanWire:
             return _reply(message, kind)
         except Refusal as refusal:
             return Broken(str(refusal))
+
+    def _other_version(self, node: int, data: bytes) -> Reply | None:
+        """Take the versions for the reply to Hello, if it is of a node that will not reply."""
+        versions = int.from_bytes(data[4:6], "little")
+        if self._pending is None or self._pending[::2] != (node, HELLO) or versions >> VERSION & 1:
+            return None
+        self._pending = None
+        return Reply({"versions": versions})
 
     def _from_host(self, node: int, data: bytes) -> OtherHost | None:
         """Note a frame of another host; one that reads or stops does not drive the amplifier."""

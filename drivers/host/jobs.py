@@ -62,6 +62,9 @@ class Member(Protocol):
     def note_other_host(self) -> None:
         """Note that another host drives it."""
 
+    def note_several(self) -> None:
+        """Note that others have its address too."""
+
     def check_request(self, name: str) -> None:
         """Raise LinkError where a request of this name must not go out now."""
 

@@ -14,7 +14,7 @@ from typing import Protocol
 from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout, Preempted
 from drivers.host.jobs import Job, JobQueue, Member, Priority
 from drivers.host.joint_start import JointStart
-from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Wire
+from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Several, Wire
 from drivers.protocol.records import Values
 from drivers.protocol.table import REACTION
 
@@ -98,13 +98,16 @@ class Line:
     def received(self, data: bytes) -> None:
         """Take bytes from the port."""
         for arrival in self.wire.received(data):
-            if isinstance(arrival, Event | OtherHost):
+            if isinstance(arrival, Event | OtherHost | Several):
                 if (member := self.members.get(arrival.address)) is None:
                     continue
-                if isinstance(arrival, Event):
-                    member.note_event(arrival.values)
-                else:
-                    member.note_other_host()
+                match arrival:
+                    case Event():
+                        member.note_event(arrival.values)
+                    case OtherHost():
+                        member.note_other_host()
+                    case Several():
+                        member.note_several()
                 continue
             job = self._current
             if job is None:

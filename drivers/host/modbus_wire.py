@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from drivers.codec.modbus.adu import ModbusResponse, RequestAdu, ResponseReader, build_adu
 from drivers.codec.modbus.exchanges import Read, Write
-from drivers.host.wire import Arrival, Broken, More, Nak, Reply, read_nak
+from drivers.host.wire import Arrival, Broken, More, Nak, Reply, Several, read_nak
 from drivers.protocol.definition import WireQuantity
 from drivers.protocol.records import Number, Numbers, Real, Record, Refusal, Rest, Rows, Values
 from drivers.protocol.serial_payload import BROADCAST
@@ -63,6 +63,7 @@ class ModbusWire:
         self._is_rtu = is_rtu
         self._number = number
         self._request: _Request | None = None
+        self._replied: tuple[RequestAdu, ModbusResponse] | None = None  # the last reply
         self._reader = ResponseReader(is_rtu=is_rtu, counters=self.counters)
         self._sizes: dict[int, tuple[int, int]] = {}  # channels and layers of each unit
 
@@ -71,7 +72,7 @@ class ModbusWire:
 
         Over TCP a request of all is a frame to each unit that was sent something before.
         """
-        self._request = None
+        self._request = self._replied = None
         if address == BROADCAST:
             if self._is_rtu:
                 return self._written(BROADCAST, name, values).adu.frame
@@ -87,12 +88,17 @@ class ModbusWire:
 
     def received(self, data: bytes) -> list[Arrival]:
         """Return what these bytes complete."""
-        request = self._request
-        adu = None if request is None else request.adu
+        adu = None
+        if self._request is not None:
+            adu = self._request.adu
+        elif self._replied is not None:
+            adu = self._replied[0]
         arrivals: list[Arrival] = []
         for response in self._reader.feed(data, adu):
             if self._request is None or self._request.adu is not adu:  # a second response
                 self.counters.unexpected_frames += 1
+                if self._replied is not None and self._replied != (adu, response):
+                    arrivals.append(Several(self._replied[0].unit))
             elif (arrival := self._arrival(self._request, response)) is not None:
                 arrivals.append(arrival)
         return arrivals
@@ -149,7 +155,7 @@ class ModbusWire:
         if request.name != "Hello" and tag != request.tag:
             self.counters.unexpected_frames += 1
             return None
-        self._request = None
+        self._request, self._replied = None, (request.adu, response)
         try:
             if request.name == "Hello":
                 return Reply(_identity(response.registers))

@@ -8,7 +8,7 @@ from drivers.codec.serial_line.frame import (
     encode_frame,
     frame_length,
 )
-from drivers.host.wire import Arrival, Broken, Event, Reply, read_nak
+from drivers.host.wire import Arrival, Broken, Event, Reply, Several, read_nak
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.serial_payload import (
     BROADCAST,
@@ -39,6 +39,7 @@ class SerialWire:
         self._baud = baud
         self._sequence = sequence
         self._pending: Frame | None = None
+        self._replied: Frame | None = None  # the last reply
         self._reader = FrameReader(on_invalid=self._count_invalid)
 
     def request(self, address: int, name: str, values: Values) -> bytes:
@@ -85,12 +86,19 @@ class SerialWire:
             or (frame.address, frame.sequence) != (pending.address, pending.sequence)
         ):
             self.counters.unexpected_frames += 1
-            return None
-        self._pending = None
+            return Several(frame.address) if self._is_second(frame) else None
+        self._pending, self._replied = None, frame
         try:
             return _reply(frame, pending)
         except Refusal as refusal:
             return Broken(str(refusal))
+
+    def _is_second(self, frame: Frame) -> bool:
+        """Whether a frame is another reply to the request that was replied to last."""
+        last = self._replied
+        if last is None or frame == last:
+            return False
+        return (frame.address, frame.sequence) == (last.address, last.sequence)
 
     def _event(self, frame: Frame) -> Event | None:
         try:

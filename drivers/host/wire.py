@@ -53,13 +53,20 @@ class OtherHost:
 
 
 @dataclass(frozen=True, slots=True)
+class Several:
+    """Several amplifiers have an address: two replies to one request differ."""
+
+    address: int
+
+
+@dataclass(frozen=True, slots=True)
 class More:
     """The request goes on with these bytes, as on Modbus."""
 
     data: bytes
 
 
-Arrival: TypeAlias = Reply | Nak | Broken | Event | OtherHost | More
+Arrival: TypeAlias = Reply | Nak | Broken | Event | OtherHost | Several | More
 
 
 def read_nak(words: Sequence[int]) -> Nak:

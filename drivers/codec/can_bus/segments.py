@@ -100,6 +100,11 @@ class Assembler:
             return None
         return self._whole()
 
+    def contradicts(self, data: bytes) -> bool:
+        """Whether the data of a frame differ from those of the same number and index before."""
+        known = self._frames.get(data[1]) if len(data) == BLOCK else None
+        return known is not None and known[0] == data[0] and known != data
+
     def _is_frame(self, data: bytes) -> bool:
         if len(data) != BLOCK or bool(data[0]) is not self._is_numbered:
             return False

@@ -12,7 +12,7 @@ from drivers.contents import Layer, Tone
 from drivers.errors import LinkError
 from drivers.host.can_wire import CanWire
 from drivers.host.group import Group
-from drivers.host.wire import Arrival, Broken, Event, Nak, OtherHost, Reply
+from drivers.host.wire import Arrival, Broken, Event, Nak, OtherHost, Reply, Several
 from drivers.protocol.table import MESSAGES
 from virtual_loop import run_virtual
 from words_line import MemoryLine
@@ -35,14 +35,36 @@ def wire() -> CanWire:
 
 
 def test_hello_starts_the_node() -> None:
-    """Network management first, then a message of type 1 without words; numbers by node."""
+    """Network management, an upload of 2000:5 (CiA 301, 7.2.4.3.5), then a message of type 1.
+
+    It has no words; numbers are by node.
+    """
     wire = CanWire(500_000, sequence=255)
     for node in (5, 6):
         sent = unpack_frames(wire.request(node, "Hello", {}))
         assert [(frame.id, frame.data.hex()) for frame in sent] == [
             (0, f"010{node}"),
+            (0x600 + node, "4000200500000000"),
             (0x200 + node, "0100010000000000"),
         ]
+
+
+def test_versions_of_another_protocol_end_hello() -> None:
+    """Bit 2 for version 2: such an amplifier has the object, and does not reply to the message."""
+    wire = CanWire(500_000, sequence=0)
+    wire.request(NODE, "Hello", {})
+    versions = [
+        pack_frames([CanFrame(can_id, bytes.fromhex(data))])
+        for can_id, data in (
+            (0x585, "4B0020050C000000"),  # 2 and 3
+            (0x586, "4B00200504000000"),  # of another node
+            (0x585, "8000200500000206"),  # no such object
+            (0x585, "4B00200504000000"),
+        )
+    ]
+    assert [wire.received(each) for each in versions] == [[], [], [], [Reply({"versions": 4})]]
+    wire.request(NODE, "GetStatus", {})
+    assert not wire.received(versions[-1])
 
 
 def test_broadcast_has_number_0_and_no_reply(wire: CanWire) -> None:
@@ -69,12 +91,18 @@ ANSWERS: dict[str, tuple[bytes, list[Arrival]]] = {
 
 @pytest.mark.parametrize("answer", ANSWERS)
 def test_reply_has_number_and_node_of_its_request(wire: CanWire, answer: str) -> None:
-    """What is neither that nor an event is unexpected, and leaves the request on the wire."""
+    """What is neither that nor an event is unexpected, and leaves the request on the wire.
+
+    After a reply another one that differs is of a second amplifier.
+    """
     data, expected = ANSWERS[answer]
     assert wire.received(data) == expected
     assert wire.counters.unexpected_frames == (not expected)
     rest = wire.received(ANSWERS["reply"][0])
-    assert len(rest) == (expected in ([], ANSWERS["event"][1]))
+    if expected in ([], ANSWERS["event"][1]):
+        assert len(rest) == 1
+    else:
+        assert rest == ([Several(NODE)] if isinstance(expected[0], Nak) else [])
 
 
 def test_reply_of_another_type_is_broken(wire: CanWire) -> None:

@@ -52,7 +52,7 @@ class CanWire:
         self._numbers: dict[int, int] = {}  # last ones by node
         self._sent: deque[CanFrame] = deque(maxlen=_KEPT)
         self._pending: tuple[int, int, int] | None = None  # node, number, type
-        self._asked = BROADCAST  # node of the last request
+        self._requested = BROADCAST  # node of the last request
         self._replies = Assembler(self.counters)
         self._events: dict[int, Assembler] = {}
 
@@ -74,7 +74,7 @@ class CanWire:
             start = CanFrame(cob_id("nmt"), bytes((_START, address)))
             frames[:0] = start, CanFrame(cob_id("sdo_request", address), _READ_VERSIONS)
         self._pending = None if address == BROADCAST else (address, number, kind)
-        self._asked = address
+        self._requested = address
         self._replies = Assembler(self.counters)
         self.counters.frames_out += len(frames)
         return pack_frames(frames)
@@ -112,7 +112,7 @@ class CanWire:
             events = self._events.setdefault(node, Assembler(self.counters, is_numbered=False))
             message = events.add(data, clock.now())
             return None if message is None else self._event(node, message)
-        if node == self._asked and self._replies.contradicts(data):
+        if node == self._requested and self._replies.contradicts(data):
             self._replies.add(data, clock.now())  # which discards the message
             return Several(node)
         if self._pending is None or (node, *data[:1]) != self._pending[:2]:

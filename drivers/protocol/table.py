@@ -66,6 +66,14 @@ REFUSALS: Mapping[str, int] = {
     "INCOMPLETE": 12,
 }
 STATUS_FLAGS: Mapping[str, int] = {"high_voltage": 0, "interlock_open": 1, "limited": 2}
+SENSOR_UNITS: Mapping[str, int] = {
+    **{"ACCELERATION": 1, "VELOCITY": 2, "DISPLACEMENT": 3, "FORCE": 4, "VOLTAGE": 5},
+}
+"""m/s², m/s, m, N and V, of the range and of the amplitudes of a sensor."""
+READING_STATES: Mapping[str, int] = {"NONE": 0, "RUNNING": 1, "COMPLETE": 2, "DISTURBED": 3}
+"""DISTURBED: complete as well, but what plays has changed within its window."""
+UNKNOWN_PLACE: Final = 0xFFFF
+"""Coordinate of a sensor whose place the amplifier does not know."""
 FEATURES: Mapping[str, int] = {
     **{"output": 0, "events": 1, "levels_measured": 2, "interlock": 3},
     **{"electrical": 4, "sensors": 5, "address": 6},

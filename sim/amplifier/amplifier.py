@@ -122,11 +122,11 @@ class SimulatedAmplifier:
     """An amplifier with a name, and numbers of channels and voices; times [s] of any one clock.
 
     listeners: called with every change of state or fault, and its time [s]. capabilities: others
-    hold from the next restart. is_of_voltage: whether its levels and outputs are of a voltage.
+    hold from the next restart. is_output: whether its levels and outputs are of a voltage.
     """
 
     def __init__(
-        self, name: str, *, channels: int, voices: int = VOICES, is_of_voltage: bool = False
+        self, name: str, *, channels: int, voices: int = VOICES, is_output: bool = False
     ) -> None:
         self.identity = Identity(
             vendor="era-haptics",
@@ -136,7 +136,7 @@ class SimulatedAmplifier:
             versions=(PROTOCOL.version,),
         )
         self.capabilities = capabilities(channels, voices)
-        if is_of_voltage:
+        if is_output:
             features = FEATURES | Feature.VOLTAGE
             self.capabilities = replace(self.capabilities, features=features)
         self.state = AmplifierState.SWITCH_ON_DISABLED

@@ -61,6 +61,43 @@ class SensorPort(Protocol):
         """Forget the reading, as without supply."""
 
 
+class AmplifierPort(Protocol):
+    """An amplifier as its far ends serve it: an `Amplifier`, or one with faults of its supply."""
+
+    @property
+    def identity(self) -> Values:
+        """Values of its identity."""
+
+    @property
+    def state(self) -> str:
+        """Name of its state."""
+
+    @property
+    def fault(self) -> str:
+        """Name of its fault."""
+
+    @property
+    def listeners(self) -> list[Callable[[Values, float], None]]:
+        """Called with the values of every Event, and its time [s]."""
+
+    @property
+    def is_answering(self) -> bool:
+        """Whether it replies at all: neither hung nor without supply."""
+
+    @property
+    def next_event(self) -> float:
+        """Time of its next event [s]."""
+
+    def tick(self, now: float) -> None:
+        """Process the events due by now."""
+
+    def handle(self, name: str, values: Values, now: float) -> Values:
+        """Return the values of the reply to a request at a time [s]; raises Refusal."""
+
+    def restart(self, moment: float) -> None:
+        """Power-cycle it."""
+
+
 def capabilities(channels: int, *, is_output: bool = False) -> Values:
     """Capabilities of a simulated amplifier with this number of channels.
 
@@ -89,6 +126,8 @@ class Amplifier:
     from the next restart. session: held while armed, or the one that ended last.
     """
 
+    is_answering = True
+
     def __init__(self, name: str, *, channels: int, is_output: bool = False) -> None:
         self.identity: Values = {
             **{"versions": 1 << 3, "vendor": "era-haptics", "product": "simulated amplifier"},
@@ -103,6 +142,7 @@ class Amplifier:
         self._faults: deque[tuple[str, int | None, float]] = deque(maxlen=_FAULTS_KEPT)
         self._heat = ThermalState(since=-math.inf)
         self._is_interlock_open = False
+        self.committed_at = -math.inf  # s; see `token`
         self._sensing: SensorPort | None = None
         self._start()
 
@@ -123,6 +163,8 @@ class Amplifier:
         self._intake = SetIntake(can)
         self._watchdog = 0.0
         self._last_fed = 0.0
+        self.token = 0
+        """Of the set since arming that changed last what plays, and began t; 0: none."""
         self._silent_from = -math.inf  # end of the last silencing ramp
         self._is_limited = False
         self.is_derated = False
@@ -317,6 +359,7 @@ class Amplifier:
         # Arming starts at level zero, even if the last session left a fade.
         self._silence(now, ramp=SILENCING_RAMP)
         self._intake.forget()
+        self.token = 0
         self.session = session
         self._last_fed = now
         self._enter(_ENABLED, now)
@@ -347,6 +390,9 @@ class Amplifier:
     def _play(self, layers: Sequence[LayerSet], token: int, now: float) -> None:
         wanted = derated(layers, DERATED) if self.is_derated else layers
         self.playback.commit(wanted, token, now)
+        if all(layer.renew for layer in layers):
+            return
+        self.token, self.committed_at = token, now
         self._is_limited |= any(self._exceeds_full(channel, now) for channel in self._channels)
         self._changed(now)
 

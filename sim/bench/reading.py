@@ -6,18 +6,11 @@ together do not leak into each other; of the samples only the newest are kept.
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 
-from drivers.protocol.messages import (
-    Measure,
-    Reading,
-    ReadingState,
-    SampleBlock,
-    SensorReading,
-    ToneReading,
-)
 from model.arrays import FloatArray
 from sim.plant.transducer import Transducer, read_accelerations
 
@@ -25,17 +18,26 @@ KEPT_SAMPLES = 16_384  # of each sensor; 1.6 s at 10 kHz
 _COUNTS = 32_767  # of a raw sample at the range
 
 
+@dataclass(frozen=True)
+class Measurement:
+    """Tones [Hz] that are measured over a window [s]; number: of the reading."""
+
+    number: int
+    window: float
+    frequencies: tuple[float, ...]
+
+
 @final
 class ToneReader:
     """Reads tones at sensors from `start` [s] on, while samples of its window come.
 
     shapes: returns those at its sensors (s, r); origin [s]: where t begins; token: of what plays.
-    on_end: called with it after the last sample.
+    on_end: called with it after the last sample. offset: t at the start [s].
     """
 
     def __init__(
         self,
-        request: Measure,
+        measurement: Measurement,
         transducers: Sequence[Transducer],
         *,
         shapes: Callable[[], FloatArray],
@@ -46,19 +48,19 @@ class ToneReader:
         rng: np.random.Generator,
         on_end: Callable[["ToneReader"], None],
     ) -> None:
-        self.request = request
-        self.end = start + request.window
+        self.measurement = measurement
+        self.end = start + measurement.window
+        self.offset = 0.0 if origin is None else start - origin
+        self.token = token
         self.is_disturbed = False
         self._transducers = tuple(transducers)
         self._shapes = shapes
         self._start = start
-        self._offset = 0.0 if origin is None else start - origin
-        self._token = token
         self._sample_rate = sample_rate
         self._rng = rng
         self._on_end = on_end
         self._reach = np.array([one.reach for one in transducers])
-        unknowns, sensors = 2 * len(request.frequencies) + 1, len(transducers)
+        unknowns, sensors = 2 * len(measurement.frequencies) + 1, len(transducers)
         self._normal = np.zeros((unknowns, unknowns))
         self._right = np.zeros((unknowns, sensors))
         self._is_overloaded = np.zeros(sensors, dtype=bool)
@@ -79,7 +81,7 @@ class ToneReader:
             sample_rate=self._sample_rate,
             rng=self._rng,
         )
-        angles = 2 * math.pi * np.outer(times[inside] - self._start, self.request.frequencies)
+        angles = 2 * math.pi * np.outer(times[inside] - self._start, self.measurement.frequencies)
         columns = np.hstack([np.sin(angles), np.cos(angles), np.ones((len(angles), 1))])
         self._normal += columns.T @ columns
         self._right += columns.T @ readings
@@ -92,46 +94,23 @@ class ToneReader:
         if len(times) and times[-1] + 1 / self._sample_rate > self.end:
             self._on_end(self)
 
-    def reading(self, first: int, now: float) -> Reading:
-        """The reading at a time [s], its sensors from one on."""
-        request = self.request
-        state, left = ReadingState.RUNNING, self.end - now
-        sensors: tuple[SensorReading, ...] = ()
-        if left <= 0:
-            state = ReadingState.DISTURBED if self.is_disturbed else ReadingState.COMPLETE
-            left, sensors = 0.0, self._sensors()[first:]
-        return Reading(
-            request.number,
-            state,
-            left,
-            self._offset,
-            self._token,
-            len(request.frequencies),
-            sensors,
-        )
+    def tones(self) -> list[tuple[bool, list[complex]]]:
+        """Of each sensor: whether it was overloaded, and the phasors of its tones."""
+        frequencies = np.array(self.measurement.frequencies)
+        count = len(frequencies)
+        found, *_ = np.linalg.lstsq(self._normal, self._right, rcond=None)
+        phasors = found[:count] + 1j * found[count : 2 * count]
+        phasors *= np.exp(-2j * math.pi * frequencies * self.offset)[:, None]
+        return list(zip(self._is_overloaded.tolist(), phasors.T.tolist(), strict=True))
 
-    def samples(self, sensor: int, first: int, *, limit: int) -> SampleBlock | None:
-        """At limit so many raw samples from one on, or the oldest kept; None for no such sensor."""
-        if not 0 <= sensor < len(self._transducers):
-            return None
+    def samples(self, sensor: int, first: int, *, limit: int) -> tuple[int, int, list[int]]:
+        """At limit so many raw samples from one on, or the oldest kept.
+
+        Returns the number of the first, the number after the newest so far, and the samples.
+        """
         first = min(max(first, self._count - KEPT_SAMPLES, 0), self._count)
         numbers = np.arange(first, min(first + limit, self._count))
-        samples = self._kept[numbers % KEPT_SAMPLES, sensor]
-        return SampleBlock(self.request.number, first, self._count, tuple(samples.tolist()))
-
-    def _sensors(self) -> tuple[SensorReading, ...]:
-        frequencies = np.array(self.request.frequencies)
-        tones = len(frequencies)
-        found, *_ = np.linalg.lstsq(self._normal, self._right, rcond=None)
-        phasors = found[:tones] + 1j * found[tones : 2 * tones]
-        phasors *= np.exp(-2j * math.pi * frequencies * self._offset)[:, None]
-        return tuple(
-            SensorReading(
-                tuple(ToneReading(abs(a), math.degrees(np.angle(a))) for a in column.tolist()),
-                is_overloaded=bool(is_overloaded),
-            )
-            for column, is_overloaded in zip(phasors.T, self._is_overloaded, strict=True)
-        )
+        return first, self._count, self._kept[numbers % KEPT_SAMPLES, sensor].tolist()
 
 
 def count_step(reach: float) -> float:

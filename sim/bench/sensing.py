@@ -3,6 +3,8 @@
 They read the acceleration of the plate in time. Not modelled: delay of the sensors.
 """
 
+import cmath
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -10,30 +12,25 @@ from typing import Protocol, final
 
 import numpy as np
 
-from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import (
-    GetBlock,
-    GetReading,
-    GetSensors,
-    Measure,
-    Nak,
-    NakCode,
-    Reading,
-    ReadingState,
-    Reply,
-    SampleBlock,
-    Sensor,
-    SensorList,
-    SensorUnit,
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.table import (
+    MAX_WORDS,
+    NO_CHANNEL,
+    QUANTITIES,
+    READING_STATES,
+    SENSOR_UNITS,
+    UNKNOWN_PLACE,
+    sensor_reading,
 )
 from model.arrays import FloatArray
-from sim.amplifier.amplifier import SensorRequest
-from sim.bench.reading import ToneReader, count_step
+from sim.bench.reading import Measurement, ToneReader, count_step
 
 REACH = 2000.0
 """Largest range [m/s²]; the paper's plate stays below with all ERAs at full stroke."""
 
-_Q = PROTOCOL.quantities
+_Q = QUANTITIES
+_MAX_SENSORS = _Q["sensor"].maximum + 1
+_SENSOR_WORDS, _HEAD_WORDS = 7, 8  # of a sensor that is listed, of a reading without sensors
 _ROUNDING = 1e-6
 _BELOW_NYQUIST, _FREQUENCY_MAX = 0.8, 3000.0  # Hz
 
@@ -74,11 +71,11 @@ class Played(Protocol):
 
     @property
     def token(self) -> int:
-        """Token of the set played last since arming; 0: none."""
+        """Token of the set since arming from whose commit t counts; 0: none."""
 
     @property
     def committed_at(self) -> float:
-        """Time of its commit [s]."""
+        """Time of that commit [s]."""
 
 
 @final
@@ -93,78 +90,91 @@ class Sensing:
         self._feet = tuple(feet)
         self._others: tuple[PlateSensor, ...] = ()
         self._rng = np.random.default_rng(seed)
-        self._reader: ToneReader | None = None
+        self.reader: ToneReader | None = None
+        """What reads the tones, or has read them last."""
 
     def place(self, others: Sequence[PlateSensor]) -> None:
         """Replace the sensors that are not at ERAs; more than the protocol counts are left out."""
         self._others = tuple(replace(one, reach=min(one.reach, REACH)) for one in others)
 
-    def handle(self, request: SensorRequest, now: float) -> Reply:
-        """Reply to a request at a time [s]."""
-        match request:
-            case GetSensors(first=first):
-                each = [self._described(sensor) for sensor in self._sensors]
-                return SensorList(len(each), tuple(each[first:]))
-            case Measure():
-                return self._measure(request, now)
-            case GetReading(first=first):
-                return self._reading(first, now)
-            case GetBlock():
-                return self._block(request)
+    def handle(self, name: str, values: Values, now: float) -> Values:
+        """Reply to GetSensors, Measure or GetReading at a time [s]; raises Refusal."""
+        if name == "GetSensors":
+            return self._listed(values["first"])
+        if name == "Measure":
+            return self._measure(values, now)
+        return self._reading(values["first"], now)
 
     def changed(self, moment: float) -> None:
         """Note that what plays changes at a time [s]."""
-        if self._reader is not None and moment < self._reader.end:
-            self._reader.is_disturbed = True
+        if self.reader is not None and moment < self.reader.end:
+            self.reader.is_disturbed = True
 
     def forget(self) -> None:
         """Forget the reading, as without supply."""
-        reader, self._reader = self._reader, None
+        reader, self.reader = self.reader, None
         if reader is not None:
             self._plate.forget_reader(reader)
 
     @property
-    def _sensors(self) -> tuple[PlateSensor, ...]:
-        return (*self._feet, *self._others)[: _Q.sensor_count.maximum]
+    def sensors(self) -> tuple[PlateSensor, ...]:
+        """All sensors, those at its ERAs first."""
+        return (*self._feet, *self._others)[:_MAX_SENSORS]
+
+    @property
+    def sample_rate(self) -> float:
+        """Sampling rate of its sensors [Hz]."""
+        return self._plate.sample_rate
+
+    @property
+    def count_steps(self) -> Sequence[float]:
+        """Reading of one count of a raw sample, by sensor."""
+        return [_binary32(count_step(sensor.reach)) for sensor in self.sensors]
 
     @property
     def _frequency_max(self) -> float:
         nyquist = self._plate.sample_rate / 2
-        return _Q.frequency.quantise(min(_BELOW_NYQUIST * nyquist, _FREQUENCY_MAX))
+        return _Q["frequency"].quantise(min(_BELOW_NYQUIST * nyquist, _FREQUENCY_MAX))
 
-    @property
-    def _raw_rate(self) -> int:
-        """Sampling rate of raw samples [Hz]; 0 for one that the protocol cannot state."""
-        rate = self._plate.sample_rate
-        return int(rate) if rate.is_integer() and rate <= _Q.sample_rate.maximum else 0
+    def _listed(self, first: int) -> Values:
+        """Describe the sensors from one on, as many as fit."""
+        described = [self._described(sensor) for sensor in self.sensors]
+        listed = described[first:][: (MAX_WORDS - 2) // _SENSOR_WORDS]
+        return {"all": len(described), "count": len(listed), "sensors": listed}
 
-    def _described(self, sensor: PlateSensor) -> Sensor:
-        return Sensor(
-            SensorUnit.ACCELERATION,
-            sensor.channel,
-            _place(sensor.x),
-            _place(sensor.y),
-            range=_binary32(sensor.reach),
-            frequency_max=self._frequency_max,
-            sample_rate=self._raw_rate,
-            count_step=_binary32(count_step(sensor.reach)) if self._raw_rate else 0.0,
+    def _described(self, sensor: PlateSensor) -> Values:
+        return {
+            "unit": SENSOR_UNITS["ACCELERATION"],
+            "channel": NO_CHANNEL if sensor.channel is None else sensor.channel,
+            **{"x": _place(sensor.x), "y": _place(sensor.y), "range": _binary32(sensor.reach)},
+            "frequency_max": _Q["frequency"].to_wire(self._frequency_max),
+        }
+
+    def _measure(self, values: Values, now: float) -> Values:
+        """Begin to measure, unless it is the same again: its reply was lost."""
+        measurement = Measurement(
+            values["reading"],
+            _Q["window"].from_wire(values["window"]),
+            tuple(_Q["frequency"].from_wire(each) for each in values["frequencies"]),
         )
+        if self.reader is None or measurement != self.reader.measurement:
+            self._begin(measurement, now)
+        return self._reading(_MAX_SENSORS, now)
 
-    def _measure(self, request: Measure, now: float) -> Reply:
-        if self._reader is not None and request == self._reader.request:
-            return self._reading(_Q.sensor.maximum + 1, now)  # its reply was lost
-        ascending = sorted(request.frequencies)
-        if not ascending:
-            return Nak(NakCode.BAD_VALUE)
+    def _begin(self, measurement: Measurement, now: float) -> None:
+        ascending = sorted(measurement.frequencies)
+        if not ascending or ascending[-1] > self._frequency_max:
+            limit = self._frequency_max
+            raise Refusal(f"frequencies must be at most {limit:g} Hz, and at least one")
         apart = min(after - before for before, after in pairwise([0.0, *ascending]))
-        if apart * request.window < 1 - _ROUNDING or ascending[-1] > self._frequency_max:
-            return Nak(NakCode.BAD_VALUE)
+        if apart * measurement.window < 1 - _ROUNDING:
+            raise Refusal(f"frequencies must be {1 / measurement.window:g} Hz apart, got {apart:g}")
         self.forget()
-        sensors = self._sensors
+        sensors = self.sensors
         points = np.array([[one.x, one.y] for one in sensors])
         token = self._played.token
-        self._reader = ToneReader(
-            request,
+        self.reader = ToneReader(
+            measurement,
             sensors,
             shapes=lambda: self._plate.shapes_at(points),
             start=now,
@@ -174,26 +184,44 @@ class Sensing:
             rng=self._rng,
             on_end=self._plate.forget_reader,
         )
-        self._plate.listen_to_plate(self._reader)
-        return self._reading(0, now)
+        self._plate.listen_to_plate(self.reader)
 
-    def _reading(self, first: int, now: float) -> Reading:
-        if self._reader is None:
-            return Reading(0, ReadingState.NONE)
-        return self._reader.reading(first, now)
+    def _reading(self, first: int, now: float) -> Values:
+        """Report the reading at a time [s], its sensors from one on, as many as fit."""
+        reader = self.reader
+        if reader is None:
+            numbers = ("reading", "state", "window_left", "window_start", "token", "tones", "count")
+            return {**dict.fromkeys(numbers, 0), "sensors": []}
+        state, left, listed = "RUNNING", reader.end - now, 0
+        tones = len(reader.measurement.frequencies)
+        words: list[int] = []
+        if left <= 0:
+            state, left = "DISTURBED" if reader.is_disturbed else "COMPLETE", 0.0
+            record = sensor_reading(tones)
+            found = reader.tones()[first:][: (MAX_WORDS - _HEAD_WORDS) // (1 + 3 * tones)]
+            listed = len(found)
+            for is_overloaded, phasors in found:
+                rows = [
+                    {
+                        "amplitude": abs(each),
+                        "phase": _Q["phase"].to_wire(math.degrees(cmath.phase(each))),
+                    }
+                    for each in phasors
+                ]
+                record.append({"flags": int(is_overloaded), "tones": rows}, words)
+        start = min(reader.offset, _Q["window_start"].high)
+        return {
+            **{"reading": reader.measurement.number, "state": READING_STATES[state]},
+            "window_left": _Q["window_left"].to_wire(left),
+            "window_start": _Q["window_start"].to_wire(start),
+            **{"token": reader.token, "tones": tones, "count": listed, "sensors": words},
+        }
 
-    def _block(self, request: GetBlock) -> Reply:
-        if not self._raw_rate or request.sensor >= len(self._sensors):
-            return Nak(NakCode.BAD_VALUE)
-        if self._reader is None:
-            return SampleBlock(0, 0, 0, ())
-        block = self._reader.samples(request.sensor, request.sample, limit=_Q.sample_count.maximum)
-        return Nak(NakCode.BAD_VALUE) if block is None else block
 
-
-def _place(at: float) -> float | None:
-    """A coordinate [m] as the protocol states it; None beyond its range."""
-    return _Q.place.quantise(at) if at < _Q.place.high else None
+def _place(at: float) -> int:
+    """A coordinate [m] as the protocol states it."""
+    last = _Q["place"].from_wire(UNKNOWN_PLACE - 1)
+    return _Q["place"].to_wire(at) if at <= last else UNKNOWN_PLACE
 
 
 def _binary32(value: float) -> float:

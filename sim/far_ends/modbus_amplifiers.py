@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.contract import AmplifierPort
 from sim.far_ends.modbus.frames import RequestAdu, RtuReader, TcpReader, rtu_frame, tcp_frame
 from sim.far_ends.modbus.pdu import (
     ILLEGAL_ADDRESS,
@@ -45,7 +45,7 @@ class ModbusAmplifiers:
 
     def __init__(
         self,
-        amplifiers: Mapping[int, Amplifier],
+        amplifiers: Mapping[int, AmplifierPort],
         send: Callable[[bytes], None],
         *,
         is_rtu: bool,
@@ -69,9 +69,12 @@ class ModbusAmplifiers:
         for request in requests:
             if request.unit == _BROADCAST and self._is_rtu:
                 for number, each in [*self._units.items()]:
-                    each.take_broadcast(request.pdu, now)
-                    self._move(number)
-            elif (unit := self._units.get(request.unit)) is not None:
+                    if each.amplifier.is_answering:
+                        each.take_broadcast(request.pdu, now)
+                        self._move(number)
+                continue
+            unit = self._units.get(request.unit)
+            if unit is not None and unit.amplifier.is_answering:
                 pdu = unit.reply(request.pdu, now)
                 is_rtu = self._is_rtu
                 self._send(rtu_frame(request.unit, pdu) if is_rtu else tcp_frame(request, pdu))
@@ -91,10 +94,10 @@ class _Unit:
     address: taken by SetAddress, once is_moving: after its reply was read.
     """
 
-    def __init__(self, amplifier: Amplifier) -> None:
+    def __init__(self, amplifier: AmplifierPort) -> None:
         self.address = 0
         self.is_moving = False
-        self._amplifier = amplifier
+        self.amplifier = amplifier
         self._replies: dict[int, tuple[int, int, Sequence[int]]] = {}  # tag, result, words
 
     def reply(self, pdu: bytes, now: float) -> bytes:
@@ -131,7 +134,7 @@ class _Unit:
         """Return the result and the words of the reply to a message."""
         try:
             name, values = read_request(message.number, words)
-            reply = self._amplifier.handle(name, values, now)
+            reply = self.amplifier.handle(name, values, now)
         except Refusal as refusal:
             _, code, channel = nak_of(refusal, message.number)
             return code << 8 | channel, ()
@@ -146,7 +149,7 @@ class _Unit:
             first = number * _BOX + _REPLY
             area = self._reply_area(BY_NUMBER[number], now)
         else:
-            first, area = _IDENTITY, _identity(self._amplifier.identity)
+            first, area = _IDENTITY, _identity(self.amplifier.identity)
         if not first <= address <= address + count <= first + len(area):
             raise ModbusException(ILLEGAL_ADDRESS)
         return area[address - first :][:count]

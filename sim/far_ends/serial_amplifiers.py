@@ -23,20 +23,27 @@ from drivers.protocol.table import (
     nak_of,
     read_request,
 )
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.contract import AmplifierPort
 
 
 class SerialAmplifiers:
     """Amplifiers by their addresses on one line; send: called with the bytes for the host."""
 
-    def __init__(self, amplifiers: Mapping[int, Amplifier], send: Callable[[bytes], None]) -> None:
+    def __init__(
+        self, amplifiers: Mapping[int, AmplifierPort], send: Callable[[bytes], None]
+    ) -> None:
         self._amplifiers = dict(amplifiers)
         self._send = send
         self._reader = FrameReader()
         self._events = 0
-        if len(amplifiers) == 1:
-            for amplifier in amplifiers.values():
-                amplifier.listeners.append(self._send_event)
+        self._told = [*amplifiers.values()] if len(amplifiers) == 1 else []
+        for amplifier in self._told:
+            amplifier.listeners.append(self._send_event)
+
+    def close(self) -> None:
+        """Send no more events."""
+        for amplifier in self._told:
+            amplifier.listeners.remove(self._send_event)
 
     def receive(self, data: bytes, now: float) -> None:
         """Take bytes from the host at a time [s]."""
@@ -45,12 +52,13 @@ class SerialAmplifiers:
                 continue
             if frame.address == BROADCAST:
                 self._broadcast(frame, now)
-            elif frame.address in self._amplifiers:
-                self._send(encode_frame(self._answer(frame, now)))
+                continue
+            amplifier = self._amplifiers.get(frame.address)
+            if amplifier is not None and amplifier.is_answering:
+                self._send(encode_frame(self._answer(frame, amplifier, now)))
 
-    def _answer(self, frame: Frame, now: float) -> Frame:
+    def _answer(self, frame: Frame, amplifier: AmplifierPort, now: float) -> Frame:
         """Return the reply to a request, a Nak where it is refused."""
-        amplifier = self._amplifiers[frame.address]
         try:
             if frame.type == HELLO:
                 payload = pack_identity(amplifier.identity)
@@ -62,7 +70,7 @@ class SerialAmplifiers:
             return frame._replace(kind=NAK | REPLY, payload=payload, version=version)
         return frame._replace(kind=frame.kind | REPLY, payload=payload)
 
-    def _payload(self, frame: Frame, amplifier: Amplifier, now: float) -> bytes:
+    def _payload(self, frame: Frame, amplifier: AmplifierPort, now: float) -> bytes:
         name, values = _request(frame)
         reply = amplifier.handle(name, values, now)
         self._note_address(frame.address, name, values)
@@ -73,6 +81,8 @@ class SerialAmplifiers:
         if message is None or not message.is_broadcast:
             return
         for address, amplifier in [*self._amplifiers.items()]:
+            if not amplifier.is_answering:
+                continue
             try:
                 name, values = _request(frame)
                 amplifier.handle(name, values, now)
@@ -86,8 +96,10 @@ class SerialAmplifiers:
             self._amplifiers[values["address"]] = self._amplifiers.pop(address)
 
     def _send_event(self, event: Values, now: float) -> None:
+        ((address, amplifier),) = self._amplifiers.items()
+        if not amplifier.is_answering:
+            return
         self._events = (self._events + 1) & 0xFFFF
-        (address,) = self._amplifiers
         payload = pack_words(EVENT_RECORD.pack(event))
         self._send(encode_frame(Frame(EVENT, address, self._events, payload, VERSION)))
 

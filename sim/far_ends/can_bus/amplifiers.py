@@ -30,7 +30,7 @@ from drivers.protocol.table import (
     read_request,
 )
 from drivers.statistics import WireCounters
-from sim.amplifier.contract import SILENCING_RAMP, Amplifier
+from sim.amplifier.contract import SILENCING_RAMP, AmplifierPort
 from sim.far_ends.can_bus.sdo import SdoServer
 from sim.far_ends.can_bus.word_objects import FAULT_NAMES, WordObjects
 
@@ -47,7 +47,7 @@ _POLL = 0.05  # s; between looks whether a heartbeat is wanted again
 class CanAmplifiers:
     """Amplifiers by their nodes on one bus; send: called with their frames."""
 
-    def __init__(self, amplifiers: Mapping[int, Amplifier], send: Send) -> None:
+    def __init__(self, amplifiers: Mapping[int, AmplifierPort], send: Send) -> None:
         self.counters = WireCounters()
         self._nodes = {
             node: _Node(amplifier, node, send, self.counters)
@@ -105,7 +105,7 @@ class _Node:
     """An amplifier at a node number."""
 
     def __init__(
-        self, amplifier: Amplifier, number: int, send: Send, counters: WireCounters
+        self, amplifier: AmplifierPort, number: int, send: Send, counters: WireCounters
     ) -> None:
         self._amplifier = amplifier
         self._send = send
@@ -137,7 +137,7 @@ class _Node:
         self._amplifier.tick(now)
         while self._heartbeat_due <= now:
             interval = self._objects.heartbeat
-            if interval:
+            if interval and self._amplifier.is_answering:
                 self._put(cob_id("heartbeat", self.number), bytes([self._state]))
             self._heartbeat_due += interval / 1000 if interval else _POLL
 
@@ -152,6 +152,8 @@ class _Node:
 
     def command(self, command: int, now: float) -> None:
         """Take a command of network management."""
+        if not self._amplifier.is_answering:
+            return
         if command == _NMT["start"]:
             self._state = _OPERATIONAL
         elif command == _NMT["stop"]:
@@ -168,12 +170,12 @@ class _Node:
     def read(self, data: bytes, now: float) -> None:
         """Take a frame to the objects."""
         self._now = now
-        if self._state != _STOPPED:
+        if self._state != _STOPPED and self._amplifier.is_answering:
             self._sdo.receive(data)
 
     def request(self, data: bytes, now: float) -> None:
         """Take a frame of a request, and reply to the message that it completes."""
-        if self._state != _OPERATIONAL:
+        if self._state != _OPERATIONAL or not self._amplifier.is_answering:
             return
         message = self._requests.add(data, now)
         if message is None:
@@ -189,7 +191,7 @@ class _Node:
 
     def obey(self, message: Message, now: float) -> None:
         """Carry out a broadcast, without a reply."""
-        if self._state != _OPERATIONAL:
+        if self._state != _OPERATIONAL or not self._amplifier.is_answering:
             return
         sender = self.number
         try:
@@ -220,11 +222,12 @@ class _Node:
 
     def _tell(self, event: Values, now: float) -> None:
         """Send an event, with an emergency where a fault comes or goes."""
-        if self._state == _OPERATIONAL:
+        is_answering = self._amplifier.is_answering
+        if self._state == _OPERATIONAL and is_answering:
             self._put(REPLY + self.number, *segments(0, EVENT, EVENT_RECORD.pack(event)))
         fault = FAULT_NAMES[event["fault"]]
         is_faulty = fault != "NONE"
-        if (is_faulty or self._was_faulty) and self._state != _STOPPED:
+        if (is_faulty or self._was_faulty) and self._state != _STOPPED and is_answering:
             known = CANOPEN["emergencies"][fault]
             state = event["state"] | event["fault"] << 4
             head = (known["code"], known["error_register"], state, event["channel"])

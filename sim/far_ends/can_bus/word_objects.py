@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from drivers.codec.can_bus.frame import CANOPEN, cob_id
 from drivers.protocol.table import FAULTS, MESSAGES
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.contract import AmplifierPort
 from sim.far_ends.can_bus.sdo import BAD_LENGTH, NO_OBJECT, NO_SUBINDEX, READ_ONLY, SdoAbort
 
 FAULT_NAMES = {number: name for name, number in FAULTS.items()}
@@ -24,7 +24,7 @@ class WordObjects:
     heartbeat: its interval [ms], 0 for none; the one object that can be written.
     """
 
-    def __init__(self, amplifier: Amplifier, node: int, now: Callable[[], float]) -> None:
+    def __init__(self, amplifier: AmplifierPort, node: int, now: Callable[[], float]) -> None:
         self._amplifier = amplifier
         self._node = node
         self._now = now

@@ -1,0 +1,149 @@
+"""Rigs simulated in this process, by URLs `sim://RIG.yaml`, each shared by its amplifiers.
+
+The plate deviates from the rig's within its uncertainty, as that of `era sim`. The amplifiers of a
+rig that are named are under one plate, as are those of one control socket; the only amplifier of a
+rig that is not named has one of its own.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import parse_qsl, unquote
+from weakref import WeakValueDictionary
+
+from drivers import clock
+from drivers.errors import CommandError
+from model.errors import InputError
+from model.rig.file import load_rig
+from model.rig.rig import Rig
+from sim.bench.bench import Bench, keep_time
+from sim.bench.bench_amplifier import AmplifierMaker
+from sim.control.context import SimulationContext
+from sim.control.server import control_socket
+from sim.plant.imperfections import Imperfections, draw_imperfections
+
+_FORM = "sim://RIG.yaml, optionally with ?control=PATH, &amplifier=NAME, and &seed=N or &exact"
+
+
+@dataclass(frozen=True)
+class SimulationUrl:
+    """A URL `sim://RIG.yaml[?control=PATH][&amplifier=NAME][&seed=N]`.
+
+    `&exact` in place of a seed, None here: the rig's own plate, with no deviation.
+    """
+
+    text: str
+    rig: Path
+    control: Path | None
+    amplifier: str | None
+    seed: int | None
+
+    @classmethod
+    def parse(cls, url: str) -> "SimulationUrl":
+        """Parse a URL; raises CommandError."""
+        path, _, query = url.removeprefix("sim://").partition("?")
+        options = dict(parse_qsl(query, keep_blank_values=True))
+        unknown = sorted(options.keys() - {"control", "amplifier", "seed", "exact"})
+        if not url.startswith("sim://") or not path or unknown:
+            what = f"unknown option {', '.join(unknown)}" if unknown else "no rig file"
+            raise CommandError(f"{url!r}: {what}; use {_FORM}")
+        is_exact, seed = "exact" in options, options.get("seed", "0")
+        if not seed.isdecimal() or (is_exact and "seed" in options):
+            raise CommandError(f"{url!r}: seed must be a whole number, without exact; use {_FORM}")
+        control = Path(options["control"]) if options.get("control") else None
+        drawn = None if is_exact else int(seed)
+        return cls(url, Path(unquote(path)), control, options.get("amplifier"), drawn)
+
+    def select(self, names: tuple[str, ...]) -> str:
+        """The amplifier that it names, or the only one; raises CommandError."""
+        if self.amplifier is None and len(names) == 1:
+            return names[0]
+        if self.amplifier in names:
+            return self.amplifier
+        raise CommandError(f"{self.text}: amplifier=NAME must name one of {', '.join(names)}")
+
+
+@asynccontextmanager
+async def opened(
+    url: SimulationUrl, make_amplifier: AmplifierMaker
+) -> AsyncIterator[tuple[SimulationContext, str]]:
+    """The simulation of a URL while this lasts, and the name of its amplifier.
+
+    Raises CommandError, LinkError.
+    """
+    try:
+        rig = load_rig(url.rig)
+        name = url.select(tuple(rig.amplifiers))
+        shared = _shared(url, make_amplifier)
+        context = await shared.acquire(rig, url.seed)
+    except (InputError, OSError) as error:
+        raise CommandError(f"{url.text}: {error}") from error
+    try:
+        yield context, name
+    finally:
+        await shared.release()
+
+
+def _shared(url: SimulationUrl, make_amplifier: AmplifierMaker) -> "_SharedRig":
+    """That of open amplifiers of the rig and control, or a new one."""
+    if url.control is None and url.amplifier is None:
+        return _SharedRig(None, make_amplifier)
+    control = url.control and url.control.resolve()
+    key = (url.rig.resolve(), control, url.seed, make_amplifier)
+    found = _rigs.get(key)
+    if found is None:
+        found = _rigs[key] = _SharedRig(url.control, make_amplifier)
+    return found
+
+
+class _SharedRig:
+    """A rig in time and its control, from the first amplifier opened to the last closed."""
+
+    def __init__(self, control: Path | None, make_amplifier: AmplifierMaker) -> None:
+        self._control = control
+        self._make_amplifier = make_amplifier
+        self._lock = asyncio.Lock()
+        self._users = 0
+        self._context: SimulationContext | None = None
+        self._running = contextlib.AsyncExitStack()
+
+    async def acquire(self, rig: Rig, seed: int | None) -> SimulationContext:
+        """Use it, made by the first user; raises what making it raises."""
+        async with self._lock:
+            if self._context is None:
+                context = SimulationContext(await asyncio.to_thread(self._make, rig, seed))
+                async with contextlib.AsyncExitStack() as stack:
+                    if self._control is not None:
+                        await stack.enter_async_context(control_socket(context, self._control))
+                    task = asyncio.create_task(keep_time(context.bench), name="simulated plate")
+                    stack.push_async_callback(_cancel, task)
+                    self._running = stack.pop_all()
+                self._context = context
+            self._users += 1
+            return self._context
+
+    async def release(self) -> None:
+        """End the use by one; the last one ends the simulation."""
+        async with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                self._context = None
+                await self._running.aclose()
+
+    def _make(self, rig: Rig, seed: int | None) -> Bench:
+        imperfections = Imperfections() if seed is None else draw_imperfections(rig, seed=seed)
+        make = self._make_amplifier
+        return Bench(rig, now=clock.now(), imperfections=imperfections, make_amplifier=make)
+
+
+_rigs: WeakValueDictionary[object, _SharedRig] = WeakValueDictionary()
+"""Rigs that amplifiers of this process share."""
+
+
+async def _cancel(task: "asyncio.Task[None]") -> None:
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task

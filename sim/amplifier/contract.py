@@ -29,6 +29,7 @@ from drivers.protocol.table import (
 from sim.amplifier.outputs import output_of
 from sim.amplifier.set_intake import SetIntake, derated
 from sim.amplifier.state_table import TRANSITIONS
+from sim.amplifier.summary import AmplifierSummary
 from sim.amplifier.thermal_model import DERATE_ABOVE, DERATED, FAULT_ABOVE, GOOD_BELOW, ThermalState
 from sim.waveform import Output
 
@@ -226,11 +227,8 @@ class Amplifier:
 
     def status(self, now: float) -> Values:
         """Return the values of the status at a time [s] up to which it has been ticked."""
-        levels = [
-            min(self.playback.level(channel, now), 1.0) for channel in range(len(self._channels))
-        ]
+        levels, is_on = self._levels(now)
         left = self._last_fed + self._watchdog - now if self.state == _ENABLED else 0.0
-        is_on = self.state in ("SWITCHED_ON", _ENABLED) or any(levels)
         decayed = math.exp(min(0.0, (self._silent_from - now) / _DISCHARGE))
         flags = {
             "high_voltage": is_on,
@@ -250,6 +248,16 @@ class Amplifier:
             "levels": [_Q["level"].to_wire(level) for level in levels],
             "tokens": [tokens.get(layer, 0) for layer in range(layers)],
         }
+
+    def summary(self, now: float) -> AmplifierSummary:
+        """What it does at a time [s] up to which it has been ticked; unlike a status, no report."""
+        levels, is_on = self._levels(now)
+        return AmplifierSummary(self.state, self.fault, self._intake.committed, is_on, levels)
+
+    def _levels(self, now: float) -> tuple[tuple[float, ...], bool]:
+        """Return the level of each channel, and whether high voltage is on."""
+        levels = tuple([min(self.playback.level(each, now), 1.0) for each in self._channels])
+        return levels, self.state in ("SWITCHED_ON", _ENABLED) or any(levels)
 
     def trip(self, fault: str, moment: float, *, channel: int | None = None) -> None:
         """Enter a fault: silent within the shortest ramp, then high voltage off, latched.

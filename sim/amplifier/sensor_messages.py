@@ -24,6 +24,7 @@ from drivers.protocol.messages import (
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import NO_CHANNEL, QUANTITIES, UNKNOWN_PLACE, sensor_reading
 from sim.amplifier.amplifier import SensorRequest, SimulatedAmplifier
+from sim.amplifier.summary import AmplifierSummary
 
 _Q = QUANTITIES
 _OLD = PROTOCOL.quantities
@@ -67,6 +68,12 @@ class SensedAmplifier(SimulatedAmplifier):
     def attach(self, sensing: ValuePort) -> None:  # type: ignore[override]  # as a bench has them
         """Give it sensors."""
         super().attach(_SensorMessages(sensing))
+
+    def summary(self, now: float) -> AmplifierSummary:
+        """What it does at a time [s] up to which it has been ticked."""
+        status = self.status(now)
+        names = (status.state.name, status.fault.name)
+        return AmplifierSummary(*names, status.token, status.high_voltage, status.levels)
 
 
 class _SensorMessages:

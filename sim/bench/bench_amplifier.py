@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from sim.amplifier.summary import AmplifierSummary
 from sim.bench.sensing import Sensing
 from sim.waveform import Output
 
@@ -45,6 +46,9 @@ class BenchAmplifier(Protocol):
 
     def status(self, now: float) -> Any:
         """Status at a time [s] up to which it has been ticked."""
+
+    def summary(self, now: float) -> AmplifierSummary:
+        """What it does at such a time; reports nothing."""
 
     def tick(self, now: float) -> None:
         """Process the events due by now, in order."""

@@ -95,13 +95,13 @@ async def _state(context: SimulationContext, request: Request, now: float) -> Re
     bench.advance(now)
     amplifiers = {}
     for name, amplifier in bench.amplifiers.items():
-        status = amplifier.status(bench.time)
+        summary = amplifier.summary(bench.time)
         amplifiers[name] = {
-            "state": status.state.name,
-            "fault": status.fault.name,
-            "token": status.token,
-            "high_voltage": status.high_voltage,
-            "levels": list(status.levels),
+            "state": summary.state,
+            "fault": summary.fault,
+            "token": summary.token,
+            "high_voltage": summary.is_high_voltage,
+            "levels": list(summary.levels),
         }
     resting = {name: list(position) for name, position in bench.positions.items()}
     return {"time_s": bench.time, "fingers": resting, "amplifiers": amplifiers}

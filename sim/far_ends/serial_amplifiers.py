@@ -36,13 +36,13 @@ class SerialAmplifiers:
         self._send = send
         self._reader = FrameReader()
         self._events = 0
-        self._told = [*amplifiers.values()] if len(amplifiers) == 1 else []
-        for amplifier in self._told:
+        self._heard = [*amplifiers.values()] if len(amplifiers) == 1 else []
+        for amplifier in self._heard:
             amplifier.listeners.append(self._send_event)
 
     def close(self) -> None:
         """Send no more events."""
-        for amplifier in self._told:
+        for amplifier in self._heard:
             amplifier.listeners.remove(self._send_event)
 
     def receive(self, data: bytes, now: float) -> None:

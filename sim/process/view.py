@@ -52,9 +52,9 @@ def draw(context: SimulationContext, plate: PlateView) -> RenderableType:
     bench = context.bench
     amplifiers = Table("amplifier", "state", "fault", "set", "level of each channel")
     for name, amplifier in bench.amplifiers.items():
-        status = amplifier.status(bench.time)
-        levels = "  ".join(f"{level:4.0%}" for level in status.levels)
-        amplifiers.add_row(name, status.state.name, status.fault.name, str(status.token), levels)
+        summary = amplifier.summary(bench.time)
+        levels = "  ".join(f"{level:4.0%}" for level in summary.levels)
+        amplifiers.add_row(name, summary.state, summary.fault, str(summary.token), levels)
     fingers = Table("finger", "at", "peak acceleration")
     felt = bench.felt(bench.time - WINDOW, bench.time)
     for name, (x, y) in bench.positions.items():

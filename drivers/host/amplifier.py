@@ -1,33 +1,33 @@
 """One amplifier of protocol 3, whatever its wire: who it is, and its requests."""
 
 import asyncio
-import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from drivers import clock
-from drivers.contents import Layer
-from drivers.errors import (
-    CommandError,
-    CommandRefused,
-    LinkDegraded,
-    LinkError,
-    LinkTimeout,
-    Preempted,
-)
+from drivers.contents import Layer, is_silence
+from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout, Preempted
 from drivers.guard.budget import COMMIT_DELAY
-from drivers.host.comparison import MAX_CONTRADICTIONS, name_of, problem_of
-from drivers.host.feeding import Feeding
+from drivers.host.comparison import name_of
+from drivers.host.dialogue import Dialogue, Staged
 from drivers.host.jobs import Priority
 from drivers.host.joint_start import JointStart
 from drivers.host.ledger import Ledger
 from drivers.host.line import ATTEMPTS, REPLY_TIMEOUT, Line
-from drivers.protocol.definition import is_newer_token
 from drivers.protocol.records import Values
 from drivers.protocol.serial_payload import speaks
-from drivers.protocol.sets import LayerSet, pack_layers, parts
-from drivers.protocol.table import FAULTS, MAX_WORDS, MESSAGES, QUANTITIES, STATES, VERSION
+from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
+from drivers.protocol.table import (
+    FAULTS,
+    FEATURES,
+    MAX_WORDS,
+    QUANTITIES,
+    STATES,
+    VERSION,
+)
+from drivers.protocol.tokens import is_newer_token
 from registry.limits import GuardLimits
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms
@@ -35,16 +35,16 @@ STOP_RAMP = 0.005  # s; the shortest without a step
 DISARM_RAMP = 0.05  # s; long enough to avoid a click
 OPEN_TIMEOUT = 0.5  # s; for boards that restart when their port is opened
 CONFIRM_TIMEOUT = 0.3  # s; three replies of the slowest wire
-_SECOND_REPLY = 0.02  # s; for one of another amplifier at the same address
 LISTENING = 0.3  # s; to an amplifier that is found armed
+SECOND_REPLY = 0.02  # s; for one of another amplifier at the same address
 _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _ENABLED = STATES["OPERATION_ENABLED"]
 _LATCHED = tuple(STATES[name] for name in ("QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT"))
 PART_BYTES = 2 * MAX_WORDS
 """Of the longest part of a set."""
-_logger = logging.getLogger(__name__)
 _POSITIVE = ("frequency_step", "level_step", "phase_step")
+_FULL_LEVEL = ("motion of a stiff source", "output of a linear amplifier")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,23 +59,11 @@ class Stopped:
     cause: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Staged:
-    """A set that an amplifier has staged, or plays at once: as the wire has it.
+class Amplifier(Dialogue):
+    """An amplifier on a line that is open.
 
-    is_exact: to the word; until: when [s] it must have been committed.
-    """
-
-    token: int
-    layers: tuple[LayerSet, ...]
-    is_exact: bool
-    until: float
-
-
-class Amplifier:
-    """An amplifier on a line that is open; a `Member` of it.
-
-    limits: configured. serial_number: the expected one, None for any.
+    limits: configured. serial_number: the expected one, None for any. is_output: what the rig says
+    of full level: the output of a linear amplifier, else the motion of a stiff source.
     """
 
     def __init__(
@@ -86,55 +74,57 @@ class Amplifier:
         *,
         name: str,
         serial_number: str | None = None,
+        is_output: bool = False,
     ) -> None:
-        self.line, self.address, self.name = line, address, name
+        super().__init__(line, address, name)
         self.limits, self._serial_number = limits, serial_number
+        self._is_output = is_output
         self.identity: Values = {}
-        self.capabilities: Values = {}
-        self.session = 0
-        self.latch: int | None = None
-        """Newest latch that a status has shown."""
-        self.status: Values | None = None
-        """The last one."""
-        self.feeding = Feeding()
-        self.silence_cause: str | None = None
-        """Why it is degraded: it did not reply to a request, and may still play."""
-        self.listeners: list[Callable[[Values], None]] = []
-        self._ledger: Ledger | None = None
-        self._admitted: Staged | None = None
-        self._contradictions = 0
-        self._other_host_at = -math.inf  # when it was heard last
-        self._are_several = False
-        line.members[address] = self
-
-    @property
-    def ledger(self) -> Ledger:
-        """Its ledger, known once it is identified."""
-        if self._ledger is None:
-            raise CommandError(f"amplifier {self.name} must be opened first")
-        return self._ledger
 
     async def open(self) -> None:
         """Identify it and leave it disarmed; a latched stop or fault stays.
 
         Raises LinkError for another amplifier or version, or another host that drives it.
         """
-        await self.identify()
-        status = await self.read_status()
+        status = await self.identify()
         if status["state"] == _ENABLED:
             await self._listen_for_another_host(status)
             await self.disarm(STOP_RAMP)
 
-    async def identify(self) -> None:
-        """Read identity and capabilities; raises LinkError."""
+    async def identify(self) -> Values:
+        """Read identity and capabilities, and return the status; raises LinkError.
+
+        Its latch is that of the status from now on: it may have lost its supply meanwhile.
+        """
         self._are_several = False
         try:
             identity = await self._request("Hello", {}, Priority.OTHER, timeout=OPEN_TIMEOUT)
-            await asyncio.sleep(_SECOND_REPLY)
+            await asyncio.sleep(SECOND_REPLY)
         except LinkTimeout:
             self._check_alone()
             raise
         self._check_alone()
+        self._check_identity(identity)
+        can = await self._request("GetCaps", {}, Priority.OTHER, timeout=OPEN_TIMEOUT)
+        self._check_capabilities(can)
+        if self._ledger is None:
+            self._ledger = Ledger(self.limits, can)
+        elif can != self.capabilities:
+            self._ledger.adopt(can)
+        self.identity, self.capabilities = identity, can
+        self._serial_number = identity["serial_number"]
+        self.latch = None
+        return await self.read_status()
+
+    def _check_alone(self) -> None:
+        """Raise LinkError where several replied."""
+        if self._are_several:
+            raise LinkError(
+                f"amplifier {self.name}: several amplifiers reply at address {self.address} on "
+                f"{self.line.name}; give each its own: era amp address --serial-number"
+            )
+
+    def _check_identity(self, identity: Values) -> None:
         if not speaks(identity, VERSION):
             spoken = [str(version) for version in range(16) if speaks(identity, version)]
             raise LinkError(
@@ -147,25 +137,33 @@ class Amplifier:
                 f"amplifier {self.name}: serial number must be {self._serial_number}, got {serial}"
                 "; connect the expected amplifier, or restart with this one"
             )
-        can = await self._request("GetCaps", {}, Priority.OTHER, timeout=OPEN_TIMEOUT)
+
+    def _check_capabilities(self, can: Values) -> None:
         for name in _POSITIVE:
             if not can[name] > 0:
                 raise LinkError(f"amplifier {self.name}: {name} must be above 0, got {can[name]}")
-        if can["watchdog_min"] > can["watchdog_max"]:
-            raise LinkError(f"amplifier {self.name}: watchdog_min must be below watchdog_max")
-        self._ledger = Ledger(self.limits, can)
-        self.identity, self.capabilities, self._serial_number = identity, can, serial
-
-    def _check_alone(self) -> None:
-        """Raise LinkError where several replied."""
-        if self._are_several:
+        for name in ("watchdog", "envelope_step", "frequency"):
+            low, high = can[f"{name}_min"], can[f"{name}_max"]
+            if low > high:
+                raise LinkError(
+                    f"amplifier {self.name}: {name}_min must be at most {name}_max, got {low} and "
+                    f"{high}"
+                )
+        is_output = bool(can["features"] >> FEATURES["output"] & 1)
+        if is_output is not self._is_output:
             raise LinkError(
-                f"amplifier {self.name}: several amplifiers reply at address {self.address} on "
-                f"{self.line.name}; give each its own: era amp address --serial-number"
+                f"amplifier {self.name}: full level must be {_FULL_LEVEL[self._is_output]} as in "
+                f"the rig file, got {_FULL_LEVEL[is_output]}; correct the rig file, or connect "
+                "another amplifier"
             )
 
     async def arm(self, session: int, watchdog: float = WATCHDOG) -> Values:
-        """Switch the high voltage on at level zero; watchdog [s]. Returns the status."""
+        """Switch the high voltage on at level zero; watchdog [s]. Returns the status.
+
+        It is identified anew: it may have lost its supply, and come back with other limits.
+        """
+        before = self.silences
+        await self.identify()
         wire = _WATCHDOG.to_wire(watchdog)
         low, high = (self.capabilities[f"watchdog_{end}"] for end in ("min", "max"))
         if not low <= wire <= high:
@@ -173,7 +171,13 @@ class Amplifier:
             raise CommandError(f"watchdog must be {bounds} s, got {watchdog:g} s")
         self.feeding.watchdog = max(self.feeding.watchdog, watchdog)
         values = {"session": session, "watchdog": wire}
-        status = await self._request("Arm", values, Priority.ARM)
+
+        def make() -> Values:
+            if self.silences != before:
+                raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
+            return values
+
+        status = await self.line.submit(self, Priority.ARM, "Arm", values, make=make)
         self.session, self.feeding.watchdog = session, watchdog
         self._contradictions = 0
         self.ledger.forget()
@@ -186,63 +190,51 @@ class Amplifier:
         the reason; Preempted where a stop came first.
         """
         cuts: list[Values] = []
+        admitted: list[Staged] = []
 
-        def first() -> tuple[str, Values]:
+        def first() -> Values:
             if not cuts:
-                moment = clock.now()
-                admitted = self.ledger.admit(layers, moment, delay=self._commit_delay)
-                stream = pack_layers(admitted)
-                if len(stream) > self.capabilities["set_words"]:
-                    limit = self.capabilities["set_words"]
-                    text = f"a set must have at most {limit} words, got {len(stream)}"
-                    raise CommandRefused(text)
-                cuts[:] = parts(stream, session=self.session, token=token, now=now)
-                until = moment + self._commit_delay
-                self._admitted = Staged(token, admitted, is_exact=True, until=until)
-            return "Set", cuts[0]
+                admitted.append(self._admit(token, layers, cuts, now=now))
+            return cuts[0]
 
-        is_silent = not any(layer.tones or layer.renew for layer in layers)
-        priority = Priority.SILENCE if is_silent else Priority.SET
-        taken = await self.line.submit(self, priority, first)
+        priority = Priority.SILENCE if is_silence(layers) else Priority.SET
+        taken = await self.line.submit(self, priority, "Set", {}, make=first)
         for part in cuts[1:]:
-            taken = await self.line.submit(self, priority, self._made("Set", part, token))
-        staged = self._admitted
-        if staged is None or staged.token != token or not (taken["staged"] or taken["played"]):
+            make = partial(self._while_admitted, token, part)
+            taken = await self.line.submit(self, priority, "Set", part, make=make)
+        (staged,) = admitted
+        if not (taken["played"] or (taken["staged"] and self._admitted is staged)):
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")
-        if taken["played"]:
-            self._confirm(token)
-        return replace(staged, is_exact=bool(taken["exact"]))
+        return staged if taken["exact"] else replace(staged, is_exact=False)
+
+    def _admit(
+        self, token: int, layers: Sequence[Layer], cuts: list[Values], *, now: bool
+    ) -> Staged:
+        """Have the ledger admit a set, and cut it into parts; raises CommandRefused."""
+        moment, delay = clock.now(), self._commit_delay
+        admitted = self.ledger.admit(layers, moment, delay=delay)
+        stream = pack_layers(admitted)
+        if len(stream) > self.capabilities["set_words"]:
+            limit = self.capabilities["set_words"]
+            raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
+        cuts[:] = parts(stream, session=self.session, token=token, now=now)
+        staged = self._admitted = Staged(token, admitted, is_exact=True, until=moment + delay)
+        return staged
 
     async def commit(self, token: int, *, start: JointStart | None = None) -> Values:
         """Play the staged set; returns the status, which shows its tokens.
 
-        start: together with the commits of other lines.
-        Raises Preempted where a stop or disarm came first, CommandRefused where it is too late for
-        what the ledger has admitted.
+        start: together with the commits of other lines. Raises Preempted where a stop or disarm
+        came first, CommandRefused where it is too late for what the ledger has admitted.
         """
         values = {"session": self.session, "token": token}
-        make = self._made("Commit", values, token)
-        return await self._request("Commit", values, Priority.SET, make=make, start=start)
+        make = partial(self._while_admitted, token, values)
+        return await self.line.submit(self, Priority.SET, "Commit", values, make=make, start=start)
 
-    def _made(self, name: str, values: Values, token: int) -> Callable[[], tuple[str, Values]]:
-        """Return what makes a request of the set that is admitted, as long as it is."""
-
-        def make() -> tuple[str, Values]:
-            self.check_admitted(token)
-            return name, values
-
-        return make
-
-    def check_admitted(self, token: int) -> None:
-        """Raise Preempted or CommandRefused unless a set may be played now."""
-        admitted = self._admitted
-        if admitted is None or admitted.token != token:
-            raise Preempted(f"amplifier {self.name}: a stop, disarm or newer set came first")
-        if clock.now() > admitted.until:
-            raise CommandRefused(
-                f"amplifier {self.name}: set {token} must be committed within "
-                f"{self._commit_delay:.3g} s; the wire is too slow or too busy"
-            )
+    def _while_admitted(self, token: int, values: Values) -> Values:
+        """Return the values of a request of the set that is admitted, as long as it is."""
+        self.check_admitted(token)
+        return values
 
     @property
     def _commit_delay(self) -> float:
@@ -250,11 +242,14 @@ class Amplifier:
         waiting = len(self.line.members) * self.line.wire.round_trip("Set", PART_BYTES)
         return max(COMMIT_DELAY, ATTEMPTS * waiting)
 
-    def _confirm(self, token: int) -> None:
-        """Note that the amplifier plays the set with this token, as it says."""
-        self.ledger.resolve(token, clock.now())
-        if self._admitted is not None and self._admitted.token == token:
-            self._admitted = None
+    async def read_achieved(self, one: LayerSet) -> LayerSet:
+        """Read what plays of a layer of the set that was committed last."""
+        values = await self._request("GetAchieved", {"layer": one.layer}, Priority.SET)
+        commands = tuple(
+            Command(each["channel"], each["frequency"], each["level"], each["phase"])
+            for each in values["commands"]
+        )
+        return replace(one, commands=commands)
 
     async def silence(self, ramp: float) -> Values:
         """Let all layers fall silent along a ramp [s]; it stays armed."""
@@ -290,17 +285,28 @@ class Amplifier:
         return await self._request("GetStatus", {}, priority)
 
     async def clear(self, latch: int | None = None) -> Values:
-        """Acknowledge the stop or fault with this latch, None for the newest that was shown."""
+        """Acknowledge the stop or fault with this latch, None for the newest that was shown.
+
+        It is identified anew: one that has lost its supply since counts its latches from 1 again.
+        """
+        shown, status = self.latch, await self.identify()
         if latch is None:
-            latch = (await self.read_status())["latch"] if self.latch is None else self.latch
+            has_restarted = shown is None or is_newer_token(shown, status["latch"])
+            latch = status["latch"] if has_restarted else shown
         return await self._request("Clear", {"latch": latch}, Priority.CLEAR)
 
-    async def stop(self, ramp: float = STOP_RAMP, *, timeout: float = CONFIRM_TIMEOUT) -> Stopped:
+    async def stop(
+        self,
+        ramp: float = STOP_RAMP,
+        *,
+        timeout: float = CONFIRM_TIMEOUT,
+        on_sent: Callable[[], None] = lambda: None,
+    ) -> Stopped:
         """Stop along a ramp [s], latched; repeated until it is confirmed, or for a time [s].
 
-        The time counts from when the first is sent. Confirmed by a status in a latched state whose
-        latch is newer than every one seen before, with the levels of all channels at zero: another
-        one may be old, kept on its way.
+        The time counts from when the first is sent, and on_sent is called then. Confirmed by a
+        status in a latched state whose latch is newer than every one seen before, with the levels
+        of all channels at zero: another one may be old, kept on its way.
         """
         cause, is_sent = "", False
         values = {"ramp": self.wire_ramp(ramp)}
@@ -311,17 +317,20 @@ class Amplifier:
         try:
             async with asyncio.timeout(waiting) as limit:
 
-                def make() -> tuple[str, Values]:
+                def make() -> Values:
                     nonlocal is_sent
                     if not is_sent:
                         limit.reschedule(asyncio.get_running_loop().time() + timeout)
+                        on_sent()
                     is_sent = True
-                    return "Stop", values
+                    return values
 
-                while True:
+                while self.line.loss is None:
                     before = self.latch
                     try:
-                        status = await self._request("Stop", values, Priority.STOP, make=make)
+                        status = await self.line.submit(
+                            self, Priority.STOP, "Stop", values, make=make
+                        )
                         while is_stopping(status, before):
                             if self._is_silent(status):
                                 return Stopped(True, clock.now())
@@ -332,7 +341,7 @@ class Amplifier:
                     await asyncio.sleep(_RAMP.from_wire(values["ramp"]) + _INTERVAL)
         except TimeoutError:
             cause = cause or f"silence was not reported within {timeout:g} s"
-        return Stopped(False, self.feeding.may_play_until, cause)
+        return Stopped(False, self.feeding.may_play_until, self.line.loss or cause)
 
     def wire_ramp(self, ramp: float) -> int:
         """Return the nearest ramp that the amplifier has: silence is never refused for it."""
@@ -341,110 +350,11 @@ class Amplifier:
             return _RAMP.to_wire(STOP_RAMP)
         return min(_RAMP.to_wire(min(max(ramp, 0.0), _RAMP.high)), int(highest))
 
-    def note_sent(self, name: str, values: Values, now: float) -> None:
-        """Note a request that may have reached it."""
-        message = MESSAGES.get(name)
-        if message is None:
-            return
-        if message.feeds and (name == "Arm" or values["session"] == self.session):
-            self.feeding.may = now
-        admitted = self._admitted
-        if message.name in ("Stop", "Disarm", "Silence", "Arm"):
-            self._admitted = None
-        elif admitted is not None and values.get("token") == admitted.token:
-            is_last = name == "Set" and values["now"] and values["index"] == values["parts"] - 1
-            if name == "Commit" or is_last:
-                self.ledger.sent(admitted.token, admitted.layers, now)
-
-    def note_heard(self) -> None:
-        """Note that it has replied, whatever."""
-        self.silence_cause = None
-
-    def note_silence(self, cause: str) -> None:
-        """Note that it has not replied to all attempts of a request."""
-        self.silence_cause = cause
-
-    def note_event(self, values: Values) -> None:
-        """Hand an event on."""
-        for listener in self.listeners:
-            try:
-                listener(values)
-            except Exception:
-                _logger.exception("amplifier %s: a listener failed", self.name)
-
-    def note_other_host(self) -> None:
-        """Note that another host drives it: it must feed the watchdog within its longest time."""
-        self._other_host_at = clock.now()
-
-    def note_several(self) -> None:
-        """Note that others have its address too; `identify` says so."""
-        self._are_several = True
-
-    def check_other_host(self) -> None:
-        """Raise LinkError if another host drives it."""
-        if clock.now() - self._other_host_at <= _WATCHDOG.high:
-            raise self._driven_by_another()
-
-    def check_request(self, name: str) -> None:
-        """Raise LinkError for what plays or feeds, while degraded or beside another host."""
-        message = MESSAGES.get(name)
-        if message is None or not message.feeds:
-            return
-        self.check_other_host()
-        if self.silence_cause is not None:
-            raise LinkDegraded(
-                f"{self.silence_cause}. The amplifier may play its last set until its watchdog has "
-                "passed; nothing new is played until it replies"
-            )
-
     async def _request(
-        self,
-        name: str,
-        values: Values,
-        priority: Priority,
-        *,
-        timeout: float = REPLY_TIMEOUT,
-        make: Callable[[], tuple[str, Values]] | None = None,
-        start: JointStart | None = None,
+        self, name: str, values: Values, priority: Priority, *, timeout: float = REPLY_TIMEOUT
     ) -> Values:
-        """Send a request, and note the status that its reply may be; make: of each attempt."""
-        sent_at = 0.0
-
-        def made() -> tuple[str, Values]:
-            nonlocal sent_at
-            sent_at = clock.now()
-            return (name, values) if make is None else make()
-
-        reply = await self.line.submit(self, priority, made, timeout=timeout, start=start)
-        if name == "Hello" or MESSAGES[name].reply is not MESSAGES["GetStatus"].reply:
-            return reply
-        self._note_status(name, values, reply, sent_at)
-        return reply
-
-    def _note_status(self, name: str, values: Values, status: Values, sent_at: float) -> None:
-        """Note a status; raises CommandRefused once it contradicts what was sent twice."""
-        now = clock.now()
-        if self.latch is None or is_newer_token(status["latch"], self.latch):
-            self.latch = status["latch"]
-        self.status = status
-        if self._ledger is None:
-            return
-        if name in ("Stop", "Disarm", "Silence"):
-            self._ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
-            return
-        self._confirm(status["token"])
-        fed = name != "Arm" and MESSAGES[name].feeds
-        if fed or name == "Arm":
-            self.feeding.since = sent_at
-        if not self.session or name in ("Arm", "Clear") or status["state"] != _ENABLED:
-            return
-        problem = problem_of(status, self._ledger, self.feeding, sent_at=sent_at, now=now, fed=fed)
-        self._contradictions = 0 if problem is None else self._contradictions + 1
-        if problem is not None and self._contradictions >= MAX_CONTRADICTIONS:
-            raise CommandRefused(
-                f"amplifier {self.name} contradicts its requests: {problem}; look for a derated or "
-                "broken channel, an exchanged cable or firmware, then clear and arm again"
-            )
+        """Send a request and return the values of its reply."""
+        return await self.line.submit(self, priority, name, values, timeout=timeout)
 
     def _is_silent(self, status: Values) -> bool:
         """Whether a status has the levels of all channels, and all are zero."""
@@ -462,9 +372,6 @@ class Amplifier:
             if status["watchdog_left"] > left:
                 raise self._driven_by_another()
             left = status["watchdog_left"]
-
-    def _driven_by_another(self) -> LinkError:
-        return LinkError(f"amplifier {self.name} is driven by another host; end that one first")
 
 
 def is_stopping(status: Values, before: int | None) -> bool:

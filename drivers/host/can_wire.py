@@ -43,10 +43,14 @@ _START: int = CANOPEN["nmt"]["start"]
 
 
 class CanWire:
-    """A bus at a bit rate [bit/s]; sequence: before the first request to a node, 0 to 255."""
+    """A bus at a bit rate [bit/s]; sequence: before the first request to a node, 0 to 255.
 
-    def __init__(self, bitrate: int, *, sequence: int) -> None:
+    delay [s]: of a network on the way to the bus.
+    """
+
+    def __init__(self, bitrate: int, *, sequence: int, delay: float = 0.0) -> None:
         self.counters = WireCounters()
+        self.delay = delay
         self._frame_time = CanTimes(bitrate).frame(BLOCK)
         self._sequence = sequence
         self._numbers: dict[int, int] = {}  # last ones by node

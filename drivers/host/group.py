@@ -6,16 +6,17 @@ from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping, S
 from functools import partial
 from typing import Any, TypeVar
 
-from drivers.contents import Layer
+from drivers.contents import Layer, is_silence
 from drivers.errors import CommandRefused, LinkError, Preempted
-from drivers.host.amplifier import DISARM_RAMP, STOP_RAMP, WATCHDOG, Amplifier, Staged, Stopped
+from drivers.host.amplifier import DISARM_RAMP, STOP_RAMP, WATCHDOG, Amplifier, Stopped
 from drivers.host.comparison import name_of
+from drivers.host.dialogue import Staged
 from drivers.host.jobs import Priority
 from drivers.host.joint_start import JointStart
 from drivers.host.line import Line
-from drivers.protocol.definition import token_after
 from drivers.protocol.records import Values
 from drivers.protocol.table import QUANTITIES, STATES
+from drivers.protocol.tokens import token_after
 
 _T = TypeVar("_T")
 _SESSION, _TOKEN = QUANTITIES["session"], QUANTITIES["token"]
@@ -86,9 +87,7 @@ class Group:
         self._check_armed()
         before = self._silences
         self._token = token = token_after(self._token)
-        is_silent = not any(
-            one.tones or one.renew for several in layers.values() for one in several
-        )
+        is_silent = all(map(is_silence, layers.values()))
         is_committing = is_silent
         try:
             staged = await _all(
@@ -162,9 +161,7 @@ class Group:
         members = [*self.amplifiers.values()]
         for line in {each.line for each in members if len(each.line.members) > 1}:
             values = {"ramp": members[0].wire_ramp(ramp)}
-            line.submit(None, Priority.STOP, partial(_same, "Stop", values)).add_done_callback(
-                _seen
-            )
+            line.submit(None, Priority.STOP, "Stop", values).add_done_callback(_seen)
         task = asyncio.gather(*(each.stop(ramp) for each in members), return_exceptions=True)
         stopped = [
             Stopped(False, each.feeding.may_play_until, repr(result))
@@ -191,7 +188,7 @@ class Group:
         for line, several in by_line.items():
             if len(several) > 1:
                 make = partial(_commit_of, several, token)
-                sent = line.submit(None, Priority.SET, make, start=start)
+                sent = line.submit(None, Priority.SET, "Commit", {}, make=make, start=start)
                 sent.add_done_callback(_seen)
                 requests.update((each, _status_of(each, token)) for each in several)
             else:
@@ -200,15 +197,11 @@ class Group:
         return await _all(_awaited(requests[each]) for each in order)
 
 
-def _same(name: str, values: Values) -> tuple[str, Values]:
-    return name, values
-
-
-def _commit_of(several: Sequence[Amplifier], token: int) -> tuple[str, Values]:
+def _commit_of(several: Sequence[Amplifier], token: int) -> Values:
     """Return the commit of all amplifiers of a line; raises unless each may play its set now."""
     for amplifier in several:
         amplifier.check_admitted(token)
-    return "Commit", {"session": several[0].session, "token": token}
+    return {"session": several[0].session, "token": token}
 
 
 def _seen(sent: "asyncio.Future[Values]") -> None:

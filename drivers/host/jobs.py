@@ -40,6 +40,15 @@ _SUPERSEDED = {
 }
 
 
+@dataclass
+class RequestCounts:
+    """Counts of an amplifier: repeated requests, those without a reply in time, refused ones."""
+
+    retries: int = 0
+    timeouts: int = 0
+    refusals: int = 0
+
+
 class Member(Protocol):
     """An amplifier as its line sees it."""
 
@@ -47,11 +56,18 @@ class Member(Protocol):
     def address(self) -> int:
         """Its address."""
 
+    @property
+    def counts(self) -> RequestCounts:
+        """Counts of its requests."""
+
     def note_sent(self, name: str, values: Values, now: float) -> None:
         """Note a request that may have reached it."""
 
-    def note_heard(self) -> None:
-        """Note that it has replied, whatever."""
+    def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
+        """Note the reply to a request sent at a time [s]; raises CommandRefused for its caller."""
+
+    def note_refusal(self) -> None:
+        """Note that it has replied, with a refusal or what cannot be read."""
 
     def note_silence(self, cause: str) -> None:
         """Note that it has not replied to all attempts of a request."""
@@ -63,7 +79,7 @@ class Member(Protocol):
         """Note that another host drives it."""
 
     def note_several(self) -> None:
-        """Note that others have its address too."""
+        """Note that a second amplifier has replied at its address."""
 
     def check_request(self, name: str) -> None:
         """Raise LinkError where a request of this name must not go out now."""
@@ -73,13 +89,15 @@ class Member(Protocol):
 class Job:
     """A request from its queueing to its result; member: None for a broadcast.
 
-    make: name and values of each attempt, in its turn; raises CommandRefused. attempts: left.
-    start: of a commit that goes out together with those of other lines.
+    make: values of each attempt, in its turn; raises CommandRefused. attempts: left. start: of a
+    commit that goes out together with those of other lines. had_no_reply: to an earlier attempt.
     """
 
     member: Member | None
     priority: Priority
-    make: Callable[[], tuple[str, Values]]
+    name: str
+    values: Values
+    make: Callable[[], Values] | None
     attempts: int
     timeout: float
     queued_at: float
@@ -88,8 +106,10 @@ class Job:
     is_held: bool = False
     number: int = 0
     not_before: float = 0.0
+    sent_at: float = 0.0
     due: float = 0.0
     looks: int = 0
+    had_no_reply: bool = False
 
     def rank(self, now: float) -> tuple[int, bool, int]:
         """Place in the queue at a time [s]; one that is held for other lines goes before sets."""

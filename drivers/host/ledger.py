@@ -37,6 +37,7 @@ class Ledger:
     """
 
     def __init__(self, limits: GuardLimits, capabilities: Values) -> None:
+        self.configured = limits
         self.limits = wire_limits(limits, capabilities)
         self.capabilities = capabilities
         self._budget = Budget(replace(limits, rate=min(limits.rate, RATE_CEILING)))
@@ -48,6 +49,11 @@ class Ledger:
     def doubt(self) -> int:
         """Token of the set that was committed and is not confirmed; 0: none."""
         return 0 if self._doubt is None else self._doubt[0]
+
+    def adopt(self, capabilities: Values) -> None:
+        """Go on with other capabilities, silent; what was spent of on-time and duty stays spent."""
+        self.limits, self.capabilities = wire_limits(self.configured, capabilities), capabilities
+        self.forget()
 
     def forget(self) -> None:
         """Start anew: the amplifier is silent, armed or not."""

@@ -7,14 +7,13 @@ against what really went out before. Times [s] are of the event loop's clock.
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
 
 from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout, Preempted
 from drivers.host.jobs import Job, JobQueue, Member, Priority
 from drivers.host.joint_start import JointStart
-from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Several, Wire
+from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
 from drivers.protocol.records import Values
 from drivers.protocol.table import REACTION
 
@@ -42,22 +41,12 @@ class Port(Protocol):
         """Hand over what has come and was not read yet."""
 
 
-@dataclass
-class LineStatistics:
-    """Counts of a line: repeated requests, those without a reply in time, and refused ones."""
-
-    retries: int = 0
-    timeouts: int = 0
-    refusals: int = 0
-
-
 class Line:
     """A line, open from its construction until it is lost or closed."""
 
     def __init__(self, wire: Wire, port: Port, name: str) -> None:
         self.wire = wire
         self.name = name
-        self.statistics = LineStatistics()
         self.loss: str | None = None
         self.members: dict[int, Member] = {}
         self._port = port
@@ -71,8 +60,10 @@ class Line:
         self,
         member: Member | None,
         priority: Priority,
-        make: Callable[[], tuple[str, Values]],
+        name: str,
+        values: Values,
         *,
+        make: Callable[[], Values] | None = None,
         timeout: float = REPLY_TIMEOUT,
         start: JointStart | None = None,
     ) -> "asyncio.Future[Values]":
@@ -80,11 +71,12 @@ class Line:
 
         Or raises LinkError, LinkTimeout, FrameError, CommandRefused; Preempted where another
         request came first. member: None for a broadcast, which has no reply: the future ends once
-        it was sent. start: with the commits of other lines.
+        it was sent. make: values of each attempt, made when its turn has come; raises
+        CommandRefused. start: with the commits of other lines.
         """
         future = self._loop.create_future()
         now = self._loop.time()
-        job = Job(member, priority, make, ATTEMPTS, timeout, now, future, start)
+        job = Job(*(member, priority, name, values, make, ATTEMPTS, timeout, now, future, start))
         if self.loss is not None:
             self._fail(job, LinkError(self.loss))
             return future
@@ -99,15 +91,8 @@ class Line:
         """Take bytes from the port."""
         for arrival in self.wire.received(data):
             if isinstance(arrival, Event | OtherHost | Several):
-                if (member := self.members.get(arrival.address)) is None:
-                    continue
-                match arrival:
-                    case Event():
-                        member.note_event(arrival.values)
-                    case OtherHost():
-                        member.note_other_host()
-                    case Several():
-                        member.note_several()
+                if (member := self.members.get(arrival.address)) is not None:
+                    _note_unasked(member, arrival)
                 continue
             job = self._current
             if job is None:
@@ -120,15 +105,28 @@ class Line:
                     return
                 continue
             self._current = None
-            if job.member is not None:
-                job.member.note_heard()
-            if isinstance(arrival, Nak):
-                self._refused(job, arrival)
-            elif isinstance(arrival, Broken):
-                self._fail(job, FrameError(f"{self.name}: {arrival.reason}"))
-            elif not job.result.done():
-                job.result.set_result(arrival.values)
+            self._end(job, arrival)
         self.pump()
+
+    def _end(self, job: Job, arrival: Reply | Nak | Broken) -> None:
+        """End the request that was on the line by what came back."""
+        member = job.member
+        if member is None:
+            return
+        if isinstance(arrival, Reply):
+            try:
+                member.note_reply(job.name, job.values, arrival.values, job.sent_at)
+            except CommandRefused as error:
+                self._fail(job, error)
+                return
+            if not job.result.done():
+                job.result.set_result(arrival.values)
+            return
+        member.note_refusal()
+        if isinstance(arrival, Nak):
+            self._refused(job, member, arrival)
+        else:
+            self._fail(job, FrameError(f"{self.name}: {arrival.reason}"))
 
     def lose(self, cause: str) -> None:
         """Fail every request: the port is lost, or closed."""
@@ -172,14 +170,18 @@ class Line:
 
     def _start(self, job: Job) -> None:
         try:
-            name, values = job.make()
-            now = self._loop.time()
+            if job.make is not None:
+                job.values = job.make()
+            now = job.sent_at = self._loop.time()
             if job.member is None:
-                self._write(0, name, values, now)
+                self._write(0, job.name, job.values, now)
                 job.result.set_result({})
                 return
-            job.member.check_request(name)
-            job.due = now + self._write(job.member.address, name, values, now) + job.timeout
+            job.member.check_request(job.name)
+            longer = self._write(job.member.address, job.name, job.values, now)
+            job.due = now + longer + job.timeout
+            if longer and job.attempts == ATTEMPTS:
+                job.attempts -= 1  # a slow wire: as long as on others until it counts as degraded
             job.attempts -= 1
             job.looks = 0
             self._current = job
@@ -198,21 +200,22 @@ class Line:
         self._port.write(data)
         return max(self.wire.round_trip(name, len(data)) + REACTION - REPLY_TIMEOUT, 0.0)
 
-    def _refused(self, job: Job, nak: Nak) -> None:
-        self.statistics.refusals += 1
+    def _refused(self, job: Job, member: Member, nak: Nak) -> None:
+        member.counts.refusals += 1
         if nak.code == "BUSY" and job.attempts > 0:
             self._repeat(job, pause=BUSY_PAUSE)
             return
         channel = "" if nak.channel is None else f", channel {nak.channel}"
         text = f"{self.name}: the amplifier refused the request: {nak.code}{channel}"
-        self._fail(job, CommandRefused(text, channel=nak.channel))
+        self._fail(job, CommandRefused(text, channel=nak.channel, may_play=job.had_no_reply))
 
     def _repeat(self, job: Job, *, pause: float = 0.0) -> None:
         """Queue a request again, unless another one of its amplifier comes before it."""
         if self._queue.supersedes(job):
             self._fail(job, Preempted(SUPERSEDED))
         else:
-            self.statistics.retries += 1
+            if job.member is not None:
+                job.member.counts.retries += 1
             job.not_before = self._loop.time() + pause if pause else 0.0
             # Behind those of its priority, so that a mute amplifier does not keep others waiting.
             self._queue.add(job)
@@ -276,7 +279,9 @@ class Line:
             job.attempts += 1
             self._repeat(job)
             return
-        self.statistics.timeouts += 1
+        job.had_no_reply = True
+        if job.member is not None:
+            job.member.counts.timeouts += 1
         cause = f"{self.name}: no reply within {1e3 * job.timeout:g} ms"
         if self._port.is_blocked:
             cause += "; check flow control and the adapter: the port takes no bytes"
@@ -286,3 +291,12 @@ class Line:
         if job.member is not None:
             job.member.note_silence(cause)
         self._fail(job, LinkTimeout(f"{cause}; check that the amplifier is switched on"))
+
+
+def _note_unasked(member: Member, arrival: Event | OtherHost | Several) -> None:
+    if isinstance(arrival, Event):
+        member.note_event(arrival.values)
+    elif isinstance(arrival, OtherHost):
+        member.note_other_host()
+    else:
+        member.note_several()

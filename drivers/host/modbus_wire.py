@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from drivers.codec.modbus.adu import ModbusResponse, RequestAdu, ResponseReader, build_adu
 from drivers.codec.modbus.exchanges import Read, Write
-from drivers.host.wire import Arrival, Broken, More, Nak, Reply, Several, read_nak
+from drivers.host.wire import NETWORK_DELAY, Arrival, Broken, More, Nak, Reply, Several, read_nak
 from drivers.protocol.definition import WireQuantity
 from drivers.protocol.records import Number, Numbers, Real, Record, Refusal, Rest, Rows, Values
 from drivers.protocol.serial_payload import BROADCAST
@@ -59,6 +59,7 @@ class ModbusWire:
     def __init__(self, baud: int, *, is_rtu: bool, number: int) -> None:
         self.counters = WireCounters()
         self.silence = max(_GAP * _BITS / baud, _SHORTEST_GAP) if baud else 0.0
+        self.delay = 0.0 if baud else NETWORK_DELAY
         self._baud = baud
         self._is_rtu = is_rtu
         self._number = number

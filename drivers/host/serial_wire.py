@@ -8,7 +8,7 @@ from drivers.codec.serial_line.frame import (
     encode_frame,
     frame_length,
 )
-from drivers.host.wire import Arrival, Broken, Event, Reply, Several, read_nak
+from drivers.host.wire import NETWORK_DELAY, Arrival, Broken, Event, Reply, Several, read_nak
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.serial_payload import (
     BROADCAST,
@@ -32,10 +32,11 @@ _BITS = 10  # of a byte, with start and stop
 
 
 class SerialWire:
-    """A line at a speed [baud], 0 for none that is known; sequence: number of the last request."""
+    """A line at a speed [baud], 0 for a network; sequence: number of the last request."""
 
     def __init__(self, baud: int, *, sequence: int) -> None:
         self.counters = WireCounters()
+        self.delay = 0.0 if baud else NETWORK_DELAY
         self._baud = baud
         self._sequence = sequence
         self._pending: Frame | None = None

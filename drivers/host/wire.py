@@ -12,6 +12,11 @@ from drivers.protocol.records import Values
 from drivers.protocol.table import NAK_RECORD, NO_CHANNEL, REFUSALS
 from drivers.statistics import WireCounters
 
+NETWORK_DELAY = 1.0
+"""Time [s] after which a port gives up a connection that has not taken what was sent.
+
+What a broken network delivers later than that is not accounted for.
+"""
 _CODES = {number: name for name, number in REFUSALS.items()}
 
 
@@ -80,6 +85,8 @@ class Wire(Protocol):
     """The host's side of a kind of wire."""
 
     counters: WireCounters
+    delay: float
+    """By which a frame may arrive later than its bits take [s]: `NETWORK_DELAY` over a network."""
 
     def request(self, address: int, name: str, values: Values) -> bytes:
         """Return the bytes of a request, which is on the wire from now on; address 0: of all."""

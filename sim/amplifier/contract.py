@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
 from drivers.playback import Playback, Voice
-from drivers.protocol.definition import token_after
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import (
@@ -26,6 +25,7 @@ from drivers.protocol.table import (
     STATES,
     STATUS_FLAGS,
 )
+from drivers.protocol.tokens import token_after
 from sim.amplifier.outputs import output_of
 from sim.amplifier.set_intake import SetIntake, derated
 from sim.amplifier.state_table import TRANSITIONS

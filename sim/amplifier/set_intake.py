@@ -7,10 +7,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from drivers.protocol.definition import is_newer_token
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Assembly, Command, Envelope, LayerSet, unpack_layers
 from drivers.protocol.table import STAGED_LIFE
+from drivers.protocol.tokens import is_newer_token
 
 
 class SetIntake:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
 
-from drivers.codec.can_bus.segments import REQUEST, unpack_frames
+from drivers.codec.can_bus.frame import CANOPEN, CanFrame, cob_id
+from drivers.codec.can_bus.segments import REQUEST, pack_frames, unpack_frames
 from drivers.codec.serial_line.frame import FrameReader
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.can_wire import CanWire
@@ -114,6 +115,16 @@ class MemoryLine:
             each: Host(self.line, address, LIMITS, name=each)
             for address, each in enumerate(names, 1)
         }
+
+    @property
+    def retries(self) -> int:
+        """Requests that were repeated."""
+        return sum(host.counts.retries for host in self.hosts.values())
+
+    def boot(self, node: int) -> None:
+        """Have a CAN node begin anew, as after its supply was away."""
+        frame = CanFrame(cob_id("nmt"), bytes((CANOPEN["nmt"]["reset_node"], node)))
+        self._end.receive(pack_frames([frame]), self.loop.time())
 
     def write(self, data: bytes) -> None:
         """Send bytes of the host."""

@@ -169,7 +169,7 @@ def test_frames_in_any_order_and_doubled_play_the_same_set() -> None:
         await asyncio.sleep(0.002)
         assert end.levels("a") == [0.5, 0.5]
         assert (await group.stop())["a"].is_confirmed
-        assert end.line.statistics.retries == 0
+        assert end.retries == 0
 
     run_virtual(run())
 

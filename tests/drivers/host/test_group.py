@@ -92,7 +92,7 @@ def test_layers_play_together_and_leave_each_other_alone(wire: str, lines: str) 
         await asyncio.sleep(0.002)
         assert all(end.levels(name) == [0.2, 0.1] for end in ends for name in end.hosts)
         assert all(each.is_exact for each in staged.values())
-        assert all(end.line.statistics.retries == 0 for end in ends)
+        assert all(end.retries == 0 for end in ends)
         assert all(end.line.wire.counters.unexpected_frames == 0 for end in ends)
 
     with_group(test, wire, *LINES[lines])
@@ -138,7 +138,7 @@ def test_lost_frame_is_repeated_and_played_once(wire: str, name: str, way: str) 
         await group.apply({"a": [layer(0, tone())]})
         await asyncio.sleep(0.002)
         assert ends[0].levels("a") == [0.5, 0.0]
-        assert ends[0].line.statistics.retries == 1
+        assert ends[0].retries == 1
         assert len(ends[0].far["a"].playback.voices_of(0)) == 1
 
     with_group(test, wire, ("a",))
@@ -169,7 +169,7 @@ def test_doubled_frames_are_carried_out_once(wire: str, way: str) -> None:
         assert ends[0].levels("a") == [0.4, 0.0]
         assert len(ends[0].far["a"].playback.voices_of(0)) == 1
         assert (await group.stop())["a"].is_confirmed
-        assert ends[0].line.statistics.retries == 0
+        assert ends[0].retries == 0
 
     with_group(test, wire, ("a",))
 
@@ -204,7 +204,9 @@ def test_amplifier_without_reply_stops_the_others(wire: str) -> None:
         assert not group.is_armed
         stopped = await group.stop()
         assert (stopped["a"].is_confirmed, stopped["b"].is_confirmed) == (True, False)
-        assert began + 0.25 <= stopped["b"].may_play_until <= began + 0.4
+        # What a network has not delivered yet may feed within a second from then on.
+        late = 1.0 if wire == "tcp" else 0.0
+        assert began + 0.25 + late <= stopped["b"].may_play_until <= began + 0.4 + late
         assert ends[0].levels("a") == [0.0, 0.0]
         await asyncio.sleep(stopped["b"].may_play_until - ends[1].loop.time())
         assert ends[1].levels("b") == [0.0, 0.0]
@@ -342,6 +344,7 @@ def test_contradictions_twice_in_a_row_are_a_fault(wire: str) -> None:
         ends[0].far["a"].set_temperature(71.0, ends[0].loop.time())
         await asyncio.sleep(0.03)
         await group.beat()
+        await asyncio.sleep(0.03)
         with pytest.raises(CommandRefused):
             await group.beat()
         assert not group.is_armed

@@ -222,7 +222,7 @@ def test_damaged_length_costs_one_attempt() -> None:
         await end.hosts["a"].open()
         end.inward = lengthened
         await end.hosts["a"].read_status()
-        assert end.line.statistics.retries == 1
+        assert end.retries == 1
 
     run_virtual(run())
 

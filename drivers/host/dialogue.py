@@ -1,0 +1,214 @@
+"""What one amplifier was sent and has replied: its ledger, watchdog, latch and contradictions."""
+
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from drivers import clock
+from drivers.errors import CommandError, CommandRefused, LinkDegraded, LinkError, Preempted
+from drivers.host.comparison import MAX_CONTRADICTIONS, problem_of
+from drivers.host.feeding import Feeding
+from drivers.host.jobs import RequestCounts
+from drivers.host.ledger import Ledger
+from drivers.host.line import Line
+from drivers.protocol.records import Values
+from drivers.protocol.sets import LayerSet
+from drivers.protocol.table import MESSAGES, QUANTITIES, STATES
+from drivers.protocol.tokens import is_newer_token
+from drivers.statistics import LinkStatistics
+
+_SAME_MOMENT = 0.01  # s; statuses that are closer show a contradiction once
+_RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
+_ENABLED = STATES["OPERATION_ENABLED"]
+_STATUS = MESSAGES["GetStatus"].reply
+_SILENCING = ("Stop", "Disarm", "Silence")
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Staged:
+    """A set that an amplifier has staged, or plays at once: as the wire has it.
+
+    is_exact: to the word; until: when [s] it must have been committed.
+    """
+
+    token: int
+    layers: tuple[LayerSet, ...]
+    is_exact: bool
+    until: float
+
+
+class Dialogue:
+    """The exchanges with one amplifier, whose line is open; a `Member` of it."""
+
+    def __init__(self, line: Line, address: int, name: str) -> None:
+        self.line, self.address, self.name = line, address, name
+        self.capabilities: Values = {}
+        self.session = 0
+        self.latch: int | None = None
+        """Newest latch that a status has shown since it was identified."""
+        self.status: Values | None = None
+        """The last one."""
+        self.status_at: float | None = None
+        """When [s] it was read."""
+        self.round_trip: float | None = None
+        """Of the last request that was answered [s]."""
+        self.played_at = -math.inf
+        """When [s] a set or silence was sent last."""
+        self.feeding = Feeding(line.wire.delay)
+        self.counts = RequestCounts()
+        self.silence_cause: str | None = None
+        """Why it is degraded: it did not reply to a request, and may still play."""
+        self.listeners: list[Callable[[Values], None]] = []
+        self.silences = 0
+        """Stops and disarms that were sent to it."""
+        self._ledger: Ledger | None = None
+        self._admitted: Staged | None = None
+        self._contradictions = 0
+        self._contradicted_at = -math.inf
+        self._other_host_at = -math.inf  # when it was heard last
+        self._are_several = False  # two amplifiers have replied since this was reset
+        line.members[address] = self
+
+    @property
+    def ledger(self) -> Ledger:
+        """Its ledger, known once it is identified."""
+        if self._ledger is None:
+            raise CommandError(f"amplifier {self.name} must be opened first")
+        return self._ledger
+
+    @property
+    def statistics(self) -> LinkStatistics:
+        """Counts of its requests, and of all frames on its line."""
+        frames, counts = self.line.wire.counters, self.counts
+        return LinkStatistics(
+            *(frames.frames_out, frames.frames_in, frames.invalid_frames),
+            *(frames.unexpected_frames, frames.events),
+            *(counts.retries, counts.timeouts, counts.refusals),
+            self.round_trip,
+        )
+
+    def note_sent(self, name: str, values: Values, now: float) -> None:
+        """Note a request that may have reached it."""
+        if name == "Hello":
+            return
+        if MESSAGES[name].feeds and (name == "Arm" or values["session"] == self.session):
+            self.feeding.may = now
+        admitted = self._admitted
+        if name in _SILENCING or name == "Arm":
+            self._admitted = None
+            self.silences += name in ("Stop", "Disarm")
+            if name == "Silence":
+                self.played_at = now
+        elif admitted is not None and values.get("token") == admitted.token:
+            is_last = name == "Set" and values["now"] and values["index"] == values["parts"] - 1
+            if name == "Commit" or is_last:
+                self.played_at = now
+                self.ledger.sent(admitted.token, admitted.layers, now)
+
+    def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
+        """Note the reply to a request that was sent at a time [s].
+
+        Raises CommandRefused once its statuses contradict what was sent, twice in a row.
+        """
+        now = clock.now()
+        self.silence_cause = None
+        self.round_trip = now - sent_at
+        message = MESSAGES.get(name)
+        if message is None:
+            return
+        if message.feeds:
+            self.feeding.confirm(sent_at, now)
+        if message.reply is _STATUS:
+            self._note_status(name, values, reply, sent_at, now)
+        elif name == "Set" and reply["played"]:
+            self._confirm(values["token"], now)
+
+    def note_refusal(self) -> None:
+        """Note that it has replied, with a refusal or what cannot be read."""
+        self.silence_cause = None
+
+    def note_silence(self, cause: str) -> None:
+        """Note that it has not replied to all attempts of a request."""
+        self.silence_cause = cause
+
+    def note_event(self, values: Values) -> None:
+        """Hand an event on."""
+        for listener in self.listeners:
+            try:
+                listener(values)
+            except Exception:
+                _logger.exception("amplifier %s: a listener failed", self.name)
+
+    def note_other_host(self) -> None:
+        """Note that another host drives it: it must feed the watchdog within its longest time."""
+        self._other_host_at = clock.now()
+
+    def note_several(self) -> None:
+        """Note that a second amplifier has replied at its address."""
+        self._are_several = True
+
+    def check_other_host(self) -> None:
+        """Raise LinkError if another host drives it."""
+        if clock.now() - self._other_host_at <= _WATCHDOG.high:
+            raise self._driven_by_another()
+
+    def check_request(self, name: str) -> None:
+        """Raise LinkError for what plays or feeds, while degraded or beside another host."""
+        if name in ("Hello", "Silence") or not MESSAGES[name].feeds:
+            return
+        self.check_other_host()
+        if self.silence_cause is not None:
+            raise LinkDegraded(
+                f"{self.silence_cause}. The amplifier may play its last set until its watchdog has "
+                "passed; nothing new is played until it replies"
+            )
+
+    def check_admitted(self, token: int) -> None:
+        """Raise Preempted or CommandRefused unless a set may be played now."""
+        admitted = self._admitted
+        if admitted is None or admitted.token != token:
+            raise Preempted(f"amplifier {self.name}: a stop, disarm or newer set came first")
+        if clock.now() > admitted.until:
+            raise CommandRefused(
+                f"amplifier {self.name}: set {token} must be committed by {admitted.until:.3f} s, "
+                f"got {clock.now():.3f} s; the wire is too slow or too busy"
+            )
+
+    def _confirm(self, token: int, now: float) -> None:
+        """Note that the amplifier plays the set with this token, as it says."""
+        self.ledger.resolve(token, now)
+        if self._admitted is not None and self._admitted.token == token:
+            self._admitted = None
+
+    def _note_status(
+        self, name: str, values: Values, status: Values, sent_at: float, now: float
+    ) -> None:
+        """Note a status; raises CommandRefused once it contradicts what was sent twice."""
+        if self.latch is None or is_newer_token(status["latch"], self.latch):
+            self.latch = status["latch"]
+        self.status, self.status_at = status, now
+        if self._ledger is None:
+            return
+        if name in _SILENCING:
+            self._ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
+            return
+        self._confirm(status["token"], now)
+        if not self.session or name in ("Arm", "Clear") or status["state"] != _ENABLED:
+            return
+        fed = MESSAGES[name].feeds
+        problem = problem_of(status, self._ledger, self.feeding, sent_at=sent_at, now=now, fed=fed)
+        if problem is None:
+            self._contradictions, self._contradicted_at = 0, -math.inf
+        elif now - self._contradicted_at >= _SAME_MOMENT:
+            self._contradictions, self._contradicted_at = self._contradictions + 1, now
+            if self._contradictions >= MAX_CONTRADICTIONS:
+                raise CommandRefused(
+                    f"amplifier {self.name} contradicts its requests: {problem}; look for a "
+                    "derated or broken channel, an exchanged cable or firmware, then clear and arm "
+                    "again"
+                )
+
+    def _driven_by_another(self) -> LinkError:
+        return LinkError(f"amplifier {self.name} is driven by another host; end that one first")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from drivers.codec.modbus.adu import ModbusResponse, RequestAdu, ResponseReader, build_adu
 from drivers.codec.modbus.exchanges import Read, Write
-from drivers.host.wire import NETWORK_DELAY, Arrival, Broken, More, Nak, Reply, Several, read_nak
+from drivers.host.wire import Arrival, Broken, More, Nak, Reply, Several, read_nak
 from drivers.protocol.definition import WireQuantity
 from drivers.protocol.records import Number, Numbers, Real, Record, Refusal, Rest, Rows, Values
 from drivers.protocol.serial_payload import BROADCAST
@@ -53,13 +53,13 @@ class _Request:
 class ModbusWire:
     """A line at a speed [baud], 0 for a network; number: of the last tag and transaction.
 
-    silence: before each frame of a serial line [s], kept by its port.
+    silence: before each frame of a serial line [s], kept by its port; delay [s]: of a network.
     """
 
-    def __init__(self, baud: int, *, is_rtu: bool, number: int) -> None:
+    def __init__(self, baud: int, *, is_rtu: bool, number: int, delay: float = 0.0) -> None:
         self.counters = WireCounters()
         self.silence = max(_GAP * _BITS / baud, _SHORTEST_GAP) if baud else 0.0
-        self.delay = 0.0 if baud else NETWORK_DELAY
+        self.delay = delay
         self._baud = baud
         self._is_rtu = is_rtu
         self._number = number

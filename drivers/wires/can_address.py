@@ -8,6 +8,7 @@ from drivers.backends.urls.can_bus import CanBusUrl, CanUrl
 from drivers.codec.can_bus.segments import NUMBER_MAX
 from drivers.errors import CommandError
 from drivers.host.can_wire import CanWire
+from drivers.host.wire import NETWORK_DELAY
 from drivers.wires.address import WireAddress
 
 
@@ -29,4 +30,5 @@ class CanAddress(WireAddress):
 
     def make_wire(self) -> CanWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""
-        return CanWire(self.bus.bitrate, sequence=number_below(NUMBER_MAX + 1))
+        delay = NETWORK_DELAY if self.bus.host else 0.0
+        return CanWire(self.bus.bitrate, sequence=number_below(NUMBER_MAX + 1), delay=delay)

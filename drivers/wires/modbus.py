@@ -7,6 +7,7 @@ from drivers.backends.ports.opening import open_port
 from drivers.backends.ports.tcp import open_connection
 from drivers.backends.urls.modbus import ModbusUrl
 from drivers.host.modbus_wire import ModbusWire
+from drivers.host.wire import NETWORK_DELAY
 from drivers.wires.address import WireAddress
 from drivers.wires.silent_port import SilentPort
 
@@ -28,7 +29,9 @@ class ModbusAddress(WireAddress):
     def make_wire(self) -> ModbusWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""
         url = self._url
-        return ModbusWire(url.baud, is_rtu=url.is_rtu, number=number_below(1 << 16))
+        delay = 0.0 if url.device else NETWORK_DELAY
+        number = number_below(1 << 16)
+        return ModbusWire(url.baud, is_rtu=url.is_rtu, number=number, delay=delay)
 
     async def open_port(
         self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]

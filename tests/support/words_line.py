@@ -14,7 +14,7 @@ from drivers.host.can_wire import CanWire
 from drivers.host.line import Line
 from drivers.host.modbus_wire import ModbusWire
 from drivers.host.serial_wire import SerialWire
-from drivers.host.wire import Wire
+from drivers.host.wire import NETWORK_DELAY, Wire
 from drivers.protocol.serial_payload import HELLO
 from drivers.protocol.table import BY_NUMBER
 from registry.limits import GuardLimits
@@ -85,7 +85,7 @@ KINDS: Mapping[str, Kind] = {
         _modbus_request,
     ),
     "tcp": Kind(
-        lambda: ModbusWire(0, is_rtu=False, number=0),
+        lambda: ModbusWire(0, is_rtu=False, number=0, delay=NETWORK_DELAY),
         partial(ModbusAmplifiers, is_rtu=False),
         lambda data: _modbus_request(data[6:]),
     ),

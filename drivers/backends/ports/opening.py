@@ -2,12 +2,12 @@
 
 import contextlib
 import os
-import socket
 from collections.abc import Callable
 
 import serial
 
 from drivers.backends.hardware import HARDWARE_PROVIDER, Port
+from drivers.backends.ports.tcp import bound_delay
 from drivers.backends.ports.watched import (
     READ_TIMEOUT,
     WatchedPort,
@@ -69,9 +69,7 @@ def _open_port(name: str, baud: int, parity: str, stop: int) -> serial.Serial:
         port.set_low_latency_mode(True)
     connection = connection_of(port)
     if connection is not None:
-        # Without it a frame may wait up to 40 ms for the acknowledgement of the one before, and a
-        # stop must not wait for that.
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        bound_delay(connection)
     port.reset_input_buffer()
     return port
 

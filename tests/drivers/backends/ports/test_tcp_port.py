@@ -41,6 +41,20 @@ async def test_first_address_that_accepts_is_used(
         await asyncio.sleep(0)
 
 
+async def test_connection_gives_up_what_is_not_taken_within_a_second() -> None:
+    """RFC 5482: the kernel's option, in milliseconds; frames are sent at once."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        port = listening.getsockname()[1]
+        connection = await open_connection("127.0.0.1", port, lambda _: None, lambda _: None)
+        taken, _ = listening.accept()
+        endpoint = connection._transport.get_extra_info("socket")  # type: ignore[attr-defined]
+        options = (socket.TCP_USER_TIMEOUT, socket.TCP_NODELAY)
+        assert [endpoint.getsockopt(socket.IPPROTO_TCP, each) for each in options] == [1000, 1]
+        taken.close()
+        connection.close()
+        await connection.wait_closed()
+
+
 async def test_link_local_address_keeps_its_zone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -1,17 +1,17 @@
-"""Lines of protocol 3 to simulated amplifiers in this process, and the `sim://` URLs of them.
+"""Simulated amplifiers of protocol 3 in this process, by URLs `sim://`.
 
 Requests and replies are the bytes of a serial line. Not modelled: transmission time.
 """
 
 import asyncio
 import contextlib
-import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from drivers import clock
+from drivers.backends.hardware import number_below
 from drivers.errors import LinkError
-from drivers.host.line import Line
 from drivers.host.serial_wire import SerialWire
+from drivers.wires.address import WireAddress
 from sim.amplifier.contract import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
@@ -19,31 +19,43 @@ from sim.shared_rig import SimulationUrl, opened
 from sim.transport.line import TwoWayLine
 
 
-class MemoryLine:
-    """A line with devices at the addresses of their numbers, in the running event loop.
+class MemoryPort:
+    """The port of a host, with devices at the addresses of their numbers at the other end.
 
-    line: the host's side, lost when the first device is unplugged. Raises LinkError while it is.
+    It works in the running event loop. on_data: called with what they send; on_loss: called once
+    with the cause when the first device is unplugged. Raises LinkError while it is.
     """
 
     is_blocked = False
 
-    def __init__(self, devices: Sequence[AmplifierDevice], name: str) -> None:
+    def __init__(
+        self,
+        devices: Sequence[AmplifierDevice],
+        on_data: Callable[[bytes], None],
+        on_loss: Callable[[str], None],
+    ) -> None:
         self._first = devices[0]
         if not self._first.is_plugged:
-            raise LinkError(f"{name} is unplugged")
+            raise LinkError(f"amplifier {self._first.name} is unplugged")
+        self._on_data, self._on_loss = on_data, on_loss
         self._end = SerialAmplifiers({each.address: each for each in devices}, self._reply)
         self._wire = TwoWayLine(
             to_amplifier=lambda data: self._end.receive(data, clock.now()),
             to_host=self._deliver,
             faults=self._first.faults,
         )
+        self._running = contextlib.AsyncExitStack()
+        self._is_open = True
         self._first.plug_listeners.append(self._plug)
-        # A random start, so that a reply to an earlier host does not match.
-        sequence = random.getrandbits(16)
-        self.line = Line(SerialWire(0, sequence=sequence), self, name)
+
+    def closes_with(self, running: contextlib.AsyncExitStack) -> None:
+        """Have it end what runs for it when it is closed."""
+        self._running = running
 
     def write(self, data: bytes) -> None:
-        """Send bytes to the amplifiers."""
+        """Send bytes to the amplifiers; raises LinkError if it is lost."""
+        if not self._is_open:
+            raise LinkError(f"amplifier {self._first.name} was unplugged")
         self._wire.inward.send(data)
 
     def poll(self) -> None:
@@ -51,12 +63,15 @@ class MemoryLine:
 
     def close(self) -> None:
         """Close it; disarm before, or vibrations last until the watchdogs trip."""
-        if self._plug in self._first.plug_listeners:
+        if self._is_open:
+            self._is_open = False
             self._first.plug_listeners.remove(self._plug)
             self._end.close()
             self._wire.close()
-        if self.line.loss is None:
-            self.line.lose(f"{self.line.name} was closed")
+
+    async def wait_closed(self) -> None:
+        """End what runs for it."""
+        await self._running.aclose()
 
     def _reply(self, data: bytes) -> None:
         self._wire.outward.send(data)
@@ -66,39 +81,40 @@ class MemoryLine:
         asyncio.get_running_loop().call_soon(self._arrived, data)
 
     def _arrived(self, data: bytes) -> None:
-        if self.line.loss is None:
-            self.line.received(data)
+        if self._is_open:
+            self._on_data(data)
 
     def _plug(self, is_plugged: bool) -> None:
         if not is_plugged:
-            self.line.lose(f"{self.line.name} was unplugged")
+            self.close()
+            self._on_loss(f"amplifier {self._first.name} was unplugged")
 
 
-class SimulatedLine:
-    """The line of an amplifier by its URL; see `SimulationUrl`. It is alone on it, at address 1."""
+class SimulatedAddress(WireAddress):
+    """An amplifier of a rig simulated in this process, alone on its line; see `SimulationUrl`."""
 
-    address = 1
+    def __init__(self, url: str) -> None:
+        self._url = SimulationUrl.parse(url)
+        self.line, self.number = url, 1
+        self.settings = {"protocol": "serial"}
 
-    def __init__(self, memory: MemoryLine, stack: contextlib.AsyncExitStack) -> None:
-        self.line = memory.line
-        self._memory = memory
-        self._stack = stack
+    def make_wire(self) -> SerialWire:
+        """Make the wire; a random start, so that a reply to an earlier host does not match."""
+        return SerialWire(0, sequence=number_below(1 << 16))
 
-    @classmethod
-    async def open(cls, url: str) -> "SimulatedLine":
-        """Simulate the rig of a URL, its plate at rest; raises CommandError, LinkError."""
+    async def open_port(
+        self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+    ) -> MemoryPort:
+        """Simulate the rig, its plate at rest, or share it; raises CommandError, LinkError.
+
+        The last port of a rig that is closed ends its simulation.
+        """
         async with contextlib.AsyncExitStack() as stack:
-            context, name = await stack.enter_async_context(
-                opened(SimulationUrl.parse(url), Amplifier)
-            )
+            context, name = await stack.enter_async_context(opened(self._url, Amplifier))
             device = context.devices.get(name)
             if not isinstance(device, AmplifierDevice):
                 device = AmplifierDevice(context.bench, name)
                 context.devices = {**context.devices, name: device}
-            memory = MemoryLine([device], url)
-            return cls(memory, stack.pop_all())
-
-    async def close(self) -> None:
-        """Close the line; the last one of a rig ends its simulation."""
-        self._memory.close()
-        await self._stack.aclose()
+            port = MemoryPort([device], on_data, on_loss)
+            port.closes_with(stack.pop_all())
+            return port

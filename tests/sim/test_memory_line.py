@@ -11,6 +11,7 @@ from drivers import clock
 from drivers.errors import CommandError, CommandRefused, LinkError
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
+from drivers.opening import Lines
 from drivers.protocol.table import FAULTS, STATES
 from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
@@ -21,10 +22,9 @@ from model.structure.fingertip import Fingertip, FingertipLoad
 from plate_in_time import apart
 from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.faults.fault_window import FaultKind, FaultWindow
-from sim.memory_line import MemoryLine, SimulatedLine
 from virtual_loop import in_virtual_time
 from wires import on_two_amplifiers
-from words_bench import LIMITS, layer, rig_in_memory
+from words_bench import LIMITS, layer, memory_line, rig_in_memory
 
 
 @in_virtual_time
@@ -129,16 +129,13 @@ async def test_unplugged_line_is_lost_and_opens_again_once_plugged_in(coarse_rig
         with pytest.raises(LinkError, match="unplugged"):
             await rig.group.beat()
         with pytest.raises(LinkError, match="unplugged"):
-            MemoryLine([device], "main")
+            memory_line([device], "main")
         await asyncio.sleep(1.01)
         assert not any(rig.bench.amplifiers["main"].summary(clock.now()).levels)
-        line = MemoryLine([device], "main")
-        host = Host(line.line, device.address, LIMITS, name="main")
+        line = memory_line([device], "main")
+        host = Host(line, device.address, LIMITS, name="main")
         await host.open()
         assert (await host.read_status())["fault"] == FAULTS["WATCHDOG"]
-        line.close()
-        with pytest.raises(LinkError, match="closed"):
-            await host.read_status()
 
 
 @in_virtual_time
@@ -150,36 +147,37 @@ async def test_lost_frames_are_asked_again(coarse_rig: Rig) -> None:
         rig.devices["main"].inject_fault(FaultWindow("drop", share=0.1))
         await rig.beat_until(clock.now() + 2.0)
         assert rig.bench.amplifiers["main"].summary(clock.now()).levels[0] == 1.0
-        assert rig.lines["main"].line.statistics.retries > 0
+        assert rig.lines["main"].statistics.retries > 0
 
 
 async def test_amplifiers_of_one_rig_share_its_simulation(tmp_path: Path) -> None:
-    """By URLs with names: the control socket sees both play, and lasts until both are closed."""
+    """By URLs with names: the control socket sees both play, and ends with them."""
     rig, control = write_rig(tmp_path / "rig.yaml", *TWO_AMPLIFIERS), tmp_path / "control"
-    lines = {
-        name: await SimulatedLine.open(f"sim://{rig}?control={control}&amplifier={name}")
-        for name in ("main", "side")
-    }
+    lines = Lines()
+    names = ("main", "side")
     group = Group(
-        {name: Host(each.line, each.address, LIMITS, name=name) for name, each in lines.items()}
+        {
+            name: await lines.amplifier(
+                f"sim://{rig}?control={control}&amplifier={name}", LIMITS, name=name
+            )
+            for name in names
+        }
     )
     await group.open()
     await group.arm(watchdog=2.0)
     played = layer((0, 110.0, 0.5), ramp=0.0)
-    await group.apply({name: [played] for name in lines})
+    await group.apply({name: [played] for name in names})
     reader, writer = await asyncio.open_unix_connection(control)
     writer.write(b'{"op": "state"}\n{"op": "inject_fault", "fault": "arc", "amplifier": "side"}\n')
     state = json.loads(await reader.readline())["amplifiers"]
-    assert [state[name]["levels"] for name in lines] == [[0.5, 0.0]] * 2
-    assert [state[name]["state"] for name in lines] == ["OPERATION_ENABLED"] * 2
+    assert [state[name]["levels"] for name in names] == [[0.5, 0.0]] * 2
+    assert [state[name]["state"] for name in names] == ["OPERATION_ENABLED"] * 2
     assert json.loads(await reader.readline())["ok"]
     with pytest.raises(CommandRefused):
         await group.beat()
     writer.close()
     await writer.wait_closed()
-    await lines["main"].close()
-    assert control.exists()
-    await lines["side"].close()
+    await lines.close()
     assert not control.exists()
     assert not [task for task in asyncio.all_tasks() if "simulated plate" in task.get_name()]
 
@@ -194,4 +192,4 @@ async def test_amplifiers_of_one_rig_share_its_simulation(tmp_path: Path) -> Non
 async def test_invalid_url_is_refused(url: str) -> None:
     """No rig, an unknown option or amplifier, a seed that is no number."""
     with pytest.raises(CommandError, match="sim://"):
-        await SimulatedLine.open(url)
+        await Lines().amplifier(url, LIMITS, name="a")

@@ -92,6 +92,7 @@ _QUANTITIES = (
     _word("phase", -18000, 17999, 100, "degrees"),
     _word("phase_step", 0, 18000, 100, "degrees"),
     _word("ramp", 0, 1000, 1000, "s"),
+    _word("any_ramp", 0, 65535, 1000, "s"),
     _word("valid_for", 0, 60000, 1000, "s"),
     _word("watchdog", 100, 2000, 1000, "s"),
     _word("watchdog_left", 0, 2000, 1000, "s"),
@@ -103,7 +104,7 @@ _QUANTITIES = (
     _word("channel", 0, 15),
     _word("channel_count", 1, 16),
     _word("layer", 0, 15),
-    _word("layer_count", 1, 16),
+    _word("layer_count", 4, 16),
     _word("voices", 8, 255),
     _word("set_words", 512, 65535),
     _word("knots", 0, 32),
@@ -214,7 +215,8 @@ _READING = Record(
 _MESSAGES = (
     Message("GetCaps", 2, Record(), _CAPABILITIES),
     Message("Arm", 3, Record(*_numbers("session", "watchdog")), _STATUS, feeds=True),
-    Message("Disarm", 4, Record(*_numbers("ramp")), _STATUS),
+    # A longer ramp than the longest counts as that one: nothing keeps an amplifier from silence.
+    Message("Disarm", 4, Record(*_numbers("ramp:any_ramp")), _STATUS),
     Message(
         "Set",
         5,
@@ -232,7 +234,7 @@ _MESSAGES = (
         feeds=True,
     ),
     Message("Silence", 7, Record(*_numbers("session", "ramp")), _STATUS, feeds=True),
-    Message("Stop", 8, Record(*_numbers("ramp")), _STATUS, is_broadcast=True),
+    Message("Stop", 8, Record(*_numbers("ramp:any_ramp")), _STATUS, is_broadcast=True),
     Message("GetStatus", 9, Record(), _STATUS),
     Message("GetFaults", 10, Record(), Record(*_numbers("count"), Rows("faults", "count", _FAULT))),
     Message("Clear", 11, Record(*_numbers("latch")), _STATUS),

@@ -20,7 +20,7 @@
 enum { CHANNELS = 2, LAYERS = 4, VOICES = 8, KNOTS = 32, SET_WORDS = 512, PAYLOAD = 240 };
 enum { ADDRESS = 1, BROADCAST = 0, VERSION = 3, REPLY = 0x80, NO_CHANNEL = 255 };
 enum { HELLO = 1, GET_CAPS, ARM, DISARM, SET, COMMIT, SILENCE, STOP, GET_STATUS, GET_FAULTS, CLEAR,
-       PING, GET_ACHIEVED, NAK = 31 };
+       PING, GET_ACHIEVED, EVENT = 30, NAK };
 enum { UNKNOWN_TYPE = 1, BAD_LENGTH, BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN,
        UNSUPPORTED_VERSION = 8, WRONG_SESSION = 10, WRONG_LATCH, INCOMPLETE };
 enum { DISABLED = 1, SWITCHED_ON = 3, ENABLED, STOPPED, REACTION, FAULT };
@@ -361,14 +361,13 @@ static int handle(int type, const uint16_t *in, int count, double now, int *chan
     if (feeds && state == ENABLED && in[0] != session) return WRONG_SESSION;
     if (type == ARM && state != ENABLED && in[0] == session) return WRONG_SESSION;
     if (type == ARM && (in[1] < 100 || in[1] > 2000)) return BAD_VALUE;
-    if ((type == DISARM || type == STOP) && in[0] > RAMP_MAX) return BAD_VALUE;
     if (type == SILENCE && in[1] > RAMP_MAX) return BAD_VALUE;
     if (type == ARM) {
         watchdog = in[1] / 1000.0;
         if (state != ENABLED) silence(now, 0.005), committed = 0, session = in[0], state = ENABLED;
     } else if (type == DISARM || type == STOP) {
         if (type == STOP) latch = after(latch);
-        silence(now, in[0] / 1000.0);
+        silence(now, fmin(in[0], RAMP_MAX) / 1000);
         if (type == DISARM && state == ENABLED) state = SWITCHED_ON;
         if (type == STOP && state < REACTION) state = STOPPED;
     } else if (type == SILENCE) {
@@ -439,7 +438,7 @@ static void received(int line, const uint8_t *stuffed, int length, double now) {
     uint32_t crc = 0;
     for (int i = 0; i < 4; i++) crc |= (uint32_t)frame[size - 4 + i] << 8 * i;
     int type = frame[0], address = frame[2], bytes = size - 9;
-    if (crc != crc_of(frame, size - 4) || type & REPLY) return;
+    if (crc != crc_of(frame, size - 4) || type & REPLY || type == EVENT) return;
     if (address != ADDRESS && !(address == BROADCAST && (type == COMMIT || type == STOP))) return;
     tick(now);
     int code = 0, channel = NO_CHANNEL, version = VERSION;

@@ -48,7 +48,7 @@ class SerialAmplifiers:
     def receive(self, data: bytes, now: float) -> None:
         """Take bytes from the host at a time [s]."""
         for frame in self._reader.feed(data):
-            if frame.is_reply:  # an echo
+            if frame.is_reply or frame.type == EVENT:  # an echo
                 continue
             if frame.address == BROADCAST:
                 self._broadcast(frame, now)

@@ -69,7 +69,13 @@ def test_longest_messages_fit_every_wire() -> None:
     """Sixteen channels and sixteen layers, the widest that an amplifier can have."""
     limits = {"frequency_min": 0, "frequency_max": 1, "level_max": 1}
     zeros = dict.fromkeys(MESSAGES["GetCaps"].reply.names, 1)
-    widest = zeros | {"voices": 8, "set_words": 512, "watchdog_min": 100, "watchdog_max": 100}
+    widest = zeros | {
+        "layers": 4,
+        "voices": 8,
+        "set_words": 512,
+        "watchdog_min": 100,
+        "watchdog_max": 100,
+    }
     caps = widest | {"channels": 16, "limits": [limits] * 16}
     assert len(MESSAGES["GetCaps"].reply.pack(caps)) <= MAX_WORDS
     status = STATUS | {"channels": 16, "layers": 16, "levels": [0] * 16, "tokens": [0] * 16}

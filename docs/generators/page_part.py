@@ -12,7 +12,7 @@ def begin(writer: str) -> str:
 
 def insert(page: str, text: str, *, writer: str) -> str:
     """The page with this text between the marks; ValueError for a page without them."""
-    found = re.fullmatch(rf"(.*{begin(writer)}\n).*({END}\n.*)", page, re.DOTALL)
+    found = re.fullmatch(rf"(.*{begin(writer)}\n).*?({END}\n.*)", page, re.DOTALL)
     if found is None:
         raise ValueError(f"the page has no lines {begin(writer)} and {END}")
     return f"{found[1]}\n{text.rstrip()}\n\n{found[2]}"

@@ -1,0 +1,233 @@
+"""The tables of docs/reference/{protocol,modbus,can}.md, from `drivers.protocol.table`.
+
+`python docs/generators/protocol_tables.py docs/reference` writes each anew between two marks, and
+the files amplifier.eds and amplifier.dbc whole.
+"""
+
+import sys
+import textwrap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from amplifier_dbc import dbc_text
+from amplifier_eds import eds_text
+from drivers.codec.can_bus.frame import CANOPEN
+from drivers.protocol.records import Bits, Number, Numbers, Real, Record, Rest, Rows, Text
+from drivers.protocol.serial_payload import HELLO
+from drivers.protocol.table import (
+    COMMAND,
+    ENVELOPE,
+    EVENT,
+    EVENT_RECORD,
+    FAULTS,
+    FEATURES,
+    IDENTITY,
+    KNOT,
+    LAYER,
+    MESSAGES,
+    NAK,
+    NAK_RECORD,
+    QUANTITIES,
+    REFUSALS,
+    STATES,
+    STATUS_FLAGS,
+    sensor_reading,
+)
+from page_part import insert
+from sim.amplifier.state_table import TRANSITIONS
+from word_names import word_names
+
+WRITER = "docs/generators/protocol_tables.py"
+_REPLIES: Mapping[str, Record] = {
+    **{"Capabilities": MESSAGES["GetCaps"].reply, "Status": MESSAGES["GetStatus"].reply},
+    **{"Taken": MESSAGES["Set"].reply, "Faults": MESSAGES["GetFaults"].reply},
+    **{"Achieved": MESSAGES["GetAchieved"].reply, "Measured": MESSAGES["GetMeasured"].reply},
+    **{"Sensors": MESSAGES["GetSensors"].reply, "Reading": MESSAGES["GetReading"].reply},
+}
+_OTHERS: Mapping[str, Record] = {
+    **{"layer": LAYER, "command": COMMAND, "envelope": ENVELOPE, "knot": KNOT},
+    **{"Event": EVENT_RECORD, "Nak": NAK_RECORD, "Identity": IDENTITY},
+}
+_MEANINGS = {
+    **{"NOT_READY": "starting; replies if it can, plays nothing, goes to 1 by itself"},
+    **{"SWITCH_ON_DISABLED": "high voltage off, **disarmed**; the state after power-up"},
+    **{"READY_TO_SWITCH_ON": "passed through on the way up, or left out"},
+    **{"SWITCHED_ON": "high voltage on; falling silent after a Disarm"},
+    **{"OPERATION_ENABLED": "**armed**: plays, watchdog running"},
+    **{"QUICK_STOP_ACTIVE": "stopped, latched; high voltage off once silent"},
+    **{"FAULT_REACTION_ACTIVE": "falling silent because of a fault"},
+    **{"FAULT": "silent, high voltage off, latched"},
+    **{"NONE": "", "WATCHDOG": "not fed in time", "OVER_TEMPERATURE": "", "OVER_VOLTAGE": ""},
+    **{"ARC": "", "CHANNEL": "one channel failed; all fall silent", "INTERNAL": ""},
+    **{"INTERLOCK": "opened in 3, 4 or 5; gone once closed", "OVER_CURRENT": ""},
+    **{"UNKNOWN_TYPE": "no such message, or a feature that is not there"},
+    **{"BAD_LENGTH": "words are missing or too many"},
+    **{"BAD_VALUE": "a number out of range, or a bit that must be 0"},
+    **{"BAD_CHANNEL": "no such channel, or twice in a layer"},
+    **{"WRONG_STATE": "not in this state; Arm with the interlock open"},
+    **{"BAD_TOKEN": "not staged, not newer, or 0"},
+    **{"BUSY": "the host repeats the request after 5 ms, at most twice"},
+    **{"UNSUPPORTED_VERSION": "of the frame: serial lines alone"},
+    **{"WRONG_SESSION": "another's, or one that has ended"},
+    **{"WRONG_LATCH": "Clear names another stop or fault than the last"},
+    **{"INCOMPLETE": "Commit of a set of which parts are missing"},
+    **{"output": "full level is a linear amplifier's output, not the stroke of a motion"},
+    **{"events": "it sends Events on this wire"},
+    **{"levels_measured": "the levels of Status are measured, not computed"},
+    **{"interlock": "it has an interlock", "electrical": "GetMeasured"},
+    **{"sensors": "GetSensors, Measure, GetReading", "address": "SetAddress"},
+    **{"high_voltage": "", "interlock_open": ""},
+    **{"limited": "a sum was limited since the last Status"},
+}
+
+
+def _table(head: Sequence[str], rows: Iterator[Sequence[object]]) -> str:
+    lines = [head, ["---"] * len(head), *([str(cell) for cell in row] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def quantities() -> str:
+    """Return the steps and ranges, a row for all quantities that have the same."""
+    groups: dict[tuple[object, ...], list[str]] = {}
+    for each in QUANTITIES.values():
+        step = f"{each.step:.6g} {each.unit}".strip()
+        groups.setdefault((each.wire, each.minimum, each.maximum, step), []).append(each.name)
+    rows = ((", ".join(names), *row) for row, names in groups.items())
+    return _table(("quantity", "type", "lowest", "highest", "one step is"), rows)
+
+
+def messages() -> str:
+    """Return the messages with the words of their requests."""
+
+    def rows() -> Iterator[Sequence[object]]:
+        yield "Hello", HELLO, "–", "Identity", "", ""
+        for each in MESSAGES.values():
+            reply = next(name for name, record in _REPLIES.items() if record is each.reply)
+            marks = ["yes" if mark else "" for mark in (each.feeds, each.is_broadcast)]
+            yield each.name, each.number, layout(each.request) or "–", reply, *marks
+        yield "Event", EVENT, "from the amplifier, unasked: see below", "–", "", ""
+        yield "Nak", NAK, "a reply alone: see below", "–", "", ""
+
+    return _table(
+        ("message", "number", "words of the request", "reply", "feeds", "broadcast"), rows()
+    )
+
+
+def records() -> str:
+    """Return the words of replies and of the parts of a set."""
+    rows = ((name, layout(record)) for name, record in {**_OTHERS, **_REPLIES}.items())
+    return _table(("record", "words"), (*rows, ("sensor of a Reading", layout(sensor_reading(1)))))
+
+
+def layout(record: Record) -> str:
+    """Return the words of a record in their order, each field with its quantity or bits."""
+    return " · ".join(map(_field, record.fields))
+
+
+def _field(field: object) -> str:
+    match field:
+        case Number(name=name, quantity=quantity):
+            kind = "" if name == quantity.name else f": {quantity.name}"
+            return name + kind + (" (2 words)" if quantity.wire == "u32" else "")
+        case Bits(parts=parts):
+            return "[" + ", ".join(f"{name} {bits}" for name, bits in parts) + "]"
+        case Real(name=name):
+            return f"{name}: f32 (2 words)"
+        case Text(name=name):
+            return f"{name}: text"
+        case Numbers(name=name, count=count, quantity=quantity):
+            return f"{name}: {quantity.name}, each of {count}"
+        case Rows(name=name, count=count, record=record):
+            if record is COMMAND:
+                return f"{name}: a command, each of {count}"
+            of = "the reading" if isinstance(count, int) else count
+            return f"{name}, each of {of}: ({layout(record)})"
+        case Rest(name=name):
+            return f"{name}: words to the end"
+    raise TypeError(type(field))
+
+
+def transitions() -> str:
+    """Return the state after each request, by state."""
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for name in MESSAGES:
+        row = tuple(
+            "–" if (after := TRANSITIONS.get((state, name))) is None else str(STATES[after])
+            for state in STATES
+        )
+        groups.setdefault(row, []).append(name)
+    rows = ((", ".join(names), *row) for row, names in groups.items())
+    return _table(("request", *(f"in {number}" for number in STATES.values())), rows)
+
+
+def _numbers(named: Mapping[str, int], title: str) -> str:
+    rows = ((name, number, _MEANINGS[name]) for name, number in named.items())
+    return _table((title, "number", ""), rows)
+
+
+def _list(title: str, named: Mapping[str, int]) -> str:
+    """Return names and numbers as a sentence, with meanings where the name is not enough."""
+    listed = (
+        f"{name} {number}" + (f" ({_MEANINGS[name]})" if _MEANINGS[name] else "")
+        for name, number in named.items()
+    )
+    return textwrap.fill(f"**{title}**: {', '.join(listed)}.", 124, break_on_hyphens=False)
+
+
+def mailboxes() -> str:
+    """Return the registers of each message on Modbus."""
+    rows = ((each.name, 256 * each.number, 256 * each.number + 128) for each in MESSAGES.values())
+    return _table(("message", "written from register", "reply read from register"), rows)
+
+
+def emergencies() -> str:
+    """Return the error code and error register of each fault on CAN."""
+    rows = (
+        (name, FAULTS[name], f"{each['code']:04X}", f"{each['error_register']:02X}")
+        for name, each in CANOPEN["emergencies"].items()
+    )
+    return _table(("fault", "number", "error code", "error register"), rows)
+
+
+def objects() -> str:
+    """Return the words of the objects 2001 and 2002 of four channels and eight layers."""
+
+    def rows() -> Iterator[Sequence[object]]:
+        for index, name in (("2001", "GetCaps"), ("2002", "GetStatus")):
+            names = word_names(MESSAGES[name].reply, {"channels": 4, "layers": 8})
+            shown = [f"{number} {each}" for number, each in enumerate(names, start=1)]
+            yield index, " · ".join(shown)
+
+    return _table(("object", "subindex and word, of four channels and eight layers"), rows())
+
+
+PARTS: Mapping[str, Mapping[str, Callable[[], str]]] = {
+    "protocol.md": {
+        **{"quantities": quantities, "messages": messages, "records": records},
+        "states": lambda: f"{_numbers(STATES, 'state')}\n\n{transitions()}",
+        "faults": lambda: _list("Faults and their numbers", FAULTS),
+        "codes": lambda: _numbers(REFUSALS, "code"),
+        "bits": lambda: "\n\n".join(
+            (_list("Features, by bit", FEATURES), _list("Flags of Status, by bit", STATUS_FLAGS))
+        ),
+    },
+    "modbus.md": {"mailboxes": mailboxes},
+    "can.md": {"emergencies": emergencies, "objects": objects},
+}
+"""What writes each part of each page."""
+FILES: Mapping[str, Callable[[], str]] = {"amplifier.eds": eds_text, "amplifier.dbc": dbc_text}
+
+
+def written(page: str, name: str) -> str:
+    """Return the text of a page by its name, with all its parts as they must be."""
+    for part, write in PARTS[name].items():
+        page = insert(page, write(), writer=f"{WRITER} {part}")
+    return page
+
+
+if __name__ == "__main__":
+    for name in PARTS:
+        path = Path(sys.argv[1]) / name
+        path.write_text(written(path.read_text("utf-8"), name), "utf-8")
+    for name, text in FILES.items():
+        (Path(sys.argv[1]) / name).write_text(text(), "utf-8")

@@ -1,159 +1,26 @@
 """What the channels of an amplifier play at a time: a pure function of sets and their commits.
 
-    Voice: Im[A(t) exp(2 pi i f (t - origin))], A(t) along its last transition, in full levels
-
-A channel plays the sum of its voices, in a few layers. A simulated amplifier asks this for samples,
-the ledger for the worst case, witness and conformance for what to expect. Times [s] are of any one
-clock and never go back; levels and frequencies are of protocol 3.
+A channel plays the sum of its voices (`drivers.voices`), in a few layers. A simulated amplifier
+asks this for samples, the ledger for the worst case, witness and conformance for what to expect.
+Times [s] are of any one clock and never go back; levels and frequencies are of protocol 3. Plain
+loops and few calls: every set is played by host and far end.
 """
 
 import cmath
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from operator import attrgetter
+from dataclasses import dataclass, field
 
-from drivers.protocol.sets import Command, Envelope, LayerSet
-from drivers.protocol.table import QUANTITIES, SHORTENED_FADE
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, LayerSet
+from drivers.protocol.table import QUANTITIES
+from drivers.voices import Voice, cut_to, voices_after
+
+__all__ = ["Playback", "Voice", "playback_of"]
 
 _LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
-_RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
-_STEP, _FREQUENCY = QUANTITIES["envelope_step"], QUANTITIES["frequency"]
-_PER_FULL, _PER_DEGREE, _PER_HERTZ = _LEVEL.per_unit, _PHASE.per_unit, _FREQUENCY.per_unit
-
-
-def amplitude_of(level: int, phase: int) -> complex:
-    """Return the complex amplitude in full levels of a level and phase of the wire."""
-    return cmath.rect(level / _PER_FULL, math.radians(phase / _PER_DEGREE))
-
-
-def amplitudes_of(envelope: Envelope) -> tuple[complex, ...]:
-    """Return the complex amplitudes of the knots of an envelope in full levels."""
-    return tuple(amplitude_of(*knot) for knot in envelope.knots)
-
-
-@dataclass(slots=True)  # frozen, each takes three times as long to make, and every set makes many
-class Transition:
-    """From one complex amplitude to another, from start [s] on.
-
-    Along straight lines through knots a step [s] apart, or without knots along a raised cosine that
-    lasts one step; a step of 0 changes at once.
-    """
-
-    start: float
-    step: float
-    first: complex
-    last: complex
-    knots: tuple[complex, ...] = ()
-    end: float = field(init=False)
-    """Time from which the amplitude is the last [s]."""
-
-    def __post_init__(self) -> None:
-        """Note the end, which is looked at often."""
-        self.end = self.start + self.step * (len(self.knots) + 1)
-
-    def at(self, time: float) -> complex:
-        """Return the amplitude at a time [s], before start the first one."""
-        if time >= self.end:
-            return self.last
-        if time <= self.start:
-            return self.first
-        steps = (time - self.start) / self.step
-        if not self.knots:
-            return self.first + (self.last - self.first) * (1 - math.cos(math.pi * steps)) / 2
-        points = (self.first, *self.knots, self.last)
-        index = int(steps)
-        return points[index] + (points[index + 1] - points[index]) * (steps - index)
-
-    def reached(self, time: float, uncertainty: float) -> complex:
-        """Return the amplitude at a time, or the largest within an uncertainty [s] around it."""
-        if time - uncertainty >= self.end:
-            return self.last
-        if not uncertainty:
-            return self.at(time)
-        since, until = max(time - uncertainty, self.start), max(time + uncertainty, self.start)
-        moments = (self.start + self.step * (index + 1) for index in range(len(self.knots)))
-        between = [
-            knot for moment, knot in zip(moments, self.knots, strict=True) if since < moment < until
-        ]
-        return max((self.at(since), *between, self.at(until)), key=abs)
-
-    def peak(self, time: float) -> float:
-        """Return the largest magnitude from a time on."""
-        passed = math.floor((time - self.start) / self.step) if self.step else len(self.knots)
-        points = (self.at(time), self.last, *self.knots[max(passed, 0) :])
-        return max(map(abs, points))
-
-    def slope(self, time: float) -> float:
-        """Return the steepest change [full levels/s] from a time on; infinite for a jump."""
-        if time >= self.end:
-            return 0.0 if time > self.end or self.step else _steepest(self.first, self.last, 0.0)
-        if not self.knots:
-            return math.pi / 2 * _steepest(self.first, self.last, self.step)
-        points = (self.first, *self.knots, self.last)
-        passed = int((time - self.start) / self.step)
-        pairs = zip(points[passed:], points[passed + 1 :], strict=False)
-        return max(_steepest(one, other, self.step) for one, other in pairs)
-
-
-def _steepest(first: complex, last: complex, time: float) -> float:
-    if first == last:
-        return 0.0
-    return abs(last - first) / time if time else math.inf
-
-
-@dataclass(frozen=True, slots=True)
-class Voice:
-    """A tone of a layer until it has faded: frequency [Hz], origin [s] of its phase.
-
-    has_ended: it falls silent and nothing continues it, unlike an onset that leads to level 0.
-    ending: how it falls silent, None for the ramp.
-    """
-
-    layer: int
-    frequency: float
-    origin: float
-    transition: Transition
-    has_ended: bool = False
-    ending: Envelope | None = None
-
-    @property
-    def silent_from(self) -> float:
-        """Time of silence [s]; infinite for a tone that lasts."""
-        return math.inf if self.transition.last else self.transition.end
-
-    def faded(self, time: float, ramp: float, uncertainty: float = 0.0) -> "Voice":
-        """Return it falling silent along a ramp [s], or as it does if that is sooner.
-
-        uncertainty [s]: see `Playback`.
-        """
-        if self.silent_from <= time + ramp:
-            return replace(self, has_ended=True)
-        transition = Transition(time, ramp, self.transition.reached(time, uncertainty), 0j)
-        return replace(self, transition=transition, has_ended=True)
-
-    def ended(self, time: float, ramp: float, uncertainty: float = 0.0) -> "Voice":
-        """Return it falling silent along its ending, or along a ramp [s] without one."""
-        if self.ending is None or self.has_ended:
-            return self.faded(time, ramp, uncertainty)
-        transition = _along(self.ending, time, self.transition.reached(time, uncertainty), 0j)
-        return replace(self, transition=transition, has_ended=True)
-
-    def scaled(self, time: float, factor: float, ramp: float) -> "Voice":
-        """Return it led to a factor of its level along a ramp [s], its ending scaled too."""
-        transition = self.transition
-        led = Transition(time, ramp, transition.at(time), transition.last * factor)
-        ending = None if self.ending is None else self.ending.scaled(factor)
-        return replace(self, transition=led, ending=ending)
-
-    def is_continued_by(self, command: Command) -> bool:
-        """Whether a command of its layer continues it, unless it has ended."""
-        is_same = self.frequency == command.frequency / _PER_HERTZ
-        return command.keep_phase and is_same and command.is_driven
-
-
-def _along(envelope: Envelope, time: float, first: complex, last: complex) -> Transition:
-    return Transition(time, _STEP.from_wire(envelope.step), first, last, amplitudes_of(envelope))
+_FREQUENCY, _SLEW = QUANTITIES["frequency"], QUANTITIES["slew"]
+_PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"].per_unit
 
 
 @dataclass
@@ -171,17 +38,20 @@ class _Layer:
 class Playback:
     """Voices of all channels, and the layers that they belong to; silent at first.
 
-    voices: how many a channel has for tones that are not cut short. uncertainty [s]: by which
-    commits may come sooner or later; fades begin at the largest amplitude within it, and layers end
-    as late as they can, so that levels are upper bounds.
+    voices: how many a channel has for tones that are not cut short. slew: steepest change of a
+    level that the amplifier has [full levels/s]. uncertainty [s]: by which commits may come sooner
+    or later; fades begin at the largest amplitude within it, and layers end as late as they can, so
+    that levels are upper bounds.
     """
 
     channels: int
     voices: int
+    slew: float = math.inf
     uncertainty: float = 0.0
+    next_due: float = field(default=math.inf, init=False)
+    """Time of the next end of `valid_for`, or start of a set that waits [s]; infinite: none."""
     _playing: list[tuple[Voice, ...]] = field(init=False)
     _layers: dict[int, _Layer] = field(default_factory=dict)
-    _due: float = math.inf  # s; see `next_due`
     _changes_at: float = math.inf  # s; before, advancing changes nothing
 
     def __post_init__(self) -> None:
@@ -226,16 +96,19 @@ class Playback:
             else:
                 self._end(number, at)
         faded = time - self.uncertainty
-        self._playing = [
-            tuple([each for each in voices if each.transition.last or each.transition.end > faded])
-            for voices in self._playing
-        ]
+        for channel, voices in enumerate(self._playing):
+            kept = []
+            for voice in voices:
+                if voice.transition.last or voice.transition.end > faded:
+                    kept.append(voice)
+            if len(kept) < len(voices):
+                self._playing[channel] = tuple(kept)
         self._note_changes()
 
     def _note_changes(self) -> None:
-        """Note when a voice has faded, or a layer ends or starts, next; plain loops: it is hot."""
+        """Note when a voice has faded, or a layer ends or starts, next."""
         due = self._next_due()
-        first = self._due = math.inf if due is None else due[0]
+        first = self.next_due = math.inf if due is None else due[0]
         for voices in self._playing:
             for voice in voices:
                 if not voice.transition.last and voice.transition.end < first:
@@ -255,6 +128,20 @@ class Playback:
                 if each.layer == layer and not each.has_ended
             ]
             self._playing[channel] = (*voices, *ends)
+
+    def correct(self, one: LayerSet, token: int) -> None:
+        """Have a layer lead to what an amplifier says it plays of the set with this token."""
+        if one.layer not in self._layers or self._layers[one.layer].token != token:
+            return
+        commands = {command.channel: command for command in one.commands}
+        for channel, voices in enumerate(self._playing):
+            self._playing[channel] = tuple(
+                voice
+                if voice.layer != one.layer or voice.has_ended
+                else voice.corrected(commands.get(channel))
+                for voice in voices
+            )
+        self._note_changes()
 
     def scale(self, time: float, factor: float, ramp: float) -> None:
         """Take all tones that last to a factor of their level along a ramp [s], endings too."""
@@ -309,27 +196,20 @@ class Playback:
         """Return a bound of the amplitude from a time on: all voices at their largest at once."""
         return sum(voice.transition.peak(time) for voice in self._playing[channel])
 
-    def slope(self, channel: int, time: float) -> float:
-        """Return the steepest change of the sum [full levels/s] from a time on, at the most."""
-        return sum(voice.transition.slope(time) for voice in self._playing[channel])
-
     @property
     def tokens(self) -> Mapping[int, int]:
         """Token of each layer that plays."""
-        lasting = {
-            voice.layer for voices in self._playing for voice in voices if not voice.has_ended
-        }
-        return {number: self._layers[number].token for number in sorted(lasting)}
+        lasting: dict[int, int] = {}
+        for voices in self._playing:
+            for voice in voices:
+                if not voice.has_ended:
+                    lasting[voice.layer] = self._layers[voice.layer].token
+        return lasting
 
     @property
     def waiting(self) -> tuple[LayerSet, ...]:
         """Sets of layers that start when onsets have ended."""
         return tuple([layer.waiting[1] for layer in self._layers.values() if layer.waiting])
-
-    @property
-    def next_due(self) -> float:
-        """Time of the next end of `valid_for`, or start of a set that waits [s]; infinite: none."""
-        return self._due
 
     @property
     def silent_from(self) -> float:
@@ -340,7 +220,7 @@ class Playback:
 
     def ramp_of(self, layer: int) -> float:
         """Return the ramp [s] along which a layer ends by itself."""
-        return _RAMP.from_wire(self._layers[layer].ramp) if layer in self._layers else 0.0
+        return self._layers[layer].ramp / _PER_RAMP if layer in self._layers else 0.0
 
     def end_of(self, layer: int) -> float:
         """Return when a layer ends by itself [s]; infinite without `valid_for`."""
@@ -356,13 +236,23 @@ class Playback:
             if layer.waiting is not None:
                 return math.inf
             fades = [
-                voice.ended(layer.ends, _RAMP.from_wire(layer.ramp)).transition.end
+                voice.ended(layer.ends, layer.ramp / _PER_RAMP).transition.end
                 for voices in self._playing
                 for voice in voices
                 if voice.layer == number and not voice.has_ended and layer.ends < math.inf
             ]
             ends += fades or [layer.ends]
         return max(ends, default=-math.inf)
+
+    def faded_from(self, time: float) -> float:
+        """Return when the fades that go on at a time have ended [s], or that time."""
+        ends = [
+            voice.transition.end
+            for voices in self._playing
+            for voice in voices
+            if voice.transition.last == 0
+        ]
+        return max([time, *ends])
 
     def is_settled(self, time: float) -> bool:
         """Whether nothing changes from a time on [s] but by the ends of layers."""
@@ -391,7 +281,7 @@ class Playback:
 
     def _end(self, layer: int, time: float) -> None:
         """Let a layer fall silent by its endings."""
-        ramp = _RAMP.from_wire(self._layers.pop(layer).ramp)
+        ramp = self._layers.pop(layer).ramp / _PER_RAMP
         self._playing = [
             tuple(
                 each.ended(time, ramp, self.uncertainty) if each.layer == layer else each
@@ -401,16 +291,17 @@ class Playback:
         ]
 
     def _start(self, one: LayerSet, token: int, time: float) -> None:
-        commands = {command.channel: command for command in one.commands}
-        ramp = _RAMP.from_wire(one.ramp)
+        commands: dict[int, Command] = {}
+        for command in one.commands:
+            commands[command.channel] = command
+        ramp = one.ramp / _PER_RAMP
         for channel, voices in enumerate(self._playing):
-            command = commands.get(channel)
-            if command is None and not voices:
-                continue
-            after = _after(voices, one.layer, command, time, ramp, self.uncertainty)
-            if len(after) > self.voices:
-                after = _within(after, time, self.voices)
-            self._playing[channel] = tuple(after)
+            if voices or channel in commands:
+                of_channel = commands.get(channel)
+                after = voices_after(voices, one.layer, of_channel, time, ramp, self.uncertainty)
+                if len(after) > self.voices:
+                    after = cut_to(after, time, self.voices, self.slew)
+                self._playing[channel] = tuple(after)
         if not commands:
             self._layers.pop(one.layer, None)
             return
@@ -418,53 +309,11 @@ class Playback:
         self._layers[one.layer] = _Layer(token, one.ramp, one.valid_for, ends)
 
 
+def playback_of(capabilities: Values) -> Playback:
+    """Return the playback of an amplifier with these capabilities, silent."""
+    slew = _SLEW.from_wire(capabilities["slew"]) or math.inf
+    return Playback(capabilities["channels"], capabilities["voices"], slew)
+
+
 def _end_of(one: LayerSet, time: float) -> float:
-    return time + _VALID_FOR.from_wire(one.valid_for) if one.valid_for else math.inf
-
-
-def _after(
-    voices: Sequence[Voice],
-    layer: int,
-    command: Command | None,
-    time: float,
-    ramp: float,
-    uncertainty: float,
-) -> list[Voice]:
-    """Return the voices of a channel once a command of a layer plays; None silences the layer."""
-    is_driven = command is not None and command.is_driven
-    continued = False
-    after: list[Voice] = []
-    for voice in voices:
-        if voice.layer != layer or voice.has_ended:
-            after.append(voice)
-        elif command is not None and voice.is_continued_by(command):
-            continued = True
-            first = voice.transition.reached(time, uncertainty)
-            transition = _towards(command, time, ramp, first)
-            after.append(replace(voice, transition=transition, ending=command.ending))
-        elif is_driven or (command is not None and command.skip_ending):
-            after.append(voice.faded(time, ramp, uncertainty))
-        else:
-            after.append(voice.ended(time, ramp, uncertainty))
-    if is_driven and command is not None and not continued:
-        transition = _towards(command, time, ramp, 0j)
-        frequency = command.frequency / _PER_HERTZ
-        after.append(Voice(layer, frequency, time, transition, False, command.ending))
-    return after
-
-
-def _towards(command: Command, time: float, ramp: float, first: complex) -> Transition:
-    last = amplitude_of(command.level, command.phase)
-    if command.onset is None:
-        return Transition(time, ramp, first, last)
-    return _along(command.onset, time, first, last)
-
-
-def _within(voices: Sequence[Voice], time: float, max_voices: int) -> list[Voice]:
-    """Cut the oldest fades short where a channel has more voices than there are."""
-    uncut = [voice for voice in voices if voice.silent_from > time + SHORTENED_FADE]
-    fades = sorted(
-        (voice for voice in uncut if voice.has_ended), key=attrgetter("transition.start")
-    )
-    cut = fades[: max(len(uncut) - max_voices, 0)]
-    return [voice.faded(time, SHORTENED_FADE) if voice in cut else voice for voice in voices]
+    return time + one.valid_for / _PER_VALID_FOR if one.valid_for else math.inf

@@ -10,9 +10,11 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from drivers.playback import Playback, Transition, Voice, amplitude_of, amplitudes_of
+from drivers.playback import Playback
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
+from drivers.transition import Transition, amplitude_of, amplitudes_of, steepest
+from drivers.voices import Voice
 
 _RAMP, _STEP, _LEVEL = QUANTITIES["ramp"], QUANTITIES["envelope_step"], QUANTITIES["level"]
 _FREQUENCY, _VALID_FOR = QUANTITIES["frequency"], QUANTITIES["valid_for"]
@@ -132,7 +134,7 @@ class ChannelBounds:
         ending = voice.ending
         skips = command is not None and (command.is_driven or command.skip_ending)
         if ending is not None and not skips:
-            step, points = _STEP.from_wire(ending.step), (highest, *_knots(ending), 0j)
+            step, points = _STEP.from_wire(ending.step), (highest, *amplitudes_of(ending), 0j)
             is_cosine = not ending.knots
         else:
             step, points, is_cosine = _RAMP.from_wire(one.ramp), (highest, 0j), True
@@ -184,7 +186,7 @@ class ChannelBounds:
             rise = 0.0 if transition.last == 0 and not transition.knots else change
         if voice.ending is None and not voice.has_ended:
             ends = (transition.peak(time), 0j), self._ramps[voice.layer]
-            change = max(change, _steepest(*ends, is_cosine=True)[1])
+            change = max(change, steepest(*ends, is_cosine=True)[1])
         if voice.ending is not None and not voice.has_ended:
             for start in _points(transition, time):
                 ending = _steepest_of_ending(start, voice.ending)
@@ -195,7 +197,7 @@ class ChannelBounds:
     def _note(
         self, frequency: float, points: Sequence[complex], step: float, *, is_cosine: bool
     ) -> None:
-        self._rises.setdefault(frequency, []).append(_steepest(points, step, is_cosine=is_cosine))
+        self._rises.setdefault(frequency, []).append(steepest(points, step, is_cosine=is_cosine))
 
 
 def worst(channels: Sequence[ChannelBounds]) -> tuple[list[float], float]:
@@ -276,21 +278,17 @@ def all_bounds(
 
 
 def _steepest_of_ending(first: complex, ending: Envelope) -> tuple[float, float]:
-    points = (first, *_knots(ending), 0j)
-    return _steepest(points, _STEP.from_wire(ending.step), is_cosine=not ending.knots)
-
-
-def _knots(envelope: Envelope | None) -> tuple[complex, ...]:
-    return () if envelope is None else amplitudes_of(envelope)
+    points = (first, *amplitudes_of(ending), 0j)
+    return steepest(points, _STEP.from_wire(ending.step), is_cosine=not ending.knots)
 
 
 def _peak(envelope: Envelope | None) -> float:
-    return max(map(abs, _knots(envelope)), default=0.0)
+    return max(map(abs, amplitudes_of(envelope)), default=0.0)
 
 
 def _course(command: Command) -> tuple[complex, ...]:
     """Return the amplitudes through which a command leads, the last one lasting."""
-    return (*_knots(command.onset), amplitude_of(command.level, command.phase))
+    return (*amplitudes_of(command.onset), amplitude_of(command.level, command.phase))
 
 
 def _path(first: float, one: LayerSet, command: Command, step: float) -> Path:
@@ -320,18 +318,3 @@ def _points(transition: Transition, time: float) -> tuple[complex, ...]:
         return (transition.last,)
     passed = int((time - transition.start) / transition.step) if transition.knots else 0
     return (transition.at(time), *transition.knots[passed:], transition.last)
-
-
-def _steepest(points: Sequence[complex], step: float, *, is_cosine: bool) -> tuple[float, float]:
-    """Return the steepest rise of the magnitude, and the fastest change, along points."""
-    rise = change = 0.0
-    for one, other in pairwise(points):
-        if one == other:
-            continue
-        fastest = abs(other - one) / step if step else math.inf
-        change = max(change, fastest)
-        # The way rises only where its end is farther out than the foot of the perpendicular.
-        if ((other - one) * other.conjugate()).real > 0:
-            rise = max(rise, fastest)
-    factor = math.pi / 2 if is_cosine else 1.0
-    return rise * factor, change * factor

@@ -5,28 +5,26 @@ over the sum of all layers. What was sent and is not confirmed is one doubt: unt
 only silence is admitted. Times [s] are of any one clock.
 """
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from numbers import Integral
 
-from drivers.contents import Layer, Shape, Tone
+from drivers.contents import Layer
 from drivers.errors import CommandRefused
 from drivers.guard.budget import COMMIT_DELAY, Budget, Vibration
 from drivers.host.bounds import all_bounds, plain_bounds, worst
 from drivers.host.limits import RATE_CEILING, wire_limits
-from drivers.playback import Playback
+from drivers.host.rounding import TOLERANCE, Rounding
+from drivers.playback import playback_of
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Command, Envelope, LayerSet
+from drivers.protocol.sets import Command, LayerSet
 from drivers.protocol.table import QUANTITIES
 from registry.limits import GuardLimits
 
-TOLERANCE = 1 + 1e-9
-"""Factor by which a sum of floats may exceed a limit."""
-_LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
+_LEVEL, _STEP = QUANTITIES["level"], QUANTITIES["envelope_step"]
 _RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
-_STEP, _FREQUENCY = QUANTITIES["envelope_step"], QUANTITIES["frequency"]
-_SLACK = 1e-6  # of a step; sums of floats
+_logger = logging.getLogger(__name__)
 
 
 class Ledger:
@@ -37,11 +35,12 @@ class Ledger:
     """
 
     def __init__(self, limits: GuardLimits, capabilities: Values) -> None:
-        self.configured = limits
+        self._configured = limits
         self.limits = wire_limits(limits, capabilities)
         self.capabilities = capabilities
+        self._rounding = Rounding(self.limits, capabilities)
         self._budget = Budget(replace(limits, rate=min(limits.rate, RATE_CEILING)))
-        self.playback = Playback(capabilities["channels"], capabilities["voices"])
+        self.playback = playback_of(capabilities)
         self.lag = 0.0  # s; by which what plays may be later than `playback` says
         self._doubt: tuple[int, tuple[LayerSet, ...], float, Vibration | None] | None = None
 
@@ -52,12 +51,13 @@ class Ledger:
 
     def adopt(self, capabilities: Values) -> None:
         """Go on with other capabilities, silent; what was spent of on-time and duty stays spent."""
-        self.limits, self.capabilities = wire_limits(self.configured, capabilities), capabilities
+        self.limits, self.capabilities = wire_limits(self._configured, capabilities), capabilities
+        self._rounding = Rounding(self.limits, capabilities)
         self.forget()
 
     def forget(self) -> None:
         """Start anew: the amplifier is silent, armed or not."""
-        self.playback = Playback(self.capabilities["channels"], self.capabilities["voices"])
+        self.playback = playback_of(self.capabilities)
         self.lag, self._doubt = 0.0, None
 
     def admit(
@@ -65,22 +65,24 @@ class Ledger:
     ) -> tuple[LayerSet, ...]:
         """Return layers as the wire has them, `valid_for` shortened to what time is left.
 
-        delay [s]: within which they are committed. Raises CommandRefused with channel and reason;
-        nothing changes then.
+        delay [s]: within which they are committed. Raises CommandRefused with channel and reason,
+        whatever fails in checking; nothing changes then.
         """
-        numbers = [layer.number for layer in layers]
-        if len(set(numbers)) < len(numbers) or not numbers:
-            raise CommandRefused(f"a set must have each layer once, at least one, got {numbers}")
         try:
-            requested = tuple([self._on_wire(layer) for layer in layers])
+            requested = self._rounding.layers(layers)
+            if not _is_vibration(requested):
+                return self._silence(requested, now, delay)
+            if self._doubt is not None:
+                raise CommandRefused(f"set {self.doubt} must be confirmed first; read the status")
+            self._check_sums(requested, now, delay)
+            return self._within_budget(requested, now, delay)
+        except CommandRefused:
+            raise
         except (ArithmeticError, TypeError, ValueError) as error:
             raise CommandRefused(f"a set must have numbers in its range: {error}") from error
-        if not any(is_vibrating(one) for one in requested):
-            return self._silence(requested, now, delay)
-        if self._doubt is not None:
-            raise CommandRefused(f"set {self.doubt} must be confirmed first; read the status")
-        self._check_sums(requested, now, delay)
-        return self._within_budget(requested, now, delay)
+        except Exception as error:
+            _logger.exception("a set could not be checked")
+            raise CommandRefused(f"a set could not be checked: {error!r}; silence it") from error
 
     def sent(self, token: int, layers: tuple[LayerSet, ...], now: float) -> None:
         """Note that a set may play from now on: it was committed, and is in doubt.
@@ -89,9 +91,11 @@ class Ledger:
         """
         if self.doubt == token:
             return
-        lasts = max((self._lasts(one) for one in layers), default=0.0)
-        is_vibration = any(is_vibrating(one) for one in layers)
-        before = self._budget.sent(now, lasts=lasts) if is_vibration else None
+        before: Vibration | None = None
+        if _is_vibration(layers):
+            is_timed = not self._budget.is_unlimited
+            lasts = max(map(_lasts, layers)) if is_timed else 0.0
+            before = self._budget.sent(now, lasts=lasts)
         self._doubt = token, layers, now, before
 
     def confirmed(self, now: float) -> None:
@@ -100,14 +104,16 @@ class Ledger:
             return
         token, layers, sent_at, _ = self._doubt
         self._doubt = None
-        if self.playback.is_settled(sent_at - self.lag) and self.playback.next_due == math.inf:
+        playback = self.playback
+        if playback.next_due == math.inf and playback.is_settled(sent_at - self.lag):
             self.lag = 0.0
-        self.lag = self.playback.uncertainty = max(self.lag, now - sent_at)
-        for one in layers:
-            ends = self.playback.end_of(one.layer)
-            if not one.renew and sent_at < ends and ends - 2 * self.lag <= now:
-                self.playback.add_ends(one.layer, sent_at)
-        self.playback.commit(layers, token, sent_at)
+        self.lag = playback.uncertainty = max(self.lag, now - sent_at)
+        if playback.next_due - 2 * self.lag <= now:
+            for one in layers:
+                ends = playback.end_of(one.layer)
+                if not one.renew and sent_at < ends and ends - 2 * self.lag <= now:
+                    playback.add_ends(one.layer, sent_at)
+        playback.commit(layers, token, sent_at)
         if not self._budget.is_unlimited:
             self._budget.confirm(sent_at, now, end=self.playback.ends_by + self.lag)
 
@@ -127,88 +133,12 @@ class Ledger:
 
     def resolve(self, token: int, now: float) -> None:
         """Resolve the doubt by the token that the amplifier says it committed last."""
-        if token == self.doubt:
+        if self._doubt is None:
+            return
+        if token == self._doubt[0]:
             self.confirmed(now)
         else:
             self.refused()
-
-    def _on_wire(self, layer: Layer) -> LayerSet:
-        """Return a layer in integers of the wire; CommandRefused for what the wire cannot have."""
-        can = self.capabilities
-        if not _is_integer(layer.number, can["layers"] - 1):
-            raise CommandRefused(f"layer must be 0 to {can['layers'] - 1}, got {layer.number!r}")
-        ramp_max = _RAMP.from_wire(can["ramp_max"])
-        for name, value, highest in (
-            ("ramp", layer.ramp, ramp_max),
-            ("valid_for", layer.valid_for, _VALID_FOR.high),
-        ):
-            if not 0 <= value <= highest:  # nor NaN
-                raise CommandRefused(f"{name} must be 0 to {highest:g} s, got {value!r} s")
-        if layer.renew and (layer.tones or layer.after):
-            raise CommandRefused("renew must be without tones and after")
-        if layer.after and not layer.tones:
-            raise CommandRefused("after must be with tones")
-        channels = [tone.channel for tone in layer.tones]
-        for tone in layer.tones:
-            if not _is_integer(tone.channel, can["channels"] - 1):
-                text = f"channel must be 0 to {can['channels'] - 1}, got {tone.channel!r}"
-                raise CommandRefused(text, channel=tone.channel)
-            if channels.count(tone.channel) > 1:
-                text = f"channel {tone.channel} must occur once in a layer"
-                raise CommandRefused(text, channel=tone.channel)
-        return LayerSet(
-            int(layer.number),
-            min(math.ceil(layer.ramp * _RAMP.per_unit - _SLACK), can["ramp_max"]),
-            max(_VALID_FOR.to_wire(layer.valid_for), 1) if layer.valid_for else 0,
-            tuple([self._command(tone) for tone in layer.tones]),
-            after=bool(layer.after),
-            renew=bool(layer.renew),
-        )
-
-    def _command(self, tone: Tone) -> Command:
-        limits, channel = self.limits, int(tone.channel)
-        level = self._level(tone.level, "level", channel)
-        for name, value in (("frequency", tone.frequency), ("phase", tone.phase)):
-            if not math.isfinite(value):
-                raise _refused(channel, f"{name} must be a finite number, got {value!r}")
-        onset, ending = tone.onset, tone.ending
-        frequency = round(tone.frequency * _FREQUENCY.per_unit)
-        if level == 0 and onset is None:
-            frequency = limits.frequency_min
-        if not limits.frequency_min <= frequency <= limits.frequency_max:
-            low, high = map(_FREQUENCY.from_wire, (limits.frequency_min, limits.frequency_max))
-            text = f"frequency must be {low:g} to {high:g} Hz, got {tone.frequency:g} Hz"
-            raise _refused(channel, text)
-        return Command(
-            *(channel, frequency, level, _PHASE.to_wire(float(tone.phase))),
-            keep_phase=bool(tone.keep_phase),
-            skip_ending=bool(tone.skip_ending),
-            onset=None if onset is None else self._envelope(onset, channel),
-            ending=None if ending is None else self._envelope(ending, channel),
-        )
-
-    def _level(self, level: float, name: str, channel: int) -> int:
-        highest = self.limits.level / _LEVEL.per_unit
-        if not 0 <= level <= highest * TOLERANCE:  # nor NaN
-            raise _refused(channel, f"{name} must be 0 to {highest:g}, got {level!r}")
-        return min(round(level * _LEVEL.per_unit), self.limits.level)
-
-    def _envelope(self, shape: Shape, channel: int) -> Envelope:
-        can = self.capabilities
-        low, high = (
-            _STEP.from_wire(can[name]) for name in ("envelope_step_min", "envelope_step_max")
-        )
-        if not low <= shape.step <= high:
-            text = f"step of an envelope must be {low:g} to {high:g} s, got {shape.step!r} s"
-            raise _refused(channel, text)
-        if len(shape.knots) > can["knots"]:
-            text = f"knots of an envelope must be at most {can['knots']}, got {len(shape.knots)}"
-            raise _refused(channel, text)
-        knots = tuple(
-            (self._level(abs(knot), "level of a knot", channel), _phase_of(knot))
-            for knot in shape.knots
-        )
-        return Envelope(math.ceil(shape.step * _STEP.per_unit - _SLACK), knots)
 
     def _silence(
         self, layers: tuple[LayerSet, ...], now: float, delay: float
@@ -233,6 +163,18 @@ class Ledger:
         self.playback.advance(late)
         if self.limits.slew == math.inf and self._is_plain_and_within(layers, late, until):
             return
+        refusal = self._refusal_of_sums(layers, late, until)
+        if refusal is None:
+            return
+        faded = self.playback.faded_from(late)
+        if faded > late and self._refusal_of_sums(layers, faded, until + faded - late) is None:
+            refusal.until = faded + self.lag
+        raise refusal
+
+    def _refusal_of_sums(
+        self, layers: Sequence[LayerSet], late: float, until: float
+    ) -> CommandRefused | None:
+        """Return why layers must not play from a time between two on [s]; None if they may."""
         bounds = all_bounds(self.playback, layers, late, until=until)
         levels, power = worst(bounds)
         highest = _LEVEL.from_wire(self.limits.level)
@@ -242,36 +184,37 @@ class Ledger:
                     f"level must rise by at most {self.limits.slew:g} per second, got "
                     f"{bound.rise:g} per second; use a longer ramp"
                 )
-                raise _refused(channel, text)
+                return CommandRefused(f"channel {channel}: {text}", channel=channel)
             if level > highest * TOLERANCE:
                 text = (
                     f"level of all layers must be at most {highest:g}, got {level:g}; lower the "
                     "levels, or let what plays end first"
                 )
-                raise _refused(channel, text)
+                return CommandRefused(f"channel {channel}: {text}", channel=channel)
         if power > self.limits.power * TOLERANCE:
-            raise CommandRefused(
+            return CommandRefused(
                 f"sum of squared levels must be at most {self.limits.power:g}, got {power:g}; "
                 "lower the levels or drive fewer channels at once"
             )
+        return None
 
     def _is_plain_and_within(self, layers: Sequence[LayerSet], late: float, until: float) -> bool:
         """Whether a cross-fade that needs no closer look is within the limits: nearly every set."""
         ends = plain_bounds(self.playback, layers, late, until=until)
         if ends is None:
             return False
-        highest = _LEVEL.from_wire(self.limits.level) * TOLERANCE
-        if max(map(max, ends)) > highest:
+        before, after = ends
+        highest, power = self.limits.level / _LEVEL.per_unit * TOLERANCE, self.limits.power
+        if max(before) > highest or max(after) > highest:
             return False
-        if self.limits.power == math.inf:
-            return True
-        return all(math.hypot(*levels) ** 2 <= self.limits.power * TOLERANCE for levels in ends)
+        most_squared = max(math.hypot(*before), math.hypot(*after)) ** 2
+        return power == math.inf or most_squared <= power * TOLERANCE
 
     def _within_budget(
         self, layers: tuple[LayerSet, ...], now: float, delay: float
     ) -> tuple[LayerSet, ...]:
         """Shorten `valid_for` to the on-time and duty that are left."""
-        fade = max(self._fade(one) for one in layers)
+        fade = 0.0 if self._budget.is_unlimited else max(map(_fade, layers))
         remaining = self._budget.remaining(now, fade=fade, delay=delay)
         if remaining == math.inf:
             return layers
@@ -283,36 +226,43 @@ class Ledger:
             for one in layers
         )
 
-    def _fade(self, one: LayerSet) -> float:
-        """Return how long a layer takes to end [s]: along its ramp or its longest ending."""
-        endings = [
-            _STEP.from_wire(command.ending.step) * (len(command.ending.knots) + 1)
-            for command in one.commands
-            if command.ending is not None
-        ]
-        return max(_RAMP.from_wire(one.ramp), *endings, 0.0)
+    def achieved(self, one: LayerSet, token: int) -> None:
+        """Note what the amplifier says it plays of a layer of the set with this token."""
+        self.playback.correct(one, token)
 
-    def _lasts(self, one: LayerSet) -> float:
-        if not is_vibrating(one):
-            return self._fade(one)
-        return self._fade(one) + (_VALID_FOR.from_wire(one.valid_for) or math.inf)
+
+def _fade(one: LayerSet) -> float:
+    """Return how long a layer takes to end [s]: along its ramp or its longest ending."""
+    longest = _RAMP.from_wire(one.ramp)
+    for command in one.commands:
+        if command.ending is not None:
+            knots = len(command.ending.knots) + 1
+            longest = max(longest, _STEP.from_wire(command.ending.step) * knots)
+    return longest
+
+
+def _lasts(one: LayerSet) -> float:
+    """Return how long a layer vibrates at most [s], fade included."""
+    if not is_vibrating(one):
+        return _fade(one)
+    return _fade(one) + (_VALID_FOR.from_wire(one.valid_for) or math.inf)
 
 
 def is_vibrating(one: LayerSet) -> bool:
     """Whether a layer plays after its set, so that it spends time and rate."""
-    return one.renew or any(command.is_driven for command in one.commands)
+    if one.renew:
+        return True
+    for command in one.commands:  # noqa: SIM110  a generator would be a call for each
+        if command.is_driven:
+            return True
+    return False
 
 
-def _is_integer(value: object, highest: int) -> bool:
-    return (type(value) is int or isinstance(value, Integral)) and 0 <= int(value) <= highest
-
-
-def _refused(channel: int, text: str) -> CommandRefused:
-    return CommandRefused(f"channel {channel}: {text}", channel=channel)
-
-
-def _phase_of(knot: complex) -> int:
-    return _PHASE.to_wire(math.degrees(math.atan2(knot.imag, knot.real)))
+def _is_vibration(layers: Sequence[LayerSet]) -> bool:
+    for one in layers:  # noqa: SIM110
+        if is_vibrating(one):
+            return True
+    return False
 
 
 def _within_ramp(one: LayerSet, left: float) -> LayerSet:

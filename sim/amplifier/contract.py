@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
-from drivers.playback import Playback, Voice
+from drivers.playback import Voice, playback_of
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import (
@@ -158,7 +158,7 @@ class Amplifier:
     def _start(self) -> None:
         """Reset all but the temperature and the fault history."""
         can = self.capabilities
-        self.playback = Playback(can["channels"], can["voices"])
+        self.playback = playback_of(can)
         self._voices: list[tuple[Voice, ...]] = [()] * can["channels"]  # of these outputs
         self._outputs: list[Output] = [()] * can["channels"]
         self._intake = SetIntake(can)

@@ -107,6 +107,52 @@ def test_layers_are_bounded_together() -> None:
     assert ledger.admit([Layer(1, (tone(level=0.9, frequency=200),))], 1.03)
 
 
+def test_refusal_says_from_when_the_set_would_be_allowed() -> None:
+    """0.6 fades for 20 ms from 1.0 on; what is too loud at any time has no such moment."""
+    ledger = Ledger(WIDE, CAN)
+    play(ledger, 1, 0.0, Layer(0, (tone(level=0.6),)))
+    play(ledger, 2, 1.0, Layer(0, ()))
+    too_early = refusal(ledger, Layer(1, (tone(level=0.9, frequency=200),)), at=1.01)
+    assert too_early.until == pytest.approx(1.02)
+    assert ledger.admit([Layer(1, (tone(level=0.9, frequency=200),))], 1.02 + 1e-9)
+    play(ledger, 3, 2.0, Layer(0, (tone(level=0.6),)))
+    assert refusal(ledger, Layer(1, (tone(level=0.9, frequency=200),)), at=3.0).until is None
+
+
+def test_check_that_fails_refuses_and_leaves_silence_possible() -> None:
+    """Whatever goes wrong in checking: refused, nothing is noted, and a silent set is admitted."""
+    ledger = Ledger(WIDE, CAN)
+    play(ledger, 1, 0.0, Layer(0, (tone(),)))
+    broken = replace(tone(1), onset=object())  # type: ignore[arg-type]
+    refusal(ledger, Layer(1, (broken,)))
+    assert ledger.doubt == 0
+    assert ledger.playback.tokens == {0: 1}
+    assert ledger.admit([Layer(0, ())], 1.0)
+
+
+def test_what_was_achieved_counts_from_then_on() -> None:
+    """0.5 was sent, 0.45 plays: 0.54 beside it is admitted, 0.56 is not."""
+    ledger = Ledger(WIDE, CAN)
+    play(ledger, 1, 0.0, Layer(0, (tone(level=0.5),)))
+    (sent,) = ledger.admit([Layer(0, (tone(level=0.45),))], 0.5)
+    ledger.achieved(sent, 2)  # of another set: without effect
+    refusal(ledger, Layer(1, (tone(level=0.54, frequency=200),)))
+    ledger.achieved(sent, 1)
+    refusal(ledger, Layer(1, (tone(level=0.56, frequency=200),)))
+    assert ledger.admit([Layer(1, (tone(level=0.54, frequency=200),))], 1.0)
+
+
+def test_other_capabilities_leave_what_was_spent() -> None:
+    """0.9 of one second within ten; a lower level limit does not give it back."""
+    ledger = Ledger(replace(WIDE, duty=0.1), CAN)
+    play(ledger, 1, 0.0, Layer(0, (tone(),), ramp=0.0))
+    play(ledger, 2, 0.9, Layer(0, (), ramp=0.0))
+    ledger.adopt({**CAN, "level_max": 5000})
+    refusal(ledger, Layer(0, (tone(level=0.51),)), at=5.0)
+    (one,) = ledger.admit([Layer(0, (tone(),), ramp=0.0)], 5.0)
+    assert 0 < one.valid_for <= 100
+
+
 def test_set_that_waits_counts_with_its_ending() -> None:
     """Level 0.1 with an ending through 0.8 waits: 0.3 beside it is refused, 0.15 is not."""
     ledger = Ledger(WIDE, CAN)

@@ -63,7 +63,7 @@ def frame(direction: Direction, data: bytes, where: str, decode: Callable[[], st
 def request(requested: object, outcome: object, duration: float) -> None:
     """Trace a request with its reply or error, and its duration [s]."""
     if has_requests():
-        _request.debug("%r -> %r in %.1f ms", requested, outcome, duration * 1e3)
+        _request.debug("%s -> %r in %.1f ms", requested, outcome, duration * 1e3)
 
 
 @contextmanager

@@ -10,12 +10,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Protocol
 
+from drivers import trace
 from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout, Preempted
 from drivers.host.jobs import Job, JobQueue, Member, Priority
 from drivers.host.joint_start import JointStart
 from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
 from drivers.protocol.records import Values
 from drivers.protocol.table import REACTION
+from drivers.trace import Direction
 
 REPLY_TIMEOUT = 0.030  # s; a heartbeat and three of these are less than three heartbeats of 50 ms
 ATTEMPTS = 3
@@ -77,6 +79,8 @@ class Line:
         future = self._loop.create_future()
         now = self._loop.time()
         job = Job(*(member, priority, name, values, make, ATTEMPTS, timeout, now, future, start))
+        if trace.has_requests():
+            future.add_done_callback(partial(_trace, job))
         if self.loss is not None:
             self._fail(job, LinkError(self.loss))
             return future
@@ -89,7 +93,10 @@ class Line:
 
     def received(self, data: bytes) -> None:
         """Take bytes from the port."""
-        for arrival in self.wire.received(data):
+        arrivals = self.wire.received(data)
+        if trace.is_active():
+            trace.frame(Direction.IN, data, self.name, lambda: ", ".join(map(repr, arrivals)))
+        for arrival in arrivals:
             if isinstance(arrival, Event | OtherHost | Several):
                 if (member := self.members.get(arrival.address)) is not None:
                     _note_unasked(member, arrival)
@@ -99,7 +106,7 @@ class Line:
                 continue
             if isinstance(arrival, More):
                 try:
-                    self._port.write(arrival.data)
+                    self._send(arrival.data, f"{job.name}, read")
                 except LinkError as error:
                     self.lose(str(error))
                     return
@@ -197,8 +204,13 @@ class Line:
         for member in self.members.values():
             if address in (0, member.address):
                 member.note_sent(name, values, now)
-        self._port.write(data)
+        self._send(data, name if address == 0 else f"{name} to {address}")
         return max(self.wire.round_trip(name, len(data)) + REACTION - REPLY_TIMEOUT, 0.0)
+
+    def _send(self, data: bytes, what: str) -> None:
+        if trace.is_active():
+            trace.frame(Direction.OUT, data, self.name, lambda: what)
+        self._port.write(data)
 
     def _refused(self, job: Job, member: Member, nak: Nak) -> None:
         member.counts.refusals += 1
@@ -300,3 +312,12 @@ def _note_unasked(member: Member, arrival: Event | OtherHost | Several) -> None:
         member.note_other_host()
     else:
         member.note_several()
+
+
+def _trace(job: Job, result: "asyncio.Future[Values]") -> None:
+    """Trace a request with its reply or error, and how long it took since it was queued."""
+    outcome: object = "cancelled"
+    if not result.cancelled():
+        outcome = result.exception() or result.result()
+    took = result.get_loop().time() - job.queued_at
+    trace.request(f"{job.name}({job.values})", outcome, took)

@@ -36,7 +36,7 @@ def test_trace_has_time_direction_bytes_and_meaning(tmp_path: Path) -> None:
     assert [time.sub("", line) for line in lines] == [
         "wire serial:///dev/x > 2c 01  Ping()",
         "wire serial:///dev/x < ff  not decoded: no such type",
-        "request 'Ping()' -> 'Status' in 12.3 ms",
+        "request Ping() -> 'Status' in 12.3 ms",
     ]
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
 

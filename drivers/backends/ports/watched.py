@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 import errno
 import os
+import select
 import socket
 import threading
 from collections.abc import Callable
@@ -101,8 +102,16 @@ class WatchedPort:
             return
         if data:
             self._on_data(data)
-        else:
+        elif self._is_hung_up():
             self._lose(self._loss_message("end of file"))
+
+    def _is_hung_up(self) -> bool:
+        """Whether an empty read is the end: a terminal without data has one as well."""
+        if self._descriptor is None or connection_of(self._port) is not None:
+            return True
+        state = select.poll()
+        state.register(self._descriptor, 0)  # a hang-up is told all the same
+        return bool(state.poll(0))
 
     def _ignore(self) -> None:
         self._writer.close()

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from drivers.contents import Layer, Tone
-from drivers.errors import CommandError, LinkError
+from drivers.errors import CommandError, LinkError, LinkTimeout
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
@@ -74,6 +74,22 @@ async def test_cut_line_is_lost_once_and_opened_again(wire: str) -> None:
         else:
             with pytest.raises(LinkError, match=r"cannot be opened|refused"):
                 await lines.amplifier(far.url(1), LIMITS, name="a")
+        await lines.close()
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("wire", WORD_WIRES)
+async def test_amplifier_that_does_not_reply_leaves_the_line(wire: str) -> None:
+    """Nobody has the second address; the first one replies as before."""
+    async with WORD_WIRES[wire](1) as far:
+        lines = Lines()
+        first, second = [
+            await lines.amplifier(far.url(number), LIMITS, name="a") for number in (1, 2)
+        ]
+        await first.open()
+        with pytest.raises(LinkTimeout):
+            await second.read_status()
+        await first.read_status()
         await lines.close()
 
 

@@ -23,6 +23,10 @@ class WireAddress(ABC):
         """Parse a URL."""
 
     @abstractmethod
+    def exchange_time(self, words: int, reply: int) -> float:
+        """Return how long a request and its reply of so many words take [s]; 0 if unknown."""
+
+    @abstractmethod
     def make_wire(self) -> Wire:
         """Make the host's side of the wire, without I/O."""
 

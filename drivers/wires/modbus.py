@@ -11,6 +11,9 @@ from drivers.host.wire import NETWORK_DELAY
 from drivers.wires.address import WireAddress
 from drivers.wires.silent_port import SilentPort
 
+_WRITE = 9 + 8  # bytes of a write of no registers on RTU, and of its response
+_READ = 8 + 5  # of a read, and of its response of no registers
+
 
 class ModbusAddress(WireAddress):
     """A unit over TCP, on a serial port of this machine, or behind a serial server."""
@@ -25,6 +28,16 @@ class ModbusAddress(WireAddress):
             "stop": parsed.stop,
         }
         self._url = parsed
+
+    def exchange_time(self, words: int, reply: int) -> float:
+        """Return how long a request and its reply of so many words take [s]; 0 over a network.
+
+        A write and a read, each with its response: with the silences before all four frames.
+        """
+        if not self._url.baud:
+            return 0.0
+        count = _WRITE + _READ + 2 * (words + 1 + reply + 2)  # tag; tag and result
+        return self._url.bits_per_byte * count / self._url.baud + 4 * self.make_wire().silence
 
     def make_wire(self) -> ModbusWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""

@@ -5,8 +5,11 @@ from collections.abc import Callable
 from drivers.backends.hardware import Port, number_below
 from drivers.backends.ports.opening import open_port
 from drivers.backends.urls.serial_line import SerialUrl
+from drivers.codec.serial_line.frame import frame_length
 from drivers.host.serial_wire import SerialWire
 from drivers.wires.address import WireAddress
+
+_BITS = 10  # of a byte, with start and stop
 
 
 class SerialAddress(WireAddress):
@@ -17,6 +20,11 @@ class SerialAddress(WireAddress):
         self.line, self.number = parsed.port, parsed.address
         self.settings = {"protocol": "serial", "baud": parsed.baud}
         self._url = parsed
+
+    def exchange_time(self, words: int, reply: int) -> float:
+        """Return how long a request and its reply of so many words take [s]; 0 behind a server."""
+        count = frame_length(2 * words) + frame_length(2 * reply)
+        return _BITS * count / self._url.baud if self._url.is_local else 0.0
 
     def make_wire(self) -> SerialWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""

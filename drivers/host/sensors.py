@@ -1,0 +1,229 @@
+"""What the sensors of an amplifier are, and readings of tones at them.
+
+Nothing here needs a session, feeds the watchdog, or changes what plays.
+"""
+
+import asyncio
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+from drivers import clock
+from drivers.errors import CommandError, CommandRefused, FrameError
+from drivers.host.amplifier import Amplifier
+from drivers.host.comparison import name_of
+from drivers.host.jobs import Priority
+from drivers.protocol.records import Record, Refusal, Rows, Values
+from drivers.protocol.table import (
+    FEATURES,
+    NO_CHANNEL,
+    QUANTITIES,
+    READING_STATES,
+    SENSOR_UNITS,
+    UNKNOWN_PLACE,
+    sensor_reading,
+)
+
+_MARGIN = 0.002  # s; of the amplifier's clock
+_MAX_OVERDUE = 2.0  # s; after the end of the window: an emulator stands still meanwhile
+_ROUNDING = 1e-6  # periods
+_Q = QUANTITIES
+_VIOLATION = "the amplifier does not keep the protocol"
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """A sensor: its unit (a name of SENSOR_UNITS), and its range in it; frequency_max [Hz].
+
+    channel: whose actuator it sits at, or None; x, y [m]: None where unknown.
+    """
+
+    unit: str
+    channel: int | None
+    x: float | None
+    y: float | None
+    range: float
+    frequency_max: float
+
+
+@dataclass(frozen=True, slots=True)
+class SensorReading:
+    """What a sensor measured: amplitude in its unit and phase [degrees] of each tone."""
+
+    is_overloaded: bool
+    tones: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A reading: its number, its state (a name of READING_STATES), and what is left of it [s].
+
+    start [s]: of its window, from the commit of token on; of itself without a token. sensors: empty
+    until it is complete.
+    """
+
+    number: int
+    state: str
+    left: float
+    start: float
+    token: int
+    tones: int
+    sensors: tuple[SensorReading, ...]
+
+
+async def read_sensors(amplifier: Amplifier) -> tuple[Sensor, ...]:
+    """Read what its sensors measure, and where; empty if it has none."""
+    if not amplifier.capabilities["features"] >> FEATURES["sensors"] & 1:
+        return ()
+    found: list[Sensor] = []
+    while True:
+        listed = await _request(amplifier, "GetSensors", {"first": len(found)})
+        found += [_sensor(each) for each in listed["sensors"]]
+        if len(found) > listed["all"]:
+            raise FrameError(f"sensors must be {listed['all']}, got {len(found)}; {_VIOLATION}")
+        is_last = len(found) > _Q["sensor"].maximum or not listed["sensors"]
+        if is_last or len(found) == listed["all"]:
+            return tuple(found)
+
+
+async def start_reading(
+    amplifier: Amplifier, frequencies: Sequence[float], window: float
+) -> Reading:
+    """Begin to measure tones [Hz] at all sensors, over a window [s] from now on.
+
+    Raises CommandError for tones that the window does not tell apart, CommandRefused for those
+    beyond the sensors.
+    """
+    check_tones(frequencies, window)
+    number = random.randint(_Q["reading"].minimum, _Q["reading"].maximum)  # noqa: S311  no secret
+    values: Values = {
+        **{"reading": number, "window": _Q["window"].to_wire(window)},
+        "tones": len(frequencies),
+        "frequencies": [_Q["frequency"].to_wire(each) for each in frequencies],
+    }
+    started = _reading(await _request(amplifier, "Measure", values))
+    _check_same(started, number=number, tones=len(frequencies))
+    return started
+
+
+async def measure_tones(
+    amplifier: Amplifier, frequencies: Sequence[float], window: float
+) -> Reading:
+    """Measure tones [Hz] at all sensors over a window [s] from now on, and wait for its end.
+
+    Tones are in the order of the frequencies. The caller feeds the watchdog meanwhile, and has
+    waited until the plate has settled. Raises what `start_reading` and `finish_reading` raise.
+    """
+    return await finish_reading(amplifier, await start_reading(amplifier, frequencies, window))
+
+
+async def finish_reading(amplifier: Amplifier, started: Reading) -> Reading:
+    """Wait for the end of a reading, and return it with all its sensors.
+
+    Raises CommandRefused if another host has started one meanwhile, and FrameError if it does not
+    end in time or lacks sensors.
+    """
+    found = started
+    end = clock.now() + started.left + _MAX_OVERDUE
+    while found.state == "RUNNING":
+        if clock.now() > end:
+            raise FrameError(
+                f"reading {started.number} must be complete after its window, got {found.state} "
+                f"{_MAX_OVERDUE:g} s later; {_VIOLATION}"
+            )
+        await asyncio.sleep(found.left + _MARGIN)
+        found = await _same_reading(amplifier, started, 0)
+    count = (await _request(amplifier, "GetSensors", {"first": 0}))["all"]
+    sensors = found.sensors
+    while len(sensors) < count:
+        more = (await _same_reading(amplifier, started, len(sensors))).sensors
+        if not more:
+            break
+        sensors += more
+    if len(sensors) != count:
+        raise FrameError(f"reading must have all {count} sensors, got {len(sensors)}; {_VIOLATION}")
+    return replace(found, sensors=sensors)
+
+
+def check_tones(frequencies: Sequence[float], window: float) -> None:
+    """Raise CommandError for tones [Hz] that a window [s] does not tell apart."""
+    limit = _Q["tone_count"].maximum
+    if not 1 <= len(frequencies) <= limit:
+        raise CommandError(f"a reading must have 1 to {limit} tones, got {len(frequencies)}")
+    apart = min(after - before for before, after in pairwise([0.0, *sorted(frequencies)]))
+    if not apart * window >= 1 - _ROUNDING:
+        raise CommandError(
+            f"window must be at least a period of each frequency and of the differences between "
+            f"them, 1/({apart:g} Hz), got {window:g} s"
+        )
+
+
+async def _same_reading(amplifier: Amplifier, started: Reading, first: int) -> Reading:
+    """Read the reading that was started, its sensors from one on."""
+    found = _reading(await _request(amplifier, "GetReading", {"first": first}))
+    _check_same(found, number=started.number, tones=started.tones)
+    return found
+
+
+def _check_same(found: Reading, *, number: int, tones: int) -> None:
+    """Raise CommandRefused for a reading of another number, FrameError for other tones."""
+    if found.number != number:
+        raise CommandRefused(
+            f"reading {number} was replaced by {found.number or 'none'}: another host measures, or "
+            "the amplifier has restarted; measure again"
+        )
+    if found.tones != tones:
+        raise FrameError(
+            f"reading {number} must have {tones} tones, got {found.tones}; {_VIOLATION}"
+        )
+
+
+async def _request(amplifier: Amplifier, name: str, values: Values) -> Values:
+    return await amplifier.line.submit(amplifier, Priority.READING, name, values)
+
+
+def _sensor(values: Values) -> Sensor:
+    channel = values["channel"]
+    return Sensor(
+        name_of(SENSOR_UNITS, values["unit"]),
+        None if channel == NO_CHANNEL else channel,
+        _place(values["x"]),
+        _place(values["y"]),
+        values["range"],
+        _Q["frequency"].from_wire(values["frequency_max"]),
+    )
+
+
+def _place(at: int) -> float | None:
+    return None if at == UNKNOWN_PLACE else _Q["place"].from_wire(at)
+
+
+def _reading(values: Values) -> Reading:
+    """Read a reading with its sensors; raises FrameError."""
+    tones, count = values["tones"], values["count"]
+    if tones > _Q["tone_count"].maximum:
+        raise FrameError(f"tones must be at most {_Q['tone_count'].maximum}, got {tones}")
+    record = Record(Rows("sensors", count, sensor_reading(tones)))
+    try:
+        rows = record.unpack(values["sensors"], is_strict=False)["sensors"] if count else []
+    except Refusal as refusal:
+        raise FrameError(f"reading: {refusal}; {_VIOLATION}") from None
+    return Reading(
+        values["reading"],
+        name_of(READING_STATES, values["state"]),
+        _Q["window_left"].from_wire(values["window_left"]),
+        _Q["window_start"].from_wire(values["window_start"]),
+        values["token"],
+        tones,
+        tuple(
+            SensorReading(
+                bool(row["flags"] & 1),
+                tuple(
+                    (tone["amplitude"], _Q["phase"].from_wire(tone["phase"]))
+                    for tone in row["tones"]
+                ),
+            )
+            for row in rows
+        ),
+    )

@@ -1,0 +1,51 @@
+"""Shortest watchdog and time to detect a loss on a wire, by arithmetic; times in s."""
+
+from collections.abc import Iterable
+
+from drivers.errors import CommandError
+from drivers.host.line import ATTEMPTS, REPLY_TIMEOUT
+from drivers.protocol.table import REACTION
+
+HEARTBEAT = 0.05
+"""Interval of heartbeats [s]."""
+MAX_LOSS_DETECTION_TIME = 3 * HEARTBEAT
+"""Longest time to detect a loss without a warning [s]."""
+_HEARTBEATS = 3  # a watchdog must outlast this many intervals
+_SET_HEAD, _LAYER_HEAD, _COMMAND = 3, 3, 4  # words
+
+TAKEN_WORDS = 3
+"""Of the reply to a set."""
+
+
+def set_words(channels: int) -> int:
+    """Return the words of a set of this many channels in one layer, without envelopes."""
+    return _SET_HEAD + _LAYER_HEAD + _COMMAND * channels
+
+
+def shortest_watchdog(round_trip: float) -> float:
+    """Return the shortest watchdog for a wire with this round trip of a set."""
+    return _HEARTBEATS * HEARTBEAT + round_trip
+
+
+def check_watchdog(watchdog: float, round_trip: float) -> None:
+    """Raise CommandError for a watchdog shorter than three heartbeats and one round trip."""
+    shortest = shortest_watchdog(round_trip)
+    if not watchdog >= shortest - 1e-9:  # sums of floats
+        raise CommandError(
+            f"watchdog must be at least {shortest * 1e3:.0f} ms ({_HEARTBEATS} heartbeats of "
+            f"{HEARTBEAT * 1e3:g} ms and a round trip of {round_trip * 1e3:.1f} ms), got "
+            f"{watchdog * 1e3:g} ms; lengthen it, or use a faster line"
+        )
+
+
+def loss_detection_time(round_trips: Iterable[float]) -> float:
+    """Return the longest time until silent amplifiers on one line are known to be so.
+
+    At the worst all fall silent right after a reply, and each is sent a set next, one after the
+    other, with all attempts: one less on a slow wire. round_trips: of a set to each.
+    """
+    detected = HEARTBEAT
+    for round_trip in round_trips:
+        takes = max(REPLY_TIMEOUT, round_trip + REACTION)
+        detected += (ATTEMPTS - (takes > REPLY_TIMEOUT)) * takes
+    return detected

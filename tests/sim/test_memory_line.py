@@ -147,7 +147,7 @@ async def test_lost_frames_are_asked_again(coarse_rig: Rig) -> None:
         rig.devices["main"].inject_fault(FaultWindow("drop", share=0.1))
         await rig.beat_until(clock.now() + 2.0)
         assert rig.bench.amplifiers["main"].summary(clock.now()).levels[0] == 1.0
-        assert rig.lines["main"].statistics.retries > 0
+        assert rig.group.amplifiers["main"].statistics.retries > 0
 
 
 async def test_amplifiers_of_one_rig_share_its_simulation(tmp_path: Path) -> None:

@@ -93,7 +93,8 @@ def discover(
     json_: Json = False,
 ) -> None:
     """List serial ports, CAN interfaces and the amplifiers on them."""
-    from drivers.discovery.search import candidates, identify_all, with_slcan
+    from drivers.discovery.places import candidates, with_slcan
+    from drivers.discovery.search import identify_all
 
     found_ports = [with_slcan(candidate) if slcan else candidate for candidate in candidates()]
     probed = [

@@ -1,40 +1,12 @@
-"""Search of ports and interfaces for amplifiers.
+"""Identification of amplifiers at URLs; only identify requests are sent, no output is driven."""
 
-Only identify requests are sent; no output is driven.
-"""
-
-import os
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
-from pathlib import Path
-
-from serial.tools.list_ports import comports
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 from drivers.amplifier import Amplifier
-from drivers.discovery.slcan import detect_slcan
 from drivers.errors import DriverError, FrameError, LinkTimeout
-from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Identity
-from drivers.registry import known_schemes, open_backend
-
-_NETWORK = Path("/sys/class/net")
-_CAN_TYPE = "280"  # ARPHRD_CAN of Linux
-_UNDESCRIBED = "n/a"  # by pyserial
-_SPEEDS = (PROTOCOL.serial.baud, 115_200)
-_MODBUS = PROTOCOL.modbus
-_GROUP_MAY = 0o060  # read and write
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A port or interface: the URLs to try, and the remedy if it cannot be used."""
-
-    name: str
-    description: str
-    urls: tuple[str, ...]
-    remedy: str | None = None
-    is_serial: bool = False
-    is_slcan: bool = False
+from drivers.registry import open_backend
 
 
 @dataclass(frozen=True)
@@ -50,38 +22,9 @@ class IdentifyResult:
     was_sent: bool = True
 
 
-def candidates() -> list[Candidate]:
-    """List the serial ports and CAN interfaces of this machine, usable or not."""
-    return [*_serial_ports(), *_can_interfaces()]
-
-
 async def identify_all(urls: Iterable[str]) -> list[IdentifyResult]:
     """Identify the amplifiers at these URLs, one after the other."""
     return [await _identify(url) for url in urls]
-
-
-def with_slcan(candidate: Candidate) -> Candidate:
-    """Turn a serial port into a CAN adapter if it replies as one.
-
-    Blocks; see `drivers.discovery.slcan` for what is sent. Its amplifiers are not identified.
-    """
-    if not candidate.is_serial or candidate.remedy is not None:
-        return candidate
-    try:
-        adapter = detect_slcan(candidate.name)
-    except (OSError, ValueError) as problem:
-        return replace(candidate, remedy=f"{candidate.name} cannot be used: {problem}")
-    if adapter is None:
-        return candidate
-    heard = adapter.nodes or ("none",)
-    what = adapter.problem or f"heartbeats of nodes: {', '.join(map(str, heard))}"
-    bitrate = PROTOCOL.canopen["bitrate"]
-    urls = tuple(
-        f"can+slcan://{_absolute(candidate.name)}?bitrate={bitrate}#{node}"
-        for node in adapter.nodes
-    )
-    description = f"{candidate.description}: slcan adapter {adapter.version}, {what}"
-    return Candidate(candidate.name, description, urls, is_slcan=True)
 
 
 async def _identify(url: str) -> IdentifyResult:
@@ -94,50 +37,3 @@ async def _identify(url: str) -> IdentifyResult:
     identity = amplifier.identity
     await amplifier.close()
     return IdentifyResult(url, identity)
-
-
-def _serial_ports() -> Iterator[Candidate]:
-    for port in sorted(comports()):
-        path = port.device
-        urls = tuple(f"serial://{_absolute(path)}?baud={speed}" for speed in _SPEEDS)
-        urls += (f"modbus+rtu://{_absolute(path)}?baud={_MODBUS['baud']}#{_MODBUS['unit']}",)
-        description = "serial port" if port.description == _UNDESCRIBED else port.description
-        yield Candidate(path, description, urls, _permission_remedy(path), is_serial=True)
-
-
-def _absolute(path: str) -> str:
-    return path if path.startswith("/") else f"/{path}"
-
-
-def _permission_remedy(path: str) -> str | None:
-    if not path.startswith("/") or os.access(path, os.R_OK | os.W_OK):
-        return None
-    momentary = f"sudo chmod a+rw {path}"
-    try:
-        is_for_group = Path(path).stat().st_mode & _GROUP_MAY == _GROUP_MAY
-        group = Path(path).group()
-    except (OSError, KeyError):  # removed meanwhile, or a group without a name
-        is_for_group = False
-    if not is_for_group:
-        return f"no permission for this user or its group; temporarily: {momentary}"
-    return (
-        f"no permission: sudo usermod -aG {group} $USER, then log in again "
-        f"(temporarily: {momentary})"
-    )
-
-
-def _can_interfaces() -> Iterator[Candidate]:
-    if not _NETWORK.is_dir():
-        return
-    for interface in sorted(_NETWORK.iterdir()):
-        kind = interface / "type"
-        if not kind.is_file() or kind.read_text(encoding="ascii").strip() != _CAN_TYPE:
-            continue
-        name = interface.name
-        is_up = (interface / "operstate").read_text(encoding="ascii").strip() != "down"
-        node = PROTOCOL.canopen["node"]
-        scheme = "can+socketcan"
-        urls = (f"{scheme}://{name}#{node}",) if scheme in known_schemes() else ()
-        bitrate = PROTOCOL.canopen["bitrate"]
-        remedy = f"interface is down: sudo ip link set {name} up type can bitrate {bitrate}"
-        yield Candidate(name, "CAN interface", urls, remedy=None if is_up else remedy)

@@ -17,7 +17,7 @@ from serial.tools.list_ports_common import ListPortInfo
 from typer.testing import CliRunner
 
 from drivers.cli import app
-from drivers.discovery.search import candidates
+from drivers.discovery.places import candidates
 from drivers.errors import CommandError, CommandRefused
 from drivers.protocol.messages import (
     AmplifierState,
@@ -289,8 +289,8 @@ def test_discover_suggests_a_group_that_has_permission(
     port = tmp_path / "tty"
     port.touch()
     port.chmod(mode)
-    monkeypatch.setattr("drivers.discovery.search.comports", lambda: [ListPortInfo(str(port))])
-    monkeypatch.setattr("drivers.discovery.search.os.access", lambda path, mode: False)
+    monkeypatch.setattr("drivers.discovery.places.comports", lambda: [ListPortInfo(str(port))])
+    monkeypatch.setattr("drivers.discovery.places.os.access", lambda path, mode: False)
     (place,) = [one for one in candidates() if one.name == str(port)]
     assert place.description == "serial port"  # pyserial reports n/a
     assert ("usermod -aG" in (place.remedy or "")) == helps_group
@@ -300,8 +300,8 @@ def test_discover_suggests_a_group_that_has_permission(
 def test_discover_reports_why_a_port_cannot_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:
     """The reason stands with the port."""
     port = ListPortInfo("/dev/no-such-port")
-    monkeypatch.setattr("drivers.discovery.search.comports", lambda: [port])
-    monkeypatch.setattr("drivers.discovery.search.os.access", lambda path, mode: True)
+    monkeypatch.setattr("drivers.discovery.places.comports", lambda: [port])
+    monkeypatch.setattr("drivers.discovery.places.os.access", lambda path, mode: True)
     result = invoke("discover")
     assert result.exit_code == 0, result.output
     assert "no such port" in result.stdout

@@ -129,7 +129,7 @@ def test_discover_probes_adapters_on_request_only(
 ) -> None:
     """With --slcan the port is named with the URLs of what was heard, and no other protocol is
     tried on it; without, no such command goes out."""
-    monkeypatch.setattr("drivers.discovery.search.comports", lambda: [ListPortInfo(adapter.port)])
+    monkeypatch.setattr("drivers.discovery.places.comports", lambda: [ListPortInfo(adapter.port)])
     options = ["--slcan"] if is_wanted else ["--no-probe"]
     result = CliRunner().invoke(app, ["amp", "discover", "--json", *options])
     assert result.exit_code == 0, result.output

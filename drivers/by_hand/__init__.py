@@ -1,0 +1,1 @@
+"""One amplifier by hand: the actions of `era amp`, and an amplifier for scripts."""

@@ -1,0 +1,266 @@
+"""Actions of `era amp` on one amplifier; each returns the rows of its result."""
+
+import asyncio
+import contextlib
+import shlex
+from collections.abc import Sequence
+from typing import Any
+
+from drivers import clock
+from drivers.backends.urls.address import with_address
+from drivers.by_hand.reaching import (
+    identified,
+    random_session,
+    reached,
+    request,
+    round_trip,
+    wire_rows,
+)
+from drivers.by_hand.rows import capability_rows, fault_rows, status_rows
+from drivers.contents import Layer, Tone
+from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
+from drivers.host.amplifier import STOP_RAMP, WATCHDOG, Amplifier
+from drivers.host.comparison import name_of
+from drivers.host.jobs import Priority
+from drivers.host.sensors import check_tones, measure_tones, read_sensors
+from drivers.host.timing import check_watchdog
+from drivers.protocol.table import FAULTS, FEATURES, QUANTITIES, STATES
+
+_TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address
+_STOP_TIMEOUT = 2.0  # s; for boards that restart when their port is opened
+_RAMP = 0.05  # s; neither start nor end of a drive clicks
+_TOKEN = 1
+_SENSOR_UNITS = {
+    "ACCELERATION": "m/s²",
+    "VELOCITY": "m/s",
+    "DISPLACEMENT": "m",
+    "FORCE": "N",
+    "VOLTAGE": "V",
+}
+_LATCHED = ("QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT")
+
+
+async def identify(url: str) -> dict[str, Any]:
+    """Read identity, capabilities and wire times."""
+    async with identified(url) as amplifier:
+        identity = {**amplifier.identity}
+        versions = identity.pop("versions")
+        return {
+            "url": url,
+            **identity,
+            "versions": [version for version in range(16) if versions >> version & 1],
+            **capability_rows(amplifier.capabilities),
+            **wire_rows(url, amplifier),
+        }
+
+
+async def status(url: str) -> dict[str, Any]:
+    """Read status, faults and link timing."""
+    async with identified(url) as amplifier:
+        now = await amplifier.read_status()
+        faults = await request(amplifier, "GetFaults", {})
+        measured: list[dict[str, Any]] = []
+        if _has(amplifier, "electrical"):
+            for row in (await request(amplifier, "GetMeasured", {}))["channels"]:
+                voltage, current = QUANTITIES["channel_voltage"], QUANTITIES["channel_current"]
+                measured.append(
+                    {
+                        "voltage_v": voltage.from_wire(row["channel_voltage"]),
+                        "current_a": current.from_wire(row["channel_current"]),
+                    }
+                )
+        return {
+            "url": url,
+            **status_rows(now),
+            "measured": measured,
+            "faults": fault_rows(faults),
+            "last_round_trip_s": amplifier.round_trip,
+            **wire_rows(url, amplifier),
+        }
+
+
+async def sensors(url: str) -> dict[str, Any]:
+    """Read what the sensors measure, and where."""
+    async with identified(url) as amplifier:
+        found = await read_sensors(amplifier)
+    return {
+        "url": url,
+        "sensors": [
+            {
+                "sensor": number,
+                "measures": one.unit.lower(),
+                "unit": _SENSOR_UNITS.get(one.unit),
+                "channel": one.channel,
+                "x_m": one.x,
+                "y_m": one.y,
+                "range": one.range,
+                "frequency_max_hz": one.frequency_max,
+            }
+            for number, one in enumerate(found)
+        ],
+    }
+
+
+async def measure(url: str, frequencies: Sequence[float], window: float) -> dict[str, Any]:
+    """Measure tones [Hz] at every sensor over a window [s]; what plays goes on."""
+    check_tones(frequencies, window)
+    async with identified(url) as amplifier:
+        described = await read_sensors(amplifier)
+        if not described:
+            raise CommandError("the amplifier has no sensors")
+        reading = await measure_tones(amplifier, frequencies, window)
+    return {
+        "url": url,
+        "state": reading.state,
+        "token": reading.token,
+        "window_s": window,
+        "sensors": [
+            {
+                "sensor": number,
+                "unit": _SENSOR_UNITS.get(described[number].unit),
+                "overload": one.is_overloaded,
+                "tones": [
+                    {"frequency_hz": at, "amplitude": amplitude, "phase_deg": phase}
+                    for at, (amplitude, phase) in zip(frequencies, one.tones, strict=True)
+                ],
+            }
+            for number, one in enumerate(reading.sensors)
+        ],
+    }
+
+
+async def stop(url: str) -> dict[str, Any]:
+    """Stop all channels; the amplifier is identified after the first Stop.
+
+    Without a confirmation it is unknown until when it may play: another host may feed it.
+    """
+    rows: dict[str, Any] = {}
+    try:
+        async with reached(url) as amplifier:
+            cause = await _stop(amplifier)
+            if amplifier.status is not None:
+                rows = status_rows(amplifier.status)
+    except LinkError as error:
+        cause = str(error)
+    return {
+        "url": url,
+        "silence": "may_play" if cause else "confirmed_silent",
+        "may_play_for_s": None if cause else 0.0,
+        "cause": cause,
+        **rows,
+    }
+
+
+async def _stop(amplifier: Amplifier) -> str:
+    """Stop an amplifier at once, then until that is confirmed; returns why it is not."""
+    cause = ""
+    with contextlib.suppress(DriverError):
+        await request(amplifier, "Stop", {"ramp": amplifier.wire_ramp(STOP_RAMP)}, Priority.STOP)
+    try:
+        await amplifier.identify()
+    except DriverError as error:  # its channels are unknown, but the stop goes on
+        cause = str(error)
+    stopped = await amplifier.stop(timeout=_STOP_TIMEOUT)
+    if stopped.is_confirmed:
+        return ""
+    return f"{cause or stopped.cause}; it is unknown when its watchdog was fed last: switch it off"
+
+
+async def set_address(url: str, address: int, serial_number: str | None) -> dict[str, Any]:
+    """Give the amplifier at a URL, or that of a serial number, another address on its line."""
+    moved = with_address(url, address)
+    if serial_number is None:
+        async with identified(url) as amplifier:
+            serial_number = amplifier.identity["serial_number"]
+            if not _has(amplifier, "address"):
+                raise CommandError("the address of this amplifier cannot be set over its wire")
+            state = name_of(STATES, (await amplifier.read_status())["state"])
+            if state != "SWITCH_ON_DISABLED":
+                raise CommandRefused("an address is set while disarmed; disarm the amplifier first")
+            await _set_address(amplifier, address, serial_number)
+    else:
+        async with reached(url) as amplifier:
+            # Of several at this address one that is not meant may reply first.
+            with contextlib.suppress(CommandRefused, LinkError):
+                await _set_address(amplifier, address, serial_number)
+    await asyncio.sleep(_TAKING_ADDRESS)
+    async with identified(moved, serial_number=serial_number):
+        return {"url": moved, "serial_number": serial_number}
+
+
+async def _set_address(amplifier: Amplifier, address: int, serial_number: str) -> None:
+    values = {"address": address, "serial_number": serial_number}
+    await request(amplifier, "SetAddress", values)
+
+
+async def clear(url: str) -> dict[str, Any]:
+    """Acknowledge a stop or a fault."""
+    async with identified(url) as amplifier:
+        return {"url": url, **status_rows(await amplifier.clear())}
+
+
+async def drive(
+    url: str, *, channel: int, frequency: float, level: float, duration: float
+) -> dict[str, Any]:
+    """Drive one channel for a time [s]; ends silent and disarmed."""
+    limit = QUANTITIES["valid_for"].high
+    if not 0 < duration <= limit:
+        raise CommandError(f"--for must be above 0 and at most {limit:g} s, got {duration:g} s")
+    async with reached(url) as amplifier:
+        await amplifier.open()
+        ramp = min(_RAMP, QUANTITIES["ramp"].from_wire(amplifier.capabilities["ramp_max"]))
+        layer = Layer(0, (Tone(channel, frequency, level),), ramp, duration)
+        try:
+            amplifier.ledger.admit([layer], clock.now(), delay=0.0)
+        except CommandRefused as refused:
+            raise CommandError(str(refused)) from refused  # bad input, not a refusal
+        lowest = QUANTITIES["watchdog"].from_wire(amplifier.capabilities["watchdog_min"])
+        watchdog = max(WATCHDOG, lowest)
+        check_watchdog(watchdog, round_trip(url, amplifier))
+        try:
+            await _arm(amplifier, watchdog, url)
+            await amplifier.stage(_TOKEN, [layer], now=True)
+            achieved = await request(amplifier, "GetAchieved", {"layer": layer.number})
+            end = clock.now() + duration
+            while (left := end - clock.now()) > 0:
+                await asyncio.sleep(min(watchdog / 5, left))
+                await amplifier.ping()
+        finally:
+            # An amplifier that cannot be reached is stopped by its watchdog.
+            with contextlib.suppress(DriverError):
+                await amplifier.disarm(_RAMP)
+        after = await amplifier.read_status()
+    tones = ("frequency", "level", "phase")
+    played = [
+        {
+            "channel": row["channel"],
+            **dict(
+                zip(
+                    ("frequency_hz", "level", "phase_deg"),
+                    (QUANTITIES[name].from_wire(row[name]) for name in tones),
+                    strict=True,
+                )
+            ),
+        }
+        for row in achieved["commands"]
+    ]
+    return {"url": url, "achieved": played, "duration_s": duration, **status_rows(after)}
+
+
+async def _arm(amplifier: Amplifier, watchdog: float, url: str) -> None:
+    """Arm with a watchdog [s]; a refusal after a stop or fault names the remedy."""
+    try:
+        await amplifier.arm(random_session(), watchdog)
+    except CommandRefused as refused:
+        now = await amplifier.read_status()
+        state = name_of(STATES, now["state"])
+        if state not in _LATCHED:
+            raise
+        raise CommandRefused(
+            f"the amplifier does not arm: state {state}, fault {name_of(FAULTS, now['fault'])}; "
+            f"once the cause is gone: era amp clear {shlex.quote(url)}"
+        ) from refused
+
+
+def _has(amplifier: Amplifier, feature: str) -> bool:
+    return bool(amplifier.capabilities["features"] >> FEATURES[feature] & 1)

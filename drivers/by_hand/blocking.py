@@ -1,0 +1,190 @@
+"""A synchronous amplifier for scripts.
+
+    with BlockingAmplifier("serial:///dev/ttyUSB0", limits=GuardLimits(40, 500, 0.5)) as amplifier:
+        amplifier.arm()
+        amplifier.play([Tone(channel=0, frequency=110, level=0.2)], duration=0.5)
+
+Only `play` and `measure`, while they wait, and `heartbeat` feed the watchdog: a script that hangs
+falls silent.
+"""
+
+import asyncio
+import threading
+from collections.abc import Coroutine, Sequence
+from types import TracebackType
+from typing import Any, TypeVar
+
+from drivers import clock
+from drivers.by_hand.reaching import random_session, request
+from drivers.by_hand.rows import capability_rows, fault_rows, status_rows
+from drivers.contents import Layer, Tone
+from drivers.errors import CommandError, CommandRefused
+from drivers.host.amplifier import WATCHDOG, Amplifier
+from drivers.host.dialogue import Staged
+from drivers.host.sensors import Reading, Sensor, measure_tones, read_sensors
+from drivers.host.timing import HEARTBEAT
+from drivers.opening import Lines
+from drivers.protocol.definition import token_after
+from drivers.protocol.table import STATES
+from registry.limits import GuardLimits
+
+_RAMP = 0.02  # s; long enough that neither start nor end of a vibration clicks
+_ENABLED = STATES["OPERATION_ENABLED"]
+
+_T = TypeVar("_T")
+
+
+class BlockingAmplifier:
+    """The amplifier at a URL within limits, open while the context lasts.
+
+    Leaving the context disarms it. Raises what `Amplifier` raises.
+    """
+
+    def __init__(self, url: str, *, limits: GuardLimits) -> None:
+        self._url = url
+        self._limits = limits
+        self._token = 1
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name=f"amplifier {url}")
+
+    def __enter__(self) -> "BlockingAmplifier":
+        self._thread.start()
+        try:
+            self._lines, self._amplifier = self._wait(self._open())
+        except BaseException:
+            self._end()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        where: TracebackType | None,
+    ) -> None:
+        try:
+            if self._amplifier.line.loss is None:
+                self._wait(self._amplifier.disarm())
+        finally:
+            try:
+                self._wait(self._lines.close())
+            finally:
+                self._end()
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Vendor, product, serial number and firmware; versions as bits."""
+        return {**self._amplifier.identity}
+
+    @property
+    def capabilities(self) -> dict[str, Any]:
+        """Frequency range, steps and channels, with the keys of `era amp identify`."""
+        return capability_rows(self._amplifier.capabilities)
+
+    def arm(self, watchdog: float = WATCHDOG) -> dict[str, Any]:
+        """Switch the high voltage on, level zero; watchdog [s]. Returns the status."""
+        return status_rows(self._wait(self._amplifier.arm(random_session(), watchdog)))
+
+    def disarm(self) -> None:
+        """Fall silent, then switch the high voltage off."""
+        self._wait(self._amplifier.disarm())
+
+    def stop(self) -> None:
+        """Quick stop, latched until `clear`; CommandRefused where silence is not confirmed."""
+        stopped = self._wait(self._amplifier.stop())
+        if not stopped.is_confirmed:
+            raise CommandRefused(f"the amplifier may play: {stopped.cause}")
+
+    def clear(self) -> dict[str, Any]:
+        """Acknowledge a stop or a fault; returns the status."""
+        return status_rows(self._wait(self._amplifier.clear()))
+
+    def status(self) -> dict[str, Any]:
+        """Read state, fault and levels, with the keys of `era amp status`."""
+        return status_rows(self._wait(self._amplifier.read_status()))
+
+    def faults(self) -> list[dict[str, Any]]:
+        """Read latched and past faults, newest first, with the keys of `era amp status`."""
+        return fault_rows(self._wait(request(self._amplifier, "GetFaults", {})))
+
+    def heartbeat(self) -> dict[str, Any]:
+        """Feed the watchdog; CommandRefused if the amplifier is no longer armed."""
+        return status_rows(self._wait(self._amplifier.ping()))
+
+    def sensors(self) -> tuple[Sensor, ...]:
+        """Read what its sensors measure, and where; empty if it has none."""
+        return self._wait(read_sensors(self._amplifier))
+
+    def measure(self, frequencies: Sequence[float], window: float) -> Reading:
+        """Measure tones [Hz] at all sensors over a window [s], feeding the watchdog meanwhile.
+
+        What plays must have settled before. Raises CommandRefused if the amplifier stops by itself.
+        """
+        return self._wait(self._measured(frequencies, window))
+
+    def apply(
+        self, tones: Sequence[Tone], *, ramp: float = _RAMP, valid_for: float = 0.0
+    ) -> Staged:
+        """Play these tones from now on, all other channels silent; returns them as on the wire."""
+        return self._wait(self._applied(tones, ramp, valid_for))
+
+    def play(self, tones: Sequence[Tone], *, duration: float, ramp: float = _RAMP) -> Staged:
+        """Play these tones for a time [s], feed the watchdog and wait for the end.
+
+        Raises CommandRefused if the amplifier stops by itself, or its replies contradict requests.
+        """
+        return self._wait(self._played(tones, ramp, duration))
+
+    async def _open(self) -> tuple[Lines, Amplifier]:
+        lines = Lines()
+        try:
+            amplifier = await lines.amplifier(self._url, self._limits, name=self._url)
+            await amplifier.open()
+        except BaseException:
+            await lines.close()
+            raise
+        return lines, amplifier
+
+    async def _applied(self, tones: Sequence[Tone], ramp: float, valid_for: float) -> Staged:
+        _require_tones(tones)
+        self._token = token_after(self._token)
+        layer = Layer(0, tuple(tones), ramp, valid_for)
+        return await self._amplifier.stage(self._token, [layer], now=True)
+
+    async def _played(self, tones: Sequence[Tone], ramp: float, duration: float) -> Staged:
+        played = await self._applied(tones, ramp, duration)
+        end = clock.now() + duration
+        while (left := end - clock.now()) > 0:
+            await asyncio.sleep(min(HEARTBEAT, left))
+            await self._amplifier.ping()
+        return played
+
+    async def _measured(self, frequencies: Sequence[float], window: float) -> Reading:
+        is_armed = (await self._amplifier.read_status())["state"] == _ENABLED
+        measuring = asyncio.ensure_future(measure_tones(self._amplifier, frequencies, window))
+        try:
+            while is_armed and not measuring.done():
+                await asyncio.wait([measuring], timeout=HEARTBEAT)
+                await self._amplifier.ping()
+            return await measuring
+        finally:
+            measuring.cancel()
+
+    def _wait(self, work: Coroutine[Any, Any, _T]) -> _T:
+        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+        try:
+            return future.result()
+        except BaseException:  # also KeyboardInterrupt: nothing goes on feeding the watchdog
+            future.cancel()
+            raise
+
+    def _end(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+
+def _require_tones(tones: object) -> None:
+    """Raise CommandError for anything but a sequence of tones."""
+    if not (isinstance(tones, Sequence) and all(isinstance(one, Tone) for one in tones)):
+        raise CommandError(f"tones must be a list of Tone, got {type(tones).__name__}")

@@ -1,0 +1,71 @@
+"""The amplifier at a URL, for one action; and what its wire carries."""
+
+import math
+import secrets
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+from drivers.host.amplifier import Amplifier
+from drivers.host.jobs import Priority
+from drivers.host.limits import FREQUENCY_FLOOR
+from drivers.host.timing import TAKEN_WORDS, set_words, shortest_watchdog
+from drivers.opening import Lines
+from drivers.protocol.records import Values
+from drivers.protocol.table import QUANTITIES
+from drivers.wires.known import address_of
+from registry.limits import GuardLimits
+
+CEILINGS = GuardLimits(FREQUENCY_FLOOR, QUANTITIES["frequency"].high, 1.0)
+"""Limits where no rig states any."""
+
+
+@asynccontextmanager
+async def reached(
+    url: str, *, limits: GuardLimits = CEILINGS, serial_number: str | None = None
+) -> AsyncIterator[Amplifier]:
+    """Open the line of an amplifier while the context lasts; nothing is sent."""
+    lines = Lines()
+    try:
+        yield await lines.amplifier(url, limits, name=url, serial_number=serial_number)
+    finally:
+        await lines.close()
+
+
+@asynccontextmanager
+async def identified(url: str, *, serial_number: str | None = None) -> AsyncIterator[Amplifier]:
+    """Open the line of an amplifier and identify it; what it plays goes on."""
+    async with reached(url, serial_number=serial_number) as amplifier:
+        await amplifier.identify()
+        yield amplifier
+
+
+async def request(
+    amplifier: Amplifier, name: str, values: Values, priority: Priority = Priority.OTHER
+) -> Values:
+    """Send a request that needs nothing of the ledger."""
+    return await amplifier.line.submit(amplifier, priority, name, values)
+
+
+def random_session() -> int:
+    """Draw the number of a session, so that it is not taken for another host's."""
+    quantity = QUANTITIES["session"]
+    return quantity.minimum + secrets.randbelow(quantity.maximum - quantity.minimum + 1)
+
+
+def round_trip(url: str, amplifier: Amplifier) -> float:
+    """Return how long a set of all channels and its reply take on the wire [s]; 0 if unknown."""
+    words = set_words(amplifier.capabilities["channels"])
+    return address_of(url).exchange_time(words, TAKEN_WORDS)
+
+
+def wire_rows(url: str, amplifier: Amplifier) -> dict[str, Any]:
+    """Return limits by the wire's speed; empty where that is unknown."""
+    takes = round_trip(url, amplifier)
+    if not takes:
+        return {}
+    return {
+        "wire_round_trip_s": round(takes, 6),
+        "sets_per_second_max": math.floor(1 / takes),
+        "watchdog_shortest_s": round(shortest_watchdog(takes), 6),
+    }

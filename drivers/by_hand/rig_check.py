@@ -1,0 +1,122 @@
+"""Check of a rig's amplifiers by their URLs alone, for `era config check`; nothing is opened."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+from drivers.errors import CommandError
+from drivers.host.amplifier import WATCHDOG
+from drivers.host.limits import FREQUENCY_FLOOR
+from drivers.host.timing import (
+    MAX_LOSS_DETECTION_TIME,
+    TAKEN_WORDS,
+    check_watchdog,
+    loss_detection_time,
+    set_words,
+)
+from drivers.protocol.table import QUANTITIES
+from drivers.wires.address import WireAddress
+from drivers.wires.known import address_of
+from registry.limits import GuardLimits
+
+COMMIT_SKEW = 0.001
+"""Skew of simultaneous commits on two links [s]: USB adapters send in frames of 1 ms, networks and
+operating systems are no better. See docs/reference/several-amplifiers.md."""
+
+_CEILING = QUANTITIES["frequency"].high
+
+
+def check_links(
+    urls: Mapping[str, str], *, channels: Mapping[str, int], limits: GuardLimits
+) -> tuple[dict[str, str], list[str]]:
+    """Return errors by amplifier name, and warnings.
+
+    urls by name; channels: number of wired channels by name, missing if none; limits: of the
+    rig.
+    """
+    errors: dict[str, str] = {}
+    addresses: dict[str, WireAddress] = {}
+    by_place: dict[tuple[str, int], str] = {}
+    for name, url in urls.items():
+        try:
+            address = address_of(url)
+            check_watchdog(WATCHDOG, _round_trip(address, channels.get(name, 0)))
+        except CommandError as error:
+            errors[name] = str(error)
+            continue
+        other = by_place.setdefault((address.line, address.number), name)
+        if other != name:
+            errors[name] = f"URL must be unique, got {url!r}, where amplifier {other} is"
+            continue
+        addresses[name] = address
+    used = {name: address for name, address in addresses.items() if channels.get(name)}
+    links = {address.line for name, address in used.items() if not urls[name].startswith("sim://")}
+    warnings = [
+        *_ceiling_warnings(limits),
+        *_skew_warnings(sorted(links), limits.frequency_max),
+        *_late_loss_warnings(used, channels),
+    ]
+    return errors, warnings
+
+
+def phase_error(frequency: float, skew: float) -> float:
+    """Phase [degrees] between ERAs whose amplifiers start with a skew [s]."""
+    return 360.0 * frequency * skew
+
+
+def remaining_contrast(frequency: float, skew: float) -> float:
+    """Contrast [dB] left at a null of two equal halves that start with a skew [s].
+
+    The level of exp(i phase) - 1 relative to one half; 0 dB from 60 degrees on.
+    """
+    phase = min(math.radians(phase_error(frequency, skew)), math.pi)
+    return max(0.0, -20.0 * math.log10(2.0 * math.sin(phase / 2.0)))
+
+
+def _round_trip(address: WireAddress, channels: int) -> float:
+    """Return how long a set of these channels and its reply take [s]."""
+    return address.exchange_time(set_words(channels), TAKEN_WORDS)
+
+
+def _ceiling_warnings(limits: GuardLimits) -> list[str]:
+    """Warn of limits beyond what is played whatever the configuration says."""
+    low, high = limits.frequency_min, limits.frequency_max
+    if low >= FREQUENCY_FLOOR and high <= _CEILING:
+        return []
+    return [
+        f"limits.frequency should be within {FREQUENCY_FLOOR:g} to {_CEILING:g} Hz, got {low:g} to "
+        f"{high:g} Hz; frequencies beyond are never played"
+    ]
+
+
+def _late_loss_warnings(
+    addresses: Mapping[str, WireAddress], channels: Mapping[str, int]
+) -> list[str]:
+    """Warn of lines on which a loss may be detected later than MAX_LOSS_DETECTION_TIME."""
+    lines: dict[str, list[str]] = {}
+    for name, address in addresses.items():
+        lines.setdefault(address.line, []).append(name)
+    limit = MAX_LOSS_DETECTION_TIME
+    warnings = []
+    for names in lines.values():
+        took = loss_detection_time(_round_trip(addresses[name], channels[name]) for name in names)
+        if took > limit:
+            warnings.append(
+                f"{', '.join(names)}: loss of the amplifiers may be detected only after "
+                f"{took * 1e3:.0f} ms, later than {limit * 1e3:.0f} ms; the watchdog stops them "
+                "regardless: use a faster line, or one line per amplifier, if that is too late"
+            )
+    return warnings
+
+
+def _skew_warnings(links: Sequence[str], frequency_max: float) -> list[str]:
+    if len(links) < 2:
+        return []
+    low = 100.0
+    return [
+        f"ERAs are on {len(links)} links ({', '.join(links)}), whose amplifiers may start "
+        f"{COMMIT_SKEW * 1e3:g} ms apart: a phase error of {phase_error(low, COMMIT_SKEW):.0f} "
+        f"degrees at {low:g} Hz and {phase_error(frequency_max, COMMIT_SKEW):.0f} at "
+        f"{frequency_max:g} Hz, which leaves {remaining_contrast(low, COMMIT_SKEW):.0f} and "
+        f"{remaining_contrast(frequency_max, COMMIT_SKEW):.0f} dB of contrast where they cancel; "
+        "put ERAs that play one frequency together on one amplifier or bus"
+    ]

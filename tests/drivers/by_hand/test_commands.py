@@ -1,0 +1,107 @@
+"""The `era amp` commands of version 3, at amplifiers simulated in the process itself."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import Result
+from serial.tools.list_ports_common import ListPortInfo
+from typer.testing import CliRunner
+
+from drivers.by_hand.cli import app
+from drivers.errors import CommandError
+from model.rig.file import example_rig_path
+
+URL = f"sim://{example_rig_path()}?exact"
+COMMON = {
+    *("url", "state", "fault", "interlock_open", "limited", "token", "high_voltage"),
+    *("high_voltage_v", "temperature_c", "watchdog_left_s", "levels", "layer_tokens"),
+}
+
+
+def invoke(*args: str) -> Result:
+    """Run `era amp` with these arguments."""
+    return CliRunner().invoke(app, ["amp", *args])
+
+
+def result_of(*args: str) -> dict[str, Any]:
+    """Run `era amp` with these arguments and --json; its result."""
+    result = invoke(*args, "--json")
+    assert result.exit_code == 0, result.output
+    parsed: dict[str, Any] = json.loads(result.stdout)
+    return parsed
+
+
+@pytest.mark.parametrize(
+    ("command", "more"),
+    [
+        ("status", {"faults", "measured", "last_round_trip_s"}),
+        ("clear", set()),
+        ("stop", {"silence", "may_play_for_s", "cause"}),
+    ],
+)
+def test_results_have_the_documented_keys(command: str, more: set[str]) -> None:
+    """Those of docs/reference/commands.md, and what version 3 has besides."""
+    assert set(result_of(command, URL)) == COMMON | more
+
+
+def test_drive_and_identify_of_a_simulated_rig() -> None:
+    """Four channels; what is driven is said as the wire has it."""
+    assert result_of("identify", URL)["channels"] == 4
+    options = ["--channel", "2", "--frequency", "123.45", "--level", "0.3", "--for", "0.05"]
+    driven = result_of("drive", URL, *options)
+    assert set(driven) == COMMON | {"achieved", "duration_s"}
+    assert driven["achieved"] == [
+        {"channel": 2, "frequency_hz": 123.45, "level": 0.3, "phase_deg": 0.0}
+    ]
+
+
+def test_unconfirmed_stop_exits_3_and_a_confirmed_one_names_the_next_command() -> None:
+    """Nothing could be sent to a port that is not there."""
+    result = invoke("stop", "serial:///dev/no-such-port", "--json")
+    assert result.exit_code == 3
+    assert "no such port" in json.loads(result.stdout)["cause"]
+    assert invoke("stop", URL).stdout.splitlines()[-1] == f"Next: era amp clear '{URL}'"
+
+
+def test_stop_needs_no_trace(tmp_path: Path) -> None:
+    """With a trace file that cannot be written it stops, while other commands do nothing."""
+    options = ("--trace", str(tmp_path / "missing" / "trace.txt"))
+    assert isinstance(invoke("clear", URL, *options).exception, CommandError)
+    assert invoke("stop", URL, *options).exit_code == 0
+
+
+def test_tones_are_measured_by_hand() -> None:
+    """Sensors with unit and channel; a reading of two tones at each, of a plate at rest."""
+    sensors = result_of("sensors", URL)["sensors"]
+    assert [one["channel"] for one in sensors] == [0, 1, 2, 3]
+    assert {(one["measures"], one["unit"]) for one in sensors} == {("acceleration", "m/s²")}
+    tones = ["--frequency", "110", "--frequency", "150", "--window", "0.1"]
+    reading = result_of("measure", URL, *tones)
+    assert (reading["state"], reading["token"]) == ("COMPLETE", 0)
+    for one in reading["sensors"]:
+        assert [tone["frequency_hz"] for tone in one["tones"]] == [110.0, 150.0]
+        assert [tone["amplitude"] for tone in one["tones"]] == [0.0, 0.0]
+
+
+def test_tones_too_close_are_an_error_of_the_command() -> None:
+    """Exit status 2 of the program, by the error's class."""
+    tones = ["--frequency", "110", "--frequency", "112", "--window", "0.1"]
+    assert isinstance(invoke("measure", URL, *tones).exception, CommandError)
+
+
+def test_discover_reports_why_a_port_cannot_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reason stands with the port."""
+    port = ListPortInfo("/dev/no-such-port")
+    monkeypatch.setattr("drivers.discovery.places.comports", lambda: [port])
+    monkeypatch.setattr("drivers.discovery.places.os.access", lambda path, mode: True)
+    result = invoke("discover")
+    assert result.exit_code == 0, result.output
+    assert "no such port" in result.stdout
+
+
+def test_discover_lists_amplifiers_of_urls() -> None:
+    """Each with its identity."""
+    (found,) = result_of("discover", URL, "--no-probe")["amplifiers"]
+    assert (found["url"], found["serial_number"]) == (URL, "SIM-main")

@@ -1,0 +1,95 @@
+"""The check of a rig's amplifiers by their URLs alone."""
+
+from dataclasses import replace
+
+import pytest
+
+from drivers.by_hand.rig_check import COMMIT_SKEW, check_links, phase_error, remaining_contrast
+from registry.limits import GuardLimits
+
+BUS = "can+socketcan://can0"
+LIMITS = GuardLimits(40.0, 250.0, 1.0)
+
+
+def checked(*urls: str, channels: int = 4) -> tuple[dict[str, str], list[str]]:
+    """Amplifiers a, b, ... at these URLs, with so many channels each."""
+    named = dict(zip("abcd", urls, strict=False))
+    return check_links(named, channels=dict.fromkeys(named, channels), limits=LIMITS)
+
+
+@pytest.mark.parametrize("frequencies", [(5.0, 250.0), (40.0, 5000.0)])
+def test_check_links_warns_of_limits_beyond_the_ceilings(frequencies: tuple[float, float]) -> None:
+    """10 Hz, and 65 535 steps of 1/20 Hz."""
+    low, high = frequencies
+    limits = replace(LIMITS, frequency_min=low, frequency_max=high)
+    _, (warning,) = check_links({}, channels={}, limits=limits)
+    assert "10 to 3276.75 Hz" in warning
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("serail:///dev/ttyUSB0", r"unknown wire 'serail://'; did you mean serial://\? known are"),
+        ("carrier+pigeon://coop", "known are .*modbus.tcp://, serial://, .*sim://"),
+        ("serial:///dev/ttyUSB0?baud=fast", "baud must be.*'fast'"),
+        ("modbus+tcp://host/999", "unit must be.*'999'"),
+        (f"{BUS}#300", "node after # must be.*'300'"),
+        # A write and a read of 22 and 3 words: 86 bytes of 11 bits at 9600 baud are 99 ms.
+        ("modbus+rtu:///dev/ttyS1?baud=9600#1", "at least 26. ms.*got 250 ms"),
+    ],
+)
+def test_check_links_names_an_unusable_url(url: str, message: str) -> None:
+    """Unknown scheme, invalid part of a URL, wire too slow for the watchdog."""
+    wrong, warnings = checked("serial:///dev/ttyUSB9", url)
+    assert list(wrong) == ["b"]
+    with pytest.raises(AssertionError, match=message):
+        raise AssertionError(wrong["b"])
+    assert warnings == []
+
+
+def test_check_links_refuses_two_amplifiers_at_one_address() -> None:
+    """However the URL is spelled; the error is on the second and names the first."""
+    wrong, _ = checked(f"{BUS}#1", f"{BUS}#2", f"{BUS}?bitrate=500000#1")
+    assert list(wrong) == ["c"]
+    assert "amplifier a" in wrong["c"]
+
+
+def test_check_links_warns_of_eras_on_several_links() -> None:
+    """No warning for one bus, one link, or a second link without ERAs."""
+    urls = {"a": "serial:///dev/ttyUSB0", "b": f"{BUS}#1"}
+    assert check_links(urls, channels={"a": 4}, limits=LIMITS) == ({}, [])
+    assert checked("modbus+tcp://host/1", "sim://rig.yaml") == ({}, [])
+    wrong, (warning,) = check_links(urls, channels={"a": 2, "b": 2}, limits=LIMITS)
+    assert wrong == {}
+    assert "2 links (/dev/ttyUSB0, can+socketcan://can0)" in warning
+    assert "36 degrees at 100 Hz and 90 at 250 Hz" in warning
+
+
+@pytest.mark.parametrize(
+    ("urls", "times"),
+    [
+        # 86 bytes of 11 bits, four silences of 3.5 characters, 10 ms for the amplifier: twice.
+        (["modbus+rtu:///dev/ttyS1?baud=19200#1"], ["185 ms"]),
+        (["serial:///dev/ttyUSB0"], []),
+        # Three times 30 ms each, after a heartbeat of 50 ms.
+        (["serial:///dev/ttyUSB0?address=1", "serial:///dev/ttyUSB0?address=2"], ["230 ms"]),
+        (["serial:///dev/ttyUSB0", "modbus+tcp://host/1"], []),
+        (["modbus+tcp://host/1", "modbus+tcp://host/2", "modbus+tcp://host/3"], ["320 ms"]),
+        ([f"{BUS}#1", f"{BUS}#5"], ["230 ms"]),
+    ],
+)
+def test_check_links_warns_of_late_loss_detection(urls: list[str], times: list[str]) -> None:
+    """Slow lines, and lines on which several amplifiers wait for each other; times by hand."""
+    wrong, warnings = checked(*urls)
+    assert wrong == {}
+    late = [warning for warning in warnings if "later than 150 ms" in warning]
+    assert len(late) == len(times)
+    for warning, time in zip(late, times, strict=True):
+        assert time in warning
+
+
+def test_remaining_contrast_of_a_skew() -> None:
+    """1 ms is a tenth of a period of 100 Hz; 2 sin(18 degrees) of one half remains at the null."""
+    assert phase_error(100.0, COMMIT_SKEW) == pytest.approx(36.0)
+    assert remaining_contrast(100.0, COMMIT_SKEW) == pytest.approx(4.18, abs=0.01)
+    assert remaining_contrast(400.0, COMMIT_SKEW) == 0.0
